@@ -62,7 +62,7 @@ class PhotoOutputs:
         record.tables = [storage(field, folder / "field.npz")]
         if self.problem.has_gains:
             record.tables.append(table_of_gains([view.name for view in self.photos.views], self.problem.exposure.table()))
-        record.volumes += [write_density(folder, field.level(number), number) for number in range(field.levels)]
+        record.volumes += [write_density(folder, field.extract_level(number), number) for number in range(field.levels)]
         record.results = {
             "views": float(len(self.photos.views)),
             "iterations": float(self.fit.next_iteration),
@@ -109,7 +109,7 @@ def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: f
         folder, problem, which: where, what, and the word.
         white: by what colours are multiplied: the radiance for which 1 stood in the fit.
     """
-    save_field(folder / f"field{which}.npz", problem.field.brightened(white))
+    save_field(folder / f"field{which}.npz", problem.field.scale_colours(white))
     if problem.sky is not None:
         write_exr(folder / f"sky{which}.exr", {"": white * problem.sky.image()})
 
@@ -166,7 +166,7 @@ def behind(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:
 
 def storage(field: SphericalGrid, path: Path) -> Table:
     """What the field takes, beside grids of the same box that keep every node."""
-    nodes, kept = field.places, len(field.listed())
+    nodes, kept = field.node_count, len(field.stored_nodes())
     kinds = {
         "every node: r, g, b and density of 8 bits": 4 * nodes,
         "every node: four numbers": 16 * nodes,
@@ -183,7 +183,7 @@ def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
     """The extinction at the nodes of a level, as a grid that other programs read; the innermost has no number."""
     raw, _ = field.to_dense()
     name = f"volumes/density{f'-level-{level}' if level else ''}"
-    sigma = np.array(field.act.value_and_slope(type(field.density)(raw.ravel()))[0]).reshape(*field.res, 1)
+    sigma = np.array(field.activation_function.value_and_slope(type(field.density)(raw.ravel()))[0]).reshape(*field.res, 1)
     write_volume(folder / f"{name}.vol", sigma, field.to_world)
     write_volume(folder / f"{name}.npz", sigma, field.to_world)
     size = tuple(float(edge) for edge in np.abs(np.diag(field.to_world)[:3]))

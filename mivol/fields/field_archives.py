@@ -165,7 +165,7 @@ def save_svox2(path: Path, field: SphericalGrid) -> None:
     if np.abs(sh).max(initial=0.0) > HALF:
         raise refusal(path, f"coefficients of up to {np.abs(sh).max():g}", f"at most {HALF:g}, a half float's", "write .npz")
     links = np.full(math.prod(field.res), -1, np.int32)
-    links[field.listed()] = np.arange(len(density))
+    links[field.stored_nodes()] = np.arange(len(density))
     arrays = {
         "radius": box / 2, "center": field.to_world[:3, 3] + box / 2, "basis_type": np.array(SVOX2_SH),
         "links": links.reshape(field.res).transpose(2, 1, 0), "density_data": density[:, None],

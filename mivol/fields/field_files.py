@@ -148,13 +148,13 @@ def _volumes(path: Path, wish: _Wish) -> list[Path]:
     if wish.field.levels == 1:
         return _pair(path, wish.field)
     names = (path.with_name(f"{path.stem}{f'-level-{k}' if k else ''}{path.suffix}") for k in range(wish.field.levels))
-    return [file for k, name in enumerate(names) for file in _pair(name, wish.field.level(k))]
+    return [file for k, name in enumerate(names) for file in _pair(name, wish.field.extract_level(k))]
 
 
 def _pair(path: Path, field: SphericalGrid) -> list[Path]:
     """Extinction and colour of one grid."""
     density, sh = field.to_dense()
-    sigma, _ = field.act.value_and_slope(mi.Float(density.reshape(-1)))
+    sigma, _ = field.activation_function.value_and_slope(mi.Float(density.reshape(-1)))
     colour = np.maximum(field.offset + Y00 * sh[..., 0, :], 0 if field.clamp else -np.inf)
     beside = path.with_name(f"{path.stem}-colour{path.suffix}")
     write_volume(path, np.array(sigma).reshape(field.res), field.to_world)

@@ -53,7 +53,7 @@ class CellLists:
     starts: np.ndarray
     entries: np.ndarray
 
-    def largest_sum(self, values: np.ndarray) -> float:
+    def max_cell_sum(self, values: np.ndarray) -> float:
         """The largest sum of a number of each Gaussian (N,) over the entries of one cell."""
         sums = np.concatenate([[0.0], np.cumsum(values[self.entries], dtype=np.float64)])
         return float(np.diff(sums[self.starts]).max(initial=0.0))

@@ -77,7 +77,7 @@ class GaussianField:
         self.refresh()
 
     @classmethod
-    def of(cls, gaussians: Gaussians, place: np.ndarray, space: str = "srgb", blur: float = 0.0) -> GaussianField:
+    def from_gaussians(cls, gaussians: Gaussians, place: np.ndarray, space: str = "srgb", blur: float = 0.0) -> GaussianField:
         """The field of some Gaussians."""
         return cls(
             {name: mi.TensorXf(getattr(gaussians, name)) for name in (*EXTINCTION_PARAMETERS, HARMONICS)}, place, space, blur
@@ -102,13 +102,13 @@ class GaussianField:
             )
         if tensors:
             return cls({name: mi.TensorXf(props[name]) for name in tensors}, place, *shown)
-        return cls.of(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place, *shown)
+        return cls.from_gaussians(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place, *shown)
 
     def refresh(self) -> None:
         """List the Gaussians anew, after parameters have changed. Reads them: not while ``dr.freeze`` records."""
         values = {name: np.array(dr.detach(tensor)) for name, tensor in self.tensors.items()}
         values.setdefault(HARMONICS, np.zeros((len(values["means"]), 1, 3), np.float32))
-        read = Gaussians(**values).checked("Gaussians of a medium")
+        read = Gaussians(**values).check("Gaussians of a medium")
         means = read.means.astype(np.float64) @ self.place[:3, :3].T + self.place[:3, 3]
         self.least_scale = _find_min_scale(read)
         scales = np.hypot(np.maximum(read.scales().astype(np.float64), self.least_scale), self.blur)
@@ -118,7 +118,7 @@ class GaussianField:
         depth = -np.log1p(-np.minimum(read.opacities().astype(np.float64), MAX_OPACITY))
         # |W omega| is largest along the shortest axis.
         largest = np.linalg.norm(whitening, ord=2, axis=(1, 2))
-        self._bound = self.lists.largest_sum(depth * largest) / math.sqrt(2 * math.pi)
+        self._bound = self.lists.max_cell_sum(depth * largest) / math.sqrt(2 * math.pi)
         self.starts, self.entries = mi.UInt32(self.lists.starts), mi.UInt32(self.lists.entries)
         # Mitsuba asks media for their extinction inside of loops, where nothing can be made beforehand.
         edge, nodes = np.diag(self.to_world)[:3], self.lists.res[::-1]
@@ -167,11 +167,11 @@ class GaussianField:
         """Of the harmonics."""
         return harmonic_degree(self.tensors[HARMONICS].shape[1])
 
-    def colour_rows(self) -> mi.Float:
+    def pack_colours(self) -> mi.Float:
         """The harmonics of all Gaussians in blocks (:mod:`mivol.fields.harmonics`), attached to the parameter."""
         return pack_harmonics(self.tensors[HARMONICS], self.degree)
 
-    def harmonics_of(self, d: mi.Vector3f) -> list[mi.Float]:
+    def eval_basis(self, d: mi.Vector3f) -> list[mi.Float]:
         """The basis for unit directions of travel in the world."""
         return dr.sh_eval(rotate_direction(local_frame(self.place), d), self.degree)
 
@@ -181,18 +181,18 @@ class GaussianField:
         def add(total: mi.Float, line: WhitenedLine, index: mi.UInt32) -> mi.Float:
             return total + line.density
 
-        return [self.each_at(mi.Ray3f(p, w), active, dr.zeros(mi.Float, dr.width(p)), add)]
+        return [self.visit_at_points(mi.Ray3f(p, w), active, dr.zeros(mi.Float, dr.width(p)), add)]
 
-    def each_at(self, ray: mi.Ray3f, active: mi.Bool, state: Any, add: Callable[..., Any]) -> Any:
+    def visit_at_points(self, ray: mi.Ray3f, active: mi.Bool, state: Any, add: Callable[..., Any]) -> Any:
         """Visit the Gaussians that may reach the origins of rays: ``add(state, line, index) -> state``."""
         cell, inside = [], mi.Bool(active)
         for x, low, pace, n in zip(mi.Point3f(ray.o), self._low, self._pace, self.lists.res[::-1], strict=True):
             u = (x - low) * pace
             inside &= (u >= 0) & (u <= n)
             cell.append(dr.clip(mi.Int32(dr.floor(u + 0.5)), 0, n))
-        return self.each_in(mi.Vector3i(*cell), (ray.o, ray.d), inside, state, add)
+        return self.visit_cell(mi.Vector3i(*cell), (ray.o, ray.d), inside, state, add)
 
-    def each_in(
+    def visit_cell(
         self,
         cell: mi.Vector3i,
         through: tuple[mi.Point3f, mi.Vector3f],

@@ -209,11 +209,11 @@ def _collect_mass(field: SphericalGrid) -> tuple[np.ndarray, np.ndarray, np.ndar
     """Nodes that hold anything (n, 3), (x, y, z), their masses [length^2] (n,) and harmonics (n, K, 3) of code values."""
     density, harmonics = field.values()
     volume = abs(float(np.linalg.det(field.to_world[:3, :3]))) / math.prod(field.res)
-    mass = np.array(field.act.value_and_slope(mi.Float(density))[0], np.float64) * volume
+    mass = np.array(field.activation_function.value_and_slope(mi.Float(density))[0], np.float64) * volume
     held = np.flatnonzero(mass > 0)
     if not len(held):
         raise MivolError("the field holds nothing; matter is expected: there is nothing to make Gaussians of.")
-    z, y, x = np.unravel_index(field.listed()[held], field.res)
+    z, y, x = np.unravel_index(field.stored_nodes()[held], field.res)
     return np.stack([x, y, z], axis=1).astype(np.float64), mass[held], _encode_harmonics(field, harmonics[held])
 
 
@@ -222,7 +222,7 @@ def _encode_harmonics(field: SphericalGrid, harmonics: np.ndarray) -> np.ndarray
     harmonics = harmonics[:, : (HIGHEST_DEGREE + 1) ** 2].astype(np.float64)
     basis = harmonics.shape[1]
     d = _fibonacci_directions()
-    own = _stack_columns(field.harmonics_of(d)[:basis])
+    own = _stack_columns(field.eval_basis(d)[:basis])
     back = np.linalg.pinv(_stack_columns(dr.sh_eval(d, math.isqrt(basis) - 1)))
     if field.space == "srgb":
         turned = np.einsum("kj,njc->nkc", back @ own, harmonics)

@@ -112,7 +112,7 @@ class WhitenedLine:
         low, high = ((t - self.peak) * self.speed * INVERSE_ROOT_2 for t in (a, b))
         return 0.5 * (dr.erf(high) - dr.erf(low))
 
-    def share_before(self, a: mi.Float) -> mi.Float:
+    def share_up_to(self, a: mi.Float) -> mi.Float:
         """The share [1] of the depth that lies before a distance from ``o``, from the far end of the line."""
         return 0.5 * (1 + dr.erf((a - self.peak) * self.speed * INVERSE_ROOT_2))
 
@@ -132,7 +132,7 @@ class WhitenedLine:
         return LineSlopes(q, v, share * self._by_opacity)
 
     @property
-    def holds_origin(self) -> mi.Bool:
+    def contains_origin(self) -> mi.Bool:
         """Whether ``o`` lies on the chord."""
         start, end = self.chord
         return self.hits & (start <= 0) & (end >= 0)
@@ -140,7 +140,7 @@ class WhitenedLine:
     @property
     def density(self) -> mi.Float:
         """The extinction [1/length] at ``o``; 0 outside of the chord."""
-        return dr.select(self.holds_origin, self.depth * self.speed * _normal_density(self.peak * self.speed), 0)
+        return dr.select(self.contains_origin, self.depth * self.speed * _normal_density(self.peak * self.speed), 0)
 
     @property
     def density_slopes(self) -> LineSlopes:

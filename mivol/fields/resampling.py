@@ -36,14 +36,14 @@ def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.n
     kept = kept[~np.array(is_covered_by_inner(mi.UInt32(kept.astype(np.uint32)), res))] if old.levels > 1 else kept
     density, harmonics = _interpolate(old, axes, np.unravel_index(kept, (old.levels, *res)))
     count = len(kept)
-    flat = dr.full(mi.Float, old.act.vacuum, count + 1)
+    flat = dr.full(mi.Float, old.activation_function.vacuum, count + 1)
     packed = dr.zeros(mi.Float, (count + 1) * old.width)
     if count:
         dr.scatter(flat, density, dr.arange(mi.UInt32, count))
         dr.scatter(packed, mi.ArrayXf(harmonics), dr.arange(mi.UInt32, count))
     dr.eval(flat, packed)
     nodes = mi.UInt32(kept.astype(np.uint32))
-    return replace(old, res=tuple(res), to_world=to_world, density=flat, harmonics=packed, nodes=nodes, listing=None)
+    return replace(old, res=tuple(res), to_world=to_world, density=flat, harmonics=packed, nodes=nodes, index=None)
 
 
 def _select_nodes(keep: np.ndarray, axes: list[_AxisWeights]) -> np.ndarray:
@@ -89,7 +89,7 @@ def _interpolate(old: SphericalGrid, axes: list[_AxisWeights], place: tuple) -> 
         ]
         node = np.ravel_multi_index([place[0], *(n for n, _ in ends)], (old.levels, *old.res))
         weight = mi.Float(math.prod(s for _, s in ends))
-        row = old.row_of(mi.UInt32(node.astype(np.uint32)))
+        row = old.look_up_rows(mi.UInt32(node.astype(np.uint32)))
         density = dr.fma(weight, dr.gather(mi.Float, old.density, row), density)
         values = dr.gather(mi.ArrayXf, old.harmonics, row, shape=(old.width, 1))
         harmonics = [dr.fma(weight, v, h) for v, h in zip(values, harmonics, strict=True)]

@@ -65,7 +65,7 @@ class Shading:
             raise MivolError(f"{name} was given {', '.join(wrong)}; finite numbers that are not negative are expected.")
         return cls(eye, light, **numbers)
 
-    def lit(self, colours: list[mi.Float], gradient: mi.Vector3f, p: mi.Point3f) -> list[mi.Float]:
+    def shade(self, colours: list[mi.Float], gradient: mi.Vector3f, p: mi.Point3f) -> list[mi.Float]:
         """What points reflect; attached to colours, gradient and eye.
 
         Args:

@@ -37,7 +37,7 @@ class Sky:
     texels: mi.Float
 
     @classmethod
-    def even(cls, rows: int, colour: np.ndarray | float) -> Sky:
+    def uniform(cls, rows: int, colour: np.ndarray | float) -> Sky:
         """The same colour in all directions: (3,), or one number for a grey.
 
         Raises:
@@ -45,10 +45,10 @@ class Sky:
         """
         if rows < 2:
             raise MivolError(f"a sky of {rows} rows was asked for; at least 2 are expected, one a pole.")
-        return cls.of_image(np.broadcast_to(colour, (rows, 2 * rows, 3)))
+        return cls.from_image(np.broadcast_to(colour, (rows, 2 * rows, 3)))
 
     @classmethod
-    def of_image(cls, image: np.ndarray) -> Sky:
+    def from_image(cls, image: np.ndarray) -> Sky:
         """The sky of an image (n, 2 n, 3)."""
         texels = np.zeros((*image.shape[:2], TEXEL), np.float32)
         texels[..., :3] = image
@@ -62,7 +62,7 @@ class Sky:
         """Another light from the same directions."""
         return replace(self, texels=texels)
 
-    def smoothed(self, share: float) -> Sky:
+    def smooth(self, share: float) -> Sky:
         """The sky whose texels have gone a share of the way to the mean of their four neighbours.
 
         Done again and again, it gives texels that no ray ends at the light of those around them.
@@ -97,7 +97,7 @@ class Sky:
             found += [(mi.UInt32(row + left), wy * (1 - fx)), (mi.UInt32(row + right), wy * fx)]
         return found
 
-    def seen(self, d: mi.Vector3f) -> mi.Color3f:
+    def eval(self, d: mi.Vector3f) -> mi.Color3f:
         """Radiance from where unit directions point to."""
         colour = mi.Color3f(0)
         for texel, share in self._corners(d):
@@ -105,8 +105,8 @@ class Sky:
             colour += mi.Color3f(packet[0], packet[1], packet[2]) * share
         return colour
 
-    def slopes(self, d: mi.Vector3f, by: mi.Color3f) -> mi.Float:
-        """Derivatives with respect to ``texels`` of a scalar, from those with respect to what :meth:`seen` gives."""
+    def texel_gradient(self, d: mi.Vector3f, by: mi.Color3f) -> mi.Float:
+        """Derivatives with respect to ``texels`` of a scalar, from those with respect to what :meth:`eval` gives."""
         total = dr.zeros(mi.Float, dr.width(self.texels))
         for texel, share in self._corners(d):
             packet = mi.ArrayXf([by.x * share, by.y * share, by.z * share, mi.Float(0)])
@@ -124,4 +124,4 @@ def read_sky(path: Path) -> Sky:
     image = np.stack([channels[name] for name in "RGB"], axis=-1) if {"R", "G", "B"} <= channels.keys() else np.zeros((1, 1, 3))
     if image.shape[0] < 2 or image.shape[1] != 2 * image.shape[0]:
         raise MivolError(f"{path} is no sky of R, G and B, twice as wide as high: take it away, or fit the field again.")
-    return Sky.of_image(image)
+    return Sky.from_image(image)

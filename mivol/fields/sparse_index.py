@@ -34,7 +34,7 @@ class SparseIndex:
         return 4 * dr.width(self.words)
 
     @classmethod
-    def of(cls, listed: mi.UInt32, places: int) -> SparseIndex:
+    def from_sorted(cls, listed: mi.UInt32, places: int) -> SparseIndex:
         """From the ascending numbers of the listed ones among so many places."""
         n = -(-max(places, 1) // 32)
         bits = dr.zeros(mi.UInt32, n)

@@ -89,7 +89,7 @@ class SphericalGrid:
         clamp: whether colours below 0 are shown as 0.
         levels: boxes that are nested, each of twice the extent; ``res`` and ``to_world`` are those of the innermost.
         space: what colours are: "srgb" (code values, as in photographs) or "linear" (radiance).
-        listing: what :meth:`listed_places` has made.
+        index: made by :meth:`sparse_index` at its first call.
     """
 
     res: tuple[int, int, int]
@@ -103,7 +103,7 @@ class SphericalGrid:
     clamp: bool = True
     levels: int = 1
     space: str = "srgb"
-    listing: SparseIndex | None = None
+    index: SparseIndex | None = None
 
     def _repr_html_(self) -> str:
         """Three middle slices of the density, for notebooks."""
@@ -137,10 +137,10 @@ class SphericalGrid:
     @property
     def rows(self) -> int:
         """Number of rows, that of the vacuum included."""
-        return self.places if self.nodes is None else dr.width(self.nodes) + 1
+        return self.node_count if self.nodes is None else dr.width(self.nodes) + 1
 
     @property
-    def places(self) -> int:
+    def node_count(self) -> int:
         """Number of nodes of all levels, stored or not."""
         return self.levels * math.prod(self.res)
 
@@ -155,7 +155,7 @@ class SphericalGrid:
         return 4 * (self.rows * (1 + self.width) + (0 if self.nodes is None else self.rows - 1))
 
     @property
-    def act(self) -> Activation:
+    def activation_function(self) -> Activation:
         """The activation itself."""
         return select_activation(self.activation)
 
@@ -227,7 +227,7 @@ class SphericalGrid:
         return cls(tuple(res), to_world, degree, *packed, nodes, activation, offset, clamp, levels, space)
 
     @classmethod
-    def nested(cls, grids: Sequence[SphericalGrid]) -> SphericalGrid:
+    def from_levels(cls, grids: Sequence[SphericalGrid]) -> SphericalGrid:
         """One field of grids of one level, the innermost first, each of twice the extent of the one before.
 
         Raises:
@@ -243,13 +243,13 @@ class SphericalGrid:
                 raise MivolError(f"{found}: place it so.")
             density, sh = grid.values()
             values.append((np.float32(density * 2.0**level), sh))
-            stored.append(grid.listed() + level * math.prod(first.res))
+            stored.append(grid.stored_nodes() + level * math.prod(first.res))
         nodes = mi.UInt32(np.concatenate(stored).astype(np.uint32))
         rows = [np.concatenate(part) for part in zip(*values, strict=True)]
         how = first.activation, first.offset, first.clamp
         return cls.from_rows(first.res, first.to_world, *rows, nodes, *how, len(grids), first.space)
 
-    def level(self, number: int) -> SphericalGrid:
+    def extract_level(self, number: int) -> SphericalGrid:
         """A level as a field of its own, in the whole of its box; what the level before covers is not cut out.
 
         Raises:
@@ -257,7 +257,7 @@ class SphericalGrid:
         """
         if not 0 <= number < self.levels:
             raise MivolError(f"level {number} of a field of {self.levels} was asked for; count from 0, the innermost.")
-        count, stored = math.prod(self.res), self.listed()
+        count, stored = math.prod(self.res), self.stored_nodes()
         own = np.flatnonzero(stored // count == number)
         density, sh = self.values()
         nodes = None if self.nodes is None else mi.UInt32((stored[own] % count).astype(np.uint32))
@@ -283,14 +283,14 @@ class SphericalGrid:
         if self.nodes is not None:
             where = np.array(self.nodes)
             packed = density, sh
-            density = np.full(math.prod(self.res), self.act.vacuum, np.float32)
+            density = np.full(math.prod(self.res), self.activation_function.vacuum, np.float32)
             sh = np.zeros((math.prod(self.res), self.basis, 3), np.float32)
             density[where], sh[where] = packed
         return density.reshape(self.res), sh.reshape(*self.res, self.basis, 3)
 
-    def sparse(self, keep: np.ndarray) -> SphericalGrid:
+    def select_nodes(self, keep: np.ndarray) -> SphericalGrid:
         """The nodes for which ``keep`` (Z, Y, X), or (levels, Z, Y, X), holds, of those that are stored."""
-        stored = self.listed()
+        stored = self.stored_nodes()
         picked = np.flatnonzero(np.asarray(keep, bool).reshape(-1)[stored])
         density, sh = self.values()
         nodes = mi.UInt32(stored[picked].astype(np.uint32))
@@ -308,31 +308,31 @@ class SphericalGrid:
         how = self.activation, self.offset, self.clamp, self.levels, self.space
         return self.from_rows(self.res, self.to_world, density, rows, self.nodes, *how)
 
-    def brightened(self, factor: float) -> SphericalGrid:
+    def scale_colours(self, factor: float) -> SphericalGrid:
         """The same field, its colours so many times as bright."""
         if factor == 1:
             return self
         return replace(self, harmonics=self.harmonics * factor, offset=self.offset * factor)
 
-    def listed(self) -> np.ndarray:
+    def stored_nodes(self) -> np.ndarray:
         """Flat numbers of the nodes that have a row, int64."""
-        return np.arange(self.places) if self.nodes is None else np.array(self.nodes).astype(np.int64)
+        return np.arange(self.node_count) if self.nodes is None else np.array(self.nodes).astype(np.int64)
 
-    def row_of(self, node: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
+    def look_up_rows(self, node: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
         """The row of nodes of all levels, by their flat numbers: the vacuum's where a node is not stored.
 
         What it looks up is made when it is first asked (not inside a loop that is being traced).
         """
         if self.nodes is None:
             return node
-        row, stored = self.listed_places().rank(node, active)
+        row, stored = self.sparse_index().rank(node, active)
         return dr.select(stored, row, self.rows - 1)
 
-    def listed_places(self) -> SparseIndex:
+    def sparse_index(self) -> SparseIndex:
         """Which nodes have a row, of a sparse field: two bits a node of the box; made once."""
-        if self.listing is None:
-            self.listing = SparseIndex.of(self.nodes, self.places)
-        return self.listing
+        if self.index is None:
+            self.index = SparseIndex.from_sorted(self.nodes, self.node_count)
+        return self.index
 
     # -- Where it lies -----------------------------------------------------------------------------------------------------
 
@@ -348,22 +348,22 @@ class SphericalGrid:
         place[:3, 3] = self.middle + 2.0**number * (self.to_world[:3, 3] - self.middle)
         return place
 
-    def own_frame(self) -> np.ndarray:
+    def local_frame(self) -> np.ndarray:
         """(3, 3) map of world directions to the grid's own frame: the inverse of the polar factor of ``to_world``."""
         return local_frame(self.to_world)
 
     def turn(self, d: mi.Vector3f) -> mi.Vector3f:
         """World directions in the grid's own frame."""
-        return rotate_direction(self.own_frame(), d)
+        return rotate_direction(self.local_frame(), d)
 
-    def harmonics_of(self, d: mi.Vector3f) -> list[mi.Float]:
+    def eval_basis(self, d: mi.Vector3f) -> list[mi.Float]:
         """The basis for unit directions of travel in the world."""
         return dr.sh_eval(self.turn(d), self.degree)
 
-    def viewer(self, points: np.ndarray) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
+    def make_view_basis(self, points: np.ndarray) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
         """The basis for directions from world points (V, 3) to nodes: a function of flat node numbers and of which point."""
         z, y, x = self.res
-        frame, per_level = self.own_frame(), math.prod(self.res)
+        frame, per_level = self.local_frame(), math.prod(self.res)
         linear = frame @ self.to_world[:3, :3] / np.array([x, y, z], np.float64)
         # The middle of the boxes in the own frame, less the point: a difference in float64.
         start = (frame @ (self.middle - np.asarray(points, np.float64)).T).T
@@ -400,12 +400,12 @@ class SphericalGrid:
             low = dr.floor(value)
             i = mi.Int32(low)
             pairs.append([(dr.clip(i, 0, n - 1), 1 - (value - low)), (dr.clip(i + 1, 0, n - 1), value - low)])
-        basis = self.harmonics_of(d)
+        basis = self.eval_basis(d)
         sigma, colour = mi.Float(0), [mi.Float(self.offset)] * 3
         for k, wz in pairs[2]:
             for j, wy in pairs[1]:
                 for i, wx in pairs[0]:
-                    row = self.row_of(mi.UInt32(((level * z + k) * y + j) * x + i), inside)
+                    row = self.look_up_rows(mi.UInt32(((level * z + k) * y + j) * x + i), inside)
                     w = wx * wy * wz
                     sigma = dr.fma(w, dr.gather(mi.Float, self.density, row, inside), sigma)
                     held = dr.gather(mi.ArrayXf, self.harmonics, row, inside, shape=(self.width, 1))
@@ -414,7 +414,7 @@ class SphericalGrid:
                         colour[a] = dr.fma(w, seen, colour[a])
         if self.clamp:
             colour = [dr.maximum(c, 0) for c in colour]
-        extinction, _ = self.act.value_and_slope(sigma)
+        extinction, _ = self.activation_function.value_and_slope(sigma)
         return dr.select(inside, extinction * scale, 0), mi.Color3f(*(dr.select(inside, c, 0) for c in colour))
 
     def _level_of(self, q: list[mi.Float]) -> tuple[mi.Int32, mi.Float]:
@@ -459,7 +459,7 @@ def with_tensors(field: SphericalGrid, density: mi.TensorXf, sh: mi.TensorXf) ->
     flat = density.array
     if vacuum:
         row = dr.arange(mi.UInt32, count + 1)
-        flat = dr.select(row < count, dr.gather(mi.Float, flat, dr.minimum(row, count - 1)), field.act.vacuum)
+        flat = dr.select(row < count, dr.gather(mi.Float, flat, dr.minimum(row, count - 1)), field.activation_function.vacuum)
     entry = dr.arange(mi.UInt32, (count + vacuum) * width)
     row, column = entry // width, entry % width
     held = (row < count) & (column < 3 * basis)
@@ -475,6 +475,6 @@ def dense_densities(field: SphericalGrid) -> list[mi.TensorXf]:
     if field.nodes is None and field.levels == 1:
         return [mi.TensorXf(field.density, (*field.res, 1))]
     node = dr.arange(mi.UInt32, math.prod(field.res))
-    rows = [field.row_of(node + k * dr.width(node)) for k in range(field.levels)]
+    rows = [field.look_up_rows(node + k * dr.width(node)) for k in range(field.levels)]
     parts = [dr.gather(mi.Float, field.density, row) * 2.0**-k for k, row in enumerate(rows)]
     return [mi.TensorXf(part, (*field.res, 1)) for part in parts]

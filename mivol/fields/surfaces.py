@@ -41,7 +41,7 @@ def default_level(field: SphericalGrid) -> float:
     """The extinction [1/length] of a surface: where a voxel's longest edge lets half of the light through, or, in a field that
     is thinner than that, half of what its matter has (the mean extinction of its nodes, weighted by itself)."""
     edges = np.linalg.norm(field.to_world[:3, :3], axis=0) / field.res[::-1]
-    sigma = np.array(field.act.value_and_slope(mi.Float(field.values()[0]))[0], np.float64)
+    sigma = np.array(field.activation_function.value_and_slope(mi.Float(field.values()[0]))[0], np.float64)
     total = sigma.sum()
     mean = float((sigma * sigma).sum() / total) if total > 0 else math.inf
     return min(math.log(2) / float(edges.max()), mean / 2)
@@ -65,13 +65,13 @@ def extract_surface(field: SphericalGrid, level: float | None = None) -> Mesh:
     """
     if level is not None and not 0 < level < math.inf:
         raise MivolError(f"the level {level:g} was given for a surface; an extinction above 0 is expected.")
-    grids = [field.level(number) for number in range(field.levels)] if field.levels > 1 else [field]
+    grids = [field.extract_level(number) for number in range(field.levels)] if field.levels > 1 else [field]
     found, most, last = [], 0.0, len(grids) - 1
     for number, grid in enumerate(grids):
         density = grid.to_dense()[0].transpose(2, 1, 0)
         wanted = default_level(grid) if level is None else float(level)
         raw = INVERSES[grid.activation](wanted)
-        most = max(most, float(np.array(grid.act.value_and_slope(mi.Float(float(density.max())))[0])[0]))
+        most = max(most, float(np.array(grid.activation_function.value_and_slope(mi.Float(float(density.max())))[0])[0]))
         inner = None if number == 0 else grids[number - 1].to_world
         found += _extract_grid_surface(grid, density, raw, inner, number == last)
     if not found:
@@ -96,7 +96,7 @@ def _extract_grid_surface(
     """
     from skimage.measure import marching_cubes  # slow to import
 
-    around = {"constant_values": min(grid.act.vacuum, raw - 1e-3)} if closes else {"mode": "edge"}
+    around = {"constant_values": min(grid.activation_function.vacuum, raw - 1e-3)} if closes else {"mode": "edge"}
     padded = np.pad(density, 1, **around)
     if not padded.min() <= raw < padded.max():
         return []

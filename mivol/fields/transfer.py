@@ -173,7 +173,7 @@ class GradientEffects:
         if self.opacity is not None:
             factor = self.opacity.factor(gradient)
             entries = [entry * factor for entry in entries]
-        return entries if self.shading is None else self.shading.lit(entries, gradient, p)
+        return entries if self.shading is None else self.shading.shade(entries, gradient, p)
 
 
 class Transfer:
@@ -186,7 +186,7 @@ class Transfer:
         refine: how many nodes stand for a voxel in each direction.
         to_world: (4, 4) affine map of the unit cube to the world.
         name: what the grid is called in a sentence that refuses it.
-        relief: what is made of the field's gradient.
+        effects: what is made of the field's gradient.
 
     Raises:
         MivolError: a field, a table, a domain or a placement of another kind.
@@ -199,18 +199,18 @@ class Transfer:
         refine: int,
         to_world: np.ndarray,
         name: str,
-        relief: GradientEffects = GradientEffects(),
+        effects: GradientEffects = GradientEffects(),
     ) -> None:
         entries, self.domain = table
-        self.name, self.refine, self.to_world, self.relief = name, refine, to_world, relief
+        self.name, self.refine, self.to_world, self.effects = name, refine, to_world, effects
         self.field = _add_channel_axis(field)
         self.table = entries if len(entries.shape) != 1 else mi.TensorXf(entries.array, (*entries.shape, 1))
         self._check()
-        self.voxels = Voxels(self.classified(), to_world, name)
+        self.voxels = Voxels(self.classify(), to_world, name)
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Transfer:
-        """Build from plugin parameters: ``filename`` or ``data``; ``table``; ``domain``; ``refine``; ``to_world``; a relief's.
+        """Build from plugin parameters: ``filename`` or ``data``; ``table``; ``domain``; ``refine``; ``to_world``; a effects's.
 
         Raises:
             MivolError: as the class, or a text that holds other things than numbers.
@@ -232,17 +232,17 @@ class Transfer:
         _check_field(field, name)
         return cls(field, (table, domain), refine, place, name, GradientEffects.from_props(props, field, place, name))
 
-    def classified(self) -> mi.TensorXf:
+    def classify(self) -> mi.TensorXf:
         """The table's entries at the nodes of the refined grid, (Z, Y, X, C), with derivatives by table and field."""
         (s,), res = self._refined(self.field)
         rows = self._entries(s)
-        if not self.relief.is_flat:
+        if not self.effects.is_flat:
             gradient, _ = self._refined(gradient_grid(self.field, self.to_world))
-            rows = self.relief.apply(rows, mi.Vector3f(*gradient), self._places(res))
+            rows = self.effects.apply(rows, mi.Vector3f(*gradient), self._places(res))
         flat = rows[0] if len(rows) == 1 else dr.ravel(mi.Vector3f(*rows))
         return mi.TensorXf(flat, (*res, len(rows)))
 
-    def departure(self) -> float:
+    def interpolation_error(self) -> float:
         """How far the classified grid is from the table half-way between its nodes: rms over its edges, in its largest entry.
 
         Cost: 9 look-ups a node of the refined grid.
@@ -270,7 +270,7 @@ class Transfer:
         """
         if not dr.flag(dr.JitFlag.FreezingScope):
             self._check()
-        self.voxels.texture.set_tensor(self.classified())
+        self.voxels.texture.set_tensor(self.classify())
 
     def _refined(self, grid: mi.TensorXf) -> tuple[list[mi.Float], tuple[int, int, int]]:
         """A grid (Z, Y, X, C) at the nodes of the refined grid, a list of channels, and its resolution (Z, Y, X)."""

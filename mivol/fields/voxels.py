@@ -87,7 +87,7 @@ class Voxels:
         return values.reshape((*values.shape[:3], -1)), place
 
     @property
-    def recorded(self) -> mi.Texture3f | None:
+    def freezable_texture(self) -> mi.Texture3f | None:
         """What a plugin shows to ``dr.freeze``, which finds arrays among a plugin's own attributes only.
 
         None on a GPU: Dr.Jit 1.5 then takes memory that nothing was written to for the handle of a hardware texture, which this
@@ -102,7 +102,7 @@ class Voxels:
         Raises:
             MivolError: ``dr.freeze`` records, and cannot follow them.
         """
-        if self.recorded is None and dr.flag(dr.JitFlag.FreezingScope):
+        if self.freezable_texture is None and dr.flag(dr.JitFlag.FreezingScope):
             advice = "render without it, use llvm_ad_rgb, or a gridvolume of Mitsuba's"
             raise MivolError(f"dr.freeze records {self.name} in {mi.variant()}, and cannot follow its values there: {advice}.")
         return self.texture.tensor()

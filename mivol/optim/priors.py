@@ -205,15 +205,15 @@ class Neighbours:
     def of(cls, field: SphericalGrid) -> Neighbours:
         """Look them up."""
         z, y, x = field.res
-        node = mi.UInt32(field.listed().astype(np.uint32))
+        node = mi.UInt32(field.stored_nodes().astype(np.uint32))
         own = dr.arange(mi.UInt32, dr.width(node))
         found = cls([], [])
         for stride, n in ((1, x), (x, y), (x * y, z)):
             place = node // stride % n
             following = dr.select(place < n - 1, node + stride, node)
             following = dr.select(is_covered_by_inner(following, field.res), node, following)
-            found.after.append(field.row_of(following))
-            before = field.row_of(dr.select(place > 0, node - stride, node))
+            found.after.append(field.look_up_rows(following))
+            before = field.look_up_rows(dr.select(place > 0, node - stride, node))
             found.before.append(dr.select(before < dr.width(node), before, own))
         dr.eval(found)
         return found

@@ -27,7 +27,7 @@ class VoxelVolume(mi.Volume):
 
     def __init__(self, props: mi.Properties) -> None:
         self.field = Voxels.from_props(props)
-        self.texture = self.field.recorded
+        self.texture = self.field.freezable_texture
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
         super().__init__(props)
 
@@ -172,8 +172,8 @@ class TransferVolume(VoxelVolume):
         self.mivol_transfer = Transfer.from_props(props)
         self.table, self.scalar = self.mivol_transfer.table, self.mivol_transfer.field
         self.field = self.mivol_transfer.voxels
-        self.texture = self.field.recorded
-        shading = self.mivol_transfer.relief.shading
+        self.texture = self.field.freezable_texture
+        shading = self.mivol_transfer.effects.shading
         self.eye = None if shading is None else shading.eye
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
         mi.Volume.__init__(self, props)

@@ -65,7 +65,7 @@ class PointCloud:
         """N."""
         return len(self.positions)
 
-    def checked(self, subject: object = "a cloud of points") -> PointCloud:
+    def check(self, subject: object = "a cloud of points") -> PointCloud:
         """Itself, if every number is finite.
 
         Raises:
@@ -87,7 +87,7 @@ def read_points(path: str | os.PathLike) -> PointCloud:
             or ``.las`` without ``laspy``.
     """
     path = check_file(path)
-    return select_by_suffix(path, CLOUD_READERS)(path).checked(path)
+    return select_by_suffix(path, CLOUD_READERS)(path).check(path)
 
 
 def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
@@ -100,7 +100,7 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
     """
     path = Path(path)
     writer = select_by_suffix(path, CLOUD_WRITERS)
-    cloud.checked(path)
+    cloud.check(path)
     write_whole(path, lambda file: writer(file, cloud))
 
 

@@ -62,7 +62,7 @@ def read_gaussians(path: str | os.PathLike) -> Gaussians:
         3
     """
     path = check_file(path)
-    return select_by_suffix(path, GAUSSIAN_READERS)(path).checked(path)
+    return select_by_suffix(path, GAUSSIAN_READERS)(path).check(path)
 
 
 def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
@@ -73,5 +73,5 @@ def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
     """
     path = Path(path)
     writer = select_by_suffix(path, GAUSSIAN_WRITERS)
-    gaussians.checked(path)
+    gaussians.check(path)
     write_whole(path, lambda file: writer(file, gaussians))

@@ -55,7 +55,7 @@ class Gaussians:
         harmonics: (N, K, 3) coefficients of the colour, K = (degree + 1)^2.
 
     Raises:
-        MivolError: shapes that do not fit together. Numbers are looked at by :meth:`checked` only.
+        MivolError: shapes that do not fit together. Numbers are looked at by :meth:`check` only.
     """
 
     means: np.ndarray
@@ -135,7 +135,7 @@ class Gaussians:
         harmonics[:, :kept] = self.harmonics[:, :kept]
         return Gaussians(self.means, self.log_scales, self.quaternions, self.opacity_logits, harmonics)
 
-    def checked(self, subject: object = "Gaussians") -> Gaussians:
+    def check(self, subject: object = "Gaussians") -> Gaussians:
         """Themselves, if every number can be drawn.
 
         Args:

@@ -54,7 +54,7 @@ def summarize_file(path: Path) -> FileSummary:
     else:
         held, lines = select_by_suffix(path, CLOUD_READERS)(path), _describe_points
     try:
-        held.checked(path)
+        held.check(path)
         refused = ""
     except MivolError as error:
         refused = str(error)

@@ -189,7 +189,7 @@ def _is_made_of_gaussians(props: mi.Properties, name: str) -> bool:
 def _is_shaded(props: mi.Properties, name: str) -> bool:
     """Whether a volume is lit: light is no coefficient."""
     transfer = getattr(props.get(name, 0.0), "mivol_transfer", None)
-    return transfer is not None and transfer.relief.shading is not None
+    return transfer is not None and transfer.effects.shading is not None
 
 
 def _volume(props: mi.Properties, name: str) -> mi.Volume:

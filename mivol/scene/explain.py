@@ -206,7 +206,7 @@ def _tables(needs: Needs) -> list[str]:
             if not hasattr(volume, "mivol_transfer"):
                 continue
             table = volume.mivol_transfer
-            missed, finer = table.departure(), table.refine + 2
+            missed, finer = table.interpolation_error(), table.refine + 2
             advice = f"; refine = {finer} would follow it closer, at {(finer / table.refine) ** 3:.3g} times the memory"
             lines.append(
                 f"{name} of {facts.name} departs from its table by {missed:.2g} of the largest entry half-way between nodes "

@@ -32,7 +32,7 @@ def test_cells_that_are_left_out_between_others_change_nothing():
     # A tenth of the nodes hold much, so that the walls of holes, which hold little less than nothing, are felt beside them.
     field = SphericalGrid.from_dense(np.where(density > 9.5, density, np.float32(-0.1)), sh, TO_WORLD)
     some = find_occupied_cells(field)
-    whole = Cells.find(field.res, TO_WORLD, field.row_of, lambda _: mi.Bool(True), field.rows)
+    whole = Cells.find(field.res, TO_WORLD, field.look_up_rows, lambda _: mi.Bool(True), field.rows)
     assert 0.2 * whole.count < some.count < 0.8 * whole.count
     o, d = aim(100)
     for ours, theirs in zip(followed(field, some, o, d), followed(field, whole, o, d), strict=True):

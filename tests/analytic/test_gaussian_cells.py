@@ -54,7 +54,7 @@ def test_the_largest_sum_is_that_of_the_fullest_cell() -> None:
     lists = lists_of(oracle.Cloud.of(random_gaussians(100, 0)))
     weight = np.random.default_rng(0).uniform(size=100)
     cells = zip(lists.starts[:-1], lists.starts[1:], strict=True)
-    assert lists.largest_sum(weight) == pytest.approx(max(weight[lists.entries[a:b]].sum() for a, b in cells))
+    assert lists.max_cell_sum(weight) == pytest.approx(max(weight[lists.entries[a:b]].sum() for a, b in cells))
 
 
 def test_what_cannot_be_listed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def interval(o: np.ndarray, d: np.ndarray, t0: np.ndarray, t1: np.ndarray) -> Ra
 
 
 def part_of(gaussians: Gaussians, scale: float = SCALE) -> GaussianExtinction:
-    return GaussianExtinction("sigma_t", GaussianField.of(gaussians, np.eye(4)), mi.Float(scale))
+    return GaussianExtinction("sigma_t", GaussianField.from_gaussians(gaussians, np.eye(4)), mi.Float(scale))
 
 
 SPANS = {

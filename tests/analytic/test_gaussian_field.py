@@ -23,7 +23,7 @@ def rows_of(field: GaussianField, scale: float = 1.0) -> np.ndarray:
 def test_rows_hold_what_a_placed_gaussian_is() -> None:
     """W maps the world to standard deviations: a shear and a mirroring of the cloud are in it."""
     gaussians, place = random_gaussians(5, 0), np.array([[2, 0.5, 0, 1], [0, -1, 0.3, 2], [0.1, 0, 3, 0], [0, 0, 0, 1.0]])
-    cloud, rows = oracle.Cloud.of(gaussians), rows_of(GaussianField.of(gaussians, place), 2.5)
+    cloud, rows = oracle.Cloud.of(gaussians), rows_of(GaussianField.from_gaussians(gaussians, place), 2.5)
     p = np.random.default_rng(0).normal(size=(7, 3))
     world = p @ place[:3, :3].T + place[:3, 3]
     ours = np.einsum("nij,pnj->pni", rows[:, :9].reshape(-1, 3, 3), world[:, None] - rows[:, 9:12])
@@ -36,13 +36,13 @@ def test_rows_hold_what_a_placed_gaussian_is() -> None:
 def test_a_value_is_at_most_the_bound_and_reaches_it_at_a_mean() -> None:
     """Of one Gaussian, at its mean along the shortest axis; of many, nowhere above."""
     one = random_gaussians(1, 0)
-    field, cloud = GaussianField.of(one, np.eye(4)), oracle.Cloud.of(one)
+    field, cloud = GaussianField.from_gaussians(one, np.eye(4)), oracle.Cloud.of(one)
     shortest = cloud.whitening()[0][np.argmin(cloud.log_scales[0])]
     w = mi.Vector3f(*(shortest / np.linalg.norm(shortest)).tolist())
     (value,) = field.eval(mi.Point3f(*cloud.means[0].tolist()), w, mi.Bool(True))
     assert float(value[0]) == pytest.approx(field.bound()[0], rel=1e-5)
     many = random_gaussians(200, 0)
-    field, rng = GaussianField.of(many, np.eye(4)), np.random.default_rng(0)
+    field, rng = GaussianField.from_gaussians(many, np.eye(4)), np.random.default_rng(0)
     p, w = many.means.repeat(20, axis=0), rng.normal(size=(4000, 3))
     w /= np.linalg.norm(w, axis=1, keepdims=True)
     (value,) = field.eval(mi.Point3f(p.T.astype(np.float32)), mi.Vector3f(w.T.astype(np.float32)), dr.full(mi.Bool, True, 4000))
@@ -56,7 +56,7 @@ def test_extremes_are_cut_and_stay_finite() -> None:
     given = random_gaussians(4, 0)
     given.opacity_logits[:] = [np.inf, -np.inf, 50, -50]
     given.log_scales[0] = [-60, -1, -1]
-    field = GaussianField.of(given, np.eye(4))
+    field = GaussianField.from_gaussians(given, np.eye(4))
     for tensor in field.tensors.values():
         dr.enable_grad(tensor)
     rows = field.rows(mi.Float(1))
@@ -72,7 +72,7 @@ def test_extremes_are_cut_and_stay_finite() -> None:
 
 def test_an_update_lists_them_anew_and_bad_numbers_are_refused_by_index() -> None:
     gaussians = random_gaussians(3, 0)
-    field = GaussianField.of(gaussians, np.eye(4))
+    field = GaussianField.from_gaussians(gaussians, np.eye(4))
     before = field.to_world.copy()
     field.tensors["means"] = mi.TensorXf(gaussians.means + 10)
     field.refresh()
@@ -81,4 +81,4 @@ def test_an_update_lists_them_anew_and_bad_numbers_are_refused_by_index() -> Non
     with pytest.raises(MivolError, match=r"Gaussians of a medium: found means .* in Gaussian 2 \(the first of 1\)"):
         field.refresh()
     with pytest.raises(MivolError, match="to_world is degenerate"):
-        GaussianField.of(gaussians, np.diag([1.0, 0, 1, 1]))
+        GaussianField.from_gaussians(gaussians, np.diag([1.0, 0, 1, 1]))

@@ -32,7 +32,7 @@ def test_flights_end_where_the_depth_of_the_twin_says(cells: float, variant_rgb:
     # The long one is entered first, and the small one may end a flight before it does.
     means[:2], scales[:2], turns[:2], opacities[:2] = [[0.5, 0, 0], [-1, 0, 0]], [[1, 0.3, 0.3], [0.1] * 3], [1, 0, 0, 0], 0.9
     gaussians = Gaussians(means, np.log(scales), turns, logit(opacities), np.zeros((20, 1, 3)))
-    part = GaussianExtinction("sigma_t", GaussianField.of(gaussians, np.eye(4)), mi.Float(SCALE))
+    part = GaussianExtinction("sigma_t", GaussianField.from_gaussians(gaussians, np.eye(4)), mi.Float(SCALE))
     o, d, end = np.array([[-4.0, 0.1, 0.05]]), np.array([[1.0, 0.0, 0.0]]), 4.8
     ray = mi.Ray3f(dr.zeros(mi.Point3f, FLIGHTS) + mi.Point3f(*o[0].tolist()), mi.Vector3f(*d[0].tolist()))
     interval = RayInterval(ray, mi.Float64(0), mi.Float64(end), dr.full(mi.Bool, True, FLIGHTS))

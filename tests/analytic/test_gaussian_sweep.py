@@ -39,7 +39,7 @@ def sweep(gaussians: Gaussians, ends: tuple[np.ndarray, np.ndarray], scale: floa
     d = rng.uniform(-0.3, 0.3, (RAYS, 3)) - o
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     o, d = (v.astype(np.float32).astype(np.float64) for v in (o, d))
-    part = GaussianExtinction("sigma_t", GaussianField.of(gaussians, np.eye(4)), mi.Float(scale), shows)
+    part = GaussianExtinction("sigma_t", GaussianField.from_gaussians(gaussians, np.eye(4)), mi.Float(scale), shows)
     body = SimpleNamespace(view=SimpleNamespace(gaussians=part, scale=mi.Float(scale)), tangents=[])
     ray = mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
     t0, t1 = (mi.Float64(t) for t in ends)
@@ -91,7 +91,7 @@ def rays(away: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
 
 def visited(gaussians: Gaussians, o: np.ndarray, d: np.ndarray, span: tuple[float, float]) -> list[list[int]]:
     """The numbers of the Gaussians that each ray visits, in the order of the visits."""
-    part = GaussianExtinction("sigma_t", GaussianField.of(gaussians, np.eye(4)), mi.Float(1))
+    part = GaussianExtinction("sigma_t", GaussianField.from_gaussians(gaussians, np.eye(4)), mi.Float(1))
     ray = mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
     interval = RayInterval(ray, mi.Float64(span[0]), mi.Float64(span[1]), dr.full(mi.Bool, True, len(o)))
     most = gaussians.count

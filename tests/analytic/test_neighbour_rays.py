@@ -45,7 +45,7 @@ def field_of(levels: int = 1, to_world: np.ndarray = TO_WORLD) -> SphericalGrid:
     if levels == 1:
         return inner
     outer = make((9, 11, 10), basis=4, seed=1, scale=0.5)
-    return SphericalGrid.nested([inner, SphericalGrid.from_dense(*outer, inner.level_to_world(1))])
+    return SphericalGrid.from_levels([inner, SphericalGrid.from_dense(*outer, inner.level_to_world(1))])
 
 
 def numbers(seen: RenderedRays) -> list[np.ndarray]:

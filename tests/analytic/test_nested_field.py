@@ -38,7 +38,7 @@ def arrays(seed: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def field_of(values: list[tuple[np.ndarray, np.ndarray]]) -> SphericalGrid:
-    return SphericalGrid.nested([SphericalGrid.from_dense(*v, place(i)) for i, v in enumerate(values)])
+    return SphericalGrid.from_levels([SphericalGrid.from_dense(*v, place(i)) for i, v in enumerate(values)])
 
 
 def twin_of(values: list[tuple[np.ndarray, np.ndarray]]) -> NestedTwin:
@@ -121,7 +121,7 @@ def test_one_fine_grid_that_holds_the_same_values_looks_the_same() -> None:
     fine = rng.normal(1, 3, (2 * n,) * 3), rng.normal(0, 0.4, (*(2 * n,) * 3, 4, 3))
     inner = tuple(a[n // 2 : n // 2 + n, n // 2 : n // 2 + n, n // 2 : n // 2 + n] for a in fine)
     outer = np.zeros((n, n, n)), np.zeros((n, n, n, 4, 3))
-    nested = SphericalGrid.nested([SphericalGrid.from_dense(*v, place(i, CUBE)) for i, v in enumerate((inner, outer))])
+    nested = SphericalGrid.from_levels([SphericalGrid.from_dense(*v, place(i, CUBE)) for i, v in enumerate((inner, outer))])
     whole = SphericalGrid.from_dense(*fine, place(1, CUBE))
     # From within the hull of the inner nodes to within it: (n - 1) / n of the inner box.
     ends = rng.uniform(-0.8, 0.8, (2, 20, 3))
@@ -141,15 +141,15 @@ def test_what_the_inner_box_covers_is_vacuum_in_the_outer_one() -> None:
         SphericalGrid.from_dense(rng.uniform(0.1, 0.4, res), np.zeros((*res, 1, 3)), place(i, CUBE), activation="none")
         for i in range(2)
     ]
-    field = SphericalGrid.nested(grids)
-    covered = np.array(is_covered_by_inner(dr.arange(mi.UInt32, field.places), field.res))
-    half = covered[field.places // 2 :].reshape(res)
+    field = SphericalGrid.from_levels(grids)
+    covered = np.array(is_covered_by_inner(dr.arange(mi.UInt32, field.node_count), field.res))
+    half = covered[field.node_count // 2 :].reshape(res)
     # n / 4 nodes on either side of the middle, less one whose cells reach over the face.
     expected = np.ones(res, bool)
     for axis, n in enumerate(res):
         inside = np.abs(np.arange(n) - (n - 1) / 2) <= n / 4 - 1
         expected &= inside.reshape([-1 if a == axis else 1 for a in range(3)])
-    assert not covered[: field.places // 2].any() and np.array_equal(half, expected) and half.any()
+    assert not covered[: field.node_count // 2].any() and np.array_equal(half, expected) and half.any()
     density = np.append(field.values()[0], np.float32(0))
     density[:-1][covered] = np.nan
     o, d = lines(400, seed=8)
@@ -191,7 +191,7 @@ def test_tables_of_pinholes_hold_what_is_seen_of_all_levels() -> None:
     count = z * y * x
     nodes = field.listed()[rows]
     density, sh = field.values()
-    frame = field.own_frame()
+    frame = field.local_frame()
     for entry in np.random.default_rng(0).integers(len(rows), size=40):
         level, inner = divmod(int(nodes[entry]), count)
         k, j, i = np.unravel_index(inner, field.res)
@@ -232,25 +232,25 @@ def test_near_derivatives_are_scaled_and_far_ones_are_not() -> None:
 def test_what_does_not_nest_is_refused() -> None:
     grid = SphericalGrid.from_dense(np.ones((4, 4, 4)), np.zeros((4, 4, 4, 1, 3)), CUBE)
     with pytest.raises(MivolError, match=r"grid 1 of a nested field is not 2\^1 times"):
-        SphericalGrid.nested([grid, grid])
+        SphericalGrid.from_levels([grid, grid])
     other = SphericalGrid.from_dense(np.ones((4, 4, 4)), np.zeros((4, 4, 4, 4, 3)), place(1, CUBE))
     with pytest.raises(MivolError, match="another kind"):
-        SphericalGrid.nested([grid, other])
+        SphericalGrid.from_levels([grid, other])
     values = np.ones((4, 4, 4)), np.zeros((4, 4, 4, 1, 3))
     soft = [SphericalGrid.from_dense(*values, place(i, CUBE), activation="exp") for i in (0, 1)]
     with pytest.raises(MivolError, match="activation exp"):
-        SphericalGrid.nested(soft)
+        SphericalGrid.from_levels(soft)
 
 
 def test_a_level_is_a_grid_again() -> None:
     values = arrays()
     field = field_of(values)
     for level in range(LEVELS):
-        back = field.level(level)
+        back = field.extract_level(level)
         assert np.array_equal(back.to_dense()[0], np.float32(values[level][0]))
         assert np.array_equal(back.to_dense()[1], values[level][1])
         np.testing.assert_allclose(back.to_world, place(level), atol=1e-12)
     with pytest.raises(MivolError, match="level 3 of a field of 3"):
-        field.level(LEVELS)
+        field.extract_level(LEVELS)
     with pytest.raises(MivolError, match="3 nested levels is no one grid"):
         field.to_dense()

@@ -21,7 +21,7 @@ def test_pieces_of_a_ray_through_the_middle_and_of_one_that_misses() -> None:
         place = CUBE * 2.0**level
         place[3, 3] = 1
         grids.append(SphericalGrid.from_dense(np.ones((4, 4, 4)), np.zeros((4, 4, 4, 1, 3)), place))
-    cells = find_occupied_cells(SphericalGrid.nested(grids))
+    cells = find_occupied_cells(SphericalGrid.from_levels(grids))
     o, d = mi.Point3f([-5.0, -5.0, 0.5], [0.25, 1.5, 0.25], 0.125), mi.Vector3f(1, 0, 0)
     # Starts and ends in world lengths: of the ray through the middle, of the one that misses, of one from within.
     expected = [

@@ -222,7 +222,7 @@ def test_cells_with_matter_are_listed(variant_rgb: str, sparse: bool) -> None:
     density, sh = make((30, 21, 25), basis=1)
     density = np.where(np.random.default_rng(1).random(density.shape) < 3e-4, 1, -1)
     field = SphericalGrid.from_dense(density, sh, CUBE)
-    cells = find_occupied_cells(field.sparse(density > 0) if sparse else field)
+    cells = find_occupied_cells(field.select_nodes(density > 0) if sparse else field)
     padded = np.pad(density > 0, 1, mode="edge")
     occupied = np.zeros((31, 22, 26), bool)
     for corner in range(8):

@@ -43,15 +43,15 @@ def test_levels_are_resampled_apart(variant_rgb: str) -> None:
         place = CUBE * 2.0**level
         place[3, 3] = 1
         grids.append(SphericalGrid.from_dense((level + 1) * (1 + x + 2 * y + 4 * z), sh + level, place))
-    fine = resample_field(SphericalGrid.nested(grids), (16, 16, 16), CUBE, np.ones((levels, n, n, n), bool))
+    fine = resample_field(SphericalGrid.from_levels(grids), (16, 16, 16), CUBE, np.ones((levels, n, n, n), bool))
     g = (np.arange(16) + 0.5) / 16
     z, y, x = np.meshgrid(g, g, g, indexing="ij")
     # Between the outer nodes values are linear; nodes of 16 from 5 to 10 are covered (16 / 4 - 1 = 3 steps from 7.5).
     inner, covered = np.s_[1:-1, 1:-1, 1:-1], np.s_[5:11, 5:11, 5:11]
     for level in range(levels):
-        density, found = fine.level(level).to_dense()
+        density, found = fine.extract_level(level).to_dense()
         stored = np.zeros((16, 16, 16), bool)
-        stored.reshape(-1)[fine.level(level).listed()] = True
+        stored.reshape(-1)[fine.extract_level(level).listed()] = True
         expected = (level + 1) * (1 + x + 2 * y + 4 * z)
         assert stored[covered].any() == (level == 0) and stored.sum() == 16**3 - (6**3 if level else 0)
         np.testing.assert_allclose(density[inner][stored[inner]], expected[inner][stored[inner]], rtol=1e-5)

@@ -57,7 +57,7 @@ def test_the_index_is_what_the_walk_reads(variant_rgb, share: float) -> None:
     cells = find_occupied_cells(made)
     listed, rows, bricks = storage.count_cells(keep)
     assert (cells.count, dr.width(cells.rows)) == (listed, rows)
-    index = made.listed_places().bytes + cells.index.bytes + held(cells.corners, cells.rows)
+    index = made.sparse_index().bytes + cells.index.bytes + held(cells.corners, cells.rows)
     assert index == storage.index_bytes(RES, listed, rows, bricks)
 
 

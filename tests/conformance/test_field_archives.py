@@ -41,7 +41,7 @@ def test_a_nested_field_is_read_as_it_was_saved(variant_rgb: str, tmp_path: Path
     density, sh = arrays()
     outer = CUBE * 2
     outer[3, 3] = 1
-    field = SphericalGrid.nested([SphericalGrid.from_dense(density, sh, place) for place in (CUBE, outer)])
+    field = SphericalGrid.from_levels([SphericalGrid.from_dense(density, sh, place) for place in (CUBE, outer)])
     save_field(tmp_path / "f.npz", field, half=False)
     back = load_field(tmp_path / "f.npz")
     assert back.levels == 2 and np.array_equal(back.listed(), field.listed())
@@ -195,7 +195,7 @@ def test_degrees_and_sparse_copies(variant_rgb: str) -> None:
     up = field.with_degree(2).values()[1]
     assert np.array_equal(up[:, :4], sh.reshape(-1, 4, 3)) and (up[:, 4:] == 0).all()
     assert np.array_equal(field.with_degree(0).values()[1], sh.reshape(-1, 4, 3)[:, :1])
-    sparse = field.sparse(density > 0)
+    sparse = field.select_nodes(density > 0)
     back = sparse.to_dense()
     assert np.array_equal(back[0], np.where(density > 0, density, 0))
-    assert np.array_equal(sparse.sparse(density > 1).listed(), np.flatnonzero(density > 1))
+    assert np.array_equal(sparse.select_nodes(density > 1).listed(), np.flatnonzero(density > 1))

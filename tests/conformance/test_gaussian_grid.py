@@ -224,7 +224,7 @@ def test_what_makes_no_gaussians_is_refused() -> None:
     grid = field_of(np.full((2, 2, 2), 0.5), np.eye(4))
     outer = np.diag([2.0, 2, 2, 1])
     outer[:3, 3] = -0.5
-    nested = SphericalGrid.nested([grid, field_of(np.full((2, 2, 2), 0.5), outer)])
+    nested = SphericalGrid.from_levels([grid, field_of(np.full((2, 2, 2), 0.5), outer)])
     thin = field_of(np.full((2, 2, 2), 0.5 * MIN_OPACITY), np.eye(4))
     for field, resolution, said in (
         (nested, None, "2 nested levels"),

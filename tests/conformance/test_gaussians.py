@@ -24,7 +24,7 @@ def test_a_quarter_turn_about_z_takes_x_to_y() -> None:
 
 def test_opacities_of_0_and_1_have_logits() -> None:
     ends = Gaussians(np.zeros((3, 3)), np.zeros((3, 3)), np.ones((3, 4)), logit([0, 0.5, 1]), np.zeros((3, 1, 3)))
-    assert ends.checked().opacities().tolist() == [0, 0.5, 1]
+    assert ends.check().opacities().tolist() == [0, 0.5, 1]
 
 
 def test_selection_and_concatenation_keep_every_number() -> None:
@@ -64,7 +64,7 @@ def test_numbers_that_cannot_be_drawn_are_named_by_index(name: str, value: float
     values = np.array(getattr(random_gaussians(4, 1), name))
     values[2:] = value
     with pytest.raises(MivolError, match=rf"{said}\(the first of 2\)"):
-        Gaussians(**{**vars(random_gaussians(4, 1)), name: values}).checked()
+        Gaussians(**{**vars(random_gaussians(4, 1)), name: values}).check()
 
 
 def test_the_basis_is_that_of_published_files(variant_rgb: str) -> None:

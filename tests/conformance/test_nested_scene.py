@@ -44,7 +44,7 @@ def nested(
         there = (grids[0] if grids else SphericalGrid.from_dense(density, sh, place)).level_to_world(level)
         stored = np.ones(density.shape, bool) if keep else None
         grids.append(SphericalGrid.from_dense(density, sh, there, stored, space=space))
-    return SphericalGrid.nested(grids)
+    return SphericalGrid.from_levels(grids)
 
 
 def rough(levels: int = 3, place: np.ndarray = TURNED) -> SphericalGrid:
@@ -189,7 +189,7 @@ def test_volumes_are_a_pair_a_level(tmp_path: Path) -> None:
     names = ["field.nrrd", "field-colour.nrrd", "field-level-1.nrrd", "field-level-1-colour.nrrd"]
     assert [path.name for path in written] == names
     for level, path in enumerate(written[::2]):
-        one, read = field.level(level), read_volume(path)
+        one, read = field.extract_level(level), read_volume(path)
         np.testing.assert_allclose(read.values[..., 0], np.maximum(one.to_dense()[0], 0), rtol=1e-6)
         np.testing.assert_allclose(read.to_world, one.to_world, atol=1e-6)
 
@@ -228,7 +228,7 @@ def test_a_surface_goes_on_from_level_to_level(radius: float, voxel: float) -> N
 
 
 def test_levels_that_no_surface_reaches_are_left_out() -> None:
-    assert len(extract_surface(shell(0.4), 8.0).points) == len(extract_surface(shell(0.4).level(0), 8.0).points)
+    assert len(extract_surface(shell(0.4), 8.0).points) == len(extract_surface(shell(0.4).extract_level(0), 8.0).points)
     with pytest.raises(MivolError, match=r"no node of the field reaches the extinction 1000, only 3\d.*; give a lower level"):
         extract_surface(shell(0.7), 1000.0)
 
@@ -258,7 +258,7 @@ def test_a_scene_shows_the_field_before_its_sky(tmp_path: Path, capsys: pytest.C
 
 
 def test_a_scene_of_radiance_has_the_radiance_of_its_sky(tmp_path: Path) -> None:
-    written = write_scene(tmp_path / "a.xml", plain([1.0, 1.0], [0.5] * 3), Sky.even(4, 3.0))
+    written = write_scene(tmp_path / "a.xml", plain([1.0, 1.0], [0.5] * 3), Sky.uniform(4, 3.0))
     assert [path.name for path in written] == ["a.xml", "a-field.npz", "a-sky.exr"]
     np.testing.assert_allclose(read_exr(written[2])[0]["G"], 3.0)
     assert [path.name for path in write_scene(tmp_path / "b.xml", plain([1.0], [0.5] * 3))] == ["b.xml", "b-field.npz"]

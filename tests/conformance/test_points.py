@@ -170,7 +170,7 @@ def test_gaussians_are_as_wide_as_their_neighbours_are_away() -> None:
     """Corners of a cube of edge 2 have their three neighbours at 2; a point that is there twice more gets the smallest scale.
     Logarithms below 8 in float32: 1e-6."""
     corners = np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (0, 2)], float)
-    balls = points_to_gaussians(PointCloud(corners, np.full((8, 3), 0.75)), opacity=0.2).checked()
+    balls = points_to_gaussians(PointCloud(corners, np.full((8, 3), 0.75)), opacity=0.2).check()
     assert np.abs(balls.log_scales - np.log(2)).max() <= 1e-6
     assert np.abs(balls.opacities() - 0.2).max() <= 1e-6
     assert np.abs(balls.base_colours() - 0.75).max() <= 1e-6

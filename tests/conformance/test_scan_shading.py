@@ -90,7 +90,7 @@ def test_without_a_gradient_there_is_ambient_light_alone() -> None:
     params = mi.traverse(volume)
     assert np.allclose(np.array(params["data"]), 0.5 * 0.25 * np.array([0.2, 0.4, 0.8]), rtol=1e-6)
     dr.enable_grad(params["scalar"])
-    dr.backward(dr.sum(volume.mivol_transfer.classified().array))
+    dr.backward(dr.sum(volume.mivol_transfer.classify().array))
     assert np.isfinite(np.array(dr.grad(params["scalar"]))).all()
 
 

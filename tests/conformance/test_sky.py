@@ -27,7 +27,7 @@ def test_a_sky_is_an_envmap_of_mitsuba(variant_rgb: str) -> None:
     # Bilinear weights move by 1e-7 of an angle times 16 columns, and by acos near the poles: sqrt(1e-7) = 3e-4 of a row.
     # On a GPU an envmap is a texture whose weights have 8 bits: two of them, each known to 1/512.
     by_texture = 0 if variant_rgb.startswith("llvm") else 2 / 512
-    seen, expected, inner = np.array(Sky.of_image(image).seen(d)), np.array(light.eval(si)), np.abs(np.array(d.y)) < 0.99
+    seen, expected, inner = np.array(Sky.from_image(image).eval(d)), np.array(light.eval(si)), np.abs(np.array(d.y)) < 0.99
     np.testing.assert_allclose(seen, expected, atol=1e-3 + by_texture)
     np.testing.assert_allclose(seen[:, inner], expected[:, inner], atol=1e-5 + by_texture)
 
@@ -37,15 +37,15 @@ def test_derivatives_of_a_sky(variant_rgb: str) -> None:
     rng, (_, d) = np.random.default_rng(2), some(500)
     way = np.float32(rng.normal(size=(5, 10, 3)))
     by = np.float32(rng.normal(size=(3, 500)))
-    seen = np.array(Sky.of_image(way).seen(d))
-    slopes = Sky.of_image(way).slopes(d, mi.Color3f(by))
+    seen = np.array(Sky.from_image(way).eval(d))
+    slopes = Sky.from_image(way).texel_gradient(d, mi.Color3f(by))
     assert np.vdot(by, seen) == pytest.approx(np.vdot(np.array(slopes).reshape(5, 10, 4)[..., :3], way), rel=1e-4)
     assert dr.all(dr.gather(mi.Float, slopes, 3 + 4 * dr.arange(mi.UInt32, 50)) == 0)
 
 
 def test_a_sky_of_one_row_is_refused(variant_rgb: str) -> None:
     with pytest.raises(MivolError, match="1 rows .* at least 2"):
-        Sky.even(1, 0.5)
+        Sky.uniform(1, 0.5)
 
 
 def test_smoothing_a_sky(variant_rgb: str) -> None:
@@ -53,7 +53,7 @@ def test_smoothing_a_sky(variant_rgb: str) -> None:
     image = np.float32(np.random.default_rng(3).random((6, 12, 3)))
     around = np.roll(image, 1, 1) + np.roll(image, -1, 1)
     around += np.concatenate([image[:1], image[:-1]]) + np.concatenate([image[1:], image[-1:]])
-    found = Sky.of_image(image).smoothed(0.25).image()
+    found = Sky.from_image(image).smooth(0.25).image()
     # A few roundings of numbers below 4.
     np.testing.assert_allclose(found, image + 0.25 * (around / 4 - image), atol=1e-6)
 
@@ -62,7 +62,7 @@ def test_corners_of_a_direction_are_texels(variant_rgb: str) -> None:
     """Four texels that exist, with shares of at least 0 that sum to 1, to two roundings: at the poles and the seam too."""
     for rows in (2, 5):
         _, d = some(400)
-        corners = Sky.of_image(np.zeros((rows, 2 * rows, 3), np.float32))._corners(d)
+        corners = Sky.from_image(np.zeros((rows, 2 * rows, 3), np.float32))._corners(d)
         texels, shares = (np.array([np.array(pair[k], np.float64) for pair in corners]) for k in (0, 1))
         assert texels.shape == (4, 400) and (texels >= 0).all() and (texels < 2 * rows * rows).all()
         assert (shares >= 0).all()

@@ -206,7 +206,7 @@ def test_a_sparse_field_renders_as_the_dense_one(variant_rgb: None, tmp_path: Pa
     keep[:, :2] = False
     dense = SphericalGrid.from_dense(density, sh, PLACE, space="linear")
     for half, bound in ((False, 1e-6), (True, 5e-3)):
-        save_field(tmp_path / "field.npz", dense.sparse(keep), half=half)
+        save_field(tmp_path / "field.npz", dense.select_nodes(keep), half=half)
         volume = {"type": "mivol_sh", "filename": str(tmp_path / "field.npz")}
         loaded = scene(box_of({"type": "mivol_medium", "emission": volume}, PLACE))
         assert tuple(mi.traverse(loaded)[f"{KEY}.density"].shape) == (int(keep.sum()), 1)
@@ -256,7 +256,7 @@ def test_the_space_of_colours_is_kept(variant_rgb: None, tmp_path: Path) -> None
     """By files, by what makes a field sparse or gives it another degree; a third space is refused."""
     field = replace(grey([0.5] * 3, 1.0), space="linear")
     save_field(tmp_path / "field.npz", field)
-    kept = field.sparse(np.ones((3, 3, 3), bool)), field.with_degree(1), load_field(tmp_path / "field.npz")
+    kept = field.select_nodes(np.ones((3, 3, 3), bool)), field.with_degree(1), load_field(tmp_path / "field.npz")
     assert [one.space for one in kept] == ["linear"] * 3
     with pytest.raises(MivolError, match="'rec709'; srgb or linear"):
         replace(field, space="rec709")

@@ -88,7 +88,7 @@ def test_explain_says_what_a_grid_misses_of_its_table():
 
 def test_a_table_of_nothing_departs_by_nothing():
     volume = mi.load_dict(through(scan(), 0 * OPACITY))
-    assert volume.mivol_transfer.departure() == 0
+    assert volume.mivol_transfer.interpolation_error() == 0
 
 
 @pytest.mark.slow

@@ -88,11 +88,11 @@ def grid(scale: float = 1.0, **more: object) -> SphericalGrid:
 
 
 def test_nested_grids_are_of_one_kind_and_in_place() -> None:
-    assert SphericalGrid.nested([grid(), grid(2.0)]).levels == 2
+    assert SphericalGrid.from_levels([grid(), grid(2.0)]).levels == 2
     for other in ({"activation": "exp"}, {"offset": 0.0}, {"clamp": False}, {"space": "linear"}):
-        says = refusal_of(SphericalGrid.nested, [grid(), grid(2.0, **other)])
+        says = refusal_of(SphericalGrid.from_levels, [grid(), grid(2.0, **other)])
         assert says == "grid 1 of a nested field is of another kind than the first: give grids of one kind."
-    says = refusal_of(SphericalGrid.nested, [grid(), grid(2.0), grid(4.0 + 1e-8)])
+    says = refusal_of(SphericalGrid.from_levels, [grid(), grid(2.0), grid(4.0 + 1e-8)])
     assert says == "grid 2 of a nested field is not 2^2 times the first one about its middle: place it so."
 
 

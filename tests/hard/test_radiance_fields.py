@@ -396,12 +396,12 @@ def test_memory_goes_with_what_is_there() -> None:
     held = [field.density, field.harmonics] * 2  # the values and the optimiser's squares
     held += [slopes.table, slopes.slope, *slopes.slopes(), field.nodes]
     held += [cells.corners, cells.rows, tables.table, tables.slope]
-    taken = sum(dr.width(a) * dr.itemsize_v(a) for a in held) + field.listed_places().bytes + cells.index.bytes
+    taken = sum(dr.width(a) * dr.itemsize_v(a) for a in held) + field.sparse_index().bytes + cells.index.bytes
     assert field.bytes == 4 * ((len(nodes) + 1) * 29 + len(nodes))
     # A fortieth of the nodes is kept: three rows of 29 numbers for each, and for the cells around it 8 corners and two tables.
     assert taken < 0.05 * 16 * 28 * n**3
     # A byte a cell and two bits a node of the box, which was 8 bytes; a little more for the last words.
-    assert field.listed_places().bytes + cells.index.bytes < 1.26 * (n + 1) ** 3
+    assert field.sparse_index().bytes + cells.index.bytes < 1.26 * (n + 1) ** 3
     assert see(field, [3, 0, 0], [-1, 0, 0])[1] < 1
 
 

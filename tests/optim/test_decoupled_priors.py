@@ -108,9 +108,9 @@ def test_what_is_covered_is_no_neighbour(variant_rgb: str) -> None:
         place = CUBE * 2.0**level
         place[3, 3] = 1
         grids.append(SphericalGrid.from_dense(np.full((n, n, n), 2.0 + 2 * level), np.zeros((n, n, n, 1, 3)), place))
-    field = SphericalGrid.nested(grids)
-    covered = np.array(is_covered_by_inner(dr.arange(mi.UInt32, field.places), field.res))
-    field = field.sparse(~covered)
+    field = SphericalGrid.from_levels(grids)
+    covered = np.array(is_covered_by_inner(dr.arange(mi.UInt32, field.node_count), field.res))
+    field = field.select_nodes(~covered)
     moved = mi.Float(field.density)
     smoothed(moved, field, 0.05)
     # Constants in each level have no variation: nothing moves, not even beside the vacuum that is not stored.

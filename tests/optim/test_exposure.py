@@ -69,7 +69,7 @@ def test_derivatives_of_gains_are_those_of_the_squared_error(variant_rgb: str) -
     loss, slopes = problem.slopes(batch)
     source = bake(problem.field, problem._cells, batch.origins, batch.slot)
     seen = render_rays(problem._cells, source, make_model(problem.field, problem.plan.stop), batch.rays)
-    shown = np.array(seen.colour + seen.T * problem.sky.seen(batch.rays.d), np.float64).T
+    shown = np.array(seen.colour + seen.T * problem.sky.eval(batch.rays.d), np.float64).T
     view, target = np.array(batch.view), np.array(batch.target, np.float64).T
     assert set(view) == {0, 2, 3}
     error = np.exp(logs[view]) * shown - target

@@ -126,7 +126,7 @@ def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> Non
     fit = fitted(RayBatches.of(photos, (1, 2)), replace(PLAN, drop=1 / 9), 70)
     problem = fit.problem
     before, squares = problem.field, np.array(fit.run.squares["density"])
-    stored = np.zeros(before.places, bool)
+    stored = np.zeros(before.node_count, bool)
     stored[before.listed()] = True
     expected = stored & maximum_filter(problem.seen_nodes()[0], 3).reshape(-1)
     dropping = fit.course.events[1]
@@ -155,7 +155,7 @@ def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: 
     problem = RadianceProblem(RayBatches.of(photos[:3], (1, 2)), BOX, PLAN)
     middle = np.zeros(problem.field.res, bool)
     middle[3:9, 3:9, 3:9] = True
-    problem.field = problem.field.sparse(middle)
+    problem.field = problem.field.select_nodes(middle)
     problem.update_occupancy()
     batch = problem.batches.draw(2, np.arange(3), 30, np.random.default_rng(3))
     _, slopes = problem.slopes(batch)
@@ -226,7 +226,7 @@ def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> N
     """A ball under a sky of two colours, photographs without alpha: the sky is found where rays pass the ball."""
     v, u = np.meshgrid(np.linspace(0, 1, 8), (np.arange(16) + 0.5) / 16, indexing="ij")
     image = np.stack([0.5 + 0.4 * np.sin(2 * np.pi * u), 0.9 - 0.8 * v, 0.3 + 0 * u], axis=-1)
-    sky = Sky.of_image(image)
+    sky = Sky.from_image(image)
     images = [np.clip(render_view(ball(), p.camera, sky).image, 0, 1) for p in photos]
     taken = [Photo(p.name, image, None, None, p.camera, WHITE) for p, image in zip(photos, images, strict=True)]
     fit = fitted(RayBatches.of(taken, (1, 2)), replace(PLAN, sky=8))

@@ -94,7 +94,7 @@ class RadianceProblem:
         if self.plan.sky:
             if self.batches.channels == 4:
                 raise MivolError("a sky was asked for and the photographs have alpha, which says what is behind: sky = 0.")
-            self.sky = Sky.even(self.plan.sky, self.batches.median())
+            self.sky = Sky.uniform(self.plan.sky, self.batches.median())
         if self.plan.exposure:
             if self.batches.channels == 4:
                 raise MivolError("gains were asked for and the photographs have alpha, as renders have: exposure = false.")
@@ -181,7 +181,7 @@ class RadianceProblem:
         seen = render_rays(self._cells, source, model, batch.rays)
         before = batch.before
         behind = before if background is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
-        behind = behind if self.sky is None else self.sky.seen(batch.rays.d)
+        behind = behind if self.sky is None else self.sky.eval(batch.rays.d)
         # Where a photograph was transparent, it shows what it is over: put what is behind there instead.
         gain = self.exposure.of(batch.view) if self.has_gains else mi.Color3f(1)
         shown = gain * (seen.colour + seen.T * behind)
@@ -204,7 +204,7 @@ class RadianceProblem:
         density, harmonics = vjp_bake(self.field, self._cells, source, batch.origins)
         slopes = {"density": self._stored(density), "harmonics": self._stored(harmonics)}
         if self.sky is not None:
-            slopes["sky"] = self.sky.slopes(batch.rays.d, by * seen.T)
+            slopes["sky"] = self.sky.texel_gradient(batch.rays.d, by * seen.T)
         if self.exposure is not None:
             by_log = by_shown * shown if self.has_gains else mi.Color3f(0)
             slopes["exposure"] = self.exposure.slopes(batch.view, by_log)
@@ -247,7 +247,7 @@ class RadianceProblem:
             arrays["exposure"] = Exposure(arrays["exposure"]).pulled(self.learning_rates(iteration)["exposure"]).logs
         # Evaluated here, or the neighbours that are read next would make the step be taken twice.
         if self.sky is not None and self.plan.sky_smooth:
-            arrays["sky"] = self.sky.with_texels(arrays["sky"]).smoothed(self.plan.sky_smooth).texels
+            arrays["sky"] = self.sky.with_texels(arrays["sky"]).smooth(self.plan.sky_smooth).texels
         dr.eval(arrays)
         for name, prior in self.plan.priors:
             if prior.is_spatial:
@@ -389,13 +389,13 @@ def _coloured(fog: SphericalGrid, colour: np.ndarray) -> SphericalGrid:
 
 def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray:
     """Nodes (levels, Z, Y, X) of the listed cells that are chosen."""
-    mask = np.zeros(field.places, bool)
+    mask = np.zeros(field.node_count, bool)
     index = dr.compress(chosen)
     if cells.count and dr.width(index):
         keep = dr.zeros(mi.UInt8, field.rows)
         for row in cells.node_rows(index, mi.Bool(True)):
             dr.scatter(keep, mi.UInt8(1), row)
-        listed = field.listed()
+        listed = field.stored_nodes()
         mask[listed] = np.array(keep)[: len(listed)] > 0
     return mask.reshape(field.levels, *field.res)
 

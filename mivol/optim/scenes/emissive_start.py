@@ -154,7 +154,7 @@ def to_photographs(views: Sequence[View]) -> list[Photo]:
 def average_density(field: SphericalGrid, place: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Mean density of a field in each voxel (Z, Y, X) of a grid, by :data:`PARTS`^3 points of it [1/length]."""
     density, _ = field.to_dense()
-    sigma = np.array(field.act.value_and_slope(mi.Float(density.reshape(-1)))[0]).reshape(field.res)
+    sigma = np.array(field.activation_function.value_and_slope(mi.Float(density.reshape(-1)))[0]).reshape(field.res)
     z, y, x = np.meshgrid(*((np.arange(PARTS * n) + 0.5) / (PARTS * n) for n in shape), indexing="ij")
     unit = np.stack([x, y, z, np.ones_like(x)], axis=-1) @ (np.linalg.inv(field.to_world) @ place).T
     nodes = [unit[..., 2 - k] * field.res[k] - 0.5 for k in range(3)]

@@ -93,7 +93,7 @@ def find_occupied_cells(field: SphericalGrid) -> Cells:
 
     A cell whose corners are not stored is vacuum.
     """
-    below = field.act.empty_below
+    below = field.activation_function.empty_below
     vacuum = field.rows - 1
 
     def occupied(corners: list[mi.UInt32]) -> mi.Bool:
@@ -101,7 +101,7 @@ def find_occupied_cells(field: SphericalGrid) -> Cells:
             return mi.Bool(True) if field.nodes is None else _any_of([c != vacuum for c in corners])
         return _any_of([dr.gather(mi.Float, field.density, c) > below for c in corners])
 
-    return Cells.find(field.res, field.to_world, field.row_of, occupied, field.rows, field.levels, field.nodes)
+    return Cells.find(field.res, field.to_world, field.look_up_rows, occupied, field.rows, field.levels, field.nodes)
 
 
 def _any_of(masks: list[mi.Bool]) -> mi.Bool:
@@ -113,7 +113,7 @@ def _any_of(masks: list[mi.Bool]) -> mi.Bool:
 
 def make_model(field: SphericalGrid, stop: float = 0.0) -> Model:
     """The model of a field: its activation and clamp."""
-    return Model(field.act, field.clamp, stop)
+    return Model(field.activation_function, field.clamp, stop)
 
 
 @dataclass
@@ -210,11 +210,11 @@ def render_rays(cells: Cells, source: Source, model: Model, rays: RayBundle, act
     Where the source gains by it, many rays are sorted, followed and evaluated, and returned in the order they were given in.
     """
     active = mi.Bool(active)
-    order = RayOrder.find(cells, rays.o, rays.d, rays.t_max) if source.gains_by_order else None
+    order = RayOrder.find(cells, rays.o, rays.d, rays.t_max) if source.gains_by_sorting else None
     if order is None:
         return _render_in_order(cells, source, model, rays, active)
     there = order.places
-    seen = _render_in_order(cells, source.of_lanes(there), model, _gather_lanes(rays, there), _gather_lanes(active, there))
+    seen = _render_in_order(cells, source.gather_lanes(there), model, _gather_lanes(rays, there), _gather_lanes(active, there))
     return replace(_gather_lanes(seen, order.back), rays=rays, order=order)
 
 
@@ -244,7 +244,7 @@ def _render_in_order(cells: Cells, source: Source, model: Model, rays: RayBundle
         before = dr.select(on, tau, before)
         tau = dr.select(on, tau + share.tau, tau)
         first = RayPosition(dr.select(begins, number, first.piece), dr.select(begins, here.t, first.t))
-        return [*light, tau, before, first, source.carry(read)]
+        return [*light, tau, before, first, source.carried_from(read)]
 
     state, last, cell = _follow(cells, rays, visit, state, active, lambda s: s[4] > model.depth)
     *light, tau, before, first, _ = state
@@ -315,7 +315,7 @@ def raise_to_max_weights(cells: Cells, source: Source, model: Model, rays: RayBu
         at = _eval_points(read, read.points, model, on)
         share = share_opacity(here.dt, *at.sigma)
         dr.scatter_reduce(dr.ReduceOp.Max, weight, dr.exp(-tau) * share.alpha, here.number, on)
-        return [dr.select(on, tau + share.tau, tau), source.carry(read)]
+        return [dr.select(on, tau + share.tau, tau), source.carried_from(read)]
 
     active = dr.full(mi.Bool, True, dr.width(rays.d))
     _follow(cells, rays, visit, [mi.Float(0), source.start()], active, lambda state: state[0] > model.depth)
@@ -351,7 +351,10 @@ def vjp_rays(
     active, order = mi.Bool(active), rendered.order
     if order is not None:
         there, rendered = order.places, replace(rendered, order=None)
-        source, rendered, by, active = source.of_lanes(there), *(_gather_lanes(tree, there) for tree in (rendered, by, active))
+        source, rendered, by, active = (
+            source.gather_lanes(there),
+            *(_gather_lanes(tree, there) for tree in (rendered, by, active)),
+        )
     _vjp_in_order(cells, source, model, rendered, by, active, near)
 
 

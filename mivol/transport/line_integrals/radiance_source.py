@@ -58,9 +58,9 @@ class Source(Protocol):
         gains_by_order: whether reads take so long that rays are worth sorting.
     """
 
-    gains_by_order: ClassVar[bool]
+    gains_by_sorting: ClassVar[bool]
 
-    def of_lanes(self, which: mi.UInt32) -> Source:
+    def gather_lanes(self, which: mi.UInt32) -> Source:
         """The source for these of its lanes, with the same derivative."""
 
     def start(self, slope: bool = False) -> Any:
@@ -69,7 +69,7 @@ class Source(Protocol):
     def read(self, cells: Cells, here: CellVisitor, carried: Any, on: mi.Bool) -> CellValues:
         """The values of a listed cell."""
 
-    def carry(self, at: CellValues) -> Any:
+    def carried_from(self, at: CellValues) -> Any:
         """What rays carry on from a cell that they have read."""
 
     def add(
@@ -91,13 +91,13 @@ class Baked:
         slope: the derivative, laid out as ``table``; None where none is computed.
     """
 
-    gains_by_order: ClassVar[bool] = False
+    gains_by_sorting: ClassVar[bool] = False
 
     table: mi.Float
     first: mi.UInt32
     slope: mi.Float | None = None
 
-    def of_lanes(self, which: mi.UInt32) -> Baked:
+    def gather_lanes(self, which: mi.UInt32) -> Baked:
         return replace(self, first=dr.gather(mi.UInt32, self.first, which))
 
     def start(self, slope: bool = False) -> list:
@@ -108,7 +108,7 @@ class Baked:
         packets = [dr.gather(mi.ArrayXf, self.table, node, on, shape=(4, 1)) for node in nodes]
         return CellValues([p[0] for p in packets], lambda on: [[p[k] for p in packets] for k in (1, 2, 3)], here.points)
 
-    def carry(self, at: CellValues) -> list:
+    def carried_from(self, at: CellValues) -> list:
         return []
 
     def add(
@@ -136,14 +136,14 @@ class Exact:
         slope: the derivative, laid out as ``table``; None where none is computed.
     """
 
-    gains_by_order: ClassVar[bool] = True
+    gains_by_sorting: ClassVar[bool] = True
 
     field: SphericalGrid
     table: mi.Float
     basis: list[mi.Float]
     slope: mi.Float | None = None
 
-    def of_lanes(self, which: mi.UInt32) -> Exact:
+    def gather_lanes(self, which: mi.UInt32) -> Exact:
         dr.eval(self.basis)
         return replace(self, basis=[dr.gather(mi.Float, y, which) for y in self.basis])
 
@@ -152,11 +152,11 @@ class Exact:
 
     def read(self, cells: Cells, here: CellVisitor, carried: Face | PendingGradients, on: mi.Bool) -> CellValues:
         face = carried.face if isinstance(carried, PendingGradients) else carried
-        corners = read_corners(cells.res, self.field.row_of, self._value, face, here, on)
+        corners = read_corners(cells.res, self.field.look_up_rows, self._value, face, here, on)
         raw, *colours = (list(channel) for channel in zip(*corners.values, strict=True))
         return CellValues(raw, lambda on: colours, corners.points, corners)
 
-    def carry(self, at: CellValues) -> Face:
+    def carried_from(self, at: CellValues) -> Face:
         return at.corners.face()
 
     def add(
@@ -244,7 +244,7 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32
 @dr.syntax
 def _fill_table(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
     """Fill the blocks of a table, in a loop, so that the field is read once and one kernel serves any number of pinholes."""
-    number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _look_up_node(field, rows), field.viewer(points)
+    number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _look_up_node(field, rows), field.make_view_basis(points)
     pinholes, count = dr.opaque(mi.UInt32, len(points)), _opaque_count(rows)
     raw = dr.gather(mi.Float, field.density, rows)
     values = dr.gather(mi.ArrayXf, field.harmonics, rows, shape=(field.width, 1))
@@ -288,7 +288,7 @@ def _sum_over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, p
     """Sum the derivatives of all pinholes, in a loop, so that one kernel serves any number of them."""
     number = dr.arange(mi.UInt32, dr.width(rows))
     node = _look_up_node(field, rows)
-    seen_from = field.viewer(points)
+    seen_from = field.make_view_basis(points)
     pinholes, count, width = dr.opaque(mi.UInt32, len(points)), _opaque_count(rows), field.width
     packet = mi.ArrayXf([mi.Float(0)] * 4)
     raw = dr.zeros(mi.Float, dr.width(rows))
@@ -324,9 +324,9 @@ def make_exact(field: SphericalGrid, d: mi.Vector3f, slope: bool = False) -> Exa
     """
     width, every = packed_width(field.basis), dr.arange(mi.UInt32, field.rows)
     if field.nodes is not None:
-        field.listed_places()  # a walk is no place to make it
+        field.sparse_index()  # a walk is no place to make it
     table = dr.empty(mi.Float, width * field.rows)
     row = dr.gather(mi.ArrayXf, field.harmonics, every, shape=(field.width, 1))
     values = [*(row[k] for k in range(3 * field.basis)), dr.gather(mi.Float, field.density, every)]
     dr.scatter(table, _pad_row(values, width), every)
-    return Exact(field, table, field.harmonics_of(d), dr.zeros(mi.Float, _round_up_size(width * field.rows)) if slope else None)
+    return Exact(field, table, field.eval_basis(d), dr.zeros(mi.Float, _round_up_size(width * field.rows)) if slope else None)

@@ -64,7 +64,7 @@ class GaussianExtinction:
         self.colours = None
         if self.shows:
             with dr.suspend_grad():
-                self.colours = dr.detach(self.field.colour_rows())
+                self.colours = dr.detach(self.field.pack_colours())
 
     @property
     def blocks(self) -> int:
@@ -73,7 +73,7 @@ class GaussianExtinction:
 
     def scaled(self, scale: mi.Float) -> mi.Float:
         rows = self.field.rows(scale)
-        return dr.concat([rows, self.field.colour_rows()]) if self.shows else rows
+        return dr.concat([rows, self.field.pack_colours()]) if self.shows else rows
 
     def start_gradient(self) -> mi.Float:
         return dr.zeros(mi.Float, ROW_SIZE * self.field.count * (1 + self.blocks))
@@ -111,17 +111,17 @@ class GaussianExtinction:
     def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         def add(total: mi.Float, line: WhitenedLine, index: mi.UInt32) -> mi.Float:
             own = self.push(line, line.density_slopes, line.density, tangent, index)
-            return dr.select(line.holds_origin, total + own, total)
+            return dr.select(line.contains_origin, total + own, total)
 
         there = mi.Ray3f(ray(t), ray.d)
-        return [self.field.each_at(there, active, dr.zeros(mi.Float, dr.width(there)), add)]
+        return [self.field.visit_at_points(there, active, dr.zeros(mi.Float, dr.width(there)), add)]
 
     def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         def add(state: tuple, line: WhitenedLine, index: mi.UInt32) -> tuple:
-            self.pull(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.holds_origin)
+            self.pull(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.contains_origin)
             return state
 
-        self.field.each_at(mi.Ray3f(ray(t), ray.d), active, (), add)
+        self.field.visit_at_points(mi.Ray3f(ray(t), ray.d), active, (), add)
 
     def enter(self, interval: RayInterval) -> Passage:
         """The part of an interval inside the box, seen from where it begins: far from the origin float32 has few digits."""
@@ -161,7 +161,7 @@ class GaussianExtinction:
                 # Most are not met: a branch costs two thirds of what adding 0 for them did.
                 return dr.if_stmt((state,), here, lambda state: add(state, line, index, ends), lambda state: state)
 
-            state = field.each_in(cell.lower + 1, through, on, state, meet)
+            state = field.visit_cell(cell.lower + 1, through, on, state, meet)
             return state if leave is None else leave(state, cell)
 
         return walk(self.cells, passage.segment, visit, state, (), passage.active, until)

@@ -88,7 +88,7 @@ class GaussianSweep:
         self.scale = dr.detach(body.view.scale)
         self.change = body.tangents[0] if tangent else None
         self.channels = RGB if self.rows == 3 else [LUMINANCE]
-        self.basis = self.part.field.harmonics_of(interval.ray.d) if self.part.shows else []
+        self.basis = self.part.field.eval_basis(interval.ray.d) if self.part.shows else []
 
     def integrate(self, skip: bool) -> BodyIntegral:
         """Sum the rows of the medium; ``skip`` has no meaning here: what is empty is never asked."""
@@ -206,7 +206,7 @@ def visit_from_the_far_end(part: GaussianExtinction, interval: RayInterval, stat
                 return dr.if_stmt((slots,), here, lambda slots: _insert(slots, (line.peak, index)), lambda slots: slots)
 
             empty = (dr.full(mi.Float, -dr.inf, dr.width(start)), dr.zeros(mi.UInt32, dr.width(start)))
-            slots = field.each_in(cell.lower + 1, through, more, [empty] * SLOTS, meet)
+            slots = field.visit_cell(cell.lower + 1, through, more, [empty] * SLOTS, meet)
             last = slots[-1]
 
             def take(slots: list, state: Any) -> tuple:

@@ -192,7 +192,7 @@ def _part_of_field(volume: mi.Volume, level: int) -> ActivatedGridExtinction | G
     if hasattr(volume, "mivol_extinction"):
         return _field_part("emission", volume.mivol_extinction, mi.Float(1), shows=True)
     lattice = Lattice(volume.mivol_densities[level], volume.mivol_field.level_to_world(level))
-    return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.act)
+    return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.activation_function)
 
 
 def _emission_lattice(emission_density: object, others: list, boundary: Box | None, places: dict) -> Lattice | None:

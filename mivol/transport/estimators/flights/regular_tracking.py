@@ -135,7 +135,7 @@ def sample_gaussian_flight(
     def add(state: tuple, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
         nearest, reached, rng = state
         rng, (u,) = draw_pcg32(rng, 1)
-        before = line.share_before(ends[0])
+        before = line.share_up_to(ends[0])
         goal = before - dr.log(1 - u) / (scale * line.depth)
         hits = goal < before + line.share(*ends)
         own = line.peak + math.sqrt(2) * dr.erfinv(dr.select(hits, 2 * goal - 1, 0)) / line.speed
