@@ -1,7 +1,7 @@
-"""Posed photographs: cameras and pixels of a data set, read and checked, ready to be fitted.
+"""Posed photographs: cameras and pixels of a data set, read and checked for a fit.
 
-Needs no Mitsuba. :func:`load_photos` reads, :func:`survey_photos` looks without reading pixels, :func:`rays` says what a pixel
-sees, :func:`project` where a point lies in the image.
+The room needs no Mitsuba. :func:`load_photos` reads a data set, :func:`survey_photos` reads its cameras without pixels,
+:func:`rays` maps pixels to rays, and :func:`project` maps points to pixels.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ __all__ = [
     "FORMATS",
     "SPLITS",
     "Camera",
-    "PhotoFrame",
     "Lens",
     "Photo",
-    "Photos",
+    "PhotoFrame",
     "PhotoSurvey",
-    "interpolate_cameras",
+    "Photos",
+    "aim_camera",
     "directions",
     "distort",
-    "aim_camera",
     "find_format",
+    "follow_keyframes",
+    "interpolate_cameras",
     "intrinsics",
     "load_photos",
-    "follow_keyframes",
-    "to_pinhole",
     "pixel_centres",
     "project",
     "rays",
     "rectify",
     "survey_photos",
+    "to_pinhole",
     "turntable",
     "undistort",
     "write_transforms",

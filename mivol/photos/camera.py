@@ -1,8 +1,8 @@
-"""A camera that took a photograph: which ray each point of the image is, and where in the image each point of space lies.
+"""The camera of a photograph: rays of image points, and image points of world points.
 
-Conventions. **Camera to world, OpenGL and NeRF: x to the right, y up, the camera looks along -z**; a rotation and a place, no
-scale. A point of the image is (x, y) in pixels from the upper left **corner**, so that the pixel of row i, column j has its
-centre at (j + 1/2, i + 1/2). ``K`` is OpenCV's matrix in those coordinates, without skew; lengths are those of the world.
+Conventions. **Camera to world as in OpenGL and NeRF: x to the right, y up, the camera looks along -z**; a rotation and a
+position, no scale. An image point is (x, y) in pixels from the upper left **corner**, so the pixel of row i, column j has its
+centre at (j + 1/2, i + 1/2). ``K`` is OpenCV's matrix in these coordinates, without skew. Lengths are world lengths.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from mivol.photos.lens import LARGEST_TERM, Fisheye, Lens, Panorama, distort, un
 __all__ = ["Camera", "directions", "field_of_view", "intrinsics", "is_seen", "pixel_centres", "project", "rays"]
 
 PIXELS_LOST = 0.1
-"""How far [pixel] a matrix that is not quite a rotation may move the corner of an image."""
+"""Largest shift of an image corner by an inexact rotation matrix [pixel]."""
 
 FLIP = np.array([1.0, -1.0, -1.0])
-"""OpenCV's camera axes (y down, z forward) to ours, and back."""
+"""Signs that convert OpenCV's camera axes (y down, z forward) to the axes here, and back."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Lens, sensor and place of a camera.
+    """Intrinsics, lens and pose of a camera.
 
     Attributes:
         K: (3, 3) float64 [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel].
         size: (width, height) [pixel].
-        to_world: (4, 4) float64, camera to world; its rotation is made exact.
-        distortion: of the lens; a wide one has no image plane (:mod:`mivol.photos.lens`).
-        name: how refusals call it.
+        to_world: (4, 4) float64, camera to world; the constructor makes the rotation exact.
+        distortion: lens model; a wide lens has no image plane (:mod:`mivol.photos.lens`).
+        name: subject of refusals.
 
     Raises:
-        MivolError: NaN, no positive focal length or size, or a ``to_world`` that is no rotation.
+        MivolError: NaN, a focal length or size that is not positive, or a ``to_world`` without a rotation.
     """
 
     K: np.ndarray
@@ -46,46 +46,46 @@ class Camera:
     name: str = "camera"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "K", _checked_intrinsics(self.K, self.size, self.name))
-        object.__setattr__(self, "to_world", _checked_pose(self.to_world, self.K, self.size, self.name))
+        object.__setattr__(self, "K", _check_intrinsics(self.K, self.size, self.name))
+        object.__setattr__(self, "to_world", _check_pose(self.to_world, self.K, self.size, self.name))
         if not (np.abs(dataclasses.astuple(self.distortion)) <= LARGEST_TERM).all():  # NaN fails every comparison
             expected = f"finite numbers of at most {LARGEST_TERM:g}"
             raise refusal(self.name, f"the distortion {self.distortion}", expected, "correct its coefficients")
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) where it stands."""
+        """World position (3,)."""
         return self.to_world[:3, 3]
 
     @property
     def forward(self) -> np.ndarray:
-        """(3,) unit direction in which it looks."""
+        """Unit direction (3,) of the optical axis in the world."""
         return -self.to_world[:3, 2]
 
     def resized(self, size: tuple[int, int]) -> Camera:
-        """The same camera with (width, height) other pixels over the same sensor."""
+        """Return the camera with (width, height) pixels over the same sensor."""
         scale = np.array([size[0] / self.size[0], size[1] / self.size[1], 1.0])
         return dataclasses.replace(self, K=scale[:, None] * self.K, size=size)
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """(3, 3) K of focal lengths and principal point [pixel from the upper left corner]."""
+    """Return K (3, 3) from focal lengths and principal point [pixel from the upper left corner]."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def pixel_centres(size: tuple[int, int]) -> np.ndarray:
-    """(height, width, 2) the centres (x, y) of all pixels of an image of that (width, height)."""
+    """Return the centres (height, width, 2) of the pixels of an image of (width, height) pixels."""
     x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     return np.stack([x, y], axis=-1)
 
 
 def directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Unit directions (..., 3) in the camera's frame of points (..., 2) of the image; the lens is traced exactly.
+    """Return unit directions (..., 3) in the camera frame of image points (..., 2), traced exactly through the lens.
 
-    Where a wide lens shows nothing (:func:`is_seen`), those at the rim of its image.
+    Points outside the image of a wide lens (:func:`is_seen`) get the direction at the rim of the image.
 
     Raises:
-        MivolError: a lens that folds back (:func:`mivol.photos.lens.undistort`).
+        MivolError: a lens whose image folds back (:func:`mivol.photos.lens.undistort`).
     """
     plane = _plane(camera, pixels)
     if camera.distortion.is_wide:
@@ -96,14 +96,14 @@ def directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 
 
 def is_seen(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """(...) bool: whether points (..., 2) show a direction. The corners of a fisheye's image lie outside of its circle."""
+    """Return whether image points (..., 2) show a direction: the corners of a fisheye image lie outside its circle."""
     if not camera.distortion.is_wide:
         return np.ones(np.shape(pixels)[:-1], bool)
     return camera.distortion.sees(_plane(camera, pixels))
 
 
 def field_of_view(camera: Camera) -> float:
-    """The angle [degree] that the middle row of the image sees, without distortion where the lens has an image plane."""
+    """Return the horizontal angle of view of the middle row [degree]; only wide lenses are distorted."""
     middle = camera.K[:2, 2]
     ends = np.array([[0.0, middle[1]], [camera.size[0], middle[1]]])
     if not camera.distortion.is_wide:
@@ -114,53 +114,53 @@ def field_of_view(camera: Camera) -> float:
 
 
 def _plane(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Points (..., 2) of the image in focal lengths from the principal point."""
+    """Image points (..., 2) in focal lengths from the principal point."""
     return (np.asarray(pixels, np.float64) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
 
 
 def rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rays that points of the image see.
+    """Return the rays of image points.
 
     Args:
-        camera: who looks.
-        pixels: (..., 2) points (x, y) [pixel]; (j + 1/2, i + 1/2) is the centre of row i, column j.
+        camera: camera of the image.
+        pixels: points (..., 2) as (x, y) [pixel]; (j + 1/2, i + 1/2) is the centre of row i, column j.
 
     Returns:
         Origins (..., 3) [length] and unit directions (..., 3) in the world, float64.
 
     Raises:
-        MivolError: a lens that folds back.
+        MivolError: a lens whose image folds back.
     """
     d = directions(camera, pixels) @ camera.to_world[:3, :3].T
     return np.broadcast_to(camera.origin, d.shape), d
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where points of the world lie in the image.
+    """Project world points to the image.
 
     Args:
-        camera: who looks.
-        points: (..., 3) [length].
+        camera: camera of the image.
+        points: world points (..., 3) [length].
 
     Returns:
-        (..., 2) points (x, y) of the image [pixel], and the depth (...) along the view [length]; behind the camera the depth
-        is negative and the point of the image NaN, as it is beyond the fold of the lens. Of a wide lens the depth is the
-        distance, and the point NaN where the lens does not look.
+        Image points (..., 2) as (x, y) [pixel], and the depths (...) along the optical axis [length]. A point behind the
+        camera has a negative depth; its image point is NaN, as for a point beyond the fold of the lens. For a wide lens the
+        depth is the distance, and points outside its image are NaN.
     """
     local = (np.asarray(points, np.float64) - camera.origin) @ camera.to_world[:3, :3] * FLIP
     if camera.distortion.is_wide:
-        at = camera.distortion.point(local) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-        return at, np.linalg.norm(local, axis=-1)
+        pixels = camera.distortion.point(local) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+        return pixels, np.linalg.norm(local, axis=-1)
     depth = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = np.where(depth[..., None] > 0, local[..., :2] / depth[..., None], np.nan)
     if camera.distortion:
-        seen = np.linalg.norm(plane, axis=-1, keepdims=True) <= camera.distortion.fold
-        plane = np.where(seen, distort(camera.distortion, plane), np.nan)
+        inside = np.linalg.norm(plane, axis=-1, keepdims=True) <= camera.distortion.fold
+        plane = np.where(inside, distort(camera.distortion, plane), np.nan)
     return plane * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], depth
 
 
-def _checked_intrinsics(matrix: np.ndarray, size: tuple[int, int], name: str) -> np.ndarray:
+def _check_intrinsics(matrix: np.ndarray, size: tuple[int, int], name: str) -> np.ndarray:
     K = np.array(matrix, np.float64)
     if min(size) < 1:
         raise refusal(name, f"an image of {size[0]} x {size[1]} pixels", "at least 1 x 1", "correct w and h")
@@ -177,15 +177,15 @@ def _checked_intrinsics(matrix: np.ndarray, size: tuple[int, int], name: str) ->
     return K
 
 
-def _checked_pose(matrix: np.ndarray, K: np.ndarray, size: tuple[int, int], name: str) -> np.ndarray:
-    """The pose with the nearest rotation.
+def _check_pose(matrix: np.ndarray, K: np.ndarray, size: tuple[int, int], name: str) -> np.ndarray:
+    """Return the pose with the nearest rotation.
 
-    A matrix M with |M^T M - 1| = e turns or stretches the rays by about e, which moves the image by up to e times the focal
-    length and half the diagonal together: e is allowed as far as that is ``PIXELS_LOST``.
+    A matrix M with |M^T M - 1| = e rotates or stretches the rays by about e. The image then moves by up to e times the sum of
+    focal length and half the diagonal. This shift is limited to ``PIXELS_LOST``.
     """
     pose = np.array(matrix, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        found = f"a transform of shape {pose.shape}" if pose.shape != (4, 4) else "a transform that holds NaN or infinity"
+        found = f"a transform of shape {pose.shape}" if pose.shape != (4, 4) else "a transform with NaN or infinity"
         raise refusal(name, found, "4 x 4 finite numbers", "correct it in the file of cameras")
     if not np.array_equal(pose[3], (0, 0, 0, 1)):
         raise refusal(name, f"a transform with last row {pose[3].tolist()}", "0, 0, 0, 1", "correct it in the file of cameras")
@@ -198,7 +198,7 @@ def _checked_pose(matrix: np.ndarray, K: np.ndarray, size: tuple[int, int], name
             name,
             f"a transform that is not a rotation: it {kind}",
             f"columns of length 1 at right angles to {allowed:.1g}, right-handed",
-            "take scale, shear and mirroring out of it",
+            "remove scale, shear and mirroring",
         )
     pose[:3, :3] = u @ vt
     return pose

@@ -1,8 +1,7 @@
-"""Cameras for a film of what was photographed: around it, from view to view, or past places of one's own.
+"""Camera paths for films of a photographed subject: around it, from view to view, or through keyframes.
 
-Conventions. Every camera of a path is a pinhole like the first of those given: its size and focal length (or WIDE degrees,
-where its lens has no image plane), without distortion, its axis through the middle of the image. A turntable keeps the
-photographs' mean distance and elevation.
+Conventions. Every camera of a path is a pinhole with the size and focal length of the first given camera (a field of view of
+``WIDE`` degrees for a wide lens), without distortion, and with the optical axis through the image centre.
 """
 
 from __future__ import annotations
@@ -17,25 +16,32 @@ from mivol.files.source import refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
 
-__all__ = ["interpolate_cameras", "aim_camera", "follow_keyframes", "turntable"]
+__all__ = ["aim_camera", "follow_keyframes", "interpolate_cameras", "turntable"]
 
 ALL_ROUND = np.radians(90)
-"""Cameras that leave no larger gap of azimuth than this go all the way round; others are swung between."""
+"""Largest azimuth gap [radian] between cameras of a full circle; a larger gap makes the path swing between its ends."""
 
 WIDE = 70.0
-"""Field of view [degree] of films of what wide lenses saw: that of a wide photograph, without the stretch of a wider one."""
+"""Field of view of films of wide lenses [degree]: a larger one would stretch the border of the image."""
 
 
 def aim_camera(like: Camera, origin: np.ndarray, target: np.ndarray, up: np.ndarray, name: str = "camera") -> Camera:
-    """A pinhole like another camera that stands at ``origin`` and looks at ``target``, with ``up`` upwards in the image.
+    """Return a pinhole at ``origin`` looking at ``target``, with ``up`` upwards in the image.
+
+    Args:
+        like: camera with the size and the focal length of the pinhole.
+        origin: position (3,) [length].
+        target: point (3,) in the image centre [length].
+        up: upward direction (3,).
+        name: subject of the refusal.
 
     Raises:
-        MivolError: origin and target are one point, or up is along the view.
+        MivolError: equal origin and target, or an upward direction along the view.
     """
     back = np.asarray(origin, np.float64) - target
     right = np.cross(up, back)
     if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(back) * np.linalg.norm(up):
-        raise refusal(name, "a view along its own upward direction, or of its own place", "another target", "move it")
+        raise refusal(name, "a view along the upward direction, or a target at the camera", "another target", "move the target")
     axes = np.column_stack([right, np.cross(back, right), back])
     pose = np.eye(4)
     pose[:3, :3] = axes / np.linalg.norm(axes, axis=0)
@@ -44,10 +50,10 @@ def aim_camera(like: Camera, origin: np.ndarray, target: np.ndarray, up: np.ndar
 
 
 def turntable(cameras: Sequence[Camera], box: np.ndarray, n: int) -> list[Camera]:
-    """n cameras around the middle of a box, in equal steps; the last is followed by the first.
+    """Return n cameras around the centre of a box, in equal steps on a closed path.
 
-    The circle lies about the photographs' upward direction, at their mean distance and elevation. Where they leave a gap
-    of more than 90 degrees, the cameras swing between its ends and back instead (sinusoidal, so that it can be repeated).
+    The circle is centred on the upward direction of the photographs, at their mean distance and elevation. If the photographs
+    leave an azimuth gap of more than 90 degrees, the path swings sinusoidally between the ends of the gap instead.
 
     Raises:
         MivolError: cameras without a common upward direction.
@@ -55,53 +61,53 @@ def turntable(cameras: Sequence[Camera], box: np.ndarray, n: int) -> list[Camera
     middle = np.mean(box, axis=0)
     up = _mean_up(cameras)
     side = np.linalg.qr(np.column_stack([up, np.eye(3)[np.argmin(np.abs(up))]]))[0][:, 1]
-    ahead = np.cross(up, side)
+    front = np.cross(up, side)
     offsets = np.array([camera.origin for camera in cameras]) - middle
-    height, along = offsets @ up, np.stack([offsets @ side, offsets @ ahead])
-    radius = float(np.linalg.norm(along, axis=0).mean())
-    azimuths = _azimuths(np.arctan2(along[1], along[0]), n)
+    height, across = offsets @ up, np.stack([offsets @ side, offsets @ front])
+    radius = float(np.linalg.norm(across, axis=0).mean())
+    azimuths = _azimuths(np.arctan2(across[1], across[0]), n)
     return [
         aim_camera(
-            cameras[0], middle + radius * (np.cos(a) * side + np.sin(a) * ahead) + height.mean() * up, middle, up, f"turn {i}"
+            cameras[0], middle + radius * (np.cos(a) * side + np.sin(a) * front) + height.mean() * up, middle, up, f"turn {i}"
         )
         for i, a in enumerate(azimuths)
     ]
 
 
 def interpolate_cameras(cameras: Sequence[Camera], n: int) -> list[Camera]:
-    """n cameras on a smooth way from the first to the last of at least two, through all of them, in equal times.
+    """Return n cameras on a smooth path through the given cameras, at equal time steps.
 
     Raises:
         MivolError: fewer than two cameras.
     """
     if len(cameras) < 2:
-        raise refusal("between", f"{len(cameras)} cameras", "at least 2", "give more views")
-    times, wanted = np.arange(len(cameras)), np.linspace(0, len(cameras) - 1, n)
-    turns = RotationSpline(times, Rotation.from_matrix([camera.to_world[:3, :3] for camera in cameras]))(wanted).as_matrix()
-    places = CubicSpline(times, [camera.origin for camera in cameras])(wanted)
+        raise refusal("a path between views", f"{len(cameras)} cameras", "at least 2", "give more views")
+    keys, times = np.arange(len(cameras)), np.linspace(0, len(cameras) - 1, n)
+    rotations = RotationSpline(keys, Rotation.from_matrix([c.to_world[:3, :3] for c in cameras]))(times).as_matrix()
+    positions = CubicSpline(keys, [camera.origin for camera in cameras])(times)
     poses = np.tile(np.eye(4), (n, 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = turns, places
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, positions
     return [_pinhole(cameras[0], pose, f"step {i}") for i, pose in enumerate(poses)]
 
 
 def follow_keyframes(cameras: Sequence[Camera], keyframes: Sequence[Sequence[float]], n: int) -> list[Camera]:
-    """n cameras on a smooth way past places of one's own, in equal times; upwards is what is up in the photographs.
+    """Return n cameras on a smooth path through keyframes, at equal time steps, upright as the photographs.
 
     Args:
-        cameras: those of the photographs.
-        keyframes: at least two; where the camera stands and what it looks at, six numbers each [length].
-        n: cameras.
+        cameras: cameras of the photographs.
+        keyframes: at least two rows of six numbers: position and target [length].
+        n: number of cameras.
 
     Raises:
-        MivolError: fewer than two keyframes, numbers that are not finite, cameras without a common upward direction, or a
-            camera that stands where it looks or looks straight up or down.
+        MivolError: fewer than two keyframes, numbers that are not finite, photographs without a common upward direction, or a
+            camera looking at its own position or straight up or down.
     """
     keys = np.array(keyframes, np.float64).reshape(-1, 6)
     if len(keys) < 2 or not np.isfinite(keys).all():
-        raise refusal("keyframes", keys.tolist(), "at least two of six finite numbers", "give places and targets")
-    up, times = _mean_up(cameras), np.arange(len(keys))
-    found = CubicSpline(times, keys)(np.linspace(0, len(keys) - 1, n))
-    return [aim_camera(cameras[0], place[:3], place[3:], up, f"step {i}") for i, place in enumerate(found)]
+        raise refusal("keyframes", keys.tolist(), "at least two of six finite numbers", "give positions and targets")
+    up = _mean_up(cameras)
+    rows = CubicSpline(np.arange(len(keys)), keys)(np.linspace(0, len(keys) - 1, n))
+    return [aim_camera(cameras[0], row[:3], row[3:], up, f"step {i}") for i, row in enumerate(rows)]
 
 
 def _pinhole(like: Camera, pose: np.ndarray, name: str) -> Camera:
@@ -112,20 +118,20 @@ def _pinhole(like: Camera, pose: np.ndarray, name: str) -> Camera:
 
 
 def _mean_up(cameras: Sequence[Camera]) -> np.ndarray:
-    """The unit direction at right angles to what is right in all images (least squares): up, for cameras held level.
+    """The common upward direction: perpendicular to the horizontal image axes in the least-squares sense.
 
-    Where that leaves a choice (cameras one above the other), their own upward directions decide, at a weight of 1e-6.
+    If several directions fit (cameras above each other), the vertical image axes decide, with a weight of 1e-6.
     """
     right, up = (np.array([camera.to_world[:3, axis] for camera in cameras]) for axis in (0, 1))
-    found = np.linalg.eigh(right.T @ right - 1e-6 * up.T @ up)[1][:, 0]
-    heights = up @ found
+    direction = np.linalg.eigh(right.T @ right - 1e-6 * up.T @ up)[1][:, 0]
+    heights = up @ direction
     if abs(heights.mean()) < 0.1:
-        raise refusal("turntable", "cameras without a common upward direction", "most of them upright", "give a path of views")
-    return found * np.sign(heights.mean())
+        raise refusal("turntable", "cameras without a common upward direction", "upright cameras", "choose a path of views")
+    return direction * np.sign(heights.mean())
 
 
-def _azimuths(seen: np.ndarray, n: int) -> np.ndarray:
-    ordered = np.sort(seen)
+def _azimuths(photographed: np.ndarray, n: int) -> np.ndarray:
+    ordered = np.sort(photographed)
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
     widest = int(np.argmax(gaps))
     if gaps[widest] <= ALL_ROUND:

@@ -1,7 +1,8 @@
 """Sparse reconstructions of COLMAP: cameras, images and points, in binary and in text.
 
-Conventions. COLMAP stores world to camera, x_c = R(q) x + t, with the quaternion (w, x, y, z) and OpenCV's axes (y down, z
-forward); it counts pixels from the upper left corner, as we do. A lens that a model lacks is a pinhole.
+Own parser: pycolmap takes 135 MB. COLMAP stores world to camera, x_c = R(q) x + t, with the quaternion (w, x, y, z) and
+OpenCV's axes (y down, z forward). COLMAP counts pixels from the upper left corner, as mivol does. Coefficients missing in a
+camera model are 0.
 
 Source: the file formats in COLMAP's documentation ("Output Format") and the parameters of its camera models.
 """
@@ -21,14 +22,14 @@ from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Fisheye, Lens
 from mivol.photos.listing import Entry, Listing, check_points
 
-__all__ = ["CAMERA_MODELS", "find_model", "read_colmap", "read_points3d", "rotation"]
+__all__ = ["CAMERA_MODELS", "find_model", "quaternion_to_matrix", "read_colmap", "read_points3d"]
 
 MODEL_NUMBERS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
 )
 
-#: name -> names of its parameters, in their order.
+#: name -> names of the parameters, in the order of the file.
 CAMERA_MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -43,7 +44,7 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Sensor:
-    """One entry of COLMAP's cameras: (width, height), K and lens."""
+    """A camera of COLMAP: (width, height), K and lens."""
 
     size: tuple[int, int]
     K: np.ndarray
@@ -52,7 +53,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Pose:
-    """One entry of COLMAP's images: its name, camera number, camera to world in our axes, and its own number."""
+    """An image of COLMAP: name, id of the camera, camera to world in mivol's axes, and id of the image."""
 
     name: str
     camera: int
@@ -62,28 +63,28 @@ class Pose:
 
 @dataclass(frozen=True)
 class Points:
-    """COLMAP's points.
+    """The points of COLMAP.
 
     Attributes:
-        rows: (N, 6) places in the world [length], and colours in 0..255.
-        tracks: numbers of the images in which each was found, N arrays.
+        rows: (N, 6) world positions [length] and colours in 0..255.
+        tracks: ids of the images of each point, N arrays.
     """
 
     rows: np.ndarray
     tracks: list[np.ndarray]
 
-    def seen_by(self) -> dict[int, np.ndarray]:
-        """Number of an image -> places (K, 3) of the points that were found in it."""
+    def by_image(self) -> dict[int, np.ndarray]:
+        """Return a table from the id of an image to the positions (K, 3) of its points."""
         images = np.concatenate([np.zeros(0, int), *self.tracks])
-        places = self.rows[np.repeat(np.arange(len(self.tracks)), [len(track) for track in self.tracks]), :3]
+        positions = self.rows[np.repeat(np.arange(len(self.tracks)), [len(track) for track in self.tracks]), :3]
         order = np.argsort(images, kind="stable")
-        numbers, starts = np.unique(images[order], return_index=True)
-        parts = np.split(places[order], starts[1:]) if len(numbers) else []
-        return dict(zip(numbers.tolist(), parts, strict=True))
+        ids, starts = np.unique(images[order], return_index=True)
+        parts = np.split(positions[order], starts[1:]) if len(ids) else []
+        return dict(zip(ids.tolist(), parts, strict=True))
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder with cameras and images: ``path`` itself, or its ``sparse/0``, ``sparse``, ``colmap/sparse/0``."""
+    """Return the folder with cameras and images: ``path``, or its ``sparse/0``, ``sparse`` or ``colmap/sparse/0``."""
     for folder in (path, path / "sparse/0", path / "sparse", path / "colmap/sparse/0"):
         if any((folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file() for suffix in READERS):
             return folder
@@ -91,13 +92,14 @@ def find_model(path: Path) -> Path | None:
 
 
 def read_colmap(path: Path) -> Listing:
-    """A folder with a sparse model, and photographs in ``images/`` beside ``sparse/``; masks in ``masks/NAME.png``.
+    """Read a sparse model with photographs in ``images/`` beside ``sparse/`` and masks in ``masks/NAME.png``.
 
-    Entries are sorted by name.
+    Returns:
+        Photographs sorted by name, and the points of the model.
 
     Raises:
-        MivolError: a camera model not in ``CAMERA_MODELS``, a truncated file, text that is not numbers, an unknown camera, a
-            point that is nowhere.
+        MivolError: a camera model outside ``CAMERA_MODELS``, a truncated file, invalid numbers, an unknown camera, or a point
+            without a finite position.
     """
     model = find_model(path)
     suffix = next(s for s in READERS if (model / f"cameras{s}").is_file() and (model / f"images{s}").is_file())
@@ -107,21 +109,23 @@ def read_colmap(path: Path) -> Listing:
     points = read.points(points_file) if points_file.is_file() else None
     if points is not None:
         check_points(points.rows, points_file, "export the model again")
-    seen = {} if points is None else points.seen_by()
+    visible = {} if points is None else points.by_image()
     base = next((folder for folder in (path, *model.parents[:2]) if (folder / "images").is_dir()), path)
     file = model / f"images{suffix}"
-    entries = [_entry(base, pose, sensors, file, seen.get(pose.number)) for pose in sorted(poses, key=lambda pose: pose.name)]
+    entries = [
+        _entry(base, pose, sensors, file, visible.get(pose.number)) for pose in sorted(poses, key=lambda pose: pose.name)
+    ]
     return Listing(entries, None if points is None else points.rows[:, :3])
 
 
 def read_points3d(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The points of ``points3D.bin`` or ``points3D.txt``.
+    """Read the points of ``points3D.bin`` or ``points3D.txt``.
 
     Returns:
-        Positions (N, 3) world [length], and colours (N, 3) in 0..255.
+        World positions (N, 3) [length] and colours (N, 3) in 0..255.
 
     Raises:
-        MivolError: another suffix, a truncated file, text that is not numbers.
+        MivolError: another suffix, a truncated file, or invalid numbers.
     """
     if path.suffix not in READERS:
         raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(READERS)}", "name COLMAP's points3D")
@@ -129,8 +133,8 @@ def read_points3d(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return rows[:, :3], rows[:, 3:]
 
 
-def rotation(q: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation of a unit quaternion (w, x, y, z); of another length l it is l^2 times one."""
+def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) of a unit quaternion (w, x, y, z); a quaternion of length l gives l^2 times a rotation."""
     w, x, y, z = q
     return np.array(
         [
@@ -143,7 +147,7 @@ def rotation(q: np.ndarray) -> np.ndarray:
 
 def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, points: np.ndarray | None) -> Entry:
     if pose.camera not in sensors:
-        raise refusal(file, f"{pose.name} taken by camera {pose.camera}", "a camera of the model", "export the model again")
+        raise refusal(file, f"camera {pose.camera} of {pose.name}", "a camera of the model", "export the model again")
     sensor = sensors[pose.camera]
 
     def camera(size: tuple[int, int]) -> Camera:
@@ -155,14 +159,14 @@ def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, point
 
 
 def _sensor(path: Path, model: str, size: tuple[int, int], parameters: tuple[float, ...]) -> Sensor:
-    named = dict(zip(_parameters(path, model), parameters, strict=True))
+    named = dict(zip(_parameter_names(path, model), parameters, strict=True))
     fx, fy = named.get("fx", named.get("f")), named.get("fy", named.get("f"))
     kind = Fisheye if model.endswith("FISHEYE") else Lens
     lens = kind(**{key: value for key, value in named.items() if key in kind.__dataclass_fields__})
     return Sensor(size, intrinsics(fx, fy, named["cx"], named["cy"]), lens)
 
 
-def _parameters(path: Path, model: str) -> tuple[str, ...]:
+def _parameter_names(path: Path, model: str) -> tuple[str, ...]:
     if model not in CAMERA_MODELS:
         raise refusal(
             path, f"the camera model {model}", f"one of {', '.join(CAMERA_MODELS)}", "undistort with colmap image_undistorter"
@@ -172,8 +176,8 @@ def _parameters(path: Path, model: str) -> tuple[str, ...]:
 
 def _to_world(q: np.ndarray, t: np.ndarray) -> np.ndarray:
     pose = np.eye(4)
-    pose[:3, :3] = rotation(np.asarray(q)).T * FLIP
-    pose[:3, 3] = -rotation(np.asarray(q)).T @ t
+    pose[:3, :3] = quaternion_to_matrix(np.asarray(q)).T * FLIP
+    pose[:3, 3] = -quaternion_to_matrix(np.asarray(q)).T @ t
     return pose
 
 
@@ -181,40 +185,40 @@ def _to_world(q: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 class Fields:
-    """Little-endian fields of a file, one after the other."""
+    """Sequential reader of little-endian fields of a file."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.data, self.at = path, read_bytes(path), 0
 
     def take(self, form: str) -> tuple[Any, ...]:
-        """The next fields, by :mod:`struct`.
+        """Return the next fields in a format of :mod:`struct`.
 
         Raises:
-            MivolError: the file ends before them.
+            MivolError: the file ends too early.
         """
         form = f"<{form}"
         self.skip(struct.calcsize(form))
         return struct.unpack_from(form, self.data, self.at - struct.calcsize(form))
 
     def skip(self, count: int) -> None:
-        """Leave out so many bytes.
+        """Skip ``count`` bytes.
 
         Raises:
-            MivolError: the file ends before.
+            MivolError: the file ends too early.
         """
         self.at += count
         if self.at > len(self.data):
             raise refusal(self.path, f"{len(self.data)} bytes", f"at least {self.at}", "the file is truncated: copy it again")
 
     def word(self) -> str:
-        """Text up to the next NUL.
+        """Return the text up to the next NUL.
 
         Raises:
-            MivolError: there is none.
+            MivolError: no NUL follows.
         """
         end = self.data.find(b"\0", self.at)
         if end < 0:
-            raise refusal(self.path, "a name that does not end", "a whole file", "the file is truncated: copy it again")
+            raise refusal(self.path, "a name without an end", "a complete file", "the file is truncated: copy it again")
         start, self.at = self.at, end + 1
         return self.data[start:end].decode("utf-8", errors="replace")
 
@@ -224,7 +228,7 @@ def _cameras_bin(path: Path) -> dict[int, Sensor]:
     for _ in range(fields.take("Q")[0]):
         number, model, width, height = fields.take("iiQQ")
         name = MODEL_NUMBERS[model] if 0 <= model < len(MODEL_NUMBERS) else f"number {model}"
-        sensors[number] = _sensor(path, name, (width, height), fields.take(f"{len(_parameters(path, name))}d"))
+        sensors[number] = _sensor(path, name, (width, height), fields.take(f"{len(_parameter_names(path, name))}d"))
     return sensors
 
 
@@ -251,7 +255,7 @@ def _points_bin(path: Path) -> Points:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Lines that are no comment; empty ones stay, since an image without points has one."""
+    """Lines without comments. Empty lines stay, because an image without points has an empty line."""
     text = read_bytes(path).decode("utf-8", errors="replace")
     return (line.strip() for line in text.splitlines() if not line.lstrip().startswith("#"))
 
@@ -260,10 +264,10 @@ def _cameras_txt(path: Path) -> dict[int, Sensor]:
     sensors = {}
     for line in filter(None, _lines(path)):
         number, model, *rest = [*line.split(maxsplit=2), "", ""][:3]
-        values = parse_reals(rest[0], 2 + len(_parameters(path, model)), path, f"camera {number}")
+        values = parse_reals(rest[0], 2 + len(_parameter_names(path, model)), path, f"camera {number}")
         if not np.isfinite(values[:2]).all():
             raise refusal(path, f"an image of {values[0]:g} x {values[1]:g} pixels", "finite numbers", "export the model again")
-        sensors[_whole(number, path)] = _sensor(path, model, (int(values[0]), int(values[1])), tuple(values[2:]))
+        sensors[_parse_id(number, path)] = _sensor(path, model, (int(values[0]), int(values[1])), tuple(values[2:]))
     return sensors
 
 
@@ -274,34 +278,34 @@ def _images_txt(path: Path) -> list[Pose]:
             continue
         words = line.split(maxsplit=9)
         if len(words) != 10:
-            raise refusal(path, f"the line '{line}'", "number, quaternion, translation, camera, name", "export it again")
+            raise refusal(path, f"the line '{line}'", "id, quaternion, translation, camera, name", "export it again")
         pose = parse_reals(" ".join(words[1:8]), 7, path, words[9])
-        poses.append(Pose(words[9], _whole(words[8], path), _to_world(pose[:4], pose[4:]), _whole(words[0], path)))
+        poses.append(Pose(words[9], _parse_id(words[8], path), _to_world(pose[:4], pose[4:]), _parse_id(words[0], path)))
         next(lines, None)
     return poses
 
 
 def _points_txt(path: Path) -> Points:
-    """Points; none of an empty file, which COLMAP's manual asks for where poses are known."""
+    """Points of a text file. An empty file is valid: COLMAP's manual asks for it with known poses."""
     if path.stat().st_size == 0:
         return Points(np.empty((0, 6)), [])
     rows, tracks = [], []
     for line in filter(None, _lines(path)):
         words = line.split()
         rows.append(parse_reals(" ".join(words[1:7]), 6, path, f"point {words[0]}"))
-        tracks.append(np.array([_whole(word, path) for word in words[8::2]], int))
+        tracks.append(np.array([_parse_id(word, path) for word in words[8::2]], int))
     return Points(np.array(rows).reshape(-1, 6), tracks)
 
 
-def _whole(word: str, path: Path) -> int:
-    if not word.isdecimal() or len(word) > 18:  # Python refuses to read numbers of thousands of digits
+def _parse_id(word: str, path: Path) -> int:
+    if not word.isdecimal() or len(word) > 18:  # Python rejects integers of thousands of digits
         raise refusal(path, f"the number '{word}'", "a whole number", "export the model again")
     return int(word)
 
 
 @dataclass(frozen=True)
 class Reader:
-    """How one encoding of a model is read."""
+    """The readers of an encoding of models."""
 
     cameras: Callable[[Path], dict[int, Sensor]]
     images: Callable[[Path], list[Pose]]

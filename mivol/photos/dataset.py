@@ -1,7 +1,7 @@
-"""Posed photographs: the images of a data set with their cameras, at one size and in one colour space.
+"""Posed photographs: the images of a data set with their cameras, in one size and one colour space.
 
-Conventions. Cameras as in :mod:`mivol.photos.camera`, pixels as in :mod:`mivol.photos.photo_file`; which photographs there are
-and what they look at is found by :mod:`mivol.photos.survey`.
+Conventions. Cameras are those of :mod:`mivol.photos.camera`, pixels those of :mod:`mivol.photos.photo_file`. The survey
+(:mod:`mivol.photos.survey`) finds the photographs and their box.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from mivol.photos.region import silhouette_box
 from mivol.photos.survey import PhotoFrame, PhotoSurvey, survey_photos
 from mivol.shown import briefly
 
-__all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos", "to_pinhole", "rectify"]
+__all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos", "rectify", "to_pinhole"]
 
 Background = str | Sequence[float] | None
 
 
-#: name -> colour for each of n views, (n, 3), from a seed.
+#: name -> function from the number of views and a seed to colours (n, 3).
 BACKGROUNDS: dict[str, Callable[[int, int], np.ndarray]] = {
     "white": lambda n, seed: np.ones((n, 3)),
     "black": lambda n, seed: np.zeros((n, 3)),
@@ -41,16 +41,16 @@ BACKGROUNDS: dict[str, Callable[[int, int], np.ndarray]] = {
 @briefly
 @dataclass(frozen=True)
 class Photo:
-    """A photograph and its camera.
+    """A photograph with its camera.
 
     Attributes:
-        name: its file's.
-        image: (H, W, 3) float32, over ``background`` where it has alpha.
-        alpha: (H, W) float32, or None where the file has none.
-        mask: (H, W) bool, False where a pixel counts for nothing; None: all count.
-        camera: of these pixels.
-        background: (3,) float32 colour behind it.
-        points: (K, 3) those of a sparse reconstruction that were found in it [length]; None where that is not known.
+        name: file name.
+        image: (H, W, 3) float32, blended over ``background`` by alpha.
+        alpha: (H, W) float32; None for a file without alpha.
+        mask: (H, W) bool, False for ignored pixels; None without ignored pixels.
+        camera: camera at the size of the image.
+        background: (3,) float32 colour behind the image.
+        points: points (K, 3) of a sparse reconstruction visible in the photograph [length], if known.
     """
 
     name: str
@@ -62,10 +62,10 @@ class Photo:
     points: np.ndarray | None = None
 
     def over(self, colour: np.ndarray) -> np.ndarray:
-        """(H, W, 3) the image over another background, (3,) or (H, W, 3).
+        """Return the image (H, W, 3) over another background, (3,) or (H, W, 3).
 
         Raises:
-            MivolError: it has no alpha.
+            MivolError: a photograph without alpha.
         """
         if self.alpha is None:
             raise _without_alpha(self.name)
@@ -75,14 +75,14 @@ class Photo:
 @briefly
 @dataclass(frozen=True)
 class Photos:
-    """Photographs, ready to be fitted.
+    """Photographs for a fit.
 
     Attributes:
-        views: of the split.
-        space: what their values are: "srgb" (code values) or "linear" (radiance).
-        survey: what was found before pixels were read.
-        white: of linear values, the radiance of the files for which 1 stands.
-        stored: what the values of the files are, of these two.
+        views: photographs of the split.
+        space: colour space of the values: "srgb" (code values) or "linear" (radiance).
+        survey: cameras, splits and box, found before reading pixels.
+        white: radiance of the files at a linear value of 1.
+        stored: colour spaces of the files.
     """
 
     views: tuple[Photo, ...]
@@ -93,7 +93,7 @@ class Photos:
 
     @property
     def box(self) -> np.ndarray:
-        """(2, 3) what is looked at [length]."""
+        """The box (2, 3) in view of the cameras [length]."""
         return self.survey.box
 
     def silhouette_box(self) -> np.ndarray:
@@ -107,12 +107,12 @@ class Photos:
 
     @property
     def near_far(self) -> tuple[float, float]:
-        """Distances between which all of the box lies [length]."""
+        """Smallest and largest distance of the box from the cameras [length]."""
         return self.survey.near_far
 
     @property
     def skipped(self) -> tuple[str, ...]:
-        """Names of photographs that are not there."""
+        """Names of missing photographs."""
         return self.survey.skipped
 
     def describe(self) -> str:
@@ -140,28 +140,28 @@ def load_photos(
     Args:
         path: folder, or file of cameras; the format is recognised (:data:`mivol.photos.survey.FORMATS`).
         split: one of :data:`mivol.photos.survey.SPLITS`.
-        scale: of the images, in (0, 1]: 0.5 halves width and height, by exact means over area.
-        background: behind images with alpha: "white", "black", "random" (a colour for each view; :meth:`Photo.over` for
-            others) or (r, g, b); None where there is no alpha.
-        space: "srgb" or "linear", what the values shall be; None: as the files are.
-        stored: "srgb" or "linear", what those of PNG and JPEG are; None: linear where a PNG says so, else srgb.
-        held_out: every n-th training photograph, or file names (:func:`survey_photos`).
-        box: (2, 3) [length]; None or "middle": found.
-        seed: of random backgrounds.
-        largest: longest edge at which any photograph is held [pixel]; larger ones are shrunk further than ``scale`` says.
-        limit: memory that may be taken [bytes]; None for what the machine has left.
+        scale: scale of the images in (0, 1]; 0.5 halves width and height by exact means over area.
+        background: colour behind images with alpha: "white", "black", "random" (one colour per view; :meth:`Photo.over`
+            blends over other colours) or (r, g, b). None for images without alpha.
+        space: colour space of the values, "srgb" or "linear"; by default the space of the files.
+        stored: colour space of PNG and JPEG files, "srgb" or "linear"; by default srgb, or linear for a PNG with a gAMA of 1.
+        held_out: n for every n-th training photograph, or file names (:func:`survey_photos`).
+        box: (2, 3) [length]; None or "middle" to find the box from the cameras or points.
+        seed: seed of random backgrounds.
+        largest: longest edge of a photograph [pixel]; larger photographs shrink below ``scale``.
+        limit: memory limit [bytes], by default the available memory.
 
     Raises:
-        MivolError: as :func:`survey_photos`; more pixels than there is memory for; images with alpha and no background or the
-            reverse; NaN; a damaged file.
+        MivolError: errors of :func:`survey_photos`; more pixels than the memory holds; images with alpha but no background,
+            or the reverse; NaN; a damaged file.
 
     Example:
         >>> photos = load_photos("chair", scale=0.25, background="white")
         >>> o, d = rays(photos.views[0].camera, pixel_centres(photos.views[0].camera.size))
     """
     survey = survey_photos(path, split=split, held_out=held_out, box=box)
-    held = _spaces(survey.frames, stored)
-    space = _space(space, held)
+    stored_spaces = _find_stored_spaces(survey.frames, stored)
+    space = _choose_space(space, stored_spaces)
     if not 0 < scale <= 1:
         raise refusal("scale", f"{scale}", "a number above 0 and at most 1", "photographs can only be shrunk")
     if largest is not None:
@@ -169,73 +169,73 @@ def load_photos(
     _check_memory(survey, scale, available_memory() if limit is None else limit)
     _check_background(check_alpha(survey.frames), background, survey.frames[0].file)
     colours = _backgrounds(background, len(survey.frames), seed)
-    views = [_photo(frame, scale, colour, (space, stored)) for frame, colour in zip(survey.frames, colours, strict=True)]
-    return Photos(tuple(views), space, survey, stored=frozenset(held))
+    views = [_load_photo(frame, scale, colour, (space, stored)) for frame, colour in zip(survey.frames, colours, strict=True)]
+    return Photos(tuple(views), space, survey, stored=frozenset(stored_spaces))
 
 
 # -- Reading ------------------------------------------------------------------------------------------------------
 
-HELD = 24
-"""Bytes a pixel that is kept: rgb as float32, and once more while a lens' distortion is taken out."""
+KEPT_BYTES = 24
+"""Memory of a loaded pixel [byte]: rgb as float32, and a copy while the lens distortion is removed."""
 
-READ = 64
-"""Bytes a pixel of the one file that is being read: rgb in float32 and float64, and their integral along an axis."""
+READ_BYTES = 64
+"""Memory of a pixel during reading [byte]: rgb as float32 and float64, and the integral along an axis."""
 
 
 def _check_memory(survey: PhotoSurvey, scale: float, limit: int | None) -> None:
-    """Refuse photographs that do not fit, before any is read.
+    """Refuse photographs larger than the memory, before reading pixels.
 
     Raises:
-        MivolError: with the largest scale that does.
+        MivolError: names the largest possible scale.
     """
     sizes = [math.prod(frame.camera.size) for frame in survey.frames]
-    kept, read = HELD * sum(sizes), READ * max(sizes)
+    kept, read = KEPT_BYTES * sum(sizes), READ_BYTES * max(sizes)
     if limit is None or kept * scale**2 + read <= limit:
         return
     fitting = math.floor(100 * math.sqrt(max(limit - read, 0) / kept)) / 100
-    advice = f"scale={fitting:g} fits" if fitting > 0 else "not even one can be read: shrink the files"
-    found = f"{len(sizes)} photographs at scale {scale:.3g} take about {(kept * scale**2 + read) / 2**30:.2g} GiB"
-    raise MivolError(f"{survey.path}: {found} and {limit / 2**30:.2g} are left; {advice}.")
+    advice = f"use scale={fitting:g}" if fitting > 0 else "a single photograph is too large: shrink the files"
+    found = f"{len(sizes)} photographs of about {(kept * scale**2 + read) / 2**30:.2g} GiB at scale {scale:.3g}"
+    raise refusal(survey.path, found, f"at most the free memory, {limit / 2**30:.2g} GiB", advice)
 
 
 def check_alpha(frames: Sequence[PhotoFrame]) -> bool:
-    """Whether photographs have alpha.
+    """Return whether the photographs have alpha.
 
     Raises:
-        MivolError: some have and some have not.
+        MivolError: only some photographs have alpha.
     """
     kinds = {read_photo_header(frame.file).has_alpha: frame.file for frame in frames}
     if len(kinds) == 2:
-        found, advice = f"alpha, and none in {kinds[False].name}", "add an opaque alpha to the others, or remove it from all"
+        found, advice = f"alpha here but not in {kinds[False].name}", "add an opaque alpha to the others, or remove alpha"
         raise refusal(kinds[True], found, "alpha in all photographs or in none", advice)
     return next(iter(kinds))
 
 
 def _check_background(has_alpha: bool, background: Background, first: Path) -> None:
     if has_alpha and background is None:
-        raise refusal(first, "an image with alpha", "a background to put it over", 'set background="white", for instance')
+        raise refusal(first, "an image with alpha", "a background behind the image", 'set background="white", for instance')
     if not has_alpha and background is not None:
         raise _without_alpha(first)
 
 
-def _spaces(frames: Sequence[PhotoFrame], stored: str | None) -> dict[str, Path]:
-    """What the values of files are, each with one of them."""
+def _find_stored_spaces(frames: Sequence[PhotoFrame], stored: str | None) -> dict[str, Path]:
+    """The colour spaces of the files, each with an example."""
     _check_space("stored", stored)
     return {find_colour_space(frame.file, stored): frame.file for frame in frames}
 
 
-def _space(wanted: str | None, held: dict[str, Path]) -> str:
-    if wanted is None and len(held) == 2:
-        names = " and ".join(file.name for file in held.values())
-        found, advice = "codes and radiance in one set", 'choose space = "srgb" or "linear" for all'
-        raise refusal(names, found, "one kind of values", advice)
-    _check_space("space", wanted)
-    return wanted or next(iter(held))
+def _choose_space(requested: str | None, stored: dict[str, Path]) -> str:
+    if requested is None and len(stored) == 2:
+        names = " and ".join(file.name for file in stored.values())
+        found, advice = "sRGB codes and radiance in one data set", 'set space = "srgb" or "linear"'
+        raise refusal(names, found, "a single colour space", advice)
+    _check_space("space", requested)
+    return requested or next(iter(stored))
 
 
 def _check_space(name: str, value: str | None) -> None:
     if value not in (None, "srgb", "linear"):
-        raise refusal(name, f'"{value}"', '"srgb" or "linear"', "choose one of those")
+        raise refusal(name, f'"{value}"', '"srgb" or "linear"', "choose one")
 
 
 def _backgrounds(background: Background, n: int, seed: int) -> Sequence[np.ndarray | None]:
@@ -244,7 +244,7 @@ def _backgrounds(background: Background, n: int, seed: int) -> Sequence[np.ndarr
     if isinstance(background, str):
         if background not in BACKGROUNDS:
             known = ", ".join(BACKGROUNDS)
-            raise refusal("background", f'"{background}"', f"one of {known}, or (r, g, b)", "choose one of those")
+            raise refusal("background", f'"{background}"', f"one of {known}, or (r, g, b)", "choose one")
         return BACKGROUNDS[background](n, seed).astype(np.float32)
     colour = np.asarray(background, np.float32)
     if colour.shape != (3,) or not np.isfinite(colour).all():
@@ -252,14 +252,14 @@ def _backgrounds(background: Background, n: int, seed: int) -> Sequence[np.ndarr
     return np.broadcast_to(colour, (n, 3))
 
 
-def _photo(frame: PhotoFrame, scale: float, background: np.ndarray | None, spaces: tuple[str, str | None]) -> Photo:
-    """Read one, whose values shall be, and in its file are, what ``spaces`` says."""
+def _load_photo(frame: PhotoFrame, scale: float, background: np.ndarray | None, spaces: tuple[str, str | None]) -> Photo:
+    """Read a photograph; ``spaces`` holds the requested colour space and the declared space of the file."""
     image, alpha = read_photo(frame.file, *spaces)
     camera = _shrunk_camera(frame.camera, scale)
     mask = None if frame.mask is None else _read_mask(frame, camera.size)
-    seen = is_seen(camera, pixel_centres(camera.size))
-    if not seen.all():
-        mask = seen if mask is None else mask & seen
+    inside = is_seen(camera, pixel_centres(camera.size))
+    if not inside.all():
+        mask = inside if mask is None else mask & inside
     image = shrink(image, camera.size)
     if alpha is not None:
         alpha = shrink(alpha, camera.size)
@@ -274,35 +274,44 @@ def _shrunk_camera(camera: Camera, scale: float) -> Camera:
 
 
 def _read_mask(frame: PhotoFrame, size: tuple[int, int]) -> np.ndarray:
-    """A shrunk pixel counts where all that it is the mean of count."""
+    """Read and shrink a mask. A new pixel is valid if all pixels below it are valid."""
     mask = read_mask(frame.mask)
     if mask.shape != frame.camera.size[::-1]:
-        found, wanted = (f"{w} x {h}" for h, w in (mask.shape, frame.camera.size[::-1]))
-        raise refusal(frame.mask, f"a mask of {found}", f"{wanted} as its photograph", "scale it")
+        found, expected = (f"{w} x {h}" for h, w in (mask.shape, frame.camera.size[::-1]))
+        raise refusal(frame.mask, f"a mask of {found}", f"{expected} as in the photograph", "scale the mask")
     return shrink((~mask).astype(np.float32), size) == 0
 
 
 def _without_alpha(name: object) -> MivolError:
-    return refusal(name, "an image without alpha", "alpha, since a background is asked for", "leave background away")
+    return refusal(name, "an image without alpha", "alpha, because a background is given", "remove background")
+
+
+# -- Rectification ------------------------------------------------------------------------------------------------
 
 
 def to_pinhole(camera: Camera) -> Camera:
-    """The pinhole with square pixels that stands in for a camera.
+    """Return a pinhole with square pixels in place of a camera.
+
+    The pinhole has the size, the principal point and the longer focal length of the camera.
 
     Raises:
-        MivolError: a wide lens, which sees more than a pinhole.
+        MivolError: a wide lens, whose field of view no pinhole covers.
     """
     if camera.distortion.is_wide:
         found = f"a {type(camera.distortion).__name__.lower()}"
-        raise refusal(camera.name, found, "a lens with an image plane", "no pinhole sees what it sees: cut pinholes out of it")
+        raise refusal(camera.name, found, "a lens with an image plane", "no pinhole covers its view: cut pinholes out of it")
     f = max(camera.K[0, 0], camera.K[1, 1])
     return dataclasses.replace(camera, K=intrinsics(f, f, *camera.K[:2, 2]), distortion=Lens())
 
 
 def rectify(photo: Photo) -> Photo:
-    """A photograph as the pinhole of its camera would have taken it; one of such a pinhole, or of a wide lens, as it is.
+    """Return a photograph resampled to the pinhole of its camera (:func:`to_pinhole`).
 
-    Bias: the interpolation is a low-pass of up to a pixel's width.
+    Colour multiplied by alpha is interpolated linearly between pixels; pixels outside the photograph are masked. Photographs of
+    a wide lens or of a pinhole with square pixels are returned unchanged. Tracing rays exactly through the lens
+    (:func:`mivol.photos.camera.rays`) needs no resampling.
+
+    Bias: the interpolation is a low-pass filter of up to a pixel.
     """
     camera = photo.camera
     if camera.distortion.is_wide:
@@ -311,21 +320,22 @@ def rectify(photo: Photo) -> Photo:
     if not camera.distortion and camera.K[0, 0] == camera.K[1, 1]:
         return photo
     plane = (pixel_centres(camera.size) - pinhole.K[:2, 2]) / pinhole.K[0, 0]
-    at = distort(camera.distortion, plane) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    seen = ((at >= 0) & (at <= camera.size)).all(axis=-1) & (np.linalg.norm(plane, axis=-1) <= camera.distortion.fold)
-    at = np.where(seen[..., None], at, 0.5)
+    pixels = distort(camera.distortion, plane) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    inside = ((pixels >= 0) & (pixels <= camera.size)).all(axis=-1)
+    inside &= np.linalg.norm(plane, axis=-1) <= camera.distortion.fold
+    pixels = np.where(inside[..., None], pixels, 0.5)
     if photo.mask is not None:
-        seen &= _interpolated(photo.mask.astype(np.float32), at) == 1
-    alpha = None if photo.alpha is None else _interpolated(photo.alpha, at)
-    return dataclasses.replace(photo, image=_interpolated(photo.image, at), alpha=alpha, mask=seen, camera=pinhole)
+        inside &= _interpolate(photo.mask.astype(np.float32), pixels) == 1
+    alpha = None if photo.alpha is None else _interpolate(photo.alpha, pixels)
+    return dataclasses.replace(photo, image=_interpolate(photo.image, pixels), alpha=alpha, mask=inside, camera=pinhole)
 
 
-def _interpolated(image: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Linear interpolation between pixel centres at points (H, W, 2); constant beyond the outermost centres."""
+def _interpolate(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Interpolate linearly between pixel centres at image points (H, W, 2); constant beyond the outermost centres."""
     last = np.array(image.shape[1::-1]) - 1
-    place = np.clip(at - 0.5, 0, last)
-    low = np.minimum(place.astype(int), np.maximum(last - 1, 0))
-    x, y = np.moveaxis((place - low).astype(np.float32), -1, 0)
+    index = np.clip(points - 0.5, 0, last)
+    low = np.minimum(index.astype(int), np.maximum(last - 1, 0))
+    x, y = np.moveaxis((index - low).astype(np.float32), -1, 0)
     if image.ndim == 3:
         x, y = x[..., None], y[..., None]
     (i, j), (i1, j1) = (low[..., 1], low[..., 0]), np.moveaxis(np.minimum(low + 1, last)[..., ::-1], -1, 0)

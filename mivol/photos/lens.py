@@ -1,13 +1,26 @@
-r"""How a lens bends the image: the polynomial model of Brown and Conrady, as OpenCV, COLMAP and nerfstudio write it.
+r"""Lens models: how directions and image points map to each other.
+
+Conventions. A direction (x, y, z) is in OpenCV's camera frame: x to the right, y **down**, z forward. An image point
+(x_d, y_d) is in focal lengths from the principal point, so its pixel is (fx x_d + cx, fy y_d + cy).
+
+:class:`Lens` is the polynomial model of Brown and Conrady, as OpenCV, COLMAP and nerfstudio write it. It distorts the plane
+one length in front of the pinhole, with (x, y) before the lens and (x_d, y_d) behind it:
 
 .. math:: x_d = x\,g + 2 p_1 x y + p_2 (r^2 + 2 x^2), \quad y_d = y\,g + p_1 (r^2 + 2 y^2) + 2 p_2 x y, \quad
    g = 1 + k_1 r^2 + k_2 r^4 + k_3 r^6 + k_4 r^8
 
-Conventions. (x, y) are directions on the plane one length in front of the pinhole, x to the right, **y down** (OpenCV), before
-the lens; (x_d, y_d) are the same after it, so that a pixel is (fx x_d + cx, fy y_d + cy). :math:`k_4` is nerfstudio's term in
-r^8, not the denominator of OpenCV's rational model.
+:math:`k_4` is nerfstudio's term in r^8, not the denominator of OpenCV's rational model.
 
-Source: Brown 1966 (Photogrammetric Engineering 32), decentring in the form of OpenCV's ``calib3d``.
+:class:`Fisheye` and :class:`Panorama` are wide lenses: their image is no plane, because they see half of all directions or
+more. A fisheye maps the angle :math:`\theta` from the axis to the distance
+
+.. math:: \theta_d = \theta\,(1 + k_1 \theta^2 + k_2 \theta^4 + k_3 \theta^6 + k_4 \theta^8)
+
+from the principal point. A panorama maps longitude and latitude [radian] to x_d and y_d; its centre shows the axis.
+
+Sources: Brown 1966 (Photogrammetric Engineering 32), decentring in the form of OpenCV's ``calib3d``; Kannala and Brandt 2006
+(IEEE PAMI 28, eq. 6) with the coefficients of OpenCV's ``fisheye``; equirectangular images as in nerfstudio, with -z of the
+camera in the centre.
 """
 
 from __future__ import annotations
@@ -18,24 +31,24 @@ import numpy as np
 
 from mivol.files.source import refusal
 
-__all__ = ["Lens", "distort", "undistort", "Fisheye", "Panorama"]
+__all__ = ["Fisheye", "Lens", "Panorama", "distort", "undistort"]
 
 NEWTON_STEPS = 20
+"""Largest number of steps that undistort a point."""
 
 CONVERGED = 1e-12
-"""Residual [1] on the plane at distance 1: 1e-8 pixel at a focal length of 10 000 pixels, and 4 000 times the rounding."""
-
+"""Residual on the plane at distance 1: 1e-8 pixel at a focal length of 10 000 pixels, 4 000 times the rounding error."""
 
 LEAST_TERM = 1e-30
-"""A last coefficient below it moves no ray of any image; dividing by it could overflow."""
+"""Smallest last coefficient of a polynomial. Smaller values move no ray, and a division by them could overflow."""
 
 LARGEST_TERM = 1e6
-"""Lenses have coefficients of the order of 1; beyond this the fold cannot be found."""
+"""Largest coefficient of a lens, beyond which the search for the fold fails. Real coefficients are of order 1."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Coefficients of the distortion; all 0: a pinhole."""
+    """Coefficients of a distorted image plane; zeros describe a pinhole."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -47,17 +60,17 @@ class Lens:
     is_wide = False
 
     def __bool__(self) -> bool:
-        """Whether it bends anything."""
+        """Whether the lens distorts."""
         return any(astuple(self))
 
     @property
     def fold(self) -> float:
-        """Radius r at which the radial part r g(r^2) stops growing: beyond it the image folds back; inf: nowhere."""
+        """Radius r at which the radial part r g(r^2) stops growing; the image folds back beyond it. Infinite without a fold."""
         return _fold_radius(self.k1, self.k2, self.k3, self.k4)
 
 
 def distort(lens: Lens, xy: np.ndarray) -> np.ndarray:
-    """Where the lens puts directions: (..., 2) on the plane at distance 1 to (..., 2) on it."""
+    """Apply the distortion to points (..., 2) on the plane at distance 1."""
     x, y = np.moveaxis(np.asarray(xy, np.float64), -1, 0)
     r2 = x * x + y * y
     gain = _gain(lens, r2)
@@ -67,38 +80,38 @@ def distort(lens: Lens, xy: np.ndarray) -> np.ndarray:
 
 
 def undistort(lens: Lens, xy: np.ndarray, name: object = "lens") -> np.ndarray:
-    """The inverse of :func:`distort`, by Newton's method with the exact Jacobian.
+    """Invert :func:`distort` by Newton's method with the exact Jacobian.
 
     Args:
         lens: coefficients.
-        xy: (..., 2) after the lens.
-        name: named in the refusal.
+        xy: distorted points (..., 2).
+        name: subject of the refusal.
 
     Returns:
-        (..., 2) before the lens; distorted again it gives ``xy`` to 1e-12.
+        Undistorted points (..., 2); distorting them gives ``xy`` to 1e-12.
 
     Raises:
-        MivolError: a point has no original on the side of the fold that holds the middle of the image.
+        MivolError: a point without an original inside the fold.
     """
     target = np.asarray(xy, np.float64)
     if not lens:
         return target.copy()
-    found = target.copy()
+    plane = target.copy()
     for _ in range(NEWTON_STEPS):
-        residual = distort(lens, found) - target
+        residual = distort(lens, plane) - target
         if np.abs(residual).max(initial=0.0) <= CONVERGED:
             break
-        found = found - _solve(lens, found, residual)
-    wrong = ~(np.abs(distort(lens, found) - target).max(axis=-1) <= CONVERGED) | (np.linalg.norm(found, axis=-1) > lens.fold)
-    if wrong.any():
-        at = target[wrong].reshape(-1, 2)[0]
+        plane = plane - _solve(lens, plane, residual)
+    failed = ~(np.abs(distort(lens, plane) - target).max(axis=-1) <= CONVERGED) | (np.linalg.norm(plane, axis=-1) > lens.fold)
+    if failed.any():
+        x, y = target[failed].reshape(-1, 2)[0]
         raise refusal(
             name,
-            f"a lens whose image folds back: nothing is seen at ({at[0]:.4g}, {at[1]:.4g}) times the focal length",
+            f"a lens whose image folds back: nothing is seen at ({x:.4g}, {y:.4g}) times the focal length",
             "distortion that can be inverted over the whole image",
             "correct k1 to k4, p1, p2, or crop the image",
         )
-    return found
+    return plane
 
 
 def _fold_radius(k1: float, k2: float, k3: float, k4: float) -> float:
@@ -114,7 +127,7 @@ def _gain(lens: Lens, r2: np.ndarray) -> np.ndarray:
 
 
 def _solve(lens: Lens, xy: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """J^-1 residual; infinite where J is singular, so that the check of the result sees it."""
+    """J^-1 residual; infinite for a singular J, which the caller detects."""
     x, y = np.moveaxis(xy, -1, 0)
     r2 = x * x + y * y
     slope = 2 * (lens.k1 + r2 * (2 * lens.k2 + r2 * (3 * lens.k3 + r2 * 4 * lens.k4)))
@@ -129,12 +142,12 @@ def _solve(lens: Lens, xy: np.ndarray, residual: np.ndarray) -> np.ndarray:
 
 
 STEPS = 60
-"""Of a search that halves its bracket where Newton's method would leave it: as many halvings leave pi / 2^60."""
+"""Largest number of steps of a safeguarded Newton search; 60 bisections reduce its bracket to pi / 2^60."""
 
 
 @dataclass(frozen=True)
 class Fisheye:
-    """Coefficients of a fisheye; all 0: the equidistant projection."""
+    """Coefficients of a fisheye; zeros describe the equidistant projection."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -145,16 +158,16 @@ class Fisheye:
 
     @property
     def widest(self) -> float:
-        """The angle from the axis up to which the image grows, at most pi; what would lie beyond is not in the image."""
+        """Largest angle from the axis in the image [radian]: the image radius grows up to it, at most up to pi."""
         return min(np.pi, _fold_radius(self.k1, self.k2, self.k3, self.k4))
 
     def radius(self, theta: np.ndarray) -> np.ndarray:
-        """Distance from the middle of the image, in focal lengths, of directions at angles from the axis [radian]."""
+        """Return the image radius [focal length] of angles from the axis [radian]."""
         t = theta * theta
         return theta * (1 + t * (self.k1 + t * (self.k2 + t * (self.k3 + t * self.k4))))
 
     def point(self, d: np.ndarray) -> np.ndarray:
-        """Where directions (..., 3) of any length lie in the image (..., 2); NaN where they do not."""
+        """Return the image points (..., 2) of directions (..., 3) of arbitrary length; NaN outside the image."""
         across = np.hypot(d[..., 0], d[..., 1])
         theta = np.arctan2(across, d[..., 2])
         radius = np.where(theta <= self.widest, self.radius(theta), np.nan)
@@ -163,9 +176,9 @@ class Fisheye:
         return unit * radius[..., None]
 
     def direction(self, xy: np.ndarray) -> np.ndarray:
-        """Unit directions (..., 3) of image points (..., 2), to 1e-12; beyond the image those of its rim.
+        """Return unit directions (..., 3) of image points (..., 2), to 1e-12; points outside get the direction at the rim.
 
-        Safeguarded Newton: the radius grows with the angle up to :attr:`widest`, so a bracket always holds the solution.
+        Safeguarded Newton: the image radius grows with the angle up to :attr:`widest`, which brackets the solution.
         """
         xy = np.asarray(xy, np.float64)
         radius = np.hypot(xy[..., 0], xy[..., 1])
@@ -175,7 +188,7 @@ class Fisheye:
         return np.concatenate([unit * np.sin(theta)[..., None], np.cos(theta)[..., None]], axis=-1)
 
     def sees(self, xy: np.ndarray) -> np.ndarray:
-        """Whether image points (..., 2) show a direction."""
+        """Return whether image points (..., 2) show a direction."""
         return np.hypot(xy[..., 0], xy[..., 1]) <= self.radius(np.float64(self.widest))
 
     def _angle(self, radius: np.ndarray) -> np.ndarray:
@@ -201,15 +214,15 @@ class Panorama:
     is_wide = True
 
     def point(self, d: np.ndarray) -> np.ndarray:
-        """Longitude and latitude (..., 2) [radian, to the right and down] of directions (..., 3) of any length."""
+        """Return longitude and latitude (..., 2) [radian, to the right and down] of directions (..., 3) of arbitrary length."""
         return np.stack([np.arctan2(d[..., 0], d[..., 2]), np.arctan2(d[..., 1], np.hypot(d[..., 0], d[..., 2]))], axis=-1)
 
     def direction(self, xy: np.ndarray) -> np.ndarray:
-        """Unit directions (..., 3) of image points (..., 2)."""
+        """Return unit directions (..., 3) of image points (..., 2)."""
         longitude, latitude = np.moveaxis(np.asarray(xy, np.float64), -1, 0)
         level = np.cos(latitude)
         return np.stack([level * np.sin(longitude), np.sin(latitude), level * np.cos(longitude)], axis=-1)
 
     def sees(self, xy: np.ndarray) -> np.ndarray:
-        """Whether image points (..., 2) show a direction: all do between the poles."""
+        """Return whether image points (..., 2) lie between the poles."""
         return np.abs(xy[..., 1]) <= np.pi / 2

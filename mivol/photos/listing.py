@@ -1,4 +1,4 @@
-"""What a data set says it has: one entry for each photograph, before any pixel is read."""
+"""The list of a data set: an entry for each photograph, before any pixel is read."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from mivol.photos.camera import Camera
 __all__ = ["UNLISTED", "Entry", "Listing", "check_points"]
 
 UNLISTED = "in no list"
-"""The split of photographs that a data set's own lists leave out."""
+"""Split of the photographs outside the lists of the data set."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A photograph that a data set names.
+    """A photograph in the list of a data set.
 
     Attributes:
-        name: as the data set calls it.
-        file: where it should lie.
-        camera: from its (width, height) in pixels.
+        name: name in the data set.
+        file: path of the image, which may be missing.
+        camera: function from (width, height) [pixel] to the camera.
         split: "train", "test", "val" or ``UNLISTED``.
-        size: (width, height) that the file of cameras says [pixel]; None: all of the split have one size.
-        mask: where its mask should lie, if it has one.
-        points: (K, 3) those of a sparse reconstruction that were found in it [length]; None where that is not known.
+        size: (width, height) in the file of cameras [pixel]; by default all photographs of the split have the same size.
+        mask: path of the mask, optional.
+        points: points (K, 3) of a sparse reconstruction visible in the photograph [length], if known.
     """
 
     name: str
@@ -42,11 +42,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class Listing:
-    """All photographs that a data set names, and the points it knows.
+    """The photographs and points of a data set.
 
     Attributes:
-        entries: in its order.
-        points: (N, 3) points of a sparse reconstruction [length], or None.
+        entries: photographs in the order of the data set.
+        points: points (N, 3) of a sparse reconstruction [length], if known.
     """
 
     entries: list[Entry]
@@ -54,10 +54,10 @@ class Listing:
 
 
 def check_points(rows: np.ndarray, file: Path, way_out: str) -> None:
-    """Refuse points (N, 3 or more) of which some number is not finite.
+    """Refuse points (N, 3 or more) with a number that is not finite.
 
     Raises:
-        MivolError: by the first of them.
+        MivolError: names the first bad point.
     """
     if not np.isfinite(rows).all():
         number = int(np.argmin(np.isfinite(rows).all(axis=1)))

@@ -1,11 +1,11 @@
-"""The pixels of a photograph: read, shrunk by area, put over a background, in the values that are fitted.
+"""The image file of a photograph: header, pixels and mask.
 
-Conventions. Pictures are float32 (rows, columns, 3), the first row on top, alpha (rows, columns) in 0..1. **PNG and JPEG hold
-sRGB code values 0..1 and OpenEXR files linear light, and each stays what it is unless the other is asked for**
-(:data:`SPACES`); radiance fields of such photographs are usually fitted to the code values. A PNG whose gAMA chunk says 1 holds
-linear light, and so do files of which the caller says it. PNG keeps colour apart from alpha, OpenEXR multiplied by it; here
-all is multiplied by alpha before it is averaged or put over a background. Averages and backgrounds are taken in the values that
-are fitted, as NeRF's protocol does. PNG of 16 bits a channel is read at full depth.
+Conventions. Images are float32 (rows, columns, 3), row 0 at the top; alpha is (rows, columns) in 0..1. **PNG and JPEG hold
+sRGB code values 0..1, OpenEXR holds linear light, and no value is converted unless the caller asks for the other space**
+(:data:`SPACES`). Radiance fields are usually fitted to the code values. A PNG with a gAMA chunk of 1 holds linear light, and
+the caller can declare other files linear. PNG stores colour without alpha, OpenEXR stores colour multiplied by alpha. Here
+colour is multiplied by alpha before averaging and before blending over a background. Both happen in the values of the fit, as
+in NeRF's protocol. PNG of 16 bits per channel is read at full depth.
 
 References: IEC 61966-2-1 (the sRGB curve); W3C PNG, section 11.3.2.2 (gAMA); Porter and Duff 1984 (SIGGRAPH), "over" with
 multiplied alpha.
@@ -29,53 +29,50 @@ __all__ = [
     "SUFFIXES",
     "PhotoHeader",
     "decode_srgb",
-    "read_photo_header",
+    "find_colour_space",
     "read_mask",
     "read_photo",
+    "read_photo_header",
     "shrink",
-    "find_colour_space",
 ]
 
-#: suffixes of photographs, in the order in which a name without one is tried.
+#: suffixes of photographs, in the order of the trials for a name without suffix.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 
-#: modes of Pillow that hold 8 bits a channel -> what they are read as.
+#: mode of Pillow with 8 bits per channel -> mode after reading.
 MODES = {"1": "RGB", "L": "RGB", "LA": "RGBA", "P": "RGBA", "RGB": "RGB", "RGBA": "RGBA", "RGBX": "RGB"}
 
 GREY_16 = ("I;16", "I")
-"""Modes of Pillow, old and new, of a grey PNG of 16 bits."""
+"""Modes of Pillow, old and new, for a grey PNG of 16 bits."""
 
 ORIENTATION = 0x0112
-"""The tag of EXIF that says how a viewer turns a picture (CIPA DC-008, section 4.6.4): 1 as it is, 6 a quarter turn, ..."""
+"""EXIF tag of the rotation by image viewers (CIPA DC-008, section 4.6.4): 1 none, 6 a quarter turn, ..."""
 
 
 def decode_srgb(code: np.ndarray) -> np.ndarray:
-    """Code values 0..1 to linear light, by the sRGB curve (same shape)."""
+    """Convert code values 0..1 to linear light by the sRGB curve, in the same shape."""
     code = np.clip(code, 0, 1)
     return np.where(code <= 0.04045, code / 12.92, ((np.maximum(code, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
-def _same(values: np.ndarray) -> np.ndarray:
-    return values
-
-
-#: (what the file holds, what is asked for) -> how to get there.
+#: (space of the file, requested space) -> conversion.
 SPACES: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
-    ("srgb", "srgb"): _same,
-    ("linear", "linear"): _same,
+    ("srgb", "srgb"): lambda values: values,
+    ("linear", "linear"): lambda values: values,
     ("srgb", "linear"): decode_srgb,
     ("linear", "srgb"): encode_srgb,
 }
 
 
 def find_colour_space(path: Path, stored: str | None = None) -> str:
-    """What the values of a file are: "linear" (OpenEXR, and a PNG that says so) or "srgb".
+    """Return the colour space of a file: "linear" (OpenEXR, and PNG with a gAMA chunk of 1) or "srgb".
 
     Args:
-        stored: what the caller says of PNG and JPEG.
+        path: PNG, JPEG or OpenEXR.
+        stored: colour space of PNG and JPEG files according to the caller, optional.
 
     Raises:
-        MivolError: missing or damaged file.
+        MivolError: a missing or damaged file.
     """
     if path.suffix.lower() == ".exr":
         return "linear"
@@ -87,12 +84,12 @@ def find_colour_space(path: Path, stored: str | None = None) -> str:
 
 @dataclass(frozen=True)
 class PhotoHeader:
-    """What a file says before its pixels are read.
+    """The header of an image file.
 
     Attributes:
-        size: (width, height) as the pixels are stored.
+        size: (width, height) of the stored pixels.
         has_alpha: whether pixels have an opacity.
-        orientation: EXIF's number, 1..8; 1 where it says none.
+        orientation: orientation of EXIF in 1..8, by default 1.
     """
 
     size: tuple[int, int]
@@ -101,29 +98,32 @@ class PhotoHeader:
 
 
 def read_photo_header(path: Path) -> PhotoHeader:
-    """The header of a photograph.
+    """Read the header of a photograph.
 
     Raises:
-        MivolError: missing or damaged file.
+        MivolError: a missing or damaged file.
     """
     if path.suffix.lower() == ".exr":
         size, names = read_exr_header(path)
         return PhotoHeader(size, "A" in names)
     with _opened(path) as image:
         orientation = image.getexif().get(ORIENTATION, 1) if "exif" in image.info else 1
-        return PhotoHeader(image.size, _kind(image) == "RGBA", orientation)
+        return PhotoHeader(image.size, _read_mode(image) == "RGBA", orientation)
 
 
 def read_photo(path: Path, space: str, stored: str | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colour multiplied by alpha (rows, columns, 3), and alpha (rows, columns) or None where the file has none.
+    """Read the pixels of a photograph.
 
     Args:
         path: PNG, JPEG or OpenEXR.
-        space: "srgb" or "linear", what the values shall be.
-        stored: what those of a PNG or JPEG are; None: as :func:`find_colour_space` says.
+        space: requested colour space, "srgb" or "linear".
+        stored: colour space of PNG and JPEG files, by default the result of :func:`find_colour_space`.
+
+    Returns:
+        Colour multiplied by alpha (rows, columns, 3), and alpha (rows, columns), or None for a file without alpha.
 
     Raises:
-        MivolError: a damaged file, grey with alpha of 16 bits, channels that are no picture, NaN.
+        MivolError: a damaged file, 16-bit grey with alpha, missing colour channels, or NaN.
     """
     is_exr, stored = path.suffix.lower() == ".exr", find_colour_space(path, stored)
     colour, alpha = (_read_exr if is_exr else _read_codes)(path)
@@ -136,21 +136,21 @@ def read_photo(path: Path, space: str, stored: str | None = None) -> tuple[np.nd
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """(rows, columns) bool, False where a mask is black: such pixels count for nothing.
+    """Read a mask (rows, columns): False for black pixels, which a fit ignores.
 
     Raises:
-        MivolError: missing or damaged file.
+        MivolError: a missing or damaged file.
     """
     with _opened(path) as image:
         return np.asarray(_loaded(image, path).convert("L")) > 0
 
 
 def shrink(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The exact mean over the area of each new pixel, for any (width, height) not above the old.
+    """Shrink an image by exact means over the area of each new pixel.
 
     Args:
-        image: (rows, columns) or (rows, columns, channels), multiplied by alpha where there is one.
-        size: (width, height).
+        image: (rows, columns) or (rows, columns, channels), already multiplied by alpha.
+        size: new (width, height), at most the old size.
     """
     for axis, n in ((0, size[1]), (1, size[0])):
         image = _mean_over_pieces(image, axis, n)
@@ -158,7 +158,7 @@ def shrink(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def _mean_over_pieces(image: np.ndarray, axis: int, n: int) -> np.ndarray:
-    """Means over n equal pieces of an axis: differences of its integral, which is linear between pixel edges."""
+    """Means over n equal pieces of an axis, as differences of the integral, which is linear between pixel edges."""
     old = image.shape[axis]
     if n == old:
         return image
@@ -173,13 +173,13 @@ def _mean_over_pieces(image: np.ndarray, axis: int, n: int) -> np.ndarray:
     return np.moveaxis(np.diff(at_edges, axis=0) * (n / old), 0, axis)
 
 
-def _kind(image: Image.Image) -> str:
-    """ "RGB" or "RGBA": what a picture of 8 bits a channel is read as."""
+def _read_mode(image: Image.Image) -> str:
+    """The mode, "RGB" or "RGBA", after reading an image of 8 bits per channel."""
     return "RGB" if image.mode == "P" and "transparency" not in image.info else MODES.get(image.mode, "RGB")
 
 
 def _read_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colour not multiplied, and alpha: code values of 8 or 16 bits over the largest."""
+    """Colour without alpha, and alpha: codes of 8 or 16 bits divided by the largest code."""
     with _opened(path) as image:
         packed = image.tile[0][3] if image.format == "PNG" and image.tile else ""
         if image.mode in GREY_16:
@@ -188,18 +188,18 @@ def _read_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         if packed in ("RGB;16B", "RGBA;16B"):
             values = _read_16_bit(path, packed)
         elif image.mode not in MODES or packed == "LA;16B":
-            found = f"pixels of the kind {image.mode}" if image.mode not in MODES else "grey with alpha of 16 bits"
-            raise refusal(path, found, "grey, RGB or RGBA of 8 bits, grey or RGB of 16", "convert it, or use OpenEXR")
+            found = f"pixels of mode {image.mode}" if image.mode not in MODES else "16-bit grey with alpha"
+            raise refusal(path, found, "grey, RGB or RGBA of 8 bits, or grey or RGB of 16", "convert the file")
         else:
-            values = np.asarray(_loaded(image, path).convert(_kind(image)), np.float32) / np.float32(255)
+            values = np.asarray(_loaded(image, path).convert(_read_mode(image)), np.float32) / np.float32(255)
     return (values[..., :3], values[..., 3]) if values.shape[-1] == 4 else (values, None)
 
 
 def _read_16_bit(path: Path, packed: str) -> np.ndarray:
-    """Codes of 16 bits over the largest.
+    """Codes of 16 bits divided by the largest code.
 
-    Pillow keeps the first byte of each number, which is its high one in a PNG. Told that low bytes come first, it keeps the
-    second.
+    Pillow keeps the first byte of each number, the high byte in a PNG. Declaring the other byte order makes Pillow keep the
+    low byte.
     """
     halves = []
     for order in (packed, packed.replace("16B", "16L")):
@@ -214,19 +214,19 @@ def _read_exr(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     channels, _ = read_exr(path)
     names = [name for name in ("RGB", "Y") if all(letter in channels for letter in name)]
     if not names:
-        raise refusal(path, f"the channels {', '.join(channels)}", "R, G, B or Y", "name the picture's channels so")
+        raise refusal(path, f"the channels {', '.join(channels)}", "R, G, B or Y", "rename the channels")
     colour = np.stack([channels[letter] for letter in (names[0] * 3)[:3]], axis=-1)
     alpha = channels.get("A")
     for values in (colour, alpha):
         if values is not None and not np.isfinite(values).all():
             row, column = (int(i) for i in np.argwhere(~np.isfinite(values))[0][:2])
-            raise refusal(path, f"NaN or infinity at row {row}, column {column}", "finite numbers", "render it again")
+            raise refusal(path, f"NaN or infinity at row {row}, column {column}", "finite numbers", "render the image again")
     return colour, alpha
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """An image of which the header is read; of any size, since what its pixels take is counted before they are read."""
+    """Open an image and read its header. The size is unlimited, because the caller checks the memory before reading pixels."""
     bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         image = Image.open(check_file(path))
@@ -247,4 +247,4 @@ def _loaded(image: Image.Image, path: Path) -> Image.Image:
 
 
 def _damaged(path: Path) -> Exception:
-    return refusal(path, "a damaged or foreign file", "a PNG, JPEG or OpenEXR image", "copy it again")
+    return refusal(path, "a damaged or foreign file", "a PNG, JPEG or OpenEXR image", "copy the file again")

@@ -1,9 +1,8 @@
-"""What a data set of photographs holds, before a pixel is read: its cameras, its splits and the box that they look at.
+"""The content of a data set of photographs before reading pixels: cameras, splits and box.
 
-Conventions. Cameras as in :mod:`mivol.photos.camera`. A data set divides itself into train, val and test; ``held_out`` takes
-every n-th photograph of the training split, or those named, aside. Photographs that are named and not there are skipped, by
-name. The box comes from the training cameras (or the points of a reconstruction), whichever split is read, so that all splits
-share it.
+Conventions. Cameras are those of :mod:`mivol.photos.camera`. A data set has the splits train, val and test. ``held_out`` moves
+every n-th or named photographs from the training split to the held-out split. Missing photographs are skipped and listed.
+The box is found from the training cameras (or from the points of a reconstruction) for every split, so all splits share it.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ SPLITS = ("train", "held_out", "val", "test", "all")
 
 @dataclass(frozen=True)
 class Format:
-    """A way in which data sets lie on disk: how to recognise one, and its reader."""
+    """A format of data sets: a test of a path, and the reader."""
 
     recognise: Callable[[Path], bool]
     read: Callable[[Path], Listing]
 
 
-#: name -> format, tried in this order.
+#: name -> format, in the order of the trials.
 FORMATS: dict[str, Format] = {
     "Blender (NeRF)": Format(lambda path: (path / "transforms_train.json").is_file(), read_blender),
     "transforms.json": Format(lambda path: (path / "transforms.json").is_file() or path.suffix == ".json", read_transforms),
@@ -50,8 +49,15 @@ FORMATS: dict[str, Format] = {
 
 @dataclass(frozen=True)
 class PhotoFrame:
-    """A photograph that is there: its file, camera, mask and split, and the points (K, 3) [length] of a reconstruction that
-    were found in it, where they are known; no pixel is read yet."""
+    """An existing photograph, without its pixels.
+
+    Attributes:
+        file: image file.
+        camera: camera at the size of the image.
+        split: one of ``SPLITS`` or ``UNLISTED``.
+        mask: file of the mask, optional.
+        points: points (K, 3) of a sparse reconstruction visible in the photograph [length], if known.
+    """
 
     file: Path
     camera: Camera
@@ -63,18 +69,18 @@ class PhotoFrame:
 @briefly
 @dataclass(frozen=True)
 class PhotoSurvey:
-    """What a data set holds, from its cameras and the headers of its images.
+    """The content of a data set, from its cameras and the headers of its images.
 
     Attributes:
-        path: as given.
+        path: path of the data set.
         format: key of ``FORMATS``.
-        frames: those of the split that are there.
-        skipped: names of those that are not.
-        box: (2, 3) float64 [length], what is looked at.
-        box_from: where the box comes from, for people.
-        near_far: distances from the cameras between which all of the box lies [length].
-        points: (N, 3) of a sparse reconstruction, or None.
-        levels: nested boxes of a fit, of which ``box`` is the innermost; 1: the box alone.
+        frames: existing photographs of the split.
+        skipped: names of missing photographs of the split.
+        box: (2, 3) float64, the box in view of the cameras [length].
+        box_from: origin of the box, as text.
+        near_far: smallest and largest distance of the box from the cameras [length].
+        points: points (N, 3) of a sparse reconstruction, if known.
+        levels: number of nested boxes of a fit, with ``box`` as the innermost.
     """
 
     path: Path
@@ -92,18 +98,18 @@ class PhotoSurvey:
         cameras = [frame.camera for frame in self.frames]
         sizes = sorted({f"{c.size[0]} x {c.size[1]}" for c in cameras})
         focal = [c.K[0, 0] for c in cameras]
-        lens = " and ".join(sorted({_lens(c) for c in cameras}))
-        angle = _range([field_of_view(c) for c in cameras])
+        lens = " and ".join(sorted({_lens_name(c) for c in cameras}))
+        angle = _format_range([field_of_view(c) for c in cameras])
         counts = ", ".join(f"{n} {split}" for split in (*SPLITS, UNLISTED) if (n := sum(f.split == split for f in self.frames)))
         lines = [
             f"{self.path}: {self.format}, {len(cameras)} photographs ({counts}), {', '.join(sizes)} pixels, {lens}",
-            f"focal length {_range(focal)} pixels, horizontal field of view {angle} degrees",
-            f"box {_corner(self.box[0])} to {_corner(self.box[1])}, {self.box_from}",
+            f"focal length {_format_range(focal)} pixels, horizontal field of view {angle} degrees",
+            f"box {_format_corner(self.box[0])} to {_format_corner(self.box[1])}, {self.box_from}",
             f"near {self.near_far[0]:.4g}, far {self.near_far[1]:.4g} from the cameras",
         ]
         if self.skipped:
             named = ", ".join(self.skipped[:5]) + (" ..." if len(self.skipped) > 5 else "")
-            lines.append(f"skipped {len(self.skipped)} that are not there: {named}")
+            lines.append(f"skipped {len(self.skipped)} missing photographs: {named}")
         return "\n".join(lines)
 
 
@@ -114,43 +120,43 @@ def survey_photos(
     held_out: int | Sequence[str] = 0,
     box: np.ndarray | str | None = None,
 ) -> PhotoSurvey:
-    """Cameras, sizes and box of a data set; no pixel is read.
+    """Read cameras, sizes and box of a data set, without pixels.
 
     Args:
         path: folder, or file of cameras.
-        split: one of ``SPLITS``: "train" without what is held out, "held_out", "val" and "test" as the data set has them.
-        held_out: every n-th of the training photographs that are there, beginning with the first (0: none), or file names.
-        box: (2, 3) [length]; None: from points or cameras (:mod:`mivol.photos.region`); "middle": the innermost of nested
-            boxes, which not every camera has to see.
+        split: one of ``SPLITS``; "train" excludes the held-out photographs.
+        held_out: n for every n-th existing training photograph from the first on (0 for no held-out view), or file names.
+        box: (2, 3) [length]; by default from points or cameras (:mod:`mivol.photos.region`); "middle" for the innermost of
+            nested boxes, which some cameras may miss.
 
     Raises:
-        MivolError: no data set, a split without photographs, cameras that are wrong or look away from the box.
+        MivolError: no data set, a split without photographs, wrong cameras, or a camera looking away from the box.
     """
     path = Path(path)
     name, listing = _read(path)
     if split not in SPLITS:
-        raise refusal("split", f'"{split}"', f"one of {', '.join(SPLITS)}", "choose one of those")
-    entries = _divided(listing.entries, held_out, path)
+        raise refusal("split", f'"{split}"', f"one of {', '.join(SPLITS)}", "choose one")
+    entries = _assign_held_out(listing.entries, held_out, path)
     present = [entry for entry in entries if entry.file.is_file()]
     chosen = [entry for entry in present if split in ("all", entry.split)]
     absent = [entry.name for entry in entries if not entry.file.is_file() and split in ("all", entry.split)]
     if not chosen:
-        raise _nothing_left(path, split, absent, entries)
+        raise _no_photographs(path, split, absent, entries)
     cameras = {id(entry): camera for entry, camera in zip(present, _cameras(present), strict=True)}
     if split in ("held_out", "val", "test"):
         _check_unseen(chosen, [entry for entry in present if entry.split == "train"], cameras)
     frames = [PhotoFrame(entry.file, cameras[id(entry)], entry.split, _mask(entry), entry.points) for entry in chosen]
     training = [entry for entry in present if entry.split in ("train", "held_out")]
     looking = [cameras[id(entry)] for entry in training or chosen]
-    found, whence = _box(box, listing.points, looking, path)
+    found_box, box_from = _box(box, listing.points, looking, path)
     if not isinstance(box, str):
-        region.check_views([frame.camera for frame in frames], found)
-    near_far = region.near_and_far([*looking, *(frame.camera for frame in frames)], found)
-    return PhotoSurvey(path, name, tuple(frames), tuple(absent), found, whence, near_far, listing.points)
+        region.check_views([frame.camera for frame in frames], found_box)
+    near_far = region.near_and_far([*looking, *(frame.camera for frame in frames)], found_box)
+    return PhotoSurvey(path, name, tuple(frames), tuple(absent), found_box, box_from, near_far, listing.points)
 
 
 def find_format(path: Path) -> str | None:
-    """The key of ``FORMATS`` of a folder or file of cameras; None where it is neither."""
+    """Return the key of ``FORMATS`` of a folder or file of cameras; None for other paths."""
     return next((name for name, kind in FORMATS.items() if kind.recognise(path)), None)
 
 
@@ -160,87 +166,87 @@ def _read(path: Path) -> tuple[str, Listing]:
     name = find_format(path)
     if name is None:
         known = ", ".join(FORMATS)
-        raise refusal(path, "no cameras", f"one of {known}", "name the folder that holds the file of cameras")
+        raise refusal(path, "no cameras", f"one of {known}", "name the folder of the file of cameras")
     return name, FORMATS[name].read(path)
 
 
-def _divided(entries: list[Entry], held_out: int | Sequence[str], path: Path) -> list[Entry]:
-    """Entries with the split "held_out" where they are held out."""
+def _assign_held_out(entries: list[Entry], held_out: int | Sequence[str], path: Path) -> list[Entry]:
+    """Set the split of held-out entries to "held_out"."""
     train = [entry for entry in entries if entry.split == "train" and entry.file.is_file()]
     if isinstance(held_out, int):
         if held_out < 0 or held_out == 1:
             raise refusal("held_out", f"{held_out}", "0, or 2 and more", "1 would hold out every view")
-        aside = {id(entry) for entry in train[::held_out]} if held_out else set()
+        chosen = {id(entry) for entry in train[::held_out]} if held_out else set()
     else:
         names = {name for entry in train for name in (entry.name, entry.file.name)}
         unknown = next((name for name in held_out if name not in names), None)
         if unknown is not None:
             raise refusal(path, f'no training photograph "{unknown}" to hold out', "names of files", "correct held_out")
-        aside = {id(entry) for entry in train if {entry.name, entry.file.name} & set(held_out)}
-    return [dataclasses.replace(entry, split="held_out") if id(entry) in aside else entry for entry in entries]
+        chosen = {id(entry) for entry in train if {entry.name, entry.file.name} & set(held_out)}
+    return [dataclasses.replace(entry, split="held_out") if id(entry) in chosen else entry for entry in entries]
 
 
-def _nothing_left(path: Path, split: str, absent: list[str], entries: list[Entry]) -> MivolError:
+def _no_photographs(path: Path, split: str, absent: list[str], entries: list[Entry]) -> MivolError:
     if absent:
-        found = f"none of the {len(absent)} photographs that it names ({absent[0]} is the first)"
+        found = f"none of the {len(absent)} listed photographs (the first is {absent[0]})"
         return refusal(path, found, "at least one image beside the cameras", "copy the images")
-    there = ", ".join(sorted({entry.split for entry in entries}))
-    return refusal(path, f"no photograph in the split {split}", f"one of {there}", "choose one, or set held_out")
+    splits = ", ".join(sorted({entry.split for entry in entries}))
+    return refusal(path, f"no photograph in the split {split}", f"one of {splits}", "choose one, or set held_out")
 
 
 def _cameras(entries: Sequence[Entry]) -> list[Camera]:
-    """Cameras of photographs whose size is what the file of cameras says, or that of the first of their split."""
+    """Cameras of photographs; each size must agree with the file of cameras, or with the first photograph of the split."""
     cameras, first = [], {}
     for entry in entries:
         header = read_photo_header(entry.file)
         size = header.size
-        wanted, whence = (
+        listed, source = (
             (entry.size, "the file of cameras") if entry.size else first.setdefault(entry.split, (size, entry.name))
         )
-        if size != wanted:
-            found, expected = (f"{w} x {h} pixels" for w, h in (size, wanted))
+        if size != listed:
+            found, expected = (f"{w} x {h} pixels" for w, h in (size, listed))
             turned = f" (EXIF orientation {header.orientation} turns them)" if header.orientation != 1 else ""
             advice = "turn the pixels" if turned else "scale the image"
-            raise refusal(entry.file, found + turned, f"{expected} as {whence}", f"{advice}, or correct the cameras")
+            raise refusal(entry.file, found + turned, f"{expected} as {source}", f"{advice}, or correct the cameras")
         _check_orientation(entry, header)
         cameras.append(entry.camera(size))
     return cameras
 
 
 def _check_orientation(entry: Entry, header: PhotoHeader) -> None:
-    """Refuse a picture that viewers turn, unless the cameras are of the pixels as they are stored.
+    """Refuse a photograph rotated by image viewers, unless the cameras clearly describe the stored pixels.
 
-    That shows where the file of cameras gives a size and a quarter turn (5 to 8) would change it.
+    A size in the file of cameras proves this if a quarter turn (orientation 5 to 8) would change the size.
 
     Raises:
-        MivolError: it does not show.
+        MivolError: a rotation without this proof.
     """
     is_quarter = header.orientation > 4 and header.size[0] != header.size[1]
     if header.orientation == 1 or (is_quarter and entry.size is not None):
         return
-    found = f"EXIF orientation {header.orientation}, by which viewers turn the picture"
-    way_out = "turn the pixels if the cameras were found for upright pictures, else remove the tag"
-    raise refusal(entry.file, found, "pixels as the cameras see them", way_out)
+    found = f"EXIF orientation {header.orientation}, by which viewers turn the image"
+    way_out = "turn the pixels if the cameras describe upright images, else remove the tag"
+    raise refusal(entry.file, found, "pixels in the orientation of the cameras", way_out)
 
 
 def _check_unseen(judged: Sequence[Entry], fitted: Sequence[Entry], cameras: Mapping[int, Camera]) -> None:
-    """Refuse a photograph that is judged and fitted, too: one file, or one picture of one camera under two names.
+    """Refuse a held-out photograph that is also a training photograph: the same file, or equal pixels and poses.
 
     Raises:
-        MivolError: the first.
+        MivolError: names the first such photograph.
     """
     files = {entry.file.resolve(): entry for entry in fitted}
-    seen = {cameras[id(entry)].to_world.tobytes(): entry for entry in fitted}
+    poses = {cameras[id(entry)].to_world.tobytes(): entry for entry in fitted}
     for entry in judged:
-        twin = files.get(entry.file.resolve()) or seen.get(cameras[id(entry)].to_world.tobytes())
+        twin = files.get(entry.file.resolve()) or poses.get(cameras[id(entry)].to_world.tobytes())
         if twin and (twin.file.samefile(entry.file) or filecmp.cmp(twin.file, entry.file, shallow=False)):
-            found, expected = f"a photograph that is fitted, too, as {twin.name}", f"a {entry.split} view that no fit sees"
-            raise refusal(entry.file, found, expected, "take it out of one list")
+            found, expected = f"a photograph also fitted as {twin.name}", f"a {entry.split} view outside the fit"
+            raise refusal(entry.file, found, expected, "remove it from one list")
 
 
 def _mask(entry: Entry) -> Path | None:
     if entry.mask is not None and not entry.mask.is_file():
-        raise refusal(entry.mask, "no mask there", f"that of {entry.name}", "copy it, or take it out of the file of cameras")
+        raise refusal(entry.mask, "no file", f"the mask of {entry.name}", "copy the mask, or remove its entry")
     return entry.mask
 
 
@@ -249,27 +255,26 @@ def _box(
 ) -> tuple[np.ndarray, str]:
     if isinstance(box, str):
         if box != "middle":
-            raise refusal("box", f'"{box}"', '"middle", or two corners', "choose one of those")
+            raise refusal("box", f'"{box}"', '"middle", or two corners', "choose one")
         found = region.middle_box(cameras, path)
-        return found, f"{region.MIDDLE:g} of the cameras' median distance from what they look at, on each side"
+        return found, f"{region.MIDDLE:g} of the median distance of the cameras from their focus, on each side"
     if box is not None:
         return region.check_box(box), "as given"
     if points is not None and len(points) >= region.FEWEST_POINTS:
-        return region.box_of_points(points), f"98 % of {len(points)} points and 5 % more on each side"
-    share = f"where at least {100 * region.VIEW_SHARE:.0f} % of {len(cameras)} cameras look"
-    return region.shared_box(cameras, path), share
+        return region.box_of_points(points), f"98 % of {len(points)} points, enlarged by 5 % on each side"
+    return region.shared_box(cameras, path), f"in view of at least {100 * region.VIEW_SHARE:.0f} % of {len(cameras)} cameras"
 
 
-def _range(values: Sequence[float]) -> str:
+def _format_range(values: Sequence[float]) -> str:
     low, high = min(values), max(values)
     return f"{low:.6g}" if high - low <= 1e-6 * high else f"{low:.6g} to {high:.6g}"
 
 
-def _lens(camera: Camera) -> str:
+def _lens_name(camera: Camera) -> str:
     if camera.distortion.is_wide:
         return type(camera.distortion).__name__.lower()
     return "with distortion" if camera.distortion else "pinhole"
 
 
-def _corner(point: np.ndarray) -> str:
+def _format_corner(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.4g}" for x in point) + ")"

@@ -1,10 +1,10 @@
 """Cameras in JSON: ``transforms_train.json`` of Blender and NeRF, ``transforms.json`` of nerfstudio and instant-ngp.
 
-Conventions. ``transform_matrix`` is camera to world with our axes (:mod:`mivol.photos.camera`), ``camera_angle_x`` the full
-horizontal angle [radian]; focal lengths and principal points count pixels from the upper left corner, as COLMAP's do.
-``train_filenames``, ``val_filenames`` and ``test_filenames`` divide the set; where there is a list to train on, what no list
-names is left alone, as are settings that only place a scene in another program's unit cube (``aabb_scale``, ``scale``,
-``offset``). ``ply_file_path`` names points of a sparse reconstruction, in the frame of the cameras.
+Conventions. ``transform_matrix`` is camera to world with the axes of :mod:`mivol.photos.camera`. ``camera_angle_x`` is the full
+horizontal angle [radian]. Focal lengths and principal points are in pixels from the upper left corner, as in COLMAP. The lists
+``train_filenames``, ``val_filenames`` and ``test_filenames`` define the splits. With a training list, photographs outside all
+lists are ignored. Settings for the unit cube of another program (``aabb_scale``, ``scale``, ``offset``) are ignored as well.
+``ply_file_path`` names the points of a sparse reconstruction in the frame of the cameras.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from mivol.photos.photo_file import SUFFIXES
 
 __all__ = ["MODELS", "Settings", "read_blender", "read_transforms", "write_transforms"]
 
-#: files of a Blender data set -> split.
+#: file of a Blender data set -> split.
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "val", "transforms_test.json": "test"}
 
 BROWN = tuple(Lens.__dataclass_fields__)
 
-#: camera_model -> its lens, and the coefficients that it may have.
+#: camera_model -> lens class, and the allowed coefficients.
 MODELS: dict[str, tuple[type[Lens | Fisheye | Panorama], tuple[str, ...]]] = {
     "OPENCV": (Lens, BROWN),
     "RADIAL": (Lens, BROWN),
@@ -46,49 +46,51 @@ MODELS: dict[str, tuple[type[Lens | Fisheye | Panorama], tuple[str, ...]]] = {
     "EQUIRECTANGULAR": (Panorama, ()),
 }
 
-#: keys that say, if they are set, that a frame was taken by another kind of camera or while it moved.
+#: keys of unsupported cameras: other projections and rolling shutters.
 OTHER_CAMERAS = ("ftheta_p0", "latlong", "equirectangular", "orthographic", "rolling_shutter")
 
 
 def read_blender(path: Path) -> Listing:
-    """A folder with ``transforms_train.json`` and perhaps ``_val`` and ``_test``.
+    """Read a folder with ``transforms_train.json`` and optional ``_val`` and ``_test`` files.
 
     Raises:
-        MivolError: as :func:`read_transforms`.
+        MivolError: errors of :func:`read_transforms`.
     """
     entries = []
     for name, split in SPLIT_FILES.items():
         if (path / name).is_file():
-            entries += _entries(path / name, _table(path / name), split)
+            entries += _entries(path / name, _read_json(path / name), split)
     return Listing(entries)
 
 
 def read_transforms(path: Path) -> Listing:
-    """One JSON file, or the folder of a ``transforms.json``.
+    """Read a JSON file, or the folder of a ``transforms.json``.
 
     Raises:
-        MivolError: no JSON, no frames, a frame without file or transform, or points that it names and that are not there.
+        MivolError: no JSON, no frames, a frame without file or transform, or a missing file of points.
     """
     file = path / "transforms.json" if path.is_dir() else path
-    table = _table(file)
+    table = _read_json(file)
     return Listing(_entries(file, table, "train"), _points(file, table))
 
 
 def write_transforms(path: Path, cameras: Mapping[str, Camera], test: Sequence[str] = ()) -> None:
-    """Write cameras as nerfstudio's ``transforms.json``, whole or not at all; read again they are the same.
+    """Write cameras as nerfstudio's ``transforms.json``, whole or not at all. Reading the file returns equal cameras.
 
     Args:
         path: destination.
-        cameras: by photograph, relative to the folder of ``path``.
-        test: which of the photographs are the test split.
+        cameras: camera of each photograph, whose path is relative to the folder of ``path``.
+        test: photographs of the test split.
 
     Raises:
-        MivolError: disk full, no such folder, or lenses of several kinds.
+        MivolError: a full disk, a missing folder, or different classes of lenses.
     """
-    frames = [{"file_path": name, **_described(camera)} for name, camera in cameras.items()]
+    frames = [{"file_path": name, **_camera_entry(camera)} for name, camera in cameras.items()]
     models = {MODEL_OF[type(camera.distortion)] for camera in cameras.values()}
     if len(models) > 1:
-        raise refusal(path, f"cameras of the kinds {', '.join(sorted(models))}", "one kind in a file", "write a file for each")
+        raise refusal(
+            path, f"the camera models {', '.join(sorted(models))}", "a single model per file", "write a file for each"
+        )
     table = {"camera_model": models.pop() if models else "OPENCV", "frames": frames}
     if test:
         table |= {"train_filenames": [name for name in cameras if name not in test], "test_filenames": list(test)}
@@ -98,7 +100,7 @@ def write_transforms(path: Path, cameras: Mapping[str, Camera], test: Sequence[s
 MODEL_OF = {Lens: "OPENCV", Fisheye: "OPENCV_FISHEYE", Panorama: "EQUIRECTANGULAR"}
 
 
-def _described(camera: Camera) -> dict[str, Any]:
+def _camera_entry(camera: Camera) -> dict[str, Any]:
     lens = {key: value for key, value in asdict(camera.distortion).items() if value}
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     w, h = camera.size
@@ -106,68 +108,68 @@ def _described(camera: Camera) -> dict[str, Any]:
     return {**numbers, **lens, "transform_matrix": camera.to_world.tolist()}
 
 
-def _table(file: Path) -> dict[str, Any]:
+def _read_json(file: Path) -> dict[str, Any]:
     try:
         table = json.loads(read_bytes(file))
-    except (ValueError, RecursionError) as error:  # of JSON, of UTF-8, and of numbers of thousands of digits
-        raise refusal(file, f"text that is not JSON ({error})", "cameras in JSON", "write it again") from error
+    except (ValueError, RecursionError) as error:  # invalid JSON or UTF-8, or numbers of thousands of digits
+        raise refusal(file, f"text that is not JSON ({error})", "cameras in JSON", "write the file again") from error
     frames = table.get("frames") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise refusal(file, "no list of frames", "a key frames with one entry per photograph", "write it again")
+        raise refusal(file, "no list of frames", "a key frames with one entry per photograph", "write the file again")
     return table
 
 
 def _points(file: Path, table: Mapping[str, Any]) -> np.ndarray | None:
-    """(N, 3) the points that a file of cameras names [length]; None where it names none."""
+    """The points (N, 3) of a file of cameras [length], if the file names points."""
     name = table.get("ply_file_path")
     if not name:
         return None
     if not isinstance(name, str):
         raise refusal(file, f"ply_file_path = {name!r}", "the name of a file", "correct it")
-    path = file.parent / slashed(file.parent, name)
+    path = file.parent / to_forward_slashes(file.parent, name)
     if not path.is_file():
-        raise refusal(file, f"ply_file_path = {name!r}, which is not there", "a file of points", "add it, or remove the key")
+        raise refusal(file, f"ply_file_path = {name!r}, a missing file", "a file of points", "add the file, or remove the key")
     points = np.asarray(vertex_positions(read_vertices(path)), np.float64)
     check_points(points, path, "remove this point")
     return points
 
 
 def _entries(file: Path, table: Mapping[str, Any], split: str) -> list[Entry]:
-    listed = _listed(file, table)
+    splits = _read_splits(file, table)
     entries = [_entry(file, table, frame, number, split) for number, frame in enumerate(table["frames"])]
-    rest = UNLISTED if "train" in listed.values() else split
-    return [dataclasses.replace(entry, split=listed.get(_place(file, entry.name), rest)) for entry in entries]
+    rest = UNLISTED if "train" in splits.values() else split
+    return [dataclasses.replace(entry, split=splits.get(_full_path(file, entry.name), rest)) for entry in entries]
 
 
-def _listed(file: Path, table: Mapping[str, Any]) -> dict[str, str]:
-    """Places of photographs -> split, as far as the lists of the data set go; a test view is one whatever else names it.
+def _read_splits(file: Path, table: Mapping[str, Any]) -> dict[str, str]:
+    """Path -> split of the listed photographs. A photograph of several lists belongs to the last of train, val and test.
 
     Raises:
-        MivolError: something else than names.
+        MivolError: a list with other entries than names.
     """
-    found = {}
+    splits = {}
     for split in ("train", "val", "test"):
         names = table.get(f"{split}_filenames") or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise refusal(file, f"{split}_filenames = {names!r}", "a list of the names of files", "correct it")
-        found |= {_place(file, name): split for name in names}
-    return found
+        splits |= {_full_path(file, name): split for name in names}
+    return splits
 
 
-def _place(file: Path, name: str) -> str:
-    """Where a photograph lies, however it is written: ``./a.png`` and ``a.png`` are one."""
-    return os.path.normpath(file.parent.absolute() / slashed(file.parent, name))
+def _full_path(file: Path, name: str) -> str:
+    """Normalised path of a photograph: ``./a.png`` and ``a.png`` are equal."""
+    return os.path.normpath(file.parent.absolute() / to_forward_slashes(file.parent, name))
 
 
 LONGEST_NAME = 255
-"""Bytes of a name in a folder: the bound of all common file systems."""
+"""Largest name in a folder on common file systems [byte]."""
 
 
-def slashed(folder: Path, name: str) -> str:
-    """The name of a file with forward slashes: data sets made on Windows name ``images\\a.png``, which other systems miss.
+def to_forward_slashes(folder: Path, name: str) -> str:
+    """Return the name of a file with forward slashes, because data sets made on Windows name ``images\\a.png``.
 
     Raises:
-        MivolError: a name longer than file systems have.
+        MivolError: a name longer than ``LONGEST_NAME``.
     """
     if any(len(part.encode(errors="replace")) > LONGEST_NAME for part in re.split(r"[\\/]", name)):
         raise refusal(folder, f"a photograph with a name of {len(name)} characters", f"at most {LONGEST_NAME}", "correct it")
@@ -178,7 +180,7 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
     missing = [key for key in ("file_path", "transform_matrix") if not isinstance(frame, dict) or key not in frame]
     if missing:
         raise refusal(file, f"frame {number} without {missing[0]}", "file_path and transform_matrix", "write it again")
-    name = slashed(file.parent, str(frame["file_path"]))
+    name = to_forward_slashes(file.parent, str(frame["file_path"]))
     settings = Settings({**table, **frame}, f"{file.name} {name}")
 
     def camera(size: tuple[int, int]) -> Camera:
@@ -195,12 +197,12 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
         camera,
         split,
         settings.size(),
-        file.parent / slashed(file.parent, mask) if mask else None,
+        file.parent / to_forward_slashes(file.parent, mask) if mask else None,
     )
 
 
 def _photograph(path: Path) -> Path:
-    """The file of a name that may lack its suffix; the first of ``SUFFIXES`` where nothing is there."""
+    """The existing file of a name with or without suffix; without a match the file with the first of ``SUFFIXES``."""
     if path.suffix.lower() in SUFFIXES or path.is_file():
         return path
     tried = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
@@ -209,21 +211,21 @@ def _photograph(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class Settings:
-    """What holds for one frame: its own keys, then those of the file.
+    """The settings of a frame, completed by the settings of the file.
 
     Attributes:
-        values: by key.
-        name: of the frame, for refusals.
+        values: settings by key.
+        name: name of the frame in refusals.
     """
 
     values: Mapping[str, Any]
     name: str
 
     def number(self, key: str, default: float = 0.0) -> float:
-        """The number under a key; ``default`` where it is absent.
+        """Return the number under a key, or ``default`` without the key.
 
         Raises:
-            MivolError: something else stands there.
+            MivolError: another value.
         """
         value = self.values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -231,20 +233,20 @@ class Settings:
         return float(value)
 
     def size(self) -> tuple[int, int] | None:
-        """(width, height), where ``w`` and ``h`` say it.
+        """Return (width, height) from ``w`` and ``h``, if present.
 
         Raises:
-            MivolError: not whole.
+            MivolError: a number that is not whole.
         """
         if "w" not in self.values or "h" not in self.values:
             return None
-        found = self.number("w"), self.number("h")
-        if not all(n >= 1 and n == int(n) for n in found):
-            raise refusal(self.name, f"w = {found[0]}, h = {found[1]}", "whole numbers of pixels", "correct them")
-        return int(found[0]), int(found[1])
+        width, height = self.number("w"), self.number("h")
+        if not all(n >= 1 and n == int(n) for n in (width, height)):
+            raise refusal(self.name, f"w = {width}, h = {height}", "whole numbers of pixels", "correct w and h")
+        return int(width), int(height)
 
     def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
-        """(3, 3) K. Focal lengths count before angles; the principal point is the middle unless it is said.
+        """Return K (3, 3). Focal lengths precede angles; the default principal point is the image centre.
 
         Raises:
             MivolError: neither a focal length nor an angle.
@@ -257,13 +259,18 @@ class Settings:
         return intrinsics(fx, fy, self.number("cx", size[0] / 2), self.number("cy", size[1] / 2))
 
     def panorama(self, size: tuple[int, int]) -> np.ndarray:
-        """(3, 3) K of an image of all directions: pixels a radian. Focal lengths that the file gives say nothing more.
+        """Return K (3, 3) of a panorama in pixels per radian; focal lengths in the file are ignored.
 
         Raises:
             MivolError: an image that is not twice as wide as high.
         """
         if size[0] != 2 * size[1]:
-            raise refusal(self.name, f"a panorama of {size[0]} x {size[1]} pixels", "twice as wide as high", "crop nothing")
+            raise refusal(
+                self.name,
+                f"a panorama of {size[0]} x {size[1]} pixels",
+                "an image twice as wide as high",
+                "use the uncropped image",
+            )
         return intrinsics(size[0] / (2 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
 
     def _focal(self, length: str, angle: str, pixels: int) -> float | None:
@@ -277,10 +284,10 @@ class Settings:
         return 0.5 * pixels / float(np.tan(radians / 2))
 
     def lens(self) -> Lens | Fisheye | Panorama:
-        """The lens. ``is_fisheye`` is instant-ngp's word for OPENCV_FISHEYE.
+        """Return the lens. ``is_fisheye`` is the key of instant-ngp for OPENCV_FISHEYE.
 
         Raises:
-            MivolError: a camera that is not in ``MODELS``, or coefficients that its lens has not.
+            MivolError: a camera outside ``MODELS``, or a coefficient unknown to the lens.
         """
         model = self.values.get("camera_model", "OPENCV_FISHEYE" if self.values.get("is_fisheye") else "OPENCV")
         other = next((key for key in OTHER_CAMERAS if self.values.get(key)), None)
@@ -296,12 +303,14 @@ class Settings:
         return kind(**{key: given[key] for key in terms})
 
     def matrix(self) -> np.ndarray:
-        """``transform_matrix`` as it stands.
+        """Return ``transform_matrix`` without checks of its shape.
 
         Raises:
-            MivolError: not a matrix of numbers.
+            MivolError: entries other than numbers.
         """
         try:
             return np.array(self.values["transform_matrix"], np.float64)
         except (ValueError, TypeError) as error:
-            raise refusal(self.name, "a transform_matrix that is no matrix", "4 rows of 4 numbers", "correct it") from error
+            raise refusal(
+                self.name, "a transform_matrix that is not a matrix", "4 rows of 4 numbers", "correct the matrix"
+            ) from error

@@ -34,7 +34,7 @@ def test_explain_says_what_there_is_and_draws_it(tmp_path: Path, capsys: pytest.
     assert main(["explain", str(folder), "-o", str(picture)]) == 0
     said = capsys.readouterr().out
     facts = ("Blender (NeRF)", "5 photographs (3 train, 2 test)", "12 x 8 pixels", "focal length 14.19", "box (", "near ")
-    for fact in (*facts, "skipped 1 that are not there: ./train/r_1", str(picture)):
+    for fact in (*facts, "skipped 1 missing photographs: ./train/r_1", str(picture)):
         assert fact in said
     with Image.open(picture) as image:
         assert image.size[0] > 1000
@@ -127,7 +127,8 @@ def test_drawn_cameras_lie_in_the_world(tmp_path: Path) -> None:
 def test_picture_shows_all_splits(tmp_path: Path, artefacts: Path) -> None:
     survey = survey_photos(write_blender(tmp_path / "set"), held_out=2)
     figure = plot_cameras(survey, artefacts / "cameras.png")
-    assert [text.get_text() for text in figure.axes[1].get_legend().get_texts()] == ["train", "held_out", "test", "box"]
+    labels = [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+    assert labels == ["training view", "held-out view", "test view", "box"]
 
 
 def test_reference_of_all_sensors_is_a_data_set(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

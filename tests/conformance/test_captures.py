@@ -70,9 +70,9 @@ def test_photographs_that_do_not_fit_are_refused_before_one_is_read(tmp_path: Pa
     limit = 64 * pixels + 24 * pixels * 4 // 4
     assert len(load_photos(folder, split="all", scale=0.5, limit=limit).views) == 4
     monkeypatch.setattr("mivol.photos.dataset.read_photo", lambda *_: pytest.fail("a photograph was read"))
-    with pytest.raises(MivolError, match=r"4 photographs at scale 1 take about .* are left; scale=0.5 fits\."):
+    with pytest.raises(MivolError, match=r"found 4 photographs of about .* at scale 1, .* free memory, .*; use scale=0.5\."):
         load_photos(folder, split="all", limit=limit)
-    with pytest.raises(MivolError, match="not even one can be read"):
+    with pytest.raises(MivolError, match="a single photograph is too large"):
         load_photos(folder, split="all", scale=0.1, limit=60 * pixels)  # what is kept would fit
 
 

@@ -37,7 +37,7 @@ def test_facing_puts_the_target_in_the_middle_and_up_upwards() -> None:
     x, y = project(camera, np.array([0.5, 0, 0.1]))[0]
     assert x == pytest.approx(32, abs=1e-12) and y < 24
     assert camera.K[0, 0] == camera.K[1, 1] == 100
-    with pytest.raises(MivolError, match="its own upward direction"):
+    with pytest.raises(MivolError, match="along the upward direction"):
         aim_camera(LIKE, np.array([0.0, 0, 2]), np.zeros(3), np.array([0, 0, 1]))
 
 

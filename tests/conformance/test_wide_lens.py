@@ -165,13 +165,13 @@ def test_cameras_of_nerfstudio_and_instant_ngp(tmp_path: Path) -> None:
         np.testing.assert_array_equal(camera.K, intrinsics(9, 8, 6, 4))
     around = survey_photos(write_transforms(tmp_path / "c", {"camera_model": "EQUIRECTANGULAR", "fl_x": 7}, (16, 8)))
     np.testing.assert_allclose(around.frames[0].camera.K, panorama((16, 8)).K)
-    assert "panorama" in around.text and "horizontal field of view 360 degrees" in around.text
+    assert "panorama" in around.describe() and "horizontal field of view 360 degrees" in around.describe()
 
 
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"camera_model": "EQUIRECTANGULAR"}, r"a panorama of 12 x 8 pixels, expected twice as wide as high"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"a panorama of 12 x 8 pixels, expected an image twice as wide as high"),
         ({"camera_model": "OPENCV_FISHEYE", "fl_x": 9, "p1": 0.1}, "_FISHEYE with p1 = 0.1, expected only k1, k2, k3, k4"),
         ({"camera_model": "THIN_PRISM_FISHEYE", "fl_x": 9}, "camera_model THIN_PRISM_FISHEYE, expected .*OPENCV_FISHEYE"),
         ({"camera_model": ["OPENCV"], "fl_x": 9}, r"camera_model \['OPENCV'\], expected one of OPENCV"),
@@ -192,7 +192,7 @@ def test_cameras_are_written_and_read_again(tmp_path: Path, camera: Camera) -> N
         assert frame.camera.distortion == camera.distortion
         np.testing.assert_allclose(frame.camera.K, camera.K, rtol=1e-15)
         np.testing.assert_allclose(frame.camera.to_world, wanted.to_world, atol=1e-15)
-    with pytest.raises(MivolError, match="cameras of the kinds OPENCV, OPENCV_FISHEYE, expected one kind in a file"):
+    with pytest.raises(MivolError, match="the camera models OPENCV, OPENCV_FISHEYE, expected a single model per file"):
         write_cameras(folder / "transforms.json", {"a": fisheye(), "b": replace(fisheye(), distortion=Lens())})
 
 

@@ -519,7 +519,7 @@ def test_mixed_alpha_of_a_judged_photograph_is_answered_once(tmp_path: Path, bac
     Image.open(odd).convert("RGB").save(odd)
     judged = ["photos.held_out=8", 'photos.judged="held_out"']
     chosen = config.load(toml(tmp_path, tmp_path / "set"), [f'photos.background="{background}"', *judged])
-    with pytest.raises(MivolError, match=r"found alpha, and none in r_0\.png"):
+    with pytest.raises(MivolError, match=r"found alpha here but not in r_0\.png"):
         photo_data.read_photos(chosen, tmp_path)
 
 

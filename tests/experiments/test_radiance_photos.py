@@ -168,7 +168,7 @@ def test_codes_and_radiance_in_one_set_are_refused(photographs: Path, tmp_path: 
         image = np.full((48, 48, 3), [0.5, 0.25, 2.0], np.float32)
         write_exr(tmp_path / name, {"": image}) if name.endswith("exr") else write_png(tmp_path / name, image)
     write_transforms(tmp_path / "transforms.json", cameras, ["c.exr"])
-    with pytest.raises(MivolError, match='b.png: found codes and radiance in one set, .*; choose space = "srgb" or'):
+    with pytest.raises(MivolError, match='b.png: found sRGB codes and radiance in one data set, .*; set space = "srgb" or'):
         read(toml(tmp_path, tmp_path))
     photos, _ = read(toml(tmp_path, tmp_path, 'space = "srgb"'))
     for view in photos.views:
