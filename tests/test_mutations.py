@@ -191,16 +191,17 @@ def test_lines_are_drawn_alike():
 def index(tmp_path: Path) -> guards.Guards:
     """The guards of a small checkout: a package that passes a name on, a helper of tests, and three tests."""
     for name, text in {
-        "pkg/__init__.py": "from pkg.d import f\n",
+        "pkg/__init__.py": "from pkg.d import f\nfrom .h import g\n",
         "pkg/a.py": "",
         "pkg/b.py": "import pkg.e\n",
         "pkg/d.py": "",
         "pkg/e.py": "",
+        "pkg/h.py": 'register_volume("grid", g)\n',
         "pkg/room/c.py": "",
         "tests/helper.py": "import pkg.e\n",
-        "tests/one/test_a.py": "from pkg.b import x\n",
+        "tests/one/test_a.py": "from pkg.b import x\nload('grid')\n",
         "tests/two/test_more.py": "from pkg import a, b, f\n",
-        "tests/two/test_other.py": "import os\nfrom helper import x\n",
+        "tests/two/test_other.py": "import pkg\nfrom helper import x\npkg.g()\n",
     }.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -216,8 +217,15 @@ def test_tests_named_like_a_module_and_named_by_its_mutations_come_first(index) 
 
 
 def test_tests_that_import_a_module_come_nearest_first(index) -> None:
-    """Through the package that passes a name on as if directly, through a helper of tests, and through another module."""
-    assert index.importing == {"pkg/a.py": [MORE], "pkg/b.py": [ONE, MORE], "pkg/d.py": [MORE], "pkg/e.py": [ONE, OTHER, MORE]}
+    """Through the package that passes a name on as if directly, through a plugin's name, a helper of tests, or a module."""
+    direct = {
+        "pkg/a.py": [MORE],
+        "pkg/b.py": [ONE, MORE],
+        "pkg/d.py": [MORE],
+        "pkg/h.py": [ONE, OTHER],
+        "pkg/__init__.py": [OTHER],
+    }
+    assert index.importing == {**direct, "pkg/e.py": [ONE, MORE, OTHER]}
     assert index.rounds("pkg/b.py") == [[], [ONE, MORE], [OTHER], ["-m", "slow", ONE, MORE]]
 
 

@@ -6,13 +6,14 @@ Nothing is written down for this: file names, imports and the entries of tests/m
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 __all__ = ["Guards", "index_guards"]
 
-MOST_FILES = 6
+MOST_FILES = 8
 """Files of tests in the second round. Half of the tests import some modules; all of those would be most of the suite."""
 
 
@@ -76,7 +77,11 @@ def index_guards(root: Path, entries: Iterable[tuple[str, str]], package: str = 
     names |= {
         name: file for m, f in modules.items() if Path(f).stem == "__init__" for name, file in _exports(root / f, m, names)
     }
+    for file in modules.values():
+        plugins = re.findall(r"register_\w+\(\s*\"(\w+)\"", (root / file).read_text())
+        names |= {f"'{plugin}'": file for plugin in plugins}  # quoted, as no module is
     imports = {file: _files_of(root / file, names) for file in (*modules.values(), *helpers.values())}
+    imports[modules[package]] = set()  # every test imports the package itself, for what it passes on or for nothing
     guards = Guards()
     for file, test in entries:
         if test not in guards.tests.setdefault(file, []):
@@ -111,8 +116,10 @@ def _distances(start: set[str], imports: dict[str, set[str]]) -> dict[str, int]:
 def _exports(path: Path, package: str, names: dict[str, str]) -> Iterator[tuple[str, str]]:
     """The (dotted name, file that defines it) pairs of what a package imports to pass on."""
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level and node.module in names:
-            yield from ((f"{package}.{alias.asname or alias.name}", names[node.module]) for alias in node.names)
+        if isinstance(node, ast.ImportFrom) and node.module:
+            module = f"{package}.{node.module}" if node.level else node.module
+            if module in names:
+                yield from ((f"{package}.{alias.asname or alias.name}", names[module]) for alias in node.names)
 
 
 def _files_of(path: Path, names: dict[str, str]) -> set[str]:
@@ -122,10 +129,14 @@ def _files_of(path: Path, names: dict[str, str]) -> set[str]:
         if isinstance(node, ast.Import):
             found |= {names[alias.name] for alias in node.names if alias.name in names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            dotted = (f"{node.module}.{alias.name}" for alias in node.names)
-            found |= {
-                names[name] if name in names else names[node.module] for name in dotted if name in names or node.module in names
-            }
+            dotted = [f"{node.module}.{alias.name}" for alias in node.names]
+            found |= {names.get(name) or names[node.module] for name in dotted if name in names or node.module in names}
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            name = f"{node.value.id}.{node.attr}"  # mivol.optimize after import mivol
+            found |= {names[name]} if name in names else set()
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            name = f"'{node.value}'"  # a plugin, as a scene names it
+            found |= {names[name]} if name in names else set()
     return found
 
 
