@@ -177,6 +177,13 @@ class Parameter:
         """Reals -> value, differentiable."""
         return MAPS[self.map].from_reals(u, *self.domain)
 
+    def map_derivative(self, u: mi.TensorXf) -> mi.TensorXf:
+        """dx/du of the map, entry by entry."""
+        u = mi.TensorXf(dr.detach(u))
+        dr.enable_grad(u)
+        dr.backward(dr.sum(self.from_reals(u).array))
+        return dr.grad(u)
+
     def bounds(self) -> tuple[float, float]:
         """The domain as an interval of the reals: infinite where the map never reaches the bound."""
         low, high = self.domain

@@ -12,12 +12,14 @@ function of its seed and i.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 import mitsuba as mi
 import numpy as np
+
+from mivol.optim.parameters import Parameter
 
 Reals: TypeAlias = "dict[str, mi.TensorXf]"
 """What an optimiser moves: one tensor for each parameter."""
@@ -76,6 +78,48 @@ class DifferentiableProblem(Problem, Protocol):
             reals: of the step; the problem may take them out: while the dictionary holds them, the gradient is in memory.
             iteration: that of the newest :meth:`loss_and_gradient`.
         """
+
+
+class BoundedProblem(DifferentiableProblem, Protocol):
+    """Additional methods for L-BFGS: bounds of the reals, and the loss alone.
+
+    Attributes:
+        parameters: the unknowns, with learning rates and bounds.
+    """
+
+    parameters: Sequence[Parameter]
+
+    def loss_value(self, reals: Reals, iteration: int) -> float:
+        """f(u), without derivatives."""
+
+
+class Linearization(Protocol):
+    """A problem around one point u: r are residuals, W their weights, R the energy of the priors.
+
+    Attributes:
+        loss: f(u).
+        gradient: J^T W r + R', by the reals.
+    """
+
+    loss: float
+    gradient: Reals
+
+    def curvature(self, direction: Reals) -> Reals:
+        """(J^T W J + R'') direction."""
+
+
+class LinearizableProblem(BoundedProblem, Protocol):
+    """Additional methods for Gauss-Newton: products with the Jacobian J."""
+
+    def check_linearizable(self) -> None:
+        """Check that the loss is quadratic.
+
+        Raises:
+            MivolError: the loss is not quadratic.
+        """
+
+    def linearize(self, reals: Reals) -> Linearization:
+        """The problem around ``reals``, with the same random numbers at each call."""
 
 
 @dataclass(frozen=True)

@@ -18,22 +18,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.optim.optimizer import Optimizer, OptimizerRun
-from mivol.optim.parameters import Parameter
-from mivol.optim.problem import Reals
-from mivol.optim.scenes.scene_problem import SceneProblem
-from mivol.optim.scenes.views import ADJOINT, PRIMAL
+from mivol.optim.problem import BoundedProblem, LinearizableProblem, Reals
 from mivol.optim.strategy import setting
 
 
 class Packing:
     """All reals as one float64 vector, each parameter in units of its learning rate, and back."""
 
-    def __init__(self, problem: SceneProblem, reals: Reals) -> None:
+    def __init__(self, problem: BoundedProblem, reals: Reals) -> None:
         self.parts = [(p.name, p.lr, tuple(reals[p.name].shape)) for p in problem.parameters]
         self.low = self._repeat([p.bounds()[0] / p.lr for p in problem.parameters])
         self.high = self._repeat([p.bounds()[1] / p.lr for p in problem.parameters])
@@ -94,14 +90,14 @@ class Lbfgs(Optimizer, tag="lbfgs"):
 
     memory: Annotated[int, setting("pair", "steps remembered", ge=1, le=100)] = 10
 
-    def begin(self, problem: SceneProblem) -> OptimizerRun:
+    def begin(self, problem: BoundedProblem) -> OptimizerRun:
         return LbfgsRun(self, problem)
 
 
 class LbfgsRun(OptimizerRun):
     """State: the reals, and the pairs (step, change of gradient)."""
 
-    def __init__(self, settings: Lbfgs, problem: SceneProblem) -> None:
+    def __init__(self, settings: Lbfgs, problem: BoundedProblem) -> None:
         super().__init__(problem)
         self.settings = settings
         self.steps: list[np.ndarray] = []
@@ -178,7 +174,7 @@ class GaussNewton(Optimizer, tag="gauss_newton"):
     inner: Annotated[int, setting("iteration", "conjugate-gradient steps per linearisation", ge=1)] = 6
     damping: Annotated[float, setting("1", "first mu, relative to D", ge=0)] = 1e-3
 
-    def begin(self, problem: SceneProblem) -> OptimizerRun:
+    def begin(self, problem: LinearizableProblem) -> OptimizerRun:
         return GaussNewtonRun(self, problem)
 
 
@@ -186,22 +182,26 @@ class GaussNewtonRun(OptimizerRun):
     """State: the reals and the damping. Image, J and J^T use the same samples in every iteration: one set of them, and
     another for the gradient where light is sampled."""
 
-    def __init__(self, settings: GaussNewton, problem: SceneProblem) -> None:
+    def __init__(self, settings: GaussNewton, problem: LinearizableProblem) -> None:
         super().__init__(problem)
         self.settings = settings
         self.damping = settings.damping
-        self.weights = [problem.loss.weight(batch.reference) for batch in problem.batches]
+        problem.check_linearizable()
 
     def step(self, iteration: int, factor: float) -> float:
         packing = Packing(self.problem, self.reals)
-        linear = Linearization(self.problem, self.reals, self.weights, packing)
-        x, g = packing.vector(self.reals), linear.gradient
+        linear = self.problem.linearize(self.reals)
+        x, g = packing.vector(self.reals), packing.vector(linear.gradient, 1)
         free = packing.free(x, g)
-        diagonal = np.abs(linear.curvature(np.ones_like(x)))
+
+        def curvature(v: np.ndarray) -> np.ndarray:
+            return packing.vector(linear.curvature(packing.tensors(v)), 1)
+
+        diagonal = np.abs(curvature(np.ones_like(x)))
         # A voxel that no ray meets has no curvature and no gradient: the floor keeps it where it is, not at 0 / 0.
         diagonal = np.maximum(diagonal, 1e-6 * diagonal.max() + 1e-300)
         p = conjugate_gradients(
-            lambda v: free * (linear.curvature(free * v) + self.damping * diagonal * v),
+            lambda v: free * (curvature(free * v) + self.damping * diagonal * v),
             -g * free, diagonal, self.settings.inner,
         )  # fmt: skip
         new, alpha = search_line(
@@ -218,58 +218,6 @@ class GaussNewtonRun(OptimizerRun):
     def unpack(self, arrays: dict[str, np.ndarray]) -> None:
         super().unpack(arrays)
         self.damping = float(arrays["damping"])
-
-
-class Linearization:
-    """The problem around one point: loss, gradient, and products with J^T W J + R''.
-
-    Attributes:
-        loss: f(u).
-        gradient: by the vector of ``packing``.
-    """
-
-    def __init__(self, problem: SceneProblem, reals: Reals, weights: list[mi.TensorXf], packing: Packing) -> None:
-        self.problem, self.reals, self.weights, self.packing = problem, reals, weights, packing
-        self.seeds = [problem.seed_for(0, index, PRIMAL) for index in range(len(problem.batches))]
-        self.slopes = {p.name: map_derivative(p, reals[p.name]) for p in problem.parameters}
-        problem.set_reals(reals)
-        compared = []
-        for index, (batch, seed) in enumerate(zip(problem.batches, self.seeds, strict=True)):
-            compared.append(problem.compare(batch, seed, len(problem.views)))
-            # The noise of an image and of a derivative from the same samples is correlated: that would bias J^T W r.
-            own = problem.seed_for(0, index, ADJOINT) if problem.noisy else seed
-            problem.vjp(batch.sensor, compared[-1].adjoint, own)
-        energy, gradients = problem.through_priors_and_maps(reals, problem.gradients())
-        self.loss = problem.remember(compared) + energy
-        self.gradient = packing.vector(gradients, 1)
-
-    def curvature(self, v: np.ndarray) -> np.ndarray:
-        """(J^T W J + R'') v."""
-        direction = {k: t * self.slopes[k] for k, t in self.packing.tensors(v).items()}
-        images = self._jvp(direction)
-        self.problem.set_reals(self.reals)
-        for batch, weight, seed, image in zip(self.problem.batches, self.weights, self.seeds, images, strict=True):
-            share = batch.n_views / len(self.problem.views) / len(image.array)
-            self.problem.vjp(batch.sensor, weight * image * share, seed)
-        product = self.problem.gradients()
-        for p in self.problem.parameters:
-            value = dr.detach(p.from_reals(self.reals[p.name]))
-            for prior in p.priors:
-                product[p.name] += prior.curvature(value, direction[p.name], p.spacing(value.shape))
-        return self.packing.vector({k: t * self.slopes[k] for k, t in product.items()}, 1)
-
-    def _jvp(self, direction: Reals) -> list[mi.TensorXf]:
-        self.problem.set_reals(self.reals)
-        pairs = zip(self.problem.batches, self.seeds, strict=True)
-        return [self.problem.jvp(batch.sensor, direction, seed) for batch, seed in pairs]
-
-
-def map_derivative(parameter: Parameter, u: mi.TensorXf) -> mi.TensorXf:
-    """dx/du of a parameter's map, entry by entry."""
-    u = mi.TensorXf(dr.detach(u))
-    dr.enable_grad(u)
-    dr.backward(dr.sum(parameter.from_reals(u).array))
-    return dr.grad(u)
 
 
 def conjugate_gradients(

@@ -24,7 +24,6 @@ from mivol.optim.parameters import Parameter
 from mivol.optim.scenes.render_noise import compare_with_reference, describe_noise, make_noise_check, split_samples
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
-from mivol.optim.second_order import Linearization, Packing
 from mivol.validate.moments import Moments
 
 SIGMA, SEEN, SPP = 0.4, 0.6, 8
@@ -217,7 +216,7 @@ def test_gauss_newton_carries_noise_back_by_other_samples(variant_rgb) -> None:
         problem = cube_problem(integrator)
         images, derivatives = [noted(problem, name, place) for name, place in (("compare", 1), ("vjp", 2))]
         reals = problem.initial_reals()
-        Linearization(problem, reals, [L2().weight(problem.batches[0].reference)], Packing(problem, reals))
+        problem.linearize(reals)
         assert len(images) == 1
         assert (images == derivatives) == same
 

@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -261,6 +262,25 @@ class SceneProblem:
         self.newest_loss = math.fsum(c.loss for c in compared), math.nan if unknown else math.fsum(c.noise for c in compared)
         return self.newest_loss[0]
 
+    # -- Curvature ------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def weights(self) -> list[mi.TensorXf]:
+        """Weights W of a quadratic loss, by batch."""
+        return [self.loss.weight(batch.reference) for batch in self.batches]
+
+    def check_linearizable(self) -> None:
+        """Check that the loss is quadratic.
+
+        Raises:
+            MivolError: the loss is not quadratic.
+        """
+        self.loss.weight(self.batches[0].reference)
+
+    def linearize(self, reals: Reals) -> Linearization:
+        """The problem around ``reals``, with the random numbers of iteration 0."""
+        return Linearization(self, reals)
+
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
         """Nothing: the scene's values are the reals'."""
         return {}
@@ -289,6 +309,51 @@ class SceneProblem:
             by_reals[p.name] = dr.grad(u)
         dr.eval(by_reals)
         return total, by_reals
+
+
+class Linearization:
+    """A scene's problem around one point u: loss, gradient, and products with J^T W J + R''.
+
+    Images, J and J^T use the same samples. The gradient has samples of its own if light is sampled.
+
+    Attributes:
+        loss: f(u).
+        gradient: derivative of the loss by the reals.
+    """
+
+    def __init__(self, problem: SceneProblem, reals: Reals) -> None:
+        self.problem, self.reals = problem, reals
+        self.seeds = [problem.seed_for(0, index, PRIMAL) for index in range(len(problem.batches))]
+        self.slopes = {p.name: p.map_derivative(reals[p.name]) for p in problem.parameters}
+        problem.set_reals(reals)
+        compared = []
+        for index, (batch, seed) in enumerate(zip(problem.batches, self.seeds, strict=True)):
+            compared.append(problem.compare(batch, seed, len(problem.views)))
+            # The noise of an image and of a derivative from the same samples is correlated, which would bias J^T W r.
+            own = problem.seed_for(0, index, ADJOINT) if problem.noisy else seed
+            problem.vjp(batch.sensor, compared[-1].adjoint, own)
+        energy, self.gradient = problem.through_priors_and_maps(reals, problem.gradients())
+        self.loss = problem.remember(compared) + energy
+
+    def curvature(self, direction: Reals) -> Reals:
+        """(J^T W J + R'') direction."""
+        direction = {k: t * self.slopes[k] for k, t in direction.items()}
+        images = self._jvp(direction)
+        self.problem.set_reals(self.reals)
+        for batch, weight, seed, image in zip(self.problem.batches, self.problem.weights, self.seeds, images, strict=True):
+            share = batch.n_views / len(self.problem.views) / len(image.array)
+            self.problem.vjp(batch.sensor, weight * image * share, seed)
+        product = self.problem.gradients()
+        for p in self.problem.parameters:
+            value = dr.detach(p.from_reals(self.reals[p.name]))
+            for prior in p.priors:
+                product[p.name] += prior.curvature(value, direction[p.name], p.spacing(value.shape))
+        return {k: t * self.slopes[k] for k, t in product.items()}
+
+    def _jvp(self, direction: Reals) -> list[mi.TensorXf]:
+        self.problem.set_reals(self.reals)
+        pairs = zip(self.problem.batches, self.seeds, strict=True)
+        return [self.problem.jvp(batch.sensor, direction, seed) for batch, seed in pairs]
 
 
 def missing_derivative_error(names: str) -> MivolError:
