@@ -78,7 +78,10 @@ def _faults_of_verb(verb: str, *rest: str) -> list[str]:
         return [] if verb.isupper() else [verb]
     known = {"demo": EXAMPLES, "bench": STUDIES, "fetch": DATA}.get(verb, rest)
     unknown = [name for name in rest[:1] if not name.startswith("-") and name not in known and not name.isupper()]
-    help_text = _help_of(lambda: mivol_parser().parse_args([verb, "--help"]))
+    if verb == "bench" and rest[:1] and rest[0] in STUDIES:
+        help_text = _help_of(lambda: importlib.import_module(f"mivol.bench.studies.{rest[0]}").main(["--help"]))
+    else:
+        help_text = _help_of(lambda: mivol_parser().parse_args([verb, "--help"]))
     return unknown + [flag for flag in _flags(rest) if not re.search(rf"(?<![\w-]){flag}(?![\w-])", help_text)]
 
 

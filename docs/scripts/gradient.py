@@ -1,9 +1,7 @@
 """How a picture's brightness depends on each voxel of a smoke."""
+import mivol
 import drjit as dr
 import mitsuba as mi
-
-import mivol
-
 mi.set_variant("llvm_ad_rgb")                       # or cuda_ad_rgb
 
 density = mi.TensorXf(mivol.make_procedural("tangle", (40, 40, 40), seed=2, peak=6.0))

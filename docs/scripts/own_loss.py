@@ -1,12 +1,9 @@
 """A density from pictures, by a loss of your own."""
 from pathlib import Path
-
+import mivol
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
-import mivol
-
 mi.set_variant("llvm_ad_rgb")
 
 def loss(image: mi.TensorXf, picture: mi.TensorXf) -> mi.TensorXf:

@@ -1,8 +1,6 @@
 """A radiance field from photographs, and the field on a floor in a scene."""
-import mitsuba as mi
-
 import mivol
-
+import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 
 settings = {"field.preset": "tiny", "photos.background": "white", "show.frames": 8}

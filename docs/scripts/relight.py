@@ -1,8 +1,6 @@
 """That density under another light."""
-import mitsuba as mi
-
 import mivol
-
+import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 
 scene = mi.load_file("scene.xml")
