@@ -392,13 +392,13 @@ def make_fields(folder: Path) -> int:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from mivol.fields.field_archives import save_field
+    from mivol.fields.field_files import write_field
     from mivol.fields.spherical_grid import SphericalGrid
 
     rng = np.random.default_rng(2)
     for name in ("field", "other"):
         dense = rng.random((4, 4, 4, 1), np.float32), rng.random((4, 4, 4, 1, 3), np.float32)
-        save_field(folder / f"{name}.npz", SphericalGrid.from_dense(*dense, np.eye(4)))
+        write_field(folder / f"{name}.npz", SphericalGrid.from_dense(*dense, np.eye(4)))
     return 0
 
 

@@ -237,9 +237,9 @@ def smoke_optimize(folder: Path) -> None:
 
 def smoke_export(folder: Path) -> None:
     """Every kind of file that a radiance field becomes."""
-    from mivol.fields.field_files import EXPORTS
+    from mivol.fields.field_files import FIELD_FORMATS
 
-    for suffix in EXPORTS:
+    for suffix in FIELD_FORMATS:
         for path in mivol("export", "photos/field.npz", f"out{suffix}").split():
             check((folder / path).stat().st_size > 100, f"{path} is empty")
     check((folder / "out.ply").read_bytes().startswith(b"ply"), "out.ply is no PLY")

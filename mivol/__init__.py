@@ -2,7 +2,7 @@
 
 ``mivol.<tab>`` shows what a script needs: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
 ``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
-(``load_photos``, ``fit_photographs``, ``fit_gaussians``, ``load_field``), Gaussians and points (``read_gaussians``,
+(``load_photos``, ``fit_photographs``, ``fit_gaussians``, ``read_field``), Gaussians and points (``read_gaussians``,
 ``read_points``, ``Splatter``) and tomography (``Projector`` and its geometries). Each is imported when it is first used.
 """
 
@@ -43,7 +43,7 @@ PUBLIC = {
     "explain": "experiments.script",
     "fit_gaussians": "experiments.script",
     "fit_photographs": "experiments.script",
-    "load_field": "fields.field_archives",
+    "read_field": "fields.field_files",
     "load_photos": "photos",
     "load_scene": "scene.load",
     "make_procedural": "fields.procedural",
@@ -52,7 +52,7 @@ PUBLIC = {
     "read_points": "points",
     "read_volume": "files",
     "render_reference": "validate.reference",
-    "save_field": "fields.field_archives",
+    "write_field": "fields.field_files",
     "write_gaussians": "points",
     "write_points": "points",
     "write_volume": "files",
@@ -65,8 +65,8 @@ if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it
     from .experiments.script import fit_gaussians as fit_gaussians
     from .experiments.script import fit_photographs as fit_photographs
     from .experiments.script import optimize as optimize
-    from .fields.field_archives import load_field as load_field
-    from .fields.field_archives import save_field as save_field
+    from .fields.field_files import read_field as read_field
+    from .fields.field_files import write_field as write_field
     from .fields.procedural import make_procedural as make_procedural
     from .files import read_volume as read_volume
     from .files import write_volume as write_volume

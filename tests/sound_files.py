@@ -59,15 +59,15 @@ def _field(path: Path) -> None:
     rng = np.random.default_rng(2)
     keep = rng.random((3, 4, 5)) < 0.5
     values = rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3))
-    mivol.save_field(path, SphericalGrid.from_dense(*values, np.eye(4), keep))
+    mivol.write_field(path, SphericalGrid.from_dense(*values, np.eye(4), keep))
 
 
 def _svox2(path: Path) -> None:
-    from mivol.fields.field_files import export_field
+    from mivol.fields.field_files import write_field
     from mivol.fields.spherical_grid import SphericalGrid
 
     rng = np.random.default_rng(3)
-    export_field(path, SphericalGrid.from_dense(rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3)), np.eye(4)))
+    write_field(path, SphericalGrid.from_dense(rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3)), np.eye(4)))
 
 
 def _mesh(path: Path) -> None:
@@ -317,8 +317,8 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "jpeg": (".jpg", lambda path: Image.fromarray(np.eye(9, 8, dtype=np.uint8) * 200).save(path), _read_picture),
     "radiance": (".exr", _exr, _read_picture),
     "mask": (".png", _picture, _read_mask),
-    "field": (".npz", _field, mivol.load_field),
-    "svox2": (".svox2.npz", _svox2, mivol.load_field),
+    "field": (".npz", _field, mivol.read_field),
+    "svox2": (".svox2.npz", _svox2, mivol.read_field),
     "mesh": (".ply", _mesh, _read_mesh),
     "columns": (".txt", _bytes(b"# a table\n1 2 3\n4.5 -6 7e-3\n8 9 10\n"), _read_columns),
     "checkpoint": (".npz", _checkpoint, _read_archive),

@@ -32,8 +32,8 @@ print(volume.values.shape, volume.meta.get("space"))
 
 photos = mivol.load_photos("photographs", background="white", held_out=8)
 print(photos.views[0].camera.size)
-mivol.save_field("field.npz", mivol.fit_photographs("photographs", "runs/field", {"field.preset": "tiny"}))
-print(mivol.load_field("field.npz").to_world)
+mivol.write_field("field.npz", mivol.fit_photographs("photographs", "runs/field", {"field.preset": "tiny"}))
+print(mivol.read_field("field.npz").to_world)
 
 angles = np.linspace(0, np.pi, 60, endpoint=False)
 grid = mivol.VoxelGrid((1, 64, 64), 1 / 32)
@@ -48,6 +48,6 @@ mivol.write_gaussians("more.ply", mivol.fit_gaussians("photographs", "runs/gauss
 splatter = mivol.Splatter(640, 480, gaussians.degree)
 
 try:
-    mivol.load_field("nowhere.npz")
+    mivol.read_field("nowhere.npz")
 except mivol.MivolError as error:
     print(error)

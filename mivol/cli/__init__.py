@@ -165,9 +165,9 @@ def report_flags(sub: argparse.ArgumentParser) -> None:
 
 def export_flags(sub: argparse.ArgumentParser) -> None:
     """Flags of a field that becomes a file of another program."""
-    from mivol.fields.field_files import EXPORTS
+    from mivol.fields.field_files import FIELD_FORMATS
 
-    known = ", ".join(f"{suffix} ({kind.name})" for suffix, kind in EXPORTS.items())
+    known = ", ".join(f"{suffix} ({kind.name})" for suffix, kind in FIELD_FORMATS.items())
     sub.add_argument("field", type=Path, help="radiance field (.npz): mivol's, or a checkpoint of svox2")
     sub.add_argument("output", type=Path, help=f"what to write, by its suffix: {known}")
     default = "where a voxel is half opaque, or half of what thinner matter has"
@@ -413,12 +413,11 @@ def export(arguments: argparse.Namespace) -> None:
     """Write a radiance field as a mesh, as volumes, as a scene with the sky beside its file, or for another program."""
     from mivol.experiments.back_end import set_variant
     from mivol.experiments.render import sky_beside
-    from mivol.fields.field_archives import load_field
-    from mivol.fields.field_files import export_field
+    from mivol.fields.field_files import read_field, write_field
 
     set_variant(arguments.mode)
-    field, sky = load_field(arguments.field), sky_beside(arguments.field)
-    print("\n".join(str(path) for path in export_field(arguments.output, field, arguments.level, sky)))
+    field, sky = read_field(arguments.field), sky_beside(arguments.field)
+    print("\n".join(str(path) for path in write_field(arguments.output, field, arguments.level, sky)))
 
 
 def convert(arguments: argparse.Namespace) -> None:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.experiments.back_end import set_variant
-from mivol.fields.field_archives import load_field, save_field
+from mivol.fields.field_files import read_field, write_field
 from mivol.fields.gaussian_grid import MAX_OPACITY, gaussian_box, gaussian_masses, gaussians_to_grid, grid_to_gaussians
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import DepthView, fuse_depths
@@ -73,8 +73,8 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     set_variant(variant)
     cloud = read_as_gaussians(source)
     low, high = corners_of_box(cloud, box)
-    save_field(target, gaussians_to_grid(cloud, low, high, resolution))
-    field = load_field(target)  # as it will be read: half floats
+    write_field(target, gaussians_to_grid(cloud, low, high, resolution))
+    field = read_field(target)  # as it will be read: half floats
     mass = float(field.values()[0].sum(dtype=np.float64) * np.linalg.det(field.to_world[:3, :3]) / math.prod(field.res))
     lines = [
         f"{target}: {' x '.join(map(str, field.res[::-1]))} nodes, {field.rows - 1} of them stored, degree {field.degree}",
@@ -100,13 +100,13 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
         What was written and what it lost, in lines.
 
     Raises:
-        MivolError: as :func:`mivol.fields.field_archives.load_field`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians`
+        MivolError: as :func:`mivol.fields.field_files.read_field`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians`
         and
             the disk.
     """
     select_by_suffix(target, GAUSSIAN_WRITERS)
     set_variant(variant)
-    field = load_field(source)
+    field = read_field(source)
     made = grid_to_gaussians(field, resolution)
     write_gaussians(target, made)
     lines = [f"{target}: {made.count} Gaussians of degree {made.degree}"]

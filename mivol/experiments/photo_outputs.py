@@ -15,7 +15,7 @@ from mivol.experiments.film import Film
 from mivol.experiments.judged_views import JudgedViews, caption_of, said_of
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
-from mivol.fields.field_archives import save_field
+from mivol.fields.field_files import write_field
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_exr, write_png, write_volume
@@ -109,7 +109,7 @@ def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: f
         folder, problem, which: where, what, and the word.
         white: by what colours are multiplied: the radiance for which 1 stood in the fit.
     """
-    save_field(folder / f"field{which}.npz", problem.field.scale_colours(white))
+    write_field(folder / f"field{which}.npz", problem.field.scale_colours(white))
     if problem.sky is not None:
         write_exr(folder / f"sky{which}.exr", {"": white * problem.sky.image()})
 

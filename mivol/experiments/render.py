@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.field_archives import load_field
+from mivol.fields.field_files import read_field
 from mivol.fields.sky import Sky, read_sky
 from mivol.files import write_exr, write_png
 from mivol.files.atomic import check_destination
@@ -135,10 +135,10 @@ def view_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: f
         size: (width, height) [pixel].
 
     Raises:
-        MivolError: as :func:`mivol.fields.field_archives.load_field`, or a camera that cannot be.
+        MivolError: as :func:`mivol.fields.field_files.read_field`, or a camera that cannot be.
     """
     camera = camera_at(look_at, up, fov, size)
-    field, sky = load_field(path), sky_beside(path)
+    field, sky = read_field(path), sky_beside(path)
     seen = render_view(field, camera, np.zeros(3) if sky is None else sky).image
     return np.maximum(seen, 0) if field.space == "linear" else decode_srgb(seen)
 

@@ -19,7 +19,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.runs import run_experiment
 from mivol.experiments.task import Nobody, Task, Watcher
-from mivol.fields.field_archives import load_field
+from mivol.fields.field_files import read_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, stack_layers
 from mivol.optim.first_order import Adam
@@ -231,7 +231,7 @@ def fit_photographs(
         >>> field = mivol.fit_photographs("photographs", "runs/field", {"field.preset": "tiny"})
     """
     fitted(photographs, output, settings, watcher, {})
-    return load_field(Path(output) / "field.npz")
+    return read_field(Path(output) / "field.npz")
 
 
 def fit_gaussians(

@@ -1,4 +1,11 @@
-"""Radiance fields on disk: our own ``.npz``, and checkpoints of svox2, which are read."""
+"""Radiance fields in NumPy archives (``.npz``): mivol's own format and the checkpoints of svox2, the program of Plenoxels.
+
+Conventions of svox2. Grid axes are X Y Z. ``links`` hold the row of each node; -1 marks an empty node. Coefficients lie
+[rgb][basis] in half floats. ``center`` and ``radius`` are the middle and the half edges of the box. svox2 shows
+``max(0, 1/2 + sum)`` and ``max(0, density)`` after interpolation, in an axis-aligned box.
+
+Source: Fridovich-Keil, Yu et al. 2022; the names of the arrays are read from svox2's own files.
+"""
 
 from __future__ import annotations
 
@@ -11,82 +18,87 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole
-from mivol.files.npy import check_memory, read_archive
+from mivol.files.npy import check_memory
 from mivol.files.source import refusal
 
-__all__ = ["load_field", "save_field", "read_svox2", "save_svox2"]
+__all__ = ["is_own_archive", "is_svox2", "parse_archive", "parse_svox2", "write_archive", "write_svox2"]
 
 FORMAT = "mivol spherical grid 2"
 
-HALF = float(np.finfo(np.float16).max)
+HALF_MAX = float(np.finfo(np.float16).max)
 
+HALF_MIN = 2.0**-12
+"""Arrays whose largest value is smaller stay float32: the step of a half float, 2^-24, would exceed 2^-12 of that value."""
 
 SVOX2_SH = 1
 """svox2's number for a basis of spherical harmonics."""
 
+MAX_NODES = 2**32 - 1
+"""Node numbers have 32 bits."""
 
-SMALL = 2.0**-12
-"""Below it the least step of a half float, 2^-24, is more than 2^-12 of the largest value."""
+ARRAY_KINDS = {
+    "res": ("iu", (3,)), "to_world": ("f", (4, 4)), "density": ("f", None), "sh": ("f", None), "nodes": ("iu", None),
+    "activation": ("U", ()), "offset": ("fiu", ()), "clamp": ("biu", ()), "levels": ("iu", ()),
+    "space": ("U", ()),
+}  # fmt: skip
+"""Array -> allowed kinds of NumPy types, and its shape where the shape is fixed."""
+
+SVOX2_KINDS = {"links": "iu", "density_data": "f", "sh_data": "f", "radius": "fiu", "center": "fiu", "basis_type": "iu"}
 
 
-def save_field(path: str | Path, field: SphericalGrid, half: bool = True) -> None:
-    """Write a field as ``.npz``.
+# -- The format of mivol -----------------------------------------------------------------------------------------------
+
+
+def write_archive(path: Path, field: SphericalGrid, half: bool = True) -> None:
+    """Write a field in mivol's own format.
 
     Args:
-        path: ends in .npz.
-        field: what to write.
-        half: as half floats (11 bits); arrays with a value beyond 65504, or with none beyond 2^-12, stay float32 in any case.
+        path: destination.
+        field: radiance field, nested or not.
+        half: store half floats (11 bits). Arrays with a value above 65504, or with all values below 2^-12, stay float32.
 
     Raises:
-        MivolError: another suffix, or the disk's refusal.
+        MivolError: the disk refuses the file.
     """
-    path = Path(path)
-    if path.suffix != ".npz":
-        raise MivolError(f"{path.name} was given for a radiance field; a name ending in .npz is expected.")
     density, sh = field.values()
-    arrays = {"density": _narrow(density, half), "sh": _narrow(sh, half)}
+    arrays = {"density": _to_half(density, half), "sh": _to_half(sh, half)}
     arrays |= {"res": np.array(field.res), "to_world": field.to_world}
     if field.nodes is not None:
         arrays["nodes"] = np.array(field.nodes)
-    about = {"format": FORMAT, "activation": field.activation, "offset": field.offset, "clamp": field.clamp}
-    about["levels"] = field.levels
-    about["space"] = field.space
-    write_whole(path, lambda file: np.savez_compressed(file, **arrays, **{k: np.array(v) for k, v in about.items()}))
+    arrays["format"] = np.array(FORMAT)
+    arrays |= {name: np.array(getattr(field, name)) for name in ("activation", "offset", "clamp", "levels", "space")}
+    write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-def _narrow(values: np.ndarray, half: bool) -> np.ndarray:
+def _to_half(values: np.ndarray, half: bool) -> np.ndarray:
     largest = np.abs(values).max(initial=0.0)
-    return values.astype(np.float16) if half and SMALL <= largest <= np.finfo(np.float16).max else values
+    return values.astype(np.float16) if half and HALF_MIN <= largest <= HALF_MAX else values
 
 
-def load_field(path: str | Path) -> SphericalGrid:
-    """Read a field: our ``.npz``, or a checkpoint of svox2.
+def is_own_archive(arrays: dict[str, np.ndarray]) -> bool:
+    """Whether the arrays of an archive are in mivol's own format."""
+    return str(arrays.get("format", "")) == FORMAT
+
+
+def parse_archive(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
+    """Make a field from the arrays of mivol's own format.
+
+    Args:
+        name: file name, for error messages.
+        arrays: contents of the archive.
 
     Raises:
-        MivolError: no such file, no such format, or contents that do not fit together.
+        MivolError: a missing array, another type or shape, values that are not finite, nodes out of order, or a grid too large
+            for the memory.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise MivolError(f"found no file {path}; give a radiance field (.npz).")
-    arrays = read_archive(path)
-    if "links" in arrays:
-        return read_svox2(path.name, arrays)
-    if str(arrays.get("format", "")) != FORMAT:
-        held = ", ".join(arrays) or "nothing"
-        raise MivolError(f"{path.name} holds {held}; a field of mivol or a checkpoint of svox2 is expected.")
-    return _of_ours(path.name, arrays)
-
-
-def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
-    needed = {"density", "sh", "res", "to_world", "activation", "offset", "clamp", "levels", "space"} - arrays.keys()
-    if needed:
-        raise MivolError(f"{name} lacks {', '.join(sorted(needed))}; write it again.")
-    _check_own_arrays(name, arrays)
-    res = tuple(int(n) for n in arrays["res"])
+    missing = {"density", "sh", "res", "to_world", "activation", "offset", "clamp", "levels", "space"} - arrays.keys()
+    if missing:
+        raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
+    _check_arrays(name, arrays)
+    res, levels = tuple(int(n) for n in arrays["res"]), int(arrays["levels"])
     nodes = arrays.get("nodes")
-    levels = int(arrays["levels"])
     n, shape = levels * math.prod(res) if nodes is None else len(nodes), arrays["sh"].shape
-    if len(res) != 3 or arrays["density"].shape != (n,) or len(shape) != 3 or shape[0] != n or shape[2] != 3:
+    if arrays["density"].shape != (n,) or len(shape) != 3 or shape[0] != n or shape[2] != 3:
         found = f"{arrays['density'].shape} densities and {shape} harmonics"
         raise MivolError(f"{name} holds {found} for {n} nodes; write it again.")
     if nodes is not None:
@@ -97,32 +109,16 @@ def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
         arrays["density"].astype(np.float32),
         arrays["sh"].astype(np.float32),
         None if nodes is None else mi.UInt32(nodes.astype(np.uint32)),
-        str(arrays["activation"]),
-        float(arrays["offset"]),
-        bool(arrays["clamp"]),
-        levels,
-        str(arrays["space"]),
+        activation=str(arrays["activation"]),
+        offset=float(arrays["offset"]),
+        clamp=bool(arrays["clamp"]),
+        levels=levels,
+        space=str(arrays["space"]),
     )
 
 
-KINDS = {
-    "res": ("iu", (3,)), "to_world": ("f", (4, 4)), "density": ("f", None), "sh": ("f", None), "nodes": ("iu", None),
-    "activation": ("U", ()), "offset": ("fiu", ()), "clamp": ("biu", ()), "levels": ("iu", ()),
-    "space": ("U", ()),
-}  # fmt: skip
-"""Of each array the kinds of NumPy types, and the shape where there is one only."""
-
-MOST_NODES = 2**32 - 1
-"""Nodes are counted in 32 bits."""
-
-
-def _check_own_arrays(name: str, arrays: dict[str, np.ndarray]) -> None:
-    """Refuse arrays of another type or shape, numbers that are not finite, and a grid that cannot be.
-
-    Raises:
-        MivolError: with what was found.
-    """
-    for key, (kinds, shape) in KINDS.items():
+def _check_arrays(name: str, arrays: dict[str, np.ndarray]) -> None:
+    for key, (kinds, shape) in ARRAY_KINDS.items():
         array = arrays.get(key)
         if array is None:
             continue
@@ -130,11 +126,11 @@ def _check_own_arrays(name: str, arrays: dict[str, np.ndarray]) -> None:
             raise MivolError(f"{name} holds {key} of type {array.dtype} and shape {array.shape}; write it again.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise MivolError(f"{name} holds {key} with values that are not finite; write it again.")
-    res = [int(arrays["levels"]), *(int(n) for n in arrays["res"])]
-    if min(res) < 1 or math.prod(res) > MOST_NODES:
-        found = " x ".join(map(str, res[res[0] == 1 :]))
-        raise MivolError(f"{name} has a grid of {found} nodes; 1 to {MOST_NODES} in all are expected.")
-    check_memory(Path(name), 4 * math.prod(res))  # the row of each node, which rays look up
+    sizes = [int(arrays["levels"]), *(int(n) for n in arrays["res"])]
+    if min(sizes) < 1 or math.prod(sizes) > MAX_NODES:
+        found = " x ".join(map(str, sizes[sizes[0] == 1 :]))
+        raise MivolError(f"{name} has a grid of {found} nodes; 1 to {MAX_NODES} in all are expected.")
+    check_memory(Path(name), 4 * math.prod(sizes))  # the index of rows has 4 bytes a node
 
 
 def _check_nodes(name: str, nodes: np.ndarray, count: int) -> None:
@@ -143,27 +139,30 @@ def _check_nodes(name: str, nodes: np.ndarray, count: int) -> None:
         raise MivolError(f"{name} lists nodes out of order or beyond the {count} of its grid; write it again.")
 
 
-def save_svox2(path: Path, field: SphericalGrid) -> None:
-    """Write a checkpoint, whole or not at all; coefficients are rounded to half floats, as svox2 does.
+# -- Checkpoints of svox2 ----------------------------------------------------------------------------------------------
+
+
+def write_svox2(path: Path, field: SphericalGrid) -> None:
+    """Write a checkpoint of svox2; coefficients are rounded to half floats, as svox2 rounds them.
 
     Raises:
-        MivolError: a field that svox2 would show otherwise (turned, another activation or offset, no clamp, radiance),
-            coefficients beyond 65504, disk full.
+        MivolError: a field that svox2 would show differently (nested, turned, another activation, offset or clamp, linear
+            radiance), coefficients above 65504, or a full disk.
     """
     if field.levels > 1:
         raise refusal(path, f"a field of {field.levels} nested levels", "one grid, as svox2 has", "write .npz or .xml")
     box = np.diagonal(field.to_world)[:3]
-    shown = (field.activation in ("none", "relu"), field.offset == 0.5, field.clamp)
     if np.count_nonzero(field.to_world[:3, :3] - np.diag(box)) or box.min() <= 0:
         raise refusal(path, "a turned or mirrored field", "an axis-aligned box, as svox2 has", "write .npz")
     if field.space != "srgb":
         raise refusal(path, "colours of linear radiance", "code values, as svox2 shows them", "write .npz")
-    if not all(shown):
+    if field.activation not in ("none", "relu") or field.offset != 0.5 or not field.clamp:
         found = f"activation {field.activation}, offset {field.offset:g}, clamp {field.clamp}"
         raise refusal(path, found, "relu, 0.5 and True, as svox2 shows fields", "write .npz")
     density, sh = field.values()
-    if np.abs(sh).max(initial=0.0) > HALF:
-        raise refusal(path, f"coefficients of up to {np.abs(sh).max():g}", f"at most {HALF:g}, a half float's", "write .npz")
+    if np.abs(sh).max(initial=0.0) > HALF_MAX:
+        found = f"coefficients of up to {np.abs(sh).max():g}"
+        raise refusal(path, found, f"at most {HALF_MAX:g}, a half float's", "write .npz")
     links = np.full(math.prod(field.res), -1, np.int32)
     links[field.stored_nodes()] = np.arange(len(density))
     arrays = {
@@ -174,15 +173,50 @@ def save_svox2(path: Path, field: SphericalGrid) -> None:
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-def _check_svox2_arrays(name: str, arrays: dict[str, np.ndarray]) -> None:
-    """Refuse links that are no whole numbers on three axes, numbers of another type, and a box that is none.
+def is_svox2(arrays: dict[str, np.ndarray]) -> bool:
+    """Whether the arrays of an archive are a checkpoint of svox2."""
+    return "links" in arrays
+
+
+def parse_svox2(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
+    """Make a field from the arrays of a checkpoint.
+
+    Args:
+        name: file name, for error messages.
+        arrays: contents of the archive.
 
     Raises:
-        MivolError: with what was found.
+        MivolError: a missing array, another type or shape, values that are not finite, another basis, or a background.
     """
-    kinds = {"links": "iu", "density_data": "f", "sh_data": "f", "radius": "fiu", "center": "fiu", "basis_type": "iu"}
-    for key, wanted in kinds.items():
-        if key in arrays and arrays[key].dtype.kind not in wanted:
+    missing = {"density_data", "sh_data", "radius", "center"} - arrays.keys()
+    if missing:
+        raise MivolError(f"{name} has links but lacks {', '.join(sorted(missing))}; a checkpoint of svox2 holds them.")
+    _check_svox2_arrays(name, arrays)
+    if int(arrays.get("basis_type", SVOX2_SH)) != SVOX2_SH:
+        found = int(arrays["basis_type"])
+        raise MivolError(f"{name} is of svox2's basis type {found}; only spherical harmonics (1) can be read.")
+    if arrays.get("background_data", np.empty(0)).size:
+        raise MivolError(f"{name} has a background of sphere layers, which mivol does not model; save it without one.")
+    links, sh = arrays["links"].transpose(2, 1, 0), arrays["sh_data"].astype(np.float32)
+    density = arrays["density_data"].astype(np.float32).reshape(-1)
+    if sh.ndim != 2 or len(sh) != len(density) or sh.shape[1] % 3 or links.max(initial=-1) >= len(density):
+        found = f"links {links.shape}, densities {density.shape} and harmonics {sh.shape}"
+        raise MivolError(f"{name} holds {found} that do not fit together; write it again.")
+    nodes = np.flatnonzero(links >= 0)
+    row = links.reshape(-1)[nodes]
+    rows = sh[row].reshape(len(row), 3, -1).transpose(0, 2, 1)
+    if nodes.size and (not np.isfinite(density[row]).all() or not np.isfinite(sh[row]).all()):
+        raise MivolError(f"{name} holds densities or harmonics that are not finite; write it again.")
+    radius, center = (np.broadcast_to(np.asarray(arrays[k], np.float64).reshape(-1), 3) for k in ("radius", "center"))
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = np.diag(2 * radius), center - radius
+    stored = mi.UInt32(nodes.astype(np.uint32))
+    return SphericalGrid.from_rows(links.shape, to_world, density[row], np.ascontiguousarray(rows), stored)
+
+
+def _check_svox2_arrays(name: str, arrays: dict[str, np.ndarray]) -> None:
+    for key, kinds in SVOX2_KINDS.items():
+        if key in arrays and arrays[key].dtype.kind not in kinds:
             raise MivolError(f"{name} holds {key} of type {arrays[key].dtype}; a checkpoint of svox2 has other numbers there.")
     if arrays["links"].ndim != 3 or arrays["links"].size == 0:
         raise MivolError(f"{name} holds links of the shape {arrays['links'].shape}; three axes are expected.")
@@ -194,31 +228,3 @@ def _check_svox2_arrays(name: str, arrays: dict[str, np.ndarray]) -> None:
         raise MivolError(f"{name} holds radius {arrays['radius'].reshape(-1).tolist()}; numbers above 0 are expected.")
     if arrays.get("basis_type", np.array(SVOX2_SH)).size != 1:
         raise MivolError(f"{name} holds basis_type of the shape {arrays['basis_type'].shape}; one number is expected.")
-
-
-def read_svox2(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
-    """A checkpoint of svox2: axes X Y Z, links to rows (negative: empty), harmonics [rgb][basis], centre and radius."""
-    needed = {"density_data", "sh_data", "radius", "center"} - arrays.keys()
-    if needed:
-        raise MivolError(f"{name} has links but lacks {', '.join(sorted(needed))}; a checkpoint of svox2 holds them.")
-    _check_svox2_arrays(name, arrays)
-    if int(arrays.get("basis_type", SVOX2_SH)) != SVOX2_SH:
-        found = int(arrays["basis_type"])
-        raise MivolError(f"{name} is of svox2's basis type {found}; only spherical harmonics (1) can be read.")
-    if arrays.get("background_data", np.empty(0)).size:
-        raise MivolError(f"{name} has a background of sphere layers, which mivol does not model; save it without one.")
-    links, sh = arrays["links"].transpose(2, 1, 0), arrays["sh_data"].astype(np.float32)
-    density = arrays["density_data"].astype(np.float32).reshape(-1)
-    if links.ndim != 3 or sh.ndim != 2 or len(sh) != len(density) or sh.shape[1] % 3 or links.max(initial=-1) >= len(density):
-        found = f"links {links.shape}, densities {density.shape} and harmonics {sh.shape}"
-        raise MivolError(f"{name} holds {found} that do not fit together; write it again.")
-    nodes = np.flatnonzero(links >= 0)
-    row = links.reshape(-1)[nodes]
-    rows = sh[row].reshape(len(row), 3, -1).transpose(0, 2, 1)
-    if nodes.size and (not np.isfinite(density[row]).all() or not np.isfinite(sh[row]).all()):
-        raise MivolError(f"{name} holds densities or harmonics that are not finite; write it again.")
-    radius, center = (np.broadcast_to(np.asarray(arrays[k], np.float64).reshape(-1), 3) for k in ("radius", "center"))
-    to_world = np.eye(4)
-    to_world[:3, :3], to_world[:3, 3] = np.diag(2 * radius), center - radius
-    listed = mi.UInt32(nodes.astype(np.uint32))
-    return SphericalGrid.from_rows(links.shape, to_world, density[row], np.ascontiguousarray(rows), listed)

@@ -1,11 +1,15 @@
-"""A radiance field as a file for other programs: :data:`EXPORTS` says which, by suffix.
+"""Radiance fields as files: the table :data:`FIELD_FORMATS` lists the formats by suffix.
 
-Conventions. Volumes hold what is shown at the nodes: the extinction [1/length], and beside it (``NAME-colour``) the colour of
-degree 0, offset included, which is the mean over all directions; values are those of the photographs that the field was fitted
-to, code values where they were of 8 bits. Where a signed density is cut at 0 after interpolation, a volume of its nodes is cut
-before, so its surfaces lie up to half a voxel elsewhere. Of a nested field there is a pair for each level (``NAME-level-1``, of
-twice the extent); the box of the level before is not of its own, and holds only what its cells at the side need. Meshes are in
-world coordinates (:mod:`mivol.fields.surfaces`).
+A new format is one writer (and a parser, where it can be read) and one line in the table.
+
+Conventions of volumes (``.vol``, ``.nrrd``). A file holds the extinction [1/length] at the nodes; a second file
+(``NAME-colour``) holds the colour of degree 0 with its offset, the mean over all directions. Colours keep the space of the
+field's photographs. The activation is applied at the nodes; a field applies it after interpolation, so surfaces of a ``relu``
+field lie up to half a voxel elsewhere. A nested field gives a pair of files for each level (``NAME-level-1``, of twice the
+extent). Level 1 and above store only the nodes that rays need outside the box of the level before.
+
+Conventions of scenes (``.xml``). The files that a scene names lie beside it and carry its name. An environment holds radiance:
+a sky of sRGB code values is decoded, as ``mivol_sh`` decodes the colours of the field.
 """
 
 from __future__ import annotations
@@ -20,27 +24,167 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.field_archives import load_field, save_field, save_svox2
+from mivol.fields.field_archives import is_own_archive, is_svox2, parse_archive, parse_svox2, write_archive, write_svox2
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import extract_surface
 from mivol.files import write_exr, write_volume, write_whole
 from mivol.files.mesh import write_mesh
+from mivol.files.npy import read_archive
 from mivol.files.source import refusal
 from mivol.photos.photo_file import decode_srgb
+from mivol.points.gaussians import CONSTANT_HARMONIC
 
-__all__ = ["EXPORTS", "Export", "export_field", "write_scene", "field_from_props"]
+__all__ = ["FIELD_FORMATS", "FieldFormat", "WriteOptions", "field_from_props", "read_field", "write_field", "write_scene"]
 
-Y00 = 0.28209479177387814
-"""The harmonic of degree 0, 1 / (2 sqrt(pi))."""
+FOREIGN = {".vdb": "a name for OpenVDB, for which no package can be installed"}
+"""Suffixes of formats that users expect and mivol cannot write."""
 
-CUBE = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
-"""Mitsuba's cube is [-1, 1]^3, the place of a field that of the unit cube."""
+PLUGIN_SETTINGS = ("activation", "offset", "clamp", "space")
+"""Parameters of the plugin that interpret stored values; files keep them too."""
 
+
+@dataclass(frozen=True)
+class WriteOptions:
+    """Options of :func:`write_field` that single formats use.
+
+    Attributes:
+        level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surfaces.default_level`.
+        sky: background that a scene shows; other formats leave it out.
+        half: whether ``.npz`` stores half floats.
+    """
+
+    level: float | None = None
+    sky: Sky | None = None
+    half: bool = True
+
+
+@dataclass(frozen=True)
+class FieldFormat:
+    """A file format of radiance fields.
+
+    Attributes:
+        name: name in messages.
+        write: writer; takes path, field and options, and returns the files written.
+        recognizes: test of an archive's arrays; None for formats that cannot be read.
+        parse: reader of such an archive; takes the file name and the arrays.
+    """
+
+    name: str
+    write: Callable[[Path, SphericalGrid, WriteOptions], list[Path]]
+    recognizes: Callable[[dict[str, np.ndarray]], bool] | None = None
+    parse: Callable[[str, dict[str, np.ndarray]], SphericalGrid] | None = None
+
+
+def read_field(path: str | os.PathLike) -> SphericalGrid:
+    """Read a radiance field: an ``.npz`` of mivol, or a checkpoint of svox2.
+
+    Raises:
+        MivolError: a missing file, another format, or contents that contradict each other.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MivolError(f"found no file {path}; give a radiance field (.npz).")
+    arrays = read_archive(path)
+    readable = [kind for kind in FIELD_FORMATS.values() if kind.recognizes is not None]
+    for kind in readable:
+        if kind.recognizes(arrays):
+            return kind.parse(path.name, arrays)
+    known = " or a ".join(kind.name for kind in readable)
+    raise MivolError(f"{path.name} holds {', '.join(arrays) or 'nothing'}; a {known} is expected.")
+
+
+def write_field(
+    path: str | os.PathLike,
+    field: SphericalGrid,
+    level: float | None = None,
+    sky: Sky | None = None,
+    half: bool = True,
+) -> list[Path]:
+    """Write a radiance field in the format of the suffix (:data:`FIELD_FORMATS`), whole or not at all.
+
+    Args:
+        path: destination.
+        field: radiance field, nested or not.
+        level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surfaces.default_level`.
+        sky: background of the field, in the space of its colours. Only a scene (``.xml``) holds it.
+        half: store half floats in ``.npz`` (11 bits). Arrays with a value above 65504, or with all values below 2^-12, stay
+            float32.
+
+    Returns:
+        Paths of the files written.
+
+    Raises:
+        MivolError: an unknown suffix, a level for a format without surfaces, a field that the format cannot hold, or a full
+            disk.
+    """
+    path = Path(path)
+    suffix = next((s for s in sorted(FIELD_FORMATS, key=len, reverse=True) if path.name.lower().endswith(s)), None)
+    if suffix is None:
+        known = ", ".join(f"{s} ({kind.name})" for s, kind in FIELD_FORMATS.items())
+        found = FOREIGN.get(path.suffix.lower(), f"the suffix {path.suffix!r}")
+        raise refusal(path, found, f"one of {known}", "choose one of those")
+    kind = FIELD_FORMATS[suffix]
+    if level is not None and kind.write is not _write_mesh:
+        raise refusal(path, f"a level for a {kind.name}", "none", "levels are for meshes: write .ply or .obj")
+    return kind.write(path, field, WriteOptions(level, sky, half))
+
+
+def _write_npz(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
+    write_archive(path, field, options.half)
+    return [path]
+
+
+def _write_svox2(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
+    write_svox2(path, field)
+    return [path]
+
+
+def _write_volumes(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
+    if field.levels == 1:
+        return _write_volume_pair(path, field)
+    names = (path.with_name(f"{path.stem}{f'-level-{k}' if k else ''}{path.suffix}") for k in range(field.levels))
+    return [file for k, name in enumerate(names) for file in _write_volume_pair(name, field.extract_level(k))]
+
+
+def _write_volume_pair(path: Path, field: SphericalGrid) -> list[Path]:
+    density, sh = field.to_dense()
+    sigma, _ = field.activation_function.value_and_slope(mi.Float(density.reshape(-1)))
+    colour = np.maximum(field.offset + float(CONSTANT_HARMONIC) * sh[..., 0, :], 0 if field.clamp else -np.inf)
+    colour_path = path.with_name(f"{path.stem}-colour{path.suffix}")
+    write_volume(path, np.array(sigma).reshape(field.res), field.to_world)
+    write_volume(colour_path, colour, field.to_world)
+    return [path, colour_path]
+
+
+def _write_mesh(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
+    write_mesh(path, extract_surface(field, options.level))
+    return [path]
+
+
+def _write_scene(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
+    return write_scene(path, field, options.sky)
+
+
+FIELD_FORMATS: dict[str, FieldFormat] = {
+    ".npz": FieldFormat("field of mivol", _write_npz, is_own_archive, parse_archive),
+    ".svox2.npz": FieldFormat("checkpoint of svox2", _write_svox2, is_svox2, parse_svox2),
+    ".vol": FieldFormat("pair of Mitsuba grids", _write_volumes),
+    ".nrrd": FieldFormat("pair of NRRD volumes", _write_volumes),
+    ".ply": FieldFormat("mesh with colours", _write_mesh),
+    ".obj": FieldFormat("mesh with colours", _write_mesh),
+    ".xml": FieldFormat("scene of Mitsuba", _write_scene),
+}
+"""Suffix -> format. The longest suffix that fits a name counts."""
+
+
+# -- Scenes of Mitsuba -------------------------------------------------------------------------------------------------
+
+CUBE_TO_UNIT = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
+"""Map of Mitsuba's cube [-1, 1]^3 to the unit cube of a field."""
 
 EYE = 0.5, -0.7, 0.8
-"""Where the camera stands, as a place in the unit cube of the innermost box: before it, a little above its middle."""
-
+"""Position of the camera in the unit cube of the innermost box: before the box, a little above its middle."""
 
 SCENE = """<scene version="3.0.0">
     <!-- The field that mivol wrote to {field}. Put surfaces and lights into it, and move the camera. -->
@@ -74,179 +218,78 @@ SCENE = """<scene version="3.0.0">
 {sky}</scene>
 """
 
-
 ENVIRONMENT = """    <emitter type="envmap">
         <string name="filename" value="{name}"/>
     </emitter>
 """
 
 
-FOREIGN = {".vdb": "a name for OpenVDB, for which no package can be installed"}
-"""Formats that people ask for and that cannot be written."""
-
-
-@dataclass(frozen=True)
-class Export:
-    """A kind of file: its name for people, and its writer (path, what to write), which returns the files that it wrote."""
-
-    name: str
-    write: Callable[[Path, _Wish], list[Path]]
-
-
-@dataclass(frozen=True)
-class _Wish:
-    """What is to be written, as :func:`export_field` was asked."""
-
-    field: SphericalGrid
-    level: float | None
-    sky: Sky | None
-
-
-def export_field(
-    path: str | os.PathLike, field: SphericalGrid, level: float | None = None, sky: Sky | None = None
-) -> list[Path]:
-    """Write a field in the format of the suffix (:data:`EXPORTS`), whole or not at all.
-
-    Args:
-        path: destination.
-        field: what to write.
-        level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surfaces.default_level`.
-        sky: what is behind the field, which a scene shows too; the other formats have no place for it.
-
-    Returns:
-        The files that were written.
-
-    Raises:
-        MivolError: a suffix that is not known, a level for what is no mesh, a field that the format cannot hold, disk full.
-    """
-    path = Path(path)
-    suffix = next((s for s in sorted(EXPORTS, key=len, reverse=True) if path.name.lower().endswith(s)), None)
-    if suffix is None:
-        known = ", ".join(f"{s} ({kind.name})" for s, kind in EXPORTS.items())
-        found = FOREIGN.get(path.suffix.lower(), f"the suffix {path.suffix!r}")
-        raise refusal(path, found, f"one of {known}", "choose one of those")
-    if level is not None and EXPORTS[suffix].write is not _mesh:
-        raise refusal(path, f"a level for a {EXPORTS[suffix].name}", "none", "levels are for meshes: write .ply or .obj")
-    return EXPORTS[suffix].write(path, _Wish(field, level, sky))
-
-
-def _field(path: Path, wish: _Wish) -> list[Path]:
-    save_field(path, wish.field)
-    return [path]
-
-
-def _svox2(path: Path, wish: _Wish) -> list[Path]:
-    save_svox2(path, wish.field)
-    return [path]
-
-
-def _write_scene_files(path: Path, wish: _Wish) -> list[Path]:
-    return write_scene(path, wish.field, wish.sky)
-
-
-def _volumes(path: Path, wish: _Wish) -> list[Path]:
-    if wish.field.levels == 1:
-        return _pair(path, wish.field)
-    names = (path.with_name(f"{path.stem}{f'-level-{k}' if k else ''}{path.suffix}") for k in range(wish.field.levels))
-    return [file for k, name in enumerate(names) for file in _pair(name, wish.field.extract_level(k))]
-
-
-def _pair(path: Path, field: SphericalGrid) -> list[Path]:
-    """Extinction and colour of one grid."""
-    density, sh = field.to_dense()
-    sigma, _ = field.activation_function.value_and_slope(mi.Float(density.reshape(-1)))
-    colour = np.maximum(field.offset + Y00 * sh[..., 0, :], 0 if field.clamp else -np.inf)
-    beside = path.with_name(f"{path.stem}-colour{path.suffix}")
-    write_volume(path, np.array(sigma).reshape(field.res), field.to_world)
-    write_volume(beside, colour, field.to_world)
-    return [path, beside]
-
-
-def _mesh(path: Path, wish: _Wish) -> list[Path]:
-    write_mesh(path, extract_surface(wish.field, wish.level))
-    return [path]
-
-
-#: suffix -> format; a longer suffix is tried first.
-EXPORTS: dict[str, Export] = {
-    ".npz": Export("field of mivol", _field),
-    ".svox2.npz": Export("checkpoint of svox2", _svox2),
-    ".vol": Export("pair of Mitsuba grids", _volumes),
-    ".nrrd": Export("pair of NRRD volumes", _volumes),
-    ".ply": Export("mesh with colours", _mesh),
-    ".obj": Export("mesh with colours", _mesh),
-    ".xml": Export("scene of Mitsuba", _write_scene_files),
-}
-
-
 def write_scene(path: Path, field: SphericalGrid, sky: Sky | None = None) -> list[Path]:
-    """Write a scene, the field's own file, and an environment where there is a sky.
+    """Write a scene of Mitsuba with the field in a cube, a camera, and an environment map of the sky.
 
     Args:
         path: ends in .xml.
-        field: what fills the cube, with all its levels.
-        sky: what is behind it, in the space of the field's colours; None for black.
+        field: content of the cube, with all its levels.
+        sky: background, in the space of the field's colours; None for black.
 
     Returns:
-        The files that were written, the scene first.
+        Paths of the files written, the scene first.
 
     Raises:
-        MivolError: disk full, or a folder that is not there.
+        MivolError: a full disk, or a missing folder.
     """
-    own, behind = path.with_name(f"{path.stem}-field.npz"), path.with_name(f"{path.stem}-sky.exr")
-    save_field(own, field)
-    written = [path, own]
+    field_path, sky_path = path.with_name(f"{path.stem}-field.npz"), path.with_name(f"{path.stem}-sky.exr")
+    write_archive(field_path, field)
+    written = [path, field_path]
     if sky is not None:
         colours = np.maximum(sky.image(), 0)
-        write_exr(behind, {"": colours if field.space == "linear" else decode_srgb(colours)})
-        written.append(behind)
+        write_exr(sky_path, {"": colours if field.space == "linear" else decode_srgb(colours)})
+        written.append(sky_path)
     place = field.to_world
     numbers = {
         "eye": place[:3, :3] @ EYE + place[:3, 3],
         "middle": field.middle,
         "up": place[:3, 2],
-        "place": field.level_to_world(field.levels - 1) @ CUBE,
+        "place": field.level_to_world(field.levels - 1) @ CUBE_TO_UNIT,
     }
     texts = {name: " ".join(f"{value:.9g}" for value in np.ravel(values)) for name, values in numbers.items()}
     commas = {name: text.replace(" ", ", ") for name, text in texts.items() if name != "place"}
-    environment = "" if sky is None else ENVIRONMENT.format(name=behind.name)
-    text = SCENE.format(field=own.name, sky=environment, place=texts["place"], **commas)
+    environment = "" if sky is None else ENVIRONMENT.format(name=sky_path.name)
+    text = SCENE.format(field=field_path.name, sky=environment, place=texts["place"], **commas)
     write_whole(path, lambda file: file.write(text.encode()))
     return written
 
 
-SHOWN = ("activation", "offset", "clamp", "space")
-"""How values are shown: parameters of the plugin, kept in files. Tensors are radiance unless told otherwise."""
+# -- Parameters of a scene ---------------------------------------------------------------------------------------------
 
 
 def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, mi.TensorXf]:
-    """Read a field from plugin parameters: ``filename``, or ``density`` and ``sh``; ``to_world`` and how values are shown.
+    """Make a field from plugin parameters: ``filename``, or ``density`` and ``sh``; ``to_world`` and :data:`PLUGIN_SETTINGS`.
+
+    Tensors hold linear radiance unless ``space`` says otherwise.
 
     Returns:
-        The field and its two tensors; those that were given, where they were, with their gradients.
+        The field, its densities and its harmonics (:meth:`SphericalGrid.with_tensors` has the shapes). Given tensors keep
+        their gradients.
 
     Raises:
-        MivolError: none or both of the sources, or values that no field can have.
+        MivolError: both sources or none, or values that no field can have.
     """
     tensors = [n for n in ("density", "sh") if n in props]
     if ("filename" in props) == bool(tensors) or len(tensors) == 1:
         found = " and ".join([*(["filename"] if "filename" in props else []), *tensors]) or "none of them"
         raise MivolError(f"mivol_sh was given {found}; give filename, or density and sh.")
+    to_world = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
     if tensors:
         density, sh = (props[n] for n in tensors)
-        how = {"space": "linear"} | {n: props[n] for n in SHOWN if n in props}
-        field = SphericalGrid.from_dense(np.array(dr.detach(density)), np.array(dr.detach(sh)), _place(props), **how)
+        settings = {"space": "linear"} | {n: props[n] for n in PLUGIN_SETTINGS if n in props}
+        field = SphericalGrid.from_dense(np.array(dr.detach(density)), np.array(dr.detach(sh)), to_world, **settings)
         return field, density, sh
-    field = load_field(str(mi.file_resolver().resolve(props["filename"])))
-    how = {n: props.get(n, getattr(field, n)) for n in SHOWN}
-    field = SphericalGrid.from_rows(field.res, field.to_world, *field.values(), field.nodes, levels=field.levels, **how)
+    field = read_field(str(mi.file_resolver().resolve(props["filename"])))
+    field = field.with_rows(*field.values(), field.nodes, **{n: props.get(n, getattr(field, n)) for n in PLUGIN_SETTINGS})
     if "to_world" in props:
-        field = replace(field, to_world=_place(props) @ field.to_world)
+        field = replace(field, to_world=to_world @ field.to_world)
     values, coefficients = field.values()
     shape = field.shape if field.nodes is None else values.shape
     sh = np.ascontiguousarray(coefficients.reshape(*shape, *coefficients.shape[1:]))
     return field, mi.TensorXf(values.reshape(*shape, 1)), mi.TensorXf(sh)
-
-
-def _place(props: mi.Properties) -> np.ndarray:
-    return np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)

@@ -1,31 +1,30 @@
-r"""A radiance field on a grid: density, and colour in spherical harmonics of the direction in which light is seen.
+r"""A radiance field on a grid: density, and colour in spherical harmonics of the viewing direction.
 
 .. math:: c(x, \omega) = \max\Big(0,\; o + \sum_b Y_b(\omega)\, k_b(x)\Big), \qquad \sigma(x) = a\big(\rho(x)\big)
 
-with k and rho trilinear between nodes, o the offset (0.5) and a the activation.
+The coefficients k and the density rho are trilinear between nodes; o is the offset (0.5), a the activation.
 
-Conventions. Nodes are voxel centres, borders are clamped, and outside the box is vacuum, as for every grid. Directions are
-those in which a camera ray travels (not those of the light), in the grid's own frame: the rotation (and mirror image) in
-``to_world`` is taken off, scale and shear are not felt, so a rotated field looks as the field did. The basis is real, in the
-order and with the signs of ``dr.sh_eval`` (those of PlenOctrees, Plenoxels and 3D Gaussian splatting).
+Conventions. Nodes are voxel centres. Values are constant in the outer half voxel, and outside the box is vacuum. Directions
+are those of camera rays, not of the light. They are taken in the grid's own frame: the rotation (and mirror image) of
+``to_world`` is removed, scale and shear have no effect, so a rotated field keeps its look. The basis is real, in the order and
+with the signs of ``dr.sh_eval``, as in PlenOctrees, Plenoxels and 3D Gaussian splatting.
 
-Levels. A field may be nested: each level is a grid of the same nodes in a box of twice the extent about the same middle m, and
-holds what lies in its box and not in that of the level before. Level l is level 0 seen from 2^l times as far: the box, the walk
-through it and the size of its numbers are those of level 0,
+Levels. The boxes of a nested field share the middle m and the number of nodes, and each has twice the extent of the one before.
+A level holds the matter of its box outside the box of the level before. Level l is level 0 seen from 2^l times as far,
 
 .. math:: \sigma(x) = 2^{-l} a\big(\rho(y)\big), \qquad y = m + 2^{-l} (x - m),
 
-so that a rate or a prior that suits one level suits all. Nodes are counted level by level.
+so the box, the walk and the size of stored numbers are the same for all levels, and a learning rate or a prior that suits one
+level suits all. Nodes are numbered level by level.
 
-Colours are what photographs show: code values of sRGB (``space`` is ``srgb``), which rays composite as they are. A field of
-``linear`` radiance is its own light; :func:`decode_srgb_code` makes light of codes, where a scene shows a field among others.
+Colours. With ``space`` "srgb" colours are sRGB code values, and rays composite the code values, as photographs show them. With
+"linear" colours are radiance. A scene with other objects decodes the codes (:func:`mivol.fields.harmonics.decode_srgb_code`).
 
-Storage. Rows, one a node: ``density`` apart from ``harmonics``, whose rows are [basis][rgb], filled up to a multiple of 4. A
-dense grid has a row for each node in Z Y X order; a sparse one lists its ``nodes`` in that order and ends in one more row, the
-vacuum around them.
+Storage. Rows, one a node: ``density``, and apart from it ``harmonics``, whose rows are [basis][rgb], padded to a multiple of 4
+numbers. A dense grid has a row for each node in Z Y X order. A sparse grid lists its ``nodes`` in this order and ends in one
+more row for the vacuum around them.
 
-References: Sloan 2008, 2013 (harmonics); Yu et al. 2021, Fridovich-Keil, Yu et al. 2022 (the model); Higham 1986 (the polar
-factor).
+References: Sloan 2008, 2013 (harmonics); Yu et al. 2021, Fridovich-Keil, Yu et al. 2022 (the model).
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -55,41 +55,47 @@ from mivol.files.notebook import slices_html
 from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["SphericalGrid", "is_covered_by_inner", "with_tensors", "dense_densities"]
-
+__all__ = ["SphericalGrid", "is_covered_by_inner"]
 
 HOMOGENEOUS = ("none", "relu")
-"""Activations of nested fields: a density n times as large is an extinction n times as large."""
+"""Activations of nested fields: an n times larger density gives an n times larger extinction."""
+
+SETTINGS = ("activation", "offset", "clamp", "levels", "space")
 
 
 def is_covered_by_inner(node: mi.UInt32, res: tuple[int, int, int]) -> mi.Bool:
-    """Whether nodes of nested grids of ``res`` are of no use: all cells about them lie in the box of the level before."""
+    """Whether rays need no value at nodes of nested grids, since all cells about a node lie in the box of the level before.
+
+    Args:
+        node: numbers of the nodes, of all levels.
+        res: nodes (Z, Y, X) of each level.
+    """
     z, y, x = res
-    inside = node >= math.prod(res)
-    for place, n in ((node % x, x), (node // x % y, y), (node // (x * y) % z, z)):
-        # The next node on either side is at most n / 4 from the middle (n - 1) / 2, where the inner box ends.
-        inside &= 2 * dr.abs(2 * mi.Int32(place) - (n - 1)) <= n - 4
-    return inside
+    covered = node >= math.prod(res)
+    for index, n in ((node % x, x), (node // x % y, y), (node // (x * y) % z, z)):
+        # The inner box ends n / 4 from the middle (n - 1) / 2; the neighbours on both sides must lie in it.
+        covered &= 2 * dr.abs(2 * mi.Int32(index) - (n - 1)) <= n - 4
+    return covered
 
 
 @briefly
 @dataclass
 class SphericalGrid:
-    """A field of density and directional colour.
+    """A grid of density and directional colour.
 
     Attributes:
         res: nodes (Z, Y, X).
         to_world: (4, 4) float64, unit cube to world.
-        degree: of the harmonics, 0 to 4.
-        density: Float, raw, one a row.
+        degree: degree of the harmonics, 0 to 4.
+        density: Float, one raw density a row.
         harmonics: Float, ``row_width`` numbers a row.
-        nodes: UInt32, ascending flat numbers of the nodes that have a row; None where all have.
+        nodes: UInt32, ascending numbers of the stored nodes; None for a dense grid.
         activation: name in ``ACTIVATIONS``.
-        offset: added to the sum of the harmonics.
-        clamp: whether colours below 0 are shown as 0.
-        levels: boxes that are nested, each of twice the extent; ``res`` and ``to_world`` are those of the innermost.
-        space: what colours are: "srgb" (code values, as in photographs) or "linear" (radiance).
-        index: made by :meth:`sparse_index` at its first call.
+        offset: constant added to the sum of the harmonics.
+        clamp: whether colours below 0 count as 0.
+        levels: number of nested boxes, each of twice the extent; ``res`` and ``to_world`` belong to the innermost box.
+        space: meaning of colours: "srgb" (code values, as in photographs) or "linear" (radiance).
+        index: rows of the nodes, made by :meth:`sparse_index` at its first call.
     """
 
     res: tuple[int, int, int]
@@ -104,10 +110,6 @@ class SphericalGrid:
     levels: int = 1
     space: str = "srgb"
     index: SparseIndex | None = None
-
-    def _repr_html_(self) -> str:
-        """Three middle slices of the density, for notebooks."""
-        return slices_html(np.array(self.to_dense()[0]), repr(self))
 
     def __post_init__(self) -> None:
         self.to_world = check_affine(self.to_world)
@@ -124,6 +126,10 @@ class SphericalGrid:
                 f"{expected} rows of 1 and {self.width} are expected."
             )
 
+    def _repr_html_(self) -> str:
+        """Three middle slices of the density, for notebooks."""
+        return slices_html(np.array(self.to_dense()[0]), repr(self))
+
     @property
     def basis(self) -> int:
         """Number of harmonics."""
@@ -131,12 +137,12 @@ class SphericalGrid:
 
     @property
     def width(self) -> int:
-        """Numbers of a row of harmonics."""
+        """Size of a row of harmonics."""
         return row_width(self.basis)
 
     @property
     def rows(self) -> int:
-        """Number of rows, that of the vacuum included."""
+        """Number of rows; a sparse grid counts the row of its vacuum."""
         return self.node_count if self.nodes is None else dr.width(self.nodes) + 1
 
     @property
@@ -146,18 +152,20 @@ class SphericalGrid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of values at all nodes: (Z, Y, X), or (levels, Z, Y, X) where the field is nested."""
+        """Shape of values at all nodes: (Z, Y, X), or (levels, Z, Y, X) for a nested field."""
         return self.res if self.levels == 1 else (self.levels, *self.res)
 
     @property
     def bytes(self) -> int:
-        """Memory that its values take."""
+        """Size of the values and of the list of nodes [bytes]."""
         return 4 * (self.rows * (1 + self.width) + (0 if self.nodes is None else self.rows - 1))
 
     @property
     def activation_function(self) -> Activation:
-        """The activation itself."""
+        """The activation."""
         return select_activation(self.activation)
+
+    # -- From arrays and back ------------------------------------------------------------------------------------------
 
     @classmethod
     def from_dense(
@@ -171,27 +179,27 @@ class SphericalGrid:
         clamp: bool = True,
         space: str = "srgb",
     ) -> SphericalGrid:
-        """Make a field of arrays.
+        """Make a field of one level from arrays.
 
         Args:
             density: (Z, Y, X) or (Z, Y, X, 1), raw.
             sh: (Z, Y, X, basis, 3).
             to_world: (4, 4) affine map of the unit cube.
-            keep: (Z, Y, X) bool, the nodes to store; None for a dense field.
-            activation, offset, clamp, space: as the attributes.
+            keep: (Z, Y, X) bool, nodes to store; None for a dense grid.
+            activation, offset, clamp, space: see the attributes.
 
         Raises:
-            MivolError: shapes that do not agree, a value that is not finite, or a negative one without an activation.
+            MivolError: shapes that disagree, a value that is not finite, or a negative density without an activation.
         """
         density, sh = np.asarray(density, np.float32), np.asarray(sh, np.float32)
         density = density[..., 0] if density.ndim == 4 and density.shape[3] == 1 else density
         if density.ndim != 3 or sh.ndim != 5 or sh.shape[:3] != density.shape or sh.shape[4] != 3 or density.size == 0:
             found = f"densities {density.shape} and harmonics {sh.shape}"
             raise MivolError(f"{found} were given; (Z, Y, X) and (Z, Y, X, basis, 3) are expected.")
-        picked = slice(None) if keep is None else np.flatnonzero(keep)
-        nodes = None if keep is None else mi.UInt32(picked.astype(np.uint32))
-        flat = density.reshape(-1)[picked], sh.reshape(-1, *sh.shape[3:])[picked]
-        return cls.from_rows(density.shape, to_world, *flat, nodes, activation, offset, clamp, space=space)
+        stored = slice(None) if keep is None else np.flatnonzero(keep)
+        nodes = None if keep is None else mi.UInt32(stored.astype(np.uint32))
+        rows = density.reshape(-1)[stored], sh.reshape(-1, *sh.shape[3:])[stored]
+        return cls.from_rows(density.shape, to_world, *rows, nodes, activation, offset, clamp, space=space)
 
     @classmethod
     def from_rows(
@@ -207,50 +215,58 @@ class SphericalGrid:
         levels: int = 1,
         space: str = "srgb",
     ) -> SphericalGrid:
-        """Make a field of the values (n,) and (n, basis, 3) at its nodes; a sparse one gets its row of vacuum.
+        """Make a field from the values (n,) and (n, basis, 3) at its stored nodes; a sparse field gets its row of vacuum.
 
         Raises:
             MivolError: as :meth:`from_dense`.
         """
-        degree, act = harmonic_degree(sh.shape[1]), select_activation(activation)
+        degree, function = harmonic_degree(sh.shape[1]), select_activation(activation)
         bad = ~np.isfinite(density) | ~np.isfinite(sh).all(axis=(1, 2))
         if bad.any():
             raise MivolError(f"the values at node {np.flatnonzero(bad)[0]} of the field are not finite; give finite numbers.")
-        if not act.signed and (density < 0).any():
+        if not function.signed and (density < 0).any():
             raise MivolError(f"a density of {density.min()} was given; without an activation none may be negative: use relu.")
         width, vacuum = row_width(sh.shape[1]), nodes is not None
         rows = np.zeros((len(density) + vacuum, width), np.float32)
         rows[: len(density), : 3 * sh.shape[1]] = sh.reshape(len(density), -1)
-        flat = np.append(density, np.float32(act.vacuum)) if vacuum else density
-        # Dr.Jit reads NumPy's memory in place, and rows as packets only where it is aligned.
+        flat = np.append(density, np.float32(function.vacuum)) if vacuum else density
+        # Dr.Jit reads NumPy's memory in place, and gathers rows as packets only from aligned memory.
         packed = mi.Float(aligned(np.ascontiguousarray(flat))), mi.Float(aligned(rows.reshape(-1)))
         return cls(tuple(res), to_world, degree, *packed, nodes, activation, offset, clamp, levels, space)
 
     @classmethod
     def from_levels(cls, grids: Sequence[SphericalGrid]) -> SphericalGrid:
-        """One field of grids of one level, the innermost first, each of twice the extent of the one before.
+        """Make a nested field from grids of one level, the innermost first, each of twice the extent of the one before.
 
         Raises:
             MivolError: grids that differ in more than their place and values, or do not nest.
         """
-        first, stored, values = grids[0], [], []
+        first, nodes, values = grids[0], [], []
         for level, grid in enumerate(grids):
-            same = ("res", "degree", "activation", "offset", "clamp", "space")
-            if grid.levels != 1 or any(getattr(grid, name) != getattr(first, name) for name in same):
+            shared = ("res", "degree", "activation", "offset", "clamp", "space")
+            if grid.levels != 1 or any(getattr(grid, name) != getattr(first, name) for name in shared):
                 raise MivolError(f"grid {level} of a nested field is of another kind than the first: give grids of one kind.")
             if not np.allclose(grid.to_world, first.level_to_world(level), rtol=0, atol=1e-9 * np.abs(grid.to_world).max()):
                 found = f"grid {level} of a nested field is not 2^{level} times the first one about its middle"
                 raise MivolError(f"{found}: place it so.")
             density, sh = grid.values()
             values.append((np.float32(density * 2.0**level), sh))
-            stored.append(grid.stored_nodes() + level * math.prod(first.res))
-        nodes = mi.UInt32(np.concatenate(stored).astype(np.uint32))
+            nodes.append(grid.stored_nodes() + level * math.prod(first.res))
         rows = [np.concatenate(part) for part in zip(*values, strict=True)]
-        how = first.activation, first.offset, first.clamp
-        return cls.from_rows(first.res, first.to_world, *rows, nodes, *how, len(grids), first.space)
+        return first.with_rows(*rows, mi.UInt32(np.concatenate(nodes).astype(np.uint32)), levels=len(grids))
+
+    def with_rows(self, density: np.ndarray, sh: np.ndarray, nodes: mi.UInt32 | None, **changes: Any) -> SphericalGrid:
+        """Make a field in the same box with other rows.
+
+        Args:
+            density, sh, nodes: as :meth:`from_rows`.
+            changes: other values of ``to_world``, ``activation``, ``offset``, ``clamp``, ``levels`` and ``space``.
+        """
+        settings = {name: getattr(self, name) for name in ("to_world", *SETTINGS)} | changes
+        return self.from_rows(self.res, density=density, sh=sh, nodes=nodes, **settings)
 
     def extract_level(self, number: int) -> SphericalGrid:
-        """A level as a field of its own, in the whole of its box; what the level before covers is not cut out.
+        """A level as a field of one level that fills its whole box; the box of the level before is not cut out.
 
         Raises:
             MivolError: no such level.
@@ -262,66 +278,108 @@ class SphericalGrid:
         density, sh = self.values()
         nodes = None if self.nodes is None else mi.UInt32((stored[own] % count).astype(np.uint32))
         scaled = np.float32(density[own] / 2.0**number)
-        how = self.activation, self.offset, self.clamp
-        return self.from_rows(self.res, self.level_to_world(number), scaled, sh[own], nodes, *how, space=self.space)
+        return self.with_rows(scaled, sh[own], nodes, to_world=self.level_to_world(number), levels=1)
 
     def values(self) -> tuple[np.ndarray, np.ndarray]:
-        """Raw densities (n,) and harmonics (n, basis, 3) at the nodes that have a row."""
+        """Raw densities (n,) and harmonics (n, basis, 3) at the stored nodes."""
         n = self.rows - (self.nodes is not None)
         rows = np.array(dr.detach(self.harmonics)).reshape(self.rows, self.width)
         return np.array(dr.detach(self.density))[:n], rows[:n, : 3 * self.basis].reshape(n, self.basis, 3)
 
     def to_dense(self) -> tuple[np.ndarray, np.ndarray]:
-        """Raw densities (Z, Y, X) and harmonics (Z, Y, X, basis, 3), with the vacuum where nothing is stored.
+        """Raw densities (Z, Y, X) and harmonics (Z, Y, X, basis, 3); nodes that are not stored hold the vacuum.
 
         Raises:
-            MivolError: a nested field: its levels are grids, and it is none (:meth:`level`).
+            MivolError: a nested field; :meth:`extract_level` gives one grid of it.
         """
         if self.levels > 1:
             raise MivolError(f"a field of {self.levels} nested levels is no one grid: take one of its levels.")
         density, sh = self.values()
         if self.nodes is not None:
-            where = np.array(self.nodes)
-            packed = density, sh
+            nodes, stored = np.array(self.nodes), (density, sh)
             density = np.full(math.prod(self.res), self.activation_function.vacuum, np.float32)
             sh = np.zeros((math.prod(self.res), self.basis, 3), np.float32)
-            density[where], sh[where] = packed
+            density[nodes], sh[nodes] = stored
         return density.reshape(self.res), sh.reshape(*self.res, self.basis, 3)
 
     def select_nodes(self, keep: np.ndarray) -> SphericalGrid:
-        """The nodes for which ``keep`` (Z, Y, X), or (levels, Z, Y, X), holds, of those that are stored."""
+        """A sparse field of the stored nodes for which ``keep`` (Z, Y, X), or (levels, Z, Y, X), holds."""
         stored = self.stored_nodes()
-        picked = np.flatnonzero(np.asarray(keep, bool).reshape(-1)[stored])
+        kept = np.flatnonzero(np.asarray(keep, bool).reshape(-1)[stored])
         density, sh = self.values()
-        nodes = mi.UInt32(stored[picked].astype(np.uint32))
-        how = self.activation, self.offset, self.clamp, self.levels, self.space
-        return self.from_rows(self.res, self.to_world, density[picked], sh[picked], nodes, *how)
+        return self.with_rows(density[kept], sh[kept], mi.UInt32(stored[kept].astype(np.uint32)))
 
     def with_degree(self, degree: int) -> SphericalGrid:
-        """The same field with harmonics up to another degree: new ones are 0, dropped ones are lost."""
+        """The field with harmonics up to another degree: new coefficients are 0, higher ones are dropped."""
         if degree == self.degree:
             return self
         density, sh = self.values()
         rows = np.zeros((len(sh), basis_size(degree), 3), np.float32)
         shared = min(sh.shape[1], rows.shape[1])
         rows[:, :shared] = sh[:, :shared]
-        how = self.activation, self.offset, self.clamp, self.levels, self.space
-        return self.from_rows(self.res, self.to_world, density, rows, self.nodes, *how)
+        return self.with_rows(density, rows, self.nodes)
 
     def scale_colours(self, factor: float) -> SphericalGrid:
-        """The same field, its colours so many times as bright."""
+        """The field with all colours multiplied by a factor."""
         if factor == 1:
             return self
         return replace(self, harmonics=self.harmonics * factor, offset=self.offset * factor)
 
+    def with_values(self, density: mi.Float, harmonics: mi.Float) -> SphericalGrid:
+        """The field with other rows at the same nodes."""
+        return replace(self, density=density, harmonics=harmonics)
+
+    def with_tensors(self, density: mi.TensorXf, sh: mi.TensorXf) -> SphericalGrid:
+        """The field with the values of two tensors, as a scene's parameters hold them; derivatives pass through.
+
+        Args:
+            density: (Z, Y, X, 1), with the levels first for a nested field; (nodes, 1) for a sparse field.
+            sh: (Z, Y, X, basis, 3), with the levels first for a nested field; (nodes, basis, 3) for a sparse field. Its degree
+                may differ from the field's.
+
+        Raises:
+            MivolError: other shapes.
+        """
+        nodes = self.shape if self.nodes is None else (dr.width(self.nodes),)
+        if tuple(density.shape) != (*nodes, 1) or tuple(sh.shape[:-2]) != nodes or sh.shape[-1] != 3:
+            found, expected = (tuple(density.shape), tuple(sh.shape)), ((*nodes, 1), (*nodes, "basis", 3))
+            raise MivolError(f"density {found[0]} and sh {found[1]} were given; {expected[0]} and {expected[1]} are expected.")
+        basis = sh.shape[-2]
+        count, width = math.prod(nodes), row_width(basis)
+        vacuum = self.nodes is not None
+        flat = density.array
+        if vacuum:
+            row = dr.arange(mi.UInt32, count + 1)
+            stored = dr.gather(mi.Float, flat, dr.minimum(row, count - 1))
+            flat = dr.select(row < count, stored, self.activation_function.vacuum)
+        entry = dr.arange(mi.UInt32, (count + vacuum) * width)
+        row, column = entry // width, entry % width
+        is_stored = (row < count) & (column < 3 * basis)
+        harmonics = dr.gather(mi.Float, sh.array, row * (3 * basis) + column, is_stored)
+        return replace(self, degree=harmonic_degree(basis), density=flat, harmonics=harmonics)
+
+    def dense_densities(self) -> list[mi.TensorXf]:
+        """Raw densities (Z, Y, X, 1) at every node of each level, with the vacuum at nodes that are not stored.
+
+        Densities are per length of the world: 2^-l times the stored density of level l. Derivatives pass through.
+        """
+        if self.nodes is None and self.levels == 1:
+            return [mi.TensorXf(self.density, (*self.res, 1))]
+        node = dr.arange(mi.UInt32, math.prod(self.res))
+        rows = [self.look_up_rows(node + k * dr.width(node)) for k in range(self.levels)]
+        parts = [dr.gather(mi.Float, self.density, row) * 2.0**-k for k, row in enumerate(rows)]
+        return [mi.TensorXf(part, (*self.res, 1)) for part in parts]
+
+    # -- Rows of nodes -------------------------------------------------------------------------------------------------
+
     def stored_nodes(self) -> np.ndarray:
-        """Flat numbers of the nodes that have a row, int64."""
+        """Numbers of the stored nodes, int64."""
         return np.arange(self.node_count) if self.nodes is None else np.array(self.nodes).astype(np.int64)
 
     def look_up_rows(self, node: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
-        """The row of nodes of all levels, by their flat numbers: the vacuum's where a node is not stored.
+        """Rows of nodes of all levels; nodes that are not stored have the row of the vacuum.
 
-        What it looks up is made when it is first asked (not inside a loop that is being traced).
+        The first call makes the index, so it must not happen inside a traced loop.
         """
         if self.nodes is None:
             return node
@@ -329,52 +387,48 @@ class SphericalGrid:
         return dr.select(stored, row, self.rows - 1)
 
     def sparse_index(self) -> SparseIndex:
-        """Which nodes have a row, of a sparse field: two bits a node of the box; made once."""
+        """The index of the stored nodes of a sparse field: two bits a node of the box; made once."""
         if self.index is None:
             self.index = SparseIndex.from_sorted(self.nodes, self.node_count)
         return self.index
 
-    # -- Where it lies -----------------------------------------------------------------------------------------------------
+    # -- Place and directions ------------------------------------------------------------------------------------------
 
     @property
     def middle(self) -> np.ndarray:
-        """(3,) of all its boxes."""
+        """(3,) middle of all boxes, world."""
         return self.to_world[:3] @ np.array([0.5, 0.5, 0.5, 1])
 
     def level_to_world(self, number: int) -> np.ndarray:
-        """(4, 4) float64, the unit cube to the box of a level."""
+        """(4, 4) float64, unit cube to the box of a level."""
         place = self.to_world.copy()
         place[:3, :3] *= 2.0**number
         place[:3, 3] = self.middle + 2.0**number * (self.to_world[:3, 3] - self.middle)
         return place
 
-    def local_frame(self) -> np.ndarray:
-        """(3, 3) map of world directions to the grid's own frame: the inverse of the polar factor of ``to_world``."""
-        return local_frame(self.to_world)
-
-    def turn(self, d: mi.Vector3f) -> mi.Vector3f:
-        """World directions in the grid's own frame."""
-        return rotate_direction(self.local_frame(), d)
-
     def eval_basis(self, d: mi.Vector3f) -> list[mi.Float]:
-        """The basis for unit directions of travel in the world."""
-        return dr.sh_eval(self.turn(d), self.degree)
+        """Harmonics of unit directions of travel in the world."""
+        return dr.sh_eval(rotate_direction(local_frame(self.to_world), d), self.degree)
 
     def make_view_basis(self, points: np.ndarray) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
-        """The basis for directions from world points (V, 3) to nodes: a function of flat node numbers and of which point."""
+        """A function of node numbers and point numbers that returns the harmonics of the directions from points to nodes.
+
+        Args:
+            points: (V, 3) world.
+        """
         z, y, x = self.res
-        frame, per_level = self.local_frame(), math.prod(self.res)
+        frame, per_level = local_frame(self.to_world), math.prod(self.res)
         linear = frame @ self.to_world[:3, :3] / np.array([x, y, z], np.float64)
-        # The middle of the boxes in the own frame, less the point: a difference in float64.
+        # Middle of the boxes minus the point, in the grid's frame: a difference in float64.
         start = (frame @ (self.middle - np.asarray(points, np.float64)).T).T
         starts = mi.Float(np.append(np.float32(start).reshape(-1), np.float32(0)))
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in linear]
 
         def basis(node: mi.UInt32, view: mi.UInt32) -> list[mi.Float]:
             inner = node % per_level
-            far = mi.Float(mi.UInt32(1) << (node // per_level))
-            places = (inner % x, x), (inner // x % y, y), (inner // (x * y), z)
-            q = [far * (mi.Float(place) + (0.5 - 0.5 * n)) for place, n in places]
+            scale = mi.Float(mi.UInt32(1) << (node // per_level))
+            indices = (inner % x, x), (inner // x % y, y), (inner // (x * y), z)
+            q = [scale * (mi.Float(index) + (0.5 - 0.5 * n)) for index, n in indices]
             from_point = [dr.gather(mi.Float, starts, view * 3 + a) for a in range(3)]
             d = mi.Vector3f(*(_affine(row, q, s) for row, s in zip(rows, from_point, strict=True)))
             length = dr.norm(d)
@@ -382,15 +436,17 @@ class SphericalGrid:
 
         return basis
 
+    # -- Values at points ----------------------------------------------------------------------------------------------
+
     def eval(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> tuple[mi.Float, mi.Color3f]:
         """Extinction and colour at world points, seen along unit world directions; 0 outside the box.
 
-        Cost: 8 rows a point. Rays are followed by :mod:`mivol.transport.line_integrals.radiance_field`, which reads less.
+        Cost: 8 rows a point. :mod:`mivol.transport.line_integrals.radiance_field` follows rays with fewer reads.
         """
         z, y, x = self.res
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in lattice_from_world(self.to_world, self.res)]
         q = [_affine(row, p, row[3]) for row in rows]
-        level, scale = self._level_of(q)
+        level, scale = self._find_level(q)
         middles = [0.5 * (n - 1) for n in (x, y, z)]
         q = [dr.fma(value - middle, scale, middle) for value, middle in zip(q, middles, strict=True)]
         inside = mi.Bool(active)
@@ -408,73 +464,30 @@ class SphericalGrid:
                     row = self.look_up_rows(mi.UInt32(((level * z + k) * y + j) * x + i), inside)
                     w = wx * wy * wz
                     sigma = dr.fma(w, dr.gather(mi.Float, self.density, row, inside), sigma)
-                    held = dr.gather(mi.ArrayXf, self.harmonics, row, inside, shape=(self.width, 1))
+                    coefficients = dr.gather(mi.ArrayXf, self.harmonics, row, inside, shape=(self.width, 1))
                     for a in range(3):
-                        seen = sum((held[3 * b + a] * value for b, value in enumerate(basis)), mi.Float(0))
-                        colour[a] = dr.fma(w, seen, colour[a])
+                        total = sum((coefficients[3 * b + a] * value for b, value in enumerate(basis)), mi.Float(0))
+                        colour[a] = dr.fma(w, total, colour[a])
         if self.clamp:
             colour = [dr.maximum(c, 0) for c in colour]
         extinction, _ = self.activation_function.value_and_slope(sigma)
         return dr.select(inside, extinction * scale, 0), mi.Color3f(*(dr.select(inside, c, 0) for c in colour))
 
-    def _level_of(self, q: list[mi.Float]) -> tuple[mi.Int32, mi.Float]:
-        """The innermost level whose box holds points of the lattice, and 2^-level; the last one outside of all."""
-        level = mi.Int32(0)
-        for number in range(self.levels - 1):
-            out = mi.Bool(False)
-            for value, n in zip(q, self.res[::-1], strict=True):
-                out |= dr.abs(value - 0.5 * (n - 1)) > 0.5 * n * 2**number
-            level += dr.select(out, 1, 0)
-        return level, 1 / mi.Float(mi.Int32(1) << level)
-
     def eval_radiance(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> mi.Color3f:
-        """Radiance at world points, seen along unit world directions, whatever the colours are stored as; 0 outside the box."""
+        """Radiance at world points, seen along unit world directions, in either colour space; 0 outside the box."""
         colour = self.eval(p, d, active)[1]
         return colour if self.space == "linear" else mi.Color3f(*(decode_srgb_code(c) for c in colour))
 
-    def with_values(self, density: mi.Float, harmonics: mi.Float) -> SphericalGrid:
-        """The same nodes with other rows."""
-        return replace(self, density=density, harmonics=harmonics)
+    def _find_level(self, q: list[mi.Float]) -> tuple[mi.Int32, mi.Float]:
+        """Innermost level whose box holds lattice points (the last level outside of all boxes), and 2^-level."""
+        level = mi.Int32(0)
+        for number in range(self.levels - 1):
+            outside = mi.Bool(False)
+            for value, n in zip(q, self.res[::-1], strict=True):
+                outside |= dr.abs(value - 0.5 * (n - 1)) > 0.5 * n * 2**number
+            level += dr.select(outside, 1, 0)
+        return level, 1 / mi.Float(mi.Int32(1) << level)
 
 
 def _affine(row: list[mi.Float], v: mi.Vector3f, rest: mi.Float) -> mi.Float:
     return dr.fma(row[0], v[0], dr.fma(row[1], v[1], dr.fma(row[2], v[2], rest)))
-
-
-def with_tensors(field: SphericalGrid, density: mi.TensorXf, sh: mi.TensorXf) -> SphericalGrid:
-    """The same field with other values; ``sh`` may have another degree.
-
-    Raises:
-        MivolError: shapes that are not those of the field.
-    """
-    nodes = field.shape if field.nodes is None else (dr.width(field.nodes),)
-    if tuple(density.shape) != (*nodes, 1) or tuple(sh.shape[:-2]) != nodes or sh.shape[-1] != 3:
-        raise MivolError(
-            f"density {tuple(density.shape)} and sh {tuple(sh.shape)} were given; {(*nodes, 1)} and {(*nodes, 'basis', 3)} are "
-            "expected."
-        )
-    basis = sh.shape[-2]
-    count, width = math.prod(nodes), row_width(basis)
-    vacuum = field.nodes is not None
-    flat = density.array
-    if vacuum:
-        row = dr.arange(mi.UInt32, count + 1)
-        flat = dr.select(row < count, dr.gather(mi.Float, flat, dr.minimum(row, count - 1)), field.activation_function.vacuum)
-    entry = dr.arange(mi.UInt32, (count + vacuum) * width)
-    row, column = entry // width, entry % width
-    held = (row < count) & (column < 3 * basis)
-    harmonics = dr.gather(mi.Float, sh.array, row * (3 * basis) + column, held)
-    return replace(field, degree=harmonic_degree(basis), density=flat, harmonics=harmonics)
-
-
-def dense_densities(field: SphericalGrid) -> list[mi.TensorXf]:
-    """The raw density at every node of each level, (Z, Y, X, 1), with the vacuum where nothing is stored.
-
-    They are those of each level in lengths of the world: 2^-l of what level l stores.
-    """
-    if field.nodes is None and field.levels == 1:
-        return [mi.TensorXf(field.density, (*field.res, 1))]
-    node = dr.arange(mi.UInt32, math.prod(field.res))
-    rows = [field.look_up_rows(node + k * dr.width(node)) for k in range(field.levels)]
-    parts = [dr.gather(mi.Float, field.density, row) * 2.0**-k for k, row in enumerate(rows)]
-    return [mi.TensorXf(part, (*field.res, 1)) for part in parts]

@@ -10,7 +10,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.field_files import field_from_props
 from mivol.fields.gaussian_field import GaussianField
-from mivol.fields.spherical_grid import SphericalGrid, dense_densities, with_tensors
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.transfer import Transfer
 from mivol.fields.voxels import Voxels
 
@@ -96,8 +96,8 @@ class SphericalVolume(mi.Volume):
         super().__init__(props)
 
     def refresh(self) -> None:
-        self.mivol_field = with_tensors(self.mivol_field, self.density, self.sh)
-        self.dense = dense_densities(self.mivol_field)
+        self.mivol_field = self.mivol_field.with_tensors(self.density, self.sh)
+        self.dense = self.mivol_field.dense_densities()
         self.seen = self.state()
 
     def state(self) -> tuple[int, ...]:

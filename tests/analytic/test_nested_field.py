@@ -10,6 +10,7 @@ from oracle_radiance import NestedTwin, Twin, sh_basis
 from radiance_rays import CUBE, TO_WORLD, derive, followed, make, rays_of, see
 
 from mivol.errors import MivolError
+from mivol.fields.harmonics import local_frame
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
 from mivol.transport.line_integrals.radiance_source import bake, make_exact, vjp_bake
@@ -189,9 +190,9 @@ def test_tables_of_pinholes_hold_what_is_seen_of_all_levels() -> None:
     rows = np.array(cells.rows)
     z, y, x = field.res
     count = z * y * x
-    nodes = field.listed()[rows]
+    nodes = field.stored_nodes()[rows]
     density, sh = field.values()
-    frame = field.local_frame()
+    frame = local_frame(field.to_world)
     for entry in np.random.default_rng(0).integers(len(rows), size=40):
         level, inner = divmod(int(nodes[entry]), count)
         k, j, i = np.unravel_index(inner, field.res)

@@ -51,7 +51,7 @@ def test_levels_are_resampled_apart(variant_rgb: str) -> None:
     for level in range(levels):
         density, found = fine.extract_level(level).to_dense()
         stored = np.zeros((16, 16, 16), bool)
-        stored.reshape(-1)[fine.extract_level(level).listed()] = True
+        stored.reshape(-1)[fine.extract_level(level).stored_nodes()] = True
         expected = (level + 1) * (1 + x + 2 * y + 4 * z)
         assert stored[covered].any() == (level == 0) and stored.sum() == 16**3 - (6**3 if level else 0)
         np.testing.assert_allclose(density[inner][stored[inner]], expected[inner][stored[inner]], rtol=1e-5)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mivol.bench.studies import storage
-from mivol.fields.field_archives import save_field
+from mivol.fields.field_files import write_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells
 
@@ -42,7 +42,7 @@ def test_formulas_are_the_bytes(variant_rgb, tmp_path: Path, degree: int, sparse
     expected = storage.sparse_bytes(kept, degree) if sparse else storage.dense_bytes(kept, degree)
     assert held(made.density, made.harmonics, *nodes) == made.bytes == expected
 
-    save_field(tmp_path / "field.npz", made)
+    write_field(tmp_path / "field.npz", made)
     with zipfile.ZipFile(tmp_path / "field.npz") as archive:
         sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
     # An .npy has a header of 128 bytes.
@@ -92,7 +92,7 @@ def test_what_is_printed(variant_rgb, tmp_path: Path, capsys: pytest.CaptureFixt
     """A table, the run's quality in the row of its kind, and JSON with the bytes of its real file."""
     run = tmp_path / "a_run"
     run.mkdir()
-    save_field(run / "field.npz", field(2, np.ones(RES, bool)))
+    write_field(run / "field.npz", field(2, np.ones(RES, bool)))
     (run / "run.json").write_text(json.dumps({"title": "A fit", "results": {"held_out_psnr": 29.54}}))
     assert storage.main(["--runs", str(run)]) == 0
     lines = capsys.readouterr().out.splitlines()

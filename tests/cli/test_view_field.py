@@ -10,7 +10,7 @@ import pytest
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments.render import camera_at
-from mivol.fields.field_archives import save_field
+from mivol.fields.field_files import write_field
 from mivol.fields.sky import read_sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr
@@ -26,7 +26,7 @@ def field(variant_rgb: str, tmp_path: Path) -> Path:
     sh = np.broadcast_to((np.array([0.9, 0.5, 0.1]) - 0.5) / Y0, (4, 4, 4, 1, 3))
     place = np.diag([2.0, 2, 2, 1])
     place[:3, 3] = -1
-    save_field(tmp_path / "field.npz", SphericalGrid.from_dense(np.full((4, 4, 4), 500.0), sh, place), half=False)
+    write_field(tmp_path / "field.npz", SphericalGrid.from_dense(np.full((4, 4, 4), 500.0), sh, place), half=False)
     return tmp_path / "field.npz"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields.field_archives import load_field, save_field, save_svox2
+from mivol.fields.field_files import read_field, write_field
 from mivol.fields.harmonics import harmonic_degree
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import npy
@@ -27,12 +27,12 @@ def test_what_was_saved_is_read(variant_rgb: str, tmp_path: Path, sparse: bool) 
     density, sh = arrays()
     keep = density > 0 if sparse else None
     field = SphericalGrid.from_dense(density, sh, CUBE, keep, "softplus" if sparse else "relu", 0.25, not sparse)
-    save_field(tmp_path / "f.npz", field)
-    back = load_field(tmp_path / "f.npz")
+    write_field(tmp_path / "f.npz", field)
+    back = read_field(tmp_path / "f.npz")
     assert (back.res, back.degree, back.activation, back.offset, back.clamp) == (
         field.res, 2, field.activation, 0.25, not sparse,
     )  # fmt: skip
-    assert np.array_equal(back.to_world, CUBE) and np.array_equal(back.listed(), field.listed())
+    assert np.array_equal(back.to_world, CUBE) and np.array_equal(back.stored_nodes(), field.stored_nodes())
     for a, b in zip(back.values(), field.values(), strict=True):
         np.testing.assert_allclose(a, b, rtol=2.0**-11, atol=1e-7)  # the rounding of half floats
 
@@ -42,27 +42,27 @@ def test_a_nested_field_is_read_as_it_was_saved(variant_rgb: str, tmp_path: Path
     outer = CUBE * 2
     outer[3, 3] = 1
     field = SphericalGrid.from_levels([SphericalGrid.from_dense(density, sh, place) for place in (CUBE, outer)])
-    save_field(tmp_path / "f.npz", field, half=False)
-    back = load_field(tmp_path / "f.npz")
-    assert back.levels == 2 and np.array_equal(back.listed(), field.listed())
+    write_field(tmp_path / "f.npz", field, half=False)
+    back = read_field(tmp_path / "f.npz")
+    assert back.levels == 2 and np.array_equal(back.stored_nodes(), field.stored_nodes())
     assert all(np.array_equal(a, b) for a, b in zip(back.values(), field.values(), strict=True))
     with pytest.raises(MivolError, match="2 nested levels"):
-        save_svox2(tmp_path / "f.svox2.npz", field)
+        write_field(tmp_path / "f.svox2.npz", field)
 
 
 def test_values_that_half_floats_cannot_hold_stay(variant_rgb: str, tmp_path: Path) -> None:
     density, sh = arrays()
     density[0, 0, 0] = 1e6
-    save_field(tmp_path / "f.npz", SphericalGrid.from_dense(density, sh, CUBE))
-    assert np.array_equal(load_field(tmp_path / "f.npz").values()[0], density.reshape(-1))
+    write_field(tmp_path / "f.npz", SphericalGrid.from_dense(density, sh, CUBE))
+    assert np.array_equal(read_field(tmp_path / "f.npz").values()[0], density.reshape(-1))
 
 
 def test_densities_of_large_scenes_keep_their_digits(variant_rgb: str, tmp_path: Path) -> None:
     """Extinctions go as 1 / length: in a box of 1e9 units half floats would make 0 of them."""
     density, sh = arrays()
     for small in (1e-4, 1e-9):
-        save_field(tmp_path / "f.npz", SphericalGrid.from_dense(density * small, sh, CUBE))
-        found, _ = load_field(tmp_path / "f.npz").values()
+        write_field(tmp_path / "f.npz", SphericalGrid.from_dense(density * small, sh, CUBE))
+        found, _ = read_field(tmp_path / "f.npz").values()
         np.testing.assert_allclose(found, small * density.reshape(-1), rtol=1e-6, atol=small * 2**-12)
 
 
@@ -82,7 +82,7 @@ def test_a_checkpoint_of_svox2(variant_rgb: str, tmp_path: Path) -> None:
         center=np.float32([0, 1, 2]),
         basis_type=1,
     )
-    field = load_field(tmp_path / "ckpt.npz")
+    field = read_field(tmp_path / "ckpt.npz")
     assert field.res == (2, 3, 4) and field.degree == 1 and field.rows == 3
     # Nodes (x, y, z) = (1, 2, 0) and (3, 0, 1): centres of voxels of the box -1..1, 0.5..1.5, 1.75..2.25.
     p = mi.Point3f([-0.25, 0.75], [1 + 1 / 3, 1 - 1 / 3], [1.875, 2.125])
@@ -112,7 +112,7 @@ def test_checkpoints_that_are_refused(variant_rgb: str, tmp_path: Path, change: 
     }
     np.savez(tmp_path / "c.npz", **{k: v for k, v in (good | change).items() if v is not None})
     with pytest.raises(MivolError, match=said):
-        load_field(tmp_path / "c.npz")
+        read_field(tmp_path / "c.npz")
 
 
 def test_files_that_are_refused(variant_rgb: str, tmp_path: Path) -> None:
@@ -120,9 +120,9 @@ def test_files_that_are_refused(variant_rgb: str, tmp_path: Path) -> None:
     (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04 and no more")
     for name, said in (("none.npz", "found no file"), ("other.npz", "holds a;"), ("torn.npz", "a damaged archive")):
         with pytest.raises(MivolError, match=said):
-            load_field(tmp_path / name)
-    with pytest.raises(MivolError, match="ending in .npz"):
-        save_field(tmp_path / "f.vol", SphericalGrid.from_dense(*arrays(), CUBE))
+            read_field(tmp_path / name)
+    with pytest.raises(MivolError, match="found the suffix '.grid'"):
+        write_field(tmp_path / "f.grid", SphericalGrid.from_dense(*arrays(), CUBE))
 
 
 HOSTILE_FIELDS = {
@@ -145,13 +145,13 @@ def test_hostile_fields_are_refused(variant_rgb: str, tmp_path: Path, monkeypatc
     change, said = HOSTILE_FIELDS[case]
     keep = np.zeros((3, 4, 5), bool)
     keep[0, 0, 0] = True
-    save_field(tmp_path / "f.npz", SphericalGrid.from_dense(*arrays(), CUBE, keep))
+    write_field(tmp_path / "f.npz", SphericalGrid.from_dense(*arrays(), CUBE, keep))
     with np.load(tmp_path / "f.npz") as stored:
         held = dict(stored)
     np.savez(tmp_path / "f.npz", **held | change)
     monkeypatch.setattr(npy, "available_memory", lambda: 2**33)
     with pytest.raises(MivolError, match=said):
-        load_field(tmp_path / "f.npz")
+        read_field(tmp_path / "f.npz")
 
 
 HOSTILE_CHECKPOINTS = {
@@ -198,4 +198,4 @@ def test_degrees_and_sparse_copies(variant_rgb: str) -> None:
     sparse = field.select_nodes(density > 0)
     back = sparse.to_dense()
     assert np.array_equal(back[0], np.where(density > 0, density, 0))
-    assert np.array_equal(sparse.select_nodes(density > 1).listed(), np.flatnonzero(density > 1))
+    assert np.array_equal(sparse.select_nodes(density > 1).stored_nodes(), np.flatnonzero(density > 1))

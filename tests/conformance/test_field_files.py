@@ -11,8 +11,7 @@ import pytest
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.fields.activation import ACTIVATIONS
-from mivol.fields.field_archives import load_field, save_field
-from mivol.fields.field_files import EXPORTS, export_field
+from mivol.fields.field_files import FIELD_FORMATS, read_field, write_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import INVERSES, default_level, extract_surface
 from mivol.files import encode_srgb, read_volume
@@ -129,7 +128,7 @@ def test_meshes_on_disk(variant_rgb: None, tmp_path: Path, suffix: str) -> None:
     """Mitsuba reads what was written: the same box and as many triangles; ours are the same to float32 and 8 bits."""
     mesh = extract_surface(ball(), 4.0)
     path = tmp_path / f"ball{suffix}"
-    assert export_field(path, ball(), 4.0) == [path]
+    assert write_field(path, ball(), 4.0) == [path]
     read = mi.load_dict({"type": suffix[1:], "filename": str(path)})
     assert read.face_count() == len(mesh.faces)
     box = read.bbox()
@@ -170,7 +169,7 @@ def test_bare_meshes_on_disk(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".vol", ".nrrd"])
 def test_volumes_show_the_nodes(variant_rgb: None, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"ball{suffix}"
-    written = export_field(path, ball())
+    written = write_field(path, ball())
     assert [p.name for p in written] == [f"ball{suffix}", f"ball-colour{suffix}"]
     sigma, colour = (read_volume(p) for p in written)
     assert sigma.to_world == pytest.approx(PLACE)
@@ -183,10 +182,10 @@ def test_a_checkpoint_of_svox2(variant_rgb: None, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     keep = rng.random((3, 4, 5)) < 0.5
     field = SphericalGrid.from_dense(rng.normal(size=keep.shape), rng.normal(size=(*keep.shape, 9, 3)), PLACE, keep)
-    export_field(tmp_path / "field.svox2.npz", field)
-    again = load_field(tmp_path / "field.svox2.npz")
+    write_field(tmp_path / "field.svox2.npz", field)
+    again = read_field(tmp_path / "field.svox2.npz")
     assert again.to_world == pytest.approx(field.to_world)
-    assert np.array_equal(again.listed(), field.listed())
+    assert np.array_equal(again.stored_nodes(), field.stored_nodes())
     for mine, theirs in zip(again.values(), field.values(), strict=True):
         assert mine == pytest.approx(theirs, rel=2**-11)
 
@@ -214,7 +213,7 @@ def test_meshes_hold_codes_whatever_the_field_holds(variant_rgb: None) -> None:
 )
 def test_what_cannot_be_exported(variant_rgb, tmp_path, name, change, level, sentence) -> None:
     with pytest.raises(MivolError) as refused:
-        export_field(tmp_path / name, ball(**change), level)
+        write_field(tmp_path / name, ball(**change), level)
     assert sentence in str(refused.value)
     assert list(tmp_path.iterdir()) == []
 
@@ -240,8 +239,8 @@ def test_meshes_that_are_none(tmp_path: Path) -> None:
 
 
 def test_the_verb(variant_rgb: None, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    save_field(tmp_path / "field.npz", ball(keep=True))
-    for suffix in EXPORTS:
+    write_field(tmp_path / "field.npz", ball(keep=True))
+    for suffix in FIELD_FORMATS:
         assert main(["export", str(tmp_path / "field.npz"), str(tmp_path / f"out{suffix}")]) == 0
     names = ("out.npz", "out.svox2.npz", "out.vol", "out-colour.vol", "out.nrrd", "out-colour.nrrd", "out.ply", "out.obj")
     names += ("out.xml", "out-field.npz")

@@ -14,8 +14,7 @@ from scattering_scenes import moments
 
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.fields.field_archives import save_field
-from mivol.fields.field_files import export_field, write_scene
+from mivol.fields.field_files import write_field, write_scene
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import extract_surface
@@ -62,7 +61,7 @@ def plain(densities: list[float], codes: list[float], place: np.ndarray = FLAT, 
 
 def boxed(field: SphericalGrid, folder: Path) -> dict:
     """A field's medium in the cube of its outermost level."""
-    save_field(folder / "field.npz", field, half=False)
+    write_field(folder / "field.npz", field, half=False)
     emission = {"type": "mivol_sh", "filename": str(folder / "field.npz")}
     return box_of({"type": "mivol_medium", "emission": emission}, field.level_to_world(field.levels - 1))
 
@@ -103,7 +102,7 @@ def test_the_parameters_are_all_levels_rows(tmp_path: Path) -> None:
     volume = mi.load_dict({"type": "mivol_sh", "filename": str(tmp_path / "field.npz")})
     assert "3 levels of 7x6x5" in str(volume)
     every = SphericalGrid.from_rows(RES, TURNED, *field.values(), levels=3, space="linear")
-    save_field(tmp_path / "every.npz", every, half=False)
+    write_field(tmp_path / "every.npz", every, half=False)
     whole = mi.traverse(mi.load_dict({"type": "mivol_sh", "filename": str(tmp_path / "every.npz")}))
     assert tuple(whole["density"].shape) == (3, *RES, 1)
 
@@ -185,7 +184,7 @@ def test_where_a_nested_field_cannot_stand(tmp_path: Path) -> None:
 
 def test_volumes_are_a_pair_a_level(tmp_path: Path) -> None:
     field = rough(2, FLAT)
-    written = export_field(tmp_path / "field.nrrd", field)
+    written = write_field(tmp_path / "field.nrrd", field)
     names = ["field.nrrd", "field-colour.nrrd", "field-level-1.nrrd", "field-level-1-colour.nrrd"]
     assert [path.name for path in written] == names
     for level, path in enumerate(written[::2]):
@@ -235,12 +234,12 @@ def test_levels_that_no_surface_reaches_are_left_out() -> None:
 
 def test_svox2_has_no_levels(tmp_path: Path) -> None:
     with pytest.raises(MivolError, match="a field of 2 nested levels, expected one grid, as svox2 has; write .npz or .xml"):
-        export_field(tmp_path / "field.svox2.npz", rough(2, FLAT))
+        write_field(tmp_path / "field.svox2.npz", rough(2, FLAT))
 
 
 def test_a_scene_shows_the_field_before_its_sky(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Rows of the sky from its zenith to its nadir; codes as the light that they stand for, of the field and of its sky."""
-    save_field(tmp_path / "field.npz", plain([500.0, 0.0], [0.8, 0.4, 0.2], space="srgb"), half=False)
+    write_field(tmp_path / "field.npz", plain([500.0, 0.0], [0.8, 0.4, 0.2], space="srgb"), half=False)
     codes = np.linspace(0.9, 0.1, 8)[:, None, None] * np.array([1.0, 0.5, 0.25])
     write_exr(tmp_path / "sky.exr", {"": np.float32(np.broadcast_to(codes, (8, 16, 3)))})
     assert main(["export", str(tmp_path / "field.npz"), str(tmp_path / "place.xml")]) == 0

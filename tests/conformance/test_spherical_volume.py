@@ -12,7 +12,7 @@ import pytest
 from scattering_scenes import cases
 
 from mivol.errors import MivolError
-from mivol.fields.field_archives import load_field, save_field
+from mivol.fields.field_files import read_field, write_field
 from mivol.fields.harmonics import decode_srgb_code
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
@@ -206,7 +206,7 @@ def test_a_sparse_field_renders_as_the_dense_one(variant_rgb: None, tmp_path: Pa
     keep[:, :2] = False
     dense = SphericalGrid.from_dense(density, sh, PLACE, space="linear")
     for half, bound in ((False, 1e-6), (True, 5e-3)):
-        save_field(tmp_path / "field.npz", dense.select_nodes(keep), half=half)
+        write_field(tmp_path / "field.npz", dense.select_nodes(keep), half=half)
         volume = {"type": "mivol_sh", "filename": str(tmp_path / "field.npz")}
         loaded = scene(box_of({"type": "mivol_medium", "emission": volume}, PLACE))
         assert tuple(mi.traverse(loaded)[f"{KEY}.density"].shape) == (int(keep.sum()), 1)
@@ -228,7 +228,7 @@ def test_codes_of_photographs_are_shown_as_the_light_that_they_stand_for(variant
     At a density of 40 the box, 2 wide, lets through exp(-40) at least where the camera looks at it frontally.
     """
     codes = [0.02, 0.5, 0.9]
-    save_field(tmp_path / "field.npz", grey(codes, 40.0), half=False)
+    write_field(tmp_path / "field.npz", grey(codes, 40.0), half=False)
     volume = {"type": "mivol_sh", "filename": str(tmp_path / "field.npz")}
     shown = {}
     for name, more in (("file", {}), ("told", {"space": "linear"})):
@@ -255,8 +255,8 @@ def test_light_of_codes_has_the_curve_and_the_slope_of_srgb(variant_rgb: None) -
 def test_the_space_of_colours_is_kept(variant_rgb: None, tmp_path: Path) -> None:
     """By files, by what makes a field sparse or gives it another degree; a third space is refused."""
     field = replace(grey([0.5] * 3, 1.0), space="linear")
-    save_field(tmp_path / "field.npz", field)
-    kept = field.select_nodes(np.ones((3, 3, 3), bool)), field.with_degree(1), load_field(tmp_path / "field.npz")
+    write_field(tmp_path / "field.npz", field)
+    kept = field.select_nodes(np.ones((3, 3, 3), bool)), field.with_degree(1), read_field(tmp_path / "field.npz")
     assert [one.space for one in kept] == ["linear"] * 3
     with pytest.raises(MivolError, match="'rec709'; srgb or linear"):
         replace(field, space="rec709")
@@ -318,6 +318,6 @@ def test_densities_that_are_none_are_refused(variant_rgb: None, activation: str,
 
 def test_a_file_is_checked_for_the_activation_it_is_given(variant_rgb: None, tmp_path: Path) -> None:
     density, sh = values()
-    save_field(tmp_path / "field.npz", SphericalGrid.from_dense(density - 2 * density.max(), sh, np.eye(4)))
+    write_field(tmp_path / "field.npz", SphericalGrid.from_dense(density - 2 * density.max(), sh, np.eye(4)))
     with pytest.raises(RuntimeError, match="without an activation none may be negative"):
         mi.load_dict({"type": "mivol_sh", "filename": str(tmp_path / "field.npz"), "activation": "none"})

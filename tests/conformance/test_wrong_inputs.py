@@ -12,9 +12,9 @@ import pytest
 from mivol.errors import MivolError
 from mivol.fields.activation import ACTIVATIONS, select_activation
 from mivol.fields.analytic import ExponentialAtmosphere
-from mivol.fields.field_archives import MOST_NODES, _check_own_arrays, _of_ours
+from mivol.fields.field_archives import MAX_NODES, _check_arrays, parse_archive
 from mivol.fields.procedural import make_procedural
-from mivol.fields.spherical_grid import SphericalGrid, with_tensors
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.events import Upsample
 from mivol.optim.losses import L2, LOSSES, Huber
 from mivol.optim.parameters import Parameter
@@ -98,12 +98,12 @@ def test_nested_grids_are_of_one_kind_and_in_place() -> None:
 
 def test_tensors_of_a_field_have_its_shape() -> None:
     zeros = lambda *shape: mi.TensorXf(np.zeros(shape, np.float32))  # noqa: E731
-    found = with_tensors(grid(), zeros(2, 2, 2, 1), zeros(2, 2, 2, 4, 3))
+    found = grid().with_tensors(zeros(2, 2, 2, 1), zeros(2, 2, 2, 4, 3))
     assert found.degree == 1
     wrong = [((2, 2, 2), (2, 2, 2, 1, 3)), ((2, 2, 3, 1), (2, 2, 2, 1, 3)), ((2, 2, 2, 1), (2, 3, 2, 1, 3)),
              ((2, 2, 2, 1), (2, 2, 2, 1, 4))]  # fmt: skip
     for density, sh in wrong:
-        says = refusal_of(with_tensors, grid(), zeros(*density), zeros(*sh))
+        says = refusal_of(grid().with_tensors, zeros(*density), zeros(*sh))
         assert says == f"density {density} and sh {sh} were given; (2, 2, 2, 1) and (2, 2, 2, 'basis', 3) are expected."
 
 
@@ -122,24 +122,24 @@ WRONG_ARRAYS = {
     "to_world": (np.eye(3), "f holds to_world of type float64 and shape (3, 3); write it again."),
     "activation": (1, "f holds activation of type int64 and shape (); write it again."),
     "offset": (np.nan, "f holds offset with values that are not finite; write it again."),
-    "res": ((2, 0, 2), f"f has a grid of 2 x 0 x 2 nodes; 1 to {MOST_NODES} in all are expected."),
-    "levels": (-1, f"f has a grid of -1 x 2 x 2 x 2 nodes; 1 to {MOST_NODES} in all are expected."),
+    "res": ((2, 0, 2), f"f has a grid of 2 x 0 x 2 nodes; 1 to {MAX_NODES} in all are expected."),
+    "levels": (-1, f"f has a grid of -1 x 2 x 2 x 2 nodes; 1 to {MAX_NODES} in all are expected."),
 }
 
 
 @pytest.mark.parametrize("name", WRONG_ARRAYS)
 def test_a_file_of_a_field_holds_what_it_should(name: str) -> None:
     value, says = WRONG_ARRAYS[name]
-    assert _of_ours("f", arrays()).res == (2, 2, 2)
-    assert refusal_of(_of_ours, "f", arrays(**{name: value})) == says
+    assert parse_archive("f", arrays()).res == (2, 2, 2)
+    assert refusal_of(parse_archive, "f", arrays(**{name: value})) == says
 
 
 @pytest.mark.parametrize("sh", [(7, 1, 3), (8, 1, 4), (8, 3)])
 def test_harmonics_of_a_file_belong_to_its_nodes(sh: tuple[int, ...]) -> None:
-    says = refusal_of(_of_ours, "f", arrays(sh=np.zeros(sh, np.float32)))
+    says = refusal_of(parse_archive, "f", arrays(sh=np.zeros(sh, np.float32)))
     assert says == f"f holds (8,) densities and {sh} harmonics for 8 nodes; write it again."
     large = arrays(res=(2048, 2048, 1024))
-    assert refusal_of(_check_own_arrays, "f", large).startswith("f has a grid of 2048 x 2048 x 1024 nodes;")
+    assert refusal_of(_check_arrays, "f", large).startswith("f has a grid of 2048 x 2048 x 1024 nodes;")
 
 
 # -- Scenes ------------------------------------------------------------------------------------------------------------

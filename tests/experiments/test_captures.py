@@ -11,7 +11,7 @@ import pytest
 from capture_photos import capture, write_capture
 
 from mivol.cli import main
-from mivol.fields.field_archives import load_field
+from mivol.fields.field_files import read_field
 from mivol.optim.loop import begin_fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
@@ -80,7 +80,7 @@ def test_a_folder_of_photographs_becomes_a_page(tmp_path: Path) -> None:
     assert "view_08.png" in page and "colours fitted" in page
     assert record["judged"] == "2 views at 32 x 24 pixels" and "2 views at 32 x 24 pixels, raw" in page.replace("\u00a0", " ")
     assert page.count("|Render − reference|") >= 2 and "the worst of 2: PSNR" in page
-    field = load_field(run / "field.npz")
+    field = read_field(run / "field.npz")
     assert field.levels == 5 and field.degree == 1
     assert (run / "volumes/density-level-4.vol").is_file()
     assert {"5 nested boxes" in line["choice"] for line in record["plan"]} == {True, False}

@@ -19,7 +19,7 @@ from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments import field_plan, photo_data, photo_fit, photo_outputs
-from mivol.fields.field_archives import load_field
+from mivol.fields.field_files import read_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr, write_png
 from mivol.optim.photographs.field_view import render_view
@@ -111,9 +111,9 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert record["results"]["held_out_psnr"] > 26
     shown = [image["view"] for image in record["images"] if image["role"] == "render"]
     assert sorted(shown) == ["view_3.png", "view_8.png"]  # all that are judged, the worst first
-    made = load_field(tmp_path / "run/field.npz")
+    made = read_field(tmp_path / "run/field.npz")
     assert made.nodes is not None
-    assert record["results"]["nodes"] == len(made.listed())
+    assert record["results"]["nodes"] == len(made.stored_nodes())
     page = (tmp_path / "run/report.html").read_text().replace("\u2011", "-").replace("\xa0", " ")
     assert "PSNR compares 8-bit sRGB values; its peak is 1." in page
     assert "largest value as its peak" not in page
@@ -169,7 +169,7 @@ def test_the_best_field_is_kept_beside_the_last(
 
     def nearest(name: str) -> int:
         """Which look saw the field of a file; files hold it in fewer digits."""
-        found = load_field(tmp_path / f"run/{name}.npz").to_dense()[0]
+        found = read_field(tmp_path / f"run/{name}.npz").to_dense()[0]
         return min(range(3), key=lambda i: np.abs(seen[i] - found).max() if seen[i].shape == found.shape else np.inf)
 
     assert (nearest("field_best"), nearest("field")) == (1, 2)

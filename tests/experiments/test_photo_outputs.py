@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from mivol.experiments import photo_outputs
-from mivol.fields.field_archives import save_field
+from mivol.fields.field_files import write_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
 from mivol.optim.photographs.field_view import FieldView
@@ -36,7 +36,7 @@ def camera(width: int = 4, height: int = 2) -> Camera:
 def test_what_a_field_takes(tmp_path, kept):
     """60 nodes of a box: 4 and 16 bytes each; 4 (1 + 4 x 3) with harmonics of degree 1 in rows of 12."""
     sparse = field(None if kept == 60 else np.arange(60).reshape(RES) < kept)
-    save_field(tmp_path / "field.npz", sparse)
+    write_field(tmp_path / "field.npz", sparse)
     table = photo_outputs.storage(sparse, tmp_path / "field.npz")
     assert table.head[0] == f"{kept} of 60 nodes are kept ({kept / 60:.1%})"
     rows = {name: each for name, _, each in table.rows}

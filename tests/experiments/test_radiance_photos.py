@@ -19,7 +19,7 @@ from mivol.experiments.field_plan import batches_of, make_plan, suited
 from mivol.experiments.judged_views import write_view
 from mivol.experiments.photo_data import MIDDLE_GREY, exposed, notes, read_photos
 from mivol.experiments.photo_outputs import judge_fitted, save_found
-from mivol.fields.field_archives import load_field
+from mivol.fields.field_files import read_field
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb, read_exr, write_exr, write_png
@@ -108,7 +108,7 @@ def test_what_is_found_is_kept_in_the_unit_of_the_files(photographs: Path, tmp_p
     problem = RadianceProblem(batches_of(plan, photos), photos.box, plan)
     problem.sky = Sky.uniform(8, 0.75)
     save_found(tmp_path, problem, "_best", photos.white)
-    found = load_field(tmp_path / "field_best.npz")
+    found = read_field(tmp_path / "field_best.npz")
     assert (found.space, found.offset) == ("linear", 0.5 * photos.white)
     assert np.all(read_exr(tmp_path / "sky_best.exr")[0]["G"] == 0.75 * photos.white)
     twice = SphericalGrid.scale_colours(scene(4), 2.0)
@@ -129,7 +129,7 @@ def test_a_fit_of_radiance_is_as_bright_as_its_photographs(photographs: Path, tm
     path = toml(tmp_path, photographs, field="effort = 1.5")
     _, judged = read(path)
     assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 0
-    found, ratios = load_field(tmp_path / "run/field.npz"), []
+    found, ratios = read_field(tmp_path / "run/field.npz"), []
     for view in judged.views:
         seen, truth = render_view(found, view.camera, np.zeros(3)).image, view.image * judged.white
         bright = view.image.max(axis=2) > 1

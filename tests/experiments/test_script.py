@@ -210,7 +210,7 @@ def test_photographs_of_the_docs_become_a_scene(variant_rgb: str, tmp_path: Path
 def seen_by(camera: Camera, space: str) -> np.ndarray:
     """What a photograph's camera sees of the fitted field in a scene, before a white sky."""
     T = mi.ScalarTransform4f
-    field = mivol.load_field("field/field.npz")
+    field = mivol.read_field("field/field.npz")
     volume = {"type": "mivol_sh", "filename": "field/field.npz", "space": space}
     box = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "mivol_medium", "emission": volume}}
     box["to_world"] = T(field.to_world).translate(0.5).scale(0.5)

@@ -127,7 +127,7 @@ def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> Non
     problem = fit.problem
     before, squares = problem.field, np.array(fit.run.squares["density"])
     stored = np.zeros(before.node_count, bool)
-    stored[before.listed()] = True
+    stored[before.stored_nodes()] = True
     expected = stored & maximum_filter(problem.seen_nodes()[0], 3).reshape(-1)
     dropping = fit.course.events[1]
     assert dropping.due(70)
@@ -139,7 +139,7 @@ def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> Non
     # Bytes of single numbers may have come and gone.
     assert held - most_held() < 1 << 16
     after = problem.field
-    np.testing.assert_array_equal(after.listed(), np.flatnonzero(expected))
+    np.testing.assert_array_equal(after.stored_nodes(), np.flatnonzero(expected))
     assert says == f"unseen nodes left out: 24 x 24 x 24 nodes, of which {after.rows - 1} are kept"
     assert 100 < after.rows < 0.9 * before.rows
     kept = expected[stored]
