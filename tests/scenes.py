@@ -72,7 +72,7 @@ def tensor(values: np.ndarray) -> mi.TensorXf:
 
 
 def skip_recorded_grids_on_a_gpu() -> None:
-    """``dr.freeze`` does not record a grid of mivol here and refuses it (:attr:`mivol.fields.voxels.Voxels.freezable_texture`)."""
+    """``dr.freeze`` refuses mivol's grids on a GPU (:attr:`mivol.fields.voxels.Voxels.freezable_texture`)."""
     if not mi.variant().startswith("llvm"):
         pytest.skip("mivol_voxels is not recorded on a GPU")
 
