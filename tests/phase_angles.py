@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import oracle_phase as oracle
 
-from mivol.phase.turn import Turn
+from mivol.phase.scattering_angle import ScatteringAngle
 
 EPS = 2.0**-23
 
@@ -27,9 +27,9 @@ def lanes(*arrays: np.ndarray) -> tuple[mi.Float, ...]:
     return tuple(mi.Float(np.ascontiguousarray(a, dtype=np.float32)) for a in arrays)
 
 
-def turns() -> tuple[Turn, np.ndarray, np.ndarray]:
+def turns() -> tuple[ScatteringAngle, np.ndarray, np.ndarray]:
     m, p = oracle.turns(ANGLES)
-    return Turn(*lanes(m, p)), m, p
+    return ScatteringAngle(*lanes(m, p)), m, p
 
 
 def as64(x: object) -> np.ndarray:
@@ -41,14 +41,14 @@ def uniforms(n: int) -> np.ndarray:
     return (np.arange(n) + 0.5) / n
 
 
-def cosines_of(turn: Turn) -> np.ndarray:
+def cosines_of(turn: ScatteringAngle) -> np.ndarray:
     return (as64(turn.above_minus_one) - as64(turn.below_one)) / 2
 
 
 def integrals(evaluate, powers: int = 4) -> np.ndarray:
     """Moments <cos^k>, k = 0 ..., by Gauss-Legendre over the cosine."""
     c, w = oracle.gauss(400)
-    values = as64(evaluate(Turn(*lanes(1 - c, 1 + c)))) * 2 * np.pi * w
+    values = as64(evaluate(ScatteringAngle(*lanes(1 - c, 1 + c)))) * 2 * np.pi * w
     return np.array([(values * c**k).sum() for k in range(powers)])
 
 

@@ -69,6 +69,6 @@ def looked(index: CellIndex, shape: tuple[int, ...], ahead: tuple[bool, ...]) ->
     """Ways (levels, Z, Y, X, 3: x, y, z) from all cells, and their numbers."""
     level, z, y, x = (mi.Int32(a.ravel().astype(np.int32)) for a in np.indices(shape))
     cell, every = mi.Vector3i(x, y, z), mi.Bool(True)
-    brick, free = index.look(cell, level, mi.Array3b(*ahead), every)
+    brick, free = index.look_up(cell, level, mi.Array3b(*ahead), every)
     number = index.rank(cell, dr.select(free.x == 0, brick, 0), every)
     return np.array(free).T.reshape(*shape, 3), np.array(number).reshape(shape)

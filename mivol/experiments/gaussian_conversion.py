@@ -23,7 +23,7 @@ from mivol.points.cloud import read_points
 from mivol.points.conversions import points_to_gaussians
 from mivol.points.gaussian_files import GAUSSIAN_WRITERS, is_gaussian_file, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
-from mivol.splatting.splatter import Splatter, tensors_of
+from mivol.splatting.splatter import Splatter, to_tensors
 from mivol.validate.metrics import psnr
 
 __all__ = [
@@ -139,7 +139,7 @@ def loss_of_field(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> f
         field: of one level, in code values.
         edge: of a view [pixel].
     """
-    splatter, reals = Splatter(edge, edge, cloud.degree), tensors_of(cloud)
+    splatter, reals = Splatter(edge, edge, cloud.degree), to_tensors(cloud)
     truth, seen = [], []
     for camera in cameras_around(field.to_world, edge):
         truth.append(np.array(splatter.forward(reals, camera, derivatives=False)[0])[..., :3])
@@ -263,7 +263,7 @@ def placed(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 def _seen(cloud: Gaussians, cameras: Sequence[Camera]) -> Iterator[DepthView]:
     """What cameras of one size see of Gaussians."""
-    splatter, reals = Splatter(*cameras[0].size, cloud.degree, median=True), tensors_of(cloud)
+    splatter, reals = Splatter(*cameras[0].size, cloud.degree, median=True), to_tensors(cloud)
     for camera in cameras:
         picture = np.array(splatter.forward(reals, camera, derivatives=False)[0], np.float64)
         alpha = picture[..., 4:]

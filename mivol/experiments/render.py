@@ -32,7 +32,7 @@ from mivol.points.gaussians import Gaussians
 from mivol.scene.explain import settings_of
 from mivol.scene.parsing import reason_of
 from mivol.scene.sensors import check_film, find_sensor
-from mivol.splatting import Splatter, tensors_of
+from mivol.splatting import Splatter, to_tensors
 
 SAMPLES_PER_PASS = 1 << 21
 KEPT = 2 * 4 * 8
@@ -260,4 +260,4 @@ def whole_view(places: np.ndarray, up: Sequence[float], fov: float, size: tuple[
 def picture_of(held: Gaussians, camera: Camera, compensated: bool, discs: bool) -> np.ndarray:
     """(height, width, 3) code values over black."""
     splatter = Splatter(*camera.size, held.degree, compensated=compensated, discs=discs)
-    return np.array(splatter.forward(tensors_of(held), camera, derivatives=False)[0])[..., :3]
+    return np.array(splatter.forward(to_tensors(held), camera, derivatives=False)[0])[..., :3]

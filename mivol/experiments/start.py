@@ -21,7 +21,7 @@ from mivol.files.fetch import resolve_path as place_in
 from mivol.machine import check_fits
 from mivol.optim.events import Upsample, check_for_grids
 from mivol.optim.parameters import GRID, Parameter, as_tensor, find
-from mivol.transport.media.medium_view import place_of_grid
+from mivol.transport.media.medium_view import find_grid_place
 
 NUMBER_BYTES = 6 * 4
 """Of each number that is looked for: value, the scene's copy, real, derivative and two moments of the optimiser."""
@@ -109,7 +109,7 @@ def start_of(sought: Sought, shape: Sequence[int]) -> Any:
 
 def place_of(key: str, scene: mi.Scene) -> np.ndarray:
     """Where the grid of a parameter lies: the (4, 4) map of the unit cube to the world."""
-    return place_of_grid(mi.traverse(scene).properties[key][2])
+    return find_grid_place(mi.traverse(scene).properties[key][2])
 
 
 def edges_of(place: np.ndarray) -> tuple[float, float, float]:

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.phase.turn import INV_FOUR_PI, Turn
+from mivol.phase.scattering_angle import INV_FOUR_PI, ScatteringAngle
 
 __all__ = [
     "eval_hg",
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 
-def eval_hg(turn: Turn, g: mi.Float) -> mi.Float:
+def eval_hg(turn: ScatteringAngle, g: mi.Float) -> mi.Float:
     r"""Density [1/sr].
 
     .. math:: \partial p/\partial g = \frac{1}{4\pi}\big[-2 g D^{-3/2} - 3 (1 - g^2)(g - \cos\theta) D^{-5/2}\big]
@@ -49,7 +49,7 @@ def eval_hg(turn: Turn, g: mi.Float) -> mi.Float:
     return INV_FOUR_PI * ((1 - a) * (1 + a)) * (inv * dr.sqrt(inv))
 
 
-def sample_hg(u: mi.Float, g: mi.Float) -> Turn:
+def sample_hg(u: mi.Float, g: mi.Float) -> ScatteringAngle:
     r"""Draw a turn with density :func:`eval_hg`.
 
     .. math:: 1 - \cos = \frac{2 (1 - g)^2 (1 - u)(1 + g u)}{(1 - g + 2 g u)^2}, \qquad
@@ -66,22 +66,22 @@ def sample_hg(u: mi.Float, g: mi.Float) -> Turn:
     inv = dr.rcp(dr.square(dr.fma(2 * a, v, 1 - a)))
     below_one = 2 * dr.square(1 - a) * w * dr.fma(a, v, 1) * inv
     above_minus_one = 2 * dr.square(1 + a) * v * dr.fma(a, v, 1 - a) * inv
-    return Turn(below_one, above_minus_one).mirrored(back)
+    return ScatteringAngle(below_one, above_minus_one).mirrored(back)
 
 
-def eval_rayleigh(turn: Turn) -> mi.Float:
+def eval_rayleigh(turn: ScatteringAngle) -> mi.Float:
     """Density [1/sr]."""
     return (0.75 * INV_FOUR_PI) * dr.fma(turn.cos, turn.cos, 1)
 
 
-def sample_rayleigh(u: mi.Float) -> Turn:
+def sample_rayleigh(u: mi.Float) -> ScatteringAngle:
     """Draw a turn with density :func:`eval_rayleigh`; u = 0, 1/2 and 1 give cos = -1, 0 and 1.
 
     Error: 2e-7 of cos.
     """
     c = 2 * dr.sinh(dr.asinh(2 * (2 * u - 1)) * (1 / 3))
     c = dr.clip(c, -1, 1)
-    return Turn(1 - c, 1 + c)
+    return ScatteringAngle(1 - c, 1 + c)
 
 
 NEWTON_STEPS = 16
@@ -93,7 +93,7 @@ def mean_cosine(g: mi.Float | float, alpha: mi.Float | float) -> mi.Float | floa
     return g * (1 + alpha * (3 + 2 * g * g) / 5) / (1 + alpha * (1 + 2 * g * g) / 3)
 
 
-def eval_draine(turn: Turn, g: mi.Float, alpha: mi.Float) -> mi.Float:
+def eval_draine(turn: ScatteringAngle, g: mi.Float, alpha: mi.Float) -> mi.Float:
     """Density [1/sr].
 
     Error: about 8e-7 of it.
@@ -103,7 +103,7 @@ def eval_draine(turn: Turn, g: mi.Float, alpha: mi.Float) -> mi.Float:
 
 
 @dr.syntax
-def sample_draine(u: mi.Float, g: mi.Float, alpha: mi.Float) -> Turn:
+def sample_draine(u: mi.Float, g: mi.Float, alpha: mi.Float) -> ScatteringAngle:
     r"""Draw a turn with density :func:`eval_draine`.
 
     With cos = c(v) the Henyey-Greenstein inversion at v, and y = 2 (1 + g) v / (1 - g + 2 g v) (g >= 0),

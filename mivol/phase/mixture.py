@@ -13,10 +13,10 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["choose_lobe", "shares_of"]
+__all__ = ["choose_lobe", "normalise_weights"]
 
 
-def shares_of(weights: Sequence[mi.Float]) -> list[mi.Float]:
+def normalise_weights(weights: Sequence[mi.Float]) -> list[mi.Float]:
     """Normalise weights by their sum, with derivatives; they become equal where the sum is 0."""
     total = sum(weights[1:], weights[0])
     empty = ~(total > 0) & (total == 0)

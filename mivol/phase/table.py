@@ -17,7 +17,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.phase.domain import LARGEST, WEIGHT
-from mivol.phase.turn import INV_TWO_PI, Turn
+from mivol.phase.scattering_angle import INV_TWO_PI, ScatteringAngle
 
 __all__ = ["Table", "adapt_nodes", "check_values", "Lookup"]
 
@@ -243,7 +243,7 @@ class Lookup:
     width: mi.Float
 
     @classmethod
-    def of(cls, table: Table) -> Lookup:
+    def from_table(cls, table: Table) -> Lookup:
         """Round a table's nodes."""
         c = table.cosines
         with np.errstate(divide="ignore"):
@@ -270,7 +270,7 @@ class Lookup:
         dr.scatter(cumulative, mi.Float(sums / total), i + 1)
         return values, dr.sum(parts), cumulative
 
-    def eval(self, turn: Turn, values: mi.Float, integral: mi.Float, active: mi.Bool = True) -> mi.Float:
+    def eval(self, turn: ScatteringAngle, values: mi.Float, integral: mi.Float, active: mi.Bool = True) -> mi.Float:
         """Density [1/sr] at a turn: the first two results of :meth:`normalise` are its values and integral.
 
         Error: 1e-6 of the larger of the two values around it.
@@ -285,7 +285,9 @@ class Lookup:
         left, right = (dr.gather(mi.Float, values, k, active) for k in (i, i + 1))
         return INV_TWO_PI * dr.fma(part, right - left, left) * dr.rcp(integral)
 
-    def sample(self, u: mi.Float, values: mi.Float, integral: mi.Float, cumulative: mi.Float, active: mi.Bool = True) -> Turn:
+    def sample(
+        self, u: mi.Float, values: mi.Float, integral: mi.Float, cumulative: mi.Float, active: mi.Bool = True
+    ) -> ScatteringAngle:
         """Draw a scattering angle with density :meth:`eval`, by exact inversion: a quadratic equation in each segment."""
         n = len(self.width)
         i = dr.binary_search(0, n, lambda k: dr.gather(mi.Float, cumulative, k, active) <= u)
@@ -297,12 +299,12 @@ class Lookup:
         root = dr.sqrt(dr.maximum(dr.fma(2 * area, slope, left * left), 0))
         offset = 2 * area * dr.rcp(dr.select(left + root > 0, left + root, 1))
         offset = dr.clip(offset, 0, width)
-        return Turn(
+        return ScatteringAngle(
             dr.maximum(dr.gather(mi.Float, self.below_one, i, active) - offset, 0),
             dr.maximum(dr.gather(mi.Float, self.above_minus_one, i, active) + offset, 0),
         )
 
-    def _offset(self, turn: Turn, i: mi.Int32, active: mi.Bool) -> mi.Float:
+    def _offset(self, turn: ScatteringAngle, i: mi.Int32, active: mi.Bool) -> mi.Float:
         """Difference of the cosine and node i, computed from 1 - c or 1 + c, whichever is smaller and so more accurate."""
         ahead = dr.gather(mi.Float, self.below_one, i, active) - turn.below_one
         behind = turn.above_minus_one - dr.gather(mi.Float, self.above_minus_one, i, active)

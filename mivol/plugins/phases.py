@@ -17,9 +17,9 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.phase.closed_forms import eval_draine, eval_hg, eval_rayleigh, sample_draine, sample_hg, sample_rayleigh
 from mivol.phase.domain import DOMAINS
-from mivol.phase.mixture import choose_lobe, shares_of
+from mivol.phase.mixture import choose_lobe, normalise_weights
+from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table, check_values
-from mivol.phase.turn import Turn, direction_after, turn_between
 
 VALUES_OF_VOLUMES = ("data", "value.value")
 """Keys under which Mitsuba's grids and constants, and ours, hold their values."""
@@ -49,10 +49,10 @@ class TurningPhase(mi.PhaseFunction):
     def flags(self, index: int | mi.Bool | None = None, active: mi.Bool = True) -> int:
         return self.m_flags
 
-    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
         raise NotImplementedError
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         raise NotImplementedError
 
     def at(self, name: str, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
@@ -69,12 +69,12 @@ class TurningPhase(mi.PhaseFunction):
         with dr.suspend_grad():
             active = mi.Bool(active)
             turn = self.sample_turn(sample2.x, mei, active)
-            return direction_after(mei.wi, turn, sample2.y), mi.Spectrum(1), self.eval_turn(turn, mei, active)
+            return scattered_direction(mei.wi, turn, sample2.y), mi.Spectrum(1), self.eval_turn(turn, mei, active)
 
     def eval_pdf(
         self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
     ) -> tuple[mi.Spectrum, mi.Float]:
-        value = self.eval_turn(turn_between(mei.wi, wo), mei, mi.Bool(active))
+        value = self.eval_turn(angle_between(mei.wi, wo), mei, mi.Bool(active))
         return mi.Spectrum(value), dr.detach(value)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -98,10 +98,10 @@ class HenyeyGreenstein(TurningPhase):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, {"g": _read(props, "g", 0.8)})
 
-    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
         return eval_hg(turn, self.at("g", mei, active))
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         return sample_hg(u, self.at("g", mei, active))
 
 
@@ -111,10 +111,10 @@ class Rayleigh(TurningPhase):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, {})
 
-    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
         return eval_rayleigh(turn)
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         return sample_rayleigh(u)
 
 
@@ -129,10 +129,10 @@ class Draine(TurningPhase):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, {"g": _read(props, "g", 0.8), "alpha": _read(props, "alpha", 1.0)})
 
-    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
         return eval_draine(turn, self.at("g", mei, active), self.at("alpha", mei, active))
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         return sample_draine(u, self.at("g", mei, active), self.at("alpha", mei, active))
 
 
@@ -148,7 +148,7 @@ class Tabulated(TurningPhase):
 
     def __init__(self, props: mi.Properties) -> None:
         self.table = _read_table(props)
-        self.nodes = Lookup.of(self.table)
+        self.nodes = Lookup.from_table(self.table)
         super().__init__(props, {"values": mi.Float(self.table.values.astype(np.float32))})
 
     def refresh(self) -> None:
@@ -160,10 +160,10 @@ class Tabulated(TurningPhase):
         self.values, self.integral, self.cumulative = self.nodes.normalise(values)
         dr.make_opaque(self.values, self.integral, self.cumulative)
 
-    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
         return self.nodes.eval(turn, self.values, self.integral, active)
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         return self.nodes.sample(u, self.values, self.integral, self.cumulative, active)
 
     def _name(self) -> str:
@@ -211,7 +211,7 @@ class Mixture(mi.PhaseFunction):
         return int(lobe.flags() if inner == ALL_COMPONENTS else lobe.flags(inner))
 
     def shares(self, mei: mi.MediumInteraction3f, active: mi.Bool) -> list[mi.Float]:
-        return shares_of([_eval(w, "weight", mei, active) for w in self.weights.values()])
+        return normalise_weights([_eval(w, "weight", mei, active) for w in self.weights.values()])
 
     def sample(
         self,

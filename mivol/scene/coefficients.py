@@ -14,7 +14,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.gaussian_field import GaussianField
-from mivol.transport.traversal.box import slab
+from mivol.transport.traversal.box import clip_to_box
 
 __all__ = ["Coefficients"]
 
@@ -141,7 +141,7 @@ class Coefficients:
         high = np.max([np.array(b.max) for b in boxes], axis=0).tolist()
         # Not Mitsuba's own box: its class belongs to the first variant of a process, and refuses the rays of a second one.
         axes = np.eye(3, 4).tolist()
-        _, _, t0, t1 = slab(axes, low, high, ray.o, ray.d, mi.Float64(0), mi.Float64(ray.maxt))
+        _, _, t0, t1 = clip_to_box(axes, low, high, ray.o, ray.d, mi.Float64(0), mi.Float64(ray.maxt))
         return t1 > t0, mi.Float(t0), mi.Float(t1)
 
     def eval(

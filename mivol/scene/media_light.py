@@ -27,10 +27,10 @@ from mivol.scene.survey import AROUND, SceneSurvey, is_instance
 from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
 from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
-from mivol.transport.media.drawn_points import draw_even_point
 from mivol.transport.media.medium_view import MediumView, traverse_medium
 from mivol.transport.media.ray_intervals import RaySegment, find_end
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.media.uniform_points import draw_uniform_point
 from mivol.transport.traversal.box import Box
 
 __all__ = ["find_emitting_boxes", "predict_gain", "read_media_light"]
@@ -147,7 +147,7 @@ def predict_gain(media: SceneMedia, table: EmissionTable, sensor: mi.Sensor, sca
         chance, drawn = chance + noise[0], drawn + noise[1]
     if scattering:
         passed = RaySegment(ray, media.medium_at(ray), end.t)
-        point = draw_even_point(media, passed, list(scattering), sampler.next_1d(), on)
+        point = draw_uniform_point(media, passed, list(scattering), sampler.next_1d(), on)
         noise = _noise(table, ray(mi.Float(point.t)), None, point.on)
         chance, drawn = chance + noise[0], drawn + noise[1]
     return chance / (COST * drawn) if drawn > 0 else 0.0

@@ -21,7 +21,7 @@ from mivol.scene.parsing import check_variant
 from mivol.scene.readings import Reading, check_light, check_numbers, is_scattering, read_part
 from mivol.scene.survey import AROUND, SceneSurvey, find_around, is_instance, survey_scene
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
-from mivol.transport.media.medium_view import MediumView, kind_of
+from mivol.transport.media.medium_view import MediumView, medium_kind
 
 __all__ = ["find_needs"]
 
@@ -104,7 +104,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording:
     common = {
         "mean_cosine": survey.cosines.get(boundary.name),
         "name": boundary.name,
-        "kind": kind_of(boundary.medium),
+        "kind": medium_kind(boundary.medium),
         "boundary": _where(boundary),
         "extinction": "rgb" if view.channels == 3 else "grey",
         "resolutions": tuple(g.res for g in grids),

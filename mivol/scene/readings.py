@@ -25,14 +25,14 @@ from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.grid_blocks import (
     BlockRanges,
     CoarseGrid,
-    block_bounds,
+    bound_blocks,
     coarsen_grid,
-    empty_block_distances,
     find_block_ranges,
+    find_distances_of_bounds,
 )
-from mivol.transport.traversal.grid_walk import box_nodes
+from mivol.transport.traversal.grid_walk import corner_nodes
 from mivol.transport.traversal.interpolation import interpolate
-from mivol.transport.traversal.lattice import Lattice, locate
+from mivol.transport.traversal.lattice import Lattice, locate_cell
 
 __all__ = ["Reading", "check_light", "check_numbers", "is_scattering", "read_part"]
 
@@ -85,7 +85,7 @@ def read_part(part: ExactExtinction, survey: SceneSurvey, name: str) -> Reading:
         elif not dr.all((array >= 0) & dr.isfinite(array)):
             floored = _floor(part, survey, name)
             values = mi.TensorXf(floored, values.shape)
-        blocks = block_bounds(values)
+        blocks = bound_blocks(values)
         host = np.array(blocks)
         _check_look_up(part, survey, name)
         return Reading(blocks, float((host > 0).mean()), float(host.max(initial=0.0)), floored)
@@ -154,8 +154,8 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
         u[len(border) :] = np.clip((chosen + rng.uniform(0, 1, chosen.shape)) / sizes, 1e-3, 1 - 1e-3)
     it = dr.zeros(mi.Interaction3f, PROBES)
     it.p = lattice.place(mi.Vector3f(u.T.astype(np.float32)))
-    cell, frac, _ = locate(lattice, it.p, mi.Vector3f(0, 0, 1), mi.Float(0))
-    nodes, c = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res), lattice.channels
+    cell, frac, _ = locate_cell(lattice, it.p, mi.Vector3f(0, 0, 1), mi.Float(0))
+    nodes, c = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res), lattice.channels
     corners = [[dr.gather(mi.Float, dr.detach(lattice.values.array), k * c + i) for k in nodes] for i in range(c)]
     ours = np.array([np.array(interpolate(row, frac)) for row in corners])
     theirs = np.array(volume.eval_1(it))[None] if c == 1 else np.array(volume.eval(it))
@@ -175,7 +175,9 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
 def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt8:
     """Measure how far each block of a part is from the nearest one that is not empty, once for each state of its array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
-    return _once(survey, ("empty distances",), array, lambda: empty_block_distances(read_part(part, survey, name).bounds, res))
+    return _once(
+        survey, ("empty distances",), array, lambda: find_distances_of_bounds(read_part(part, survey, name).bounds, res)
+    )
 
 
 def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges:

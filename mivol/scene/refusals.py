@@ -11,7 +11,7 @@ from mivol.errors import MivolError
 from mivol.scene.choices import choose_media_light, is_lit, shares_cells
 from mivol.scene.facts import Needs
 from mivol.transport.line_integrals.aovs import AOVS
-from mivol.transport.media.grid_extinction import share_cells
+from mivol.transport.media.grid_extinction import have_same_cells
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.path.estimators import Settings
 
@@ -67,7 +67,7 @@ def refuse_scattering(needs: Needs, settings: Settings) -> None:
 def refuse_emission(needs: Needs, settings: Settings) -> None:
     """Refuse emission that varies faster than the cells that are summed."""
     for facts, view in zip(needs.media, needs.views, strict=True):
-        if isinstance(view.emission_density, mi.Volume) and not share_cells(view.walked_lattice, view.emission_lattice):
+        if isinstance(view.emission_density, mi.Volume) and not have_same_cells(view.walked_lattice, view.emission_lattice):
             raise MivolError(
                 f"the emission_density of the medium in {facts.name} has {view.emission_lattice.res} voxels (Z, Y, X) and its "
                 f"extinction {view.walked_lattice.res}, or they lie in different places; it is summed in the cells of the "

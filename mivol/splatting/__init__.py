@@ -1,7 +1,7 @@
 """Points and Gaussians in tiles of pixels, composited front to back, with derivatives.
 
     splatter = Splatter(width, height, degree)
-    picture, kept = splatter.forward(tensors_of(gaussians), camera)
+    picture, kept = splatter.forward(to_tensors(gaussians), camera)
     gradient, statistics = splatter.backward(kept, d_picture)
 
 One picture passes through three modules: ``projection`` makes an ellipse in the image of each Gaussian (EWA splatting),
@@ -9,6 +9,6 @@ One picture passes through three modules: ``projection`` makes an ellipse in the
 forward and backward. ``splatter`` records the kernels of all three once, and launches them for any cloud and any camera.
 """
 
-from mivol.splatting.splatter import Kept, Splatter, Statistics, tensors_of
+from mivol.splatting.splatter import Splatter, SplatterCache, Statistics, to_tensors
 
-__all__ = ["Kept", "Splatter", "Statistics", "tensors_of"]
+__all__ = ["SplatterCache", "Splatter", "Statistics", "to_tensors"]

@@ -30,7 +30,7 @@ from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.photos.camera import FLIP, Camera
 
-__all__ = ["Cloud", "Filter", "Splats", "project", "View", "numbers_of"]
+__all__ = ["Cloud", "Filter", "Splats", "project", "View", "pack_view"]
 
 LEAST_COMPENSATION = 1e-12
 """Squared factor below which the compensated opacity is not derived: with 1e-6 of its opacity no Gaussian is drawn."""
@@ -252,15 +252,15 @@ class View:
     shift: mi.Vector3f
 
     @classmethod
-    def of(cls, numbers: mi.Float) -> View:
-        """The view of the 20 numbers of :func:`numbers_of`."""
+    def unpack(cls, numbers: mi.Float) -> View:
+        """The view of the 20 numbers of :func:`pack_view`."""
         read = [dr.gather(mi.Float, numbers, mi.UInt32(k)) for k in range(20)]
         axes = [mi.Vector3f(*read[k : k + 3]) for k in (3, 6, 9)]
         plane = [mi.Vector2f(*read[k : k + 2]) for k in (12, 14, 16, 18)]
         return cls(mi.Point3f(*read[:3]), *axes, *plane, dr.zeros(mi.Vector3f), dr.zeros(mi.Vector3f))
 
 
-def numbers_of(camera: Camera, size: tuple[int, int]) -> mi.Float:
+def pack_view(camera: Camera, size: tuple[int, int]) -> mi.Float:
     """A camera as one array on the device: the numbers of a :class:`View`, in the order of its attributes.
 
     Args:

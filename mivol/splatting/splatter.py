@@ -23,11 +23,11 @@ from mivol.machine import available_memory
 from mivol.photos.camera import Camera
 from mivol.points import Gaussians
 from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
-from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, View, numbers_of, project
+from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, View, pack_view, project
 from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, nearest_first, write_tiles
 from mivol.threads import check_one_thread
 
-__all__ = ["NAMES", "Kept", "Splatter", "Statistics", "tensors_of"]
+__all__ = ["NAMES", "SplatterCache", "Splatter", "Statistics", "to_tensors"]
 
 NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
 """The tensors of a cloud."""
@@ -37,7 +37,7 @@ ENTRY_BYTES = 4 * (4 + LANES * PIXELS // CHUNK)
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class SplatterCache:
     """What a picture keeps for its derivatives; valid until the splatter draws the next one."""
 
     cloud: Cloud
@@ -67,7 +67,7 @@ class Statistics:
     radius: np.ndarray
 
 
-def tensors_of(gaussians: Gaussians) -> dict[str, mi.TensorXf]:
+def to_tensors(gaussians: Gaussians) -> dict[str, mi.TensorXf]:
     """The tensors of a cloud by name, as :meth:`Splatter.forward` takes them."""
     return {name: mi.TensorXf(getattr(gaussians, name)) for name in NAMES}
 
@@ -98,7 +98,7 @@ class Splatter:
 
     Example:
         >>> gaussians = mivol.read_gaussians("biker.ply")
-        >>> picture, _ = Splatter(800, 800, gaussians.degree).forward(tensors_of(gaussians), camera)
+        >>> picture, _ = Splatter(800, 800, gaussians.degree).forward(to_tensors(gaussians), camera)
     """
 
     def __init__(
@@ -135,7 +135,9 @@ class Splatter:
     def __repr__(self) -> str:
         return f"Splatter({self.size[0]} x {self.size[1]}, degree {self.degree})"
 
-    def forward(self, reals: Mapping[str, mi.TensorXf], camera: Camera, derivatives: bool = True) -> tuple[mi.TensorXf, Kept]:
+    def forward(
+        self, reals: Mapping[str, mi.TensorXf], camera: Camera, derivatives: bool = True
+    ) -> tuple[mi.TensorXf, SplatterCache]:
         """Draw a cloud.
 
         Args:
@@ -153,7 +155,7 @@ class Splatter:
         check_one_thread()
         shapes = _checked_shapes(reals, self.degree)
         cloud = Cloud(*[kept_aligned(dr.detach(reals[name].array)) for name in NAMES])
-        view = numbers_of(camera, self.size)
+        view = pack_view(camera, self.size)
         n = shapes["means"][0]
         if n == 0:
             return self._nothing(cloud, view, shapes)
@@ -166,10 +168,10 @@ class Splatter:
         frame = self._frame(lists, derivatives)
         image, chunks, frame.transmittance = self._composite((shape, rest), lists, self._grid, frame)
         seen = counts > 0
-        kept = Kept(cloud, view, shapes, shape, rest, lists, frame, chunks, seen, np.where(seen, np.array(radius), 0))
+        kept = SplatterCache(cloud, view, shapes, shape, rest, lists, frame, chunks, seen, np.where(seen, np.array(radius), 0))
         return self._tensor(image), kept
 
-    def backward(self, kept: Kept, d_picture: mi.TensorXf) -> tuple[dict[str, mi.TensorXf], Statistics]:
+    def backward(self, kept: SplatterCache, d_picture: mi.TensorXf) -> tuple[dict[str, mi.TensorXf], Statistics]:
         """The derivatives of a number L by everything that a picture was made of.
 
         Args:
@@ -213,7 +215,7 @@ class Splatter:
     def _trace_projection(
         self, cloud: Cloud, view: mi.Float, filtering: Filter, grid: Grid, shape: mi.Float, rest: mi.Float
     ) -> tuple:
-        splats = project(cloud.split(self.degree), View.of(view), filtering, self.degree, self.compensated)
+        splats = project(cloud.split(self.degree), View.unpack(view), filtering, self.degree, self.compensated)
         index = dr.arange(mi.UInt32, dr.width(splats.x))
         drawn = splats.drawn & ~splats.faulty
         dr.scatter(shape, mi.ArrayXf(splats.shape()), index)
@@ -224,7 +226,7 @@ class Splatter:
     def _trace_adjoint(
         self, cloud: Cloud, view: mi.Float, filtering: Filter, adjoint: Adjoint, target: Cloud
     ) -> tuple[Cloud, list[mi.Float], mi.Float]:
-        parts, looking = cloud.split(self.degree), View.of(view)
+        parts, looking = cloud.split(self.degree), View.unpack(view)
         # A motion for each Gaussian: Dr.Jit would add up the derivatives by a single one at each step of the formula.
         nothing = mi.Float(dr.arange(mi.UInt32, dr.width(cloud.opacity_logits)) & 0)
         looking.turn, looking.shift = mi.Vector3f(nothing), mi.Vector3f(nothing)
@@ -270,12 +272,14 @@ class Splatter:
         image = _blank(width * height * self.channels)
         return Frame(self._width, self._height, image, transmittance, self.depth, self.median, derivatives, self.discs)
 
-    def _nothing(self, cloud: Cloud, view: mi.Float, shapes: Mapping[str, tuple[int, ...]]) -> tuple[mi.TensorXf, Kept]:
+    def _nothing(
+        self, cloud: Cloud, view: mi.Float, shapes: Mapping[str, tuple[int, ...]]
+    ) -> tuple[mi.TensorXf, SplatterCache]:
         """The picture of a cloud without Gaussians."""
         nothing, empty = mi.Float(), np.zeros(0, np.float32)
         lists = Lists(mi.UInt32(), mi.UInt32(), mi.UInt32(), mi.UInt32())
         frame = Frame(self._width, self._height, nothing, nothing, self.depth, self.median, True, self.discs)
-        kept = Kept(cloud, view, shapes, nothing, nothing, lists, frame, mi.UInt32(), np.zeros(0, bool), empty)
+        kept = SplatterCache(cloud, view, shapes, nothing, nothing, lists, frame, mi.UInt32(), np.zeros(0, bool), empty)
         return dr.zeros(mi.TensorXf, (self.size[1], self.size[0], self.channels)), kept
 
     def _tensor(self, image: mi.Float) -> mi.TensorXf:

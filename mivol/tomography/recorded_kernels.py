@@ -17,9 +17,9 @@ from mivol.transport.media.column_integral import (
     pad_nodes,
     zero_nodes,
 )
-from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_segment
-from mivol.transport.traversal.box import slab
-from mivol.transport.traversal.lattice import Lattice, clip
+from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_segment
+from mivol.transport.traversal.box import clip_to_box
+from mivol.transport.traversal.lattice import Lattice, clip_to_grid
 
 __all__ = ["RecordedKernels"]
 
@@ -66,12 +66,12 @@ class RecordedKernels:
 
     def _trace_integral(self, values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
         lattice = Lattice(mi.TensorXf(values, self._shape), None, empty, from_world=rows)
-        return integrate_segment(lattice, values, clip(lattice, o, d, 0, dr.inf))[0]
+        return integrate_segment(lattice, values, clip_to_grid(lattice, o, d, 0, dr.inf))[0]
 
     def _trace_backprojection(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
         lattice = Lattice(mi.TensorXf(dr.zeros(mi.Float, self.grid.size), self._shape), None, from_world=rows)
-        target = Gradient.zeros(lattice)
-        backproject_segment(lattice, target, [weight], clip(lattice, o, d, 0, dr.inf))
+        target = NodeGradient.zeros(lattice)
+        backproject_segment(lattice, target, [weight], clip_to_grid(lattice, o, d, 0, dr.inf))
         return target.fold()
 
     def _lattice_of(self, values: mi.Float) -> Lattice:
@@ -110,7 +110,7 @@ class RecordedKernels:
 def _line_in(grid: ColumnGrid, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> Line:
     """The part of rays inside the box of the grid."""
     high = tuple(n - 0.5 for n in grid.res[::-1])
-    q, v, t0, t1 = slab(rows, (-0.5,) * 3, high, o, d, mi.Float64(0), mi.Float64(dr.inf))
+    q, v, t0, t1 = clip_to_box(rows, (-0.5,) * 3, high, o, d, mi.Float64(0), mi.Float64(dr.inf))
     hit = t1 > t0
     entry = [dr.clip(dr.fma(dr.select(hit, t0, 0), v[a], q[a]), -0.5, high[a]) for a in range(3)]
     return Line(entry, v, dr.select(hit, t1 - t0, 0))

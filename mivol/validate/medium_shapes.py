@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.media.medium_view import children_of, kind_of, traverse_medium
+from mivol.transport.media.medium_view import find_children, medium_kind, traverse_medium
 
 __all__ = ["ON_FACE", "RESTART", "MediumShape", "number", "read_medium_shape"]
 
@@ -89,7 +89,7 @@ def read_medium_shape(shape: mi.Shape) -> MediumShape:
     params = traverse_medium(shape.interior_medium())
     volumes = _extinction_volumes(shape.interior_medium())
     stock = next((v for v in volumes if v.class_name() in ("GridVolume", "ConstVolume")), None)
-    kind = kind_of(shape.interior_medium())
+    kind = medium_kind(shape.interior_medium())
     mesh = "vertex_positions" in geometry
     points = np.array(geometry["vertex_positions"], np.float64).reshape(-1, 3) if mesh else _corners(shape.bbox())
     faces = np.array(geometry["faces"]).reshape(-1, 3) if mesh else None
@@ -140,7 +140,7 @@ def _skin(points: np.ndarray, volumes: list[mi.Volume], to_local: np.ndarray | N
 
 def _extinction_volumes(medium: mi.Medium) -> list[mi.Volume]:
     """The volumes whose sum is a medium's extinction."""
-    return [v for name, v in children_of(medium).items() if name in ("sigma_t", "sigma_a", "sigma_s")]
+    return [v for name, v in find_children(medium).items() if name in ("sigma_t", "sigma_a", "sigma_s")]
 
 
 def _reach(kind: str, volumes: list[mi.Volume]) -> np.ndarray | None:

@@ -93,10 +93,10 @@ def test_a_point_has_the_parts_that_are_asked_for():
     np.testing.assert_allclose(values(body.extinction_at(*at)), [1.5] * 3, rtol=ROUNDING)
     np.testing.assert_allclose(values(body.extinction_at(*at, "sigma_s")), [1] * 3, rtol=ROUNDING)
     body.tangents = [mi.Float(3), dr.full(mi.Float, 4, 8)]
-    np.testing.assert_allclose(values(body.tangent_at(*at)), [7] * 3, rtol=ROUNDING)
-    np.testing.assert_allclose(values(body.tangent_at(*at, "sigma_s")), [4] * 3, rtol=ROUNDING)
-    np.testing.assert_allclose(values(body.tangent_of_part(body.view.parts[1], *at)), [4] * 3, rtol=ROUNDING)
-    np.testing.assert_allclose(values(body.tangent(inside(), 3)), [7] * 3, rtol=ROUNDING)
+    np.testing.assert_allclose(values(body.jvp_extinction_at(*at)), [7] * 3, rtol=ROUNDING)
+    np.testing.assert_allclose(values(body.jvp_extinction_at(*at, "sigma_s")), [4] * 3, rtol=ROUNDING)
+    np.testing.assert_allclose(values(body.jvp_part_at(body.view.parts[1], *at)), [4] * 3, rtol=ROUNDING)
+    np.testing.assert_allclose(values(body.jvp_optical_depth(inside(), 3)), [7] * 3, rtol=ROUNDING)
 
 
 def started(*parts: object, **more: object) -> Body:
@@ -114,10 +114,10 @@ def vjp(body: Body) -> list[float]:
 def test_gradients_go_to_the_parts_that_are_named():
     weight, ray, t, on = [mi.Float(1), mi.Float(2), mi.Float(4)], across(), mi.Float(1.5), mi.Bool(ON)
     for deposit, expected in {
-        "all": (lambda b: b.deposit(ray, t, weight, on), [7, 7]),
-        "named": (lambda b: b.deposit(ray, t, weight, on, "sigma_s"), [0, 7]),
-        "one": (lambda b: b.deposit_in_part(b.view.parts[1], ray, t, weight, on), [0, 7]),
-        "along": (lambda b: b.backproject(inside(), weight), [7, 7]),
+        "all": (lambda b: b.vjp_extinction_at(ray, t, weight, on), [7, 7]),
+        "named": (lambda b: b.vjp_extinction_at(ray, t, weight, on, "sigma_s"), [0, 7]),
+        "one": (lambda b: b.vjp_part_at(b.view.parts[1], ray, t, weight, on), [0, 7]),
+        "along": (lambda b: b.vjp_optical_depth(inside(), weight), [7, 7]),
         "constants": (lambda b: b.add_to_constants(weight, on), [7, 0]),
         "a cell": (lambda b: b.add_to_grid(b.view.parts[1], mi.Vector3i(0), [(weight, [mi.Float(0.125)] * 8)], on), [0, 7]),
     }.values():
@@ -128,10 +128,10 @@ def test_gradients_go_to_the_parts_that_are_named():
 
 def test_bounded_parts_are_left_out_of_derivatives_along_a_ray():
     body = started(constant(0.25), bounded())
-    body.backproject(inside(), [mi.Float(3)])
+    body.vjp_optical_depth(inside(), [mi.Float(3)])
     assert vjp(body) == [3, 0]
     body.tangents = [mi.Float(5), mi.Float(7)]
-    assert values(body.tangent(inside(), 1)) == [5]
+    assert values(body.jvp_optical_depth(inside(), 1)) == [5]
 
 
 FLAKES = np.array([[4, 1, 0.5], [1, 2, 0.25], [0.5, 0.25, 8]])
@@ -156,12 +156,12 @@ def test_flakes_multiply_the_extinction_by_their_projected_area(where: str) -> N
     body.microflakes_tangent = [mi.Float(t) for t in tangent]
     weight = [mi.Float(3)]
     if where == "at a point":
-        (sigma,), (change,) = (f(ray, mi.Float(1), 1, on) for f in (body.extinction_at, body.tangent_at))
-        body.deposit(ray, mi.Float(1), weight, on)
+        (sigma,), (change,) = (f(ray, mi.Float(1), 1, on) for f in (body.extinction_at, body.jvp_extinction_at))
+        body.vjp_extinction_at(ray, mi.Float(1), weight, on)
     else:
         interval = RayInterval(ray, mi.Float(1), mi.Float(2), on)
-        (sigma,), (change,) = (f(interval, 1) for f in (body.optical_depth, body.tangent))
-        body.backproject(interval, weight)
+        (sigma,), (change,) = (f(interval, 1) for f in (body.optical_depth, body.jvp_optical_depth))
+        body.vjp_optical_depth(interval, weight)
     # The scale is 2 and the constant 0.5.
     assert sigma[0] == pytest.approx(area, rel=ROUNDING)
     assert change[0] == pytest.approx(slopes @ tangent, abs=ROUNDING * np.abs(slopes * tangent).sum())

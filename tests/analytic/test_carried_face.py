@@ -12,12 +12,12 @@ from mivol.device_arrays import ALIGNMENT
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
 from mivol.transport.line_integrals.radiance_source import Exact, make_exact
-from mivol.transport.traversal.occupied_cells import Cells
+from mivol.transport.traversal.occupied_cells import OccupiedCells
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
-def followed(field: SphericalGrid, cells: Cells, o, d) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def followed(field: SphericalGrid, cells: OccupiedCells, o, d) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """What rays see through these cells, and the derivatives of a sum of it."""
     rays, model = rays_of(o, d), make_model(field)
     source = make_exact(field, rays.d, slope=True)
@@ -32,7 +32,7 @@ def test_cells_that_are_left_out_between_others_change_nothing():
     # A tenth of the nodes hold much, so that the walls of holes, which hold little less than nothing, are felt beside them.
     field = SphericalGrid.from_dense(np.where(density > 9.5, density, np.float32(-0.1)), sh, TO_WORLD)
     some = find_occupied_cells(field)
-    whole = Cells.find(field.res, TO_WORLD, field.look_up_rows, lambda _: mi.Bool(True), field.rows)
+    whole = OccupiedCells.find(field.res, TO_WORLD, field.look_up_rows, lambda _: mi.Bool(True), field.rows)
     assert 0.2 * whole.count < some.count < 0.8 * whole.count
     o, d = aim(100)
     for ours, theirs in zip(followed(field, some, o, d), followed(field, whole, o, d), strict=True):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
-from mivol.transport.traversal.interpolation import GAUSS
+from mivol.transport.traversal.interpolation import GAUSS_POINT
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -44,7 +44,7 @@ def test_linear_emission_in_constant_extinction():
     """
     sigma, slope = SIGMAS[2:4], 2.0
     found = weigh_emission_density(mi.Float64(DT), mi.Float64(sigma), mi.Float64(sigma))
-    at = [1 + slope * DT * p for p in (GAUSS, 1 - GAUSS)]
+    at = [1 + slope * DT * p for p in (GAUSS_POINT, 1 - GAUSS_POINT)]
     total = sum(np.array(w) * j for w, j in zip(found.weights, at, strict=True))
     tau = sigma * DT
     exact = -np.expm1(-tau) / sigma + slope * (1 - (1 + tau) * np.exp(-tau)) / sigma**2

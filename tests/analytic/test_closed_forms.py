@@ -20,7 +20,7 @@ from mivol.phase.closed_forms import (
     sample_rayleigh,
 )
 from mivol.phase.domain import NEXT_TO_ONE
-from mivol.phase.turn import Turn
+from mivol.phase.scattering_angle import ScatteringAngle
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -55,11 +55,11 @@ def test_moments_of_hg(g):
 def test_legendre_moments_and_backscatter_of_hg():
     g = 0.7
     c, w = oracle.gauss(400)
-    values = as64(eval_hg(Turn(*lanes(1 - c, 1 + c)), mi.Float(g))) * 2 * np.pi * w
+    values = as64(eval_hg(ScatteringAngle(*lanes(1 - c, 1 + c)), mi.Float(g))) * 2 * np.pi * w
     moments = [(values * np.polynomial.legendre.Legendre.basis(k)(c)).sum() for k in range(10)]
     assert np.max(np.abs(moments - g ** np.arange(10.0))) <= 40 * EPS
     c, w = (c - 1) / 2, w / 2
-    back = (as64(eval_hg(Turn(*lanes(1 - c, 1 + c)), mi.Float(g))) * 2 * np.pi * w).sum()
+    back = (as64(eval_hg(ScatteringAngle(*lanes(1 - c, 1 + c)), mi.Float(g))) * 2 * np.pi * w).sum()
     assert back == pytest.approx((1 - g) / (2 * g) * ((1 + g) / np.sqrt(1 + g * g) - 1), rel=10 * EPS)
 
 

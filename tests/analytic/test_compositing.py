@@ -10,8 +10,8 @@ from mivol.transport.media.compositing import (
     BodyIntegral,
     CellIntegral,
     ReverseState,
+    composite_over,
     pass_cell,
-    put_in_front,
     transmittance_of,
 )
 
@@ -41,7 +41,7 @@ def test_pieces_are_put_in_front_of_each_other_with_their_tangents() -> None:
     swept = BodyIntegral([mi.Float64(0)] * 2, [mi.Float(0)] * 2)
     for (tau, colour), (dtau, dcolour) in list(zip(PIECES, change, strict=True))[::-1]:
         own = mi.Float(dcolour * -np.expm1(-tau))
-        swept = put_in_front(swept, [integral_of(tau, colour)], [[mi.Float(dtau)]], [own])
+        swept = composite_over(swept, [integral_of(tau, colour)], [[mi.Float(dtau)]], [own])
     moved = [[(t + s * h * a, c + s * h * b) for (t, c), (a, b) in zip(PIECES, change, strict=True)] for s in (1, -1)]
     assert float(swept.N[0][0]) == pytest.approx(light(PIECES, 0.0), rel=1e-6)
     assert float(swept.tau[0][0]) == pytest.approx(sum(tau for tau, _ in PIECES), rel=1e-6)

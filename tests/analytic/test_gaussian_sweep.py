@@ -16,7 +16,7 @@ from mivol.fields.gaussian_line import WhitenedLine
 from mivol.points.gaussians import Gaussians
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
-from mivol.transport.media.gaussian_sweep import SLOTS, GaussianSweep, visit_from_the_far_end
+from mivol.transport.media.gaussian_sweep import SLOTS, GaussianSweep, visit_far_to_near
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -102,7 +102,7 @@ def visited(gaussians: Gaussians, o: np.ndarray, d: np.ndarray, span: tuple[floa
         dr.scatter(seen, index, lane * most + count)
         return count + 1
 
-    counts = np.array(visit_from_the_far_end(part, interval, dr.zeros(mi.UInt32, len(o)), add))
+    counts = np.array(visit_far_to_near(part, interval, dr.zeros(mi.UInt32, len(o)), add))
     table = np.array(seen).reshape(len(o), most)
     return [row[:n].tolist() for row, n in zip(table, counts, strict=True)]
 

@@ -14,7 +14,7 @@ from mivol.transport.media.grid_extinction import (
     GridExtinction,
     SummedExtinction,
     add_to_cell,
-    share_cells,
+    have_same_cells,
 )
 from mivol.transport.traversal.lattice import Lattice
 
@@ -163,6 +163,6 @@ def test_values_are_activated_and_tangents_are_not():
 
 
 def test_cells_are_shared_by_grids_of_one_resolution_and_place():
-    assert share_cells(lattice(), lattice(3))
-    assert not share_cells(lattice(), lattice(res=(2, 2, 3)))
-    assert not share_cells(lattice(), lattice(shift=1e-3))
+    assert have_same_cells(lattice(), lattice(3))
+    assert not have_same_cells(lattice(), lattice(res=(2, 2, 3)))
+    assert not have_same_cells(lattice(), lattice(shift=1e-3))

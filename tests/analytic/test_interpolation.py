@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from mivol.transport.traversal.interpolation import (
-    cubic_at,
-    cubic_integral,
-    cubic_through,
+    eval_cubic,
+    fit_cubic,
+    fraction_from_lower,
+    integrate_cubic,
     interpolate,
     invert_cubic_integral,
-    upward_frac,
-    weights,
+    trilinear_weights,
 )
 from scenes import as_float32
 
@@ -41,14 +41,14 @@ def test_weights_are_the_transpose():
     """Products of three factors x or 1 - x: at most five roundings each."""
     p = points()
     exact = np.prod(np.where(BITS[:, :, None] == 1, p.astype(np.float64), 1 - p.astype(np.float64)), axis=1)
-    for found, weight in zip(weights(mi.Vector3f(*p)), exact, strict=True):
+    for found, weight in zip(trilinear_weights(mi.Vector3f(*p)), exact, strict=True):
         np.testing.assert_allclose(np.array(found), weight, rtol=5 * ROUNDING)
 
 
 def test_the_outer_half_voxel_has_one_node():
     """A grid of (Z, Y, X) = (4, 3, 2): all weight is on the upper node before the first, on the lower from the last on."""
     lower = mi.Vector3i(mi.Int32(-1, 0, 1), mi.Int32(-1, 1, 2), mi.Int32(-1, 2, 3))
-    found = np.array(upward_frac(mi.Vector3f(0.25), lower, (4, 3, 2)))
+    found = np.array(fraction_from_lower(mi.Vector3f(0.25), lower, (4, 3, 2)))
     np.testing.assert_array_equal(found, [[1, 0.25, 0]] * 3)
 
 
@@ -75,29 +75,29 @@ def depth(values: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def lanes(values: np.ndarray) -> list[mi.Float]:
-    return cubic_through(*(mi.Float(row) for row in values))
+    return fit_cubic(*(mi.Float(row) for row in values))
 
 
 def inverted(values: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Where the integral is ``u`` of the whole."""
     curve = lanes(values)
-    whole = cubic_integral(curve, mi.Float(DT), mi.Float(1))
+    whole = integrate_cubic(curve, mi.Float(DT), mi.Float(1))
     return np.array(invert_cubic_integral(curve, mi.Float(DT), mi.Float(u) * whole, whole), np.float64)
 
 
 def test_values_and_integrals_are_those_of_the_cubic():
     values, x = curves(), as_float32(np.random.default_rng(3).uniform(0, 1, N))
     curve, top = lanes(values), values.max(axis=0)
-    found = np.array(cubic_at(curve, mi.Float(x)))
+    found = np.array(eval_cubic(curve, mi.Float(x)))
     np.testing.assert_array_less(np.abs(found - sum(c * x**k for k, c in enumerate(exact(values)))), OF_VALUE * top)
-    found = np.array(cubic_integral(curve, mi.Float(DT), mi.Float(x)))
+    found = np.array(integrate_cubic(curve, mi.Float(DT), mi.Float(x)))
     np.testing.assert_array_less(np.abs(found - depth(values, x)), OF_INTEGRAL * DT * top)
 
 
 def test_no_integral_is_negative():
     """Of F x^3 from 0 to 1e-4 little is left but the rounding of its coefficients, which are 0 on paper."""
     values = as_float32(np.random.default_rng(4).uniform(1, 2, N) * THIRDS[:, None] ** 3)
-    assert np.array(cubic_integral(lanes(values), mi.Float(1), mi.Float(1e-4))).min() == 0
+    assert np.array(integrate_cubic(lanes(values), mi.Float(1), mi.Float(1e-4))).min() == 0
 
 
 def test_the_inverse_reaches_its_goal():

@@ -14,8 +14,8 @@ from mivol.scene.survey import SceneSurvey
 from mivol.transport.media import medium_view
 from mivol.transport.media.extinction import ConstantExtinction
 from mivol.transport.media.grid_extinction import GridExtinction
-from mivol.transport.media.medium_view import MediumView, place_of_grid, view_medium
-from mivol.transport.traversal.box import Box, box_of_cube
+from mivol.transport.media.medium_view import MediumView, find_grid_place, view_medium
+from mivol.transport.traversal.box import Box, read_box
 from mivol.transport.traversal.lattice import Lattice
 from scenes import FRAMES, box_of, centred, grid_volume, medium, refused
 
@@ -74,7 +74,7 @@ def test_a_stock_grid_that_fills_its_boundary_is_placed_exactly(draw):
     turned = scenes.rotation(rng.normal(size=3), rng.uniform(0.3, 3)) @ np.diag(rng.uniform(1, 3, 3))
     place = scenes.centred(turned, rng.uniform(1, 3, 3))
     cube = mi.load_dict(box_of(medium("heterogeneous", grid_volume("gridvolume", VALUES, place)), place))
-    found = view_medium(cube.interior_medium(), box_of_cube(cube)).parts[0].lattice.to_world
+    found = view_medium(cube.interior_medium(), read_box(cube)).parts[0].lattice.to_world
     # Vertices of size 6 at most, each rounded to half an ulp (2^-22) once in the transform and once in the product; the fit
     # over 24 of them averages. Six digits would leave 5e-6.
     assert np.abs(found - place).max() <= 2 * 2.0**-22
@@ -85,13 +85,13 @@ def test_a_stock_grid_elsewhere_is_placed_to_six_digits(frame):
     place = FRAMES[frame]
     volume = mi.load_dict(grid_volume("gridvolume", VALUES, place))
     # The promise of place_of_grid: 5e-6 of the size.
-    assert np.abs(place_of_grid(volume) - place).max() <= 5e-6 * np.abs(place).max()
+    assert np.abs(find_grid_place(volume) - place).max() <= 5e-6 * np.abs(place).max()
 
 
 def test_our_grid_knows_its_place():
     place = FRAMES["sheared"]
     volume = mi.load_dict(grid_volume("mivol_voxels", VALUES, place))
-    assert np.array_equal(place_of_grid(volume), np.float32(place).astype(np.float64))
+    assert np.array_equal(find_grid_place(volume), np.float32(place).astype(np.float64))
 
 
 def scatters(description: dict) -> bool:
@@ -132,7 +132,7 @@ def test_a_grid_is_placed_once_for_each_boundary(monkeypatch: pytest.MonkeyPatch
         asked.append((volume.ptr, boundary))
         return np.full((4, 4), len(asked))
 
-    monkeypatch.setattr(medium_view, "place_of_grid", place)
+    monkeypatch.setattr(medium_view, "find_grid_place", place)
     one, two = (SimpleNamespace(ptr=number) for number in (1, 2))
     small, large = Box(np.eye(4)), Box(2 * np.diag([1.0, 1, 1, 0.5]))
     places: dict = {}

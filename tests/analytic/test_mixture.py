@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from phase_angles import EPS, as64, lanes
 
-from mivol.phase.mixture import choose_lobe, shares_of
+from mivol.phase.mixture import choose_lobe, normalise_weights
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def test_shares_and_choice():
-    shares = shares_of([mi.Float(1), mi.Float(0), mi.Float(3)])
+    shares = normalise_weights([mi.Float(1), mi.Float(0), mi.Float(3)])
     assert [float(s[0]) for s in shares] == [0.25, 0, 0.75]
     chosen, inside = choose_lobe(shares, *lanes([0, 0.1, 0.2499, 0.25, 0.5, 1 - 2.0**-24]))
     assert list(chosen) == [0, 0, 0, 2, 2, 2]
@@ -26,7 +26,7 @@ def test_shares_and_choice():
 def test_a_lobe_without_a_share_is_never_chosen():
     """Not at the ends either: u = 0 before a first one, u = 1 (shares may sum to less, by rounding) after a last one."""
     for weights, want in (([0, 1, 0], [1, 1, 1]), ([2, 0, 0], [0, 0, 0]), ([0, 0, 3], [2, 2, 2])):
-        chosen, _ = choose_lobe(shares_of([mi.Float(w) for w in weights]), mi.Float(0, 0.5, 1))
+        chosen, _ = choose_lobe(normalise_weights([mi.Float(w) for w in weights]), mi.Float(0, 0.5, 1))
         assert list(chosen) == want
 
 
@@ -34,7 +34,7 @@ def test_shares_without_any_weight_are_equal():
     """And have a derivative of 0 by weights that sum to 0, where w / 0 would have none."""
     weights = [mi.Float(0, 1), mi.Float(0, 3)]
     dr.enable_grad(weights)
-    shares = shares_of(weights)
+    shares = normalise_weights(weights)
     assert [list(s) for s in shares] == [[0.5, 0.25], [0.5, 0.75]]
     dr.backward(shares[0])
     # Of 1 / (1 + 3): 3/16 by the first weight and -1/16 by the second.

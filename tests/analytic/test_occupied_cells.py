@@ -14,9 +14,9 @@ from scipy.ndimage import distance_transform_cdt
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells
 from mivol.transport.traversal.grid_blocks import REACH
-from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.lattice import clip_to_grid
 from mivol.transport.traversal.occupied_cells import CellIndex
-from mivol.transport.traversal.occupied_walk import march
+from mivol.transport.traversal.occupied_walk import walk_occupied_cells
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -27,8 +27,8 @@ def test_fractions_across_a_ray_along_an_axis_are_those_of_its_start():
     n = 64
     o = np.stack([np.full(n, -1.0), *np.random.default_rng(1).uniform(0.1, 0.9, (2, n))], axis=-1)
     rays, cells = rays_of(o, [1.0, 0.0, 0.0]), find_occupied_cells(field)
-    segment = clip(cells, rays.o, rays.d, 0, rays.t_max)
-    seen, _, _ = march(cells, segment, lambda _, here, on: mi.Vector3f(here.points[0]), mi.Vector3f(0))
+    segment = clip_to_grid(cells, rays.o, rays.d, 0, rays.t_max)
+    seen, _, _ = walk_occupied_cells(cells, segment, lambda _, here, on: mi.Vector3f(here.points[0]), mi.Vector3f(0))
     start = np.array(segment.frac)
     assert np.array_equal(np.array(seen)[1:], start[1:])
     # The test is no test where the rounding is none.

@@ -9,7 +9,7 @@ from radiance_rays import CUBE
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells
-from mivol.transport.traversal.occupied_walk import piece_of, pieces
+from mivol.transport.traversal.occupied_walk import count_pieces, find_piece
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -29,9 +29,9 @@ def test_pieces_of_a_ray_through_the_middle_and_of_one_that_misses() -> None:
         [(1, 3), (3, 7), None, None, (7, 9)],
         [None, None, (0, 0.5), (0.5, 1.5), (1.5, 3.5)],
     ]
-    assert pieces(cells) == 5
+    assert count_pieces(cells) == 5
     for number in range(5):
-        piece = piece_of(cells, o, d, np.inf, mi.Int32(number))
+        piece = find_piece(cells, o, d, np.inf, mi.Int32(number))
         level = abs(number - 2)
         assert int(piece.level[0]) == level and float(piece.scale[0]) == 2**level
         start = np.array(piece.segment.t0) * 2.0**level

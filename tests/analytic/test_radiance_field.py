@@ -13,7 +13,7 @@ from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, raise_to_max_weights, render_rays
 from mivol.transport.line_integrals.radiance_source import make_exact
-from mivol.transport.traversal.occupied_cells import Cells
+from mivol.transport.traversal.occupied_cells import OccupiedCells
 
 
 @pytest.mark.slow_for("none")
@@ -212,7 +212,7 @@ def test_a_ray_that_stops_early_errs_by_what_it_leaves(variant_rgb: str) -> None
     assert np.abs(see(field, o, d)[0] - see(field, o, d, stop=0.05)[0]).max() <= 0.05 * brightest
 
 
-def numbers_of(cells: Cells) -> np.ndarray:
+def numbers_of(cells: OccupiedCells) -> np.ndarray:
     """Of each cell (Z, Y, X) its place in the list, which only listed ones have."""
     return looked(cells.index, (1, *(n + 1 for n in cells.res)), (True, True, True))[1][0]
 

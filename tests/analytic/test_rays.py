@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scattering_scenes import assert_same_images, fog, mivol, point, smoke
 
-from mivol.transport.traversal.rays import FineRay, point_along, traced
+from mivol.transport.traversal.rays import FineRay, point_along, to_mitsuba_ray
 from scenes import ball_of, camera, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -20,7 +20,7 @@ PLACE = np.array([100.0 + 1e-9, -8.0 + 1e-10, 1e-12])
 def ray_from(place: np.ndarray) -> FineRay:
     it = dr.zeros(mi.MediumInteraction3f)
     it.time = 0.25
-    return FineRay.leaving(mi.Point3d(*place.tolist()), mi.Vector3f(0, 0.6, 0.8), it, mi.Float(3))
+    return FineRay.from_point(mi.Point3d(*place.tolist()), mi.Vector3f(0, 0.6, 0.8), it, mi.Float(3))
 
 
 def numbers(p: object) -> np.ndarray:
@@ -30,7 +30,7 @@ def numbers(p: object) -> np.ndarray:
 def test_an_origin_keeps_its_digits():
     ray = ray_from(PLACE)
     assert (numbers(ray.o) == PLACE).all()
-    assert (numbers(FineRay.of(ray).o) == PLACE).all()
+    assert (numbers(FineRay.from_ray(ray).o) == PLACE).all()
     assert float(ray.time[0]) == 0.25
     assert float(ray.maxt[0]) == 3
 
@@ -46,7 +46,7 @@ def test_points_are_found_in_float64_and_rounded_once():
 
 
 def test_mitsuba_traces_from_the_nearest_point():
-    found = traced(ray_from(PLACE))
+    found = to_mitsuba_ray(ray_from(PLACE))
     assert isinstance(found, mi.Ray3f)
     assert (numbers(found.o) == PLACE.astype(np.float32)).all()
     assert float(found.maxt[0]) == 3
@@ -54,7 +54,7 @@ def test_mitsuba_traces_from_the_nearest_point():
 
 def test_a_ray_of_mitsuba_becomes_one_without_change():
     ray = mi.Ray3f(mi.Point3f(0.1, 0.2, 0.3), mi.Vector3f(0, 0, 1), 2.0, 0.5, mi.Color0f())
-    found = FineRay.of(ray)
+    found = FineRay.from_ray(ray)
     assert (numbers(found.o) == np.float32([0.1, 0.2, 0.3])).all()
     assert float(found.maxt[0]) == 2
     assert float(found.time[0]) == 0.5

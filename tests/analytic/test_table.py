@@ -82,7 +82,7 @@ VALUES = np.array([0.3, 0.0, 0.0, 1.0, 1.0, 2.0, 40.0, 300.0, 1000.0])
 
 
 def lookup(table: Table) -> tuple[Lookup, mi.Float, mi.Float, mi.Float]:
-    nodes = Lookup.of(table)
+    nodes = Lookup.from_table(table)
     return nodes, *nodes.normalise(mi.Float(table.values.astype(np.float32)))
 
 

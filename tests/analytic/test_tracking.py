@@ -19,7 +19,7 @@ from mivol.transport.estimators.flights import tracking
 from mivol.transport.estimators.flights.tracking import residual_ratio_tracking
 from mivol.transport.media.grid_integral import integrate_segment
 from mivol.transport.traversal.grid_blocks import find_block_ranges
-from mivol.transport.traversal.lattice import Lattice, clip
+from mivol.transport.traversal.lattice import Lattice, clip_to_grid
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from mivol.validate.moments import Moments
 from scenes import as_float32, refused
@@ -72,7 +72,7 @@ def estimates(lattice: Lattice, scale: float = 1.0) -> tuple[np.ndarray, np.ndar
     """[channel, repeat, ray] estimates along random rays, and [channel, ray] exact transmittances in float64."""
     o, d = (np.tile(v, (REPEATS, 1)).T for v in aimed(7, RAYS))
     o, d = mi.Point3f(o), mi.Vector3f(d)
-    n, segment = RAYS * REPEATS, clip(lattice, o, d, 0, dr.inf)
+    n, segment = RAYS * REPEATS, clip_to_grid(lattice, o, d, 0, dr.inf)
     found, _ = residual_ratio_tracking(lattice, segment, mi.Float(scale), seed_pcg32(start(0.3), n), mi.Bool(True))
     exact = integrate_segment(lattice, lattice.values.array, segment)
     T = [np.exp(-scale * np.array(t, dtype=np.float64)[:RAYS]) for t in exact]
@@ -122,7 +122,7 @@ def test_variance_is_as_derived():
     values[..., 0] = 0.1 + 0.15 * np.arange(7)
     lattice, n = grid(values, shift=3), 1 << 19
     o = mi.Point3f(dr.full(mi.Float, -2, n), mi.Float(0), mi.Float(0))
-    segment = clip(lattice, o, mi.Vector3f(1, 0, 0), 0, dr.inf)
+    segment = clip_to_grid(lattice, o, mi.Vector3f(1, 0, 0), 0, dr.inf)
     found, _ = residual_ratio_tracking(lattice, segment, mi.Float(1), seed_pcg32(start(0.7), n), mi.Bool(True))
     found = np.array(found[0], dtype=np.float64)
     f = (np.arange(1000) + 0.5) / 1000

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from phase_angles import EPS, as64, turns
 
-from mivol.phase.turn import direction_after, turn_between
+from mivol.phase.scattering_angle import angle_between, scattered_direction
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -22,7 +22,7 @@ def test_turn_between_directions_keeps_small_angles():
     for sign in (-1, 1):
         wo = sign * wi * np.cos(1e-3) + side * np.sin(1e-3)
         a, b = (x.astype(np.float32).astype(np.float64) for x in (wi, wo))
-        turn = turn_between(mi.Vector3f(a.T), mi.Vector3f(b.T))
+        turn = angle_between(mi.Vector3f(a.T), mi.Vector3f(b.T))
         # A difference of neighbours is exact; three squares, two sums and a product are six roundings.
         for x, want in ((turn.below_one, ((a + b) ** 2).sum(1) / 2), (turn.above_minus_one, ((a - b) ** 2).sum(1) / 2)):
             assert np.max(np.abs(as64(x) / want - 1)) <= 3 * EPS
@@ -32,7 +32,7 @@ def test_direction_after_turns_by_the_angle():
     """Straight on is -wi, straight back wi, and the sine is right down to 1e-6."""
     turn, m, p = turns()
     wi = mi.Vector3f(0.6, 0.0, 0.8)
-    wo = as64(direction_after(wi, turn, mi.Float(0.3))).T
+    wo = as64(scattered_direction(wi, turn, mi.Float(0.3))).T
     # The three products of each component and the frame are a few roundings of 1.
     assert np.max(np.abs(wo @ [0.6, 0, 0.8] + (p - m) / 2)) <= 4 * EPS
     # Across the axis the vector is sin times a unit vector with its own roundings, plus those of cos wi.

@@ -21,7 +21,7 @@ from mivol.optim.gaussians.gaussian_start import make_start_cloud
 from mivol.photos import Photo, Photos
 from mivol.photos.transforms import write_transforms
 from mivol.points import Gaussians
-from mivol.splatting import Splatter, tensors_of
+from mivol.splatting import Splatter, to_tensors
 
 WHITE = np.ones(3, np.float32)
 
@@ -37,7 +37,7 @@ def ball(count: int = 80) -> Gaussians:
 def test_a_cloud_is_judged_with_the_filter_that_it_was_fitted_with(variant_rgb: str) -> None:
     """Gaussians of a twentieth of a pixel keep their light with the mip filter, and their opacity without: pictures differ."""
     cloud = replace(ball(), log_scales=np.full((80, 3), np.log(2e-3), np.float32))
-    seen = np.array(Splatter(32, 32, 0, compensated=True).forward(tensors_of(cloud), camera(0, 32), derivatives=False)[0])
+    seen = np.array(Splatter(32, 32, 0, compensated=True).forward(to_tensors(cloud), camera(0, 32), derivatives=False)[0])
     view = Photo("0", seen[..., :3] + 1 - seen[..., 3:], None, None, camera(0, 32), WHITE)
     assert psnr_of(cloud, [view], replace(PRESETS["tiny"], mip=True)) > 50
     assert psnr_of(cloud, [view], PRESETS["tiny"]) < 40
@@ -47,7 +47,7 @@ def test_a_cloud_is_judged_with_the_filter_that_it_was_fitted_with(variant_rgb: 
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Ten views of 32 x 32 pixels: with alpha, two of them the test split; without alpha, every other one half as bright."""
     mi.set_variant("llvm_ad_rgb")
-    splatter, cloud, found = Splatter(32, 32, 0), tensors_of(ball()), {}
+    splatter, cloud, found = Splatter(32, 32, 0), to_tensors(ball()), {}
     for name, alpha in (("alpha", True), ("exposed", False)):
         folder, cameras = tmp_path_factory.mktemp(name), {}
         for k in range(10):

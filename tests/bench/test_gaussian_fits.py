@@ -15,7 +15,7 @@ from mivol.optim.gaussians.gaussian_plan import PRESETS
 from mivol.optim.gaussians.gaussian_start import make_start_cloud
 from mivol.photos import Photo
 from mivol.points import Gaussians
-from mivol.splatting import Splatter, tensors_of
+from mivol.splatting import Splatter, to_tensors
 
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
@@ -30,7 +30,7 @@ def test_views_of_the_same_gaussians_agree_to_8_bits_and_those_of_others_do_not(
     splatter, white = Splatter(32, 32, 0), np.ones(3, np.float32)
     views = []
     for k in range(2):
-        seen = np.array(splatter.forward(tensors_of(cloud), camera(k, 32), derivatives=False)[0])
+        seen = np.array(splatter.forward(to_tensors(cloud), camera(k, 32), derivatives=False)[0])
         image = np.rint(np.clip(seen[..., :3] + 1 - seen[..., 3:], 0, 1) * 255).astype(np.float32) / 255
         views.append(Photo(f"{k}", image, None, None, camera(k, 32), white))
     assert mi.variant() == variant_rgb

@@ -13,7 +13,7 @@ from bounded_ball import Ball
 from mivol.fields.activation import select_activation
 from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, ExactExtinction, RayInterval
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
-from mivol.transport.traversal.grid_blocks import block_bounds, empty_block_distances
+from mivol.transport.traversal.grid_blocks import bound_blocks, find_distances_of_bounds
 from mivol.transport.traversal.lattice import Lattice
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -28,7 +28,7 @@ def noise(channels: int, low: float) -> Lattice:
     values = np.random.default_rng(3).uniform(low, 2, (*RES, channels)).astype(np.float32)
     values[:, :, 5:] = min(low, 0)
     values, occupied = mi.TensorXf(values), mi.TensorXf(np.maximum(values, 0))
-    return Lattice(values, BOX, empty_block_distances(block_bounds(occupied), RES))
+    return Lattice(values, BOX, find_distances_of_bounds(bound_blocks(occupied), RES))
 
 
 KINDS: dict[str, Callable[[], ExactExtinction]] = {

@@ -23,7 +23,7 @@ from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
-from mivol.splatting import Splatter, tensors_of
+from mivol.splatting import Splatter, to_tensors
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -142,7 +142,7 @@ def test_what_rays_lose_is_what_small_splats_hide() -> None:
         pose[2, 3] = 8.0
         camera = Camera(intrinsics(focal, focal, SIDE / 2, SIDE / 2), (SIDE, SIDE), pose)
         splatter = Splatter(SIDE, SIDE, 0, low_pass=1e-6, least_alpha=1e-6)
-        drawn = np.array(splatter.forward(tensors_of(small), camera, derivatives=False)[0])[..., 3]
+        drawn = np.array(splatter.forward(to_tensors(small), camera, derivatives=False)[0])[..., 3]
         grid = (np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), -1).reshape(-1, 2) + 0.5 - SIDE / 2) / focal
         d = np.column_stack([grid[:, 0], -grid[:, 1], -np.ones(len(grid))])
         d /= np.linalg.norm(d, axis=1, keepdims=True)

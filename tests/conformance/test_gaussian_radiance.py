@@ -23,7 +23,7 @@ from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS, Gaussi
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
-from mivol.splatting import Splatter, tensors_of
+from mivol.splatting import Splatter, to_tensors
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -230,7 +230,7 @@ def test_small_ones_look_as_splatted() -> None:
     for shrink in (1.0, 0.25, 0.0625):
         small = replace(gaussians, log_scales=gaussians.log_scales + np.float32(np.log(shrink)))
         splatter = Splatter(side, side, 2, low_pass=1e-6, least_alpha=1e-6)
-        drawn = np.array(splatter.forward(tensors_of(small), camera, derivatives=False)[0])[..., :3].reshape(-1, 3)
+        drawn = np.array(splatter.forward(to_tensors(small), camera, derivatives=False)[0])[..., :3].reshape(-1, 3)
         light, _ = twin(small, (np.broadcast_to(pose[:3, 3], d.shape), d), space="linear")
         errors.append(np.sqrt(((drawn - light) ** 2).mean() / (light**2).mean()))
     assert errors[0] < 0.3

@@ -27,7 +27,7 @@ from mivol.photos.region import count_views, find_focus, silhouette_box
 from mivol.photos.transforms import write_transforms as write_cameras
 from mivol.report.cameras import outline
 from mivol.scene.photographs import sensor_of
-from mivol.splatting.projection import numbers_of
+from mivol.splatting.projection import pack_view
 
 LENS = Fisheye(-0.01, 0.0005, 0.00002, 0.000001)
 """Of the size of what calibrations of fisheyes give. Its slope, 1 - 0.03 t^2 + 0.0025 t^4 and more, is above 0 at any t."""
@@ -255,7 +255,7 @@ def test_what_needs_an_image_plane_refuses_by_name(variant_rgb: str) -> None:
     with pytest.raises(MivolError, match="fish: .*cut pinholes out of it"):
         sensor_of(camera)
     with pytest.raises(MivolError, match="fish: .*cut pinholes out of it"):
-        numbers_of(camera, camera.size)
+        pack_view(camera, camera.size)
     shown = photo(camera)
     assert rectify(shown) is shown
     with pytest.raises(MivolError, match="fish: found a wide lens, expected cameras with an image plane"):

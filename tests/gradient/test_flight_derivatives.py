@@ -23,7 +23,7 @@ from mivol.bench.studies.gradients.twin import Twin
 from mivol.scene import plan
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes
 from mivol.transport.estimators.segment import FlightPoint, PathSegment
-from mivol.transport.media.drawn_points import EvenPoint
+from mivol.transport.media.uniform_points import UniformPoint
 from mivol.transport.traversal.rays import FineRay
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
@@ -238,12 +238,12 @@ def test_probes_are_kept_in_proportion_to_their_gain():
     """Before a scattering the first flight alone; after it flights of gains 1 and 3, kept in 1/4 and 3/4 of evenly spread
     lanes, which stand for 4 together. Flights that may not scatter any more, and lanes without a point, are not kept."""
     n, never = 64, dr.full(mi.Bool, False, 64)
-    ray = FineRay.of(mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0), mi.Vector3f(0, 0, 1)))
+    ray = FineRay.from_ray(mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0), mi.Vector3f(0, 0, 1)))
     on, zero = ~never, dr.zeros(mi.UInt32, n)
 
     def offered(probes: Probes, t: float, gain: float, depth: int, may_scatter: mi.Bool = on, found: mi.Bool = on) -> Probes:
         segment = PathSegment(ray, dr.zeros(mi.MediumPtr, n), mi.Spectrum(1), may_scatter, None, zero + depth)
-        point = EvenPoint(dr.full(mi.Float64, t, n), dr.full(mi.Float, 1, n), zero, found)
+        point = UniformPoint(dr.full(mi.Float64, t, n), dr.full(mi.Float, 1, n), zero, found)
         return probes.offer(segment, FlightPoint(point, dr.full(mi.Spectrum, gain, n), (dr.arange(mi.Float, n) + 0.5) / n))
 
     probes = offered(Probes(Probe.empty(ray), Probe.empty(ray)), 7.0, 2.0, 0)

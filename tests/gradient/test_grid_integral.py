@@ -188,8 +188,9 @@ def test_a_million_rays_into_few_voxels(seed, shape):
     assert row.sum(dtype=np.float64) == pytest.approx(n, rel=1e-5)
     if shape == (2, 2, 2):
         u = np.clip(o[:, 1:] * 2 - 0.5, 0, 1)
-        exact = 0.5 * np.array([[(1 - u[:, 1]) @ (1 - u[:, 0]), (1 - u[:, 1]) @ u[:, 0]],
-                                [u[:, 1] @ (1 - u[:, 0]), u[:, 1] @ u[:, 0]]])
+        exact = 0.5 * np.array(
+            [[(1 - u[:, 1]) @ (1 - u[:, 0]), (1 - u[:, 1]) @ u[:, 0]], [u[:, 1] @ (1 - u[:, 0]), u[:, 1] @ u[:, 0]]]
+        )
         # A GPU adds each term to the sum itself: 1e6 roundings of at most 6e-8 of it spread by 2e-5, in no fixed order.
         rtol = 1e-5 if mi.variant().startswith("llvm") else 1e-4
         assert np.allclose(row, exact[:, :, None], rtol=rtol, atol=0)
@@ -224,6 +225,6 @@ def test_gradients_are_packed_up_to_a_size(variant_rgb, monkeypatch, spare):
 
     lattice = make_lattice(np.ones((3, 4, 5, 2), np.float32), FRAMES["unit"], False)
     monkeypatch.setattr(grid_integral, "PACKED_LIMIT", grid_integral.gradient_bytes(lattice.res, 2) + spare)
-    found = grid_integral.Gradient.zeros(lattice)
+    found = grid_integral.NodeGradient.zeros(lattice)
     packed = spare == 0 and "llvm" in variant_rgb
     assert (found.packed, dr.width(found.buffer)) == (packed, 8 * 4 * 5 * 6 * 2 if packed else 3 * 4 * 5 * 2)

@@ -9,9 +9,9 @@ import oracle_phase as oracle
 import pytest
 
 from mivol.phase.closed_forms import eval_draine, eval_hg
-from mivol.phase.mixture import shares_of
+from mivol.phase.mixture import normalise_weights
+from mivol.phase.scattering_angle import ScatteringAngle, angle_between
 from mivol.phase.table import Lookup, Table
-from mivol.phase.turn import Turn, turn_between
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -31,7 +31,7 @@ def f32(x: float) -> float:
 def slopes(evaluate, *parameters: float) -> list[np.ndarray]:
     """Derivatives of a density by each parameter at every turn, (2, n): in reverse and in forward mode."""
     m, p = oracle.turns(ANGLES)
-    turn = Turn(*lanes(m, p))
+    turn = ScatteringAngle(*lanes(m, p))
     given = [dr.full(mi.Float, x, len(m)) for x in parameters]
     dr.enable_grad(given)
     dr.backward(evaluate(turn, *given))
@@ -69,7 +69,7 @@ def test_slope_of_hg_integrates_to_nothing(g):
     c, w = oracle.gauss(400)
     x = dr.full(mi.Float, g, len(c))
     dr.enable_grad(x)
-    dr.backward(eval_hg(Turn(*lanes(1 - c, 1 + c)), x))
+    dr.backward(eval_hg(ScatteringAngle(*lanes(1 - c, 1 + c)), x))
     slope = 2 * np.pi * w * np.array(dr.grad(x), dtype=np.float64)
     # Nodes in the peak are rounded by eps/2 of 1 - c against (1 - g), where dp/dg has the slope 1/(1 - g)^3 times the width.
     assert [slope.sum(), slope @ c] == pytest.approx([0, 1], abs=20 * EPS / (1 - abs(g)) ** 2)
@@ -101,7 +101,7 @@ def test_slope_by_direction(g):
     x = mi.Vector3f(*lanes(*wo))
     dr.enable_grad(x)
     dr.set_grad(x, mi.Vector3f(*lanes(*tangent)))
-    value = eval_hg(turn_between(mi.Vector3f(wi), x), mi.Float(g))
+    value = eval_hg(angle_between(mi.Vector3f(wi), x), mi.Float(g))
     dr.forward_to(value)
     g = f32(g)
     got, want = np.array(dr.grad(value)), np.empty(5)
@@ -124,11 +124,11 @@ def test_slopes_of_a_table():
     cosines, values = np.array([-1, -0.4, 0.1, 0.9, 1.0]), np.array([0.5, 0.0, 2.0, 1.0, 8.0])
     x = mi.Float(values.astype(np.float32))
     dr.enable_grad(x)
-    nodes = Lookup.of(Table(cosines, values))
+    nodes = Lookup.from_table(Table(cosines, values))
     projected, integral, _ = nodes.normalise(x)
     c = np.array([-0.7, -0.2, 0.05, 0.5, 0.95])
     weights = np.array([1.0, -2.0, 0.5, 3.0, 0.25])
-    value = nodes.eval(Turn(*lanes(1 - c, 1 + c)), projected, integral)
+    value = nodes.eval(ScatteringAngle(*lanes(1 - c, 1 + c)), projected, integral)
     dr.backward(dr.sum(value * mi.Float(weights.astype(np.float32))))
 
     def loss(v: np.ndarray) -> float:
@@ -144,9 +144,9 @@ def test_slopes_of_shares():
     """d (w_0 / sum) / d w: (sum - w_0) / sum^2 and -w_0 / sum^2, at a weight of 0 as well."""
     weights = [mi.Float(0), mi.Float(3), mi.Float(1)]
     dr.enable_grad(weights)
-    dr.backward(shares_of(weights)[0])
+    dr.backward(normalise_weights(weights)[0])
     assert [float(dr.grad(w)[0]) for w in weights] == pytest.approx([0.25, 0, 0], abs=EPS)
     weights = [mi.Float(2), mi.Float(3)]
     dr.enable_grad(weights)
-    dr.backward(shares_of(weights)[0])
+    dr.backward(normalise_weights(weights)[0])
     assert [float(dr.grad(w)[0]) for w in weights] == pytest.approx([3 / 25, -2 / 25], rel=4 * EPS)

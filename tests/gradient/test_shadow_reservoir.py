@@ -37,7 +37,7 @@ def fog() -> object:
 def test_mean_is_the_sum() -> None:
     """The derivative of light L over a length l by a constant extinction is -L l."""
     media, n = fog(), 1 << 14
-    ray = FineRay.of(mi.Ray3f(dr.full(mi.Point3f, 0.1, n), mi.Vector3f(0, 0, 1)))
+    ray = FineRay.from_ray(mi.Ray3f(dr.full(mi.Point3f, 0.1, n), mi.Vector3f(0, 0, 1)))
     rng, kept = seed_pcg32(mi.Float((0.4 + fresh(0) * 0.6180339887498949) % 1), n), ShadowReservoir.empty(media, ray)
     for light, length in zip(LIGHTS, LENGTHS, strict=True):
         rng, (chance,) = draw_pcg32(rng, 1)

@@ -14,7 +14,7 @@ from hard_rays import BOUND, EPS, assert_tau, positive
 from oracle import tau_scale, tau_twin
 
 from mivol.transport.traversal.box import Box
-from mivol.transport.traversal.grid_walk import walk_box
+from mivol.transport.traversal.grid_walk import walk_box_cells
 from scenes import (
     FRAMES,
     affine,
@@ -252,7 +252,7 @@ def lengths(place: np.ndarray, o: np.ndarray, d: np.ndarray, on: bool = True) ->
         return dr.select(on, t1, last), gap
 
     zero = dr.zeros(mi.Float, n)
-    last, gap = walk_box(rows, COUNT, mi.Ray3f(p, w), visit, (zero, zero), dr.full(mi.Bool, on, n))
+    last, gap = walk_box_cells(rows, COUNT, mi.Ray3f(p, w), visit, (zero, zero), dr.full(mi.Bool, on, n))
     return np.array(table).reshape(n, COUNT, COUNT, COUNT), np.array(last), np.array(gap)
 
 
@@ -297,7 +297,7 @@ def test_no_cell_outside_is_visited() -> None:
         return wrong | (on & ~dr.all((cell >= 0) & (cell < COUNT)))
 
     rows, none = [[COUNT * v for v in row] for row in Box(place).rows()], dr.full(mi.Bool, False, n)
-    assert not np.array(walk_box(rows, COUNT, mi.Ray3f(p, w), visit, none, ~none)).any()
+    assert not np.array(walk_box_cells(rows, COUNT, mi.Ray3f(p, w), visit, none, ~none)).any()
 
 
 def test_rays_along_axes_and_rays_that_miss() -> None:

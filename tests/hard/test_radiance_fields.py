@@ -56,8 +56,8 @@ from mivol.photos.camera import intrinsics
 from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
 from mivol.transport.line_integrals.radiance_source import bake, make_exact
 from mivol.transport.traversal.grid_blocks import REACH
-from mivol.transport.traversal.lattice import clip
-from mivol.transport.traversal.occupied_walk import march
+from mivol.transport.traversal.lattice import clip_to_grid
+from mivol.transport.traversal.occupied_walk import walk_occupied_cells
 from scenes import box_of, tensor, transform
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -151,8 +151,8 @@ def test_a_short_fit_makes_matter_opaque() -> None:
 def visited(field: SphericalGrid, o, d) -> np.ndarray:
     """How many cells each ray visits."""
     rays, cells = rays_of(o, d), find_occupied_cells(field)
-    segment = clip(cells, rays.o, rays.d, 0, rays.t_max)
-    count, _, _ = march(cells, segment, lambda n, here, on: n + mi.UInt32(on), mi.UInt32(0))
+    segment = clip_to_grid(cells, rays.o, rays.d, 0, rays.t_max)
+    count, _, _ = walk_occupied_cells(cells, segment, lambda n, here, on: n + mi.UInt32(on), mi.UInt32(0))
     return np.array(count)
 
 
@@ -185,7 +185,7 @@ def test_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: 
     """
     field = even(density, res=(1, 1, 60))
     ray, cells = rays_of([-3, 0.1, 0.2], [1, 0, 0]), find_occupied_cells(field)
-    segment = clip(cells, ray.o, ray.d, 0, ray.t_max)
+    segment = clip_to_grid(cells, ray.o, ray.d, 0, ray.t_max)
     gather, count = dr.gather, []
 
     def counted(kind, source, *rest, **more):
@@ -195,7 +195,7 @@ def test_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: 
 
     monkeypatch.setattr(dr, "gather", counted)
     with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
-        march(cells, segment, lambda n, here, on: n + mi.UInt32(on), mi.UInt32(0))
+        walk_occupied_cells(cells, segment, lambda n, here, on: n + mi.UInt32(on), mi.UInt32(0))
     assert len(count) == reads
 
 

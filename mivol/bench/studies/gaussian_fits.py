@@ -23,7 +23,7 @@ from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo, Photos, load_photos
 from mivol.points import Gaussians
-from mivol.splatting import Splatter, tensors_of
+from mivol.splatting import Splatter, to_tensors
 from mivol.validate import images
 
 __all__ = ["Fitted", "asked_of", "fit_and_judge", "fitted", "photographs", "psnr_of"]
@@ -107,7 +107,7 @@ def fitted(photos: Photos, plan: GaussianPlan, seed: int) -> GaussianProblem:
 def psnr_of(cloud: Gaussians, judged: Sequence[Photo], plan: GaussianPlan) -> float:
     """Mean PSNR [dB] of Gaussians against photographs of one size, with the filter of the plan at that size."""
     settings = {"low_pass": plan.low_pass, "compensated": plan.mip}
-    splatter, reals = Splatter(*judged[0].camera.size, cloud.degree, **settings), tensors_of(cloud)
+    splatter, reals = Splatter(*judged[0].camera.size, cloud.degree, **settings), to_tensors(cloud)
     qualities = []
     for photo in judged:
         seen = np.array(splatter.forward(reals, photo.camera, derivatives=False)[0])

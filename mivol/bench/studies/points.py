@@ -40,7 +40,7 @@ from mivol.bench.studies.optical_depth.work import Work, camera_rays
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import Gaussians, read_gaussians
-from mivol.splatting import Splatter, tensors_of
+from mivol.splatting import Splatter, to_tensors
 
 __all__ = ["BENCH", "FULL", "QUICK", "Size", "compare", "dense_cloud", "main"]
 
@@ -141,7 +141,7 @@ class Drawing(NamedTuple):
 
     @classmethod
     def of(cls, gaussians: Gaussians, camera: Camera) -> Drawing:
-        return cls(tensors_of(gaussians), camera, Splatter(*camera.size, gaussians.degree))
+        return cls(to_tensors(gaussians), camera, Splatter(*camera.size, gaussians.degree))
 
     def forward(self) -> Contestant:
         """The picture alone."""

@@ -48,7 +48,7 @@ from mivol.transport.line_integrals.radiance_field import (
     vjp_rays,
 )
 from mivol.transport.line_integrals.radiance_source import Baked, bake, vjp_bake
-from mivol.transport.traversal.occupied_cells import Cells
+from mivol.transport.traversal.occupied_cells import OccupiedCells
 
 
 @dataclasses.dataclass
@@ -387,7 +387,7 @@ def _coloured(fog: SphericalGrid, colour: np.ndarray) -> SphericalGrid:
     return fog.with_values(fog.density, dr.tile(mi.Float(row), dr.width(fog.density)))
 
 
-def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray:
+def _nodes_of(field: SphericalGrid, cells: OccupiedCells, chosen: mi.Bool) -> np.ndarray:
     """Nodes (levels, Z, Y, X) of the listed cells that are chosen."""
     mask = np.zeros(field.node_count, bool)
     index = dr.compress(chosen)

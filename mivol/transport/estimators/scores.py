@@ -23,7 +23,7 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.media.channels import tangent_of
+from mivol.transport.media.channels import take_tangent
 
 __all__ = [
     "Primal",
@@ -160,7 +160,7 @@ class TrackedTerm:
 
     def jvp(self) -> mi.Spectrum:
         with dr.resume_grad():
-            own = tangent_of(self.attached)
+            own = take_tangent(self.attached)
         return dr.select(self.active, own, 0)
 
 
@@ -187,6 +187,6 @@ class TrackedFactor:
     def jvp(self) -> mi.Spectrum:
         with dr.resume_grad():
             value = self.evaluate()
-            own = tangent_of(value)
+            own = take_tangent(value)
         f = dr.detach(value)
         return dr.select(self.active & (f != 0), own * dr.rcp(dr.select(f != 0, f, 1)), 0)

@@ -18,7 +18,6 @@ import mitsuba as mi
 
 from mivol.transport.estimators.lighting.shadow_rays import estimate_transmittance
 from mivol.transport.estimators.scores import Factor, Term
-from mivol.transport.media.drawn_points import EvenPoint
 from mivol.transport.media.optical_depth import (
     integrate_optical_depth,
     jvp_optical_depth,
@@ -27,6 +26,7 @@ from mivol.transport.media.optical_depth import (
 )
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.media.uniform_points import UniformPoint
 from mivol.transport.traversal.random_numbers import Strata, draw_pcg32, seed_pcg32
 from mivol.transport.traversal.rays import Ray
 
@@ -101,7 +101,7 @@ class FlightPoint:
         chance: a number in [0, 1), by which one of several flights' points is kept.
     """
 
-    point: EvenPoint
+    point: UniformPoint
     gain: mi.Spectrum
     chance: mi.Float
 

@@ -25,7 +25,7 @@ from mivol.transport.media.compositing import CellIntegral
 from mivol.transport.media.optical_depth import integrate_optical_depth, jvp_rows, vjp_rows
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.rays import Ray, camera_ray
+from mivol.transport.traversal.rays import Ray, clip_camera_ray
 
 __all__ = [
     "AOVS",
@@ -129,7 +129,7 @@ def vjp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], daovs: list[mi
 
 def _find_first_segment(media: SceneMedia, ray: Ray, active: mi.Bool) -> _FirstSegment:
     """Follow rays to the first opaque surface or out of the scene."""
-    ray = camera_ray(ray)
+    ray = clip_camera_ray(ray)
     medium = media.medium_at(ray)
     end, tau = integrate_optical_depth(media, ray, medium, mi.Bool(active))
     stopped = end.si.is_valid()

@@ -18,12 +18,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
-from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, pass_cell, put_in_front, zeros
+from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, composite_over, pass_cell, zeros
 from mivol.transport.media.grid_extinction import SummedExtinction
 from mivol.transport.media.ray_intervals import MediumInterval
-from mivol.transport.traversal.grid_walk import Cell, walk
+from mivol.transport.traversal.grid_walk import Cell, walk_cells
 from mivol.transport.traversal.interpolation import node_weights
-from mivol.transport.traversal.lattice import Lattice, Segment, clip
+from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
 from mivol.transport.traversal.rays import Ray
 
 __all__ = ["BodySweep"]
@@ -76,22 +76,22 @@ class BodySweep:
         def add_constant(integral: BodyIntegral, a: mi.Float64, b: mi.Float64) -> BodyIntegral:
             site, sigma, integrals = self._constant(a, b)
             if not tangent:
-                return put_in_front(integral, integrals, [], [])
+                return composite_over(integral, integrals, [], [])
             changes = [[d] for d in self._rows(self.change.constant)]
-            return put_in_front(integral, integrals, changes, self.integrand.jvp(site, sigma))
+            return composite_over(integral, integrals, changes, self.integrand.jvp(site, sigma))
 
         def visit(integral: BodyIntegral, cell: Cell, on: mi.Bool) -> BodyIntegral:
             site, sigma, integrals = self._cell(cell, on)
             if not tangent:
-                return put_in_front(integral, integrals, [], [])
-            return put_in_front(integral, integrals, self._changes(cell), self.integrand.jvp(site, sigma))
+                return composite_over(integral, integrals, [], [])
+            return composite_over(integral, integrals, self._changes(cell), self.integrand.jvp(site, sigma))
 
         if self._has_constants and layout.lattice is not None:
             integral = add_constant(integral, layout.leave, layout.t1)
         if layout.lattice is not None:
             alone = skip and len(self.extinction.reads) == 1 and not self._has_constants
             lattice = layout.lattice if alone else replace(layout.lattice, empty_distances=None)
-            integral = walk(lattice, layout.segment, visit, integral, self._reads, self.active)
+            integral = walk_cells(lattice, layout.segment, visit, integral, self._reads, self.active)
         if self._has_constants:
             integral = add_constant(integral, layout.t0, layout.enter)
         return integral
@@ -128,7 +128,7 @@ class BodySweep:
             activations = self.extinction.slopes(cell.corners, points)
             if activations is not None:
                 slopes = [[g * slope for g, slope in zip(row, activations, strict=True)] for row in slopes]
-            by_point = [self.media.sums([row[p] for row in slopes]) for p in range(len(corners))]
+            by_point = [self.media.sum_channels([row[p] for row in slopes]) for p in range(len(corners))]
             for part in grids:
                 body.add_to_grid(part, cell.lower, list(zip(by_point, corners, strict=True)), on)
             return sweep
@@ -137,10 +137,10 @@ class BodySweep:
             sweep = add_constant(sweep, layout.leave, layout.t1)
         if layout.lattice is not None:
             lattice = replace(layout.lattice, empty_distances=None)
-            sweep = walk(lattice, layout.segment, visit, sweep, self.extinction.reads, self.active)
+            sweep = walk_cells(lattice, layout.segment, visit, sweep, self.extinction.reads, self.active)
         if self._has_constants:
             sweep = add_constant(sweep, layout.t0, layout.enter)
-            body.add_to_constants(self.media.sums(sweep.constant), self.active)
+            body.add_to_constants(self.media.sum_channels(sweep.constant), self.active)
         # Only after the walk: Dr.Jit loses what is differentiated inside a loop by an array that was differentiated by before
         # it.
         for site, sigma, weights in outside:
@@ -190,7 +190,7 @@ class BodySweep:
 
     def _rows(self, channels: list[mi.Float]) -> list[mi.Float]:
         """One number for each row of the integrand, from one for each channel of the medium."""
-        channels = self.media.rows(channels)
+        channels = self.media.to_channels(channels)
         return [channels[r % len(channels)] for r in range(self.integrand.rows)]
 
 
@@ -199,7 +199,7 @@ def _find_layout(interval: MediumInterval, ray: Ray) -> _IntervalLayout:
     start, end = mi.Float64(interval.t0), mi.Float64(interval.t1)
     if lattice is None:
         return _IntervalLayout(start, end, end, end, None, None)
-    segment = clip(lattice, ray.o, -ray.d, -interval.t1, -interval.t0)
+    segment = clip_to_grid(lattice, ray.o, -ray.d, -interval.t1, -interval.t0)
     hit = segment.length > 0
     leave = dr.select(hit, -segment.start, end)
     return _IntervalLayout(start, dr.select(hit, -segment.end, end), leave, end, lattice, segment)

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.traversal.occupied_walk import CellVisitor
+from mivol.transport.traversal.occupied_walk import OccupiedCell
 
 __all__ = ["CellCorners", "Face", "PendingGradients", "read_corners"]
 
@@ -58,7 +58,7 @@ class PendingGradients:
     waiting: list = field(default_factory=lambda: _zeros(4))
     some: mi.Bool = field(default_factory=lambda: mi.Bool(False))
 
-    def add(self, corners: CellCorners, here: CellVisitor, slopes: Numbers, write: Callable, on: mi.Bool) -> PendingGradients:
+    def add(self, corners: CellCorners, here: OccupiedCell, slopes: Numbers, write: Callable, on: mi.Bool) -> PendingGradients:
         """Add the derivatives of a cell, and write those of the corners that the ray leaves behind.
 
         Args:
@@ -118,7 +118,7 @@ def read_corners(
     row: Callable[[mi.UInt32, mi.Bool], mi.UInt32],
     value: Callable[[mi.UInt32, mi.Bool], list[mi.Float]],
     face: Face,
-    here: CellVisitor,
+    here: OccupiedCell,
     on: mi.Bool,
 ) -> CellCorners:
     """The corners of a cell, of which those of the last face are known where the ray has come through it.
@@ -171,7 +171,7 @@ def _write(write: Callable, rows: list[mi.UInt32], values: list[list[mi.Float]],
         write(row, numbers, on)
 
 
-def _node_numbers(res: tuple[int, int, int], axis: mi.Int32, here: CellVisitor) -> Callable[[int], mi.UInt32]:
+def _node_numbers(res: tuple[int, int, int], axis: mi.Int32, here: OccupiedCell) -> Callable[[int], mi.UInt32]:
     """The flat numbers of the nodes at the corners of a cell."""
     z, y, x = res
     low, high = dr.maximum(here.cell, 0), dr.minimum(here.cell + 1, mi.Vector3i(x - 1, y - 1, z - 1))

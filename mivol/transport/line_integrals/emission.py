@@ -27,13 +27,13 @@ from mivol.transport.estimators.segment import PathSegment, SegmentEstimate, Seg
 from mivol.transport.line_integrals.composite import Composite, composite_ray, vjp_composite
 from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
 from mivol.transport.media.body import medium_interaction
-from mivol.transport.media.channels import by_channel, spectrum, tangent_of
+from mivol.transport.media.channels import colours_to_channels, take_tangent, to_spectrum
 from mivol.transport.media.compositing import CellIntegral
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment, find_end
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
-from mivol.transport.traversal.interpolation import GAUSS
+from mivol.transport.traversal.interpolation import GAUSS_POINT
 from mivol.transport.traversal.random_numbers import Strata
 
 __all__ = ["integrate_emission", "vjp_emission", "Emission"]
@@ -91,7 +91,7 @@ class _EmissionIntegrand:
 
     rows: int
     channels: int
-    points: ClassVar[tuple[float, ...]] = (GAUSS, 1 - GAUSS)
+    points: ClassVar[tuple[float, ...]] = (GAUSS_POINT, 1 - GAUSS_POINT)
     asked: ClassVar[str] = "a medium emits"
     way_out: ClassVar[str] = "take its emission out"
 
@@ -148,7 +148,7 @@ class _EmissionIntegrand:
             Le, fraction = self._absorbed(site, t)
             for name, by in (("sigma_a", 1 - fraction), ("sigma_s", -fraction)):
                 rows = factor * per * Le * by
-                body.deposit(site.ray, t, by_channel(rows, self.channels), site.on, name)
+                body.vjp_extinction_at(site.ray, t, colours_to_channels(rows, self.channels), site.on, name)
 
     def jvp(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[mi.Float]:
         body = site.body
@@ -157,12 +157,13 @@ class _EmissionIntegrand:
         by_source, by_density, per_sigma = self._weights(site, sigma)
         with dr.resume_grad():
             sent = self._sent(site, by_source, by_density)
-            change = tangent_of(sent)
+            change = take_tangent(sent)
         if body.view.emission is not None and body.view.albedo is None:
             for t, per in zip(self._places(site), per_sigma, strict=True):
                 Le, fraction = self._absorbed(site, t)
                 by_a, by_s = (
-                    spectrum(body.tangent_at(site.ray, t, self.channels, site.on, name)) for name in ("sigma_a", "sigma_s")
+                    to_spectrum(body.jvp_extinction_at(site.ray, t, self.channels, site.on, name))
+                    for name in ("sigma_a", "sigma_s")
                 )
                 change += per * Le * ((1 - fraction) * by_a - fraction * by_s)
         return [change[r] for r in range(self.rows)]
@@ -197,7 +198,7 @@ class _EmissionIntegrand:
         if body.view.albedo is not None:
             return mi.Spectrum(1)
         sigma_a, sigma_t = (
-            spectrum(body.extinction_at(site.ray, t, self.channels, site.on, name)) for name in ("sigma_a", "sigma_")
+            to_spectrum(body.extinction_at(site.ray, t, self.channels, site.on, name)) for name in ("sigma_a", "sigma_")
         )
         return dr.detach(dr.select(sigma_t > 0, sigma_a / dr.select(sigma_t > 0, sigma_t, 1), 1))
 
@@ -220,8 +221,8 @@ class _EmissionIntegrand:
         endless = site.on & ~finite
         if by_density:
             lengths = [dr.rcp(dr.maximum(row[0], 1e-30)) for row in rows]
-            by_density[0] = dr.select(endless & (spectrum([r[0] for r in rows]) > 0), spectrum(lengths), by_density[0])
-        by_source[0] = dr.select(endless & (spectrum([r[0] for r in rows]) > 0), 1, by_source[0])
+            by_density[0] = dr.select(endless & (to_spectrum([r[0] for r in rows]) > 0), to_spectrum(lengths), by_density[0])
+        by_source[0] = dr.select(endless & (to_spectrum([r[0] for r in rows]) > 0), 1, by_source[0])
         return by_source, by_density, per_sigma
 
     def _sent(self, site: RayPiece, by_source: list, by_density: list) -> mi.Spectrum:
@@ -269,7 +270,7 @@ def _eval_field(field: mi.Volume | mi.Float | mi.Color3f, site: RayPiece, t: mi.
 
 def _group_by_point(pairs: list[tuple[mi.Float, mi.Float]]) -> list[mi.Spectrum]:
     """A spectrum for each of the two points, from the (first, second) pair of each channel."""
-    return [spectrum([pair[q] for pair in pairs]) for q in range(2)]
+    return [to_spectrum([pair[q] for pair in pairs]) for q in range(2)]
 
 
 class Emission:
@@ -342,5 +343,5 @@ class _EmittingSegment:
 
     def jvp_transmittance(self) -> mi.Spectrum:
         k = dr.size_v(mi.Spectrum)
-        dtau = spectrum([mi.Float(t) for t in self.composite.tau[k : k + self.media.channels]])
+        dtau = to_spectrum([mi.Float(t) for t in self.composite.tau[k : k + self.media.channels]])
         return -dr.select(self.active, dtau, 0)

@@ -20,7 +20,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.transport.media.body import Body
 from mivol.transport.media.compositing import CellIntegral
-from mivol.transport.media.grid_extinction import share_cells
+from mivol.transport.media.grid_extinction import have_same_cells
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import Ray
@@ -106,7 +106,7 @@ def check_cells_shared(media: SceneMedia, integrand: Integrand) -> None:
             raise MivolError(f"{integrand.asked} and a medium has the phase function sggx; {integrand.way_out}.")
         grids = [p.lattice for p in body.view.parts if p.lattice is not None]
         for other in grids[1:]:
-            if not share_cells(grids[0], other):
+            if not have_same_cells(grids[0], other):
                 raise MivolError(
                     f"{integrand.asked} and a medium sums grids of {grids[0].res} and {other.res} voxels (Z, Y, X); "
                     f"give both the same resolution and to_world, or {integrand.way_out}."

@@ -36,11 +36,19 @@ from mivol.fields.activation import Activation
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_source import CellValues, Source
 from mivol.transport.traversal.cell_quadrature import share_opacity
-from mivol.transport.traversal.interpolation import GAUSS, interpolate, weights
+from mivol.transport.traversal.interpolation import GAUSS_POINT, interpolate, trilinear_weights
 from mivol.transport.traversal.lattice import Segment
 from mivol.transport.traversal.neighbour_rays import RayOrder
-from mivol.transport.traversal.occupied_cells import Cells
-from mivol.transport.traversal.occupied_walk import CellVisitor, Piece, end_of, march, piece_of, pieces, reversed_from
+from mivol.transport.traversal.occupied_cells import OccupiedCells
+from mivol.transport.traversal.occupied_walk import (
+    OccupiedCell,
+    Piece,
+    count_pieces,
+    find_last_cell,
+    find_piece,
+    reverse_segment,
+    walk_occupied_cells,
+)
 
 __all__ = [
     "Model",
@@ -88,7 +96,7 @@ class Model:
         return min(MAX_DEPTH, -math.log(self.stop)) if self.stop > 0 else MAX_DEPTH
 
 
-def find_occupied_cells(field: SphericalGrid) -> Cells:
+def find_occupied_cells(field: SphericalGrid) -> OccupiedCells:
     """The cells of a field that have light or a derivative; skipping the others changes nothing.
 
     A cell whose corners are not stored is vacuum.
@@ -101,7 +109,7 @@ def find_occupied_cells(field: SphericalGrid) -> Cells:
             return mi.Bool(True) if field.nodes is None else _any_of([c != vacuum for c in corners])
         return _any_of([dr.gather(mi.Float, field.density, c) > below for c in corners])
 
-    return Cells.find(field.res, field.to_world, field.look_up_rows, occupied, field.rows, field.levels, field.nodes)
+    return OccupiedCells.find(field.res, field.to_world, field.look_up_rows, occupied, field.rows, field.levels, field.nodes)
 
 
 def _any_of(masks: list[mi.Bool]) -> mi.Bool:
@@ -195,7 +203,7 @@ def _eval_points(at: CellValues, points: tuple[mi.Vector3f, mi.Vector3f], model:
     return _PointValues(sigma, slope, colour, shown)
 
 
-def render_rays(cells: Cells, source: Source, model: Model, rays: RayBundle, active: mi.Bool = True) -> RenderedRays:
+def render_rays(cells: OccupiedCells, source: Source, model: Model, rays: RayBundle, active: mi.Bool = True) -> RenderedRays:
     """Follow rays through a field.
 
     Args:
@@ -227,11 +235,11 @@ def _gather_lanes(tree: Any, which: mi.UInt32) -> Any:
     return dr.gather(type(tree), tree, which) if dr.is_array_v(tree) else tree
 
 
-def _render_in_order(cells: Cells, source: Source, model: Model, rays: RayBundle, active: mi.Bool) -> RenderedRays:
+def _render_in_order(cells: OccupiedCells, source: Source, model: Model, rays: RayBundle, active: mi.Bool) -> RenderedRays:
     """:func:`render_rays` in the order of the rays."""
     state = [*(mi.Float(0) for _ in range(6)), RayPosition(mi.Int32(-1), mi.Float(0)), source.start()]
 
-    def visit(state: list, here: CellVisitor, on: mi.Bool, number: mi.Int32, piece: Piece) -> list:
+    def visit(state: list, here: OccupiedCell, on: mi.Bool, number: mi.Int32, piece: Piece) -> list:
         *light, tau, before, first, carried = state
         read = source.read(cells, here, carried, on)
         at = _eval_points(read, read.points, model, on)
@@ -252,9 +260,9 @@ def _render_in_order(cells: Cells, source: Source, model: Model, rays: RayBundle
 
 
 def _follow(
-    cells: Cells,
+    cells: OccupiedCells,
     rays: RayBundle,
-    visit: Callable[[Any, CellVisitor, mi.Bool, mi.Int32, Piece], Any],
+    visit: Callable[[Any, OccupiedCell, mi.Bool, mi.Int32, Piece], Any],
     state: Any,
     active: mi.Bool,
     until: Callable[[Any], mi.Bool],
@@ -262,7 +270,7 @@ def _follow(
     """Visit the occupied cells of all pieces of rays, in order.
 
     Args:
-        visit: as that of ``march``, with the number of the piece and the piece.
+        visit: as that of ``walk_occupied_cells``, with the number of the piece and the piece.
         until: lanes that need not go on.
 
     Returns:
@@ -272,27 +280,29 @@ def _follow(
     if cells.levels == 1:
         # The loop over pieces would take a third of the time of rays through a thin shell.
         number = mi.Int32(0)
-        piece = piece_of(cells, rays.o, rays.d, rays.t_max, number)
-        state, cell, t = march(cells, piece.segment, partial(visit, number=number, piece=piece), state, active, until)
+        piece = find_piece(cells, rays.o, rays.d, rays.t_max, number)
+        state, cell, t = walk_occupied_cells(
+            cells, piece.segment, partial(visit, number=number, piece=piece), state, active, until
+        )
         return state, RayPosition(dr.select(t > 0, number, -1), t), cell
     return _follow_pieces(cells, rays, visit, state, active, until)
 
 
 @dr.syntax
 def _follow_pieces(
-    cells: Cells,
+    cells: OccupiedCells,
     rays: RayBundle,
-    visit: Callable[[Any, CellVisitor, mi.Bool, mi.Int32, Piece], Any],
+    visit: Callable[[Any, OccupiedCell, mi.Bool, mi.Int32, Piece], Any],
     state: Any,
     active: mi.Bool,
     until: Callable[[Any], mi.Bool],
 ) -> tuple[Any, RayPosition, mi.Vector3i]:
     """:func:`_follow` where boxes are nested."""
-    count, number = dr.opaque(mi.Int32, pieces(cells)), mi.Int32(0)
+    count, number = dr.opaque(mi.Int32, count_pieces(cells)), mi.Int32(0)
     last, last_cell = RayPosition(mi.Int32(-1), mi.Float(0)), mi.Vector3i(0)
     while dr.hint(active & (number < count), label="pieces"):
-        piece = piece_of(cells, rays.o, rays.d, rays.t_max, number)
-        state, cell, t = march(
+        piece = find_piece(cells, rays.o, rays.d, rays.t_max, number)
+        state, cell, t = walk_occupied_cells(
             cells, piece.segment, partial(visit, number=number, piece=piece), state, active, until, piece.level
         )
         # Of a piece without occupied cells the ray left none.
@@ -303,13 +313,13 @@ def _follow_pieces(
     return state, last, last_cell
 
 
-def raise_to_max_weights(cells: Cells, source: Source, model: Model, rays: RayBundle, weight: mi.Float) -> None:
+def raise_to_max_weights(cells: OccupiedCells, source: Source, model: Model, rays: RayBundle, weight: mi.Float) -> None:
     """Raise ``weight``, one number an occupied cell, to the largest compositing weight T alpha that the cell has on a ray.
 
     Cost: as :func:`render_rays`, and one write a visited cell.
     """
 
-    def visit(state: list, here: CellVisitor, on: mi.Bool, number: mi.Int32, piece: Piece) -> list:
+    def visit(state: list, here: OccupiedCell, on: mi.Bool, number: mi.Int32, piece: Piece) -> list:
         tau, carried = state
         read = source.read(cells, here, carried, on)
         at = _eval_points(read, read.points, model, on)
@@ -321,13 +331,13 @@ def raise_to_max_weights(cells: Cells, source: Source, model: Model, rays: RayBu
     _follow(cells, rays, visit, [mi.Float(0), source.start()], active, lambda state: state[0] > model.depth)
 
 
-def _point_distances(segment: Segment, here: CellVisitor, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
+def _point_distances(segment: Segment, here: OccupiedCell, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Distances of the two points from the ray's origin."""
-    return tuple(scale * (segment.t0 + dr.fma(here.dt, g, here.t)) for g in (GAUSS, 1 - GAUSS))
+    return tuple(scale * (segment.t0 + dr.fma(here.dt, g, here.t)) for g in (GAUSS_POINT, 1 - GAUSS_POINT))
 
 
 def vjp_rays(
-    cells: Cells,
+    cells: OccupiedCells,
     source: Source,
     model: Model,
     rendered: RenderedRays,
@@ -359,7 +369,7 @@ def vjp_rays(
 
 
 def _vjp_in_order(
-    cells: Cells, source: Source, model: Model, rendered: RenderedRays, by: RayGradient, active: mi.Bool, near: float
+    cells: OccupiedCells, source: Source, model: Model, rendered: RenderedRays, by: RayGradient, active: mi.Bool, near: float
 ) -> None:
     """:func:`vjp_rays` in the order of the rays."""
     by_colour, by_distance = [mi.Float(c) for c in by.colour], mi.Float(by.distance)
@@ -368,7 +378,7 @@ def _vjp_in_order(
     # is the last one of the ray; what the source carries.
     state = [mi.Float(by.T), mi.Float(rendered.before), mi.Bool(True), source.start(slope=True)]
 
-    def visit(state: list, here: CellVisitor, on: mi.Bool, back: Segment, scale: mi.Float) -> list:
+    def visit(state: list, here: OccupiedCell, on: mi.Bool, back: Segment, scale: mi.Float) -> list:
         r, before, is_last, carried = state
         read = source.read(cells, here, carried, on)
         # The points in the order of the ray: the sweep runs the other way.
@@ -386,7 +396,7 @@ def _vjp_in_order(
         if reach is not None:
             kept = [dr.minimum(dr.square(t * reach), 1) for t in times]
             raw, parts = ([a * k for a, k in zip(values, kept, strict=True)] for values in (raw, parts))
-        w1, w2 = (weights(p) for p in points)
+        w1, w2 = (trilinear_weights(p) for p in points)
         corners_raw = [a * raw[0] + b * raw[1] for a, b in zip(w1, w2, strict=True)]
         corners_colour = []
         for k in range(3):
@@ -400,32 +410,34 @@ def _vjp_in_order(
     source.finish(state[3])
 
 
-def _follow_back(cells: Cells, rendered: RenderedRays, visit: Callable, state: Any, active: mi.Bool) -> Any:
+def _follow_back(cells: OccupiedCells, rendered: RenderedRays, visit: Callable, state: Any, active: mi.Bool) -> Any:
     """Visit the cells of rays from the last one that was visited to where extinction begins.
 
     Args:
-        visit: as that of ``march``, with the reversed segment and the world's lengths in one of its own.
+        visit: as that of ``walk_occupied_cells``, with the reversed segment and the world's lengths in one of its own.
     """
     first, last, rays = rendered.first, rendered.last, rendered.rays
     if cells.levels == 1:
-        piece = piece_of(cells, rays.o, rays.d, rays.t_max, mi.Int32(0))
-        back = reversed_from(piece.segment, rendered.cell, last.t, first.t)
-        return march(cells, back, partial(visit, back=back, scale=piece.scale), state, active)[0]
+        piece = find_piece(cells, rays.o, rays.d, rays.t_max, mi.Int32(0))
+        back = reverse_segment(piece.segment, rendered.cell, last.t, first.t)
+        return walk_occupied_cells(cells, back, partial(visit, back=back, scale=piece.scale), state, active)[0]
     return _follow_pieces_back(cells, rendered, visit, state, active)
 
 
 @dr.syntax
-def _follow_pieces_back(cells: Cells, rendered: RenderedRays, visit: Callable, state: Any, active: mi.Bool) -> Any:
+def _follow_pieces_back(cells: OccupiedCells, rendered: RenderedRays, visit: Callable, state: Any, active: mi.Bool) -> Any:
     """:func:`_follow_back` where boxes are nested."""
     first, last, rays = rendered.first, rendered.last, rendered.rays
     number = mi.Int32(last.piece)
     while dr.hint(active & (number >= first.piece), label="pieces back"):
-        piece = piece_of(cells, rays.o, rays.d, rays.t_max, number)
-        end = end_of(piece.segment)
+        piece = find_piece(cells, rays.o, rays.d, rays.t_max, number)
+        end = find_last_cell(piece.segment)
         ends = number == last.piece
         cell, t = dr.select(ends, rendered.cell, end), dr.select(ends, last.t, piece.segment.length)
-        back = reversed_from(piece.segment, cell, t, dr.select(number == first.piece, first.t, 0))
-        state, _, _ = march(cells, back, partial(visit, back=back, scale=piece.scale), state, active, None, piece.level)
+        back = reverse_segment(piece.segment, cell, t, dr.select(number == first.piece, first.t, 0))
+        state, _, _ = walk_occupied_cells(
+            cells, back, partial(visit, back=back, scale=piece.scale), state, active, None, piece.level
+        )
         number -= 1
     return state
 

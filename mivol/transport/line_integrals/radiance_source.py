@@ -22,8 +22,8 @@ import numpy as np
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.carried_face import CellCorners, Face, PendingGradients, read_corners
-from mivol.transport.traversal.occupied_cells import Cells
-from mivol.transport.traversal.occupied_walk import CellVisitor
+from mivol.transport.traversal.occupied_cells import OccupiedCells
+from mivol.transport.traversal.occupied_walk import OccupiedCell
 
 __all__ = ["Baked", "CellValues", "Colours", "Exact", "Source", "bake", "make_exact", "vjp_bake"]
 
@@ -66,14 +66,21 @@ class Source(Protocol):
     def start(self, slope: bool = False) -> Any:
         """What rays carry that have met no cell; ``slope``: for :meth:`add`."""
 
-    def read(self, cells: Cells, here: CellVisitor, carried: Any, on: mi.Bool) -> CellValues:
+    def read(self, cells: OccupiedCells, here: OccupiedCell, carried: Any, on: mi.Bool) -> CellValues:
         """The values of a listed cell."""
 
     def carried_from(self, at: CellValues) -> Any:
         """What rays carry on from a cell that they have read."""
 
     def add(
-        self, cells: Cells, here: CellVisitor, at: CellValues, carried: Any, raw: list[mi.Float], colours: Colours, on: mi.Bool
+        self,
+        cells: OccupiedCells,
+        here: OccupiedCell,
+        at: CellValues,
+        carried: Any,
+        raw: list[mi.Float],
+        colours: Colours,
+        on: mi.Bool,
     ) -> Any:
         """Add derivatives by what :meth:`read` gave to those of the field; what rays carry on then."""
 
@@ -103,7 +110,7 @@ class Baked:
     def start(self, slope: bool = False) -> list:
         return []
 
-    def read(self, cells: Cells, here: CellVisitor, carried: list, on: mi.Bool) -> CellValues:
+    def read(self, cells: OccupiedCells, here: OccupiedCell, carried: list, on: mi.Bool) -> CellValues:
         nodes = self._nodes(cells, here.number, on)
         packets = [dr.gather(mi.ArrayXf, self.table, node, on, shape=(4, 1)) for node in nodes]
         return CellValues([p[0] for p in packets], lambda on: [[p[k] for p in packets] for k in (1, 2, 3)], here.points)
@@ -112,7 +119,14 @@ class Baked:
         return []
 
     def add(
-        self, cells: Cells, here: CellVisitor, at: CellValues, carried: list, raw: list[mi.Float], colours: Colours, on: mi.Bool
+        self,
+        cells: OccupiedCells,
+        here: OccupiedCell,
+        at: CellValues,
+        carried: list,
+        raw: list[mi.Float],
+        colours: Colours,
+        on: mi.Bool,
     ) -> list:
         for node, values in zip(self._nodes(cells, here.number, on), zip(raw, *colours, strict=True), strict=True):
             _add_packet(self.slope, values, node, on)
@@ -121,7 +135,7 @@ class Baked:
     def finish(self, carried: list) -> None:
         pass
 
-    def _nodes(self, cells: Cells, number: mi.UInt32, on: mi.Bool) -> list[mi.UInt32]:
+    def _nodes(self, cells: OccupiedCells, number: mi.UInt32, on: mi.Bool) -> list[mi.UInt32]:
         return [self.first + node for node in cells.nodes(number, on)]
 
 
@@ -150,7 +164,7 @@ class Exact:
     def start(self, slope: bool = False) -> Face | PendingGradients:
         return PendingGradients() if slope else Face()
 
-    def read(self, cells: Cells, here: CellVisitor, carried: Face | PendingGradients, on: mi.Bool) -> CellValues:
+    def read(self, cells: OccupiedCells, here: OccupiedCell, carried: Face | PendingGradients, on: mi.Bool) -> CellValues:
         face = carried.face if isinstance(carried, PendingGradients) else carried
         corners = read_corners(cells.res, self.field.look_up_rows, self._value, face, here, on)
         raw, *colours = (list(channel) for channel in zip(*corners.values, strict=True))
@@ -161,8 +175,8 @@ class Exact:
 
     def add(
         self,
-        cells: Cells,
-        here: CellVisitor,
+        cells: OccupiedCells,
+        here: OccupiedCell,
         at: CellValues,
         carried: PendingGradients,
         raw: list[mi.Float],
@@ -221,7 +235,7 @@ def _add_packet(target: mi.Float, values: Sequence[mi.Float], row: mi.UInt32, on
     dr.scatter_add(target, mi.ArrayXf(list(values)), row, on, mode=mode)
 
 
-def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32, slope: bool = False) -> Baked:
+def bake(field: SphericalGrid, cells: OccupiedCells, points: np.ndarray, view: mi.UInt32, slope: bool = False) -> Baked:
     """Sum the harmonics of each node in the directions from pinholes.
 
     Args:
@@ -273,7 +287,7 @@ def _look_up_node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
     return row if field.nodes is None else dr.gather(mi.UInt32, field.nodes, row, row < field.rows - 1)
 
 
-def vjp_bake(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
+def vjp_bake(field: SphericalGrid, cells: OccupiedCells, baked: Baked, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
     """Derivatives with respect to the rows of a field, from those with respect to its baked table: the transpose of
     :func:`bake`.
 

@@ -16,9 +16,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.transport.media.channels import as_rows, for_part, spectrum
+from mivol.transport.media.channels import to_part_channels, to_scene_channels, to_spectrum
 from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval
-from mivol.transport.media.grid_extinction import SummedExtinction, add_to_cell, share_cells
+from mivol.transport.media.grid_extinction import SummedExtinction, add_to_cell, have_same_cells
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.rays import Ray, point_along
@@ -72,16 +72,16 @@ class Body:
         """A(d) [1], the factor on the extinction for light that travels along the unit vector ``d``; 1 without microflakes."""
         if self.view.microflakes is None:
             return 1.0
-        return dr.safe_sqrt(dr.dot(d, self.facing(d)))
+        return dr.safe_sqrt(dr.dot(d, self.apply_microflakes(d)))
 
-    def facing(self, d: mi.Vector3f) -> mi.Vector3f:
+    def apply_microflakes(self, d: mi.Vector3f) -> mi.Vector3f:
         """S d, the matrix of the microflakes times a direction: half the gradient of A^2 with respect to ``d``."""
         xx, yy, zz, xy, xz, yz = dr.detach(self.view.microflakes)
         return mi.Vector3f(xx * d.x + xy * d.y + xz * d.z, xy * d.x + yy * d.y + yz * d.z, xz * d.x + yz * d.y + zz * d.z)
 
     def _area_slopes(self, d: mi.Vector3f) -> list[mi.Float]:
         """d log A / d S_k for the six entries (xx, yy, zz, xy, xz, yz); 0 where A is 0. Extinction is proportional to A."""
-        square = dr.dot(d, self.facing(d))
+        square = dr.dot(d, self.apply_microflakes(d))
         half = dr.select(square > 0, 0.5 * dr.rcp(dr.select(square > 0, square, 1)), 0)
         twice = 2 * half
         return [half * d.x * d.x, half * d.y * d.y, half * d.z * d.z, twice * d.x * d.y, twice * d.x * d.z, twice * d.y * d.z]
@@ -129,23 +129,23 @@ class Body:
         bound = None if enough is None else enough / scale
         total = [mi.Float(0) for _ in range(channels)]
         for part in parts:
-            total = _add(total, as_rows(part.integrate(interval, bound), channels))
+            total = _add(total, to_scene_channels(part.integrate(interval, bound), channels))
         return [scale * tau for tau in total]
 
-    def tangent(self, interval: RayInterval, channels: int) -> list[mi.Float]:
+    def jvp_optical_depth(self, interval: RayInterval, channels: int) -> list[mi.Float]:
         """Derivative of the optical depth of the exact parts along the tangent that :meth:`SceneMedia.start_tangent` took."""
         pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.exact_line]
         area = self.area(interval.ray.d)
         total = [mi.Float(0) for _ in range(channels)]
         for part, change in pairs:
-            total = _add(total, as_rows(part.jvp(change, interval), channels))
+            total = _add(total, to_scene_channels(part.jvp(change, interval), channels))
         rows = [area * row for row in total]
         if self.microflakes_tangent is None:
             return rows
         turned = self._jvp_microflakes(interval.ray.d)
         return [r + t * turned for r, t in zip(rows, self.optical_depth(interval, channels), strict=True)]
 
-    def backproject(self, interval: RayInterval, weight: list[mi.Float]) -> None:
+    def vjp_optical_depth(self, interval: RayInterval, weight: list[mi.Float]) -> None:
         """Add ``weight`` (d loss / d tau of each channel) times this interval to the gradients of the exact parts."""
         if self.microflakes_gradient is not None:
             amount = self.optical_depth(interval, len(weight))
@@ -153,46 +153,46 @@ class Body:
         weight = [self.area(interval.ray.d) * w for w in weight]
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             if part.exact_line:
-                part.vjp(gradient, for_part(weight, part.channels), interval)
+                part.vjp(gradient, to_part_channels(weight, part.channels), interval)
 
-    def tangent_of_part(self, part: Extinction, ray: Ray, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
+    def jvp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Tangent of one part's coefficient [1/length] at a point of a ray."""
         change = next(v for p, v in zip(self.view.parts, self.tangents, strict=True) if p is part)
-        return as_rows(part.jvp_at(change, ray, t, active), channels)
+        return to_scene_channels(part.jvp_at(change, ray, t, active), channels)
 
-    def deposit_in_part(self, part: Extinction, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
-        """Add ``weight`` (d loss / d coefficient of each channel) at a point: the transpose of :meth:`tangent_of_part`."""
+    def vjp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
+        """Add ``weight`` (d loss / d coefficient of each channel) at a point: the transpose of :meth:`jvp_part_at`."""
         gradient = next(g for p, g in zip(self.view.parts, self.gradients, strict=True) if p is part)
-        part.vjp_at(gradient, for_part(weight, part.channels), ray, t, active)
+        part.vjp_at(gradient, to_part_channels(weight, part.channels), ray, t, active)
 
     def extinction_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of those called ``name``."""
         total = [mi.Float(0) for _ in range(channels)]
         for part in self.view.parts:
             if part.name.startswith(name):
-                total = _add(total, as_rows(part.eval_at(self.view.scale, ray, t, active), channels))
+                total = _add(total, to_scene_channels(part.eval_at(self.view.scale, ray, t, active), channels))
         return [self.area(ray.d) * row for row in total]
 
-    def tangent_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
+    def jvp_extinction_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """As :meth:`extinction_at`, of the tangent that :meth:`SceneMedia.start_tangent` took from the parameters."""
         total = [mi.Float(0) for _ in range(channels)]
         for part, change in zip(self.view.parts, self.tangents, strict=True):
             if part.name.startswith(name):
-                total = _add(total, as_rows(part.jvp_at(change, ray, t, active), channels))
+                total = _add(total, to_scene_channels(part.jvp_at(change, ray, t, active), channels))
         rows = [self.area(ray.d) * row for row in total]
         if self.microflakes_tangent is None:
             return rows
         turned = self._jvp_microflakes(ray.d)
         return [r + s * turned for r, s in zip(rows, self.extinction_at(ray, t, channels, active, name), strict=True)]
 
-    def deposit(self, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
-        """Add ``weight`` (d loss / d coefficient of each channel) at a point of a ray: the transpose of :meth:`tangent_at`."""
+    def vjp_extinction_at(self, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
+        """Add ``weight`` (d loss / d coefficient of each channel) at a point: the transpose of :meth:`jvp_extinction_at`."""
         if self.microflakes_gradient is not None:
             self._vjp_microflakes(ray.d, weight, self.extinction_at(ray, t, len(weight), active, name), active)
         weight = [self.area(ray.d) * w for w in weight]
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             if part.name.startswith(name):
-                part.vjp_at(gradient, for_part(weight, part.channels), ray, t, active)
+                part.vjp_at(gradient, to_part_channels(weight, part.channels), ray, t, active)
 
     def add_to_grid(self, part: ExactExtinction, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
         """Add to the gradient of a grid, in one packet for each channel, at the cell behind a node.
@@ -204,13 +204,13 @@ class Body:
             active: lanes that add.
         """
         gradient = next(g for p, g in zip(self.view.parts, self.gradients, strict=True) if p is part)
-        add_to_cell(gradient, lower, [(for_part(weight, part.channels), corners) for weight, corners in terms], active)
+        add_to_cell(gradient, lower, [(to_part_channels(weight, part.channels), corners) for weight, corners in terms], active)
 
     def add_to_constants(self, weight: list[mi.Float], active: mi.Bool) -> None:
         """Add ``weight`` (d loss of each channel of the scene) to the gradients of the constants."""
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             if part.is_constant:
-                for c, w in enumerate(for_part(weight, part.channels)):
+                for c, w in enumerate(to_part_channels(weight, part.channels)):
                     dr.scatter_add(gradient, w, mi.UInt32(c), active)
 
 
@@ -224,7 +224,7 @@ def flight_parts(parts: list[Extinction]) -> list[ExactExtinction]:
     """The parts that one walk of cells can sum: constants, and grids that share the cells of ``sigma_s`` (or the first)."""
     grids = [p for p in parts if p.lattice is not None]
     lead = next((p for p in grids if p.name == "sigma_s"), grids[0] if grids else None)
-    return [p for p in parts if p.is_constant or (p.lattice is not None and share_cells(p.lattice, lead.lattice))]
+    return [p for p in parts if p.is_constant or (p.lattice is not None and have_same_cells(p.lattice, lead.lattice))]
 
 
 def _add(a: list[mi.Float], b: list[mi.Float]) -> list[mi.Float]:
@@ -263,7 +263,7 @@ def eval_emission(body: Body, ray: Ray, t: mi.Float64, channels: int, on: mi.Boo
     total = mi.Spectrum(0)
     if body.view.emission is not None:
         name, slope = emission_slope(body, ray, t, on)
-        total += spectrum(body.extinction_at(ray, dr.select(on, t, 0), channels, on, name)) * slope
+        total += to_spectrum(body.extinction_at(ray, dr.select(on, t, 0), channels, on, name)) * slope
     if body.view.emission_density is not None:
         total += _at(body, body.view.emission_density, ray, t, on)
     return total

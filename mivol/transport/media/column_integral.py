@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import lesser
-from mivol.transport.traversal.interpolation import GAUSS
+from mivol.transport.traversal.interpolation import GAUSS_POINT
 
 __all__ = [
     "backproject_columns",
@@ -158,7 +158,7 @@ def _spare(grid: ColumnGrid) -> int:
 
 def _gauss_points(cell: ColumnCell) -> list[list[mi.Float]]:
     """The two points of the quadrature, as fractions of the cell."""
-    return [[dr.fma(s, g, f) for s, f in zip(cell.step, cell.frac, strict=True)] for g in (GAUSS, 1 - GAUSS)]
+    return [[dr.fma(s, g, f) for s, f in zip(cell.step, cell.frac, strict=True)] for g in (GAUSS_POINT, 1 - GAUSS_POINT)]
 
 
 def _interpolate(columns: Columns, point: list[mi.Float]) -> mi.Float:

@@ -21,7 +21,7 @@ __all__ = [
     "CellIntegral",
     "ReverseState",
     "pass_cell",
-    "put_in_front",
+    "composite_over",
     "transmittance_of",
     "zeros",
 ]
@@ -72,7 +72,7 @@ class ReverseState:
     constant: list[mi.Float]
 
 
-def put_in_front(
+def composite_over(
     integral: BodyIntegral, integrals: list[CellIntegral], changes: list[list[mi.Float]], jvp: list[mi.Float]
 ) -> BodyIntegral:
     """Composite a cell over what has been swept: it adds its own N and dims the rest.

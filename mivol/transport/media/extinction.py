@@ -19,8 +19,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.fields.protocol import Field
-from mivol.transport.media.channels import tangent_of
-from mivol.transport.traversal.box import Box, slab
+from mivol.transport.media.channels import take_tangent
+from mivol.transport.traversal.box import Box, clip_to_box
 from mivol.transport.traversal.lattice import Lattice
 from mivol.transport.traversal.rays import Ray
 
@@ -208,7 +208,7 @@ class BoundedExtinction:
     def clip(self, interval: RayInterval) -> tuple[mi.Float, mi.Float]:
         """The part [t0, t1] of an interval of a ray that lies in the field's box; t1 <= t0 where there is none."""
         ray, t0, t1 = interval.ray, mi.Float64(interval.t0), mi.Float64(interval.t1)
-        _, _, t0, t1 = slab(self._rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
+        _, _, t0, t1 = clip_to_box(self._rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
         return mi.Float(t0), mi.Float(t1)
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
@@ -218,7 +218,7 @@ class BoundedExtinction:
         with dr.resume_grad():
             values = self.field.eval(ray(t), ray.d, active)
             # One pass for all channels: it clears the edges behind it, which they share.
-            changes = tangent_of(mi.Color3f(*values)) if self.channels == 3 else [tangent_of(values[0])]
+            changes = take_tangent(mi.Color3f(*values)) if self.channels == 3 else [take_tangent(values[0])]
         pairs = zip(dr.detach(values), changes, strict=True)
         return [dr.select(active, tangent * value + self.scale * change, 0) for value, change in pairs]
 

@@ -14,11 +14,11 @@ from mivol.fields.gaussian_line import ROW_SIZE, SCALE_COLUMN, LineSlopes, White
 from mivol.fields.harmonics import blocks_per_gaussian
 from mivol.numerics import greater, lesser
 from mivol.transport.media.extinction import RayInterval
-from mivol.transport.traversal.grid_walk import Cell, walk
-from mivol.transport.traversal.lattice import Lattice, Segment, clip
+from mivol.transport.traversal.grid_walk import Cell, walk_cells
+from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
 from mivol.transport.traversal.rays import Ray
 
-__all__ = ["GaussianExtinction", "Passage", "add_block"]
+__all__ = ["GaussianExtinction", "Passage", "add_to_block"]
 
 
 @dataclass
@@ -88,29 +88,29 @@ class GaussianExtinction:
 
         until = None if enough is None else lambda tau: tau > enough
         passage = self.enter(interval)
-        return [self.each_along(passage, dr.zeros(mi.Float, dr.width(passage.d)), add, until)]
+        return [self.visit_gaussians(passage, dr.zeros(mi.Float, dr.width(passage.d)), add, until)]
 
     def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
         def add(tau: mi.Float, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.Float:
-            return tau + self.push(line, line.share_slopes(*ends), line.depth * line.share(*ends), tangent, index)
+            return tau + self.jvp_value(line, line.share_slopes(*ends), line.depth * line.share(*ends), tangent, index)
 
         passage = self.enter(interval)
-        return [self.each_along(passage, dr.zeros(mi.Float, dr.width(passage.d)), add)]
+        return [self.visit_gaussians(passage, dr.zeros(mi.Float, dr.width(passage.d)), add)]
 
     def vjp(self, gradient: mi.Float, weight: list[mi.Float], interval: RayInterval) -> None:
         def add(state: tuple, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
             own = line.depth * line.share(*ends)
-            self.pull(gradient, line, line.share_slopes(*ends), (own, weight[0]), index, mi.Bool(True))
+            self.vjp_value(gradient, line, line.share_slopes(*ends), (own, weight[0]), index, mi.Bool(True))
             return state
 
-        self.each_along(self.enter(interval), (), add)
+        self.visit_gaussians(self.enter(interval), (), add)
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return [dr.detach(scale) * value for value in self.field.eval(ray(t), ray.d, active)]
 
     def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         def add(total: mi.Float, line: WhitenedLine, index: mi.UInt32) -> mi.Float:
-            own = self.push(line, line.density_slopes, line.density, tangent, index)
+            own = self.jvp_value(line, line.density_slopes, line.density, tangent, index)
             return dr.select(line.contains_origin, total + own, total)
 
         there = mi.Ray3f(ray(t), ray.d)
@@ -118,7 +118,7 @@ class GaussianExtinction:
 
     def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         def add(state: tuple, line: WhitenedLine, index: mi.UInt32) -> tuple:
-            self.pull(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.contains_origin)
+            self.vjp_value(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.contains_origin)
             return state
 
         self.field.visit_at_points(mi.Ray3f(ray(t), ray.d), active, (), add)
@@ -126,11 +126,11 @@ class GaussianExtinction:
     def enter(self, interval: RayInterval) -> Passage:
         """The part of an interval inside the box, seen from where it begins: far from the origin float32 has few digits."""
         ray = interval.ray
-        segment = clip(self.cells, ray.o, ray.d, interval.t0, interval.t1)
+        segment = clip_to_grid(self.cells, ray.o, ray.d, interval.t0, interval.t1)
         there = (dr.fma(segment.start, mi.Float64(v), mi.Float64(x)) for x, v in zip(ray.o, ray.d, strict=True))
         return Passage(segment, mi.Point3f(*(mi.Float(x) for x in there)), ray.d, interval.active & (segment.length > 0))
 
-    def each_along(
+    def visit_gaussians(
         self,
         passage: Passage,
         state: Any,
@@ -164,14 +164,16 @@ class GaussianExtinction:
             state = field.visit_cell(cell.lower + 1, through, on, state, meet)
             return state if leave is None else leave(state, cell)
 
-        return walk(self.cells, passage.segment, visit, state, (), passage.active, until)
+        return walk_cells(self.cells, passage.segment, visit, state, (), passage.active, until)
 
-    def push(self, line: WhitenedLine, slopes: LineSlopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32) -> mi.Float:
+    def jvp_value(
+        self, line: WhitenedLine, slopes: LineSlopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32
+    ) -> mi.Float:
         """The tangent of the scale times a value that has these derivatives."""
         change = read_row(tangent, index)
         return self.scale * row_tangent(line, slopes, change) + value * change[SCALE_COLUMN]
 
-    def pull(
+    def vjp_value(
         self,
         gradient: mi.Float,
         line: WhitenedLine,
@@ -183,10 +185,10 @@ class GaussianExtinction:
         """Add to the gradient of a row: ``value`` is a number with these derivatives, and d loss / d (scale times it)."""
         own, weight = value
         entries = [self.scale * weight * slope for slope in slopes.by_row(line)]
-        add_block(gradient, [*entries, weight * own], index, on)
+        add_to_block(gradient, [*entries, weight * own], index, on)
 
 
-def add_block(gradient: mi.Float, entries: list[mi.Float], index: mi.UInt32, on: mi.Bool) -> None:
+def add_to_block(gradient: mi.Float, entries: list[mi.Float], index: mi.UInt32, on: mi.Bool) -> None:
     """Add numbers, at most ``ROW``, to a block of a gradient."""
     packet = mi.ArrayXf([*entries, *(mi.Float(0) for _ in range(ROW_SIZE - len(entries)))])
     dr.scatter_add(gradient, packet, index, on, mode=dr.ReduceMode.Expand)

@@ -29,14 +29,14 @@ from mivol.fields.gaussian_line import ROW_SIZE, WhitenedLine, intersect_gaussia
 from mivol.fields.harmonics import eval_colour, eval_colour_slopes, read_harmonics, sum_harmonics
 from mivol.numerics import greater, lesser, one_minus_exp
 from mivol.transport.media.channels import LUMINANCE
-from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, pass_cell, put_in_front, zeros
+from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, composite_over, pass_cell, zeros
 from mivol.transport.media.extinction import RayInterval
-from mivol.transport.media.gaussian_extinction import GaussianExtinction, add_block
+from mivol.transport.media.gaussian_extinction import GaussianExtinction, add_to_block
 from mivol.transport.media.ray_intervals import MediumInterval
-from mivol.transport.traversal.grid_walk import Cell, walk
-from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.grid_walk import Cell, walk_cells
+from mivol.transport.traversal.lattice import clip_to_grid
 
-__all__ = ["GaussianSweep", "visit_from_the_far_end"]
+__all__ = ["GaussianSweep", "visit_far_to_near"]
 
 RGB = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
 """Weights of red, green and blue in rows of colours."""
@@ -97,9 +97,9 @@ class GaussianSweep:
         def add(integral: BodyIntegral, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> BodyIntegral:
             seen = self._see(line, index, ends)
             if self.change is None:
-                return put_in_front(integral, seen.integrals(), [], [])
-            moved = self.part.push(line, line.share_slopes(*ends), seen.own, self.change, index)
-            return put_in_front(integral, seen.integrals(), [[moved]] * self.rows, self._jvp_colour(seen))
+                return composite_over(integral, seen.integrals(), [], [])
+            moved = self.part.jvp_value(line, line.share_slopes(*ends), seen.own, self.change, index)
+            return composite_over(integral, seen.integrals(), [[moved]] * self.rows, self._jvp_colour(seen))
 
         return self._sweep(BodyIntegral(zeros(mi.Float64, rows), zeros(mi.Float, rows)), add)
 
@@ -114,7 +114,7 @@ class GaussianSweep:
             seen = self._see(line, index, ends)
             sweep, slopes, weights = pass_cell(sweep, seen.integrals(), weight, behind)
             by_tau = sum((row[0] for row in slopes), mi.Float(0))
-            self.part.pull(gradient, line, line.share_slopes(*ends), (seen.own, by_tau), index, mi.Bool(True))
+            self.part.vjp_value(gradient, line, line.share_slopes(*ends), (seen.own, by_tau), index, mi.Bool(True))
             self._vjp_colour(gradient, seen, weights)
             return sweep
 
@@ -122,7 +122,7 @@ class GaussianSweep:
         self._sweep(start, add)
 
     def _sweep(self, state: object, add: object) -> object:
-        return visit_from_the_far_end(self.part, self.interval, state, add)
+        return visit_far_to_near(self.part, self.interval, state, add)
 
     def _see(self, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> _Seen:
         own, colour = line.depth * line.share(*ends), [mi.Float(0)] * self.rows
@@ -158,7 +158,7 @@ class GaussianSweep:
         entries = [y * by for y in self.basis for by in by_rgb]
         first = self.part.field.count + seen.index * self.part.blocks
         for block in range(self.part.blocks):
-            add_block(gradient, entries[ROW_SIZE * block : ROW_SIZE * (block + 1)], first + block, mi.Bool(True))
+            add_to_block(gradient, entries[ROW_SIZE * block : ROW_SIZE * (block + 1)], first + block, mi.Bool(True))
 
 
 def _dot(weights: list[float], values: list[mi.Float]) -> mi.Float:
@@ -173,7 +173,7 @@ LAST_PLACE = 1 - 1e-6
 """Share of a passage at which a peak beyond its end is looked for: the last cell holds it, whatever rounding did to its end."""
 
 
-def visit_from_the_far_end(part: GaussianExtinction, interval: RayInterval, state: Any, add: Callable[..., Any]) -> Any:
+def visit_far_to_near(part: GaussianExtinction, interval: RayInterval, state: Any, add: Callable[..., Any]) -> Any:
     """Visit once each Gaussian that an interval of a ray meets, that of the farthest peak first.
 
     Args:
@@ -188,7 +188,7 @@ def visit_from_the_far_end(part: GaussianExtinction, interval: RayInterval, stat
     """
     passage = part.enter(interval)
     ray = interval.ray
-    segment = clip(part.cells, ray.o, -ray.d, -mi.Float64(interval.t1), -mi.Float64(interval.t0))
+    segment = clip_to_grid(part.cells, ray.o, -ray.d, -mi.Float64(interval.t1), -mi.Float64(interval.t0))
     field, through, length, rows = part.field, (passage.o, passage.d), passage.segment.length, part.field.flat
     start = dr.full(mi.Float, dr.inf, dr.width(passage.d))
 
@@ -222,7 +222,7 @@ def visit_from_the_far_end(part: GaussianExtinction, interval: RayInterval, stat
         first = (start, dr.zeros(mi.UInt32, dr.width(start)))
         return dr.while_loop((on, first, state), lambda more, *_: more, fill, label="Gaussians of a cell, sorted")[2]
 
-    return walk(part.cells, segment, visit, state, (), passage.active & (segment.length > 0))
+    return walk_cells(part.cells, segment, visit, state, (), passage.active & (segment.length > 0))
 
 
 def _is_farther(a: tuple[mi.Float, mi.UInt32], b: tuple[mi.Float, mi.UInt32]) -> mi.Bool:

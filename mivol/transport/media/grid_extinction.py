@@ -13,15 +13,15 @@ from mivol.fields.activation import Activation
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.grid_integral import (
     ActivatedNodes,
-    Gradient,
+    NodeGradient,
     backproject_activated,
     backproject_segment,
     integrate_activated,
     integrate_segment,
 )
-from mivol.transport.traversal.grid_walk import Nodes, box_nodes
-from mivol.transport.traversal.interpolation import interpolate, upward_frac, weights
-from mivol.transport.traversal.lattice import Lattice, Segment, clip, locate
+from mivol.transport.traversal.grid_walk import NodeArray, corner_nodes
+from mivol.transport.traversal.interpolation import fraction_from_lower, interpolate, trilinear_weights
+from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid, locate_cell
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [
@@ -33,7 +33,7 @@ __all__ = [
     "ActivatedGridExtinction",
     "SummedExtinction",
     "activate",
-    "share_cells",
+    "have_same_cells",
 ]
 
 
@@ -64,18 +64,18 @@ class NodeValues:
     def scaled(self, scale: mi.Float) -> mi.Float:
         return scale * self.values
 
-    def start_gradient(self) -> Gradient:
-        return Gradient.zeros(self.lattice)
+    def start_gradient(self) -> NodeGradient:
+        return NodeGradient.zeros(self.lattice)
 
-    def deliver(self, scale: mi.Float, gradient: Gradient) -> mi.Float:
+    def deliver(self, scale: mi.Float, gradient: NodeGradient) -> mi.Float:
         flat = gradient.fold()
         dr.eval(flat)
         return dr.sum(dr.ravel(self.scaled(scale)) * flat)
 
-    def add_at_point(self, gradient: Gradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
+    def add_at_point(self, gradient: NodeGradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d interpolated value of each channel) at a point of a ray to a gradient of the nodes."""
-        cell, frac, inside = locate(self.lattice, ray.o, ray.d, t)
-        corners = weights(upward_frac(frac, cell, self.lattice.res))
+        cell, frac, inside = locate_cell(self.lattice, ray.o, ray.d, t)
+        corners = trilinear_weights(fraction_from_lower(frac, cell, self.lattice.res))
         add_to_cell(gradient, cell, [(weight, corners)], inside & active)
 
 
@@ -98,7 +98,7 @@ class GridExtinction(NodeValues):
         lattice = replace(self.lattice, empty_distances=None)
         return integrate_segment(lattice, tangent, clip_interval(lattice, interval), interval.active)
 
-    def vjp(self, gradient: Gradient, weight: list[mi.Float], interval: RayInterval) -> None:
+    def vjp(self, gradient: NodeGradient, weight: list[mi.Float], interval: RayInterval) -> None:
         backproject_segment(self.lattice, gradient, weight, clip_interval(self.lattice, interval), interval.active)
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
@@ -107,24 +107,24 @@ class GridExtinction(NodeValues):
     def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return interpolate_at(self.lattice, tangent, ray, t, active)
 
-    def vjp_at(self, gradient: Gradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
+    def vjp_at(self, gradient: NodeGradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         self.add_at_point(gradient, weight, ray, t, active)
 
 
 def clip_interval(lattice: Lattice, interval: RayInterval) -> Segment:
     """The part of an interval of a ray inside the box of a grid."""
-    return clip(lattice, interval.ray.o, interval.ray.d, interval.t0, interval.t1)
+    return clip_to_grid(lattice, interval.ray.o, interval.ray.d, interval.t0, interval.t1)
 
 
 def interpolate_at(lattice: Lattice, values: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
     """Each channel of flat node values at a point of a ray; 0 outside the grid's box."""
-    cell, frac, inside = locate(lattice, ray.o, ray.d, t)
+    cell, frac, inside = locate_cell(lattice, ray.o, ray.d, t)
     upward = dr.full(dr.mask_t(mi.Vector3f), True)
-    nodes, on, n = box_nodes(cell, upward, lattice.res), inside & active, lattice.channels
+    nodes, on, n = corner_nodes(cell, upward, lattice.res), inside & active, lattice.channels
     return [interpolate([dr.gather(mi.Float, values, k * n + c, on) for k in nodes], frac) for c in range(n)]
 
 
-def add_to_cell(gradient: Gradient, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
+def add_to_cell(gradient: NodeGradient, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
     """Add to the gradient of a grid, in one packet for each channel.
 
     Args:
@@ -158,19 +158,19 @@ class ActivatedGridExtinction(NodeValues):
         nodes = replace(self._nodes(), lattice=replace(self.lattice, empty_distances=None))
         return integrate_activated(nodes, clip_interval(nodes.lattice, interval), interval.active, None, tangent)
 
-    def vjp(self, gradient: Gradient, weight: list[mi.Float], interval: RayInterval) -> None:
+    def vjp(self, gradient: NodeGradient, weight: list[mi.Float], interval: RayInterval) -> None:
         backproject_activated(self._nodes(), gradient, weight[0], clip_interval(self.lattice, interval), interval.active)
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         (value,) = interpolate_at(self.lattice, dr.detach(self.scaled(scale)), ray, t, active)
         # Outside of the box 0 is read, of which an activation may make a positive extinction.
-        inside = locate(self.lattice, ray.o, ray.d, t)[2]
+        inside = locate_cell(self.lattice, ray.o, ray.d, t)[2]
         return [dr.select(inside, self.activation.value_and_slope(value)[0], 0)]
 
     def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return [self._slope(ray, t, active) * row for row in interpolate_at(self.lattice, tangent, ray, t, active)]
 
-    def vjp_at(self, gradient: Gradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
+    def vjp_at(self, gradient: NodeGradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         self.add_at_point(gradient, [self._slope(ray, t, active) * weight[0]], ray, t, active)
 
     def _nodes(self) -> ActivatedNodes:
@@ -196,7 +196,7 @@ class SummedExtinction:
         self.channels, self.scale = max(p.channels for p in parts), scale
         pairs = list(zip(parts, values, strict=True))
         self.activations = [None if linear else p.activation for p, _ in pairs if p.lattice is not None]
-        self.reads = [Nodes(v, p.channels) for p, v in pairs if p.lattice is not None]
+        self.reads = [NodeArray(v, p.channels) for p, v in pairs if p.lattice is not None]
         self.has_constants = len(self.reads) < len(parts)
         constants = [_as_channels(v, p.channels) for p, v in pairs if p.is_constant]
         self.constant = [scale * sum((k[c % len(k)] for k in constants), mi.Float(0)) for c in range(self.channels)]
@@ -216,7 +216,7 @@ class SummedExtinction:
         return [self.activations[0].value_and_slope(interpolate(corners[0][0], p))[1] for p in points]
 
 
-def share_cells(a: Lattice, b: Lattice) -> bool:
+def have_same_cells(a: Lattice, b: Lattice) -> bool:
     """Whether two grids have the same resolution and place."""
     return a.res == b.res and np.array_equal(a.to_world, b.to_world)
 

@@ -23,13 +23,13 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation
 from mivol.numerics import least_of
-from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, walk
+from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, walk_cells
 from mivol.transport.traversal.interpolation import gauss_points, interpolate, node_weights
-from mivol.transport.traversal.lattice import Lattice, Segment, clip
+from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
 
 __all__ = [
     "ActivatedNodes",
-    "Gradient",
+    "NodeGradient",
     "backproject_activated",
     "backproject_segment",
     "integrate_activated",
@@ -74,7 +74,7 @@ def integrate_tau(
         raise MivolError(f"a grid of {lattice.channels} channels was given; an optical depth has 1 (grey) or 3 (rgb).")
     if dr.grad_enabled(o, d, t_max):
         raise MivolError("rays with gradients were given; optical depth is differentiable in the grid only: detach the rays.")
-    segment = clip(lattice, o, d, 0, t_max)
+    segment = clip_to_grid(lattice, o, d, 0, t_max)
     tau = dr.custom(_OpticalDepth, lattice.values.array, lattice, segment, mi.Bool(active))
     return tau[0] if lattice.channels == 1 else mi.Color3f(*tau)
 
@@ -87,7 +87,7 @@ def integrate_segment(
     Args:
         lattice: where the grid lies, and which blocks are empty.
         values: flat node values (the lattice's own, or a tangent of them).
-        segment: from :func:`mivol.transport.traversal.lattice.clip`.
+        segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
         active: lanes to integrate; the others return 0.
         enough: stop where every channel has more than this; None to walk to the end.
 
@@ -105,7 +105,7 @@ def integrate_segment(
     zero = [mi.Float(0) for _ in range(lattice.channels)]
 
     until = None if enough is None else lambda tau: least_of(tau) > enough
-    return walk(lattice, segment, visit, zero, [Nodes(values, lattice.channels)], active, until)
+    return walk_cells(lattice, segment, visit, zero, [NodeArray(values, lattice.channels)], active, until)
 
 
 @dataclass
@@ -151,13 +151,13 @@ def integrate_activated(
             total += value if tangent is None else slope * interpolate(cell.corners[1][0], p)
         return [dr.fma(half, total, tau[0])]
 
-    reads = [Nodes(nodes.values)] if tangent is None else [Nodes(nodes.values), Nodes(tangent)]
+    reads = [NodeArray(nodes.values)] if tangent is None else [NodeArray(nodes.values), NodeArray(tangent)]
     until = None if enough is None else lambda tau: tau[0] > enough
-    return walk(nodes.lattice, segment, visit, [mi.Float(0)], reads, active, until)
+    return walk_cells(nodes.lattice, segment, visit, [mi.Float(0)], reads, active, until)
 
 
 def backproject_activated(
-    nodes: ActivatedNodes, target: Gradient, weight: mi.Float, segment: Segment, active: mi.Bool = True
+    nodes: ActivatedNodes, target: NodeGradient, weight: mi.Float, segment: Segment, active: mi.Bool = True
 ) -> None:
     """The transpose of the tangent of :func:`integrate_activated`: add ``weight`` (d loss / d tau) times it to ``target``."""
 
@@ -169,11 +169,11 @@ def backproject_activated(
         target.add(0, cell, [0.5 * cell.dt * weight * r for r in row], on)
         return state
 
-    walk(replace(nodes.lattice, empty_distances=None), segment, visit, None, [Nodes(nodes.values)], active)
+    walk_cells(replace(nodes.lattice, empty_distances=None), segment, visit, None, [NodeArray(nodes.values)], active)
 
 
 @dataclass
-class Gradient:
+class NodeGradient:
     """The derivative of a scalar with respect to the nodes of a grid, to which the transpose adds.
 
     On the CPU a cell adds its 8 corners as one packet to a buffer that has 8 numbers a cell and a copy for each thread, so that
@@ -193,7 +193,7 @@ class Gradient:
     packed: bool
 
     @classmethod
-    def zeros(cls, lattice: Lattice) -> Gradient:
+    def zeros(cls, lattice: Lattice) -> NodeGradient:
         """A gradient of zero for the nodes of ``lattice``."""
         z, y, x = lattice.res
         cells = (z + 1) * (y + 1) * (x + 1) * lattice.channels
@@ -215,7 +215,7 @@ class Gradient:
             dr.scatter_add(self.buffer, mi.ArrayXf(corners), index, active, mode=dr.ReduceMode.Expand)
             return
         upward = dr.full(dr.mask_t(mi.Vector3f), True)
-        for node, value in zip(box_nodes(lower, upward, self.res), corners, strict=True):
+        for node, value in zip(corner_nodes(lower, upward, self.res), corners, strict=True):
             dr.scatter_add(self.buffer, value, node * self.channels + channel, active)
 
     def fold(self) -> mi.Float:
@@ -243,7 +243,7 @@ def gradient_bytes(res: tuple[int, int, int], channels: int) -> int:
 
 
 def backproject_segment(
-    lattice: Lattice, target: Gradient, weight: list[mi.Float], segment: Segment, active: mi.Bool = True
+    lattice: Lattice, target: NodeGradient, weight: list[mi.Float], segment: Segment, active: mi.Bool = True
 ) -> None:
     """Add ``weight`` times the row of ``A`` of each lane to a gradient: the transpose ``A^T``.
 
@@ -251,7 +251,7 @@ def backproject_segment(
         lattice: where the grid lies. Empty blocks are walked too, since an empty voxel has a derivative.
         target: the gradient to add to.
         weight: d loss / d tau of each lane, one entry a channel.
-        segment: from :func:`mivol.transport.traversal.lattice.clip`.
+        segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
         active: lanes to project back.
 
     Cost: one packed write of 8 a cell and channel.
@@ -264,7 +264,7 @@ def backproject_segment(
             target.add(channel, cell, [w * r for r in row], on)
         return state
 
-    walk(replace(lattice, empty_distances=None), segment, visit, None, (), active)
+    walk_cells(replace(lattice, empty_distances=None), segment, visit, None, (), active)
 
 
 class _OpticalDepth(dr.CustomOp):
@@ -280,7 +280,7 @@ class _OpticalDepth(dr.CustomOp):
         self.set_grad_out(integrate_segment(dense, self.grad_in("values"), self.segment, self.active))
 
     def backward(self) -> None:
-        target = Gradient.zeros(self.lattice)
+        target = NodeGradient.zeros(self.lattice)
         backproject_segment(self.lattice, target, list(self.grad_out()), self.segment, self.active)
         self.set_grad_in("values", target.fold())
 

@@ -26,7 +26,7 @@ from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridE
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["MediumView", "children_of", "nested_field", "traverse_medium", "view_medium"]
+__all__ = ["MediumView", "find_children", "nested_field", "traverse_medium", "view_medium"]
 
 
 @dataclass
@@ -115,11 +115,11 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     Raises:
         MivolError: a medium or a volume of another kind.
     """
-    kind = kind_of(medium)
+    kind = medium_kind(medium)
     params = traverse_medium(medium)
     if kind not in (*STOCK, "mivol_medium"):
         raise MivolError(f"a medium of type {kind} was found; mivol renders mivol_medium, homogeneous and heterogeneous media.")
-    children = children_of(medium)
+    children = find_children(medium)
     names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if n in children]
     places = {} if places is None else places
     scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
@@ -217,19 +217,19 @@ def _repeats_border(volume: object) -> bool:
 
 
 def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:
-    """Where a grid lies (4x4, unit cube to world), from the cache ``places`` or by :func:`place_of_grid`."""
+    """Where a grid lies (4x4, unit cube to world), from the cache ``places`` or by :func:`find_grid_place`."""
     key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
     if key not in places:
-        places[key] = place_of_grid(volume, boundary)
+        places[key] = find_grid_place(volume, boundary)
     return places[key]
 
 
-def kind_of(medium: mi.Medium) -> str:
+def medium_kind(medium: mi.Medium) -> str:
     """Name of a medium's class; ``mivol_medium`` for ours (Mitsuba calls every Python class by its base)."""
     return "mivol_medium" if hasattr(medium, "coefficients") else medium.class_name()
 
 
-def children_of(medium: mi.Medium) -> dict[str, mi.Object]:
+def find_children(medium: mi.Medium) -> dict[str, mi.Object]:
     """The volumes and the phase function of a medium, by name; one object may stand under several names."""
     found = {}
 
@@ -244,7 +244,7 @@ def children_of(medium: mi.Medium) -> dict[str, mi.Object]:
 
 def nested_field(medium: mi.Medium) -> SphericalGrid | None:
     """The radiance field that a medium is, where that has more than one level; None of all other media."""
-    field = getattr(children_of(medium).get("emission"), "mivol_field", None)
+    field = getattr(find_children(medium).get("emission"), "mivol_field", None)
     return field if field is not None and field.levels > 1 else None
 
 
@@ -255,7 +255,7 @@ def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
     merges equal objects of a scene) it lists under one of the names, and here it is listed under both.
     """
     params = mi.traverse(medium)
-    for name, child in children_of(medium).items():
+    for name, child in find_children(medium).items():
         own = mi.traverse(child)
         params.properties |= {f"{name}.{key}": entry for key, entry in own.properties.items()}
         params.hierarchy |= {node: entry for node, entry in own.hierarchy.items() if node not in params.hierarchy}
@@ -307,7 +307,7 @@ def _part(
     channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
     values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))
     if volume.ptr not in places:
-        places[volume.ptr] = place_of_grid(volume)
+        places[volume.ptr] = find_grid_place(volume)
     return GridExtinction(name, Lattice(values, places[volume.ptr]))
 
 
@@ -316,7 +316,7 @@ def _tensor(values: mi.TensorXf) -> mi.TensorXf:
     return values if len(values.shape) == 4 else mi.TensorXf(values.array, (*values.shape, 1))
 
 
-def place_of_grid(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:
+def find_grid_place(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:
     """Find where a grid volume lies: the (4, 4) float64 map of the unit cube to the world.
 
     A ``mivol_voxels`` hands its own map out. A stock ``gridvolume`` only prints its transform, to 6 digits, and returns its

@@ -8,8 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.media.channels import by_channel, spectrum
-from mivol.transport.media.drawn_points import DrawnPoint, bounded_parts, draw_in, start_points
+from mivol.transport.media.channels import colours_to_channels, to_spectrum
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
     RaySegment,
@@ -18,6 +17,7 @@ from mivol.transport.media.ray_intervals import (
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.media.uniform_points import PointReservoir, bounded_parts, offer_medium_interval, start_reservoirs
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [
@@ -87,7 +87,7 @@ def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectru
 
     Cost: one walk of each medium, with one packed write of 8 a cell and channel.
     """
-    vjp_rows(media, segment, by_channel(weight, media.channels), active & dr.any(weight != 0))
+    vjp_rows(media, segment, colours_to_channels(weight, media.channels), active & dr.any(weight != 0))
 
 
 def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
@@ -95,20 +95,20 @@ def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], act
 
     bounded = bounded_parts(media.bodies)
 
-    def visit(points: list[DrawnPoint], interval: MediumInterval) -> list[DrawnPoint]:
-        interval.body.backproject(interval, weight)
+    def visit(points: list[PointReservoir], interval: MediumInterval) -> list[PointReservoir]:
+        interval.body.vjp_optical_depth(interval, weight)
         return _pass(points, bounded, interval)
 
-    points = revisit_media(media, segment, visit, start_points(len(bounded), segment.u, dr.width(segment.ray)), active)
+    points = revisit_media(media, segment, visit, start_reservoirs(len(bounded), segment.u, dr.width(segment.ray)), active)
     for (body, part), point in zip(bounded, points, strict=True):
         # After the walk: Dr.Jit loses what is differentiated in a loop with respect to an array that already has a gradient.
         on, each = active & (point.total > 0), [w * point.total for w in weight]
-        body.deposit_in_part(part, segment.ray, point.t, each, on)
+        body.vjp_part_at(part, segment.ray, point.t, each, on)
 
 
 def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> mi.Spectrum:
     """Tangent of the optical depth of a segment, from the parameters' tangents that :meth:`SceneMedia.start_tangent` took."""
-    return spectrum(jvp_rows(media, segment, active))
+    return to_spectrum(jvp_rows(media, segment, active))
 
 
 def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
@@ -118,21 +118,21 @@ def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi
 
     def visit(state: tuple, interval: MediumInterval) -> tuple:
         tau, points = state
-        own = interval.body.tangent(interval, len(tau))
+        own = interval.body.jvp_optical_depth(interval, len(tau))
         return [t + d for t, d in zip(tau, own, strict=True)], _pass(points, bounded, interval)
 
-    start = (zero, start_points(len(bounded), segment.u, dr.width(segment.ray)))
+    start = (zero, start_reservoirs(len(bounded), segment.u, dr.width(segment.ray)))
     tau, points = revisit_media(media, segment, visit, start, active)
     for (body, part), point in zip(bounded, points, strict=True):
         on = active & (point.total > 0)
-        rows = body.tangent_of_part(part, segment.ray, point.t, media.channels, on)
+        rows = body.jvp_part_at(part, segment.ray, point.t, media.channels, on)
         tau = [t + dr.select(on, point.total * row, 0) for t, row in zip(tau, rows, strict=True)]
     return tau
 
 
-def _pass(points: list[DrawnPoint], bounded: list[tuple], interval: MediumInterval) -> list[DrawnPoint]:
+def _pass(points: list[PointReservoir], bounded: list[tuple], interval: MediumInterval) -> list[PointReservoir]:
     """Pass an interval of one medium with the points of all bounded parts."""
     return [
-        draw_in(point, part, interval) if owner is interval.body else point
+        offer_medium_interval(point, part, interval) if owner is interval.body else point
         for (owner, part), point in zip(bounded, points, strict=True)
     ]

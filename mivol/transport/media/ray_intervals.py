@@ -19,8 +19,8 @@ import mitsuba as mi
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.box import slab
-from mivol.transport.traversal.rays import FineRay, Ray, distance_along, spawn_ray, traced
+from mivol.transport.traversal.box import clip_to_box
+from mivol.transport.traversal.rays import FineRay, Ray, hit_distance, spawn_ray, to_mitsuba_ray
 
 __all__ = [
     "OWN_SURFACE",
@@ -78,7 +78,7 @@ class RaySegment:
     @classmethod
     def upto(cls, ray: Ray, medium: mi.MediumPtr, t: mi.Float64) -> RaySegment:
         """The first part of a ray, of length ``t``."""
-        return cls(replace(FineRay.of(ray), maxt=mi.Float(t)), medium, t)
+        return cls(replace(FineRay.from_ray(ray), maxt=mi.Float(t)), medium, t)
 
 
 @dataclass
@@ -103,7 +103,7 @@ class MediumInterval(RayInterval):
         """The interval inside the boundary [length]; the end is not behind the start where it misses it."""
         t0, t1 = mi.Float64(self.t0), mi.Float64(self.t1)
         if self.body.box is not None and not self.body.cuts_grids:
-            _, _, t0, t1 = slab(self.body.rows, *UNIT, self.ray.o, self.ray.d, t0, t1)
+            _, _, t0, t1 = clip_to_box(self.body.rows, *UNIT, self.ray.o, self.ray.d, t0, t1)
         return t0, t1
 
 
@@ -172,10 +172,10 @@ def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: m
     for body in media.boxed:
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.cuts_grids:
-            _, _, t0, t1 = slab(body.rows, *UNIT, ray.o, ray.d, t0, t1)
+            _, _, t0, t1 = clip_to_box(body.rows, *UNIT, ray.o, ray.d, t0, t1)
         ends = [(t0, t1)]
         if body.hole is not None:
-            _, _, enter, leave = slab(body.hole_rows, *UNIT, ray.o, ray.d, t0, t1)
+            _, _, enter, leave = clip_to_box(body.hole_rows, *UNIT, ray.o, ray.d, t0, t1)
             misses = leave <= enter
             ends = [(t0, dr.select(misses, t1, enter)), (dr.select(misses, t1, leave), t1)]
         found += [MediumInterval(ray, a, b, active & (b > a), body) for a, b in ends]
@@ -200,7 +200,7 @@ def _trace(
     passes_null &= media.has_null_transmission
 
     # -- State ------------------------------------------------------------------------------------------------------------
-    onward = traced(ray)  #                        the ray from the last boundary on
+    onward = to_mitsuba_ray(ray)  #                        the ray from the last boundary on
     medium = mi.MediumPtr(medium)  #                 what surrounds its origin
     t = mi.Float(0)  #                               distance of that origin
     going = mi.Bool(active)
@@ -209,7 +209,7 @@ def _trace(
     while dr.hint(going, label="to the next opaque surface"):
         hit = media.scene.ray_intersect(onward, mi.RayFlags.All, False, going)
         found = going & hit.is_valid()
-        t_hit = dr.select(found, dr.maximum(t, distance_along(ray, hit)), ray.maxt)
+        t_hit = dr.select(found, dr.maximum(t, hit_distance(ray, hit)), ray.maxt)
 
         # -- The medium on this side of the surface fills the interval --------------------------------------------------------
         transition = found & hit.is_medium_transition()

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.body import Body, is_followed
-from mivol.transport.media.channels import as_rows
+from mivol.transport.media.channels import to_scene_channels
 from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["SceneMedia"]
@@ -75,12 +75,12 @@ class SceneMedia:
         """Whether one walk of cells passes all extinction in its order: one medium, whose grids share their cells."""
         return len(self.bodies) == 1 and len(self.bodies[0].flight_parts) == len(self.bodies[0].view.parts)
 
-    def rows(self, values: list[mi.Float]) -> list[mi.Float]:
+    def to_channels(self, values: list[mi.Float]) -> list[mi.Float]:
         """Numbers of a grey or rgb body, for each channel of the scene."""
-        return as_rows(values, self.channels)
+        return to_scene_channels(values, self.channels)
 
-    def sums(self, rows: list[mi.Float]) -> list[mi.Float]:
-        """Derivatives by the channels of the scene, from those by colours: the transpose of :meth:`rows`."""
+    def sum_channels(self, rows: list[mi.Float]) -> list[mi.Float]:
+        """Derivatives by the channels of the scene, from those by colours: the transpose of :meth:`to_channels`."""
         return rows if len(rows) == self.channels else [sum(rows[1:], rows[0])]
 
     @property
@@ -103,9 +103,9 @@ class SceneMedia:
         """Whether some medium is a source of light."""
         return any(b.view.emits for b in self.bodies)
 
-    def vectors(self, values: list[mi.Vector3f]) -> list[mi.Vector3f]:
+    def vectors_to_channels(self, values: list[mi.Vector3f]) -> list[mi.Vector3f]:
         """Vectors of a grey or rgb body, for each channel of the scene."""
-        axes = [self.rows([v[a] for v in values]) for a in range(3)]
+        axes = [self.to_channels([v[a] for v in values]) for a in range(3)]
         return [mi.Vector3f(*v) for v in zip(*axes, strict=True)]
 
     def medium_at(self, ray: mi.Ray3f) -> mi.MediumPtr:

@@ -27,12 +27,12 @@ import numpy as np
 from mivol.transport.estimators.flights.flight_derivatives import Baseline, collision_weights
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay
 from mivol.transport.estimators.segment import Collision, PathSegment
-from mivol.transport.media.channels import colours
+from mivol.transport.media.channels import to_components
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
 from mivol.transport.path.walk import FirstCollision, gather_lanes, walk_branch, walk_path, walk_stem
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
-from mivol.transport.traversal.rays import FineRay, camera_ray
+from mivol.transport.traversal.rays import FineRay, clip_camera_ray
 
 __all__ = ["count_branches", "replay_branches", "prepare_derivatives"]
 
@@ -187,7 +187,7 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point2
     rays, tile = mi.Ray3f(ray), _film_tile(on_film)
     # What is gathered from has to be evaluated: at once, not each number of a ray by a kernel of its own.
     dr.eval(rays, tile)
-    some = camera_ray(dr.gather(mi.Ray3f, rays, index))
+    some = clip_camera_ray(dr.gather(mi.Ray3f, rays, index))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(BASELINE_SEED, count)
     collision = _find_first_collisions(estimators, sampler.clone(), some)
@@ -197,7 +197,7 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point2
     seen, weight, at = dr.detach(path.L), dr.detach(weight), dr.gather(mi.UInt32, tile, index)
     # Each sum would walk the paths again.
     dr.eval(seen, weight)
-    pairs = [_tile_means(L, w, at) for L, w in zip(colours(seen), colours(weight), strict=True)]
+    pairs = [_tile_means(L, w, at) for L, w in zip(to_components(seen), to_components(weight), strict=True)]
     first = mi.Spectrum(*(dr.gather(mi.Float, tiles, tile) for _, tiles in pairs))
     level = Baseline(first, mi.Spectrum(*(mean for mean, _ in pairs)))
     dr.eval(level)

@@ -139,7 +139,7 @@ def _sample_bsdf(
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     factor = _bsdf_factor(vertex, sample.wo, on & ~through)
     return NextDirection(
-        FineRay.of(onward), medium, weight, sample.pdf, delta, sample.eta, mi.Interaction3f(si), on, through, [factor]
+        FineRay.from_ray(onward), medium, weight, sample.pdf, delta, sample.eta, mi.Interaction3f(si), on, through, [factor]
     )
 
 
@@ -150,7 +150,7 @@ def _sample_phase_function(
     media, mei = estimators.media, collision.mei
     on = collision.on & may_scatter
     wo, weight, pdf = sample_phase(media, mei, samples.component, samples.direction, on)
-    ray, n = FineRay.leaving(collision.place, wo, mei), dr.width(wo)
+    ray, n = FineRay.from_point(collision.place, wo, mei), dr.width(wo)
     never, alone = dr.full(mi.Bool, False, n), dr.full(mi.Bool, not estimators.lights_media, n)
     factor = TrackedFactor(lambda: MediumVertex(media, mei, collision.place).eval(wo, on), on)
     weight = collision.albedo * weight

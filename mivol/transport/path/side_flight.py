@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.phase.closed_forms import eval_hg, sample_hg
-from mivol.phase.turn import direction_after, turn_between
+from mivol.phase.scattering_angle import angle_between, scattered_direction
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantEmitterSample
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.scores import IMAGE, Factor, TrackedTerm
@@ -130,11 +130,11 @@ def estimate_side_flight(
     """
     media, mei, attached = estimators.media, collision.mei, purpose != IMAGE
     w = _direction_to_emitter(aim)
-    wo = direction_after(-w, sample_hg(samples.lobe.x, estimators.lobe), samples.lobe.y)
+    wo = scattered_direction(-w, sample_hg(samples.lobe.x, estimators.lobe), samples.lobe.y)
     vertex = MediumVertex(media, mei, collision.place)
     f, p = vertex.eval_and_pdf(wo, active)
-    reached = beta * collision.albedo * dr.rcp(p + eval_hg(turn_between(-w, wo), estimators.lobe))
-    ray = FineRay.leaving(collision.place, wo, mei)
+    reached = beta * collision.albedo * dr.rcp(p + eval_hg(angle_between(-w, wo), estimators.lobe))
+    ray = FineRay.from_point(collision.place, wo, mei)
     ahead = PathSegment(ray, mei.medium, reached * f, active, samples.flight, depth, is_side_flight=True)
     flown = estimators.segment.estimate(ahead, purpose, active)
     there = flown.collision
@@ -159,7 +159,7 @@ def weigh_emitter_sample(
 
     The path leaves this vertex in the direction ``wo``, of density ``p``.
     """
-    q = eval_hg(turn_between(-_direction_to_emitter(sample), wo), estimators.lobe)
+    q = eval_hg(angle_between(-_direction_to_emitter(sample), wo), estimators.lobe)
     return WeightedEmitterSample(sample, dr.select(active, p * dr.rcp(p + q), 1))
 
 

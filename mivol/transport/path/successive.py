@@ -20,7 +20,7 @@ from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.walk import Path, advance_path, film_alpha, gather_lanes, leave_camera, start_path
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
-from mivol.transport.traversal.rays import camera_ray
+from mivol.transport.traversal.rays import clip_camera_ray
 
 __all__ = ["paths_per_lane", "walk_successively"]
 
@@ -75,7 +75,7 @@ def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f
     n = dr.width(ray)
     lanes, per_lane = -(-n // count), dr.opaque(mi.UInt32, count)
     seeds = draw_seeds(sampler)
-    departure = _PathStarts(camera_ray(ray), estimators.media.medium_at(ray), seeds)
+    departure = _PathStarts(clip_camera_ray(ray), estimators.media.medium_at(ray), seeds)
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
     dr.eval(departure, L, alpha)
     index = dr.arange(mi.UInt32, lanes) * per_lane

@@ -29,7 +29,7 @@ from mivol.transport.estimators.lighting.direct_lighting import DirectLight, Dis
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.body import medium_interaction
-from mivol.transport.media.channels import colours
+from mivol.transport.media.channels import to_components
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent, TurnSamples, sample_next_direction
 from mivol.transport.path.side_flight import (
@@ -39,7 +39,7 @@ from mivol.transport.path.side_flight import (
     weigh_emitter_sample,
 )
 from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_state
-from mivol.transport.traversal.rays import FineRay, Ray, camera_ray, point_along
+from mivol.transport.traversal.rays import FineRay, Ray, clip_camera_ray, point_along
 
 __all__ = [
     "FirstCollision",
@@ -160,7 +160,7 @@ def walk_path(
     samples.
     """
     active = mi.Bool(active) & (estimators.settings.depth_limit > 0)
-    path = start_path(estimators, camera_ray(ray), score, sampler, strata, active)
+    path = start_path(estimators, clip_camera_ray(ray), score, sampler, strata, active)
     path = leave_camera(estimators, path, estimators.media.medium_at(ray))
     if has_one_segment(estimators):
         path, event = _follow_segment(estimators, path)
@@ -182,7 +182,7 @@ def walk_stem(estimators: Estimators, sampler: mi.Sampler, ray: Ray, score: Scor
     """
     goes_on = estimators.media.has_surfaces
     kept = ("first", "later") if goes_on else ("first",)
-    path = start_path(estimators, camera_ray(ray), score, sampler, None, dr.full(mi.Bool, True, dr.width(ray)))
+    path = start_path(estimators, clip_camera_ray(ray), score, sampler, None, dr.full(mi.Bool, True, dr.width(ray)))
     path = _start_reservoirs(estimators, leave_camera(estimators, path, estimators.media.medium_at(ray)), *kept)
     path, event = _follow_segment(estimators, path)
     path = _add_emitted_light(estimators, path, event)
@@ -248,7 +248,7 @@ def start_path(
     """A path that has not met anything yet, outside all media."""
     n = dr.width(ray)
     return Path(
-        ray=FineRay.of(ray),
+        ray=FineRay.from_ray(ray),
         medium=dr.zeros(mi.MediumPtr, n),
         beta=dr.full(mi.Spectrum, 1, n),
         eta=dr.full(mi.Float, 1, n),
@@ -341,7 +341,7 @@ def film_alpha(path: Path) -> mi.Float:
     This is the mean of what ``volpath`` draws from ``max_depth`` 2 on (1 where it finds a point in a medium or on a surface),
     without its noise. At depth 1 ``volpath`` finds no points in media, and its smoke has no alpha; here it has the same one.
     """
-    return dr.select(path.stopped, 1, 1 - sum(colours(path.clear)) / dr.size_v(path.clear))
+    return dr.select(path.stopped, 1, 1 - sum(to_components(path.clear)) / dr.size_v(path.clear))
 
 
 def has_one_segment(estimators: Estimators) -> bool:

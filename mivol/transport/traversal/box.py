@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["Box", "box_of_cube", "slab"]
+__all__ = ["Box", "read_box", "clip_to_box"]
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Box:
         return bool(apart.max() <= tolerance * size)
 
 
-def box_of_cube(shape: mi.Shape) -> Box:
+def read_box(shape: mi.Shape) -> Box:
     """The box of a ``cube`` shape. It reads the vertices on the host, which is not possible inside ``dr.freeze``."""
     world = _vertices(shape)
     unit = (_vertices(mi.load_dict({"type": "cube"})) + 1) / 2
@@ -62,7 +62,7 @@ def _vertices(shape: mi.Shape) -> np.ndarray:
     return np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
 
 
-def slab(
+def clip_to_box(
     rows: list, low: tuple, high: tuple, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: mi.Float64
 ) -> tuple[list[mi.Float64], list[mi.Float64], mi.Float64, mi.Float64]:
     """Cut [t0, t1] of a ray to a box, in float64 (the slab test of Kay & Kajiya 1986).

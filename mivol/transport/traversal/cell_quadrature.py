@@ -22,7 +22,7 @@ An emission density j (radiance per length that does not go with the extinction)
 N is the integral of the transmittance over the cell, and v follows from the mean position of the light that leaves it. Both
 come from the moments E_n of :mod:`mivol.numerics`, to second and to first order in the slope of the extinction.
 
-Conventions. Points 1 and 2 are the first and second Gauss point along the ray (:data:`GAUSS`). Nothing is divided by an
+Conventions. Points 1 and 2 are the first and second Gauss point along the ray (:data:`GAUSS_POINT`). Nothing is divided by an
 extinction or by a transmittance, so values and derivatives are finite for every sigma >= 0, 0 included. Derivatives are
 returned in closed form; Dr.Jit tracks none of them.
 
@@ -39,7 +39,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import exp_moments, lesser, one_minus_exp, phi1, reciprocal
-from mivol.transport.traversal.interpolation import GAUSS
+from mivol.transport.traversal.interpolation import GAUSS_POINT
 
 __all__ = ["DensityWeights", "OpacityShares", "share_opacity", "weigh_emission_density"]
 
@@ -146,8 +146,8 @@ def weigh_emission_density(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> 
     shift = e[2] - e[3] - e[1] * (e[1] - e[2])
     place = dr.fma(lean, shift, e[1])
     moves = drift[1] + lean * (drift[2] - drift[3] - drift[1] * (e[1] - e[2]) - e[1] * (drift[1] - drift[2]))
-    spread = 1 / (1 - 2 * GAUSS)
-    v = (place - GAUSS) * spread
+    spread = 1 / (1 - 2 * GAUSS_POINT)
+    v = (place - GAUSS_POINT) * spread
     between = (v > 0) & (v < 1)
     v = dr.clip(v, 0, 1)
     v_tau, v_lean = dr.select(between, spread * moves, 0), dr.select(between, spread * shift, 0)

@@ -24,12 +24,12 @@ __all__ = [
     "REACH",
     "SHIFT",
     "Reduction",
-    "block_bounds",
+    "bound_blocks",
     "count_blocks",
-    "distances",
-    "empty_block_distances",
+    "find_distances",
+    "find_distances_of_bounds",
     "find_empty_distances",
-    "over_blocks",
+    "reduce_blocks",
     "BlockRanges",
     "find_block_ranges",
     "CoarseGrid",
@@ -48,7 +48,7 @@ REACH = 15
 steps with it."""
 
 
-def block_bounds(values: mi.TensorXf) -> mi.Float:
+def bound_blocks(values: mi.TensorXf) -> mi.Float:
     """Bound |values| over each block of ``BLOCK``^3 cells (all nodes that its cells touch), all channels together.
 
     Returns:
@@ -57,7 +57,7 @@ def block_bounds(values: mi.TensorXf) -> mi.Float:
     Cost: 5/4 look-ups a voxel along x, fewer along the others.
     """
     flat = _channel_max(dr.abs(dr.detach(values.array)), values.shape[3])
-    return over_blocks(flat, values.shape[:3], SHIFT, Reduction(dr.maximum, 0))
+    return reduce_blocks(flat, values.shape[:3], SHIFT, Reduction(dr.maximum, 0))
 
 
 def count_blocks(n: int, shift: int = SHIFT) -> int:
@@ -72,7 +72,7 @@ class Reduction(NamedTuple):
     neutral: float
 
 
-def over_blocks(flat: mi.Float, res: tuple[int, int, int], shift: int, reduction: Reduction) -> mi.Float:
+def reduce_blocks(flat: mi.Float, res: tuple[int, int, int], shift: int, reduction: Reduction) -> mi.Float:
     """Reduce the values at all nodes that each block of cells touches, one axis after the other.
 
     Args:
@@ -117,15 +117,15 @@ def _over_axis(flat: mi.Float, shape: tuple[int, int, int], shift: int, reductio
 
 
 def find_empty_distances(values: mi.TensorXf) -> mi.UInt8:
-    """The :func:`empty_block_distances` of a grid (Z, Y, X, C)."""
-    return empty_block_distances(block_bounds(values), values.shape[:3])
+    """The :func:`find_distances_of_bounds` of a grid (Z, Y, X, C)."""
+    return find_distances_of_bounds(bound_blocks(values), values.shape[:3])
 
 
-def empty_block_distances(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UInt8:
+def find_distances_of_bounds(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UInt8:
     """Measure how far each block is from the nearest one that is not empty.
 
     Args:
-        bounds: from :func:`block_bounds`.
+        bounds: from :func:`bound_blocks`.
         res: of the grid (Z, Y, X).
 
     Returns:
@@ -134,10 +134,10 @@ def empty_block_distances(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UIn
 
     Cost: 6 ``REACH`` look-ups a block at most.
     """
-    return distances(bounds > 0, tuple(count_blocks(n) for n in res))
+    return find_distances(bounds > 0, tuple(count_blocks(n) for n in res))
 
 
-def distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
+def find_distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
     """The Chebyshev distance of each of (Z, Y, X) blocks from the nearest occupied one, at most ``REACH``.
 
     Cost: 6 ``REACH`` look-ups each at most, one axis after the other.
@@ -220,8 +220,8 @@ def find_block_ranges(values: mi.TensorXf, shift: int | None = None) -> BlockRan
     rows, ranges = [], []
     for channel in range(c):
         own = dr.gather(mi.Float, flat, dr.arange(mi.UInt32, z * y * x) * c + channel) if c > 1 else flat
-        low = over_blocks(own, (z, y, x), shift, Reduction(dr.minimum, dr.inf))
-        high = over_blocks(own, (z, y, x), shift, Reduction(dr.maximum, -dr.inf))
+        low = reduce_blocks(own, (z, y, x), shift, Reduction(dr.minimum, dr.inf))
+        high = reduce_blocks(own, (z, y, x), shift, Reduction(dr.maximum, -dr.inf))
         rows.append(low)
         # A tracker divides (value - low) by this range. The range is rounded up, so that rounding never makes that exceed 1.
         ranges.append((high - low) * (1 + 1e-6))

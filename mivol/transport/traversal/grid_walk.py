@@ -20,16 +20,16 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import greater, lesser
-from mivol.transport.traversal.box import slab
+from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks
 from mivol.transport.traversal.lattice import Lattice, Mask3, Segment
 from mivol.transport.traversal.rays import Ray
 
-__all__ = ["Cell", "Nodes", "box_nodes", "read_nodes", "walk", "CellVisitor", "walk_box"]
+__all__ = ["Cell", "NodeArray", "corner_nodes", "read_nodes", "walk_cells", "CellVisitor", "walk_box_cells"]
 
 
 @dataclass
-class Nodes:
+class NodeArray:
     """An array over the nodes of a lattice that a walk reads: flat, channels fastest, then x."""
 
     array: mi.Float
@@ -56,12 +56,12 @@ class Cell:
 
 
 @dr.syntax
-def walk(
+def walk_cells(
     lattice: Lattice,
     segment: Segment,
     visit: Callable[[Any, Cell, mi.Bool], Any],
     state: Any,
-    reads: Sequence[Nodes] = (),
+    reads: Sequence[NodeArray] = (),
     active: mi.Bool = True,
     until: Callable[[Any], mi.Bool] | None = None,
     halts: bool = False,
@@ -73,7 +73,7 @@ def walk(
     Args:
         lattice: the grid; where it has ``empty_distances``, empty blocks are crossed without a visit, as many at once as are
             empty all around.
-        segment: from :func:`clip`.
+        segment: from :func:`clip_to_grid`.
         visit: ``visit(state, cell, active) -> state``; called once, while the loop is traced.
         state: any PyTree of Dr.Jit arrays.
         reads: arrays over the nodes; the visitor finds their corners in ``cell.corners``.
@@ -189,7 +189,7 @@ def _planes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> tuple
     return dr.select(ahead, low, high), dr.select(ahead, high, low)
 
 
-def box_nodes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> list[mi.UInt32]:
+def corner_nodes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> list[mi.UInt32]:
     """Flat node indices of the 8 corners of a cell, near and far along ``ahead`` (all true: lower and upper)."""
     return _box(*_planes(cell, ahead, res))
 
@@ -227,7 +227,7 @@ def _along(through: Mask3, x: mi.Float, y: mi.Float, z: mi.Float) -> mi.Float:
     return dr.select(through.x, x, dr.select(through.y, y, z))
 
 
-def read_nodes(reads: Sequence[Nodes], nodes: list[mi.UInt32], active: mi.Bool) -> list:
+def read_nodes(reads: Sequence[NodeArray], nodes: list[mi.UInt32], active: mi.Bool) -> list:
     """Read [array][channel][node] values."""
     return [
         [[dr.gather(mi.Float, r.array, n * r.channels + c, active) for n in nodes] for c in range(r.channels)] for r in reads
@@ -238,21 +238,21 @@ CellVisitor = Callable[..., Any]
 """``visit(state, cell, t0, t1, on) -> state``: what to do with the interval of a ray in one cell (x, y, z)."""
 
 
-def walk_box(rows: list[list[mi.Float64]], count: int, ray: Ray, visit: CellVisitor, state: Any, active: mi.Bool) -> Any:
+def walk_box_cells(rows: list[list[mi.Float64]], count: int, ray: Ray, visit: CellVisitor, state: Any, active: mi.Bool) -> Any:
     """Visit the cells of a box in the order of a ray that has no end.
 
     Args:
         rows: (3, 4) map from the world to the box, where a cell has the edge 1.
         count: cells along each axis.
         ray: world space.
-        visit: :data:`CellVisitor`.
+        visit: :data:`OccupiedCell`.
         state: any PyTree of Dr.Jit arrays.
         active: lanes to walk.
 
     Returns:
         The last state. Cost: at most 3 ``count`` - 2 cells.
     """
-    q, v, t0, t1 = slab(rows, (0.0,) * 3, (float(count),) * 3, ray.o, ray.d, mi.Float64(0), mi.Float64(dr.inf))
+    q, v, t0, t1 = clip_to_box(rows, (0.0,) * 3, (float(count),) * 3, ray.o, ray.d, mi.Float64(0), mi.Float64(dr.inf))
     q, v = mi.Point3f(*map(mi.Float, q)), mi.Vector3f(*map(mi.Float, v))
     end, parallel = mi.Float(t1), v == 0
     inv = dr.rcp(dr.select(parallel, 1, v))

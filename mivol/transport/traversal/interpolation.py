@@ -16,26 +16,26 @@ import mitsuba as mi
 from mivol.transport.traversal.grid_walk import Cell
 
 __all__ = [
-    "GAUSS",
+    "GAUSS_POINT",
     "gauss_points",
     "interpolate",
     "node_weights",
-    "upward_frac",
-    "weights",
-    "cubic_at",
-    "cubic_integral",
-    "cubic_through",
+    "fraction_from_lower",
+    "trilinear_weights",
+    "eval_cubic",
+    "integrate_cubic",
+    "fit_cubic",
     "invert_cubic_integral",
 ]
 
 
-GAUSS = 0.5 - math.sqrt(3) / 6
+GAUSS_POINT = 0.5 - math.sqrt(3) / 6
 """First of the two Gauss-Legendre points on [0, 1]; the other is 1 minus it. The rule is exact for cubics."""
 
 
 def gauss_points(cell: Cell) -> tuple[mi.Vector3f, mi.Vector3f]:
     """The two Gauss points of a ray's interval in a cell, as fractions from the cell's near planes."""
-    return dr.fma(cell.step, GAUSS, cell.frac), dr.fma(cell.step, 1 - GAUSS, cell.frac)
+    return dr.fma(cell.step, GAUSS_POINT, cell.frac), dr.fma(cell.step, 1 - GAUSS_POINT, cell.frac)
 
 
 def interpolate(corners: list[mi.Float], frac: mi.Vector3f) -> mi.Float:
@@ -51,7 +51,7 @@ def _lerp(a: mi.Float, b: mi.Float, t: mi.Float) -> mi.Float:
     return dr.fma(t, b - a, a)
 
 
-def weights(frac: mi.Vector3f) -> list[mi.Float]:
+def trilinear_weights(frac: mi.Vector3f) -> list[mi.Float]:
     """The 8 trilinear weights at a point of a cell: the transpose of :func:`interpolate`."""
     x, y, z = (1 - frac.x, frac.x), (1 - frac.y, frac.y), (1 - frac.z, frac.z)
     return [c * b * a for c in z for b in y for a in x]
@@ -59,15 +59,15 @@ def weights(frac: mi.Vector3f) -> list[mi.Float]:
 
 def node_weights(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> list[mi.Float]:
     """The 8 trilinear weights at a point of a cell (from its near planes), in the order of the grid's own axes."""
-    return weights(_natural_frac(frac, cell, res))
+    return trilinear_weights(_natural_frac(frac, cell, res))
 
 
 def _natural_frac(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> mi.Vector3f:
-    """Fractions along the grid's own axes, from fractions along the ray; see :func:`upward_frac`."""
-    return upward_frac(dr.select(cell.ahead, frac, 1 - frac), cell.lower, res)
+    """Fractions along the grid's own axes, from fractions along the ray; see :func:`fraction_from_lower`."""
+    return fraction_from_lower(dr.select(cell.ahead, frac, 1 - frac), cell.lower, res)
 
 
-def upward_frac(frac: mi.Vector3f, lower: mi.Vector3i, res: tuple[int, int, int]) -> mi.Vector3f:
+def fraction_from_lower(frac: mi.Vector3f, lower: mi.Vector3i, res: tuple[int, int, int]) -> mi.Vector3f:
     """Fractions from the lower node of a cell; in the outer half voxel they put all weight on the only node that exists."""
     z, y, x = res
     return dr.select(lower < 0, 1, dr.select(lower >= mi.Vector3i(x - 1, y - 1, z - 1), 0, frac))
@@ -78,7 +78,7 @@ NEWTON_STEPS = 8
 these leave an error of 2^-8 of a cell in a place that holds hardly any light."""
 
 
-def cubic_through(f0: mi.Float, f1: mi.Float, f2: mi.Float, f3: mi.Float) -> list[mi.Float]:
+def fit_cubic(f0: mi.Float, f1: mi.Float, f2: mi.Float, f3: mi.Float) -> list[mi.Float]:
     """Coefficients of the cubic through values at 0, 1/3, 2/3, 1 (Lagrange)."""
     return [
         f0,
@@ -88,12 +88,12 @@ def cubic_through(f0: mi.Float, f1: mi.Float, f2: mi.Float, f3: mi.Float) -> lis
     ]
 
 
-def cubic_at(c: list[mi.Float], x: mi.Float) -> mi.Float:
+def eval_cubic(c: list[mi.Float], x: mi.Float) -> mi.Float:
     """The value at x."""
     return dr.fma(x, dr.fma(x, dr.fma(x, c[3], c[2]), c[1]), c[0])
 
 
-def cubic_integral(c: list[mi.Float], dt: mi.Float, x: mi.Float) -> mi.Float:
+def integrate_cubic(c: list[mi.Float], dt: mi.Float, x: mi.Float) -> mi.Float:
     """The integral from 0 to x over a piece of the length ``dt``; rounding makes it no less than 0."""
     return dr.maximum(dt * x * dr.fma(x, dr.fma(x, dr.fma(x, 0.25 * c[3], c[2] / 3), 0.5 * c[1]), c[0]), 0)
 
@@ -109,9 +109,9 @@ def invert_cubic_integral(c: list[mi.Float], dt: mi.Float, goal: mi.Float, whole
     """
     low, high, x = mi.Float(0), mi.Float(1), dr.clip(goal / dr.maximum(whole, 1e-30), 0, 1)
     for _ in range(NEWTON_STEPS):
-        error = cubic_integral(c, dt, x) - goal
+        error = integrate_cubic(c, dt, x) - goal
         low, high = dr.select(error < 0, x, low), dr.select(error > 0, x, high)
-        step = x - error / dr.maximum(dt * cubic_at(c, x), 1e-30)
+        step = x - error / dr.maximum(dt * eval_cubic(c, x), 1e-30)
         # The ends of the bracket count as inside: once x is at the root, it is one of the ends, and a step of 0 must keep it
         # there.
         x = dr.select((step >= low) & (step <= high), step, 0.5 * (low + high))

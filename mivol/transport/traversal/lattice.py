@@ -18,10 +18,10 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.traversal.box import slab
+from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.rays import Ray
 
-__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "piece_points", "segment_between", "split"]
+__all__ = ["Lattice", "Mask3", "Segment", "clip_to_grid", "locate_cell", "points_of_piece", "segment_between", "split_float64"]
 
 
 Mask3 = Any
@@ -107,7 +107,7 @@ class Segment:
         return self.start + mi.Float64(self.length)
 
 
-def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max: mi.Float) -> Segment:
+def clip_to_grid(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max: mi.Float) -> Segment:
     """Cut a ray to the box of a grid, in float64.
 
     Args:
@@ -120,7 +120,7 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
     """
     n = lattice.res[::-1]
     high = tuple(k - 0.5 for k in n)
-    q, v, t0, t1 = slab(lattice.from_world, (-0.5,) * 3, high, o, d, mi.Float64(t_min), mi.Float64(t_max))
+    q, v, t0, t1 = clip_to_box(lattice.from_world, (-0.5,) * 3, high, o, d, mi.Float64(t_min), mi.Float64(t_max))
     return segment_between(q, v, n, t0, t1)
 
 
@@ -137,17 +137,17 @@ def segment_between(
         cell[a], frac[a] = mi.Int32(low), mi.Float(entry - low)
     direction = mi.Vector3f(mi.Float(v[0]), mi.Float(v[1]), mi.Float(v[2]))
     rest = mi.Vector3f(*(mi.Float(v[a] - mi.Float64(direction[a])) for a in range(3)))
-    start, start_rest = split(t0)
+    start, start_rest = split_float64(t0)
     return Segment(cell, frac, direction, rest, start, mi.Float(dr.select(hit, t1 - t0, 0)), start_rest)
 
 
-def split(x: mi.Float64 | mi.Float) -> tuple[mi.Float, mi.Float]:
+def split_float64(x: mi.Float64 | mi.Float) -> tuple[mi.Float, mi.Float]:
     """A number as the nearest float32 and what that leaves over."""
     near = mi.Float(x)
     return near, mi.Float(mi.Float64(x) - mi.Float64(near))
 
 
-def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tuple[mi.Vector3i, mi.Vector3f, mi.Bool]:
+def locate_cell(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tuple[mi.Vector3i, mi.Vector3f, mi.Bool]:
     """Find the cell of a point of a ray, in float64.
 
     Returns:
@@ -166,7 +166,7 @@ def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tupl
     return cell, frac, inside
 
 
-def piece_points(
+def points_of_piece(
     lattice: Lattice, ray: Ray, start: mi.Float64, dt: mi.Float, active: mi.Bool
 ) -> tuple[mi.Vector3i, list[mi.Vector3f], mi.Bool]:
     """Four points of a piece of a ray that lies in one cell, at 0, 1/3, 2/3 and 1 of its length.
@@ -180,7 +180,7 @@ def piece_points(
     Returns:
         The lower node of the cell, the points as fractions from there, and the lanes whose piece lies in the box.
     """
-    segment = clip(lattice, ray.o, ray.d, start, start + mi.Float64(dt))
+    segment = clip_to_grid(lattice, ray.o, ray.d, start, start + mi.Float64(dt))
     # The cell is that of the middle of the piece: its ends lie in faces of the cell, and rounding may put them on either side.
     along = segment.d * segment.length
     shift = mi.Vector3i(dr.floor(segment.frac + 0.5 * along))

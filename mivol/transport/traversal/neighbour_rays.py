@@ -13,8 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.device_arrays import aligned
-from mivol.transport.traversal.box import slab
-from mivol.transport.traversal.occupied_cells import Cells
+from mivol.transport.traversal.box import clip_to_box
+from mivol.transport.traversal.occupied_cells import OccupiedCells
 
 __all__ = ["FEWEST", "RayOrder"]
 
@@ -42,7 +42,7 @@ class RayOrder:
     back: mi.UInt32
 
     @classmethod
-    def find(cls, cells: Cells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> RayOrder | None:
+    def find(cls, cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> RayOrder | None:
         """The order of rays through a grid; None where there are too few to gain by one, and on GPUs, where it is not measured.
 
         Args:
@@ -66,11 +66,11 @@ class RayOrder:
         return cls(*(mi.UInt32(aligned(a)) for a in (places, back)))
 
 
-def _key(cells: Cells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> mi.UInt32:
+def _key(cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> mi.UInt32:
     """The coarse cells in which rays enter and leave the outermost box; rays that miss it come last."""
     n, size = cells.res[::-1], 2 ** (cells.levels - 1)
     low, high = (tuple(0.5 * (k - 1) + side * size * 0.5 * k for k in n) for side in (-1, 1))
-    q, v, t0, t1 = slab(cells.from_world, low, high, o, d, mi.Float64(0), mi.Float64(t_max))
+    q, v, t0, t1 = clip_to_box(cells.from_world, low, high, o, d, mi.Float64(0), mi.Float64(t_max))
     indices = []
     for t in (t0, t1):
         for a in range(3):

@@ -27,13 +27,13 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks, distances
+from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks, find_distances
 
-__all__ = ["Cells", "CellIndex"]
+__all__ = ["OccupiedCells", "CellIndex"]
 
 
 @dataclass
-class Cells:
+class OccupiedCells:
     """The occupied cells of a grid.
 
     Attributes:
@@ -66,7 +66,7 @@ class Cells:
         most: int,
         levels: int = 1,
         stored: mi.UInt32 | None = None,
-    ) -> Cells:
+    ) -> OccupiedCells:
         """Find the occupied cells of a grid.
 
         Args:
@@ -205,18 +205,18 @@ class CellIndex:
         count = dr.width(filled)
         if count == 0:
             # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive.
-            far = distances(dr.zeros(mi.Bool, total), counts)
+            far = find_distances(dr.zeros(mi.Bool, total), counts)
             return cls(counts, mi.UInt32(far), dr.zeros(mi.UInt32, 2), dr.zeros(mi.UInt32, 1)), listed
         place, is_filled, bits = dr.gather(mi.UInt32, asked, filled), dr.zeros(mi.UInt8, total), dr.zeros(mi.UInt32, 2 * count)
         dr.scatter(is_filled, mi.UInt8(1), place)
         dr.scatter(bits, mi.ArrayXu([dr.gather(mi.UInt32, word, filled) for word in (low, high)]), dr.arange(mi.UInt32, count))
-        bricks = mi.UInt32(distances(is_filled > 0, counts))
+        bricks = mi.UInt32(find_distances(is_filled > 0, counts))
         dr.scatter(bricks, dr.arange(mi.UInt32, count) | FILLED, place)
         index = cls(counts, bricks, bits, dr.gather(mi.UInt32, before, filled))
         dr.eval(index, listed)
         return index, listed
 
-    def look(
+    def look_up(
         self, cell: mi.Vector3i, level: mi.Int32 | int, ahead: mi.Array3b, active: mi.Bool
     ) -> tuple[mi.UInt32, mi.Vector3i]:
         """The number of the brick of cells, and how many cells a ray may cross along each axis, its own among them.

@@ -10,16 +10,16 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import greater, lesser
-from mivol.transport.traversal.box import slab
-from mivol.transport.traversal.interpolation import GAUSS
-from mivol.transport.traversal.lattice import Segment, clip, segment_between
-from mivol.transport.traversal.occupied_cells import Cells
+from mivol.transport.traversal.box import clip_to_box
+from mivol.transport.traversal.interpolation import GAUSS_POINT
+from mivol.transport.traversal.lattice import Segment, clip_to_grid, segment_between
+from mivol.transport.traversal.occupied_cells import OccupiedCells
 
-__all__ = ["CellVisitor", "march", "end_of", "reversed_from", "Piece", "pieces", "piece_of"]
+__all__ = ["OccupiedCell", "walk_occupied_cells", "find_last_cell", "reverse_segment", "Piece", "count_pieces", "find_piece"]
 
 
 @dataclass
-class CellVisitor:
+class OccupiedCell:
     """What a visitor is told of one occupied cell.
 
     Attributes:
@@ -49,10 +49,10 @@ class CellVisitor:
 
 
 @dr.syntax
-def march(
-    cells: Cells,
+def walk_occupied_cells(
+    cells: OccupiedCells,
     segment: Segment,
-    visit: Callable[[Any, CellVisitor, mi.Bool], Any],
+    visit: Callable[[Any, OccupiedCell, mi.Bool], Any],
     state: Any,
     active: mi.Bool = True,
     until: Callable[[Any], mi.Bool] | None = None,
@@ -62,7 +62,7 @@ def march(
 
     Args:
         cells: the list.
-        segment: from :func:`mivol.transport.traversal.lattice.clip`, or :func:`reversed_from`.
+        segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`, or :func:`reverse_segment`.
         visit: ``visit(state, here, active) -> state``, called once, while the loop is traced.
         state: any PyTree of Dr.Jit arrays.
         active: lanes to walk.
@@ -100,7 +100,7 @@ def march(
         brick = mi.UInt32(0)
         searching = mi.Bool(active)
         while dr.hint(searching, label="search"):
-            brick, free = index.look(first + sign * n, level, ahead, searching)
+            brick, free = index.look_up(first + sign * n, level, ahead, searching)
             searching &= free.x > 0
             ends = n + free
             reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
@@ -119,12 +119,12 @@ def march(
         exit = lesser(lesser(reach.x, reach.y), reach.z)
         dt = greater(lesser(exit, length) - t, 0)
         offset = entry - mi.Vector3f(n)
-        along = tuple(dr.clip(dr.fma(speed, dr.fma(dt, g, t), offset), 0, 1) for g in (GAUSS, 1 - GAUSS))
+        along = tuple(dr.clip(dr.fma(speed, dr.fma(dt, g, t), offset), 0, 1) for g in (GAUSS_POINT, 1 - GAUSS_POINT))
         points = tuple(dr.select(ahead, p, 1 - p) for p in along)
         through = reach <= exit
         leaves = dr.select(through.x, 0, dr.select(through.y, 1, mi.Int32(2)))
         cell = segment.cell + sign * n
-        here = CellVisitor(index.rank(cell + 1, brick, active), points, t, dt, along, cell, level, ahead, entered, leaves)
+        here = OccupiedCell(index.rank(cell + 1, brick, active), points, t, dt, along, cell, level, ahead, entered, leaves)
         state = visit(state, here, active)
         last = dr.select(active, cell, last)
         left = dr.select(active, t + dt, left)
@@ -137,7 +137,7 @@ def march(
     return state, last, left
 
 
-def end_of(segment: Segment) -> mi.Vector3i:
+def find_last_cell(segment: Segment) -> mi.Vector3i:
     """The cell (lower node) in which a segment ends, found in float64: one of the two that a face divides."""
     cell = mi.Vector3i()
     for a in range(3):
@@ -146,7 +146,7 @@ def end_of(segment: Segment) -> mi.Vector3i:
     return cell
 
 
-def reversed_from(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.Float) -> Segment:
+def reverse_segment(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.Float) -> Segment:
     """The reversed segment from the point in ``cell`` at ``t`` back to ``until`` [lengths from the start of ``segment``]."""
     planes = mi.Vector3f(cell - segment.cell)
     frac = dr.clip(dr.fma(segment.d, t, segment.frac - planes), 0, 1)
@@ -168,12 +168,12 @@ class Piece:
     scale: mi.Float
 
 
-def pieces(cells: Cells) -> int:
+def count_pieces(cells: OccupiedCells) -> int:
     """Number of pieces that a ray through nested boxes may have."""
     return 2 * cells.levels - 1
 
 
-def piece_of(cells: Cells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float, number: mi.Int32) -> Piece:
+def find_piece(cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float, number: mi.Int32) -> Piece:
     """A piece of rays.
 
     Args:
@@ -183,7 +183,7 @@ def piece_of(cells: Cells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | floa
         number: of the piece, from 0 in the order of the ray.
     """
     if cells.levels == 1:
-        return Piece(mi.Int32(0), clip(cells, o, d, mi.Float(0), t_max), mi.Float(1))
+        return Piece(mi.Int32(0), clip_to_grid(cells, o, d, mi.Float(0), t_max), mi.Float(1))
     n = cells.res[::-1]
     last = dr.opaque(mi.Int32, cells.levels - 1)
     level = dr.abs(number - last)
@@ -198,9 +198,9 @@ def piece_of(cells: Cells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | floa
         place.append(dr.fma(q - m, shrink, m))
     speed = [dr.fma(row[0], f64(d[0]), dr.fma(row[1], f64(d[1]), row[2] * f64(d[2]))) for row in cells.from_world]
     own = [[f64(a == b) for b in range(3)] + [f64(0)] for a in range(3)]
-    q, v, start, end = slab(own, (-0.5,) * 3, tuple(k - 0.5 for k in n), place, speed, f64(0), f64(t_max) * shrink)
+    q, v, start, end = clip_to_box(own, (-0.5,) * 3, tuple(k - 0.5 for k in n), place, speed, f64(0), f64(t_max) * shrink)
     inner = [tuple(m + sign * 0.25 * k for m, k in zip(middle, n, strict=True)) for sign in (-1, 1)]
-    _, _, entry, leave = slab(own, *inner, place, speed, start, end)
+    _, _, entry, leave = clip_to_box(own, *inner, place, speed, start, end)
     crosses = leave > entry
     inwards, outwards = number < last, number > last
     t0 = dr.select(outwards, dr.select(crosses, leave, end), start)

@@ -13,7 +13,7 @@ from typing import Union
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["FineRay", "Ray", "point_along", "traced", "camera_ray", "distance_along", "spawn_ray"]
+__all__ = ["FineRay", "Ray", "point_along", "to_mitsuba_ray", "clip_camera_ray", "hit_distance", "spawn_ray"]
 
 
 @dataclass
@@ -34,12 +34,12 @@ class FineRay:
     wavelengths: mi.Color0f
 
     @classmethod
-    def of(cls, ray: Ray) -> FineRay:
+    def from_ray(cls, ray: Ray) -> FineRay:
         """A copy of a ray."""
         return cls(mi.Point3d(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Float(ray.time), ray.wavelengths)
 
     @classmethod
-    def leaving(cls, o: mi.Point3d, d: mi.Vector3f, at: mi.Interaction3f, maxt: mi.Float = dr.inf) -> FineRay:
+    def from_point(cls, o: mi.Point3d, d: mi.Vector3f, at: mi.Interaction3f, maxt: mi.Float = dr.inf) -> FineRay:
         """A ray that leaves a point, at the time of an interaction there."""
         return cls(o, mi.Vector3f(d), mi.Float(maxt), mi.Float(at.time), mi.Color0f())
 
@@ -57,12 +57,12 @@ def point_along(ray: Ray, t: mi.Float | mi.Float64) -> mi.Point3d:
     return mi.Point3d(*(dr.fma(mi.Float64(t), mi.Float64(ray.d[a]), mi.Float64(ray.o[a])) for a in range(3)))
 
 
-def traced(ray: Ray) -> mi.Ray3f:
+def to_mitsuba_ray(ray: Ray) -> mi.Ray3f:
     """A copy of a ray, as Mitsuba traces it: with an origin in float32."""
     return mi.Ray3f(mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Float(ray.time), ray.wavelengths)
 
 
-def distance_along(ray: Ray, hit: mi.SurfaceInteraction3f) -> mi.Float:
+def hit_distance(ray: Ray, hit: mi.SurfaceInteraction3f) -> mi.Float:
     """Distance of a hit along the ray that began at the camera.
 
     The lengths of the spawned rays are not summed: each of them starts an epsilon (1e-4 of a length) further on and to the
@@ -87,7 +87,7 @@ def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi
     return ray
 
 
-def camera_ray(ray: mi.Ray3f) -> mi.Ray3f:
+def clip_camera_ray(ray: mi.Ray3f) -> mi.Ray3f:
     """The ray of a sensor, ended at the sensor's ``far_clip``; ``maxt`` is infinite where that is not finite."""
     end = dr.select(ray.maxt < dr.largest(mi.Float), ray.maxt, dr.inf)
     return mi.Ray3f(ray.o, ray.d, end, ray.time, ray.wavelengths)

@@ -16,10 +16,10 @@ from mivol.bench.scenes import box_scene
 from mivol.bench.studies.optical_depth.peers import by_drjit_dda, inside_box, padded
 from mivol.bench.studies.optical_depth.size import Size
 from mivol.bench.studies.optical_depth.work import Work, camera_rays, shuffled
-from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_tau
-from mivol.transport.traversal.grid_blocks import block_bounds
-from mivol.transport.traversal.grid_walk import walk
-from mivol.transport.traversal.lattice import Lattice, clip
+from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_tau
+from mivol.transport.traversal.grid_blocks import bound_blocks
+from mivol.transport.traversal.grid_walk import walk_cells
+from mivol.transport.traversal.lattice import Lattice, clip_to_grid
 
 __all__ = ["measure_grids", "measure_memory", "measure_reverse", "measure_walk"]
 
@@ -51,8 +51,8 @@ def race_reverse(work: Work, rounds: int) -> dict:
     dr.make_opaque(ones)
 
     def reverse(_: int) -> mi.Float:
-        target = Gradient.zeros(lattice)
-        backproject_segment(lattice, target, [ones], clip(lattice, work.o, work.d, 0, math.inf))
+        target = NodeGradient.zeros(lattice)
+        backproject_segment(lattice, target, [ones], clip_to_grid(lattice, work.o, work.d, 0, math.inf))
         return target.fold()
 
     contestants = {
@@ -141,7 +141,7 @@ def measure_grids(size: Size) -> dict:
         timings = race(contestants, size.rounds)
         work = orders["camera order"]
         counts = {skip: count_cells(work.lattice(skip), work) for skip in (False, True)}
-        held = np.array(block_bounds(work.tensor)) > 0
+        held = np.array(bound_blocks(work.tensor)) > 0
         figures[grid] = {"grid": str(found), "rays": work.n, "occupied_blocks": float(held.mean())}
         for name, t in timings.items():
             visited, steps = counts["skipped" in name]
@@ -162,5 +162,5 @@ def count_cells(lattice: Lattice, work: Work) -> tuple[float, float]:
         return state[0] + dr.select(on, mi.UInt32(1), 0), state[1] + 1
 
     zero = dr.zeros(mi.UInt32, work.n)
-    visited, steps = walk(lattice, clip(lattice, work.o, work.d, 0, math.inf), visit, (zero, mi.UInt32(zero)))
+    visited, steps = walk_cells(lattice, clip_to_grid(lattice, work.o, work.d, 0, math.inf), visit, (zero, mi.UInt32(zero)))
     return tuple(float(np.array(c, np.float64).mean()) for c in (visited, steps))

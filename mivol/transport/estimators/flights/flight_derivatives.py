@@ -32,7 +32,7 @@ from mivol.transport.estimators.flights.gaussian_light import GaussianLight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import Collision, FlightPoint, PathSegment
 from mivol.transport.media.body import Body, emission_slope, eval_albedo, eval_emission
-from mivol.transport.media.channels import by_channel, spectrum, tangent_of
+from mivol.transport.media.channels import colours_to_channels, take_tangent, to_spectrum
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
@@ -148,7 +148,9 @@ class FlightSegment:
                     dr.backward_from(dr.select(on, dL * found.gain * emitted, 0))
             value = dr.select(on, dr.detach(emitted), value)
             for name, slope in _emission_slopes(body, ray, found.point.t, on):
-                body.deposit(ray, found.point.t, by_channel(dL * found.gain * slope, media.channels), on, name)
+                body.vjp_extinction_at(
+                    ray, found.point.t, colours_to_channels(dL * found.gain * slope, media.channels), on, name
+                )
         vjp_optical_depth(media, self._to_emission, -dL * found.gain * value, found.point.on)
 
     def jvp_light(self) -> mi.Spectrum:
@@ -164,9 +166,9 @@ class FlightSegment:
                 continue
             with dr.resume_grad():
                 emitted = eval_emission(body, ray, found.point.t, media.channels, on)
-                own = tangent_of(emitted)
+                own = take_tangent(emitted)
             for name, slope in _emission_slopes(body, ray, found.point.t, on):
-                own += slope * spectrum(body.tangent_at(ray, found.point.t, media.channels, on, name))
+                own += slope * to_spectrum(body.jvp_extinction_at(ray, found.point.t, media.channels, on, name))
             value, change = dr.select(on, dr.detach(emitted), value), dr.select(on, own, change)
         change -= value * jvp_optical_depth(media, self._to_emission, found.point.on)
         return total + dr.select(found.point.on, found.gain * change, 0)
@@ -183,7 +185,9 @@ class FlightSegment:
         vjp_optical_depth(media, self.passed, -rest, self.active)
         for body, on in media.bodies_at(hit.body, hit.on & self.segment.may_scatter):
             name, weight = _collision_weight(media, body, ray, hit.t, on)
-            body.deposit(ray, dr.select(on, hit.t, 0), by_channel(dr.select(on, rest * weight, 0), media.channels), on, name)
+            body.vjp_extinction_at(
+                ray, dr.select(on, hit.t, 0), colours_to_channels(dr.select(on, rest * weight, 0), media.channels), on, name
+            )
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
@@ -197,7 +201,7 @@ class FlightSegment:
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
-                own = tangent_of(_albedo_ratio(eval_albedo(body, hit.mei, on)))
+                own = take_tangent(_albedo_ratio(eval_albedo(body, hit.mei, on)))
             change += dr.select(on, own, 0)
         return change
 
@@ -208,7 +212,7 @@ class FlightSegment:
         change = -jvp_optical_depth(media, self.passed, self.active)
         for body, on in media.bodies_at(hit.body, hit.on & self.segment.may_scatter):
             name, weight = _collision_weight(media, body, ray, hit.t, on)
-            own = spectrum(body.tangent_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
+            own = to_spectrum(body.jvp_extinction_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
             change += dr.select(on, own * weight, 0)
         return change
 
@@ -241,7 +245,7 @@ class Probe:
         n = dr.width(ray)
         zero = dr.zeros(mi.Float, n)
         nothing = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
-        return cls(FineRay.of(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
+        return cls(FineRay.from_ray(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
 
     def offer(self, segment: PathSegment, found: FlightPoint, on: mi.Bool) -> Probe:
         """Keep a point of one more flight, or the one that was kept before."""
@@ -331,7 +335,9 @@ class ProbeTerm:
         media, probe = self.media, self.probe
         for body, on in media.bodies_at(probe.body, self.on):
             name, weight = self._weight(body, on)
-            body.deposit(probe.ray, probe.t, by_channel(dr.select(on, dL * weight, 0), media.channels), on, name)
+            body.vjp_extinction_at(
+                probe.ray, probe.t, colours_to_channels(dr.select(on, dL * weight, 0), media.channels), on, name
+            )
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
@@ -343,17 +349,17 @@ class ProbeTerm:
         media, probe, total = self.media, self.probe, mi.Spectrum(0)
         for body, on in media.bodies_at(probe.body, self.on):
             name, weight = self._weight(body, on)
-            own = weight * spectrum(body.tangent_at(probe.ray, probe.t, media.channels, on, name))
+            own = weight * to_spectrum(body.jvp_extinction_at(probe.ray, probe.t, media.channels, on, name))
             if body.view.albedo is not None:
                 with dr.resume_grad():
                     albedo = eval_albedo(body, self.mei, on)
-                    own += tangent_of(self._by_albedo(body, albedo, on) * albedo)
+                    own += take_tangent(self._by_albedo(body, albedo, on) * albedo)
             total += dr.select(on, own, 0)
         return total
 
     def _by_albedo(self, body: Body, albedo: mi.Spectrum, on: mi.Bool) -> mi.Spectrum:
         """The derivative of the light by an albedo that collisions leave out."""
-        sigma_t = spectrum(body.extinction_at(self.probe.ray, self.probe.t, self.media.channels, on))
+        sigma_t = to_spectrum(body.extinction_at(self.probe.ray, self.probe.t, self.media.channels, on))
         return dr.select(dr.detach(albedo) < MIN_ALBEDO, self._gain * sigma_t * self.source, 0)
 
 
@@ -368,7 +374,7 @@ def collision_weights(media: SceneMedia, ray: Ray, hit: Collision) -> mi.Spectru
 def _collision_weight(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
     """The name of the coefficient sigma that makes collisions scatter, and 1 / (sigma + kappa) [length] at a point."""
     name = "sigma_s" if body.view.albedo is None else "sigma_"
-    sigma = spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
+    sigma = to_spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
     return name, dr.rcp(sigma + _probe_extinction(media, body))
 
 
@@ -419,7 +425,9 @@ class ShadowReservoir:
         n = dr.width(ray)
         zero = dr.zeros(mi.Float, n)
         u = zero if media.is_bounded else None
-        return cls(RaySegment(FineRay.of(ray), dr.zeros(mi.MediumPtr, n), zero, True, u), dr.zeros(mi.Spectrum, n), zero, zero)
+        return cls(
+            RaySegment(FineRay.from_ray(ray), dr.zeros(mi.MediumPtr, n), zero, True, u), dr.zeros(mi.Spectrum, n), zero, zero
+        )
 
     def offer(self, light: DirectLight, chance: mi.Float) -> ShadowReservoir:
         """The reservoir after one more shadow ray: a step of weighted reservoir sampling.

@@ -40,13 +40,13 @@ from mivol.transport.estimators.segment import (
     SegmentTransmittance,
 )
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
-from mivol.transport.media.channels import colours, spectrum
-from mivol.transport.media.drawn_points import draw_even_point
+from mivol.transport.media.channels import to_components, to_spectrum
 from mivol.transport.media.extinction import Extinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.optical_depth import segment_optical_depth
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, SegmentEnd, visit_media
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.media.uniform_points import draw_uniform_point
 from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_pcg32, draw_state
 from mivol.transport.traversal.rays import Ray, point_along
 
@@ -142,19 +142,19 @@ class FreeFlight:
         tau = segment_optical_depth(self.media, passed, active)
         # Only ratios of transmittances count, and the largest of them is made 1.
         least = least_of(tau)
-        value = spectrum([dr.exp(least - row) for row in tau])
+        value = to_spectrum([dr.exp(least - row) for row in tau])
         hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
         for body, here in hits:
             value = dr.select(here, value * _eval_extinction(self.media, body, segment.ray, collision.t, here), value)
         shares = _channel_probabilities(segment.beta)
-        density = sum((p * v for p, v in zip(shares, colours(value), strict=True)), mi.Float(0))
+        density = sum((p * v for p, v in zip(shares, to_components(value), strict=True)), mi.Float(0))
         return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
 
     def _point_of(
         self, segment: PathSegment, passed: RaySegment, among: list[Body], u: mi.Float, chance: mi.Float, active: mi.Bool
     ) -> FlightPoint:
         """Draw a point evenly from what a flight has passed of some media."""
-        point = draw_even_point(self.media, passed, among, u, active)
+        point = draw_uniform_point(self.media, passed, among, u, active)
         front = RaySegment.upto(segment.ray, segment.medium, dr.select(point.on, point.t, 0))
         gain = segment.beta * self._weigh(segment, front, point.on, None) * point.length
         return FlightPoint(point, gain, chance)
@@ -181,7 +181,7 @@ def _scattering_albedo(
 
 
 def _eval_extinction(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
-    return spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
+    return to_spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
 
 
 def _find_first_collision(
@@ -232,7 +232,7 @@ def _uses_delta_tracking(part: Extinction) -> bool:
 
 def _channel_probabilities(beta: mi.Spectrum) -> list[mi.Float]:
     """The probability of each channel: its share of the throughput."""
-    rows = [dr.abs(row) for row in colours(beta)]
+    rows = [dr.abs(row) for row in to_components(beta)]
     total = sum(rows[1:], rows[0])
     return [dr.select(total > 0, row / dr.select(total > 0, total, 1), 1 / len(rows)) for row in rows]
 

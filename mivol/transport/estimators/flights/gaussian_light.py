@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.segment import PathSegment
-from mivol.transport.media.channels import colours
+from mivol.transport.media.channels import to_components
 from mivol.transport.media.compositing import zeros
 from mivol.transport.media.gaussian_sweep import GaussianSweep
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
@@ -90,7 +90,7 @@ class GaussianLight:
         def add(state: tuple, entry: _Entry) -> tuple:
             sweep, weight = GaussianSweep(entry.interval, self.rows), dr.select(entry.on, dL * entry.gain, 0)
             own = sweep.integrate(False)
-            sweep.vjp(colours(weight), own.tau, zeros(mi.Float, self.rows))
+            sweep.vjp(to_components(weight), own.tau, zeros(mi.Float, self.rows))
             vjp_optical_depth(self.media, entry.front, -weight * mi.Spectrum(*own.N), entry.on)
             return state
 

@@ -17,19 +17,19 @@ import mitsuba as mi
 
 from mivol.fields.gaussian_line import WhitenedLine
 from mivol.numerics import greater, lesser
-from mivol.transport.media.channels import as_rows
+from mivol.transport.media.channels import to_scene_channels
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import activate, clip_interval
-from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, read_nodes, walk
+from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, read_nodes, walk_cells
 from mivol.transport.traversal.interpolation import (
-    cubic_integral,
-    cubic_through,
+    fit_cubic,
     gauss_points,
+    integrate_cubic,
     interpolate,
     invert_cubic_integral,
 )
-from mivol.transport.traversal.lattice import piece_points
+from mivol.transport.traversal.lattice import points_of_piece
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
 __all__ = ["regular_tracking", "sample_gaussian_flight"]
@@ -79,7 +79,7 @@ def _collide_in_grid(
 ) -> mi.Float64:
     lattice, ray = part.lattice, interval.ray
     segment, width = clip_interval(lattice, interval), dr.width(ray)
-    reads = [Nodes(dr.detach(part.values), part.channels)]
+    reads = [NodeArray(dr.detach(part.values), part.channels)]
 
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple:
         left, s, dt, found = state
@@ -92,22 +92,22 @@ def _collide_in_grid(
 
     zero = dr.zeros(mi.Float, width)
     start = (mi.Float(goal), zero, zero, dr.full(mi.Bool, False, width))
-    left, s, dt, found = walk(lattice, segment, visit, start, reads, interval.active, until=lambda state: state[3])
+    left, s, dt, found = walk_cells(lattice, segment, visit, start, reads, interval.active, until=lambda state: state[3])
 
     # -- The cell of the collision once more: where in it --------------------------------------------------------------
     begin = segment.start + mi.Float64(s)
-    cell, points, inside = piece_points(lattice, ray, begin, dt, found)
-    nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
+    cell, points, inside = points_of_piece(lattice, ray, begin, dt, found)
+    nodes = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     rows = read_nodes(reads, nodes, inside)[0]
     corners = [_select_channel([row[q] for row in rows], channel) for q in range(8)]
-    curve = cubic_through(*(scale * activate(part.activation, interpolate(corners, p)) for p in points))
-    x = invert_cubic_integral(curve, dt, left, cubic_integral(curve, dt, mi.Float(1)))
+    curve = fit_cubic(*(scale * activate(part.activation, interpolate(corners, p)) for p in points))
+    x = invert_cubic_integral(curve, dt, left, integrate_cubic(curve, dt, mi.Float(1)))
     return dr.select(found, begin + mi.Float64(x) * mi.Float64(dt), dr.inf)
 
 
 def _select_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
     """The number of one channel; a grey part has but one, and a mono variant sees the luminance of the three."""
-    rows = as_rows(rows, 1) if mi.is_monochromatic else rows
+    rows = to_scene_channels(rows, 1) if mi.is_monochromatic else rows
     value = rows[0]
     for k, row in enumerate(rows[1:], 1):
         value = dr.select(channel == k, row, value)
@@ -148,5 +148,5 @@ def sample_gaussian_flight(
 
     width = dr.width(passage.d)
     start = (dr.full(mi.Float, dr.inf, width), dr.zeros(mi.Float, width), mi.UInt32(rng))
-    nearest, _, rng = part.each_along(passage, start, add, lambda state: state[0] <= state[1], leave)
+    nearest, _, rng = part.visit_gaussians(passage, start, add, lambda state: state[0] <= state[1], leave)
     return dr.select(dr.isfinite(nearest), passage.segment.start + mi.Float64(nearest), dr.inf), rng

@@ -24,7 +24,7 @@ import mitsuba as mi
 from mivol.numerics import largest_of
 from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction, clip_interval
-from mivol.transport.traversal.grid_walk import Cell, walk
+from mivol.transport.traversal.grid_walk import Cell, walk_cells
 from mivol.transport.traversal.lattice import Lattice, Segment
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
@@ -47,7 +47,7 @@ LOOKUP_RATE = 4.0
 
 @dataclass
 class BlockLattice:
-    """The blocks as cells of a coarse lattice, for :func:`walk`."""
+    """The blocks as cells of a coarse lattice, for :func:`walk_cells`."""
 
     res: tuple[int, int, int]
     empty_distances: None = None
@@ -81,7 +81,7 @@ def residual_ratio_tracking(
 
     Args:
         lattice: the grid, with its ``block_ranges``.
-        segment: from :func:`mivol.transport.traversal.lattice.clip`.
+        segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
         scale: factor on the values.
         rng: state of the generator.
         active: lanes to track; the others return 1.
@@ -140,7 +140,7 @@ def residual_ratio_tracking(
         -dr.log(u[0]),
         mi.UInt32(rng),
     )
-    end = walk(BlockLattice(tuple(n - 1 for n in blocks.res)), coarse, visit, start, (), active, is_dark, halts=True)
+    end = walk_cells(BlockLattice(tuple(n - 1 for n in blocks.res)), coarse, visit, start, (), active, is_dark, halts=True)
     return [w * dr.exp(-t) for t, w in zip(end.tau, end.weight, strict=True)], end.rng
 
 
@@ -242,7 +242,7 @@ def delta_tracking_in_blocks(
     rng, (u,) = draw_pcg32(rng, 1)
     start = (-dr.log(u), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width), rng)
     coarse = BlockLattice(tuple(n - 1 for n in blocks.res))
-    _, s, found, rng = walk(
+    _, s, found, rng = walk_cells(
         coarse, block_segment(segment, shift), visit, start, (), interval.active, until=lambda state: state[2], halts=True
     )
     return dr.select(found, segment.start + mi.Float64(s), dr.inf), rng

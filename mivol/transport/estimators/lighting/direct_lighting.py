@@ -27,7 +27,7 @@ from mivol.transport.estimators.lighting.emitters import ChosenEmitter, EventSam
 from mivol.transport.estimators.lighting.moving_emitters import attach_position, moving_transmittance
 from mivol.transport.estimators.lighting.shadow_rays import find_transmittance, trace_shadow_ray
 from mivol.transport.estimators.lighting.vertex import MediumVertex, Vertex, sample_phase
-from mivol.transport.media.channels import tangent_of
+from mivol.transport.media.channels import take_tangent
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
@@ -218,7 +218,7 @@ class DirectLighting:
         emitters, mei = self.emitters, vertex.interaction
         wo, weight, pdf = sample_phase(self.media, mei, samples.component, samples.direction, active)
         on = active & (pdf > 0)
-        ray = FineRay.leaving(vertex.place, wo, mei)
+        ray = FineRay.from_point(vertex.place, wo, mei)
         end, _, light = find_transmittance(self.media, ray, mei.medium, on, rng)
         si = end.si
         emitter = si.emitter(self.media.scene, on)
@@ -261,7 +261,7 @@ class DirectLight:
     def jvp(self) -> mi.Spectrum:
         along = jvp_optical_depth(self.media, self.ray_segment, self.active)
         with dr.resume_grad():
-            own = tangent_of(self.attached)
+            own = take_tangent(self.attached)
         return dr.select(self.active, own - along * self.value, 0)
 
 

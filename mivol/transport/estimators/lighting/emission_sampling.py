@@ -26,11 +26,11 @@ from mivol.transport.estimators.lighting.shadow_rays import find_transmittance
 from mivol.transport.estimators.lighting.vertex import Vertex
 from mivol.transport.estimators.scores import TrackedTerm
 from mivol.transport.media.body import Body, emission_slope, eval_emission
-from mivol.transport.media.channels import by_channel, colours, spectrum
+from mivol.transport.media.channels import colours_to_channels, to_components, to_spectrum
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
-from mivol.transport.traversal.grid_walk import walk_box
+from mivol.transport.traversal.grid_walk import walk_box_cells
 from mivol.transport.traversal.random_numbers import draw_pcg32
 from mivol.transport.traversal.rays import FineRay, Ray
 
@@ -101,7 +101,7 @@ class EmissionSampling:
         weight = power_heuristic(line.pdf, vertex.pdf(d, on)) / dr.select(on, line.pdf * line.density, 1)
         # -- The light that arrives from there ----------------------------------------------------------------------------
         start, medium = vertex.leave(it.p + d * line.t)
-        ray = FineRay.leaving(start, d, it, dr.select(on, line.t, 0))
+        ray = FineRay.from_point(start, d, it, dr.select(on, line.t, 0))
         end, _, light = find_transmittance(media, ray, medium, on, rng if estimates else None)
         on &= ~end.si.is_valid()
         inside = [
@@ -169,13 +169,13 @@ class EmissionLight(TrackedTerm):
         super().vjp(dL)
         ray, t = self.point.ray_segment.ray, self.point.t
         for body, on, name, slope in self._slopes():
-            body.deposit(ray, t, by_channel(dL * self.front * slope, self.media.channels), on, name)
+            body.vjp_extinction_at(ray, t, colours_to_channels(dL * self.front * slope, self.media.channels), on, name)
 
     def jvp(self) -> mi.Spectrum:
         """Tangent of both."""
         change, ray, t = super().jvp(), self.point.ray_segment.ray, self.point.t
         for body, on, name, slope in self._slopes():
-            own = spectrum(body.tangent_at(ray, t, self.media.channels, on, name))
+            own = to_spectrum(body.jvp_extinction_at(ray, t, self.media.channels, on, name))
             change += dr.select(on, self.front * slope * own, 0)
         return change
 
@@ -331,7 +331,7 @@ class EmissionTable:
                 k = mi.UInt32((cell.z * CELLS_PER_AXIS + cell.y) * CELLS_PER_AXIS + cell.x) + first * CELLS_PER_AXIS**3
                 return visit(state, k, t0, t1, on)
 
-            state = walk_box(box.rows, CELLS_PER_AXIS, ray, visit_cell, state, active)
+            state = walk_box_cells(box.rows, CELLS_PER_AXIS, ray, visit_cell, state, active)
         return state
 
 
@@ -378,7 +378,7 @@ def _cell_power(box: EmittingBox, channels: int) -> mi.Float:
     ray = mi.Ray3f(p, d)
     on = box.holds(p)
     light = dr.detach(eval_emission(box.body, ray, mi.Float64(0), channels, on))
-    value = dr.select(on, sum(colours(light)), 0)
+    value = dr.select(on, sum(to_components(light)), 0)
     power = dr.zeros(mi.Float, CELLS_PER_AXIS**3)
     dr.scatter_add(
         power,

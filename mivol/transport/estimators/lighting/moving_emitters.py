@@ -20,14 +20,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.body import Body
-from mivol.transport.media.channels import spectrum
+from mivol.transport.media.channels import to_spectrum
 from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.grid_walk import Cell, Nodes, walk
-from mivol.transport.traversal.interpolation import GAUSS, gauss_points
-from mivol.transport.traversal.lattice import Lattice, Segment, clip
-from mivol.transport.traversal.rays import Ray, distance_along, point_along, spawn_ray, traced
+from mivol.transport.traversal.grid_walk import Cell, NodeArray, walk_cells
+from mivol.transport.traversal.interpolation import GAUSS_POINT, gauss_points
+from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
+from mivol.transport.traversal.rays import Ray, hit_distance, point_along, spawn_ray, to_mitsuba_ray
 
 __all__ = ["attach_position", "moving_transmittance", "optical_depth_gradient"]
 
@@ -58,12 +58,12 @@ def optical_depth_gradient(
         body, t0, t1, on = interval.body, interval.t0, interval.t1, interval.active
         scale = dr.detach(body.view.scale) * body.area(d)
         for part in body.view.parts:
-            rows = media.vectors([scale * v for v in _part_gradient(body, part, ray_segment, t0, t1, on)])
+            rows = media.vectors_to_channels([scale * v for v in _part_gradient(body, part, ray_segment, t0, t1, on)])
             total = [a + b for a, b in zip(total, rows, strict=True)]
         if body.view.microflakes is None:
             return total
         # The projected area of microflakes changes with the direction of the ray, which moves perpendicular to itself.
-        turn = body.facing(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
+        turn = body.apply_microflakes(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
         own = body.optical_depth(interval, media.channels)
         return [a + t * turn for a, t in zip(total, own, strict=True)]
 
@@ -84,7 +84,7 @@ def moving_transmittance(
     moved = end - dr.detach(end)
     with dr.suspend_grad():
         slopes = optical_depth_gradient(media, ray_segment, tau, active)
-    return spectrum([1 - dr.dot(s, moved) for s in slopes])
+    return to_spectrum([1 - dr.dot(s, moved) for s in slopes])
 
 
 @dr.syntax
@@ -92,13 +92,13 @@ def _boundary_gradient(media: SceneMedia, ray_segment: RaySegment, active: mi.Bo
     """L times the term of the derivative from boundaries that are traced, one vector a channel."""
     # -- State ------------------------------------------------------------------------------------------------------------
     ray = ray_segment.ray
-    onward = traced(ray)  #                        the ray from the last surface on
+    onward = to_mitsuba_ray(ray)  #                        the ray from the last surface on
     going = mi.Bool(active)
     total = [dr.zeros(mi.Vector3f, dr.width(ray)) for _ in range(media.channels)]
 
     while dr.hint(going, label="boundaries on the way to an emitter"):
         hit = media.scene.ray_intersect(onward, mi.RayFlags.All, False, going)
-        t = distance_along(ray, hit)
+        t = hit_distance(ray, hit)
         going &= hit.is_valid() & (t < ray_segment.length * OWN_SURFACE)
         crosses = going & hit.is_medium_transition()
         total = _add_boundary(total, media, ray, hit, t, crosses)
@@ -135,7 +135,7 @@ def _part_gradient(
         shift = dr.select(on & (t0 > 0), entering * mi.Float(t0), 0) - dr.select(on & (t1 < end), leaving * mi.Float(t1), 0)
         return [v * shift for v in each]
     lattice = replace(part.lattice, empty_distances=None)
-    segment = clip(lattice, ray.o, ray.d, t0, t1)
+    segment = clip_to_grid(lattice, ray.o, ray.d, t0, t1)
     a, b = mi.Float64(segment.t0), mi.Float64(segment.t0) + mi.Float64(segment.length)
     inside = on & (segment.length > 0)
     vectors = _rotation_gradient(lattice, part, segment, inside)
@@ -162,14 +162,14 @@ def _rotation_gradient(lattice: Lattice, part: ExactExtinction, segment: Segment
 
     def visit(total: list, cell: Cell, on: mi.Bool) -> list:
         half = dr.select(on, 0.5 * cell.dt, 0)
-        for u, p in zip((GAUSS, 1 - GAUSS), gauss_points(cell), strict=True):
+        for u, p in zip((GAUSS_POINT, 1 - GAUSS_POINT), gauss_points(cell), strict=True):
             t = segment.t0 + cell.s + u * cell.dt
             slopes = [dr.select(cell.ahead, g, -g) for g in (_trilinear_gradient(c, p) for c in cell.corners[0])]
             total = [v + (half * t) * g for v, g in zip(total, slopes, strict=True)]
         return total
 
     zero = [dr.zeros(mi.Vector3f, dr.width(segment.length)) for _ in range(part.channels)]
-    found = walk(lattice, segment, visit, zero, [Nodes(values, part.channels)], active)
+    found = walk_cells(lattice, segment, visit, zero, [NodeArray(values, part.channels)], active)
     rows = [[mi.Float(v) for v in row[:3]] for row in lattice.from_world]
     return [mi.Vector3f(*(sum(rows[a][k] * g[a] for a in range(3)) for k in range(3))) for g in found]
 

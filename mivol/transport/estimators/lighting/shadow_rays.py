@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from mivol.numerics import least_of
 from mivol.transport.estimators.flights.tracking import ratio_tracking, residual_ratio_tracking
-from mivol.transport.media.channels import as_rows, spectrum
+from mivol.transport.media.channels import to_scene_channels, to_spectrum
 from mivol.transport.media.grid_extinction import clip_interval
 from mivol.transport.media.optical_depth import integrate_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import (
@@ -76,7 +76,7 @@ def estimate_transmittance(
     """Where a ray ends, and an unbiased estimate of the share of light that its media let through; ``rng`` draws it."""
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
     end, (T, _) = visit_media(media, ray, medium, _multiply_transmittance, start, active, passes_null)
-    return end, spectrum(T)
+    return end, to_spectrum(T)
 
 
 def _multiply_transmittance(state: tuple, interval: MediumInterval) -> tuple:
@@ -101,10 +101,10 @@ def _estimate_medium_transmittance(interval: MediumInterval, channels: int, rng:
     for part in tracked:
         segment = clip_interval(part.lattice, interval)
         own, rng = residual_ratio_tracking(part.lattice, segment, scale, rng, interval.active)
-        T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
+        T = [a * b for a, b in zip(T, to_scene_channels(own, channels), strict=True)]
     for part in (p for p in body.view.parts if not p.exact_line):
         own, rng = ratio_tracking(part, scale, interval, rng)
-        T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
+        T = [a * b for a, b in zip(T, to_scene_channels(own, channels), strict=True)]
     return T, rng
 
 
@@ -134,7 +134,7 @@ def trace_shadow_ray(
         rng, (u,) = draw_pcg32(rng, 1)
     away = direct.p - mi.Point3f(start)
     length = dr.norm(away)
-    ray = FineRay.leaving(start, dr.normalize(away), direct, length)
+    ray = FineRay.from_point(start, dr.normalize(away), direct, length)
     stop, tau, light = find_transmittance(media, ray, medium, active, rng)
     clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
     return RaySegment(ray, medium, length, True, u), clear, tau, light

@@ -12,7 +12,7 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-from mivol.phase.turn import INV_FOUR_PI
+from mivol.phase.scattering_angle import INV_FOUR_PI
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import spawn_ray
 

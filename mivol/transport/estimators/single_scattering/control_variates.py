@@ -32,9 +32,16 @@ from mivol.transport.estimators.single_scattering.distance_sampling import extin
 from mivol.transport.media.body import Body, eval_albedo
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, find_boxed_intervals
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, read_nodes, walk
-from mivol.transport.traversal.interpolation import GAUSS, gauss_points, interpolate, node_weights, upward_frac, weights
-from mivol.transport.traversal.lattice import Lattice, clip, locate
+from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, read_nodes, walk_cells
+from mivol.transport.traversal.interpolation import (
+    GAUSS_POINT,
+    fraction_from_lower,
+    gauss_points,
+    interpolate,
+    node_weights,
+    trilinear_weights,
+)
+from mivol.transport.traversal.lattice import Lattice, clip_to_grid, locate_cell
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [
@@ -114,7 +121,7 @@ class GridControl:
 
     def at_point(self, body: Body, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """S at a point of a ray."""
-        cell, _, inside = locate(body.view.parts[0].lattice, ray.o, ray.d, t)
+        cell, _, inside = locate_cell(body.view.parts[0].lattice, ray.o, ray.d, t)
         S = self.at(cell, inside & active)
         return S * 3 if self.channels == 1 and not mi.is_monochromatic else S
 
@@ -343,15 +350,15 @@ class ControlSweep:
         (part,) = body.view.parts
         extinction = body.extinction(ray)
         lattice = replace(part.lattice, empty_distances=None)
-        segment = clip(lattice, ray.o, -ray.d, -interval.t1, -interval.t0)
+        segment = clip_to_grid(lattice, ray.o, -ray.d, -interval.t1, -interval.t0)
         # Distances from the far end, where the walk begins: those from the camera would have to be compared in float64.
         begin = mi.Float(-segment.start - probe.begin)
-        reads = [*extinction.reads, Nodes(body.tangents[0], part.channels)] if tracks.tangent else extinction.reads
+        reads = [*extinction.reads, NodeArray(body.tangents[0], part.channels)] if tracks.tangent else extinction.reads
 
         def visit(state: _Sweep, cell: Cell, on: mi.Bool) -> _Sweep:
             points = list(gauss_points(cell))
             half = dr.select(on, 0.5 * cell.dt, 0)
-            own = media.rows([half * (a + b) for a, b in extinction.along(cell.corners[:1], points)])
+            own = media.to_channels([half * (a + b) for a, b in extinction.along(cell.corners[:1], points)])
             near = [dr.maximum(a - o, 0) for a, o in zip(state.ahead, own, strict=True)]
             T_out, T_in = state.T, [dr.exp(-n) for n in near]
             taken = [extinguished_light(o, i, t) for o, i, t in zip(own, T_in, T_out, strict=True)]
@@ -366,7 +373,9 @@ class ControlSweep:
                 behind.append(dr.fma(taken[c], source, state.behind[j]))
             change = state.change
             if tracks.tangent:
-                rows = media.rows([half * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in cell.corners[1]])
+                rows = media.to_channels(
+                    [half * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in cell.corners[1]]
+                )
                 change = [dr.fma(w, rows[j % len(rows)], t) for j, (w, t) in enumerate(zip(slopes, change, strict=True))]
             else:
                 a, b = (node_weights(p, cell, lattice.res) for p in points)
@@ -376,27 +385,29 @@ class ControlSweep:
 
         zero = [dr.zeros(mi.Float, dr.width(ray)) for _ in tracks.shares]
         state = _Sweep(zero, [mi.Float(t) for t in self.tau], [dr.exp(-t) for t in self.tau], list(zero))
-        return walk(lattice, segment, visit, state, reads, interval.active).change
+        return walk_cells(lattice, segment, visit, state, reads, interval.active).change
 
     def _add_probe(self) -> list[mi.Float]:
         """Differentiate the probe: its extinction, and that of the part of its cell in front of it."""
         media, (body,), ray, tracks, probe = self.media, self.media.bodies, self.passed.ray, self.tracks, self.probe
         (part,) = body.view.parts
-        cell, frac, inside = locate(part.lattice, ray.o, ray.d, probe.t)
+        cell, frac, inside = locate_cell(part.lattice, ray.o, ray.d, probe.t)
         on = inside & probe.on
         length = mi.Float(dr.maximum(probe.t - probe.begin, 0))
         rows = part.lattice.from_world
         speed = mi.Vector3f(*(mi.Float(sum(row[a] * mi.Float64(ray.d[a]) for a in range(3))) for row in rows))
         start = dr.clip(frac - speed * length, 0, 1)
-        points = [dr.fma(frac - start, g, start) for g in (GAUSS, 1 - GAUSS)]
+        points = [dr.fma(frac - start, g, start) for g in (GAUSS_POINT, 1 - GAUSS_POINT)]
         if tracks.tangent:
             upward = dr.full(dr.mask_t(mi.Vector3f), True)
-            (corners,) = read_nodes([Nodes(body.tangents[0], part.channels)], box_nodes(cell, upward, part.lattice.res), on)
-            at = media.rows([interpolate(v, frac) for v in corners])
-            front = media.rows([0.5 * length * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in corners])
+            (corners,) = read_nodes(
+                [NodeArray(body.tangents[0], part.channels)], corner_nodes(cell, upward, part.lattice.res), on
+            )
+            at = media.to_channels([interpolate(v, frac) for v in corners])
+            front = media.to_channels([0.5 * length * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in corners])
             pairs = zip(probe.source, probe.dims, strict=True)
             return [dr.select(on, s * at[j % len(at)] - d * front[j % len(at)], 0) for j, (s, d) in enumerate(pairs)]
-        at, a, b = (weights(upward_frac(p, cell, part.lattice.res)) for p in (frac, *points))
+        at, a, b = (trilinear_weights(fraction_from_lower(p, cell, part.lattice.res)) for p in (frac, *points))
         front = [-0.5 * length * (x + y) for x, y in zip(a, b, strict=True)]
         body.add_to_grid(part, cell, [(probe.source, at), (probe.dims, front)], on)
         return [mi.Float(0) for _ in probe.source]

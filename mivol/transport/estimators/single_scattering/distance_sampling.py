@@ -21,9 +21,9 @@ from mivol.transport.estimators.single_scattering.shadow_tables import Visibilit
 from mivol.transport.media.body import Body
 from mivol.transport.media.ray_intervals import MediumInterval, SegmentEnd, visit_media
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.grid_walk import Cell, box_nodes, read_nodes, walk
-from mivol.transport.traversal.interpolation import cubic_at, cubic_integral, cubic_through, gauss_points, invert_cubic_integral
-from mivol.transport.traversal.lattice import clip, piece_points, split
+from mivol.transport.traversal.grid_walk import Cell, corner_nodes, read_nodes, walk_cells
+from mivol.transport.traversal.interpolation import eval_cubic, fit_cubic, gauss_points, integrate_cubic, invert_cubic_integral
+from mivol.transport.traversal.lattice import clip_to_grid, points_of_piece, split_float64
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from mivol.transport.traversal.rays import Ray
 
@@ -79,7 +79,7 @@ def sample_distance(
     on = active & (candidate.weight > 0)
     dt = dr.select(on, candidate.dt, 1)
     curve = _extinction_curves(media, ray, candidate, on)
-    whole = [cubic_integral(c, dt, 1) for c in curve]
+    whole = [integrate_cubic(c, dt, 1) for c in curve]
     front = [dr.exp(-f) for f in candidate.front]
 
     # -- The technique: free flight, or uniform (in angle where the emitter is finite, in length for probes) -----------
@@ -95,8 +95,8 @@ def sample_distance(
     x = dr.select(collides, _invert_collision_cdf(curve, whole, front, dt, u), even * dr.rcp(dt))
 
     # -- The density of their mixture ------------------------------------------------------------------------------------
-    sigma = [dr.maximum(cubic_at(c, x), 0) for c in curve]
-    tau = [cubic_integral(c, dt, x) for c in curve]
+    sigma = [dr.maximum(eval_cubic(c, x), 0) for c in curve]
+    tau = [integrate_cubic(c, dt, x) for c in curve]
     taken = sum((f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)), mi.Float(0))
     hits = sum((f * s * dr.exp(-t) for f, s, t in zip(front, sigma, tau, strict=True)), mi.Float(0))
     pdf = by_collision * dr.select(taken > 0, hits / dr.select(taken > 0, taken, 1), 0)
@@ -119,7 +119,7 @@ def _extinction_curves(media: SceneMedia, ray: Ray, candidate: Candidate, on: mi
         here = on & (candidate.body == index)
         own = _extinction_along(media, body, ray, candidate, here)
         values = [[dr.select(here, n, v) for n, v in zip(new, old, strict=True)] for new, old in zip(own, values, strict=True)]
-    return [cubic_through(*v) for v in values]
+    return [fit_cubic(*v) for v in values]
 
 
 def _extinction_along(media: SceneMedia, body: Body, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
@@ -130,8 +130,8 @@ def _extinction_along(media: SceneMedia, body: Body, ray: Ray, candidate: Candid
     if lattice is None:
         return _to_scene_channels(media, constant)
     start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)
-    cell, points, inside = piece_points(lattice, ray, start, candidate.dt, on)
-    nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
+    cell, points, inside = points_of_piece(lattice, ray, start, candidate.dt, on)
+    nodes = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     grid = extinction.along(read_nodes(extinction.reads, nodes, inside), points)
     own = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
     return _to_scene_channels(media, own)
@@ -139,7 +139,7 @@ def _extinction_along(media: SceneMedia, body: Body, ray: Ray, candidate: Candid
 
 def _to_scene_channels(media: SceneMedia, values: list[list[mi.Float]]) -> list[list[mi.Float]]:
     """[channel of the scene][point], from [channel of the medium][point]."""
-    return [list(row) for row in zip(*(media.rows([v[k] for v in values]) for k in range(4)), strict=True)]
+    return [list(row) for row in zip(*(media.to_channels([v[k] for v in values]) for k in range(4)), strict=True)]
 
 
 def _invert_collision_cdf(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Float, u: mi.Point2f) -> mi.Float:
@@ -318,10 +318,10 @@ class _Filling:
         Ends of a box come in float64: seen from 30 box sizes away, a float32 entry errs by 1e-6 of a box.
         """
         body, t0, t1, on = interval.body, interval.t0, interval.t1, interval.active
-        ray, rows, chosen, cache = self.proposal.ray, self.proposal.media.rows, self.proposal.chosen, self.proposal.cache
+        ray, rows, chosen, cache = self.proposal.ray, self.proposal.media.to_channels, self.proposal.chosen, self.proposal.cache
         extinction = body.extinction(ray, body.flight_parts)
         grid = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
-        segment = clip(grid, ray.o, ray.d, t0, t1) if grid is not None else None
+        segment = clip_to_grid(grid, ray.o, ray.d, t0, t1) if grid is not None else None
         filled = segment.length if segment is not None and not extinction.has_constants else mi.Float(t1 - t0)
         probe_sigma = self._probe_sigma(filled)
 
@@ -330,7 +330,7 @@ class _Filling:
             length = dr.select(on, dr.maximum(mi.Float(b - a), 0), 0)
             dt = lit_length(sigma, length)
             tau = [s * dt for s in sigma]
-            begin, rest = split(a)
+            begin, rest = split_float64(a)
             reservoir = self._offer(reservoir, _Piece(begin, rest, dt, tau, on & (dt > 0)), None, probe_sigma)
             # The length may be infinite: 0 * inf would be NaN.
             tau = [f + dr.select(s > 0, s * length, 0) for f, s in zip(front, sigma, strict=True)]
@@ -355,7 +355,7 @@ class _Filling:
         # Light from beyond the optical depth DARK is negligible in an image. Derivatives need the whole optical depth, since
         # they are swept from the far end.
         until = None if self.proposal.probe_depth else lambda p: least_of(p.tau) > NEGLIGIBLE_TAU
-        reservoir = walk(lattice, segment, visit, reservoir, extinction.reads, on, until)
+        reservoir = walk_cells(lattice, segment, visit, reservoir, extinction.reads, on, until)
         if extinction.has_constants:
             reservoir = add_constant(reservoir, dr.select(hit, segment.end, t1), t1)
         return _set_probe_sigma(reservoir, probe_sigma)

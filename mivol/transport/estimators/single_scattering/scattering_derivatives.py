@@ -31,7 +31,7 @@ from mivol.transport.estimators.single_scattering.control_variates import (
 )
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
-from mivol.transport.media.channels import by_channel, colours, spectrum, tangent_of
+from mivol.transport.media.channels import colours_to_channels, take_tangent, to_components, to_spectrum
 from mivol.transport.media.optical_depth import jvp_optical_depth, transmittance, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
@@ -104,7 +104,7 @@ class ScatteredSegment:
                 if body.view.albedo is not None:
                     sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, on)
                     value += dr.select(on, probe.weight * sigma_t * eval_albedo(body, probe.mei, on), 0)
-            dL = tangent_of(value)
+            dL = take_tangent(value)
         shadow, dimmed, on = _choose_shadow_ray(probe)
         return dL - dr.select(on, carried * dimmed * jvp_optical_depth(self.media, shadow, on), 0)
 
@@ -131,8 +131,8 @@ class ScatteredSegment:
             albedo, name = mi.Spectrum(1), "sigma_s"
             if body.view.albedo is not None:
                 albedo, name = dr.detach(eval_albedo(body, probe.mei, on)), "sigma_"
-            weight = by_channel(dL * (probe.weight * albedo - source), media.channels)
-            body.deposit(ray, probe.event.t, weight, on, name)
+            weight = colours_to_channels(dL * (probe.weight * albedo - source), media.channels)
+            body.vjp_extinction_at(ray, probe.event.t, weight, on, name)
         vjp_optical_depth(media, self._in_front, -dL * (probe.sigma_s * probe.weight - lost), probe.event.on)
 
     def _jvp_coefficients(self) -> mi.Spectrum:
@@ -145,7 +145,7 @@ class ScatteredSegment:
             albedo, name = mi.Spectrum(1), "sigma_s"
             if body.view.albedo is not None:
                 albedo, name = dr.detach(eval_albedo(body, probe.mei, on)), "sigma_"
-            tangent = spectrum(body.tangent_at(ray, probe.event.t, media.channels, on, name))
+            tangent = to_spectrum(body.jvp_extinction_at(ray, probe.event.t, media.channels, on, name))
             dL += dr.select(on, (probe.weight * albedo - source) * tangent, 0)
         return dr.select(probe.event.on, dL, 0)
 
@@ -153,7 +153,7 @@ class ScatteredSegment:
 
     def _jvp_by_sweep(self) -> mi.Spectrum:
         one, lit = mi.Spectrum(1), dr.select(self.segment.may_scatter, self.segment.beta, 0)
-        shares = [[(c % self.grid_control.channels, b)] for c, b in enumerate(colours(lit))]
+        shares = [[(c % self.grid_control.channels, b)] for c, b in enumerate(to_components(lit))]
         return mi.Spectrum(*self._sweep(shares, 0 * one, one, True))
 
     def _sweep(
@@ -164,10 +164,10 @@ class ScatteredSegment:
         (body,) = media.bodies
         S = self.grid_control.at_point(body, self.segment.ray, point.t, point.on)
         albedo = dr.detach(eval_albedo(body, probe.mei, point.on))
-        left = dr.select(point.on, probe.weight * albedo - probe.gain * spectrum(S), 0)
-        sigma_t = spectrum(point.sigma_t)
+        left = dr.select(point.on, probe.weight * albedo - probe.gain * to_spectrum(S), 0)
+        sigma_t = to_spectrum(point.sigma_t)
         asked = (dL * left, dL * left * sigma_t, rest)
-        rows = [colours(x) if tangent else by_channel(x, media.channels) for x in asked]
+        rows = [to_components(x) if tangent else colours_to_channels(x, media.channels) for x in asked]
         tracks = SweepSums(shares, rows[2], tangent)
         found = ProbeDifference(point.begin, point.t, rows[0], rows[1], point.on)
         return ControlSweep(media, self.grid_control, self._passed, self.tau, tracks, found).differentiate(self.active)
@@ -181,7 +181,7 @@ class ScatteredSegment:
         It is scaled by (1 - T) / tau, since less light of a constant sky reaches the inside of a thicker medium. (Measured:
         0.01 to 0.06 of the variance without it in thin media, 0.3 to 0.5 in those of a few optical depths, 0.8 beyond.)
         """
-        return self.constant_control * spectrum([phi1(t) for t in self.tau])
+        return self.constant_control * to_spectrum([phi1(t) for t in self.tau])
 
     def _constant_source_at(self) -> tuple[mi.Spectrum, mi.Spectrum]:
         """The control variate's weight of the event for an extinction of 1, and for its actual extinction."""
@@ -222,7 +222,7 @@ def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.B
         return first.ray_segment, dr.detach(first.value), first.on
     second = probe.direct[1]
     values = [dr.detach(s.value) for s in probe.direct]
-    light = [sum(colours(v)) for v in values]
+    light = [sum(to_components(v)) for v in values]
     total = light[0] + light[1]
     p = dr.select(total > 0, light[0] / dr.select(total > 0, total, 1), 0.5)
     is_first = probe.chance < p
@@ -239,10 +239,10 @@ def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.B
 def _control_factors(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
     """For each channel of the extinction, the (channel of S, factor) pairs of the control variate, summed over colours."""
     if of_control == 1:
-        return [[(0, w)] for w in by_channel(weight, channels)]
+        return [[(0, w)] for w in colours_to_channels(weight, channels)]
     if channels == 1:
-        return [list(enumerate(colours(weight)))]
-    return [[(c, w)] for c, w in enumerate(colours(weight))]
+        return [list(enumerate(to_components(weight)))]
+    return [[(c, w)] for c, w in enumerate(to_components(weight))]
 
 
 @dataclass
@@ -286,7 +286,7 @@ def at_event(media: SceneMedia, event: MediumEvent) -> list[tuple[Body, mi.Bool]
 def event_sigma_t(media: SceneMedia, body: Body, ray: Ray, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
     """The extinction [1/length] at an event."""
     rows = event.sigma_t if media.is_single else body.extinction_at(ray, event.t, media.channels, on)
-    return spectrum(rows)
+    return to_spectrum(rows)
 
 
 def event_sigma_s(media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
@@ -294,7 +294,7 @@ def event_sigma_s(media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.Mediu
     total = mi.Spectrum(0)
     for body, on in at_event(media, event):
         if body.view.albedo is None:
-            value = spectrum(body.extinction_at(ray, event.t, media.channels, on, "sigma_s"))
+            value = to_spectrum(body.extinction_at(ray, event.t, media.channels, on, "sigma_s"))
         else:
             value = dr.detach(eval_albedo(body, mei, on)) * event_sigma_t(media, body, ray, event, on)
         total = dr.select(on, value, total)

@@ -38,13 +38,13 @@ from mivol.transport.estimators.single_scattering.distance_sampling import lit_l
 from mivol.transport.estimators.single_scattering.shadow_tables import TransmittanceGrid
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
-from mivol.transport.media.channels import spectrum
+from mivol.transport.media.channels import to_spectrum
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.grid_walk import Cell, walk
-from mivol.transport.traversal.interpolation import GAUSS
-from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.grid_walk import Cell, walk_cells
+from mivol.transport.traversal.interpolation import GAUSS_POINT
+from mivol.transport.traversal.lattice import clip_to_grid
 from mivol.transport.traversal.random_numbers import Strata
 from mivol.transport.traversal.rays import Ray, point_along
 
@@ -190,7 +190,7 @@ class _LitRay:
             return self._source(body, t, active)
 
         def add_constant(state: _LightSum, a: mi.Float64, b: mi.Float64) -> _LightSum:
-            sigma = media.rows(extinction.constant)
+            sigma = media.to_channels(extinction.constant)
             dt = dr.select(on, lit_length(sigma, dr.maximum(mi.Float(b - a), 0)), 0)
             span = _Span(a, dt, lambda x: sigma, source, self.equiangular, on & (dt > 0))
             return _add_span(state, span, mi.Float(CONSTANT_PIECES))
@@ -198,22 +198,22 @@ class _LitRay:
         t0, t1 = mi.Float64(interval.t0), mi.Float64(interval.t1)
         if grid is None:
             return add_constant(state, t0, t1)
-        segment = clip(grid, ray.o, ray.d, t0, t1)
+        segment = clip_to_grid(grid, ray.o, ray.d, t0, t1)
         hit = segment.length > 0
 
         def visit(state: _LightSum, cell: Cell, full: mi.Bool) -> _LightSum:
             def sigma(x: mi.Float) -> list[mi.Float]:
-                return media.rows([v[0] for v in extinction.along(cell.corners, [dr.fma(cell.step, x, cell.frac)])])
+                return media.to_channels([v[0] for v in extinction.along(cell.corners, [dr.fma(cell.step, x, cell.frac)])])
 
             start = segment.start + mi.Float64(cell.s)
             span = _Span(start, cell.dt, sigma, source, self.equiangular, full & (cell.dt > 0))
             return _add_span(state, span, mi.Float(1))
 
         if not extinction.has_constants:
-            return walk(grid, segment, visit, state, extinction.reads, on)
+            return walk_cells(grid, segment, visit, state, extinction.reads, on)
         state = add_constant(state, t0, dr.select(hit, segment.start, t1))
         # No block may be skipped: where the grid is empty the constants are not.
-        state = walk(replace(grid, empty_distances=None), segment, visit, state, extinction.reads, on)
+        state = walk_cells(replace(grid, empty_distances=None), segment, visit, state, extinction.reads, on)
         return add_constant(state, dr.select(hit, segment.end, t1), t1)
 
     def _source(self, body: Body, t: mi.Float64, on: mi.Bool) -> mi.Spectrum:
@@ -234,7 +234,7 @@ class _LitRay:
 def _add_span(state: _LightSum, span: _Span, least: mi.Float) -> _LightSum:
     """Cut a span into pieces, ``least`` of them or more, and add them in their order."""
     dt, sigma, equiangular = span.length, span.sigma, span.equiangular
-    near, far = sigma(mi.Float(GAUSS)), sigma(mi.Float(1 - GAUSS))
+    near, far = sigma(mi.Float(GAUSS_POINT)), sigma(mi.Float(1 - GAUSS_POINT))
     thick = largest_of([0.5 * dt * (a + b) for a, b in zip(near, far, strict=True)])
     count = dr.maximum(least, dr.ceil(thick / MAX_PIECE_TAU))
     if equiangular is not None:
@@ -274,7 +274,7 @@ def _bisect_once(
 
 def _optical_depth_to(x: mi.Float, dt: mi.Float, sigma: ExtinctionProfile) -> list[mi.Float]:
     """Optical depth of each channel from the start of a cell to a fraction of it."""
-    return [0.5 * x * dt * (a + b) for a, b in zip(sigma(GAUSS * x), sigma((1 - GAUSS) * x), strict=True)]
+    return [0.5 * x * dt * (a + b) for a, b in zip(sigma(GAUSS_POINT * x), sigma((1 - GAUSS_POINT) * x), strict=True)]
 
 
 def _sort_rows(shares: list[mi.Float]) -> list[mi.Float]:
@@ -319,7 +319,7 @@ def _deep_fraction(edges: list[mi.Float], index: mi.UInt32) -> mi.Float:
 def _add_piece(state: _LightSum, span: _Span, near: mi.Float, far: mi.Float, on: mi.Bool) -> _LightSum:
     """Add the piece [near, far] of a span by two-stage Gauss collocation."""
     step = dr.select(on, far - near, 0)
-    places = [near + GAUSS * (far - near), near + (1 - GAUSS) * (far - near)]
+    places = [near + GAUSS_POINT * (far - near), near + (1 - GAUSS_POINT) * (far - near)]
     inverse = dr.rcp(dr.maximum(span.length, 1e-30))
     values = [span.sigma(p * inverse) for p in places]
     c = [span.source(span.start + mi.Float64(p), on & (step > 0)) for p in places]
@@ -336,7 +336,7 @@ def _add_piece(state: _LightSum, span: _Span, near: mi.Float, far: mi.Float, on:
         gain.append((whole * w1, whole * w2))
         ahead.append(tau + own)
         beyond.append(T * dr.exp(-own))
-    added = dr.select(on, spectrum([g[0] for g in gain]) * c[0] + spectrum([g[1] for g in gain]) * c[1], 0)
+    added = dr.select(on, to_spectrum([g[0] for g in gain]) * c[0] + to_spectrum([g[1] for g in gain]) * c[1], 0)
     return _LightSum(ahead, beyond, state.light + added)
 
 
@@ -344,5 +344,5 @@ def _scattering_albedo(media: SceneMedia, body: Body, ray: Ray, mei: mi.MediumIn
     """The albedo, or sigma_s / sigma_t where the medium has both coefficients; 0 where its extinction is 0."""
     if body.view.albedo is not None:
         return eval_albedo(body, mei, on)
-    scattered, whole = (spectrum(body.extinction_at(ray, mei.t, media.channels, on, name)) for name in ("sigma_s", "sigma_"))
+    scattered, whole = (to_spectrum(body.extinction_at(ray, mei.t, media.channels, on, name)) for name in ("sigma_s", "sigma_"))
     return dr.select(whole > 0, scattered / dr.select(whole > 0, whole, 1), 0)

@@ -20,7 +20,7 @@ import mitsuba as mi
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
 from mivol.transport.media.body import Body
-from mivol.transport.media.channels import spectrum
+from mivol.transport.media.channels import to_spectrum
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_blocks import CoarseGrid
 from mivol.transport.traversal.interpolation import interpolate
@@ -202,7 +202,7 @@ class TransmittanceGrid:
             offset = number * self.channels + c
             corners = [dr.gather(mi.Float, self.tau, k * (self.emitters * self.channels) + offset, active) for k in node]
             rows.append(dr.exp(-interpolate(corners, frac)))
-        return spectrum(rows)
+        return to_spectrum(rows)
 
 
 def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: int = 1) -> TransmittanceGrid:

@@ -22,11 +22,19 @@ from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
 
-__all__ = ["DrawnPoint", "bounded_parts", "draw_in", "offer_interval", "start_points", "EvenPoint", "draw_even_point"]
+__all__ = [
+    "PointReservoir",
+    "bounded_parts",
+    "offer_medium_interval",
+    "offer_interval",
+    "start_reservoirs",
+    "UniformPoint",
+    "draw_uniform_point",
+]
 
 
 @dataclass
-class DrawnPoint:
+class PointReservoir:
     """The reservoir of one bounded extinction.
 
     Attributes:
@@ -51,7 +59,7 @@ def bounded_parts(bodies: list[Body]) -> list[tuple[Body, BoundedExtinction]]:
     return [(body, part) for body in bodies for part in body.view.parts if not part.exact_line]
 
 
-def start_points(count: int, u: mi.Float | None, width: int) -> list[DrawnPoint]:
+def start_reservoirs(count: int, u: mi.Float | None, width: int) -> list[PointReservoir]:
     """Begin a segment with ``count`` bounded extinctions.
 
     Raises:
@@ -60,15 +68,15 @@ def start_points(count: int, u: mi.Float | None, width: int) -> list[DrawnPoint]
     if count and u is None:
         raise MivolError("the derivative of an optical depth through a bounded field was asked for, which is estimated only.")
     zero = dr.zeros(mi.Float, width)
-    return [DrawnPoint(zero, zero, zero, mi.Float(u)) for _ in range(count)]
+    return [PointReservoir(zero, zero, zero, mi.Float(u)) for _ in range(count)]
 
 
-def draw_in(point: DrawnPoint, part: BoundedExtinction, interval: RayInterval) -> DrawnPoint:
+def offer_medium_interval(point: PointReservoir, part: BoundedExtinction, interval: RayInterval) -> PointReservoir:
     """Offer one more interval to the reservoir."""
     return offer_interval(point, *part.clip(interval), interval.active)[0]
 
 
-def offer_interval(point: DrawnPoint, begin: mi.Float, end: mi.Float, on: mi.Bool) -> tuple[DrawnPoint, mi.Bool]:
+def offer_interval(point: PointReservoir, begin: mi.Float, end: mi.Float, on: mi.Bool) -> tuple[PointReservoir, mi.Bool]:
     """Offer the interval between two distances to the reservoir; besides, the lanes that keep it."""
     length = dr.select(on & (end > begin), end - begin, 0)
     total = point.total + length
@@ -76,7 +84,7 @@ def offer_interval(point: DrawnPoint, begin: mi.Float, end: mi.Float, on: mi.Boo
     keep = point.u < share
     # Given the outcome, the number is uniform in [0, share) or in [share, 1), and is stretched to [0, 1) again.
     u = dr.select(keep, point.u / dr.select(share > 0, share, 1), (point.u - share) / dr.select(share < 1, 1 - share, 1))
-    kept = DrawnPoint(total, dr.select(keep, begin, point.begin), dr.select(keep, length, point.length), u)
+    kept = PointReservoir(total, dr.select(keep, begin, point.begin), dr.select(keep, length, point.length), u)
     return kept, keep & (length > 0)
 
 
@@ -86,7 +94,7 @@ float32, the others infinite."""
 
 
 @dataclass
-class EvenPoint:
+class UniformPoint:
     """A point of a segment, and the length that it stands for.
 
     Attributes:
@@ -102,7 +110,7 @@ class EvenPoint:
     on: mi.Bool
 
 
-def draw_even_point(media: SceneMedia, passed: RaySegment, among: list[Body], u: mi.Float, active: mi.Bool) -> EvenPoint:
+def draw_uniform_point(media: SceneMedia, passed: RaySegment, among: list[Body], u: mi.Float, active: mi.Bool) -> UniformPoint:
     """Draw a point evenly from the intervals of a segment in some media.
 
     Args:
@@ -125,6 +133,6 @@ def draw_even_point(media: SceneMedia, passed: RaySegment, among: list[Body], u:
         return point, dr.select(kept, mi.UInt32(number), index)
 
     zero = dr.zeros(mi.Float, width)
-    start = (DrawnPoint(zero, zero, zero, u + zero), dr.zeros(mi.UInt32, width))
+    start = (PointReservoir(zero, zero, zero, u + zero), dr.zeros(mi.UInt32, width))
     point, body = revisit_media(media, passed, visit, start, active)
-    return EvenPoint(mi.Float64(point.t), point.total, body, active & (point.total > 0))
+    return UniformPoint(mi.Float64(point.t), point.total, body, active & (point.total > 0))

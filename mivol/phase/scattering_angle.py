@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["INV_FOUR_PI", "INV_TWO_PI", "Turn", "direction_after", "turn_between"]
+__all__ = ["INV_FOUR_PI", "INV_TWO_PI", "ScatteringAngle", "scattered_direction", "angle_between"]
 
 INV_TWO_PI = 0.15915494309189535
 INV_FOUR_PI = 0.07957747154594767
 
 
 @dataclass
-class Turn:
+class ScatteringAngle:
     """The cosine of a scattering angle, as its differences from 1 and from -1.
 
     Attributes:
@@ -42,23 +42,23 @@ class Turn:
         """The sine, to a few roundings of itself at every angle."""
         return dr.sqrt(self.below_one * self.above_minus_one)
 
-    def mirrored(self, where: mi.Bool) -> Turn:
+    def mirrored(self, where: mi.Bool) -> ScatteringAngle:
         """The same with the cosine negated in some lanes."""
-        return Turn(
+        return ScatteringAngle(
             dr.select(where, self.above_minus_one, self.below_one),
             dr.select(where, self.below_one, self.above_minus_one),
         )
 
 
-def turn_between(wi: mi.Vector3f, wo: mi.Vector3f) -> Turn:
+def angle_between(wi: mi.Vector3f, wo: mi.Vector3f) -> ScatteringAngle:
     """The scattering angle between travel along ``-wi`` and travel along ``wo``, both of unit length.
 
     Error: that of the directions themselves; an angle near 0 or pi is known to 1e-7.
     """
-    return Turn(0.5 * dr.squared_norm(wo + wi), 0.5 * dr.squared_norm(wo - wi))
+    return ScatteringAngle(0.5 * dr.squared_norm(wo + wi), 0.5 * dr.squared_norm(wo - wi))
 
 
-def direction_after(wi: mi.Vector3f, turn: Turn, u: mi.Float) -> mi.Vector3f:
+def scattered_direction(wi: mi.Vector3f, turn: ScatteringAngle, u: mi.Float) -> mi.Vector3f:
     """The direction after scattering by an angle; ``u`` in [0, 1) is the azimuth, as a fraction of 2 pi."""
     s, t = mi.coordinate_system(wi)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * u)

@@ -10,10 +10,10 @@ from bounded_ball import Ball
 
 from mivol.errors import MivolError
 from mivol.transport.media.body import Body
-from mivol.transport.media.drawn_points import EvenPoint, draw_even_point, draw_in, start_points
 from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.media.uniform_points import UniformPoint, draw_uniform_point, offer_medium_interval, start_reservoirs
 from scenes import ball_of, box_of, camera, centred, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -25,9 +25,9 @@ def bounded_points(*intervals: tuple[float, float], on: bool = True) -> tuple[np
     """Points for N even numbers, and the length, of a ray that is in the field's box from 1 to 3."""
     part = BoundedExtinction("sigma_t", Ball(mi.Float(1), 1.0, (0, 0, 2)), mi.Float(1), mi.Float(1))
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))
-    (point,) = start_points(1, (dr.arange(mi.Float, N) + 0.5) / N, N)
+    (point,) = start_reservoirs(1, (dr.arange(mi.Float, N) + 0.5) / N, N)
     for t0, t1 in intervals:
-        point = draw_in(point, part, RayInterval(ray, mi.Float(t0), mi.Float(t1), mi.Bool(on)))
+        point = offer_medium_interval(point, part, RayInterval(ray, mi.Float(t0), mi.Float(t1), mi.Bool(on)))
     return np.array(point.t), float(np.array(point.total).max())
 
 
@@ -52,9 +52,9 @@ def test_lanes_that_are_off_have_no_length():
 
 
 def test_a_segment_needs_a_random_number_where_something_is_bounded():
-    assert start_points(0, None, 1) == []
+    assert start_reservoirs(0, None, 1) == []
     with pytest.raises(MivolError, match="which is estimated only"):
-        start_points(1, None, 1)
+        start_reservoirs(1, None, 1)
 
 
 LOW, HIGH = (2.0, 3.0), (4.5, 4.75)
@@ -72,12 +72,12 @@ def two_boxes(same: bool = False) -> SceneMedia:
 
 def even_points(
     media: SceneMedia, length: float = 9.0, x: float = 0.0, among: list[Body] | None = None, on: bool = True
-) -> EvenPoint:
+) -> UniformPoint:
     """Points for N even numbers, of a ray of some length, in all media unless told which."""
     ray = mi.Ray3f(mi.Point3f(x, 0, -3), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     u = (dr.arange(mi.Float, N) + 0.5) / N
     passed = RaySegment.upto(ray, dr.zeros(mi.MediumPtr), mi.Float64(length))
-    return draw_even_point(media, passed, media.bodies if among is None else among, u, dr.full(mi.Bool, on, N))
+    return draw_uniform_point(media, passed, media.bodies if among is None else among, u, dr.full(mi.Bool, on, N))
 
 
 @pytest.mark.parametrize("same", [False, True], ids=["two media", "one medium, entered twice"])
@@ -134,7 +134,7 @@ def test_intervals_without_end_count_as_empty():
     ray = mi.Ray3f(mi.Point3f(mi.Float(0, 5, 5), 0, -3), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     around = dr.select(dr.full(mi.Bool, True, 3), mi.MediumPtr(fog), None)
     passed = RaySegment.upto(ray, around, mi.Float64(2, np.inf, dr.largest(mi.Float)))
-    point = draw_even_point(media, passed, media.bodies, mi.Float(0.5), dr.full(mi.Bool, True, 3))
+    point = draw_uniform_point(media, passed, media.bodies, mi.Float(0.5), dr.full(mi.Bool, True, 3))
     assert np.array(point.on).tolist() == [True, False, False]
     assert np.array(point.t)[0] == pytest.approx(1.0, abs=1e-5)
     assert np.array(point.length)[0] == pytest.approx(2.0, abs=1e-5)
