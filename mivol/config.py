@@ -18,21 +18,24 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from mivol.errors import MivolError
-from mivol.optim.events import Checkpoint, Evaluate, Upsample
-from mivol.optim.first_order import Adam, RMSprop
-from mivol.optim.losses import L1, L2, Huber, Log, RelativeL2
+from mivol.optim.events import EVENTS, Checkpoint, Evaluate
+from mivol.optim.first_order import Adam
+from mivol.optim.losses import L2, LOSSES
+from mivol.optim.optimizers import OPTIMIZERS
 from mivol.optim.parameters import MAPS
-from mivol.optim.priors import Bounds, HuberTotalVariation, Laplacian, Sparse, TotalVariation
+from mivol.optim.priors import PRIORS
 from mivol.optim.projections.solvers import ALL_SOLVERS
-from mivol.optim.schedules import Constant, Cosine, Exponential, Step
-from mivol.optim.second_order import GaussNewton, Lbfgs
-from mivol.optim.strategy import setting, suggest_name
+from mivol.optim.schedules import SCHEDULES, Constant
+from mivol.optim.strategy import setting, suggest_name, union_type
 from mivol.scene.cameras import Hemisphere, LookAts, Ring, SceneSensors
 from mivol.schema import check_keys, sentence
 from mivol.tomography.ramp import WINDOWS
 from mivol.validate.images import METRICS
 
 INFINITY = math.inf
+
+AnyOptimizer, AnySchedule, AnyLoss = union_type(OPTIMIZERS), union_type(SCHEDULES), union_type(LOSSES)
+AnyPrior, AnyEvent = union_type(PRIORS), union_type(EVENTS)
 
 DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
 """A hundred names with dots between them; tomllib takes the square of their number as time, a minute for a file of 200 kB."""
@@ -107,9 +110,7 @@ class Sought(Section):
         setting("1", "emission: the start is given the shape of an emissive volume fitted to the views"),
     ] = ""
     shape: Annotated[tuple[Count, Count, Count] | None, setting("voxel", "(Z, Y, X) of a constant start")] = None
-    prior: Annotated[
-        tuple[TotalVariation | HuberTotalVariation | Laplacian | Sparse | Bounds, ...], setting("1", "what is known before")
-    ] = ()
+    prior: Annotated[tuple[AnyPrior, ...], setting("1", "what is known before")] = ()
 
     def __post_init__(self) -> None:
         if self.map not in MAPS:
@@ -151,10 +152,10 @@ class Experiment(Section):
     reference: Annotated[Rendered | Files, setting("1", "what was seen")] = Rendered()
     truth: Annotated[Truth | None, setting("1", "what the references show, where known")] = None
     fit: Annotated[SceneFitSettings, setting("1", "how long and how finely")] = SceneFitSettings()
-    optimiser: Annotated[Adam | RMSprop | Lbfgs | GaussNewton, setting("1", "how to walk downhill")] = Adam()
-    schedule: Annotated[Constant | Cosine | Step | Exponential, setting("1", "factor on the learning rate")] = Constant()
-    loss: Annotated[L1 | L2 | RelativeL2 | Huber | Log, setting("1", "distance of image and reference")] = L2()
-    event: Annotated[tuple[Upsample | Checkpoint | Evaluate, ...], setting("1", "what happens between iterations")] = (
+    optimiser: Annotated[AnyOptimizer, setting("1", "how to walk downhill")] = Adam()
+    schedule: Annotated[AnySchedule, setting("1", "factor on the learning rate")] = Constant()
+    loss: Annotated[AnyLoss, setting("1", "distance of image and reference")] = L2()
+    event: Annotated[tuple[AnyEvent, ...], setting("1", "what happens between iterations")] = (
         Checkpoint(),
         Evaluate(),
     )

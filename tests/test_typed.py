@@ -84,7 +84,7 @@ def test_public_signatures_say_what_they_take(variant_rgb: str) -> None:
     kinds = reached(mivol.PUBLIC)
     assert {place: kind for place, kind in kinds.items() if vague(kind)} == {}
     # From `optimize` by way of the fit to its checkpoint: the walk does not end at the first signature.
-    assert {"optimize: return", "Fit: store", "Store: fingerprint", "VolumeData: meta"} <= set(kinds)
+    assert {"optimize: return", "Fit: checkpoint", "CheckpointFile: fingerprint", "VolumeData: meta"} <= set(kinds)
 
 
 def test_a_user_script_names_all_that_is_public() -> None:

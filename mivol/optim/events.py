@@ -202,7 +202,11 @@ class Evaluate(Event, tag="evaluate"):
         return ""
 
 
-EVENTS = make_table(Upsample, CoarseToFine, DropUnseen, UpdateOccupancy, ControlDensity, Checkpoint, Evaluate)
+EVENTS = make_table(Upsample, Checkpoint, Evaluate)
+"""Events that a file can name."""
+
+PLAN_EVENTS = make_table(CoarseToFine, DropUnseen, UpdateOccupancy, ControlDensity)
+"""Events of the plans of radiance fields and Gaussians."""
 
 
 def checkpoints_first(events: tuple[Event, ...]) -> list[Event]:

@@ -350,7 +350,8 @@ def decay_view_dependence(harmonics: mi.Float, width: int, share: float) -> mi.F
     return dr.select(dr.arange(mi.UInt32, dr.width(harmonics)) % width < 3, harmonics, harmonics * kept)
 
 
-PRIORS = make_table(
-    *(TotalVariation, HuberTotalVariation, Laplacian, Sparse, Bounds),
-    *(Smoothness, Sparsity, ViewDependence),
-)
+PRIORS = make_table(TotalVariation, HuberTotalVariation, Laplacian, Sparse, Bounds)
+"""Priors in the loss, which a file can name."""
+
+DECOUPLED_PRIORS = make_table(Smoothness, Sparsity, ViewDependence)
+"""Priors of radiance fields that move values after a step."""

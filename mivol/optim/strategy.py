@@ -8,7 +8,7 @@ checks and ``mivol optimize --help`` come. Tables of strategies are plain dicts,
 from __future__ import annotations
 
 import difflib
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, Union
 
 import msgspec
 
@@ -39,6 +39,11 @@ def make_table(*strategies: type[S]) -> dict[str, type[S]]:
     if len(named) != len(strategies):
         raise AssertionError("two strategies of one table share a name")
     return named
+
+
+def union_type(strategies: dict[str, type[S]]) -> Any:
+    """The type of a setting that is any strategy of a table."""
+    return Union[tuple(strategies.values())]  # noqa: UP007  (the members are known only at run time)
 
 
 def suggest_name(word: str, known: list[str]) -> str:
