@@ -20,8 +20,6 @@ from hatch_build import absolute
 from mivol import config
 from mivol.bench.harness.catalogue import STUDIES
 from mivol.cli import parser
-from mivol.optim.losses import LOSSES
-from mivol.optim.optimizers import OPTIMIZERS
 from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 
@@ -221,10 +219,10 @@ def test_links_on_pypi_lead_to_the_repository() -> None:
 
 
 def test_theory_says_what_each_name_computes() -> None:
-    """Every entry of the tables that a plan or a file chooses from, with its bench."""
+    """Every estimator and solver that a plan or a file chooses from, with its bench; optimizers and losses have docstrings."""
     text = (DOCS / "theory.md").read_text()
-    chosen = [*SEGMENT_ESTIMATORS, *ALL_SOLVERS, *OPTIMIZERS, *LOSSES]
-    assert len(chosen) > 20
+    chosen = [*SEGMENT_ESTIMATORS, *ALL_SOLVERS]
+    assert len(chosen) > 10
     assert [name for name in chosen if f"`{name}`" not in text] == []
     assert [study for study in STUDIES if f"`{study}`" not in text] == []
 
