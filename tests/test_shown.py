@@ -116,7 +116,7 @@ def test_a_view_is_shown_beside_its_render() -> None:
     rendered[1, 3] = np.nan
     text = pairs_html([("left <1>", seen, rendered)])
     (picture,) = pictures_of(text)
-    assert "left &lt;1&gt;: seen, rendered" in text
+    assert "left &lt;1&gt;: photograph, render" in text
     assert picture.shape == (EDGE // 2, 2 * EDGE + GAP, 3)
     assert picture[0, 0].tolist() == [255] * 3
     # 0.25 and 0.5 of white in sRGB: 137 and 188.

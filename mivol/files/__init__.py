@@ -1,6 +1,6 @@
-"""What lies on disk: volumes, projections, images; read, checked against their headers, written whole.
+"""Files of volumes, projections and images: readers that check headers, writers that never leave half a file.
 
-Needs no Mitsuba. Grids are float32 (Z, Y, X, C) at voxel centres over the unit cube, placed by ``to_world``.
+The room needs no Mitsuba. Grids are float32 (Z, Y, X, C) at voxel centres of the unit cube; ``to_world`` places the cube.
 """
 
 from __future__ import annotations
@@ -31,8 +31,6 @@ __all__ = [
     "encode_srgb",
     "frame_from_box",
     "frame_from_steps",
-    "to_space",
-    "stack_layers",
     "read_columns",
     "read_exr",
     "read_exr_header",
@@ -40,6 +38,8 @@ __all__ = [
     "read_slices",
     "read_stack",
     "read_volume",
+    "stack_layers",
+    "to_space",
     "whole_file",
     "write_exr",
     "write_png",

@@ -1,11 +1,8 @@
-"""A file is on disk whole or not at all: written beside its place, synced, then renamed over it.
+"""Write files so that neither a crash nor a second process leaves them incomplete.
 
-Conventions. The temporary lies in the same folder as the destination (a rename is atomic only within one file system),
-is hidden and ends in ``.part``; it is removed whatever goes wrong, Ctrl-C included. A symbolic link is followed, so the
-file it points to is replaced and the link stays.
-
-Here: :func:`whole_file` (for writers that want a path), :func:`write_whole` (for writers that want a binary file),
-:func:`write_whole_bytes`, :func:`write_whole_text`; :func:`remove_temporaries` cleans up after killed processes.
+Conventions. A temporary file in the folder of the destination is written, synced and renamed over the destination: a rename is
+atomic only within one file system. The temporary is hidden, ends in ``.part`` and is removed after every error, Ctrl-C
+included. A symbolic link stays: its target is replaced. :func:`lock_folder` keeps a second process out of a folder.
 """
 
 from __future__ import annotations
@@ -22,30 +19,30 @@ from typing import BinaryIO
 
 from mivol.errors import MivolError
 
-#: What the operating system said -> (what was found, the way out).
+#: error number of the system -> (found, way out).
 DISK_FAULTS: dict[int, tuple[str, str]] = {
     errno.ENOSPC: ("no space left on the disk", "free some space or write elsewhere"),
     errno.EDQUOT: ("the disk quota used up", "free some space or write elsewhere"),
-    errno.EFBIG: ("a file larger than the system allows here", "raise the limit (ulimit -f) or write elsewhere"),
+    errno.EFBIG: ("a file larger than the limit of the system", "raise the limit (ulimit -f) or write elsewhere"),
     errno.EROFS: ("a read-only file system", "write elsewhere"),
-    errno.EACCES: ("no permission to write there", "change the folder's permissions or write elsewhere"),
-    errno.EPERM: ("no permission to write there", "change the folder's permissions or write elsewhere"),
-    errno.ENAMETOOLONG: ("a file name that is too long", "choose a shorter one"),
+    errno.EACCES: ("no permission to write", "change the permissions of the folder or write elsewhere"),
+    errno.EPERM: ("no permission to write", "change the permissions of the folder or write elsewhere"),
+    errno.ENAMETOOLONG: ("a file name that is too long", "choose a shorter name"),
     errno.EIO: ("an input/output error of the disk", "write to another disk"),
 }
 
 
 @contextlib.contextmanager
 def disk_faults(path: str | os.PathLike, expected: str, left: str = "") -> Iterator[None]:
-    """Say in a sentence what the system refuses while something is written.
+    """Turn errors of the system during a write into one sentence.
 
     Args:
-        path: what is written; first in the sentence.
+        path: written file, the subject of the sentence.
         expected: what the disk should have had.
-        left: what is left of it, after the way out.
+        left: state of the file after the error, appended to the way out.
 
     Raises:
-        MivolError: for what :data:`DISK_FAULTS` knows; other errors pass.
+        MivolError: an error of :data:`DISK_FAULTS`; other errors pass unchanged.
     """
     try:
         yield
@@ -58,17 +55,17 @@ def disk_faults(path: str | os.PathLike, expected: str, left: str = "") -> Itera
 
 @contextlib.contextmanager
 def whole_file(path: str | os.PathLike) -> Iterator[Path]:
-    """Give a temporary path to write to; on leaving without an error it takes the place of ``path``.
+    """Yield a temporary path, and rename it to ``path`` after the body has ended without an error.
 
     Args:
-        path: the destination; its folder must exist.
+        path: destination in an existing folder.
 
     Yields:
-        A path in the same folder that does not exist yet; the body must create it.
+        A new path in the same folder, which the body must create.
 
     Raises:
-        MivolError: the destination is a folder, its folder is missing, or the system refused the write (disk full,
-            quota, permission ...); what was at ``path`` before is untouched and the temporary is gone.
+        MivolError: a folder as destination, a missing folder, or an error of the system (full disk, quota, permission ...).
+            An earlier file at ``path`` stays unchanged, and the temporary is removed.
     """
     target = _destination(Path(path))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
@@ -84,14 +81,14 @@ def whole_file(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def write_whole(path: str | os.PathLike, writer: Callable[[BinaryIO], object]) -> None:
-    """Write a file through ``writer``, never half: see :func:`whole_file`.
+    """Write a file through ``writer``, whole or not at all (:func:`whole_file`).
 
     Args:
-        path: the destination; its folder must exist.
-        writer: called once with a binary file, open for writing and seekable.
+        path: destination in an existing folder.
+        writer: function called once with a seekable binary file.
 
     Raises:
-        MivolError: as :func:`whole_file`; whatever ``writer`` raises is passed on.
+        MivolError: errors of :func:`whole_file`; errors of ``writer`` pass unchanged.
 
     Example:
         >>> write_whole("run.json", lambda file: file.write(b"{}"))
@@ -101,12 +98,12 @@ def write_whole(path: str | os.PathLike, writer: Callable[[BinaryIO], object]) -
 
 
 def write_whole_bytes(path: str | os.PathLike, data: bytes) -> None:
-    """Write ``data`` to ``path``, never half: see :func:`write_whole`."""
+    """Write ``data`` to ``path``, whole or not at all (:func:`write_whole`)."""
     write_whole(path, lambda file: file.write(data))
 
 
 def write_whole_text(path: str | os.PathLike, text: str) -> None:
-    """Write ``text`` to ``path`` as UTF-8, never half: see :func:`write_whole`."""
+    """Write ``text`` to ``path`` as UTF-8, whole or not at all (:func:`write_whole`)."""
     write_whole_bytes(path, text.encode("utf-8"))
 
 
@@ -114,10 +111,10 @@ _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.part")
 
 
 def remove_temporaries(folder: Path) -> list[Path]:
-    """Remove the temporaries of killed processes from a folder and the folders in it; call it where nobody else writes.
+    """Remove the temporaries of killed processes below a folder in which no other process writes.
 
     Returns:
-        What was removed.
+        Removed files.
     """
     stale = [path for path in folder.rglob(".*.part") if _TEMPORARY.fullmatch(path.name) and path.is_file()]
     for path in stale:
@@ -126,10 +123,10 @@ def remove_temporaries(folder: Path) -> list[Path]:
 
 
 def check_destination(path: str | os.PathLike) -> None:
-    """Refuse a file name that nothing can be written to, before there is anything to write.
+    """Refuse an impossible destination before the work for its content starts.
 
     Raises:
-        MivolError: the name is that of a folder, its folder is missing, or nothing may be written there.
+        MivolError: a folder as destination, a missing folder, or a folder without write permission.
     """
     target = _destination(Path(path))
     if not os.access(target.parent, os.W_OK):
@@ -140,9 +137,9 @@ def check_destination(path: str | os.PathLike) -> None:
 def _destination(path: Path) -> Path:
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
-        raise MivolError(f"{path}: found a folder or device, expected the name of a file to write; add a file name.")
+        raise MivolError(f"{path}: found a folder or device, expected a file to write; add a file name.")
     if not target.parent.is_dir():
-        raise MivolError(f"{path}: found no folder {target.parent}, expected one to write into; create it first.")
+        raise MivolError(f"{path}: found no folder {target.parent}, expected an existing folder; create it first.")
     return target
 
 
@@ -161,40 +158,42 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+# -- Locks --------------------------------------------------------------------------------------------------------
+
 LOCK = ".lock"
-"""What is locked on Windows, where folders cannot be."""
+"""Locked file on Windows, which cannot lock folders."""
 
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder for this process; the system lets go of it however the process ends.
+    """Lock a folder for this process on Linux, macOS and Windows. The system unlocks the folder when the process ends.
 
-    Where the file system knows no locks (some network disks) nothing is held, and nothing is refused.
+    A file system without locks (some network disks) gives no protection and no refusal.
 
     Raises:
-        MivolError: another process holds it.
+        MivolError: another process holds the lock.
     """
-    held = os.open(folder, os.O_RDONLY) if os.name == "posix" else os.open(folder / LOCK, os.O_RDWR | os.O_CREAT)
+    handle = os.open(folder, os.O_RDONLY) if os.name == "posix" else os.open(folder / LOCK, os.O_RDWR | os.O_CREAT)
     try:
-        _take(held, folder.name)
+        _lock(handle, folder.name)
         yield
     finally:
-        os.close(held)
+        os.close(handle)
 
 
-def _take(held: int, name: str) -> None:
+def _lock(handle: int, name: str) -> None:
     try:
         if os.name == "posix":
             import fcntl
 
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         else:
             import msvcrt
 
-            msvcrt.locking(held, msvcrt.LK_NBLCK, 1)
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
     except OSError as error:
-        # EWOULDBLOCK is flock's answer where another process holds it, EACCES that of msvcrt.
+        # If another process holds the lock, flock raises EWOULDBLOCK and msvcrt raises EACCES.
         if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-            raise MivolError(f'another run is at work in "{name}": wait for its end, or choose another folder.') from None
+            raise MivolError(f'another run uses the folder "{name}"; wait for its end, or choose another folder.') from None
         if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):
             raise

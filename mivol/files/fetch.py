@@ -1,8 +1,8 @@
-"""Public data by name: from its public address, checked by its SHA-256, kept in a cache; what broke off goes on.
+"""Public data sets by name: download, SHA-256 check and cache.
 
-Conventions. A set is one file at one commit of a public repository, so that it never changes. It is looked for below
-``MIVOL_DATA`` where that is set, then in the cache (``MIVOL_CACHE``, or the system's own place for caches). Paths of
-experiments may say ``data:NAME``. Nothing is fetched that was not asked for by name.
+Conventions. A data set is a file of a public repository at a fixed commit, so it never changes. A set is searched below
+``MIVOL_DATA`` and then in the cache (``MIVOL_CACHE``, or the cache folder of the system). Paths in experiments may be
+``data:NAME``. Only :func:`fetch_data` uses the network, and it resumes interrupted downloads.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
-from http.client import HTTPException, HTTPResponse
+from http.client import HTTPException
 from pathlib import Path
 
 from mivol.errors import MivolError
@@ -23,10 +23,10 @@ from mivol.errors import MivolError
 __all__ = ["DATA", "PREFIX", "DataSet", "cache_folder", "fetch_data", "find_local_file", "resolve_path"]
 
 PREFIX = "data:"
-"""With what a path begins that names a set."""
+"""Prefix of a path that names a data set."""
 
 SECONDS = 30.0
-"""How long a server may keep silent."""
+"""Timeout of the server [s]."""
 
 CHUNK = 1 << 16
 GITHUB = "https://raw.githubusercontent.com"
@@ -34,20 +34,20 @@ GITHUB = "https://raw.githubusercontent.com"
 
 @dataclass(frozen=True)
 class DataSet:
-    """One public file.
+    """A public file.
 
     Attributes:
-        name: what it is called here.
-        says: what it is.
-        url: its public address.
-        path: where it lies below ``MIVOL_DATA`` and the cache.
-        size: [byte].
-        sha256: of its bytes, in hexadecimal.
-        licence: as its repository states it.
+        name: name in mivol.
+        content: content of the file.
+        url: public address.
+        path: path below ``MIVOL_DATA`` and the cache.
+        size: size of the file [byte].
+        sha256: hash of the file, in hexadecimal.
+        licence: licence of the repository.
     """
 
     name: str
-    says: str
+    content: str
     url: str
     path: str
     size: int
@@ -56,10 +56,10 @@ class DataSet:
 
     def describe(self) -> str:
         """Describe the data set in a line."""
-        return f"{self.name}: {self.says}, {self.size / 2**20:.2f} MiB; licence: {self.licence}; {self.url}"
+        return f"{self.name}: {self.content}, {self.size / 2**20:.2f} MiB; licence: {self.licence}; {self.url}"
 
 
-def _at(repository: str, path: str) -> str:
+def _github_url(repository: str, path: str) -> str:
     return f"{GITHUB}/{repository}/{path}"
 
 
@@ -67,7 +67,7 @@ SETS = (
     DataSet(
         "smoke",
         "the smoke of Mitsuba's tutorials, 44 x 45 x 53",
-        _at("mitsuba-renderer/mitsuba-tutorials/a8dbee7e81b1039a983770ce1042f2d78688d0ae", "scenes/volume.vol"),
+        _github_url("mitsuba-renderer/mitsuba-tutorials/a8dbee7e81b1039a983770ce1042f2d78688d0ae", "scenes/volume.vol"),
         "volumes_vol/tutorials_volume.vol",
         419808,
         "85732786c722b91f4dcf8a7509bba286912d93ac03c23e781e1535d1609d9291",
@@ -76,19 +76,19 @@ SETS = (
     DataSet(
         "cloud",
         "a cumulus of a large-eddy simulation, 32 x 37 x 26 (Matheou and Chung 2014)",
-        _at(
+        _github_url(
             "CloudTomography/AT3D/ffd8994f91b42f390dbf31369447c2136749b93a",
             "at3d/data/synthetic_cloud_fields/jpl_les/rico32x37x26.txt",
         ),
         "clouds_les/rico32x37x26.txt",
         99634,
         "bca65313a095ce96f9a92d4af764c7fcfc453112abcf5921bd98e89c0b139c49",
-        "GPL-3 (that of its repository)",
+        "GPL-3 (of the repository)",
     ),
     DataSet(
         "tooth",
         "a CT scan of a tooth, 103 x 94 x 161",
-        _at("Kitware/vtk-js-datasets/cbdbd91c8b9f161d41fc1ddbb9369e17e20e6344", "data/nrrd/tooth.nrrd"),
+        _github_url("Kitware/vtk-js-datasets/cbdbd91c8b9f161d41fc1ddbb9369e17e20e6344", "data/nrrd/tooth.nrrd"),
         "ct_mri/tooth.nrrd",
         1559102,
         "5ad2e1c52929fde75becd7ba1654c5ef9f4fef40c3032cf36d72ef7bcca0dc64",
@@ -97,7 +97,7 @@ SETS = (
     DataSet(
         "bonsai",
         "a CT scan of a bonsai, 256 x 256 x 256",
-        _at("Kitware/vtk-js-datasets/cbdbd91c8b9f161d41fc1ddbb9369e17e20e6344", "data/vti/bonsai.vti"),
+        _github_url("Kitware/vtk-js-datasets/cbdbd91c8b9f161d41fc1ddbb9369e17e20e6344", "data/vti/bonsai.vti"),
         "ct_mri/bonsai.vti",
         3376795,
         "7129989b41b2197a73b68f66b3b889d9dc7ab6ef08dbdcfb61ca9cdf9f0981dc",
@@ -106,7 +106,7 @@ SETS = (
     DataSet(
         "tooth_projections",
         "181 synchrotron projections of a tooth, with flat and dark fields",
-        _at("tomopy/tomopy/2c94ed18a06f7908b018c6f8e43d320f8a8488f2", "source/tomopy/data/tooth.h5"),
+        _github_url("tomopy/tomopy/2c94ed18a06f7908b018c6f8e43d320f8a8488f2", "source/tomopy/data/tooth.h5"),
         "ct_projections/tooth.h5",
         1043312,
         "ab1d9bd073b7fb1beae4defa991c2a2626605c5cf1f4be0d0203656bc47b6489",
@@ -117,7 +117,7 @@ DATA: dict[str, DataSet] = {data.name: data for data in SETS}
 
 
 def cache_folder() -> Path:
-    """Where fetched data is kept: ``MIVOL_CACHE``, or the system's own place for caches."""
+    """Return the folder of fetched data: ``MIVOL_CACHE``, or the cache folder of the system."""
     if named := os.environ.get("MIVOL_CACHE"):
         return Path(named)
     home = Path.home()
@@ -129,23 +129,23 @@ def cache_folder() -> Path:
 
 
 def find_data_set(name: str) -> DataSet:
-    """The set of that name.
+    """Return a data set by name.
 
     Raises:
-        MivolError: there is none; the nearest is offered.
+        MivolError: an unknown name, with the most similar name.
     """
     if name not in DATA:
         near = get_close_matches(name, DATA, 1)
-        meant = f'did you mean "{near[0]}"?' if near else f"known are {', '.join(DATA)}."
-        raise MivolError(f'there is no data set "{name}": {meant}')
+        way_out = f'did you mean "{near[0]}"?' if near else f"choose one of {', '.join(DATA)}."
+        raise MivolError(f'there is no data set "{name}"; {way_out}')
     return DATA[name]
 
 
 def find_local_file(name: str) -> Path | None:
-    """The file of a set, where it is on this machine; None where it is not.
+    """Return the local file of a data set, or None before the download.
 
     Raises:
-        MivolError: there is no set of that name.
+        MivolError: an unknown name.
     """
     data = find_data_set(name)
     folders = [Path(folder) for folder in (os.environ.get("MIVOL_DATA"), cache_folder()) if folder]
@@ -153,40 +153,43 @@ def find_local_file(name: str) -> Path | None:
 
 
 def resolve_path(base: Path, named: str) -> Path:
-    """What an experiment names: a path relative to its file, or ``data:NAME``.
+    """Resolve a path of an experiment.
+
+    Args:
+        base: folder of the experiment.
+        named: path relative to ``base``, or ``data:NAME``.
 
     Raises:
-        MivolError: no such set, or it has not been fetched.
+        MivolError: an unknown data set, or a data set before its download.
     """
     if not named.startswith(PREFIX):
         return base / named
     name = named.removeprefix(PREFIX)
-    found = find_local_file(name)
-    if found is None:
+    file = find_local_file(name)
+    if file is None:
         raise MivolError(
-            f'the data set "{name}" is not on this machine: mivol fetch {name} brings it '
-            f"({find_data_set(name).size / 2**20:.2f} MiB), or name a file of your own in place of {named}."
+            f'the data set "{name}" is not on this machine; download it with "mivol fetch {name}" '
+            f"({find_data_set(name).size / 2**20:.2f} MiB), or name another file instead of {named}."
         )
-    return found
+    return file
 
 
 # -- Fetching -----------------------------------------------------------------------------------------------------
 
 
 def fetch_data(data: DataSet, folder: Path | None = None, watch: Callable[[int], None] = lambda done: None) -> Path:
-    """Bring a set to this machine; what is there and whole is not fetched again.
+    """Download a data set, unless a complete copy exists.
 
     Args:
-        data: one of ``DATA``.
-        folder: where it is kept; by default the cache.
-        watch: told how many bytes are there.
+        data: entry of ``DATA``.
+        folder: destination folder, by default the cache.
+        watch: function called with the number of downloaded bytes.
 
     Returns:
         The file.
 
     Raises:
-        MivolError: the server cannot be reached or breaks off (what has come is kept, and the next call goes on from there), or
-            the bytes are not those that the set had.
+        MivolError: an unreachable server, an interrupted download (the next call resumes it), or a wrong hash.
     """
     target = (folder or cache_folder()) / data.path
     if target.is_file() and hash_file(target) == data.sha256:
@@ -196,48 +199,41 @@ def fetch_data(data: DataSet, folder: Path | None = None, watch: Callable[[int],
     try:
         _download(data, partial, watch)
     except (OSError, HTTPException) as error:
-        there = partial.stat().st_size if partial.is_file() else 0
+        size = partial.stat().st_size if partial.is_file() else 0
         reason = getattr(error, "reason", None) or error
         raise MivolError(
-            f"{data.url} could not be fetched ({reason}) after {there} of {data.size} bytes: call again, and it goes on from "
-            "there."
+            f"{data.url} could not be fetched ({reason}) after {size} of {data.size} bytes; call again to resume the download."
         ) from None
-    found, size = hash_file(partial), partial.stat().st_size
+    sha256, size = hash_file(partial), partial.stat().st_size
     if size < data.size:
-        raise MivolError(
-            f"{data.url} broke off after {size} of {data.size} bytes: call again, and it goes on from there."
-        )
-    if found != data.sha256:
+        raise MivolError(f"{data.url} broke off after {size} of {data.size} bytes; call again to resume the download.")
+    if sha256 != data.sha256:
         partial.unlink()
         raise MivolError(
-            f"{data.url} has the SHA-256 {found[:12]}..., expected {data.sha256[:12]}...: it has changed or was damaged on its "
-            "way, and was not kept; call again, or report it."
+            f"{data.url} has the SHA-256 {sha256[:12]}..., expected {data.sha256[:12]}..., so the download was deleted; "
+            "call again, or report the change."
         )
     partial.replace(target)
     return target
 
 
 def _download(data: DataSet, partial: Path, watch: Callable[[int], None]) -> None:
-    there = partial.stat().st_size if partial.is_file() else 0
-    if there >= data.size:
+    size = partial.stat().st_size if partial.is_file() else 0
+    if size >= data.size:
         return
-    request = urllib.request.Request(data.url, headers={"Range": f"bytes={there}-"} if there else {})
-    with urllib.request.urlopen(request, timeout=SECONDS) as answer:
-        goes_on = there > 0 and answer.status == 206  # a server that knows no ranges sends all of it again
-        done = there if goes_on else 0
-        with partial.open("ab" if goes_on else "wb") as file:
-            # One byte more than expected shows a file that has grown; no server fills the disk.
-            while done <= data.size and (chunk := _read(answer)):
+    request = urllib.request.Request(data.url, headers={"Range": f"bytes={size}-"} if size else {})
+    with urllib.request.urlopen(request, timeout=SECONDS) as response:
+        is_resumed = size > 0 and response.status == 206  # a server without ranges sends the whole file again
+        done = size if is_resumed else 0
+        with partial.open("ab" if is_resumed else "wb") as file:
+            # One surplus byte reveals a larger file, so no server can fill the disk.
+            while done <= data.size and (chunk := response.read1(CHUNK)):
                 file.write(chunk)
                 done += len(chunk)
                 watch(done)
 
 
-def _read(answer: HTTPResponse) -> bytes:
-    return answer.read1(CHUNK)
-
-
 def hash_file(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,8 +1,8 @@
-"""HDF5 through h5py: volumes by dataset name, and tomographic projections in the Data Exchange layout.
+"""HDF5 through h5py: volumes by dataset name, and projections in the Data Exchange layout.
 
-Conventions. Projections are (views, rows, columns) counts; flat fields (beam without sample) and dark fields (no beam)
-are stacks of the same rows and columns; ``theta`` is in degrees unless its ``units`` say radians, and angles are given
-in radians. h5py is imported when the first such file is read.
+Conventions. Projections are counts (views, rows, columns). Flat fields (beam without sample) and dark fields (no beam) are
+stacks of the same rows and columns. ``theta`` is in degrees unless its ``units`` say radians; angles are returned in radians.
+h5py is imported at the first use.
 
 Reference: De Carlo et al. 2014, "Scientific data exchange: a schema for HDF5-based storage of raw and analyzed data".
 """
@@ -26,7 +26,7 @@ from mivol.shown import briefly
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 
-#: units attribute of theta -> factor to radians.
+#: units of theta -> factor to radians.
 ANGLES: dict[str, float] = {
     "degrees": np.pi / 180,
     "degree": np.pi / 180,
@@ -40,14 +40,14 @@ ANGLES: dict[str, float] = {
 @briefly
 @dataclasses.dataclass(frozen=True)
 class ProjectionData:
-    """What a detector counted while the sample turned.
+    """The counts of a tomographic scan.
 
     Attributes:
-        projections: float32 (views, rows, columns), counts with sample.
-        flats: float32 (n, rows, columns), counts of the beam alone.
-        darks: float32 (m, rows, columns), counts without beam.
-        angles: float64 (views,), rotation of the sample [rad].
-        meta: ``path``, ``format``, ``group``, ``dtype``, ``unit`` of the counts.
+        projections: counts with sample, float32 (views, rows, columns).
+        flats: counts of the beam without sample, float32 (n, rows, columns).
+        darks: counts without beam, float32 (m, rows, columns).
+        angles: rotation of the sample, float64 (views,) [rad].
+        meta: ``path``, ``format``, ``group``, ``dtype`` and ``unit`` of the counts.
     """
 
     projections: np.ndarray
@@ -58,7 +58,7 @@ class ProjectionData:
 
 
 def read_hdf5(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read one dataset (Z, Y, X) or (Z, Y, X, C); it lies on the unit cube, for HDF5 says nothing else."""
+    """Read a dataset (Z, Y, X) or (Z, Y, X, C), on the unit cube because HDF5 stores no placement."""
     with _opened(path) as file:
         grids = _grids(file)
         name = select_dataset(path, dataset.strip("/") if dataset else None, list(grids))
@@ -68,15 +68,14 @@ def read_hdf5(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 def read_projections(path: str | os.PathLike, group: str = "exchange") -> ProjectionData:
-    """Read a Data Exchange file: ``data``, ``data_white``, ``data_dark`` and ``theta`` of one group.
+    """Read a Data Exchange file: ``data``, ``data_white``, ``data_dark`` and ``theta`` of a group.
 
     Args:
-        path: an HDF5 file.
-        group: where the four lie.
+        path: HDF5 file.
+        group: group of the four datasets.
 
     Raises:
-        MivolError: no HDF5 file, h5py is not installed, a dataset missing, shapes that do not agree, angles that are
-            not finite, counts with NaN or Inf.
+        MivolError: no HDF5 file, a missing h5py or dataset, inconsistent shapes, or angles or counts that are not finite.
     """
     path = check_file(path)
     with _opened(path) as file:
@@ -108,7 +107,7 @@ def _check_projections(path: Path, projections: np.ndarray, flats: np.ndarray, d
                 path,
                 f"{name} of {stack.shape[1]} x {stack.shape[2]} pixels",
                 f"{projections.shape[1]} x {projections.shape[2]} as in data",
-                "crop both alike",
+                "crop both to the same pixels",
             )
     if len(angles) != len(projections):
         raise refusal(path, f"{len(angles)} angles", f"{len(projections)}, one per view", "correct theta")
@@ -123,7 +122,7 @@ def _h5py(path: Path) -> ModuleType:
     try:
         import h5py
     except ImportError as error:
-        raise refusal(path, "an HDF5 file but no h5py", "h5py installed", "install it: pip install h5py") from error
+        raise refusal(path, "an HDF5 file but no h5py", "an installed h5py", "install it: pip install h5py") from error
     return h5py
 
 
@@ -143,7 +142,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _grids(file: Any) -> dict[str, str | bytes]:
-    """The arrays of 3 or 4 dimensions: their names as text, and as the file has them (bytes where they are not UTF-8)."""
+    """The arrays of 3 or 4 dimensions: names as text -> names in the file (bytes if not UTF-8)."""
     names: list[str | bytes] = []
     file.visititems(lambda name, item: names.append(name) if getattr(item, "ndim", 0) in (3, 4) else None)
     return {_text(name): name for name in names}
@@ -153,8 +152,8 @@ def _dataset(file: Any, path: Path, group: str, name: str) -> Any:
     full = f"{group}/{name}"
     if full not in file or not hasattr(file[full], "shape"):
         holder = file[group] if group in file and hasattr(file[group], "keys") else file
-        there = sorted(map(_text, holder.keys()))
-        raise refusal(path, f"no dataset {full} (there: {', '.join(there)})", "one", "name another group or add it")
+        present = ", ".join(sorted(map(_text, holder.keys())))
+        raise refusal(path, f"no dataset {full} (present: {present})", "the dataset", "name another group or add the dataset")
     return file[full]
 
 

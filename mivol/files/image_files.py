@@ -1,8 +1,11 @@
-"""OpenEXR: float32 channels of one image, in layers, with text in the header.
+"""Image files: OpenEXR for linear numbers, PNG for people.
 
-Conventions. Images are (rows, columns), the first row on top. One part, scan lines, every channel float32 and ZIP
-compressed, so that ``mi.Bitmap`` reads them; layers are ``name.R``, ``name.G``, ``name.B``, the picture itself has no
-layer name. The file is made in memory and then written whole: OpenEXR 3.5 does not notice a full disk.
+Conventions. Images are (rows, columns), the first row on top. OpenEXR files have one part of scan lines, every channel float32
+and ZIP compressed, so ``mi.Bitmap`` reads them. Channels of a layer are ``name.R``, ``name.G``, ``name.B``; the main image has
+no layer name. A file is made in memory and then written whole, because OpenEXR 3.5 does not notice a full disk. PNG holds 8-bit
+sRGB: values are clipped to 0..1, and alpha, the fourth channel, is not gamma-coded.
+
+Reference: IEC 61966-2-1 (the sRGB curve).
 """
 
 from __future__ import annotations
@@ -22,23 +25,23 @@ from mivol.files.source import refusal
 
 MAGIC = b"\x76\x2f\x31\x01"
 
-#: channels of an array (rows, columns, C) -> their names within a layer.
+#: number of channels of an array -> names of the channels in a layer.
 COMPONENTS: dict[int, str] = {1: "Y", 3: "RGB", 4: "RGBA"}
 
 
 def write_exr(
     path: str | os.PathLike, channels: Mapping[str, np.ndarray], header: Mapping[str, str | int | float] | None = None
 ) -> None:
-    """Write one image of named channels.
+    """Write an image of named channels, whole or not at all.
 
     Args:
-        path: destination; written whole or not at all.
-        channels: name -> (rows, columns), one channel of that name; or layer -> (rows, columns, 3 or 4), the channels
-            ``layer.R`` and so on ("" for the picture itself: R, G, B). All of one size; NaN and Inf are kept.
-        header: text (for instance JSON) or numbers to store as attributes.
+        path: destination.
+        channels: (rows, columns) by channel name, or (rows, columns, 1, 3 or 4) by layer name, "" for the main image; the
+            channels of a layer are ``layer.R`` ... All arrays have equal sizes. NaN and Inf are kept.
+        header: attributes of the file: text (for instance JSON) or numbers.
 
     Raises:
-        MivolError: no channel, sizes that differ, a rank or channel count that is not known, disk full.
+        MivolError: no channel, different sizes, another rank or number of channels, or a full disk.
     """
     planes: dict[str, np.ndarray] = {}
     for name, array in channels.items():
@@ -46,7 +49,7 @@ def write_exr(
     shapes = {plane.shape for plane in planes.values()}
     if len(shapes) != 1 or 0 in next(iter(shapes)):
         found = ", ".join(f"{name} {plane.shape}" for name, plane in planes.items()) or "no channel"
-        raise refusal(path, found, "at least one channel and one size for all", "write them to separate files")
+        raise refusal(path, found, "at least one channel and equal sizes", "write separate files")
     attributes = {**(header or {}), "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     buffer = io.BytesIO()
     OpenEXR.File(attributes, {name: OpenEXR.Channel(plane) for name, plane in planes.items()}).write(buffer)
@@ -54,61 +57,61 @@ def write_exr(
 
 
 def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read every channel of a one-part image.
+    """Read all channels of an OpenEXR file of one part.
 
     Returns:
-        name -> float32 (rows, columns), with the names of the file ("R", "variance.R" ...), and the header's
-        attributes. :func:`stack_layers` stacks the channels again.
+        Channels, float32 (rows, columns), by their names in the file ("R", "variance.R" ...), and the attributes of the
+        header. :func:`stack_layers` stacks the channels into layers.
 
     Raises:
-        MivolError: missing, foreign, truncated, several parts, deep or subsampled pixels.
+        MivolError: a missing, foreign or truncated file, several parts, deep or subsampled pixels.
     """
     data = source.read_bytes(path)
     if not data.startswith(MAGIC):
-        raise refusal(path, "another kind of file (by its first bytes)", "OpenEXR", "name an .exr file")
+        raise refusal(path, "another format (by the first bytes)", "OpenEXR", "name an .exr file")
     try:
         file = OpenEXR.File(io.BytesIO(data), separate_channels=True)
-        parts, header, found = len(file.parts), dict(file.header()), file.channels()
+        parts, header, channels = len(file.parts), dict(file.header()), file.channels()
     except (RuntimeError, ValueError, IndexError) as error:
-        raise refusal(path, "a damaged OpenEXR file", "a whole one", "the file is truncated: copy it again") from error
+        raise refusal(path, "a damaged OpenEXR file", "a complete file", "the file is truncated: copy it again") from error
     if parts != 1:
-        raise refusal(path, f"{parts} parts", "one", "save the part you want as a file of its own")
-    images = {name: np.asarray(channel.pixels) for name, channel in found.items()}
+        raise refusal(path, f"{parts} parts", "one part", "save one part as a separate file")
+    images = {name: np.asarray(channel.pixels) for name, channel in channels.items()}
     if any(image.dtype.kind not in "fiu" or image.ndim != 2 for image in images.values()):
         raise refusal(path, "deep pixels", "one number per pixel and channel", "flatten the image first")
     if len({image.shape for image in images.values()}) != 1:
-        raise refusal(path, "channels of several sizes (subsampled)", "one size", "save it without subsampling")
+        raise refusal(path, "channels of different sizes (subsampled)", "equal sizes", "save the image without subsampling")
     header.pop("channels", None)
     return {name: image.astype(np.float32) for name, image in images.items()}, header
 
 
 def read_exr_header(path: str | os.PathLike) -> tuple[tuple[int, int], tuple[str, ...]]:
-    """(width, height) and the names of the channels, before a pixel is read.
+    """Read (width, height) and the names of the channels of an OpenEXR file, without pixels.
 
     Raises:
-        MivolError: missing, foreign or damaged.
+        MivolError: a missing, foreign or damaged file.
     """
     with source.check_file(path).open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise refusal(path, "another kind of file (by its first bytes)", "OpenEXR", "name an .exr file")
+            raise refusal(path, "another format (by the first bytes)", "OpenEXR", "name an .exr file")
     try:
         header = OpenEXR.File(str(path), header_only=True).header()
         low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
         names = tuple(channel.name for channel in header["channels"])
     except (RuntimeError, ValueError, IndexError, KeyError) as error:
-        raise refusal(path, "a damaged OpenEXR file", "a whole one", "the file is truncated: copy it again") from error
+        raise refusal(path, "a damaged OpenEXR file", "a complete file", "the file is truncated: copy it again") from error
     width, height = (int(n) for n in high - low + 1)
     return (width, height), names
 
 
 def stack_layers(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Stack channels into layers: "R", "G", "B" become "" (rows, columns, 3), "a.R" ... become "a"; others stay.
+    """Stack channels into layers: "R", "G", "B" become "", and "a.R" ... become "a"; other channels stay single.
 
     Args:
-        channels: as :func:`read_exr` gives them.
+        channels: channels of :func:`read_exr`.
 
     Returns:
-        layer -> (rows, columns, 3 or 4), and single channels under their own name -> (rows, columns).
+        (rows, columns, 3 or 4) by layer name, and (rows, columns) by the name of a single channel.
     """
     stacked: dict[str, np.ndarray] = {}
     for name in channels:
@@ -125,7 +128,7 @@ def stack_layers(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _planes(path: object, name: str, array: np.ndarray) -> dict[str, np.ndarray]:
     if array.dtype.kind not in "biuf":
-        raise refusal(path, f"pixels of type {array.dtype} in {name!r}", "real numbers", "convert them to float32")
+        raise refusal(path, f"pixels of type {array.dtype} in {name!r}", "real numbers", "convert the pixels to float32")
     plane = np.ascontiguousarray(array, np.float32)
     if array.ndim == 2 and name:
         return {name: plane}
@@ -142,25 +145,25 @@ def _planes(path: object, name: str, array: np.ndarray) -> dict[str, np.ndarray]
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write a linear image as 8-bit sRGB PNG.
+    """Write a linear image as 8-bit sRGB PNG, whole or not at all.
 
     Args:
-        path: destination; written whole or not at all.
+        path: destination.
         image: real numbers (rows, columns) or (rows, columns, 1, 3 or 4).
 
     Raises:
-        MivolError: another shape, an empty image, NaN (named by its pixel), disk full.
+        MivolError: another shape, an empty image, NaN (with its pixel), or a full disk.
     """
     image = np.asarray(image)
     if image.dtype.kind not in "biuf" or image.ndim not in (2, 3) or image.size == 0:
-        raise refusal(path, f"an array {image.shape} of {image.dtype}", "an image of real numbers", "reshape it")
+        raise refusal(path, f"an array {image.shape} of {image.dtype}", "an image of real numbers", "convert the array")
     if image.ndim == 3 and image.shape[2] not in (1, 3, 4):
-        raise refusal(path, f"{image.shape[2]} channels", "1, 3 or 4", "choose channels with image[..., :3]")
+        raise refusal(path, f"{image.shape[2]} channels", "1, 3 or 4 channels", "choose channels with image[..., :3]")
     image = image.astype(np.float32)
     bad = np.isnan(image)
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0][:2])
-        raise refusal(path, f"NaN at row {row}, column {column}", "numbers", "find its cause or use numpy.nan_to_num")
+        raise refusal(path, f"NaN at row {row}, column {column}", "numbers", "find the cause, or use numpy.nan_to_num")
     coded = encode_srgb(image)
     if image.ndim == 3 and image.shape[2] == 4:
         coded[..., 3] = np.clip(image[..., 3], 0, 1)
@@ -171,6 +174,6 @@ def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """The sRGB curve of IEC 61966-2-1: linear light, clipped to 0..1, to code values 0..1 (same shape)."""
+    """Convert linear light, clipped to 0..1, to code values 0..1 by the sRGB curve, in the same shape."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)

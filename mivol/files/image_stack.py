@@ -1,6 +1,7 @@
-"""Stacks of projections: TIFF (one file of many pages, or many files), NumPy and HDF5, as one array.
+"""Stacks of images as one array: projections in TIFF, NumPy or HDF5, and headerless slices of a volume.
 
-Conventions. (n, rows, cols) float32. A pattern (``scan_*.tif``) takes the files in the order of the numbers in their names.
+Conventions. A stack is float32 (n, rows, columns). A pattern (``scan_*.tif``) takes the files in the order of the numbers in
+their names: slice.2 before slice.10.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarra
     """Read projections.
 
     Args:
-        path: a TIFF, .npy, .npz or HDF5 file, or a pattern of TIFF files.
-        dataset: which array of an .npz or HDF5 file.
+        path: TIFF, .npy, .npz or HDF5 file, or a pattern of TIFF files.
+        dataset: name of the array in an .npz or HDF5 file.
 
     Returns:
-        (n, rows, cols) float32.
+        Projections (n, rows, columns), float32.
 
     Raises:
-        MivolError: no such file, not such a stack, images of several sizes, numbers that are not finite.
+        MivolError: no file, another format, images of different sizes, or numbers that are not finite.
     """
     files = sorted(Path(path).parent.glob(Path(path).name), key=natural_order)
     if not files or Path(path).is_dir():
@@ -39,7 +40,7 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarra
     if files[0].suffix.lower() in TIFF:
         stack = read_images(files)
     elif len(files) > 1:
-        raise refusal(path, f"{len(files)} files", "one, or a pattern of TIFF files", "name one of them")
+        raise refusal(path, f"{len(files)} files", "one file, or a pattern of TIFF files", "name one of the files")
     else:
         stack = read_volume(files[0], dataset).values[..., 0]
     check_finite(path, stack)
@@ -47,41 +48,41 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarra
 
 
 def check_finite(path: str | os.PathLike, stack: np.ndarray) -> None:
-    """Refuse readings that are no finite numbers.
+    """Refuse readings that are not finite.
 
     Raises:
-        MivolError: how many, and where the first is.
+        MivolError: states their number and the index of the first.
     """
     bad = ~np.isfinite(stack)
     if bad.any():
-        where = tuple(map(int, np.argwhere(bad)[0]))
+        first = tuple(map(int, np.argwhere(bad)[0]))
         raise refusal(
             path,
-            f"{int(bad.sum())} pixels that are not finite, the first at (view, row, column) = {where}",
+            f"{int(bad.sum())} pixels that are not finite, the first at (view, row, column) = {first}",
             "finite numbers",
-            "write 0 there: a reading of 0 has weight 0",
+            "replace them by 0: a reading of 0 has weight 0",
         )
 
 
 def read_images(files: list[Path]) -> np.ndarray:
-    """All pages of TIFF files, one after the other.
+    """Read the pages of TIFF files.
 
     Returns:
-        (n, rows, cols) float32.
+        Pages (n, rows, columns), float32.
 
     Raises:
-        MivolError: as :func:`read_stack`.
+        MivolError: errors of :func:`read_stack`.
     """
     from PIL import Image, ImageSequence
 
     pages = []
     for file in files:
-        there = check_file(file)
+        check_file(file)
         try:
-            with Image.open(there) as image:
+            with Image.open(file) as image:
                 pages += [np.asarray(page, np.float32) for page in ImageSequence.Iterator(image)]
-        except Exception as error:  # Pillow raises what its parser stumbles over: a TypeError where there is no width
-            raise refusal(file, f"a damaged or foreign file ({error})", "TIFF", "copy it again") from error
+        except Exception as error:  # Pillow raises errors of its parser, such as a TypeError without a width
+            raise refusal(file, f"a damaged or foreign file ({error})", "TIFF", "copy the file again") from error
     shapes = {page.shape for page in pages}
     if len(shapes) > 1 or len(next(iter(shapes))) != 2:
         raise refusal(files[0], f"images of shapes {sorted(shapes)[:3]}", "grey images of one size", "crop or convert them")
@@ -98,22 +99,22 @@ def read_slices(
     pattern: str = "*",
     skip: int = 0,
 ) -> VolumeData:
-    """Read a folder of raw slices as one volume.
+    """Read a folder of headerless slices as a volume: a file for each z from 0 upwards, x fastest.
 
     Args:
-        folder: where they lie.
-        shape: (rows, columns) = (Y, X) of each.
+        folder: folder of the files.
+        shape: (rows, columns) = (Y, X) of a slice.
         dtype: NumPy type with its byte order, for instance "<u2".
-        spacing: distance between voxel centres along x, y, z.
-        origin: world position of the first voxel's centre.
-        pattern: file names to take (shell pattern); there must be at least one.
-        skip: bytes before the numbers in each file.
+        spacing: distance between voxel centres along x, y, z [length].
+        origin: centre of the first voxel in the world [length].
+        pattern: shell pattern of the file names, with at least one match.
+        skip: bytes before the numbers of each file.
 
     Returns:
         The volume (files, rows, columns, 1).
 
     Raises:
-        MivolError: no such folder or files, a file of another length, a spacing that flattens the box.
+        MivolError: no folder or file, a file of another length, or a spacing that flattens the box.
 
     Example:
         >>> read_slices("headsq", shape=(64, 64), dtype="<u2", spacing=(3.2, 3.2, 1.5), pattern="quarter.*")
@@ -123,7 +124,7 @@ def read_slices(
         raise refusal(folder, "no folder", "a folder of raw slices", "check the path")
     files = sorted((name for name in folder.glob(pattern) if name.is_file()), key=natural_order)
     if not files:
-        raise refusal(folder, f"no file that fits {pattern!r}", "at least one slice", "give another pattern")
+        raise refusal(folder, f"no file matching {pattern!r}", "at least one slice", "give another pattern")
     rows, columns = shape
     if min(rows, columns) < 1:
         raise refusal(folder, f"a slice shape of {shape}", "at least 1 x 1", "give (rows, columns)")
@@ -142,5 +143,5 @@ def read_slices(
 
 
 def natural_order(path: Path) -> tuple:
-    """Numbers in a name compare as numbers: pieces alternate text, number, text ..."""
+    """Return a sort key that compares numbers in a name as numbers."""
     return tuple(int(piece) if piece.isdigit() else piece for piece in re.split(r"(\d+)", path.name))

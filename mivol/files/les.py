@@ -1,8 +1,10 @@
 """Clouds of large-eddy simulations as text: i, j, k, liquid water content [g/m^3], effective radius [um] of wet cells.
 
-Conventions. Lines: a comment; nx, ny, nz; dx, dy [km]; nz altitudes [km], which must be evenly spaced; the names of
-the columns; then one line per cell with indices from 0. Cells that are not listed are dry. World lengths are metres.
-Water drops much larger than the wavelength have the extinction 1.5 lwc / r_e [1/m] (water of 1 g/cm^3, efficiency 2).
+Own reader: only AT3D itself reads this format.
+
+Conventions. The lines are: a comment; nx, ny, nz; dx, dy [km]; nz evenly spaced altitudes [km]; the names of the columns; one
+line per cell with indices from 0. Missing cells are dry. World lengths are metres. Water drops much larger than the wavelength
+have the extinction 1.5 lwc / r_e [1/m], for water of 1 g/cm^3 and an extinction efficiency of 2.
 
 Reference: Matheou and Chung 2014 (the simulation); the file format is AT3D's.
 """
@@ -19,17 +21,17 @@ from mivol.files.source import refusal, select_dataset
 from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 COLUMNS = ("x,y,z,lwc,reff", "i,j,k,lwc,reff")
-"""The line that names the columns, as AT3D's files have it and as its documentation does; both count cells."""
+"""The line of the column names in AT3D's files and in its documentation; both give cell indices."""
 
-#: Unevenness of the altitudes [of their mean step] that rounding to 1 m leaves at steps of 40 m.
+#: Largest unevenness of the altitudes [mean step]: rounding to 1 m at steps of 40 m.
 UNEVEN = 0.03
 
-#: Cells of a grid; a list of wet cells does not bound it, so a damaged size would ask for any amount of memory.
+#: Largest number of cells. The list of wet cells does not bound the grid, so a damaged size could request unlimited memory.
 LARGEST = 2**30
 
 
 def is_les(head: bytes) -> bool:
-    """Whether the first lines name the columns."""
+    """Return whether the first bytes name the columns."""
     return any(names.encode() in head.replace(b" ", b"") for names in COLUMNS)
 
 
@@ -37,8 +39,7 @@ def read_les(path: Path, dataset: str | None = None) -> VolumeData:
     """Read ``extinction`` [1/m] (the default), ``lwc`` [g/m^3] or ``reff`` [um] on the dense grid.
 
     Raises:
-        MivolError: a header that is not understood, cells outside the grid, altitudes that are not evenly spaced,
-            water of no radius.
+        MivolError: an invalid header, cells outside the grid, uneven altitudes, or water with a radius of 0.
     """
     lines = [line.partition("#")[0].strip() for line in source.read_bytes(path).decode("ascii", "replace").splitlines()]
     lines = [line for line in lines if line]
@@ -69,5 +70,5 @@ def read_les(path: Path, dataset: str | None = None) -> VolumeData:
 def _extinction(cells: np.ndarray, path: Path) -> np.ndarray:
     water, radius = cells[:, 3], cells[:, 4]
     if ((radius <= 0) & (water > 0)).any():
-        raise refusal(path, "water of effective radius 0", "a radius above 0 where there is water", "correct the file")
+        raise refusal(path, "water of effective radius 0", "a radius above 0 in wet cells", "correct the file")
     return np.divide(1.5 * water, radius, out=np.zeros_like(water), where=radius > 0)

@@ -1,11 +1,11 @@
 """Triangle meshes on disk: Stanford's ``.ply`` (binary, little endian) and Wavefront's ``.obj`` (text).
 
-Conventions. Faces name their corners counterclockwise as seen from outside, from 0 (``.obj`` counts from 1, which the writer
-sees to). Colours are code values 0..1; ``.ply`` holds them in 8 bits, as most programs expect (Mitsuba's ``ply`` takes numbers
-for what they are and warns: divide its ``vertex_color`` by 255 and take the sRGB curve off), ``.obj`` after the coordinates,
-where most programs look for them though the format's first description has none.
+Own reader and writers: plyfile is under the GPL.
 
-Here: :data:`MESH_WRITERS`, :class:`Mesh`, :func:`write_mesh`, :func:`read_ply`.
+Conventions. Faces list their corners counterclockwise as seen from outside, from 0; an ``.obj`` counts from 1. Colours are
+code values 0..1. A ``.ply`` stores colours in 8 bits, as most programs expect. Mitsuba's ``ply`` reads these as linear numbers
+with a warning, so divide its ``vertex_color`` by 255 and invert the sRGB curve. An ``.obj`` has colours after the coordinates,
+a common extension of the format.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles.
+    """A triangle mesh.
 
     Attributes:
-        points: (V, 3) world [length].
-        faces: (F, 3) whole numbers of points.
-        normals: (V, 3) unit, outwards; None: none.
-        colours: (V, 3) in 0..1; None: none.
+        points: world positions (V, 3) [length].
+        faces: indices of points (F, 3).
+        normals: unit normals (V, 3) pointing outwards, optional.
+        colours: code values (V, 3) in 0..1, optional.
 
     Raises:
-        MivolError: shapes that do not fit together, or a corner that is no point.
+        MivolError: inconsistent shapes, or an index without a point.
     """
 
     points: np.ndarray
@@ -52,56 +52,54 @@ class Mesh:
         per_point = [a for a in (self.points, self.normals, self.colours) if a is not None]
         shapes = [a.shape for a in (*per_point, self.faces)]
         if any(a.shape != (len(self.points), 3) for a in per_point) or self.faces.ndim != 2 or self.faces.shape[1] != 3:
-            raise refusal("a mesh", f"arrays of {shapes}", "(V, 3) for each of the points and (F, 3) faces", "reshape them")
+            raise refusal("a mesh", f"arrays of {shapes}", "(V, 3) per point and (F, 3) faces", "reshape the arrays")
         if self.faces.size and not (self.faces.min() >= 0 and self.faces.max() < len(self.points)):
             found = f"corners {self.faces.min()} to {self.faces.max()}"
-            raise refusal("a mesh", found, f"numbers of its {len(self.points)} points", "count from 0")
+            raise refusal("a mesh", found, f"indices of its {len(self.points)} points", "count from 0")
 
 
 def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
-    """Write a mesh, whole or not at all; the suffix chooses the format (:data:`MESH_WRITERS`).
+    """Write a mesh, whole or not at all; the suffix selects the format (:data:`MESH_WRITERS`).
 
     Raises:
-        MivolError: another suffix, disk full.
+        MivolError: another suffix, or a full disk.
     """
-    path = Path(path)
-    if path.suffix.lower() not in MESH_WRITERS:
-        raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(MESH_WRITERS)}", "correct the name")
-    write_whole(path, lambda file: MESH_WRITERS[path.suffix.lower()](file, mesh))
+    writer = source.select_by_suffix(Path(path), MESH_WRITERS)
+    write_whole(path, lambda file: writer(file, mesh))
 
 
 def read_ply(path: str | os.PathLike) -> Mesh:
-    """Read a ``.ply`` that :func:`write_mesh` wrote.
+    """Read a ``.ply`` written by :func:`write_mesh`.
 
     Raises:
-        MivolError: missing, truncated, or laid out in another way.
+        MivolError: a missing or truncated file, or another layout.
     """
     data = source.read_bytes(path)
     head, end, body = data.partition(b"end_header\n")
     words = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     counts = {w[1]: int(w[2]) for w in words if len(w) == 3 and w[0] == "element" and w[2].isdigit()}
     names = tuple(w[2] for w in words if len(w) == 3 and w[0] == "property")
-    kinds = {_point(*kind).names: _point(*kind) for kind in ((n, c) for n in (False, True) for c in (False, True))}
+    kinds = {_point_type(*kind).names: _point_type(*kind) for kind in ((n, c) for n in (False, True) for c in (False, True))}
     if not end or not head.startswith(PLY_HEAD.encode()) or names not in kinds or counts.keys() != {"vertex", "face"}:
-        raise refusal(path, "another layout", "a binary mesh as mivol writes it", "convert it")
+        raise refusal(path, "another layout", "a binary mesh of mivol", "convert the file")
     n, kind = counts["vertex"], kinds[names]
     points = source.parse_elements(body[: n * kind.itemsize], kind, n, path)
     faces = source.parse_elements(body[n * kind.itemsize :], FACE, counts["face"], path)
-    held = {"points": "xyz", "normals": ("nx", "ny", "nz"), "colours": ("red", "green", "blue")}
-    arrays = {k: np.stack([points[c] for c in v], axis=1) for k, v in held.items() if v[0] in kind.names}
+    columns = {"points": "xyz", "normals": ("nx", "ny", "nz"), "colours": ("red", "green", "blue")}
+    arrays = {k: np.stack([points[c] for c in v], axis=1) for k, v in columns.items() if v[0] in kind.names}
     if "colours" in arrays:
         arrays["colours"] = arrays["colours"] / np.float32(255)
     return Mesh(faces=faces["corners"].astype(np.int64), **arrays)
 
 
-def _point(normals: bool, colours: bool) -> np.dtype:
-    """What a ``.ply`` holds of a point."""
+def _point_type(normals: bool, colours: bool) -> np.dtype:
+    """The record of a point in a ``.ply``."""
     numbers = [*"xyz", *(("nx", "ny", "nz") if normals else ())]
     return np.dtype([(c, "<f4") for c in numbers] + [(c, "u1") for c in (("red", "green", "blue") if colours else ())])
 
 
 def _write_ply(file: BinaryIO, mesh: Mesh) -> None:
-    points = np.empty(len(mesh.points), _point(mesh.normals is not None, mesh.colours is not None))
+    points = np.empty(len(mesh.points), _point_type(mesh.normals is not None, mesh.colours is not None))
     codes = None if mesh.colours is None else np.rint(np.clip(mesh.colours, 0, 1) * 255)
     values = [a for a in (mesh.points, mesh.normals, codes) if a is not None]
     for name, column in zip(points.dtype.names, np.concatenate(values, axis=1).T, strict=True):
@@ -125,5 +123,5 @@ def _write_obj(file: BinaryIO, mesh: Mesh) -> None:
     np.savetxt(file, number, fmt="f %d %d %d" if mesh.normals is None else "f %d//%d %d//%d %d//%d")
 
 
-#: suffix -> writer(file, mesh).
+#: suffix -> writer of a mesh to a binary file.
 MESH_WRITERS: dict[str, Callable[[BinaryIO, Mesh], None]] = {".ply": _write_ply, ".obj": _write_obj}

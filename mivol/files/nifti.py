@@ -1,8 +1,11 @@
 """NIfTI-1 and NIfTI-2 in one file (``.nii``, ``.nii.gz``): a binary header, then the numbers, x fastest.
 
-Conventions. The world frame is RAS (x to the right, y forwards, z up). The place is the sform where its code is above
-0, else the qform (quaternion, pixdim, qfac), else the bare voxel sizes. Stored numbers are scaled by ``scl_slope`` and
-``scl_inter`` unless the slope is 0. One axis beyond the third may be longer than 1: it becomes the channels.
+Own reader: nibabel 5.4 (13 MB, 0.4 s to import) reads the test files, but accepts files longer than their header says, reads
+complex numbers and names no sizes in its errors.
+
+Conventions. The world frame is RAS (x to the right, y forwards, z up). The placement is the sform if its code is above 0, else
+the qform (quaternion, pixdim, qfac), else the voxel sizes. Stored numbers are scaled by ``scl_slope`` and ``scl_inter`` unless
+the slope is 0. One axis after the third may be longer than 1 and becomes the channels.
 
 Reference: nifti.nimh.nih.gov, nifti1.h and nifti2.h.
 """
@@ -39,7 +42,14 @@ UNITS: dict[int, str] = {0: "unknown", 1: "m", 2: "mm", 3: "um"}
 
 
 class Layout(NamedTuple):
-    """A version's header: its length, its magic bytes and their offset, and name -> (struct code, byte offset)."""
+    """The header of a version of the format.
+
+    Attributes:
+        size: length [byte], which is also the first number of the header.
+        magic: magic bytes.
+        magic_at: offset of the magic bytes [byte].
+        fields: name -> (struct code, byte offset).
+    """
 
     size: int
     magic: bytes
@@ -47,7 +57,7 @@ class Layout(NamedTuple):
     fields: dict[str, tuple[str, int]]
 
 
-#: length of the header, which is its first number -> layout.
+#: length of the header -> layout.
 LAYOUTS: dict[int, Layout] = {
     348: Layout(
         348,
@@ -83,17 +93,17 @@ LAYOUTS: dict[int, Layout] = {
     ),
 }
 
-#: Extensions between header and data are text; a gigabyte of them is a damaged number.
+#: Largest offset of the data [byte]. Extensions before the data are text, so a gigabyte means a damaged number.
 LARGEST_OFFSET = 2**30
 
 
 def is_nifti(head: bytes) -> bool:
-    """Whether the first bytes are a NIfTI header of either version and byte order."""
+    """Return whether the first bytes are a NIfTI header of either version and byte order."""
     return _layout(head) is not None
 
 
 def is_nifti_gz(head: bytes) -> bool:
-    """Whether the first bytes are gzip around a NIfTI header."""
+    """Return whether the first bytes are a NIfTI header in gzip."""
     return head[:2] == b"\x1f\x8b" and is_nifti(_peek(head))
 
 
@@ -101,7 +111,7 @@ def read_nifti(path: Path, dataset: str | None = None) -> VolumeData:
     """Read a single-file NIfTI.
 
     Raises:
-        MivolError: truncated, a type that is not a real number, several time steps, no usable place.
+        MivolError: a truncated file, numbers that are not real, or several time steps.
     """
     refuse_dataset(path, dataset)
     data = source.read_bytes(path)
@@ -128,7 +138,7 @@ def read_nifti(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 def _stored(data: bytes, offset: float, header: int, dtype: np.dtype, shape: list[int], path: Path) -> np.ndarray:
-    """The numbers of ``shape`` (flat), from ``offset`` or the end of the header, whichever is later."""
+    """The flat numbers of ``shape``, from ``offset`` or the end of the header, whichever comes later."""
     if not 0 <= offset <= LARGEST_OFFSET:
         raise refusal(path, f"vox_offset {offset}", f"0 to {LARGEST_OFFSET}", "correct the header")
     first, count = max(int(offset), header), math.prod(shape)
@@ -153,23 +163,23 @@ def _layout(head: bytes) -> tuple[Layout, str] | None:
 
 
 def _sizes(dim: tuple[int, ...], path: Path) -> tuple[list[int], int]:
-    """Voxels along x, y, z, and the product of the further axes, of which one may be longer than 1."""
+    """Voxels along x, y, z, and the product of the other axes, at most one of them longer than 1."""
     rank = dim[0]
     sizes = [int(number) for number in dim[1 : rank + 1]] if 1 <= rank <= 7 else []
     sizes += [1] * (3 - len(sizes))
     if rank not in range(1, 8) or min(sizes) < 1 or sum(number > 1 for number in sizes[3:]) > 1:
-        raise refusal(path, f"dim {list(dim)}", "3 sizes above 0 and at most one further axis", "extract one volume")
+        raise refusal(path, f"dim {list(dim)}", "3 sizes above 0 and at most one more axis", "extract one volume")
     return sizes[:3], math.prod(sizes[3:])
 
 
 def _dtype(code: int, order: str, path: Path) -> tuple[np.dtype, int]:
     if code not in TYPES:
-        raise refusal(path, f"datatype {code}", f"a real one ({', '.join(map(str, TYPES))})", "convert it to float32 first")
+        raise refusal(path, f"datatype {code}", f"a real type ({', '.join(map(str, TYPES))})", "convert it to float32 first")
     return (np.dtype("u1"), 3) if TYPES[code] == "3u1" else (np.dtype(order + TYPES[code]), 1)
 
 
 def _place(fields: dict[str, tuple]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Steps (3, 3), the first voxel's centre (3,), and which form they come from."""
+    """Steps (3, 3), the centre of the first voxel (3,), and the name of their form."""
     pixdim = np.array(fields["pixdim"], np.float64)
     qform, sform = fields["codes"]
     if sform > 0:
@@ -183,7 +193,7 @@ def _place(fields: dict[str, tuple]) -> tuple[np.ndarray, np.ndarray, str]:
 
 
 def rotation(b: float, c: float, d: float) -> np.ndarray:
-    """The rotation (3, 3) of the unit quaternion (a, b, c, d) with a >= 0 left out, as NIfTI stores it."""
+    """Return the rotation (3, 3) of the unit quaternion (a, b, c, d), whose a >= 0 NIfTI does not store."""
     a = np.sqrt(max(0.0, 1 - (b * b + c * c + d * d)))
     return np.array(
         [

@@ -1,12 +1,13 @@
-"""Scans of Nikon (X-Tek) laboratory CT: an ``.xtekct`` file of settings, and a TIFF file for each projection.
+"""Scans of Nikon (X-Tek) laboratory CT: an ``.xtekct`` file of settings, and a TIFF file per projection.
 
-Conventions. Lengths are mm, angles degrees. In the files the first row of an image is the highest, and its columns run as they
-are seen by someone who looks from the detector to the source: both are turned round on reading, as
-:mod:`mivol.tomography.geometry` has them.
+Own reader: TIGRE and the Core Imaging Library read these scans as parts of whole reconstruction toolkits.
 
-Sources of the format's facts: ``NikonDataReader`` of the Core Imaging Library (University of Manchester and STFC), which takes
-angles from the steps because it found those in ``_ctdata.txt`` and ``.ang`` files to be wrong; the loaders of TIGRE and of
-CCPi-Reconstruction (names of the files, columns of the lists).
+Conventions. Lengths are in mm, angles in degrees. In the files the first row of an image is the highest, and columns run as
+seen from the detector towards the source. Reading flips both, as :mod:`mivol.tomography.geometry` expects.
+
+Sources: ``NikonDataReader`` of the Core Imaging Library (University of Manchester and STFC), which computes angles from the
+steps because the angles in ``_ctdata.txt`` and ``.ang`` files were wrong; the loaders of TIGRE and of CCPi-Reconstruction (file
+names, columns of the lists).
 """
 
 from __future__ import annotations
@@ -28,21 +29,21 @@ SECTION = "xtekct"
 
 @dataclass(frozen=True, eq=False)
 class NikonScan:
-    """What an ``.xtekct`` file says.
+    """The settings of an ``.xtekct`` file.
 
     Attributes:
-        path: of the file.
-        images: a file for each projection.
-        source_to_axis, source_to_detector: [mm].
-        detector: (rows, columns).
+        path: path of the file.
+        images: file of each projection.
+        source_to_axis, source_to_detector: distances from the source [mm].
+        detector: pixels (rows, columns).
         pitch: distance of pixel centres along (rows, columns) [mm].
         white_level: reading of a pixel without an object.
-        angles: (views,) how far the sample has turned, clockwise as seen from above [degree].
-        axis_offset: where the rotation axis is, along a detector's columns that are turned round [mm].
-        tilt, roll: of the rotation axis, towards the detector and along it [degree].
-        shape: (Z, Y, X) voxels; None where the file does not say.
-        voxel_size: (x, y, z) [mm].
-        left_out: settings that are not 0 and that nothing here heeds.
+        angles: rotation of the sample (views,), clockwise as seen from above [degree].
+        axis_offset: position of the rotation axis along the flipped detector columns [mm].
+        tilt, roll: angles of the rotation axis, towards the detector and along the detector [degree].
+        shape: voxels (Z, Y, X), if known.
+        voxel_size: edges of a voxel (x, y, z) [mm].
+        left_out: settings with a value that mivol ignores.
     """
 
     path: Path
@@ -64,11 +65,12 @@ class NikonScan:
 def read_nikon(path: str | os.PathLike) -> NikonScan:
     """Read the settings of a scan and find its images.
 
-    The axis is at ``ObjectOffsetX``; older files have it on the detector, at the mean of ``CentreOfRotationTop`` and
-    ``CentreOfRotationBottom``, whose difference is the axis' roll. Angles are ``InitialAngle + AngularStep i``.
+    The rotation axis is at ``ObjectOffsetX``. Older files give its position on the detector: the mean of
+    ``CentreOfRotationTop`` and ``CentreOfRotationBottom``, whose difference is the roll. Angles are
+    ``InitialAngle + AngularStep i``.
 
     Raises:
-        MivolError: no such file, a key that is missing or no number, another number of images than of projections.
+        MivolError: no file, a missing or invalid key, or different numbers of images and projections.
     """
     path = check_file(path)
     keys = _Keys(path, _section(path))
@@ -77,12 +79,12 @@ def read_nikon(path: str | os.PathLike) -> NikonScan:
     to_axis, to_detector = keys.length("SrcToObject"), keys.length("SrcToDetector")
     images, views = _images(path, keys), keys.count("Projections")
     if len(images) != views:
-        raise refusal(path, f"{len(images)} images for {views} projections", "one for each", "copy the scan again")
+        raise refusal(path, f"{len(images)} images for {views} projections", "an image per projection", "copy the scan again")
     top, bottom = keys.number("CentreOfRotationTop", 0.0), keys.number("CentreOfRotationBottom", 0.0)
     offset = keys.number("ObjectOffsetX", (top + bottom) / 2 * to_axis / to_detector)
     sizes = tuple(keys.number(f"VoxelSize{axis}", 0.0) for axis in "XYZ")
     counts = tuple(int(keys.number(f"Voxels{axis}", 0)) for axis in "ZYX")
-    heedless = [f"Detector{name}" for name in ("OffsetX", "OffsetY")] + [f"Offset{axis}" for axis in "XYZ"] + ["Scattering"]
+    ignored = [f"Detector{name}" for name in ("OffsetX", "OffsetY")] + [f"Offset{axis}" for axis in "XYZ"] + ["Scattering"]
     return NikonScan(
         path, images, to_axis, to_detector, (rows, columns), pitch, keys.length("WhiteLevel"),
         keys.number("InitialAngle", 0.0) + keys.number("AngularStep") * np.arange(views),
@@ -91,47 +93,45 @@ def read_nikon(path: str | os.PathLike) -> NikonScan:
         keys.number("ObjectRoll", -math.degrees(math.atan2(top - bottom, rows * pitch[0]))),
         counts if min(counts) > 0 and min(sizes) > 0 else None,
         sizes,
-        tuple(f"{name} = {keys.number(name, 0.0):g}" for name in heedless if keys.number(name, 0.0)),
+        tuple(f"{name} = {keys.number(name, 0.0):g}" for name in ignored if keys.number(name, 0.0)),
     )  # fmt: skip
 
 
 def read_nikon_angles(path: str | os.PathLike, views: int) -> np.ndarray:
-    """Angles [degree] from ``_ctdata.txt`` or an ``.ang`` file: lines that begin with a view's number, then its angle.
+    """Read angles [degree] from ``_ctdata.txt`` or an ``.ang`` file: lines of a view number and its angle.
 
     Raises:
-        MivolError: no such file, or another number of angles than ``views``.
+        MivolError: no file, or another number of angles than ``views``.
     """
-    path, found = check_file(path), {}
+    path, angles = check_file(path), {}
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         words = re.split(r"[\s,:;]+", line.strip())
         if len(words) > 1 and words[0].isdigit():
             try:
-                found[int(words[0])] = float(words[1])
+                angles[int(words[0])] = float(words[1])
             except ValueError:
                 continue
-    # The second line of _ctdata.txt has numbers of its own (projections, frames, exposure): the last view's line replaces it.
-    numbers = sorted(found)
-    start = 0 if 0 in found else 1
-    wanted = range(start, start + views)
-    if any(number not in found for number in wanted):
-        raise refusal(path, f"{len(numbers)} angles", f"one for each of {views} views, after the view's number", "complete it")
-    return np.array([found[number] for number in wanted])
+    # The second line of _ctdata.txt holds other numbers (projections, frames, exposure); the line of the last view replaces it.
+    start = 0 if 0 in angles else 1
+    numbers = range(start, start + views)
+    if any(number not in angles for number in numbers):
+        raise refusal(path, f"{len(angles)} angles", f"one line for each of {views} views", "complete the file")
+    return np.array([angles[number] for number in numbers])
 
 
 def read_nikon_transmission(scan: NikonScan, saturation: float = math.inf) -> np.ndarray:
-    """(views, rows, cols) float32 readings over the white level, rows from the lowest, columns as seen from the source.
+    """Return readings divided by the white level, float32 (views, rows, columns).
 
-    Readings from ``saturation`` on are NaN.
+    Rows start at the lowest, and columns run as seen from the source. Readings of ``saturation`` or more become NaN.
 
     Raises:
-        MivolError: an image that cannot be read, or has another size than the detector.
+        MivolError: an unreadable image, or an image of another size than the detector.
     """
     readings = read_images(list(scan.images))
     if readings.shape[1:] != scan.detector:
         rows, columns = readings.shape[1:]
-        raise refusal(
-            scan.path, f"images of {rows} x {columns} pixels", "{} x {} as DetectorPixels".format(*scan.detector), "correct it"
-        )
+        expected = "{} x {} as DetectorPixels".format(*scan.detector)
+        raise refusal(scan.path, f"images of {rows} x {columns} pixels", expected, "correct the settings")
     check_finite(scan.path, readings)
     readings[readings >= saturation] = np.nan
     return readings[:, ::-1, ::-1] / np.float32(scan.white_level)
@@ -142,10 +142,11 @@ def _section(path: Path) -> dict[str, str]:
     try:
         parser.read_string(path.read_text(encoding="utf-8-sig", errors="replace"))
     except configparser.Error as error:
-        raise refusal(path, f"no settings ({' '.join(str(error).split())})", "a section [XTekCT]", "copy it again") from None
+        found = f"no settings ({' '.join(str(error).split())})"
+        raise refusal(path, found, "a section [XTekCT]", "copy the file again") from None
     name = next((name for name in parser.sections() if name.lower() == SECTION), None)
     if name is None:
-        raise refusal(path, f"sections {parser.sections()}", "one that is called XTekCT", "name the .xtekct file of a scan")
+        raise refusal(path, f"sections {parser.sections()}", "a section XTekCT", "name the .xtekct file of a scan")
     return dict(parser[name])
 
 

@@ -1,8 +1,10 @@
-"""NumPy's own files: ``.npy`` (one array, no place) and ``.npz`` (arrays by name, place and metadata beside them).
+"""NumPy's files: ``.npy`` (one array without placement) and ``.npz`` (arrays by name, placement and metadata).
 
-Conventions. Arrays are (Z, Y, X) or (Z, Y, X, C). A ``.npz`` of mivol holds ``values`` (float32), ``to_world``
-(float64, 4x4) and ``metadata`` (a 0-d string of JSON); any other ``.npz`` is read by naming one of its arrays, and then
-lies on the unit cube. Pickled objects are never loaded.
+Conventions. Grids are (Z, Y, X) or (Z, Y, X, C). A ``.npz`` of mivol holds ``values`` (float32), ``to_world`` (float64, 4x4)
+and ``metadata`` (a 0-d string of JSON). Any other ``.npz`` is read by the name of an array and placed on the unit cube. Only
+numbers, truth values and text are read, never Python objects. NumPy's own ``load`` would allocate whatever an archive claims.
+:func:`read_archive` compares the size of each array in its header with the size of the member, and the sum of the sizes with
+the free memory.
 """
 
 from __future__ import annotations
@@ -28,14 +30,14 @@ NPZ_MAGIC = b"PK\x03\x04"
 
 
 def read_npy(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read one array; it lies on the unit cube, for the format says nothing else."""
+    """Read an array, on the unit cube because the format stores no placement."""
     refuse_dataset(path, dataset)
-    array = _loaded(path)
+    array = _load_array(path)
     return VolumeData(to_values(array, path), np.eye(4), _meta(path, "npy", array))
 
 
 def read_npz(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read one array of an archive: ``dataset``, else ``values``, else the only one of rank 3 or 4."""
+    """Read an array of an archive: ``dataset``, else ``values``, else the only array of rank 3 or 4."""
     arrays = read_archive(path)
     grids = [name for name, array in arrays.items() if array.ndim in (3, 4)]
     name = select_dataset(path, "values" if dataset is None and "values" in grids else dataset, grids)
@@ -50,19 +52,19 @@ def read_npz(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 def write_npy(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
-    """Write the values alone.
+    """Write the values only.
 
     Raises:
-        MivolError: a place or metadata, which the format has no room for.
+        MivolError: a placement or metadata, which the format cannot hold.
     """
     if metadata or not np.array_equal(to_world, np.eye(4)):
         raise refusal(
             "write_volume",
             "to_world or metadata for a .npy file",
-            "neither (the format has no room)",
-            "write .npz or leave them out",
+            "the values only",
+            "write .npz, or remove both",
         )
-    # numpy.save goes around the file object (ndarray.tofile) and loses the system's reason when the disk is full.
+    # numpy.save bypasses the file object (ndarray.tofile) and loses the error of the system when the disk is full.
     np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(values))
     file.write(values.data)
 
@@ -73,12 +75,12 @@ def write_npz(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
 
 
 def write_npz_stored(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
-    """As :func:`write_npz`, uncompressed: larger and about ten times faster."""
+    """Write a ``.npz`` without compression: larger, and about ten times faster than :func:`write_npz`."""
     np.savez(file, allow_pickle=False, values=values, to_world=to_world, metadata=np.array(json.dumps(metadata)))
 
 
-def _loaded(path: Path) -> np.ndarray:
-    """What numpy.load gives; any error of its parsers says that the file is damaged."""
+def _load_array(path: Path) -> np.ndarray:
+    """Load an array; every error of NumPy's parsers means a damaged file."""
     try:
         with path.open("rb") as file:
             return np.load(file, allow_pickle=False)
@@ -88,9 +90,8 @@ def _loaded(path: Path) -> np.ndarray:
         reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         if "allow_pickle=False" in reason:
             raise refusal(path, "Python objects", "numbers", "convert them to float32 and save again") from error
-        raise refusal(
-            path, f"a damaged NumPy file ({reason})", "a whole one", "the file is truncated: copy or write it again"
-        ) from error
+        way_out = "the file is truncated: copy or write it again"
+        raise refusal(path, f"a damaged NumPy file ({reason})", "a complete file", way_out) from error
 
 
 def _meta(path: Path, kind: str, array: np.ndarray) -> dict[str, Any]:
@@ -116,70 +117,69 @@ def _metadata(array: np.ndarray, path: Path) -> dict[str, Any]:
 
 
 KINDS = "biufU"
-"""Kinds of NumPy types that are read: truth values, whole and real numbers, text."""
+"""Allowed kinds of NumPy types: truth values, integers, real numbers and text."""
 
 DAMAGE = (
     *(ValueError, TypeError, KeyError, IndexError, EOFError, SyntaxError, NotImplementedError, RecursionError, OverflowError),
     *(zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, RuntimeError, UnicodeError, OSError),
 )
-"""What the parsers of ZIP and of array headers raise on bytes that are not theirs."""
+"""Errors of the parsers of ZIP files and array headers for foreign bytes."""
 
 
 def read_archive(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an archive, by name.
+    """Read all arrays of an archive by name.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        MivolError: no whole archive, arrays of objects, sizes that contradict each other, or more than the free memory holds.
+        FileNotFoundError: a missing file.
+        MivolError: a damaged archive, arrays of objects, contradictory sizes, or more data than the free memory holds.
     """
     try:
         with path.open("rb") as file:
             if file.read(6) == b"\x93NUMPY":
                 raise refusal(path, "one array (.npy)", "an archive of arrays (.npz)", "rename the file to .npy")
             with zipfile.ZipFile(file) as archive:
-                members = {one.filename.removesuffix(".npy"): one for one in archive.infolist() if not one.is_dir()}
-                check_memory(path, sum(one.file_size for one in members.values()))
-                return {name: _array(path, archive, name, one) for name, one in members.items()}
+                members = {m.filename.removesuffix(".npy"): m for m in archive.infolist() if not m.is_dir()}
+                check_memory(path, sum(member.file_size for member in members.values()))
+                return {name: _read_member(path, archive, name, member) for name, member in members.items()}
     except (MivolError, FileNotFoundError):
         raise
     except DAMAGE as error:
         reason = " ".join(str(error).split()).rstrip(".")[:200] or type(error).__name__
-        raise refusal(path, f"a damaged archive ({reason})", "a whole .npz", "write or copy it again") from error
+        raise refusal(path, f"a damaged archive ({reason})", "a complete .npz", "write or copy it again") from error
 
 
 def check_memory(path: Path, size: int) -> None:
-    """Refuse what would not fit into the free memory.
+    """Refuse arrays larger than the free memory.
 
     Raises:
-        MivolError: with both sizes.
+        MivolError: states both sizes.
     """
     free = available_memory()
     if free is not None and size > free:
-        raise refusal(
-            path, f"arrays of {size / 2**30:.1f} GiB", f"at most the free memory, {free / 2**30:.1f} GiB", "free some"
-        )
+        expected = f"at most the free memory, {free / 2**30:.1f} GiB"
+        raise refusal(path, f"arrays of {size / 2**30:.1f} GiB", expected, "free some memory")
 
 
-def _array(path: Path, archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo) -> np.ndarray:
+def _read_member(path: Path, archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(member) as file:
-        shape, order, dtype, header = _header(file)
+        shape, order, dtype, header = _read_array_header(file)
         found = f"an array {name[:80]!r} of type {dtype}"
         if dtype.kind not in KINDS:
             found = f"Python objects in {name[:80]!r}" if dtype.hasobject else found
             raise refusal(path, found, "numbers, truth values or text", "convert it, and save again")
         size = math.prod(shape) * dtype.itemsize
         if header + size != member.file_size or any(n < 0 for n in shape):
-            said = f"{found} and shape {shape} in {member.file_size} bytes"
-            raise refusal(path, said, f"{header + size} bytes", "write the file again")
+            found += f" and shape {shape} in {member.file_size} bytes"
+            raise refusal(path, found, f"{header + size} bytes", "write the file again")
         values = np.frombuffer(file.read(size), dtype)
     return values.reshape(shape, order="F" if order else "C").copy()
 
 
-def _header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype, int]:
-    """Shape, whether columns come first, type, and the bytes that the header takes."""
+def _read_array_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+    """Shape, Fortran order, type, and length of the header [byte]."""
     version = np.lib.format.read_magic(file)
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in read:
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
         raise ValueError(f"version {version} of an array header")
-    shape, order, dtype = read[version](file, max_header_size=10000)
+    shape, order, dtype = readers[version](file, max_header_size=10000)
     return shape, order, dtype, file.tell()

@@ -1,11 +1,14 @@
-"""NRRD: a header of ``field: value`` lines, then the numbers, the first axis fastest; or the numbers in other files.
+"""NRRD: a header of ``field: value`` lines, then the numbers, the first axis fastest, or the names of data files.
 
-Conventions. Axes with a vector in ``space directions`` (else with ``domain`` or ``space`` in ``kinds``, else all of
-three) are x, y, z in the order of the file; one more axis, wherever it stands, is the channel. ``space origin`` is the
-centre of the first voxel. Line skip comes before decompression, byte skip after it; byte skip -1 takes the end of a raw
-file. The frame is kept as the file says (``meta["space"]`` "LPS" or "RAS" where it names one).
+Own reader: pynrrd 1.1 does not read lists and patterns of files, line skips of compressed data, or several blanks between
+numbers in text.
 
-Reference: the format's definition, "Definition of NRRD File Format", teem.sourceforge.net/nrrd/format.html.
+Conventions. Axes with a vector in ``space directions`` are x, y, z in the order of the file. Without these vectors the axes of
+``kinds`` "domain" or "space" count, without ``kinds`` all three axes. One more axis at any position holds the channels.
+``space origin`` is the centre of the first voxel. A line skip precedes decompression, a byte skip follows it; a byte skip of -1
+reads the end of a raw file. The frame stays as in the file (``meta["space"]`` is "LPS" or "RAS" if named there).
+
+Reference: "Definition of NRRD File Format", teem.sourceforge.net/nrrd/format.html.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ def _names(dtype: str, *names: str) -> dict[str, str]:
     return dict.fromkeys(names, dtype)
 
 
-#: name in the header -> NumPy type without byte order.
+#: type in the header -> NumPy type without byte order.
 TYPES: dict[str, str] = {
     **_names("i1", "signed char", "int8", "int8_t"),
     **_names("u1", "uchar", "unsigned char", "uint8", "uint8_t"),
@@ -44,7 +47,7 @@ TYPES: dict[str, str] = {
     **_names("f8", "double"),
 }
 
-#: name in the header -> how the bytes are packed.
+#: encoding in the header -> packing of the bytes.
 ENCODINGS: dict[str, str] = {
     "raw": "raw",
     "gz": "gzip",
@@ -67,7 +70,7 @@ SPACES: dict[str, str] = {
 
 SPACE_NAMES: dict[str, str] = {name: long for long, name in SPACES.items() if "-" in long}
 
-#: spellings of a field without its blank.
+#: spelling of a field without blank -> name of the field.
 ALIASES: dict[str, str] = {
     "datafile": "data file",
     "lineskip": "line skip",
@@ -79,10 +82,10 @@ ALIASES: dict[str, str] = {
 
 
 def read_nrrd(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read ``.nrrd`` or ``.nhdr`` (raw, gzip, bzip2 or ascii; attached or detached).
+    """Read ``.nrrd`` or ``.nhdr``: raw, gzip, bzip2 or ascii data, attached or detached.
 
     Raises:
-        MivolError: a field missing or not understood, sizes that do not fit the data, axes that cannot be told apart.
+        MivolError: a missing or invalid field, sizes that do not fit the data, or ambiguous axes.
     """
     refuse_dataset(path, dataset)
     fields, comments, attached = _header(source.read_bytes(path), path)
@@ -107,7 +110,7 @@ def read_nrrd(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 def write_nrrd(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
-    """Write an attached, gzip-compressed float32 NRRD; ``metadata`` becomes ``key:=value`` lines of strings."""
+    """Write an attached, gzip-compressed float32 NRRD, with ``metadata`` as ``key:=value`` lines."""
     nz, ny, nx, channels = values.shape
     steps = to_world[:3, :3] / (nx, ny, nz)
     origin = to_world[:3, 3] + steps.sum(axis=1) / 2
@@ -138,7 +141,7 @@ def _vector(numbers: np.ndarray) -> str:
 
 
 def _header(data: bytes, path: Path) -> tuple[dict[str, str], list[str], bytes]:
-    """Fields (names in lower case), the lines after ``data file: LIST``, and the bytes after the blank line."""
+    """The fields (names in lower case), the lines after ``data file: LIST``, and the bytes after the blank line."""
     end = re.search(rb"\r?\n\r?\n", data)
     head, attached = (data[: end.start()], data[end.end() :]) if end else (data, b"")
     lines = head.decode("utf-8", errors="replace").splitlines()
@@ -160,7 +163,7 @@ def _header(data: bytes, path: Path) -> tuple[dict[str, str], list[str], bytes]:
 
 def _field(fields: dict[str, str], name: str, path: Path) -> str:
     if name not in fields:
-        raise refusal(path, f"no field '{name}'", "one in the NRRD header", f"add '{name}: ...' to the header")
+        raise refusal(path, f"no field '{name}'", "the field in the NRRD header", f"add '{name}: ...' to the header")
     return fields[name]
 
 
@@ -187,29 +190,9 @@ def _packing(fields: dict[str, str], path: Path) -> str:
 def _stored(fields: dict[str, str], listed: list[str], attached: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:
     if "data file" not in fields:
         return _unpack(attached, fields, dtype, count, path)
-    files = _data_files(fields["data file"], listed, count, path)
-    if count % len(files):
-        raise refusal(path, f"{len(files)} data files", f"a divisor of {count} numbers", "correct the list")
-    parts = [_unpack(source.read_bytes(name), fields, dtype, count // len(files), name) for name in files]
-    return np.concatenate(parts)
-
-
-def _data_files(value: str, listed: list[str], count: int, path: Path) -> list[Path]:
-    words = value.split()
-    if words and words[0].upper() == "LIST":
-        names = [line.strip() for line in listed if line.strip()]
-    elif len(words) in (4, 5) and "%" in words[0]:
-        try:
-            first, last, step = (int(word) for word in words[1:4])
-            numbers = range(first, last + (1 if step > 0 else -1), step)
-        except ValueError as error:
-            raise refusal(path, f"'data file: {value}'", "pattern, first, last, step", "correct the header") from error
-        return source.numbered_files(path, words[0], numbers, count)
-    else:
-        names = [value]
-    if not names:
-        raise refusal(path, "an empty list of data files", "at least one", "correct the header")
-    return [path.parent / name for name in names]
+    return source.read_data_files(
+        path, fields["data file"], listed, count, lambda data, n, file: _unpack(data, fields, dtype, n, file)
+    )
 
 
 def _unpack(data: bytes, fields: dict[str, str], dtype: np.dtype, count: int, path: Path) -> np.ndarray:
@@ -217,7 +200,7 @@ def _unpack(data: bytes, fields: dict[str, str], dtype: np.dtype, count: int, pa
     (byte_skip,) = source.parse_integers(fields.get("byte skip", "0"), 1, path, "byte skip")
     if not 0 <= line_skip <= data.count(b"\n"):
         found = f"'line skip: {line_skip}' in a file of fewer lines"
-        raise refusal(path, found, "a skip of lines that are there", "correct the header")
+        raise refusal(path, found, "at most the lines of the file", "correct the header")
     data = data.split(b"\n", line_skip)[-1]
     packing = _packing(fields, path)
     if packing == "ascii":
@@ -229,7 +212,7 @@ def _unpack(data: bytes, fields: dict[str, str], dtype: np.dtype, count: int, pa
 
 
 def _axes(fields: dict[str, str], sizes: list[int], path: Path) -> tuple[list[int], list[int]]:
-    """Numbers of the spatial axes (x, y, z) and of the channel axis (at most one)."""
+    """Indices of the spatial axes (x, y, z) and of the channel axis, if present."""
     if "space directions" in fields:
         spatial = [axis for axis, vector in enumerate(_vectors(fields, path)) if vector is not None]
     elif "kinds" in fields:
@@ -243,15 +226,14 @@ def _axes(fields: dict[str, str], sizes: list[int], path: Path) -> tuple[list[in
             path,
             f"{len(sizes)} axes of which {len(spatial)} are spatial",
             "3 spatial axes and at most one of channels",
-            "say which with 'kinds' or 'space directions'",
+            "mark the axes with 'kinds' or 'space directions'",
         )
     return spatial, channel
 
 
 def _vectors(fields: dict[str, str], path: Path) -> list[np.ndarray | None]:
-    text = fields["space directions"]
-    found = re.findall(r"none|\(([^)]*)\)", text)
-    return [source.parse_reals(inner, 3, path, "space directions") if inner else None for inner in found]
+    vectors = re.findall(r"none|\(([^)]*)\)", fields["space directions"])
+    return [source.parse_reals(numbers, 3, path, "space directions") if numbers else None for numbers in vectors]
 
 
 def _place(fields: dict[str, str], spatial: list[int], size: list[int], path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -270,6 +252,6 @@ def _place(fields: dict[str, str], spatial: list[int], size: list[int], path: Pa
 
 
 def _per_axis(fields: dict[str, str], name: str, spatial: list[int], count: int, default: float, path: Path) -> np.ndarray:
-    """The numbers of the spatial axes; ``default`` where the file has none or says NaN."""
+    """The numbers of the spatial axes; ``default`` for a missing field and for NaN."""
     values = source.parse_reals(fields.get(name) or "nan " * count, count, path, name)
     return np.array([default if np.isnan(values[axis]) else values[axis] for axis in spatial])

@@ -1,13 +1,12 @@
-"""Stanford's ``.ply`` as tables: every element that a header lists, by name, in binary of either byte order or in text.
+"""Stanford's ``.ply`` as tables: the elements of a file by name, in binary of either byte order or in text.
 
-Conventions. Elements stand in the order of the header. What an element would take is counted from the header and compared with
-the bytes that are there before any of it is taken. Properties are single numbers: an element with lists (faces) ends what is
-read, since the length of a row is not known then; it and what follows it are left out. ``read_ply`` of
-:mod:`mivol.files.mesh` reads triangles.
+Own reader: plyfile is under the GPL.
+
+Conventions. Elements follow the order of the header. The size of an element is computed from the header and compared with the
+size of the file before memory is allocated. Properties are single numbers. The length of an element with lists (faces) is
+unknown, so this element and all later elements are skipped; ``read_ply`` of :mod:`mivol.files.mesh` reads triangles.
 
 Source: Greg Turk, The PLY Polygon File Format, 1994.
-
-Here: :func:`read_tables`, :func:`read_layout`, :func:`is_ply`, :func:`write_table`.
 """
 
 from __future__ import annotations
@@ -22,27 +21,27 @@ import numpy as np
 from mivol.files import source
 from mivol.files.source import refusal
 
-__all__ = ["POSITION", "is_ply", "vertex_positions", "read_layout", "read_tables", "read_vertices", "write_table"]
+__all__ = ["POSITION", "is_ply", "read_layout", "read_tables", "read_vertices", "vertex_positions", "write_table"]
 
 POSITION = ("x", "y", "z")
-"""Properties of a vertex that has a place."""
+"""Properties with the position of a vertex."""
 
 LONGEST_HEADER = 1 << 16
-"""Bytes in which a header has to end; those of published files have some 2000."""
+"""Longest header [byte]; headers of published files have about 2000 bytes."""
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
     **{"float64": "f8"},
 }
-"""Names of types, old and new, and NumPy's."""
+"""Name of a type, old or new -> NumPy type."""
 
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
 @dataclass
 class Element:
-    """What a header says of one element: its properties as (name, type), and whether one of them is a list."""
+    """An element of the header: its properties as (name, type), and whether a property is a list."""
 
     name: str
     count: int
@@ -51,15 +50,15 @@ class Element:
 
 
 def is_ply(head: bytes) -> bool:
-    """Whether these first bytes are those of a ``.ply``."""
+    """Return whether the first bytes are the start of a ``.ply``."""
     return re.match(rb"ply\r?\n", head) is not None
 
 
 def read_layout(path: str | os.PathLike) -> dict[str, tuple[str, ...]]:
-    """Names of the properties of every element, from the header alone.
+    """Read the property names of every element from the header.
 
     Raises:
-        MivolError: no PLY, or a header that does not end or contradicts itself.
+        MivolError: another format, or an endless or inconsistent header.
     """
     with source.check_file(path).open("rb") as file:
         head, _ = _split(file.read(LONGEST_HEADER), path)
@@ -67,14 +66,13 @@ def read_layout(path: str | os.PathLike) -> dict[str, tuple[str, ...]]:
 
 
 def read_tables(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """All elements of a file up to the first that has lists.
+    """Read all elements before the first element with lists.
 
     Returns:
-        By name of the element, a structured array (count,) with a field a property, in the types and the order of the file.
+        A structured array (count,) by name of the element, with a field per property in the types and the order of the file.
 
     Raises:
-        MivolError: no PLY, a header that does not end or contradicts itself, fewer bytes than it promises, or more where no
-            element with lists follows.
+        MivolError: another format, an endless or inconsistent header, missing bytes, or surplus bytes after the last element.
     """
     data = source.read_bytes(path)
     head, body = _split(data, path)
@@ -83,10 +81,10 @@ def read_tables(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def read_vertices(path: str | os.PathLike) -> np.ndarray:
-    """The table of vertices of a file, which has x, y and z.
+    """Read the table of vertices, which must have x, y and z.
 
     Raises:
-        MivolError: as :func:`read_tables`; no vertices, or none with a place.
+        MivolError: errors of :func:`read_tables`, no vertices, or no positions.
     """
     vertex = read_tables(path).get("vertex")
     if vertex is None or any(name not in vertex.dtype.names for name in POSITION):
@@ -95,17 +93,17 @@ def read_vertices(path: str | os.PathLike) -> np.ndarray:
 
 
 def vertex_positions(vertex: np.ndarray) -> np.ndarray:
-    """(N, 3) x, y, z of a table of vertices."""
+    """Return the positions (N, 3) of a table of vertices."""
     return np.stack([vertex[name] for name in POSITION], axis=1)
 
 
 def write_table(file: BinaryIO, table: np.ndarray, comment: str = "") -> None:
-    """Write one element ``vertex``, binary and little-endian.
+    """Write an element ``vertex`` in little-endian binary.
 
     Args:
-        file: open for writing.
-        table: structured (count,), fields of float32 and unsigned bytes.
-        comment: a line of the header; empty: none.
+        file: binary file.
+        table: structured array (count,) with fields of float32 and unsigned bytes.
+        comment: comment line of the header, or empty.
     """
     kinds = {"float32": "float", "uint8": "uchar"}
     lines = [
@@ -120,17 +118,17 @@ def write_table(file: BinaryIO, table: np.ndarray, comment: str = "") -> None:
 
 
 def _split(data: bytes, path: object) -> tuple[str, bytes]:
-    """The header, without its last line, and what follows it."""
+    """The header without its last line, and the bytes after the header."""
     if not is_ply(data):
-        raise refusal(path, f"first bytes {data[:8]!r}", "those of a PLY", "name another file")
+        raise refusal(path, f"first bytes {data[:8]!r}", "the first bytes of a PLY", "name another file")
     end = re.compile(rb"^end_header\r?\n", re.MULTILINE).search(data, 0, LONGEST_HEADER)
     if end is None:
-        raise refusal(path, f"no end_header in the first {LONGEST_HEADER} bytes", "one", "copy or write the file again")
+        raise refusal(path, f"no end_header in the first {LONGEST_HEADER} bytes", "end_header", "copy or write the file again")
     return data[: end.start()].decode("ascii", errors="replace"), data[end.end() :]
 
 
 def _header(text: str, path: object) -> tuple[str, list[Element]]:
-    """The format, and what is said of each element."""
+    """The format and the elements of a header."""
     form, elements = "", []
     for line in text.splitlines()[1:]:
         match line.split():
@@ -153,13 +151,13 @@ def _header(text: str, path: object) -> tuple[str, list[Element]]:
 
 
 def _check_names(elements: list[Element], path: object) -> None:
-    for names, what in [([e.name for e in elements], "elements"), *(([p for p, _ in e.properties], e.name) for e in elements)]:
+    for names, group in [([e.name for e in elements], "elements"), *(([p for p, _ in e.properties], e.name) for e in elements)]:
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
-            raise refusal(path, f"{twice!r} twice among the {what}", "each name once", "write the file again")
+            raise refusal(path, f"{twice!r} twice among the {group}", "each name once", "write the file again")
     empty = next((e.name for e in elements if not e.properties and not e.has_lists), None)
     if empty is not None:
-        raise refusal(path, f"the element {empty!r} without properties", "one at least", "write the file again")
+        raise refusal(path, f"the element {empty!r} without properties", "at least one property", "write the file again")
 
 
 def _binary_tables(body: bytes, elements: list[Element], order: str, path: object) -> dict[str, np.ndarray]:
@@ -173,12 +171,12 @@ def _binary_tables(body: bytes, elements: list[Element], order: str, path: objec
         tables[element.name] = np.frombuffer(body, dtype, element.count, at)
         at = end
     if at < len(body):
-        raise refusal(path, f"{len(body) - at} bytes after the last element", "none", "copy or write the file again")
+        raise refusal(path, f"{len(body) - at} bytes after the last element", "no more", "copy or write the file again")
     return tables
 
 
 def _text_tables(body: bytes, elements: list[Element], path: object) -> dict[str, np.ndarray]:
-    """As the binary ones: whole numbers of 32 bits and less are exact in float64, through which they go."""
+    """The tables of a text file. Numbers are parsed as float64, which holds integers of 32 bits exactly."""
     words, tables, at = body.split(), {}, 0
     for element in elements:
         if element.has_lists:
@@ -190,14 +188,14 @@ def _text_tables(body: bytes, elements: list[Element], path: object) -> dict[str
         table = np.empty(element.count, [(name, kind) for name, kind in element.properties])
         for column, (name, kind) in zip(rows.T, element.properties, strict=True):
             if kind[0] != "f" and not np.array_equal(column, column.astype(kind)):
-                raise refusal(path, f"numbers that are no {kind} as {name!r}", "numbers of that type", "write the file again")
+                raise refusal(path, f"{name!r} outside of its type {kind}", "numbers of this type", "write the file again")
             table[name] = column
         tables[element.name], at = table, end
     if at < len(words):
-        raise refusal(path, f"{len(words) - at} numbers after the last element", "none", "copy or write the file again")
+        raise refusal(path, f"{len(words) - at} numbers after the last element", "no more", "copy or write the file again")
     return tables
 
 
-def _check_size(found: str, left: int, expected: str, path: object) -> None:
-    if left < 0:
+def _check_size(found: str, surplus: int, expected: str, path: object) -> None:
+    if surplus < 0:
         raise refusal(path, found, f"at least {expected}, from the header", "the file is truncated: copy it again")

@@ -1,7 +1,6 @@
-"""The bytes of a file, and what they must add up to.
+"""Checked bytes and numbers of a file, for all readers.
 
-Every reader takes its bytes from here, so that a missing, empty, truncated or damaged file is refused in the same words
-everywhere: what was found, what was expected, the way out.
+A missing, empty, truncated or damaged file is refused in the same words everywhere: found, expected, way out.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from mivol.errors import MivolError
 
 T = TypeVar("T")
 
-#: Characters of what was found that a refusal quotes; line ends in it become blanks.
+#: Longest quotation of an input in a refusal [character]; line ends become blanks.
 LONGEST_QUOTE = 300
 
 #: codec name -> constructor of a decompressor with ``decompress(data, max_length)``, ``eof`` and ``unused_data``.
@@ -38,64 +37,61 @@ CODECS: dict[str, Callable[[], object]] = {
 
 
 def refusal(subject: object, found: str, expected: str, way_out: str) -> MivolError:
-    """The one sentence that refuses an input (``subject``: file or parameter): found, expected, the way out."""
+    """Return the error that refuses an input in one sentence.
+
+    Args:
+        subject: file or parameter.
+        found: actual content, shortened to ``LONGEST_QUOTE`` characters.
+        expected: valid content.
+        way_out: advice for the user.
+    """
     found = textwrap.shorten(found, LONGEST_QUOTE, placeholder=" ...")
     return MivolError(f"{subject}: found {found}, expected {expected}; {way_out}.")
 
 
-#: the way out of a reader that a folder was given to.
-RAW_SLICES = "name a file in it (a stack of raw slices is read by read_slices)"
+# -- Files --------------------------------------------------------------------------------------------------------
+
+#: advice of a reader that got a folder.
+RAW_SLICES = "name a file in it (read_slices reads a stack of raw slices)"
 
 
 def check_file(path: str | os.PathLike, in_a_folder: str = RAW_SLICES) -> Path:
-    """The path, if it names a file that holds at least one byte.
+    """Return the path of an existing file with at least one byte.
 
     Args:
-        path: what is looked for.
-        in_a_folder: the way out where a folder is there.
+        path: path of the file.
+        in_a_folder: advice for the path of a folder.
 
     Raises:
-        MivolError: nothing is there (the nearest name in the folder is offered), a folder is there, or an empty file.
+        MivolError: no file (with the most similar name of the folder), a folder, or an empty file.
     """
     path = Path(path)
     try:
         is_folder = path.is_dir()
-    except OSError as error:  # a name that no file can have: headers name other files
-        raise refusal(path.name[:LONGEST_QUOTE], f"a name that is none ({error.strerror})", "a file's", "correct it") from None
+    except OSError as error:  # an impossible file name, from the header of another file
+        name = path.name[:LONGEST_QUOTE]
+        raise refusal(name, f"an invalid name ({error.strerror})", "the name of a file", "correct it") from None
     if is_folder:
         raise refusal(path, "a folder", "a file", in_a_folder)
     if not path.is_file():
-        raise refusal(path, "nothing there", "an existing file", _nearest(path))
+        raise refusal(path, "nothing there", "an existing file", _suggest_name(path))
     if path.stat().st_size == 0:
-        raise refusal(path, "an empty file", "data", "copy or write it again")
+        raise refusal(path, "an empty file", "data", "copy or write the file again")
     return path
 
 
-def numbered_files(header: Path, pattern: str, numbers: range, most: int) -> list[Path]:
-    """Files beside a header whose names hold a number, as ``slice%03d.raw`` of 0, 1, ...; each of them is there.
-
-    Args:
-        header: the file that names them.
-        pattern: a name with one ``%d``, ``%3d`` or ``%03d``.
-        numbers: what is put there.
-        most: how many there may be, since each holds at least one number of ``most``.
-
-    Raises:
-        MivolError: another pattern, no number, more than ``most``, a file that is not there.
-    """
-    if not re.fullmatch(r"[^%]*%\d{0,2}d[^%]*", pattern):
-        raise refusal(header, f"the pattern {pattern!r} of files", "a name with one %d or %03d", "correct the header")
-    if not numbers or numbers[most:]:
-        found = f"files numbered from {numbers.start} to {numbers.stop} in steps of {numbers.step}"
-        raise refusal(header, found, f"1 to {most} files", "correct the header")
-    return [check_file(header.parent / (pattern % number)) for number in numbers]
+def _suggest_name(path: Path) -> str:
+    if not path.parent.is_dir():
+        return f"the folder {path.parent} does not exist either"
+    near = difflib.get_close_matches(path.name, (entry.name for entry in path.parent.iterdir()), 1)
+    return f"did you mean {near[0]}" if near else "check the spelling and the folder"
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """All bytes of an existing, non-empty file.
+    """Read all bytes of an existing, non-empty file.
 
     Raises:
-        MivolError: as :func:`check_file`, or the file may not be read.
+        MivolError: errors of :func:`check_file`, or no permission.
     """
     path = check_file(path)
     try:
@@ -105,24 +101,108 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 
 def select_by_suffix(path: Path, table: Mapping[str, T]) -> T:
-    """What a table of suffixes has for a file.
+    """Return the entry of a table for the suffix of a file.
 
     Raises:
-        MivolError: a suffix that it does not have.
+        MivolError: an unknown suffix.
     """
     if path.suffix.lower() not in table:
         raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(table)}", "convert the file or correct its name")
     return table[path.suffix.lower()]
 
 
-def parse_elements(data: bytes, dtype: np.dtype | str, count: int, path: object, *, offset: int = 0) -> np.ndarray:
-    """The ``count`` numbers that fill ``data`` from byte ``offset`` to its end, exactly.
+def read_data_files(
+    header: Path, value: str, listed: Sequence[str], count: int, unpack: Callable[[bytes, int, Path], np.ndarray]
+) -> np.ndarray:
+    """Read the numbers of a volume from the data files named in its header.
 
     Args:
-        data: the bytes of the file or of one decompressed block.
+        header: file that names the data files; they lie in its folder.
+        value: a file name, ``LIST``, or a pattern with first number, last number and step (``slice%03d.raw 0 9 1``).
+        listed: lines after the header, the names of a ``LIST``.
+        count: number of values in all files, shared equally.
+        unpack: function from bytes, count and file to numbers.
+
+    Returns:
+        Numbers (count,).
+
+    Raises:
+        MivolError: an invalid pattern, a missing file, or a number of files that does not divide ``count``.
+    """
+    words = value.split()
+    if words and words[0].upper() == "LIST":
+        names = [line.strip() for line in listed if line.strip()]
+    elif len(words) in (4, 5) and "%" in words[0]:
+        names = _numbered_names(header, words, count)
+    else:
+        names = [value]
+    if not names or not names[0]:
+        raise refusal(header, "no data file", "at least one name", "correct the header")
+    if count % len(names):
+        raise refusal(header, f"{len(names)} data files", f"a divisor of {count} numbers", "correct the header")
+    files = [check_file(header.parent / name) for name in names]
+    return np.concatenate([unpack(read_bytes(file), count // len(files), file) for file in files])
+
+
+def _numbered_names(header: Path, words: Sequence[str], most: int) -> list[str]:
+    """The names of a pattern with one ``%d``, ``%3d`` or ``%03d``: at most ``most``, since a file holds at least one number."""
+    if not re.fullmatch(r"[^%]*%\d{0,2}d[^%]*", words[0]):
+        raise refusal(header, f"the pattern {words[0]!r} of files", "a name with one %d or %03d", "correct the header")
+    try:
+        first, last, step = (int(word) for word in words[1:4])
+        numbers = range(first, last + (1 if step > 0 else -1), step)
+    except ValueError as error:
+        raise refusal(header, f"the files {' '.join(words)!r}", "pattern, first, last, step", "correct the header") from error
+    if not numbers or numbers[most:]:
+        found = f"files numbered from {numbers.start} to {numbers.stop} in steps of {numbers.step}"
+        raise refusal(header, found, f"1 to {most} files", "correct the header")
+    return [words[0] % number for number in numbers]
+
+
+def decompress(data: bytes, codec: str, limit: int, path: object) -> bytes:
+    """Decompress data to at most ``limit`` bytes, which bounds the memory by the promise of the header.
+
+    Concatenated streams (several gzip members) are joined; zero padding after the last stream is skipped.
+
+    Args:
+        data: compressed bytes.
+        codec: key of :data:`CODECS`.
+        limit: largest size according to the header [byte].
+        path: subject of refusals.
+
+    Raises:
+        MivolError: damaged, truncated or too long data.
+    """
+    limit = min(limit, sys.maxsize - 1)
+    pieces, total, rest = [], 0, data
+    while rest:
+        stream = CODECS[codec]()
+        try:
+            piece = stream.decompress(rest, limit + 1 - total)
+        except (zlib.error, OSError, EOFError, lzma.LZMAError) as error:
+            raise refusal(path, f"damaged {codec} data ({error})", "a sound stream", "copy the file again") from error
+        pieces.append(piece)
+        total += len(piece)
+        if total > limit:
+            found, expected = f"more than {limit} bytes after decompression", f"at most {limit} (from the header)"
+            raise refusal(path, found, expected, "correct the header")
+        if not stream.eof:
+            raise refusal(path, f"a {codec} stream that breaks off", "its end", "the file is truncated: copy it again")
+        rest = stream.unused_data.lstrip(b"\0")
+    return b"".join(pieces)
+
+
+# -- Numbers ------------------------------------------------------------------------------------------------------
+
+
+def parse_elements(data: bytes, dtype: np.dtype | str, count: int, path: object, *, offset: int = 0) -> np.ndarray:
+    """Return the numbers that fill ``data`` exactly from byte ``offset`` to the end.
+
+    Args:
+        data: bytes of the file, or of a decompressed block.
         dtype: NumPy type with its byte order.
-        count: how many numbers the header promises.
-        path: named in the refusal.
+        count: number of values according to the header.
+        path: subject of refusals.
         offset: first byte of the numbers.
 
     Returns:
@@ -145,10 +225,10 @@ def parse_elements(data: bytes, dtype: np.dtype | str, count: int, path: object,
 
 
 def parse_numbers(text: bytes | str, count: int, path: object) -> np.ndarray:
-    """The ``count`` numbers written in ``text``, separated by white space or commas, as float64 (count,).
+    """Return ``count`` numbers separated by white space or commas, as float64 (count,).
 
     Raises:
-        MivolError: something that is not a number, or another count.
+        MivolError: other text than numbers, or another count.
     """
     if isinstance(text, bytes):
         text = text.decode("ascii", errors="replace")
@@ -157,7 +237,7 @@ def parse_numbers(text: bytes | str, count: int, path: object) -> np.ndarray:
             warnings.simplefilter("error")
             values = np.fromstring(text.replace(",", " "), dtype=np.float64, sep=" ")
     except (ValueError, DeprecationWarning) as error:
-        raise refusal(path, "text that is not a number among the values", "numbers only", "write it again") from error
+        raise refusal(path, "text that is not a number among the values", "numbers only", "write the file again") from error
     if values.size != count:
         fault = "truncated" if values.size < count else "longer than its header says"
         raise refusal(path, f"{values.size} numbers", f"{count} (from the header)", f"the file is {fault}: write it again")
@@ -165,16 +245,16 @@ def parse_numbers(text: bytes | str, count: int, path: object) -> np.ndarray:
 
 
 def parse_integers(text: str, count: int, path: object, name: str) -> list[int]:
-    """The ``count`` whole numbers in ``text``, separated by white space.
+    """Return ``count`` integers separated by white space.
 
     Args:
-        text: the value of a header's field.
-        count: how many there must be.
-        path: the file, named in the refusal.
-        name: the field, named in the refusal.
+        text: value of a header field.
+        count: expected number of integers.
+        path: file, the subject of refusals.
+        name: name of the field in refusals.
 
     Raises:
-        MivolError: something else, or another count.
+        MivolError: other text than integers, or another count.
     """
     words = text.split()
     if len(words) != count or not all(re.fullmatch(r"[+-]?\d{1,18}", word, re.ASCII) for word in words):
@@ -183,9 +263,10 @@ def parse_integers(text: str, count: int, path: object, name: str) -> list[int]:
 
 
 def parse_reals(text: str, count: int, path: object, name: str) -> np.ndarray:
-    """The ``count`` numbers in ``text``, separated by white space or commas, as float64 (count,).
+    """Return the ``count`` numbers of a header field as float64 (count,): :func:`parse_numbers` with the name of the field.
 
-    As :func:`parse_numbers`, for a field of a header: arguments and refusal as :func:`parse_integers`.
+    Raises:
+        MivolError: other text than numbers, or another count.
     """
     try:
         return parse_numbers(text, count, path)
@@ -193,84 +274,13 @@ def parse_reals(text: str, count: int, path: object, name: str) -> np.ndarray:
         raise refusal(path, f"'{name} = {text.strip()}'", f"numbers ({count})", "correct the header") from error
 
 
-def decompress(data: bytes, codec: str, limit: int, path: object) -> bytes:
-    """Decompress all of ``data``, never to more than ``limit`` bytes (the header's promise bounds the memory).
-
-    Concatenated streams (several gzip members) are joined; zero padding after the last one is skipped.
-
-    Args:
-        data: compressed bytes.
-        codec: a key of :data:`CODECS`.
-        limit: the most bytes that the header allows.
-        path: named in the refusal.
-
-    Raises:
-        MivolError: damaged, truncated, or longer than ``limit``.
-    """
-    limit = min(limit, sys.maxsize - 1)
-    pieces, total, rest = [], 0, data
-    while rest:
-        stream = CODECS[codec]()
-        try:
-            piece = stream.decompress(rest, limit + 1 - total)
-        except (zlib.error, OSError, EOFError, lzma.LZMAError) as error:
-            raise refusal(path, f"damaged {codec} data ({error})", "a sound stream", "copy the file again") from error
-        pieces.append(piece)
-        total += len(piece)
-        if total > limit:
-            raise refusal(
-                path,
-                f"more than {limit} bytes after decompression",
-                f"at most {limit} (from the header)",
-                "correct the header",
-            )
-        if not stream.eof:
-            raise refusal(path, f"a {codec} stream that breaks off", "its end", "the file is truncated: copy it again")
-        rest = stream.unused_data.lstrip(b"\0")
-    return b"".join(pieces)
-
-
-def select_dataset(path: object, dataset: str | None, names: Sequence[str]) -> str:
-    """Which of several arrays to read: the one asked for, or the only one.
-
-    Raises:
-        MivolError: the name is not there (the nearest is offered), or none was given where there are several.
-    """
-    listed = ", ".join(map(repr, names)) or "none"
-    if dataset is None:
-        if len(names) == 1:
-            return names[0]
-        raise refusal(path, f"{len(names)} arrays ({listed})", "one", "name the one you want with dataset=")
-    if dataset not in names:
-        near = difflib.get_close_matches(dataset, names, 1)
-        way_out = f"did you mean {near[0]!r}" if near else "choose one of those"
-        raise refusal(path, f"no array {dataset!r} (there: {listed})", "an array of that name", way_out)
-    return dataset
-
-
-def refuse_dataset(path: object, dataset: str | None) -> None:
-    """Refuse a dataset name where the format holds one unnamed array.
-
-    Raises:
-        MivolError: ``dataset`` is not None.
-    """
-    if dataset is not None:
-        raise refusal(path, f"dataset={dataset!r} for a file with one unnamed array", "no dataset", "leave it out")
-
-
-def _nearest(path: Path) -> str:
-    if not path.parent.is_dir():
-        return f"the folder {path.parent} does not exist either"
-    names = (entry.name for entry in path.parent.iterdir())
-    near = difflib.get_close_matches(path.name, names, 1)
-    return f"did you mean {near[0]}" if near else "check the spelling and the folder"
-
-
 def read_columns(path: str | os.PathLike, count: int) -> np.ndarray:
-    """Read a table of ``count`` columns, float64 (rows, count).
+    """Read a text table of ``count`` columns as float64 (rows, count).
+
+    Columns are separated by white space or commas. Lines starting with ``#`` and a first line of names are skipped.
 
     Raises:
-        MivolError: no such file, a line of another length, text that is no number, a number that is not finite, no line.
+        MivolError: no file, a line of another length, invalid or infinite numbers, or no line.
     """
     path = check_file(path)
     rows = []
@@ -281,10 +291,41 @@ def read_columns(path: str | os.PathLike, count: int) -> np.ndarray:
         try:
             row = [float(word) for word in words]
         except ValueError:
-            raise refusal(path, f"{line.strip()!r} in line {number}", "numbers", "write it again") from None
+            raise refusal(path, f"{line.strip()!r} in line {number}", "numbers", "correct the line") from None
         if len(row) != count or not np.isfinite(row).all():
-            raise refusal(path, f"{line.strip()!r} in line {number}", f"{count} finite numbers", "complete it")
+            raise refusal(path, f"{line.strip()!r} in line {number}", f"{count} finite numbers", "correct the line")
         rows.append(row)
     if not rows:
-        raise refusal(path, "no line of numbers", f"{count} a line", "write it again")
+        raise refusal(path, "no line of numbers", f"{count} numbers per line", "write the file again")
     return np.array(rows)
+
+
+# -- Arrays of a file ---------------------------------------------------------------------------------------------
+
+
+def select_dataset(path: object, dataset: str | None, names: Sequence[str]) -> str:
+    """Return the name of the array to read: ``dataset``, or the only array of the file.
+
+    Raises:
+        MivolError: an unknown name (with the most similar name), or no name for a file of several arrays.
+    """
+    listed = ", ".join(map(repr, names)) or "none"
+    if dataset is None:
+        if len(names) == 1:
+            return names[0]
+        raise refusal(path, f"{len(names)} arrays ({listed})", "a single array", "choose an array with dataset=")
+    if dataset not in names:
+        near = difflib.get_close_matches(dataset, names, 1)
+        way_out = f"did you mean {near[0]!r}" if near else "choose another array"
+        raise refusal(path, f"no array {dataset!r} (the file has {listed})", "an array of that name", way_out)
+    return dataset
+
+
+def refuse_dataset(path: object, dataset: str | None) -> None:
+    """Refuse a dataset name for a format with one unnamed array.
+
+    Raises:
+        MivolError: a name is given.
+    """
+    if dataset is not None:
+        raise refusal(path, f"dataset={dataset!r} for a file with one unnamed array", "no dataset", "remove dataset")

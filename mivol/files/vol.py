@@ -1,9 +1,11 @@
 """Mitsuba's grid file ``.vol``: a header of 48 bytes, then the numbers, x fastest after the channel.
 
-Layout, little endian: "VOL", version 3 (uint8), encoding (int32), voxels along x, y, z (3 int32), channels (int32), box
-corners (6 float32), data. Encoding 1 is float32, the only one that Mitsuba 3 reads; the format's first description
-(Mitsuba 0.6, ``gridvolume``) also has 2 float16, 3 uint8 (0..255 stands for 0..1) and 4 quantised directions, which are
-no field of numbers and are refused. Stock ``gridvolume`` ignores the box unless ``use_grid_bbox`` is set.
+Own reader: Mitsuba's needs a variant and reads float32 only.
+
+Layout, little endian: "VOL", version 3 (uint8), encoding (int32), voxels along x, y, z (3 int32), channels (int32), box corners
+(6 float32), data. Encoding 1 is float32, the only encoding of Mitsuba 3. Mitsuba 0.6 (``gridvolume``) also defines 2 float16,
+3 uint8 (0..255 for 0..1) and 4 quantised directions, which are refused. Stock ``gridvolume`` ignores the box without
+``use_grid_bbox``.
 """
 
 from __future__ import annotations
@@ -27,10 +29,10 @@ ENCODINGS: dict[int, tuple[str, float]] = {1: ("<f4", 1.0), 2: ("<f2", 1.0), 3: 
 
 
 def read_vol(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read a ``.vol`` file; its box is taken from the header.
+    """Read a ``.vol`` file with its box.
 
     Raises:
-        MivolError: truncated or too long, another version or encoding, sizes below 1.
+        MivolError: a truncated or too long file, another version or encoding, or sizes below 1.
     """
     refuse_dataset(path, dataset)
     data = source.read_bytes(path)
@@ -58,13 +60,13 @@ def read_vol(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 def write_vol(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
-    """Write version 3, float32; the box must be axis-aligned, and its corners are rounded to float32.
+    """Write version 3 in float32. The corners of the axis-aligned box are rounded to float32.
 
     Raises:
-        MivolError: a rotated, sheared or mirrored ``to_world``, or metadata, which the format has no room for.
+        MivolError: a rotated, sheared or mirrored ``to_world``, or metadata, which the format cannot hold.
     """
     if metadata:
-        raise refusal("write_volume", "metadata for a .vol file", "none (the format has no room)", "write .npz or leave it out")
+        raise refusal("write_volume", "metadata for a .vol file", "no metadata", "write .npz, or remove the metadata")
     sides = np.diagonal(to_world)[:3]
     if np.count_nonzero(to_world[:3, :3] - np.diag(sides)) or sides.min() <= 0:
         raise refusal(
@@ -79,7 +81,7 @@ def write_vol(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
         raise refusal(
             "write_volume",
             f"a box from {low.tolist()} with sides {sides.tolist()} for a .vol file",
-            "corners that float32 can tell apart",
+            "corners that differ in float32",
             "write .npz or .nrrd, or move the box nearer to the origin",
         )
     nz, ny, nx, channels = values.shape

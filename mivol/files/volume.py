@@ -1,12 +1,9 @@
-"""A grid of numbers at voxel centres, and the affine map that says where in the world its unit cube lies.
+"""Volumes: a grid of voxel values with its placement in the world.
 
-Conventions. ``values`` is float32, C-contiguous, (Z, Y, X, C): x is the fastest spatial axis. Voxel (i, j, k) of the
-x, y, z axes has its centre at ((i + .5)/Nx, (j + .5)/Ny, (k + .5)/Nz) in local coordinates; ``to_world`` (4, 4)
-float64 takes local (x, y, z, 1) to the file's own physical frame, columns first. ``origin`` is the world position of
-the *centre* of voxel (0, 0, 0), as in NRRD, MetaImage, NIfTI and VTK, so the unit cube begins half a voxel before it.
-
-Here: :class:`VolumeData`, frames (:func:`frame_from_steps`, :func:`frame_from_box`, :func:`check_frame`,
-:func:`to_space`), values (:func:`to_values`, :func:`check_volume`).
+Conventions. ``values`` is float32, C-contiguous, (Z, Y, X, C): x is the fastest spatial axis. Voxel (i, j, k) of the x, y, z
+axes has its centre at ((i + .5)/Nx, (j + .5)/Ny, (k + .5)/Nz) in local coordinates. ``to_world`` (4, 4) float64 maps local
+(x, y, z, 1), a column, to the physical frame of the file. ``origin`` is the world position of the *centre* of voxel (0, 0, 0),
+as in NRRD, MetaImage, NIfTI and VTK, so the unit cube begins half a voxel before it.
 """
 
 from __future__ import annotations
@@ -20,25 +17,25 @@ from mivol.files.notebook import slices_html
 from mivol.files.source import refusal
 from mivol.shown import brief, briefly
 
-#: Sides of a box below this are not normal float32 numbers, so their reciprocal overflows.
+#: Smallest side of a box: the reciprocal of a denormal float32 number overflows.
 SMALLEST_SIDE = float(np.finfo(np.float32).tiny)
 
-#: |det| of the three sides over the product of their lengths; below 16 float32 roundings the box is flat in float32.
+#: Smallest |det| of the three sides divided by the product of their lengths: 16 float32 roundings.
 FLATTEST = 16 * float(np.finfo(np.float32).eps)
 
-#: Names of medical frames -> the sign of their x, y, z axes against right-anterior-superior.
+#: medical frame -> signs of its x, y, z axes relative to right-anterior-superior.
 SPACES: dict[str, tuple[int, int, int]] = {"RAS": (1, 1, 1), "LPS": (-1, -1, 1), "LAS": (-1, 1, 1)}
 
 
 @briefly
 @dataclasses.dataclass(frozen=True)
 class VolumeData:
-    """A volume as it was read: numbers, place, and where they came from.
+    """A volume with its placement and the facts of its file.
 
     Attributes:
-        values: float32 (Z, Y, X, C), C-contiguous; negative and non-finite numbers are kept (see check_volume).
-        to_world: float64 (4, 4), unit cube to the file's physical frame.
-        meta: ``path``, ``format``, ``dtype`` (on disk), ``space`` ("RAS", "LPS" or None) and the format's own facts.
+        values: float32 (Z, Y, X, C), C-contiguous; negative and non-finite numbers are kept (:func:`check_volume`).
+        to_world: unit cube to the physical frame of the file, float64 (4, 4).
+        meta: ``path``, ``format``, ``dtype`` (on disk), ``space`` ("RAS", "LPS" or None), and facts of the format.
     """
 
     values: np.ndarray
@@ -46,40 +43,40 @@ class VolumeData:
     meta: dict[str, object] = dataclasses.field(default_factory=dict)
 
     def _repr_html_(self) -> str:
-        """Three middle slices, for notebooks."""
+        """Return three middle slices for notebooks."""
         return slices_html(self.values, f"{brief(self.values)}, from {self.values.min():.4g} to {self.values.max():.4g}")
 
     @property
     def size(self) -> np.ndarray:
-        """Voxels along x, y, z: int (3,)."""
+        """Voxels along x, y, z, int (3,)."""
         return np.array(self.values.shape[2::-1])
 
     @property
     def steps(self) -> np.ndarray:
-        """World vector from a voxel's centre to its neighbour's, one column per axis x, y, z: float64 (3, 3)."""
+        """World vectors between neighbouring voxel centres, a column per axis x, y, z, float64 (3, 3) [length]."""
         return self.to_world[:3, :3] / self.size
 
     @property
     def spacing(self) -> np.ndarray:
-        """Distance between neighbouring voxel centres along x, y, z [length of the file]: float64 (3,)."""
+        """Distances between neighbouring voxel centres along x, y, z, float64 (3,) [length]."""
         return np.linalg.norm(self.steps, axis=0)
 
     @property
     def origin(self) -> np.ndarray:
-        """World position of the centre of voxel (0, 0, 0): float64 (3,)."""
+        """World position of the centre of voxel (0, 0, 0), float64 (3,) [length]."""
         return self.to_world[:3, 3] + self.steps.sum(axis=1) / 2
 
 
 def frame_from_steps(size: Sequence[int], steps: np.ndarray, origin: Sequence[float]) -> np.ndarray:
-    """The unit cube's affine map from voxel steps and the first voxel's centre.
+    """Return the placement of the unit cube from voxel steps and the centre of the first voxel.
 
     Args:
         size: voxels along x, y, z.
-        steps: (3, 3), column a is the world vector from a voxel to the next along axis a (direction times spacing).
+        steps: (3, 3); column a is the world vector between neighbouring voxels along axis a (direction times spacing).
         origin: world position (3,) of the centre of voxel (0, 0, 0).
 
     Returns:
-        float64 (4, 4); voxel centre (i + .5)/N goes to origin + steps @ (i, j, k).
+        float64 (4, 4); it maps the voxel centre (i + .5)/N to origin + steps @ (i, j, k).
     """
     steps = np.asarray(steps, np.float64)
     to_world = np.eye(4)
@@ -89,7 +86,7 @@ def frame_from_steps(size: Sequence[int], steps: np.ndarray, origin: Sequence[fl
 
 
 def frame_from_box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
-    """The affine map (4, 4) of the unit cube onto the axis-aligned box from corner ``low`` to corner ``high``."""
+    """Return the placement (4, 4) of the unit cube on the axis-aligned box from corner ``low`` to corner ``high``."""
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     to_world = np.diag([*(high - low), 1.0])
     to_world[:3, 3] = low
@@ -97,15 +94,15 @@ def frame_from_box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
 
 
 def check_frame(to_world: np.ndarray, name: object) -> None:
-    """Refuse an affine map that flattens the unit cube.
+    """Refuse a placement that flattens the unit cube.
 
     Args:
         to_world: (4, 4).
-        name: file or parameter, named in the refusal.
+        name: file or parameter, the subject of the refusal.
 
     Raises:
-        MivolError: wrong shape, a number that is not finite, a last row other than (0, 0, 0, 1), a side shorter than
-            any normal float32 number, or three sides in one plane (det 0 to float32 accuracy).
+        MivolError: another shape, a number that is not finite, a last row other than (0, 0, 0, 1), a side shorter than the
+            smallest normal float32 number, or three sides in a plane (det 0 in float32).
     """
     to_world = np.asarray(to_world, np.float64)
     if to_world.shape != (4, 4) or not np.array_equal(to_world[3], (0, 0, 0, 1)):
@@ -131,31 +128,29 @@ def check_frame(to_world: np.ndarray, name: object) -> None:
 
 
 def to_space(volume: VolumeData, space: str) -> VolumeData:
-    """The same volume with its world frame renamed: NIfTI counts x to the right and y forwards (RAS), NRRD of medical
-    origin and MetaImage to the left and backwards (LPS).
+    """Return the volume in another medical frame.
+
+    In NIfTI x points to the right and y forwards (RAS); in medical NRRD and MetaImage x points to the left and y backwards
+    (LPS).
 
     Args:
-        volume: its ``meta["space"]`` must be a key of :data:`SPACES`.
-        space: a key of :data:`SPACES`.
+        volume: volume with a key of :data:`SPACES` in ``meta["space"]``.
+        space: key of :data:`SPACES`.
 
     Raises:
-        MivolError: a frame that is not known.
+        MivolError: an unknown frame.
     """
-    found = volume.meta.get("space")
-    for name in (found, space):
+    current = volume.meta.get("space")
+    for name in (current, space):
         if name not in SPACES:
-            raise refusal(
-                volume.meta.get("path", "volume"),
-                f"the frame {name!r}",
-                f"one of {', '.join(SPACES)}",
-                "set to_world by hand",
-            )
-    signs = np.array(SPACES[found]) * np.array(SPACES[space])
+            expected = f"one of {', '.join(SPACES)}"
+            raise refusal(volume.meta.get("path", "volume"), f"the frame {name!r}", expected, "set to_world by hand")
+    signs = np.array(SPACES[current]) * np.array(SPACES[space])
     return dataclasses.replace(volume, to_world=np.diag([*signs, 1.0]) @ volume.to_world, meta={**volume.meta, "space": space})
 
 
 def to_values(array: np.ndarray, path: object) -> np.ndarray:
-    """An array (Z, Y, X) or (Z, Y, X, C) of any real type as float32 (Z, Y, X, C), C-contiguous.
+    """Convert a real array (Z, Y, X) or (Z, Y, X, C) to C-contiguous float32 (Z, Y, X, C).
 
     Integers above 2^24 are rounded to the nearest float32.
 
@@ -166,12 +161,8 @@ def to_values(array: np.ndarray, path: object) -> np.ndarray:
     if array.dtype.kind not in "biuf":
         raise refusal(path, f"numbers of type {array.dtype}", "real numbers", "convert them to float32 first")
     if array.ndim not in (3, 4):
-        raise refusal(
-            path,
-            f"an array of shape {array.shape}",
-            "(Z, Y, X) or (Z, Y, X, C)",
-            "reshape it or choose one time step first",
-        )
+        way_out = "reshape it or choose one time step first"
+        raise refusal(path, f"an array of shape {array.shape}", "(Z, Y, X) or (Z, Y, X, C)", way_out)
     if array.size == 0:
         raise refusal(path, f"an empty array of shape {array.shape}", "at least one voxel", "write it again")
     if array.ndim == 3:
@@ -182,27 +173,23 @@ def to_values(array: np.ndarray, path: object) -> np.ndarray:
         lost = np.isinf(values) & np.isfinite(array)
         if lost.any():
             index = tuple(int(i) for i in np.argwhere(lost)[0])
-            raise refusal(
-                path,
-                f"{array[index]:.4g} at voxel {_voxel(index)}",
-                "numbers within float32 (3.4e38)",
-                "rescale the data",
-            )
+            found = f"{array[index]:.4g} at voxel {_voxel(index)}"
+            raise refusal(path, found, "numbers within float32 (3.4e38)", "rescale the data")
     return values
 
 
 def check_volume(values: np.ndarray, *, name: str, channels: Sequence[int] = (1, 3), minimum: float | None = 0.0) -> None:
-    """Refuse a grid that cannot be a coefficient of a medium; the first bad voxel is named by its index.
+    """Refuse a grid that cannot be a coefficient of a medium.
 
     Args:
         values: (Z, Y, X, C).
-        name: parameter or file, named in the refusal.
-        channels: channel counts that are allowed.
-        minimum: smallest value allowed; None allows every finite number.
+        name: parameter or file, the subject of the refusal.
+        channels: allowed numbers of channels.
+        minimum: smallest allowed value; None allows all finite numbers.
 
     Raises:
-        MivolError: wrong rank, channel count, an empty axis, numbers that are not real, NaN, Inf, or a value below
-            ``minimum``.
+        MivolError: another rank or number of channels, an empty axis, numbers that are not real, or a NaN, an Inf or a value
+            below ``minimum`` (with the index of the first such voxel).
     """
     values = np.asarray(values)
     if values.ndim != 4:

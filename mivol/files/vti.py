@@ -1,9 +1,11 @@
 """VTK's XML image (``.vti``): arrays on a regular grid, x fastest after the component; text, base64 or raw bytes.
 
-Conventions. ``Origin`` is the point of index (0, 0, 0), so the first point of the piece is ``Direction`` times spacing
-times the extent's beginning away from it. Point arrays give voxel centres; cell arrays have one element fewer along
-each axis and their centres lie half a step in. A block begins with its length (``header_type``), a compressed one with
-block count, block size, size of the last block and the packed sizes.
+Own reader: the vtk toolkit reads this format, but no small library; meshio 5.3 does not.
+
+Conventions. ``Origin`` is the point of index (0, 0, 0); the first point of the piece is ``Direction`` times spacing times the
+start of the extent away. Point arrays give voxel centres. Cell arrays have one element fewer along each axis, and their centres
+are half a step inside. A block starts with its length (``header_type``), a compressed block with the number of blocks, the
+block size, the size of the last block and the packed sizes.
 
 Reference: VTK file formats, docs.vtk.org, "XML file formats".
 """
@@ -40,15 +42,15 @@ COMPRESSORS: dict[str, str] = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataComp
 
 ORDERS: dict[str, str] = {"LittleEndian": "<", "BigEndian": ">"}
 
-#: take(n) -> the next n bytes of a block, after decoding.
+#: function from n to the next n decoded bytes of a block.
 Take = Callable[[int], bytes]
 
 
 def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read one array of a ``.vti``: ``dataset``, else the active scalars, else the only one.
+    """Read an array of a ``.vti``: ``dataset``, else the active scalars, else the only array.
 
     Raises:
-        MivolError: not image data, several pieces, a compressor or type that is not known, sizes that do not fit.
+        MivolError: other data than an image, several pieces, an unknown compressor or type, or inconsistent sizes.
     """
     root, appended, encoding = _document(source.read_bytes(path), path)
     image = root.find("ImageData")
@@ -56,7 +58,7 @@ def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
         raise refusal(path, f"VTK data of type {root.get('type')}", "ImageData", "convert it to an image first")
     pieces = image.findall("Piece")
     if len(pieces) != 1:
-        raise refusal(path, f"{len(pieces)} pieces", "one", "write the file again in one piece")
+        raise refusal(path, f"{len(pieces)} pieces", "one piece", "write the file again in one piece")
     words = pieces[0].get("Extent") or image.get("WholeExtent", "")
     extent = np.array(source.parse_integers(words, 6, path, "Extent")).reshape(3, 2)
     node, is_cell = _array(pieces[0], dataset, path)
@@ -81,7 +83,7 @@ def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 def _document(data: bytes, path: Path) -> tuple[ElementTree.Element, bytes, str]:
-    """The XML without its appended data (raw bytes are no XML), that data after its underscore, and its encoding."""
+    """The XML without the appended data (raw bytes are not XML), the data after its underscore, and the encoding."""
     appended, encoding = b"", "raw"
     tag = re.search(rb"<AppendedData([^>]*)>\s*_", data)
     if tag:
@@ -91,21 +93,20 @@ def _document(data: bytes, path: Path) -> tuple[ElementTree.Element, bytes, str]
     try:
         return ElementTree.fromstring(data), appended, encoding
     except ElementTree.ParseError as error:
-        raise refusal(
-            path, f"broken XML ({error})", "a whole VTKFile element", "the file is truncated: copy it again"
-        ) from error
+        way_out = "the file is truncated: copy it again"
+        raise refusal(path, f"broken XML ({error})", "a complete VTKFile element", way_out) from error
 
 
 def _array(piece: ElementTree.Element, dataset: str | None, path: Path) -> tuple[ElementTree.Element, bool]:
-    """The array's element, and whether it lives on cells."""
-    found: dict[str, tuple[ElementTree.Element, bool]] = {}
+    """The element of the array, and whether the array belongs to cells."""
+    arrays: dict[str, tuple[ElementTree.Element, bool]] = {}
     active = None
     for kind in ("PointData", "CellData"):
         for group in piece.findall(kind):
             active = active or group.get("Scalars")
             for node in group.findall("DataArray"):
-                found.setdefault(node.get("Name", ""), (node, kind == "CellData"))
-    return found[select_dataset(path, active if dataset is None and active in found else dataset, list(found))]
+                arrays.setdefault(node.get("Name", ""), (node, kind == "CellData"))
+    return arrays[select_dataset(path, active if dataset is None and active in arrays else dataset, list(arrays))]
 
 
 def _place(image: ElementTree.Element, first: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +150,7 @@ def _decode(
 
 
 def _block(take: Take, word: np.dtype, compressor: str | None, promised: int, path: Path) -> bytes:
-    """The bytes of one array, after its length or its table of packed blocks."""
+    """The bytes of an array, behind its length or its table of packed blocks."""
 
     def words(n: int) -> list[int]:
         return np.frombuffer(take(n * word.itemsize), word).tolist()
@@ -165,19 +166,15 @@ def _block(take: Take, word: np.dtype, compressor: str | None, promised: int, pa
     if not blocks:
         return b""
     if (blocks - 1) * size + (last or size) != promised:
-        raise refusal(
-            path,
-            f"{blocks} blocks of {size} bytes with {last} in the last",
-            f"{promised} bytes (from the extent)",
-            "write the file again",
-        )
+        found = f"{blocks} blocks of {size} bytes with {last} in the last"
+        raise refusal(path, found, f"{promised} bytes (from the extent)", "write the file again")
     packed = words(blocks)
     codec = COMPRESSORS[compressor]
     return b"".join(source.decompress(take(length), codec, size, path) for length in packed)
 
 
 def _broken(path: Path) -> Exception:
-    return refusal(path, "a block that breaks off", "all its bytes", "the file is truncated: copy it again")
+    return refusal(path, "a block that breaks off", "all of its bytes", "the file is truncated: copy it again")
 
 
 def _raw(stream: bytes, path: Path) -> Take:
@@ -194,11 +191,11 @@ def _raw(stream: bytes, path: Path) -> Take:
 
 
 def _base64(stream: bytes, path: Path) -> Take:
-    """Bytes of base64 read in whole groups of four characters.
+    """Decode base64 in whole groups of four characters.
 
-    VTK codes the length and the bytes of an uncompressed block in one run, the table of a compressed one in a run of its
-    own; other writers pad the length as well. Padding ends a run, and a group that has some yields one or two bytes
-    instead of three: so no byte of a following run is ever read with the one before.
+    VTK encodes the length and the bytes of an uncompressed block in the same run, and the table of a compressed block in a
+    separate run; other writers also pad the length. Padding ends a run: its group gives one or two bytes instead of three, so
+    bytes of the next run are never read together with the previous run.
     """
     position, held = 0, b""
 
@@ -219,8 +216,8 @@ def _base64(stream: bytes, path: Path) -> Take:
     return take
 
 
-#: how bytes are coded -> constructor of the source of bytes.
+#: encoding -> constructor of a decoder.
 STREAMS: dict[str, Callable[[bytes, Path], Take]] = {"raw": _raw, "base64": _base64}
 
-#: type of the lengths before a block.
+#: type of block lengths -> NumPy type.
 HEADER_TYPES: dict[str, str] = {"UInt32": "u4", "UInt64": "u8"}

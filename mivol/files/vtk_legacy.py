@@ -1,8 +1,10 @@
 """Legacy VTK (``.vtk``): a text header, then ``STRUCTURED_POINTS`` arrays as text or big-endian bytes, x fastest.
 
-Conventions. ``ORIGIN`` is the first point; point arrays give voxel centres, cell arrays (one fewer along each axis)
-have theirs half a step in. Arrays are read in order: SCALARS, VECTORS, and the members of FIELD; what follows an array
-that is not known is not read.
+Own reader: meshio 5.3 turns images into meshes of hexahedra.
+
+Conventions. ``ORIGIN`` is the first point. Point arrays give voxel centres; cell arrays (one element fewer along each axis)
+have their centres half a step inside. Arrays are read in order: SCALARS, VECTORS, and the members of FIELD. Reading stops at
+the first unknown array.
 
 Reference: VTK file formats, docs.vtk.org, "Simple legacy formats".
 """
@@ -37,13 +39,13 @@ TYPES: dict[str, str] = {
 
 
 class _Cursor:
-    """A place in the file: lines of text, then runs of numbers."""
+    """A position in the file, which holds lines of text and runs of numbers."""
 
     def __init__(self, data: bytes, path: Path) -> None:
         self.data, self.path, self.at, self.binary = data, path, 0, False
 
     def line(self) -> list[str]:
-        """Words of the next line that has any; [] at the end of the file."""
+        """Return the words of the next line that is not blank; [] at the end of the file."""
         while self.at < len(self.data):
             text, newline, _ = self.data[self.at : self.at + 4096].partition(b"\n")
             self.at += len(text) + len(newline)
@@ -53,7 +55,7 @@ class _Cursor:
         return []
 
     def take(self, kind: str, count: int) -> np.ndarray:
-        """The next ``count`` numbers of a VTK type."""
+        """Return the next ``count`` numbers of a VTK type."""
         if kind.lower() not in TYPES:
             raise refusal(self.path, f"the type {kind}", f"one of {', '.join(TYPES)}", "convert it to float first")
         dtype = np.dtype(TYPES[kind.lower()])
@@ -69,16 +71,16 @@ class _Cursor:
         return source.parse_numbers(b" ".join(words[:count]), count, self.path)
 
     def skip_metadata(self) -> None:
-        """Pass over lines up to the next blank one."""
+        """Skip the lines up to the next blank line."""
         end = self.data.find(b"\n\n", self.at)
         self.at = len(self.data) if end < 0 else end + 2
 
 
 def read_vtk(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read one array of a legacy ``.vtk``: ``dataset``, else the only one.
+    """Read an array of a legacy ``.vtk``: ``dataset``, or the only array.
 
     Raises:
-        MivolError: another kind of data set, a key missing, a type that is not known, or a truncated array.
+        MivolError: another kind of data set, a missing key, an unknown type, or a truncated array.
     """
     cursor = _Cursor(source.read_bytes(path), path)
     keys = _head(cursor)
@@ -102,7 +104,7 @@ def read_vtk(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 def _head(cursor: _Cursor) -> dict[str, list[str]]:
-    """The keys before the first section of arrays, at which the cursor stays."""
+    """The keys before the first section of arrays, where the cursor stops."""
     cursor.line()
     cursor.at = cursor.data.find(b"\n", cursor.at) + 1
     mode = " ".join(cursor.line()).upper()
@@ -115,7 +117,7 @@ def _head(cursor: _Cursor) -> dict[str, list[str]]:
         keys[words[0].upper()] = words[1:]
         section = cursor.at
     if not words:
-        raise refusal(cursor.path, "no POINT_DATA or CELL_DATA", "one in the header", "the file is truncated: copy it again")
+        raise refusal(cursor.path, "no POINT_DATA or CELL_DATA", "a section of arrays", "the file is truncated: copy it again")
     cursor.at = section
     found = " ".join(keys.get("DATASET", ["none"]))
     if found.upper() != "STRUCTURED_POINTS":
@@ -124,13 +126,13 @@ def _head(cursor: _Cursor) -> dict[str, list[str]]:
 
 
 def _floats(keys: dict[str, list[str]], path: Path, *names: str) -> np.ndarray:
-    """The three numbers under the first of ``names`` that is there."""
+    """The three numbers under the first existing key of ``names``."""
     name = next((name for name in names if name in keys), names[0])
     return source.parse_reals(" ".join(keys.get(name, [])), 3, path, name)
 
 
 def _arrays(cursor: _Cursor, points: list[int]) -> dict[str, tuple[np.ndarray, bool]]:
-    """name -> (flat numbers, whether on cells); the cursor is at a section, and reading ends at the first unknown word."""
+    """name -> (flat numbers, whether on cells), from the cursor at a section to the first unknown word."""
     arrays: dict[str, tuple[np.ndarray, bool]] = {}
     while words := cursor.line():
         key = words[0].upper()
@@ -189,10 +191,10 @@ def _whole(cursor: _Cursor, word: str) -> int:
     return int(word)
 
 
-#: section of a file -> whether its arrays live on cells.
+#: section of a file -> whether its arrays belong to cells.
 SECTIONS: dict[str, bool] = {"POINT_DATA": False, "CELL_DATA": True}
 
-#: first word of an array -> reader(cursor, words of the line, elements) -> name -> flat numbers.
+#: first word of an array -> reader from cursor, words of the line and number of elements to flat numbers by name.
 ARRAYS: dict[str, Callable[[_Cursor, list[str], int], dict[str, np.ndarray]]] = {
     "SCALARS": _scalars,
     "VECTORS": _vectors,

@@ -37,7 +37,7 @@ def test_what_does_not_fit_is_not_inflated(tmp_path: Path, monkeypatch: pytest.M
     np.savez_compressed(tmp_path / "a.npz", a=np.zeros(2**17))
     assert (tmp_path / "a.npz").stat().st_size < 4096
     monkeypatch.setattr(npy, "available_memory", lambda: 2**19)
-    monkeypatch.setattr(npy, "_array", lambda *given: pytest.fail("unpacked"))
+    monkeypatch.setattr(npy, "_read_member", lambda *given: pytest.fail("unpacked"))
     with pytest.raises(MivolError, match="at most the free memory"):
         read_archive(tmp_path / "a.npz")
 

@@ -181,7 +181,7 @@ def test_files_that_are_no_scan(variant_rgb, tmp_path: Path) -> None:
     with pytest.raises(MivolError, match="images of 9 x 12 pixels, expected 10 x 12"):
         projections.make_data(chosen, tmp_path, VoxelGrid((2, 2, 2)))
     (tmp_path / "few.txt").write_text("1 0.0\n2 1.0\n")
-    with pytest.raises(MivolError, match="2 angles, expected one for each of 16 views"):
+    with pytest.raises(MivolError, match="2 angles, expected one line for each of 16 views"):
         read_nikon_angles(tmp_path / "few.txt", VIEWS)
     path.write_text("[Other]\nx=1\n")
     with pytest.raises(MivolError, match="XTekCT"):
