@@ -139,7 +139,7 @@ class SceneFitSettings(Section):
             raise ValueError(f'max_depth is "{self.max_depth}": expected a whole number from -1 on, or "{AUTO}"')
 
 
-class Experiment(Section):
+class SceneExperiment(Section):
     """All of ``fit.toml``."""
 
     title: Annotated[str, setting("1", "heading of the report", min_length=1)]
@@ -305,7 +305,7 @@ class Grid(Section):
     centre: Annotated[tuple[float, float, float], setting("length", "(x, y, z) of the box's middle")] = (0.0, 0.0, 0.0)
 
 
-class Solve(Section):
+class SolveSettings(Section):
     """How the projections are inverted."""
 
     name: Annotated[str, setting("1", "auto, or a key of mivol.optim.projections.solvers.ALL_SOLVERS", min_length=1)] = "auto"
@@ -361,14 +361,14 @@ class Solve(Section):
             raise ValueError(f'unknown window "{self.window}": {suggest_name(self.window, list(WINDOWS))}'.rstrip("."))
 
 
-class Scan(Section):
+class ScanExperiment(Section):
     """All of a TOML file for tomography: it has a table ``[scan]`` in place of ``[scene]``."""
 
     title: Annotated[str, setting("1", "heading of the report", min_length=1)]
     scan: Annotated[Parallel | Cone | Table | Matrices | OfData, setting("1", "beam and detector")]
     data: Annotated[Ellipsoids | Known | Measured | Stack | Nikon, setting("1", "what was seen")]
     grid: Annotated[Grid | None, setting("1", "where the voxels lie; absent: where a Nikon file says")] = None
-    solve: Annotated[Solve, setting("1", "how it is inverted")] = Solve()
+    solve: Annotated[SolveSettings, setting("1", "how it is inverted")] = SolveSettings()
     held_out_every: Annotated[int, setting("view", "every so many is predicted, not fitted; 0: none", ge=0)] = 0
     checkpoint_every: Annotated[int, setting("iteration", "how often", ge=1)] = 5
     variant: Annotated[str, setting("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
@@ -431,7 +431,7 @@ MOST_LEVELS = 12
 """Nested boxes that may be asked for: the largest is then 2048 times the innermost."""
 
 
-class Field(Section):
+class FieldSettings(Section):
     """The radiance field and how it is fitted."""
 
     preset: Annotated[str, setting("1", "nodes, steps, rates and priors: tiny, cpu, fine, capture or gpu", min_length=1)] = (
@@ -482,7 +482,7 @@ class Field(Section):
 Keyframe = tuple[float, float, float, float, float, float]
 
 
-class Shown(Section):
+class ShowSettings(Section):
     """What is made of a fitted field."""
 
     views: Annotated[int, setting("view", "judged views that are shown beside their photographs", ge=0)] = 4
@@ -509,13 +509,13 @@ class Shown(Section):
             raise ValueError(f'unknown metric "{unknown}": {suggest_name(unknown, list(METRICS))}'.rstrip("."))
 
 
-class FieldFit(Section):
+class FieldExperiment(Section):
     """All of ``fit.toml`` of a radiance field."""
 
     title: Annotated[str, setting("1", "heading of the report", min_length=1)]
     photos: Annotated[Photographs, setting("1", "what was seen")]
-    field: Annotated[Field, setting("1", "what is looked for")] = Field()
-    show: Annotated[Shown, setting("1", "what is made of it")] = Shown()
+    field: Annotated[FieldSettings, setting("1", "what is looked for")] = FieldSettings()
+    show: Annotated[ShowSettings, setting("1", "what is made of it")] = ShowSettings()
     checkpoint_every: Annotated[int, setting("step", "how often", ge=1)] = 500
     variant: Annotated[str, setting("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
     seed: Annotated[int, setting("1", "root of the fit's random numbers", ge=0)] = 0
@@ -559,13 +559,13 @@ class GaussianSettings(Section):
             raise ValueError(f"ssim is {self.ssim}: a number from 0 to 1 is expected")
 
 
-class GaussianFit(Section):
+class GaussianExperiment(Section):
     """All of a TOML file that fits Gaussians to photographs: it has a table ``[gaussians]`` in place of ``[field]``."""
 
     title: Annotated[str, setting("1", "heading of the report", min_length=1)]
     photos: Annotated[Photographs, setting("1", "what was seen")]
     gaussians: Annotated[GaussianSettings, setting("1", "what is looked for")]
-    show: Annotated[Shown, setting("1", "what is made of it")] = Shown()
+    show: Annotated[ShowSettings, setting("1", "what is made of it")] = ShowSettings()
     checkpoint_every: Annotated[int, setting("step", "how often", ge=1)] = 500
     variant: Annotated[str, setting("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
     seed: Annotated[int, setting("1", "root of the fit's random numbers", ge=0)] = 0
@@ -573,11 +573,22 @@ class GaussianFit(Section):
     output: Annotated[str, setting("path", "run folder, relative to where the command runs", min_length=1)] = "runs/gaussians"
 
 
-PhotoFit = FieldFit | GaussianFit
+PhotoExperiment = FieldExperiment | GaussianExperiment
 """A fit of photographs, of either model."""
 
+Experiment = SceneExperiment | ScanExperiment | PhotoExperiment
+"""Settings of an experiment of any kind."""
+
+TITLES: dict[str, type[Section]] = {
+    "images": SceneExperiment,
+    "projections": ScanExperiment,
+    "photographs": FieldExperiment,
+    "photographs, to Gaussians": GaussianExperiment,
+}
+"""Kinds of experiments, by the data that they fit."""
+
 #: Table of the file that tells which experiment it is; without any of them it is one on a scene.
-KINDS: dict[str, type] = {"scan": Scan, "gaussians": GaussianFit, "photos": FieldFit}
+KINDS: dict[str, type] = {"scan": ScanExperiment, "gaussians": GaussianExperiment, "photos": FieldExperiment}
 
 CAPTURE = {
     "photos": {"largest": 240, "box": "middle"},
@@ -589,7 +600,7 @@ CAPTURE = {
 NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "show")
 
 
-def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | PhotoFit:
+def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
     """Read an experiment.
 
     Args:
@@ -616,13 +627,13 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | P
     return from_dict(raw, path.name)
 
 
-def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Scan | PhotoFit:
+def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
     """An experiment from plain dicts and lists; its tables tell which it is (``KINDS``).
 
     Raises:
         MivolError: as :func:`load`; ``name`` begins the sentence.
     """
-    kind = next((KINDS[table] for table in KINDS if table in raw), Experiment)
+    kind = next((KINDS[table] for table in KINDS if table in raw), SceneExperiment)
     raw = _with_capture(raw)
     check_keys(raw, kind, "", name)
     try:
@@ -632,7 +643,7 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Sca
         raise MivolError(f"{name}: {said}") from None
 
 
-def of_photographs(path: Path, preset: str, changes: Sequence[str] = ()) -> FieldFit:
+def of_photographs(path: Path, preset: str, changes: Sequence[str] = ()) -> FieldExperiment:
     """The experiment of a folder of photographs, or of a file of cameras, that has no file of its own.
 
     Raises:
@@ -653,7 +664,7 @@ def _with_capture(raw: dict[str, Any]) -> dict[str, Any]:
     return raw | {name: CAPTURE[name] | held if isinstance(held, dict) else held for name, held in given.items()}
 
 
-def resolved(experiment: Experiment | Scan | PhotoFit) -> dict[str, Any]:
+def resolved(experiment: Experiment) -> dict[str, Any]:
     """Every setting, defaults included, as plain dicts and lists."""
     return msgspec.to_builtins(experiment)
 

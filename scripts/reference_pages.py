@@ -166,10 +166,10 @@ def toml_page() -> str:
     from mivol import config
 
     kinds = {
-        "Pictures of a scene (a table `[scene]`)": config.Experiment,
-        "Projections (a table `[scan]`)": config.Scan,
-        "Photographs (a table `[photos]`)": config.FieldFit,
-        "Gaussians (tables `[photos]` and `[gaussians]`)": config.GaussianFit,
+        "Pictures of a scene (a table `[scene]`)": config.SceneExperiment,
+        "Projections (a table `[scan]`)": config.ScanExperiment,
+        "Photographs (a table `[photos]`)": config.FieldExperiment,
+        "Gaussians (tables `[photos]` and `[gaussians]`)": config.GaussianExperiment,
     }
     lines = ["# Settings of an experiment", "", *SETTINGS_HEAD.splitlines(), ""]
     for title, kind in kinds.items():

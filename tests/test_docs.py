@@ -183,7 +183,7 @@ def test_experiments_of_the_pages_are_taken() -> None:
     """Every setting is known and has a value of its domain."""
     texts = [(path, text) for path in PAGES for text in blocks(path, "toml")]
     kinds = {type(config.from_dict(tomllib.loads(text), name_of(path))) for path, text in texts}
-    assert kinds == {config.Experiment, config.Scan, config.FieldFit, config.GaussianFit}
+    assert kinds == {config.SceneExperiment, config.ScanExperiment, config.FieldExperiment, config.GaussianExperiment}
 
 
 def test_reference_is_what_the_code_says(variant_rgb: str) -> None:

@@ -12,7 +12,7 @@ from fit_scene import KEY
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.explain import explain_fit
+from mivol.experiments.kinds import explain_experiment
 from mivol.files import write_exr, write_volume
 
 SCENE = """<scene version="3.0.0">
@@ -88,7 +88,7 @@ def refused(capsys: pytest.CaptureFixture, *arguments: object) -> str:
 def assert_explained(path: Path, changes: list[str], said: str) -> None:
     """``explain`` refuses an experiment with changes by the sentence that ``optimize`` said, free memory apart."""
     try:
-        found = explain_fit(config.load(path, changes), path.parent).refusal
+        found = explain_experiment(config.load(path, changes), path.parent).refusal
     except MivolError as error:
         found = str(error)
     assert without_memory(found) == without_memory(said.rpartition("mivol: ")[2].rstrip("\n"))

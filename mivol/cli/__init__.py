@@ -148,8 +148,9 @@ def optimize_flags(sub: argparse.ArgumentParser) -> None:
     from mivol import config
     from mivol.schema import describe
 
-    lines = ["images:", *describe(config.Experiment), "", "projections:", *describe(config.Scan)]
-    lines += ["", "photographs:", *describe(config.FieldFit), "", "photographs, to Gaussians:", *describe(config.GaussianFit)]
+    lines: list[str] = []
+    for title, kind in config.TITLES.items():
+        lines += [*([""] if lines else []), f"{title}:", *describe(kind)]
     sub.epilog = "settings of the file for " + "\n  ".join(line.replace("%", "%%") for line in lines)
     sub.add_argument("experiment", type=Path, help="TOML file, or posed photographs: a folder or its file of cameras")
     sub.add_argument("--preset", help="of photographs without a TOML file: capture for a place around the cameras, or cpu, ...")
@@ -271,9 +272,9 @@ def explain_scene(arguments: argparse.Namespace) -> int:
 
 def explain_experiment(arguments: argparse.Namespace) -> int:
     """Facts, choices, reasons of a fit, with every check that it would make."""
-    from mivol.experiments.explain import explain_fit
+    from mivol.experiments.kinds import explain_experiment as explain_settings
 
-    said = explain_fit(*chosen_of(arguments.scene, arguments), arguments.output)
+    said = explain_settings(*chosen_of(arguments.scene, arguments), arguments.output)
     print(said.text)
     return int(bool(said.refusal))
 
@@ -372,13 +373,13 @@ def reference(arguments: argparse.Namespace) -> None:
 
 def optimize(arguments: argparse.Namespace) -> None:
     """Reconstruct a volume from its views; everything that comes of it lies in the run folder."""
-    from mivol.cli.progress import Terminal
-    from mivol.experiments.runs import run_experiment
-    from mivol.experiments.task import Task
+    from mivol.cli.progress import TerminalProgress
+    from mivol.experiments.fit_kind import RunContext
+    from mivol.experiments.kinds import run_experiment
 
     chosen, base = chosen_of(arguments.experiment, arguments)
     folder = arguments.output or Path(chosen.output)
-    print(run_experiment(Task(chosen, base, folder, arguments.resume, Terminal(), arguments.command)))
+    print(run_experiment(RunContext(chosen, base, folder, arguments.resume, TerminalProgress(), arguments.command)))
 
 
 def chosen_of(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path]:
@@ -468,7 +469,7 @@ def convert_points(arguments: argparse.Namespace, kind: str | None) -> str:
 
 def demo(arguments: argparse.Namespace) -> None:
     """Run an example that comes with mivol, list them, or copy one to begin from."""
-    from mivol.cli.progress import Terminal
+    from mivol.cli.progress import TerminalProgress
     from mivol.experiments.examples import copy_example, list_examples, run_example
 
     if not arguments.name:
@@ -476,7 +477,7 @@ def demo(arguments: argparse.Namespace) -> None:
     elif arguments.into is not None:
         print(copy_example(arguments.name, arguments.into))
     else:
-        settings = {"changes": tuple(arguments.set), "watcher": Terminal(), "command": arguments.command}
+        settings = {"changes": tuple(arguments.set), "progress": TerminalProgress(), "command": arguments.command}
         print(run_example(arguments.name, arguments.output, **settings))
 
 

@@ -19,8 +19,8 @@ from mivol.report.record import QUANTITIES, Quantity
 T = TypeVar("T")
 
 
-class Terminal:
-    """A :class:`mivol.experiments.task.Watcher` that prints to the error output."""
+class TerminalProgress:
+    """A :class:`mivol.experiments.fit_kind.Progress` that prints to the error output."""
 
     def say(self, lines: Sequence[str]) -> None:
         """Print lines."""

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.experiments.runs import run_experiment
-from mivol.experiments.task import Nobody, Task, Watcher
+from mivol.experiments.fit_kind import NullProgress, Progress, RunContext
+from mivol.experiments.kinds import run_experiment
 from mivol.fields.procedural import make_procedural
 from mivol.files import write_volume
 from mivol.files.atomic import disk_faults
@@ -240,7 +240,7 @@ def whole_folder(path: Path) -> Iterator[None]:
 
 
 def run_example(
-    name: str, folder: Path | None, *, changes: tuple[str, ...] = (), watcher: Watcher | None = None, command: str = ""
+    name: str, folder: Path | None, *, changes: tuple[str, ...] = (), progress: Progress | None = None, command: str = ""
 ) -> Path:
     """Run an example; the page.
 
@@ -248,41 +248,41 @@ def run_example(
         name: key of ``EXAMPLES``.
         folder: run folder; None: the ``output`` of the changes, else runs/NAME.
         changes: settings as ``--set`` takes them.
-        watcher: who is told how it goes.
+        progress: who is told how it goes.
         command: what was typed, for the record.
 
     Raises:
         MivolError: no such example, and whatever its fit refuses.
     """
-    example, watcher = example_named(name), watcher or Nobody()
+    example, progress = example_named(name), progress or NullProgress()
     source = example.source(name)
     # Before anything is made for it: what the changes ask for may be refused.
     wanted = config.load(source / example.file, (f"output=runs/{name}", *changes)).output
     folder = folder or Path(wanted)
-    given = (*prepare(name, example, source, folder, watcher), *changes)
+    given = (*prepare(name, example, source, folder, progress), *changes)
     chosen = config.load(source / example.file, given)
-    return run_experiment(Task(chosen, source, folder, watcher=watcher, command=command))
+    return run_experiment(RunContext(chosen, source, folder, progress=progress, command=command))
 
 
-def prepare(name: str, example: Example, source: Path, folder: Path, watcher: Watcher) -> list[str]:
+def prepare(name: str, example: Example, source: Path, folder: Path, progress: Progress) -> list[str]:
     """What lies ready before an example runs, as changes of settings: photographs, readings, or a stand-in for public data."""
     folder.mkdir(parents=True, exist_ok=True)
     if example.photographs:
         photographs = folder.resolve() / "photographs"
         if not (photographs / "transforms.json").exists():
-            watcher.say(["making the photographs"])
+            progress.say(["making the photographs"])
             run_script(source / example.photographs, ["-o", str(photographs)])
         return [f"photos.path={quoted(photographs)}"]
     if example.scan:
         readings = folder.resolve() / "scan"
         if not (readings / "truth.npz").exists():
-            watcher.say(["making the readings"])
+            progress.say(["making the readings"])
             run_script(source / example.scan, ["-o", str(readings)])
         return [f"{setting}={quoted(readings / file)}" for setting, file in SCAN_FILES.items()]
     if example.stand_in is None or find_local_file(example.stand_in.data) is not None:
         return []
     wanted = example.stand_in
-    watcher.say([
+    progress.say([
         f'the public data set "{wanted.data}" is not on this machine: {wanted.says} (mivol fetch {wanted.data} brings it)'
     ])  # fmt: skip
     return wanted.make(folder)

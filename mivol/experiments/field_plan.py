@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mivol.config import FieldFit
+from mivol.config import FieldExperiment
 from mivol.errors import MivolError
 from mivol.optim.photographs.radiance_plan import (
     FEW_PHOTOGRAPHS,
@@ -43,7 +43,7 @@ LEARNED = {"sky": ("sky", "sky_smooth"), "nested": ("sky", "sky_smooth", "levels
 """What the plan takes from the preset ``capture``, by the word for what is behind."""
 
 
-def make_plan(chosen: FieldFit) -> RadiancePlan:
+def make_plan(chosen: FieldExperiment) -> RadiancePlan:
     """The preset with what the file says otherwise.
 
     Raises:

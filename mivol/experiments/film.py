@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mivol.config import Shown
+from mivol.config import ShowSettings
 from mivol.errors import MivolError
+from mivol.experiments.fit_kind import Progress
 from mivol.experiments.run_folder import RunFolder
-from mivol.experiments.task import Watcher
 from mivol.photos import Camera, Photos, follow_keyframes, interpolate_cameras, turntable
 from mivol.report.record import Image
 from mivol.report.video import NO_FFMPEG_NOTE, film_suffix, volume_frames, write_video
@@ -48,27 +48,27 @@ class Film:
     shrink: float = 1.0
     notes: tuple[str, ...] = ()
 
-    def write(self, folder: Path, picture: Callable[[Camera], NDArray], watcher: Watcher) -> Image:
+    def write(self, folder: Path, picture: Callable[[Camera], NDArray], progress: Progress) -> Image:
         """Make the pictures and write them; says how films become mp4 where they do not.
 
         Args:
             folder: run folder; the film lies in ``film/``.
             picture: (H, W, 3) code values that a camera sees.
-            watcher: who is told how it goes.
+            progress: who is told how it goes.
         """
         path = f"film/{self.way}{film_suffix()}"
         if not path.endswith(".mp4"):
-            watcher.say([NO_FFMPEG_NOTE])
+            progress.say([NO_FFMPEG_NOTE])
 
         def frames() -> Iterator[NDArray[np.uint8]]:
-            for camera in watcher.track(self.cameras, "frames"):
+            for camera in progress.track(self.cameras, "frames"):
                 yield np.round(np.clip(picture(camera), 0, 1) * 255).astype(np.uint8)
 
         write_video(folder / path, frames(), fps=len(self.cameras) / SECONDS)
         return Image(path=path, role="film", caption=f"{len(self.cameras)} {WAYS[self.way]}")
 
 
-def plan_film(show: Shown, photos: Photos) -> Film:
+def plan_film(show: ShowSettings, photos: Photos) -> Film:
     """Place the cameras of a film, before anything is fitted.
 
     Raises:

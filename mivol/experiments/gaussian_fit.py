@@ -1,77 +1,214 @@
-"""Gaussians fitted to photographs: from the settings of an experiment to a run folder, one call per arrow.
+"""A fit of 3D Gaussians to photographs.
 
-Conventions. ``metrics.jsonl`` has ``loss`` (that of a step's picture) and the PSNR of a fixed set of judged views now and then;
-``gaussians.ply`` holds the Gaussians as published viewers read them, ``film/turntable.mp4`` (``.webp`` where there is no
-ffmpeg) a camera path around them.
+Conventions. The loss in ``metrics.jsonl`` is that of a step's picture. ``gaussians.ply`` holds the Gaussians as published
+viewers read them.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mivol import config
-from mivol.config import GaussianFit
-from mivol.experiments.back_end import choose_back_end
-from mivol.experiments.film import plan_film
-from mivol.experiments.gaussian_outputs import GaussianOutputs, compare
-from mivol.experiments.gaussian_start import begin, make_gaussian_plan
-from mivol.experiments.photo_data import boxed, notes, read_photos
-from mivol.experiments.photo_fit import solve
-from mivol.experiments.run_folder import BestIterate, FilesOfBest, RunFolder
-from mivol.experiments.task import Task
+from mivol.config import GaussianExperiment
+from mivol.errors import MivolError
+from mivol.experiments.fit_kind import Stages
+from mivol.experiments.photo_fit import PhotoFit
+from mivol.experiments.run_folder import BestFiles, RunFolder
+from mivol.optim.gaussians.density_control import CloudArrays
+from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.gaussians.gaussian_start import find_start_points, make_start_cloud
+from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.strategy import suggest_name
+from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.points import Gaussians, write_gaussians
-from mivol.report.page import write_page
-from mivol.report.record import RunRecord
+from mivol.report.record import PlanLine, RunRecord, Table
+from mivol.validate.images import Quality, judge
 
-__all__ = ["gaussian_fit"]
+__all__ = ["Begun", "GaussianFit", "begin", "compare", "make_gaussian_plan", "picture_of"]
+
+FILE = "gaussians.ply"
 
 
-def gaussian_fit(task: Task) -> Path:
-    """Fit Gaussians to photographs; result and refusals as :func:`mivol.experiments.scene_fit.scene_fit`.
+class GaussianFit(PhotoFit):
+    """A fit of 3D Gaussians.
 
-    Args:
-        task: with a :class:`~mivol.config.GaussianFit`.
+    Attributes:
+        begun: plan, photographs and Gaussians of the first step.
     """
-    chosen: GaussianFit = task.chosen
-    choose_back_end(chosen.variant, chosen.threads)
-    asked = make_gaussian_plan(chosen)
-    run = RunFolder(task.folder, new_record(task), task.resume)
-    with run.at_work():
-        with run.stage("photographs"):
-            photos, judged = read_photos(chosen, task.base)
-            photos = boxed(chosen, photos)
-            film = plan_film(chosen.show, photos)
-            begun = begin(chosen, photos, asked)
-            run.record.plan, run.record.notes = begun.lines, [*notes(photos, judged), *film.notes]
-            task.watcher.say([photos.describe(), *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
-        with run.stage("fit"):
-            problem = begun.problem(chosen.seed)
-            best = BestIterate(run, best_files(problem))
-            fit = solve(task, run, problem, judged, best, compare)
-        with run.stage("images and Gaussians"):
-            GaussianOutputs(task, run, fit, photos, judged, film).write()
-    page = write_page(task.folder)
-    task.watcher.say([*best.says(), run.summary()])
-    return page
+
+    settings: GaussianExperiment
+    problem: GaussianProblem
+    stages = Stages("photographs", "fit", "images and Gaussians")
+
+    @property
+    def fits_colours(self) -> bool:
+        """Whether the photographs have gains."""
+        return self.problem.exposure is not None
+
+    def make_plan(self, settings: GaussianExperiment) -> GaussianPlan:
+        return make_gaussian_plan(settings)
+
+    def new_record(self) -> RunRecord:
+        relocates = self.plan.control == "relocation"
+        return RunRecord.new(
+            self.settings.title,
+            method=f"3D Gaussians, splatted in tiles and fitted to photographs; preset {self.settings.gaussians.preset}",
+            config=config.resolved(self.settings),
+            command=self.context.command,
+            seeds={"fit": self.settings.seed},
+            units={"loss": "1"},
+            citations=["mitsuba3", "drjit", "kerbl_2023", "zwicker_2001", "wang_2004"] + ["kheradmand_2024"] * relocates,
+        )
+
+    def plan_fit(self) -> list[PlanLine]:
+        self.begun = begin(self.settings, self.photos, self.plan)
+        self.plan = self.begun.plan
+        return self.begun.lines
+
+    def make_problem(self) -> GaussianProblem:
+        return self.begun.problem(self.settings.seed)
+
+    def best_files(self) -> BestFiles:
+        name = "gaussians_best.ply"
+        return BestFiles((name,), lambda folder: write_gaussians(folder / name, Gaussians(**self.problem.cloud)))
+
+    def rectified(self, photo: Photo) -> Photo:
+        return rectify(photo)
+
+    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, Quality]:
+        return compare(self.problem, self.judged, photo, metrics)
+
+    def film_frame(self, camera: Camera) -> NDArray:
+        low_pass = self.plan.low_pass_at(self.film.shrink)
+        return picture_of(self.problem, camera, self.photos.views[0].background, low_pass)
+
+    def write_model(self, run: RunFolder) -> dict[str, float]:
+        gaussians, path = Gaussians(**self.problem.cloud), run.path / FILE
+        write_gaussians(path, gaussians)
+        self.record.tables = [storage(gaussians, path.stat().st_size)]
+        return {"gaussians": float(gaussians.count)}
+
+    def gains(self) -> NDArray | None:
+        return None if self.problem.exposure is None else self.problem.exposure.table()
 
 
-def best_files(problem: GaussianProblem) -> FilesOfBest:
-    """Where the best Gaussians lie beside the last ones."""
-    name = "gaussians_best.ply"
-    return FilesOfBest((name,), lambda folder: write_gaussians(folder / name, Gaussians(**problem.cloud)))
+def compare(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, Quality]:
+    """A photograph's view of the Gaussians (H, W, 3), and how alike they are; what a lens distorts is rectified first."""
+    photo = rectify(photo)
+    seen = picture_of(problem, photo.camera, photo.background, problem.plan.low_pass)
+    return seen, judge(seen, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
 
-def new_record(task: Task) -> RunRecord:
-    """The record of a run that begins."""
-    chosen: GaussianFit = task.chosen
-    relocates = make_gaussian_plan(chosen).control == "relocation"
-    return RunRecord.new(
-        chosen.title,
-        method=f"3D Gaussians, splatted in tiles and fitted to photographs; preset {chosen.gaussians.preset}",
-        config=config.resolved(chosen),
-        command=task.command,
-        seeds={"fit": chosen.seed},
-        units={"loss": "1"},
-        citations=["mitsuba3", "drjit", "kerbl_2023", "zwicker_2001", "wang_2004"] + ["kheradmand_2024"] * relocates,
+def picture_of(problem: GaussianProblem, camera: Camera, behind: NDArray, low_pass: float) -> NDArray:
+    """What a pinhole sees of the Gaussians, (H, W, 3) over a colour (3,)."""
+    splatter = problem.splatter_for(camera.size, low_pass)
+    seen = np.array(splatter.forward(problem.values(), camera, derivatives=False)[0])
+    return seen[..., :3] + (1 - seen[..., 3:]) * np.asarray(behind, np.float32)
+
+
+def storage(found: Gaussians, bytes_: int) -> Table:
+    """What the Gaussians take, and what they are like."""
+    opacity, scale = found.opacities(), found.scales()
+    rows = (
+        ("Gaussians", f"{found.count}"),
+        ("harmonics", f"degree {found.degree}"),
+        ("file", f"{bytes_ / 2**20:.2f} MiB"),
+        ("opacity: median", f"{np.median(opacity):.3g}"),
+        ("longest axis: median [length]", f"{np.median(scale.max(axis=1)):.3g}"),
+        ("longest over shortest axis: median", f"{np.median(scale.max(axis=1) / scale.min(axis=1)):.3g}"),
     )
+    return Table(title="What was found", head=("", ""), rows=rows)
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What a fit begins with.
+
+    Attributes:
+        views: the photographs, as pinholes saw them.
+        plan: for photographs of their size.
+        batches: the photographs in the sizes of the plan.
+        cloud: the first Gaussians.
+        lines: what will be done, and why.
+    """
+
+    views: tuple[Photo, ...]
+    plan: GaussianPlan
+    batches: RayBatches
+    cloud: CloudArrays
+    lines: list[PlanLine]
+
+    def problem(self, seed: int) -> GaussianProblem:
+        """What is fitted, before its first step; ``seed``: of the views and the places that are drawn."""
+        return GaussianProblem(self.batches, [view.camera for view in self.views], self.cloud, self.plan, seed)
+
+
+def make_gaussian_plan(chosen: GaussianExperiment) -> GaussianPlan:
+    """The preset with what the file says otherwise.
+
+    Raises:
+        MivolError: an unknown preset or control of the density.
+    """
+    wanted = chosen.gaussians
+    if wanted.preset not in PRESETS:
+        raise MivolError(f'gaussians.preset = "{wanted.preset}" is unknown: {suggest_name(wanted.preset, list(PRESETS))}')
+    if wanted.control is not None and wanted.control not in CONTROLS:
+        raise MivolError(f'gaussians.control = "{wanted.control}" is unknown: {suggest_name(wanted.control, list(CONTROLS))}')
+    given = {name: getattr(wanted, name) for name in ("start", "most", "control", "ssim")}
+    told = {name: value for name, value in given.items() if value is not None}
+    plan = replace(PRESETS[wanted.preset], mip=wanted.mip, exposure=wanted.exposure, **told)
+    if wanted.degree is not None:
+        stages = [replace(stage, degree=min(stage.degree, wanted.degree)) for stage in plan.stages]
+        plan = replace(plan, stages=(*stages[:-1], replace(stages[-1], degree=wanted.degree)))
+    return plan.scaled(wanted.effort)
+
+
+def begin(chosen: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> Begun:
+    """Photographs, plan and first Gaussians of a fit; memory is counted before it is taken.
+
+    Raises:
+        MivolError: more memory than there is, or no place where Gaussians could begin.
+    """
+    views = tuple(rectify(view) for view in photos.views)
+    longest = max(max(view.camera.size) for view in views)
+    plan = plan.for_edge(longest)
+    places, whence = find_start_points(photos, plan.start, chosen.seed)
+    largest = max(view.camera.size[0] * view.camera.size[1] for view in views)
+    if chosen.gaussians.minutes is not None:
+        plan = plan.in_minutes(chosen.gaussians.minutes, largest)
+    pixels = largest // min(s.shrink for s in plan.stages) ** 2
+    channels = 4 if all(view.alpha is not None for view in views) else 3
+    sizes = {stage.shrink for stage in plan.stages}
+    taken = sum(view.image.size // 3 * channels // shrink**2 for view in views for shrink in sizes)
+    memory = check_memory(replace(plan, start=len(places)), taken, pixels)
+    batches = RayBatches.of(views, [stage.shrink for stage in plan.stages])
+    cloud = make_start_cloud(places, views, plan.stages[0].degree)
+    return Begun(views, plan, batches, cloud, choices(plan, photos, len(places), whence, memory, plan.minutes(largest)))
+
+
+GAINS = PlanLine(choice="gains of each photograph", reason="cameras that choose their exposure; pulled towards 1")
+
+
+def choices(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:
+    """What will be done, and why."""
+    stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
+    behind = "alpha says what is there" if photos.views[0].alpha is not None else "photos.background"
+    control = {
+        "clone_split": "divided where the photographs pull most, taken out where they are transparent (Kerbl et al. 2023)",
+        "relocation": "moved from where they are transparent to where others are opaque (Kheradmand et al. 2024)",
+    }[plan.control]
+    return [
+        PlanLine(choice=f"{len(photos.views)} photographs", reason=photos.survey.box_from),
+        PlanLine(choice=f"{count} Gaussians at first", reason=whence),
+        PlanLine(choice=f"up to {max(plan.most, count)} Gaussians", reason=control),
+        PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason="small photographs first, one a step"),
+        PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="absolute error beside it"),
+        PlanLine(choice="what is behind is no part of the Gaussians", reason=behind),
+        *[GAINS][: plan.exposure],
+        PlanLine(choice=f"about {minutes:.2g} minutes", reason="on two idle cores, by the number of steps; no clock ends it"),
+        PlanLine(choice=memory, reason="counted before it is taken"),
+    ]

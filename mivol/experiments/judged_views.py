@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,12 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.files import write_png
-from mivol.photos import Photo
+from mivol.photos import Camera, Photo
 from mivol.photos.photo_file import SPACES
-from mivol.report.record import CODES, Image
-from mivol.validate.images import METRICS, Quality
+from mivol.report.record import CODES, Image, Table
+from mivol.validate.images import METRICS, Quality, colour_fitted, judge
 
-__all__ = ["JudgedViews", "caption_of", "said_of", "spread_over", "write_view"]
+__all__ = [
+    "JudgedViews",
+    "caption_of",
+    "judge_colour_fitted",
+    "rename_metrics",
+    "said_of",
+    "spread_over",
+    "table_of_views",
+    "write_view",
+]
 
 MANY = 32
 """Judged views from which the small ones are smaller: a page stays below some 20 MB."""
@@ -133,3 +142,33 @@ def said_of(views: Iterable[Photo]) -> str:
     width, height = sizes[0]
     size = f"{width} x {height} pixels" if set(sizes) == {sizes[0]} else "their own sizes"
     return f"{len(sizes)} view{'s' if len(sizes) > 1 else ''} at {size}"
+
+
+def judge_colour_fitted(image: NDArray, photo: Photo, space: str) -> float:
+    """PSNR [dB] of a view whose colours, as a screen shows them, were fitted to its photograph's."""
+    shown, wanted = (SPACES[space, "srgb"](values) for values in (image, photo.image))
+    return judge(colour_fitted(shown, wanted, photo.mask), wanted, mask=photo.mask).values["psnr"]
+
+
+def table_of_views(camera: Camera, found: Sequence[Quality], fitted: Sequence[float] = ()) -> Table:
+    """Every judged view with its own figures, the worst one first.
+
+    Args:
+        camera: of the first view, whose size is said.
+        found: the metrics of each.
+        fitted: PSNR [dB] of each with its colours fitted to the photograph's; none: it is not said.
+    """
+    metrics = list(found[0].values)
+    head = ("view", *(METRICS[name].label for name in metrics))
+    rows = [(one.name, *(f"{one.values[name]:.{METRICS[name].digits}f}" for name in metrics)) for one in found]
+    if fitted:
+        head += ("PSNR [dB], colours fitted to the photograph's",)
+        rows = [(*row, f"{value:.2f}") for row, value in zip(rows, fitted, strict=True)]
+    rows.sort(key=lambda row: float(row[1]))
+    width, height = camera.size
+    return Table(title=f"Judged views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
+
+
+def rename_metrics(values: dict[str, float]) -> dict[str, float]:
+    """Metrics by the names of :data:`mivol.report.record.QUANTITIES`."""
+    return {("held_out_psnr" if name == "psnr" else name): value for name, value in values.items()}

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mivol.config import GaussianFit, PhotoFit
+from mivol.config import GaussianExperiment, PhotoExperiment
 from mivol.errors import MivolError
 from mivol.experiments.field_plan import LEARNED
 from mivol.optim.photographs.colour_scale import EPSILON
@@ -20,7 +20,7 @@ from mivol.photos.region import near_and_far
 from mivol.validate.images import check_metrics
 
 
-def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
+def read_photos(chosen: PhotoExperiment, base: Path) -> tuple[Photos, Photos | None]:
     """Photographs to fit, and those to judge by.
 
     Raises:
@@ -39,7 +39,7 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
         "stored": wanted.stored,
         "box": SEARCHED.get(box) if isinstance(box, str) else np.array(box, np.float64),
     }
-    if isinstance(chosen, GaussianFit):
+    if isinstance(chosen, GaussianExperiment):
         if wanted.space == "linear":
             raise MivolError('photos.space = "linear" was asked for; Gaussians are fitted to code values: "srgb" is expected.')
         settings["space"] = "srgb"
@@ -62,21 +62,21 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
     return exposed(photos, white), exposed(_over(judged, wanted.background), white)
 
 
-def check_background(chosen: PhotoFit, has_alpha: bool) -> None:
+def check_background(chosen: PhotoExperiment, has_alpha: bool) -> None:
     """Refuse a word for what is behind that is none, or none for photographs of this kind.
 
     Raises:
         MivolError: with the words that are.
     """
     word = chosen.photos.background
-    learned = [] if isinstance(chosen, GaussianFit) else list(LEARNED)
+    learned = [] if isinstance(chosen, GaussianExperiment) else list(LEARNED)
     known = list(BACKGROUNDS) if has_alpha else ["white", "black", *learned]
     if not isinstance(word, str) or word in ("", *known):
         return
     if word not in (*BACKGROUNDS, *LEARNED):
         raise MivolError(f'photos.background = "{word}" is unknown: {suggest_name(word, known)}')
     kind = "photographs with alpha" if has_alpha else "photographs without alpha"
-    if word in LEARNED and isinstance(chosen, GaussianFit):
+    if word in LEARNED and isinstance(chosen, GaussianExperiment):
         kind = "Gaussians"
     raise MivolError(f'photos.background = "{word}" is not for {kind}: {", ".join(known)} or an rgb triple is expected.')
 
@@ -126,7 +126,7 @@ def note_on_alpha(survey: PhotoSurvey) -> str:
     return f"alpha in all photographs: photos.background says what they are put over; {box}"
 
 
-def boxed(chosen: PhotoFit, photos: Photos) -> Photos:
+def boxed(chosen: PhotoExperiment, photos: Photos) -> Photos:
     """The photographs with the box where matter may be.
 
     Raises:

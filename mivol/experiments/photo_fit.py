@@ -1,142 +1,204 @@
-"""A radiance field fitted to photographs: from the settings of an experiment to a run folder, one call per arrow.
+"""What fits of photographs share, whatever the model.
 
-Conventions. ``metrics.jsonl`` has ``loss`` (mean squared error of a step's rays) and the PSNR of a fixed set of judged views
-now and then; ``field.npz`` is the field, ``film/turntable.mp4`` (``.webp`` where there is no ffmpeg) a camera path around it.
+Conventions. ``metrics.jsonl`` has the loss of a step and, at some steps, the PSNR of a fixed set of judged views. Films are
+``film/turntable.mp4``, or ``.webp`` without ffmpeg.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mivol import config
-from mivol.config import FieldFit, PhotoFit
-from mivol.experiments.back_end import choose_back_end
-from mivol.experiments.field_plan import batches_of, choices, make_plan, suited
+from mivol.config import PhotoExperiment
+from mivol.experiments.camera_pictures import pictures_of_photos, survey_of
 from mivol.experiments.film import plan_film
+from mivol.experiments.fit_kind import Evaluation, FitKind, RunContext, Say, Stages
+from mivol.experiments.judged_views import (
+    JudgedViews,
+    caption_of,
+    judge_colour_fitted,
+    rename_metrics,
+    said_of,
+    table_of_views,
+)
 from mivol.experiments.photo_data import boxed, notes, read_photos
-from mivol.experiments.photo_outputs import PhotoOutputs, compare, save_found
-from mivol.experiments.run_folder import BestIterate, FilesOfBest, RunFolder
-from mivol.experiments.task import Task
-from mivol.optim.checkpoint import CheckpointFile
+from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.optim.events import Checkpoint
-from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.photographs.radiance_problem import RadianceProblem
-from mivol.photos import Photos
-from mivol.report.page import write_page
-from mivol.report.record import RunRecord
-from mivol.validate.images import Quality
+from mivol.optim.loop import Course, Fit
+from mivol.optim.optimizer import Optimizer
+from mivol.optim.photographs.field_view import FieldView
+from mivol.photos import Camera, Photo
+from mivol.report.cameras import plot_cameras
+from mivol.report.record import Image, PlanLine, Table
+from mivol.scene.explain import Explanation
+from mivol.validate.images import Quality, score
+
+__all__ = ["PhotoFit", "table_of_gains"]
 
 
-def photo_fit(task: Task) -> Path:
-    """Fit a radiance field to photographs; result and refusals as :func:`mivol.experiments.scene_fit.scene_fit`.
+class PhotoFit(FitKind):
+    """A fit of a model to photographs.
 
-    Args:
-        task: with a :class:`~mivol.config.FieldFit`.
+    Attributes:
+        plan: stages, steps and rates of the fit.
+        photos: photographs to fit, with their box.
+        judged: photographs to judge by; None for none.
+        film: cameras of the film.
+        levels: nested boxes of the model.
+        fits_colours: whether judged views also have a PSNR with their colours fitted to the photographs'.
     """
-    chosen: FieldFit = task.chosen
-    choose_back_end(chosen.variant, chosen.threads)
-    asked = make_plan(chosen)
-    run = RunFolder(task.folder, new_record(task), task.resume)
-    with run.at_work():
-        with run.stage("photographs"):
-            photos, judged = read_photos(chosen, task.base)
-            photos = boxed(chosen, photos)
-            film = plan_film(chosen.show, photos)
-            plan = suited(asked, photos)
-            batches = batches_of(plan, photos)
-            if photos.space == "linear":
-                run.record.citations.append("mildenhall_2022")
-            run.record.plan, run.record.notes = choices(plan, photos, batches), [*notes(photos, judged), *film.notes]
-            task.watcher.say([photos.describe(), *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
-        with run.stage("fit"):
-            problem = RadianceProblem(batches, photos.box, plan, chosen.seed)
-            best = BestIterate(run, best_files(problem, photos.white))
-            fit = solve(task, run, problem, judged, best)
-        with run.stage("images and volumes"):
-            PhotoOutputs(task, run, fit, photos, judged, film).write()
-    page = write_page(task.folder)
-    task.watcher.say([*best.says(), run.summary()])
-    return page
+
+    stages = Stages("photographs", "fit", "images and volumes")
+    levels: int = 1
+    fits_colours: bool
+    plan: Any
+    settings: PhotoExperiment
+
+    def __init__(self, context: RunContext) -> None:
+        self.plan = self.make_plan(context.settings)
+        super().__init__(context)
+
+    @abstractmethod
+    def make_plan(self, settings: Any) -> Any:
+        """Return the preset of the settings, changed by the other settings.
+
+        Raises:
+            MivolError: an unknown preset.
+        """
+
+    @abstractmethod
+    def plan_fit(self) -> list[PlanLine]:
+        """Adapt the plan to the photographs; return its choices with their reasons."""
+
+    def load(self, say: Say) -> None:
+        photos, self.judged = read_photos(self.settings, self.context.base)
+        self.photos = boxed(self.settings, photos)
+        say(self.photos.describe())
+        say(f"  judged by {0 if self.judged is None else len(self.judged.views)} photographs")
+        self.film = plan_film(self.settings.show, self.photos)
+        for note in self.film.notes:
+            say(f"  {note}")
+        self.record.plan = self.plan_fit()
+        self.record.notes = [*notes(self.photos, self.judged), *self.film.notes]
+        for line in self.record.plan:
+            say(f"  {line.choice}: {line.reason}")
+
+    def announcement(self) -> list[str]:
+        return [self.photos.describe(), *(f"{line.choice}: {line.reason}" for line in self.record.plan)]
+
+    def optimizer(self) -> Optimizer:
+        return self.plan.optimizer
+
+    def course(self) -> Course:
+        return self.plan.course(Checkpoint(every=self.settings.checkpoint_every))
+
+    def digests(self) -> dict[str, str]:
+        return {"photos": self.problem.batches.digest()}
+
+    def evaluate(self, fit: Fit) -> Evaluation | None:
+        if fit.next_iteration % self.settings.show.every and fit.next_iteration != self.plan.steps:
+            return None
+        self.problem.set_reals(fit.run.reals)
+        return Evaluation(self.judge_few())
+
+    def judge_few(self) -> dict[str, float]:
+        """Return the mean PSNR [dB] of the same judged views at each call, evenly spread over all of them.
+
+        Its name is that of the held-out views only if all of them are judged.
+        """
+        if self.judged is None:
+            return {}
+        views = self.judged.views
+        count = min(self.settings.show.judged or len(views), len(views))
+        numbers = np.linspace(0, len(views) - 1, count).round().astype(int)
+        values = [self.judge(views[number], ("psnr",))[1].values["psnr"] for number in numbers]
+        return {"held_out_psnr" if count == len(views) else "few_psnr": float(np.mean(values))}
+
+    def finish(self, fit: Fit, run: RunFolder) -> None:
+        self.record.notes += fit.log
+
+    # -- Outputs ---------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView | NDArray, Quality]:
+        """Return a photograph's view of the model, and the metrics between both."""
+
+    @abstractmethod
+    def film_frame(self, camera: Camera) -> NDArray:
+        """Return a view of the model for the film: code values (H, W, 3)."""
+
+    @abstractmethod
+    def write_model(self, run: RunFolder) -> dict[str, float]:
+        """Write the files of the model, and put their tables and volumes on record; return results on its size."""
+
+    @abstractmethod
+    def gains(self) -> NDArray | None:
+        """Return the fitted gains of the photographs (photographs, 3); None without gains."""
+
+    def rectified(self, photo: Photo) -> Photo:
+        """Return the photograph that a view of the model is compared with."""
+        return photo
+
+    def write_first_view(self, run: RunFolder, view: FieldView | NDArray, photo: Photo) -> list[Image]:
+        """Write more images of the first judged view."""
+        return []
+
+    def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
+        record = self.record
+        run.make("views", "film")
+        sizes = self.write_model(run)
+        gains = self.gains()
+        if gains is not None:
+            record.tables.append(table_of_gains([view.name for view in self.photos.views], gains))
+        record.results = {"views": float(len(self.photos.views)), "iterations": float(fit.next_iteration), **sizes}
+        if self.judged is not None:
+            record.results |= self.write_judged(run)
+        if self.film.cameras:
+            record.images.append(self.film.write(run.path, self.film_frame, self.context.progress))
+        record.images += pictures_of_photos(run.path, self.photos, self.judged, self.levels)
+        run.write_curves()
+
+    def write_judged(self, run: RunFolder) -> dict[str, float]:
+        """Judge all views, and write them beside their photographs; return the means of their metrics."""
+        views, space, show = self.judged.views, self.judged.space, self.settings.show
+        qualities, fitted, first = [], [], []
+        pictures = JudgedViews(run.path, space, len(views), show.views)
+        for number, photo in enumerate(views):
+            photo = self.rectified(photo)
+            view, quality = self.judge(photo, show.metrics)
+            image = view if isinstance(view, np.ndarray) else view.image
+            qualities.append(quality)
+            if self.fits_colours:
+                fitted.append(judge_colour_fitted(image, photo, space))
+            psnr = quality.values.get("psnr", fitted[-1] if fitted else next(iter(quality.values.values())))
+            pictures.add(photo, image, psnr, caption_of(quality, fitted[-1] if fitted else None))
+            if number == 0:
+                first = self.write_first_view(run, view, photo)
+        self.record.images += [*pictures.images(), *first]
+        self.record.judged = said_of(views)
+        self.record.tables.append(table_of_views(views[0].camera, qualities, fitted))
+        means = rename_metrics(score(qualities).values)
+        return means | ({"psnr_colour_fitted": float(np.mean(fitted))} if fitted else {})
+
+    # -- Explain ---------------------------------------------------------------------------------------------------
+
+    def rehearse(self, say: Say) -> Explanation:
+        self.optimizer().begin(self.make_problem())
+        return Explanation(())
+
+    def draw_cameras(self, path: Path) -> None:
+        """Draw the cameras of all photographs and the boxes of the model into an image."""
+        plot_cameras(survey_of(self.photos, self.judged, self.levels), path)
 
 
-def new_record(task: Task) -> RunRecord:
-    """The record of a run that begins."""
-    chosen: FieldFit = task.chosen
-    return RunRecord.new(
-        chosen.title,
-        method=f"a sparse grid of density and spherical harmonics, fitted to photographs; preset {chosen.field.preset}",
-        config=config.resolved(chosen),
-        command=task.command,
-        seeds={"fit": chosen.seed},
-        units={"loss": "1"},
-        citations=["mitsuba3", "drjit", "plenoxels_2022", "relu_fields_2022", "max_1995"],
-    )
-
-
-def best_files(problem: RadianceProblem, white: float) -> FilesOfBest:
-    """Where the best field lies beside the last one, with its sky where there is one, in the photographs' radiance."""
-    names = ("field_best.npz", *(["sky_best.exr"] if problem.sky is not None else []))
-    return FilesOfBest(names, lambda folder: save_found(folder, problem, "_best", white))
-
-
-def solve(
-    task: Task,
-    run: RunFolder,
-    problem: Any,
-    judged: Photos | None,
-    best: BestIterate,
-    compare: Callable[..., tuple[Any, Quality]] = compare,
-) -> Fit:
-    """All steps, with metrics and checkpoints; the best iterate is kept.
-
-    Args:
-        task, run: the experiment and its folder.
-        problem: a :class:`RadianceProblem` or a :class:`~mivol.optim.gaussians.gaussian_problem.GaussianProblem`.
-        judged: what the curve shows; None for nothing.
-        best: the best iterate so far.
-        compare: as :func:`mivol.experiments.photo_outputs.compare`, of that problem.
-
-    Raises:
-        MivolError: a checkpoint of another run, or photographs that show nothing in the box.
-    """
-    chosen: PhotoFit = task.chosen
-    plan, every = problem.plan, chosen.show.every
-    store = CheckpointFile(
-        run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume
-    )
-    fit = begin_fit(problem, plan.optimizer, plan.course(Checkpoint(every=chosen.checkpoint_every)), checkpoint=store)
-    best.restore()
-    run.begin(fit.next_iteration)
-    with task.watcher.watch(plan.steps) as watch:
-
-        def observe(fit: Fit) -> None:
-            if fit.next_iteration % every == 0 or fit.next_iteration == plan.steps:
-                problem.set_reals(fit.run.reals)
-                errors = judge_few(chosen, problem, judged, compare)
-                best.see(fit.next_iteration, errors)
-                run.append(fit.next_iteration, fit.seconds, loss=fit.history[-1]["loss"], **errors)
-            watch(fit)
-
-        fit.complete(observe)
-    best.settle()
-    run.record.notes += fit.log + best.says()
-    return fit
-
-
-def judge_few(
-    chosen: PhotoFit, problem: Any, judged: Photos | None, compare: Callable[..., tuple[Any, Quality]] = compare
-) -> dict[str, float]:
-    """Mean PSNR of a fixed set of judged views, spread evenly over them: the points of a curve can be compared.
-
-    It is called that of the held-out views where it is that of all of them only.
-    """
-    if judged is None:
-        return {}
-    count = min(chosen.show.judged or len(judged.views), len(judged.views))
-    numbers = np.linspace(0, len(judged.views) - 1, count).round().astype(int)
-    found = [compare(problem, judged, judged.views[number], ("psnr",))[1].values["psnr"] for number in numbers]
-    return {"held_out_psnr" if count == len(judged.views) else "few_psnr": float(np.mean(found))}
+def table_of_gains(names: Sequence[str], gains: NDArray) -> Table:
+    """Table of the gains (photographs, 3) of the photographs, with the gains farthest from 1 first."""
+    far = np.argsort(-np.abs(np.log(gains)).max(axis=1), kind="stable")
+    rows = [(names[k], *(f"{gain:.3f}" for gain in gains[k])) for k in far]
+    head = ("photograph", "red", "green", "blue")
+    return Table(title="Gains of the photographs: exposure and white balance", head=head, rows=tuple(rows))

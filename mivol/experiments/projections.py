@@ -66,12 +66,12 @@ class Projections:
         return hashlib.sha256(self.y.tobytes() + self.weights.tobytes()).hexdigest()
 
 
-def beam_of(chosen: config.Scan) -> str:
+def beam_of(chosen: config.ScanExperiment) -> str:
     """The kind of beam, for people."""
     return f"{type(chosen.data if isinstance(chosen.scan, OfData) else chosen.scan).__name__.lower()} beam"
 
 
-def make_geometry(chosen: config.Scan, base: Path) -> FlatDetector:
+def make_geometry(chosen: config.ScanExperiment, base: Path) -> FlatDetector:
     """Beam and detector of computed projections."""
     wanted = chosen.scan
     angles = np.arange(0) if isinstance(wanted, Table | Matrices) else evenly(wanted)
@@ -84,7 +84,7 @@ def evenly(wanted: Detector) -> np.ndarray:
 
 
 def place_beam(
-    chosen: config.Scan, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
+    chosen: config.ScanExperiment, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
 ) -> FlatDetector:
     """The beam that was asked for, with these angles [rad] and pixels; a found ``axis_offset`` replaces the file's."""
     wanted = chosen.scan
@@ -102,7 +102,7 @@ def place_beam(
     return ParallelBeam(angles, detector, wanted.pitch, **offsets)
 
 
-def make_grid(chosen: config.Scan, base: Path) -> VoxelGrid:
+def make_grid(chosen: config.ScanExperiment, base: Path) -> VoxelGrid:
     """Where the voxels lie.
 
     Raises:
@@ -112,7 +112,7 @@ def make_grid(chosen: config.Scan, base: Path) -> VoxelGrid:
     return nikon_grid(chosen.data, base) if wanted is None else VoxelGrid(wanted.shape, wanted.voxel_size, wanted.centre)
 
 
-def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:
+def make_data(chosen: config.ScanExperiment, base: Path, grid: VoxelGrid) -> Projections:
     """Projections, measured or computed.
 
     Raises:
@@ -132,7 +132,7 @@ def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:
     return replace(data, notes=(*data.notes, *note_rows(chosen.data, data.geometry, grid, data.y, data.weights)))
 
 
-def check_rays(chosen: config.Scan) -> None:
+def check_rays(chosen: config.ScanExperiment) -> None:
     """Refuse a computed scan of more rays than can be kept; of a table of views, one view is counted.
 
     Raises:
@@ -198,7 +198,7 @@ def add_noise(geometry: FlatDetector, exact: np.ndarray, truth: np.ndarray, phot
     return Projections(geometry, y, counts, truth, quanta, is_noise_known=True)
 
 
-def read_measured(chosen: config.Scan, base: Path) -> Projections:
+def read_measured(chosen: config.ScanExperiment, base: Path) -> Projections:
     """Readings from files as line integrals with weights; the axis of a circular scan is found where asked for.
 
     Raises:
@@ -226,7 +226,7 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
 
 
 def settle_axis(
-    chosen: config.Scan, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
+    chosen: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
 ) -> tuple[float | None, list[str]]:
     """The ``axis_offset`` of a circular scan [length] where it is looked for, else None, and what is said about it.
 
@@ -242,7 +242,7 @@ def settle_axis(
 
 
 def look_for_axis(
-    chosen: config.Scan, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
+    chosen: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
 ) -> tuple[float | None, str]:
     """The ``axis_offset`` of a circular scan [length], and a sentence about it; None where a cone beam does not tell it.
 
@@ -262,7 +262,7 @@ def look_for_axis(
     return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
 
 
-def quanta_of(chosen: config.Scan, found: ScanReadings) -> Quanta:
+def quanta_of(chosen: config.ScanExperiment, found: ScanReadings) -> Quanta:
     """Numbers of quanta of a measured scan; where air is named, the light without an object is as bright as it is there.
 
     Raises:
@@ -279,7 +279,7 @@ def quanta_of(chosen: config.Scan, found: ScanReadings) -> Quanta:
     return replace(quanta, blank=quanta.blank * find_air(found.transmission.value, chosen.data.air))
 
 
-def held_out_views(chosen: config.Scan, count: int) -> np.ndarray:
+def held_out_views(chosen: config.ScanExperiment, count: int) -> np.ndarray:
     """Numbers of the views that are predicted, not fitted."""
     every = chosen.held_out_every
     if every == 1:

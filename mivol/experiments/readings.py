@@ -41,7 +41,7 @@ class ScanReadings:
     notes: tuple[str, ...] = ()
 
 
-def read_scan(chosen: config.Scan, base: Path) -> ScanReadings:
+def read_scan(chosen: config.ScanExperiment, base: Path) -> ScanReadings:
     """Read a measured scan.
 
     Raises:
@@ -59,7 +59,7 @@ def read_scan(chosen: config.Scan, base: Path) -> ScanReadings:
     return read_stack_scan(chosen, base)
 
 
-def read_stack_scan(chosen: config.Scan, base: Path) -> ScanReadings:
+def read_stack_scan(chosen: config.ScanExperiment, base: Path) -> ScanReadings:
     """Read a stack of images or an array.
 
     Raises:
@@ -80,7 +80,7 @@ def read_stack_scan(chosen: config.Scan, base: Path) -> ScanReadings:
     return ScanReadings(transmission, read_angles(chosen, base, len(readings)), intensity=fields)
 
 
-def read_angles(chosen: config.Scan, base: Path, views: int) -> np.ndarray | None:
+def read_angles(chosen: config.ScanExperiment, base: Path, views: int) -> np.ndarray | None:
     """Angles [rad] of a stack: listed, or evenly over the arc; None where a table has the geometry.
 
     Raises:

@@ -13,9 +13,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mivol.config import Experiment, Files
+from mivol.config import Files, SceneExperiment
 from mivol.errors import MivolError
-from mivol.experiments.task import Task
+from mivol.experiments.fit_kind import RunContext
 from mivol.fields.procedural import make_procedural
 from mivol.files import read_exr, read_volume, stack_layers
 from mivol.files.fetch import PREFIX, resolve_path
@@ -63,26 +63,37 @@ class References:
         return h.hexdigest()
 
 
-def find_references(task: Task, loaded: LoadedScene, truth: np.ndarray | None) -> References:
-    """What was seen from each view, with the truth in the scene where there is one.
+def find_references(
+    context: RunContext,
+    settings: SceneExperiment,
+    loaded: LoadedScene,
+    truth: np.ndarray | None,
+    sensors: Sequence[Any],
+    held_out: frozenset[int],
+) -> References:
+    """Render or read the reference of each view; renders show the truth if it is known.
+
+    Args:
+        context: base folder, run folder and progress.
+        settings: all settings, with a number for ``fit.max_depth``.
+        loaded, truth: scene, and true volume (Z, Y, X, C) or None.
+        sensors, held_out: from :func:`find_sensors`.
 
     Raises:
-        MivolError: no views, held-out views that are not there, files that do not fit.
+        MivolError: files that cannot be read or do not fit the views.
     """
-    chosen: Experiment = task.chosen
-    sensors, held_out = find_sensors(chosen, loaded.scene)
-    if isinstance(chosen.reference, Files):
-        return read_references(chosen, task.base, loaded, sensors, held_out)
-    seen = References(held_out)
+    if isinstance(settings.reference, Files):
+        return read_references(settings, context.base, loaded, sensors, held_out)
+    references = References(held_out)
     if truth is None:
-        render_views(seen, task, loaded, sensors)
+        render_views(references, context, settings, loaded, sensors)
     else:
-        with holding(loaded.scene, chosen.truth.key, truth):
-            render_views(seen, task, load_scene(loaded.scene), sensors)
-    return seen
+        with holding(loaded.scene, settings.truth.key, truth):
+            render_views(references, context, settings, load_scene(loaded.scene), sensors)
+    return references
 
 
-def find_sensors(chosen: Experiment, scene: mi.Scene) -> tuple[list[Any], frozenset[int]]:
+def find_sensors(chosen: SceneExperiment, scene: mi.Scene) -> tuple[list[Any], frozenset[int]]:
     """All views in their order, and the numbers of those that are held out.
 
     Raises:
@@ -98,7 +109,7 @@ def find_sensors(chosen: Experiment, scene: mi.Scene) -> tuple[list[Any], frozen
     return sensors, frozenset(held_out)
 
 
-def load_experiment_scene(chosen: Experiment, base: Path) -> LoadedScene:
+def load_experiment_scene(chosen: SceneExperiment, base: Path) -> LoadedScene:
     """The scene of an experiment, with its defines; those may name public data (``data:NAME``).
 
     Raises:
@@ -128,19 +139,20 @@ def check_held_out(held_out: Sequence[int], count: int) -> None:
         raise MivolError(f"all {count} views are held out, expected one to fit: shorten reference.held_out.")
 
 
-def render_views(seen: References, task: Task, loaded: LoadedScene, sensors: Sequence[Any]) -> None:
-    """References by Mitsuba's path tracer, kept in ``references/`` for other fits of the same views."""
-    chosen, cache = task.chosen, task.folder / "references"
+def render_views(
+    references: References, context: RunContext, settings: SceneExperiment, loaded: LoadedScene, sensors: Sequence[Any]
+) -> None:
+    """Render references by Mitsuba's path tracer, cached in ``references/`` for other fits of the same views."""
+    cache, wanted = context.folder / "references", settings.reference
     cache.mkdir(exist_ok=True)
-    wanted = chosen.reference
-    depth = chosen.fit.max_depth if wanted.max_depth is None else wanted.max_depth
-    settings = {
+    depth = settings.fit.max_depth if wanted.max_depth is None else wanted.max_depth
+    options = {
         "max_depth": depth, "target_se": wanted.standard_error or None, "max_spp": wanted.spp,
         "seed": wanted.seed, "progress": False,
     }  # fmt: skip
-    for sensor in task.watcher.track(sensors, "references"):
-        made = render_reference(loaded, cache, sensor=sensor, **settings)
-        seen.add(sensor, made.mean, standard_error(made))
+    for sensor in context.progress.track(sensors, "references"):
+        render = render_reference(loaded, cache, sensor=sensor, **options)
+        references.add(sensor, render.mean, standard_error(render))
 
 
 def standard_error(made: ReferenceResult) -> np.ndarray:
@@ -149,7 +161,7 @@ def standard_error(made: ReferenceResult) -> np.ndarray:
 
 
 def read_references(
-    chosen: Experiment, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: frozenset[int]
+    chosen: SceneExperiment, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: frozenset[int]
 ) -> References:
     """References from OpenEXR files; those that mivol wrote must be of the scene that they are said to be of.
 
@@ -187,7 +199,7 @@ VOXEL_BYTES = 9 * 8
 """Of a procedural volume while it is made: its places twice, and three numbers that are made of them, in float64."""
 
 
-def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
+def make_truth(chosen: SceneExperiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
     """The true volume (Z, Y, X, C), where the experiment knows one.
 
     Raises:
@@ -204,7 +216,7 @@ def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | 
     return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
 
 
-def check_truth(chosen: Experiment) -> None:
+def check_truth(chosen: SceneExperiment) -> None:
     """Refuse a truth of a parameter that is not fitted: references would show it, and renders what the scene holds.
 
     Raises:

@@ -198,7 +198,7 @@ JUDGES = {"nrmse": 1.0, "held_out_psnr": -1.0, "few_psnr": -1.0}
 
 
 @dataclass(frozen=True)
-class FilesOfBest:
+class BestFiles:
     """Files of their own format that hold the best iterate, where parameters alone do not say what it is.
 
     Attributes:
@@ -223,7 +223,7 @@ class BestIterate:
         newest: value of the newest one.
     """
 
-    def __init__(self, run: RunFolder, files: FilesOfBest | None = None) -> None:
+    def __init__(self, run: RunFolder, files: BestFiles | None = None) -> None:
         self.files = files
         self.run, self.judge, self.iteration, self.value, self.newest = run, "", 0, 0.0, 0.0
 

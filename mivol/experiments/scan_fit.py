@@ -1,20 +1,20 @@
-"""A volume reconstructed from projections: from the settings of a scan to a run folder, one call per arrow.
+"""A reconstruction of a volume from projections.
 
-Conventions. ``metrics.jsonl`` has ``loss`` (what the solver minimises), ``residual`` (relative, weighted) and ``nrmse`` where
-the truth is known. Views that are held out are predicted at the end.
+Conventions. ``metrics.jsonl`` has ``loss`` (the solver's objective), ``residual`` (relative, weighted), and ``nrmse`` if the
+truth is known. Held-out views are predicted at the end.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from mivol import config
+from mivol.config import ScanExperiment
 from mivol.errors import MivolError
-from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.fit_kind import Evaluation, FitKind, Say, Stages
 from mivol.experiments.projections import Projections, beam_of, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.scan_outputs import write_best, write_outputs
@@ -28,17 +28,15 @@ from mivol.experiments.solver_choice import (
     settle_solver,
     strength_of,
 )
-from mivol.experiments.task import Task
-from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Checkpoint
-from mivol.optim.loop import Course, Fit, begin_fit
+from mivol.optim.loop import Course, Fit
 from mivol.optim.projections.inversion import LinearSolve, ProjectionProblem, fit_drift
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
-from mivol.report.page import write_page
 from mivol.report.pixel_scale import is_preview_due, write_preview
 from mivol.report.record import PlanLine, RunRecord
-from mivol.tomography.filtered import feldkamp, filtered_backprojection
+from mivol.scene.explain import Explanation
+from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.preprocess import bridge_gaps
 from mivol.tomography.projector import Projector
@@ -57,77 +55,125 @@ CITED = {
 }
 
 
-def scan_fit(task: Task) -> Path:
-    """Reconstruct a volume from projections; result and refusals as :func:`mivol.experiments.scene_fit.scene_fit`.
+class ScanFit(FitKind):
+    """A reconstruction of a volume from projections.
 
-    Args:
-        task: with a :class:`~mivol.config.Scan`.
+    Attributes:
+        grid: requested voxels; the projector's grid may divide them.
+        data: projections; after the fit without the fitted drift of the light.
+        held_out, kept: indices of the views that are predicted, and of the views that are fitted.
+        projector: rays of all views, and the unknowns.
     """
-    chosen: config.Scan = task.chosen
-    choose_back_end(chosen.variant, chosen.threads)
-    run = RunFolder(task.folder, new_record(task), task.resume)
-    with run.at_work():
-        grid = make_grid(chosen, task.base)
-        with run.stage("projections"):
-            check_grid(chosen, grid)
-            data = make_data(chosen, task.base, grid)
-            run.record.notes += data.notes
-            task.watcher.say(data.notes)
-        held_out = held_out_views(chosen, len(data.y))
-        kept = fitted_views(held_out, len(data.y))
-        chosen, lines = settle(chosen, data, grid, kept)
-        task = replace(task, chosen=chosen)
-        run.record.plan += lines
-        projector = make_projector(chosen, data, grid)
-        with run.stage("solve"):
-            problem = make_problem(chosen, projector, data, kept)
-            best = BestIterate(run)
-            storage = choose_storage(chosen.solve, problem.linear_problem.A)
-            run.record.plan.append(storage.line)
-            storage.apply(problem)
-            run.record.plan += settle_noise(problem, chosen.solve, data)
-            state = solve(task, run, problem, data, grid, best)
-            residual = state.residual_norm / norm_of(problem.linear_problem)
-            run.record.results = {"iterations": float(state.iteration), "residual": residual}
-            run.record.plan += plan_of_prior(problem.linear_problem.prior, state)
-            if data.is_noise_known:
-                run.record.results["discrepancy"] = state.residual_norm / expected_residual_norm(
-                    problem.linear_problem, chosen.solve.name
-                )
-            data = without_drift(problem, data, held_out, state)
-        with run.stage("images and volumes"):
-            write_outputs(run, projector, grid, data, held_out, state.x.reshape(projector.grid.shape))
-            write_best(run, grid, best)
-    page = write_page(task.folder)
-    task.watcher.say([*best.says(), run.summary()])
-    return page
+
+    stages = Stages("projections", "solve", "images and volumes")
+    settings: ScanExperiment
+    problem: ProjectionProblem
+
+    def new_record(self) -> RunRecord:
+        settings = self.settings
+        name = settings.solve.solver
+        prior = ["rudin_1992", "huber_1964"] if strength_of(settings.solve) else []
+        return RunRecord.new(
+            settings.title,
+            method=f"{name} on line integrals of a {beam_of(settings)}",
+            config=config.resolved(settings),
+            command=self.context.command,
+            seeds={"noise": getattr(settings.data, "seed", 0)},
+            units={"loss": "1"},
+            plan=[
+                PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
+            ],
+            citations=["mitsuba3", "drjit", *CITED[name], *prior],
+        )
+
+    def load(self, say: Say) -> None:
+        base = self.context.base
+        self.grid = grid = make_grid(self.settings, base)
+        edges = grid.voxel_size if len(set(grid.voxel_size)) > 1 else grid.voxel_size[:1]
+        say(f"  grid      {' x '.join(map(str, grid.shape))} voxels of {' x '.join(f'{edge:g}' for edge in edges)}")
+        check_grid(self.settings, grid)
+        self.data = make_data(self.settings, base, grid)
+        views, rows, columns = self.data.y.shape
+        say(f"  scan      {views} views of {rows} x {columns} pixels, {beam_of(self.settings)}")
+        for note in self.data.notes:
+            say(f"  data      {note}")
+        self.record.notes += self.data.notes
+        self.held_out = held_out_views(self.settings, views)
+        self.kept = fitted_views(self.held_out, views)
+        say(f"  held out  {len(self.held_out)} views")
+        solve, self.choices = settle_solver(self.settings.solve, Projector(self.data.geometry, grid, self.kept))
+        self.settings = msgspec.structs.replace(self.settings, solve=solve)
+        self.record.plan += self.choices
+        self.projector = make_projector(self.settings, self.data, grid)
+
+    def announcement(self) -> list[str]:
+        return list(self.data.notes)
+
+    def make_problem(self) -> ProjectionProblem:
+        return make_problem(self.settings, self.projector, self.data, self.kept)
+
+    def prepare(self, run: RunFolder) -> None:
+        storage = choose_storage(self.settings.solve, self.problem.linear_problem.A)
+        self.record.plan.append(storage.line)
+        storage.apply(self.problem)
+        self.record.plan += settle_noise(self.problem, self.settings.solve, self.data)
+        self.noise = noise_of(self.settings, self.problem, self.data)
+
+    def optimizer(self) -> LinearSolve:
+        return make_solver(self.settings, self.noise)
+
+    def course(self) -> Course:
+        return Course(self.settings.solve.iterations, events=(Checkpoint(every=self.settings.checkpoint_every),))
+
+    def digests(self) -> dict[str, str]:
+        return {"data": self.data.digest()}
+
+    def evaluate(self, fit: Fit) -> Evaluation:
+        state, problem = fit.run.state, self.problem.linear_problem
+        volume = voxel_means(state.x.reshape(problem.A.grid.shape), self.grid.shape)
+        errors = {"residual": state.residual_norm / norm_of(problem)}
+        if self.data.truth is not None:
+            errors["nrmse"] = nrmse(volume, self.data.truth)
+        if self.noise:
+            errors["discrepancy"] = state.residual_norm / self.noise
+        return Evaluation(errors, {"volume": volume})
+
+    def show(self, run: RunFolder, fit: Fit, evaluation: Evaluation) -> None:
+        if is_preview_due(fit.next_iteration, self.settings.solve.iterations):
+            write_preview(run.path, evaluation.values["volume"], tuple(self.grid.extent))
+
+    def finish(self, fit: Fit, run: RunFolder) -> None:
+        last, state, problem, record = self.settings.solve.iterations, fit.run.state, self.problem.linear_problem, self.record
+        if fit.run.stop_reason and fit.next_iteration < last:
+            record.notes.append(f"stopped after iteration {fit.next_iteration} of {last}: {fit.run.stop_reason}")
+        record.results = {"iterations": float(state.iteration), "residual": state.residual_norm / norm_of(problem)}
+        record.plan += plan_of_prior(problem.prior, state)
+        if self.data.is_noise_known:
+            record.results["discrepancy"] = state.residual_norm / expected_residual_norm(problem, self.settings.solve.name)
+        self.data = without_drift(self.problem, self.data, self.held_out, state)
+
+    def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
+        volume = fit.run.state.x.reshape(self.projector.grid.shape)
+        write_outputs(run, self.projector, self.grid, self.data, self.held_out, volume)
+        write_best(run, self.grid, best)
+
+    def rehearse(self, say: Say) -> Explanation:
+        settings = self.settings
+        if settings.solve.start == "filtered":
+            check_directions(self.projector)
+        # Back-projection alone takes longer than all else here.
+        cheap = msgspec.structs.replace(settings, solve=msgspec.structs.replace(settings.solve, start="empty"))
+        problem = make_problem(cheap, self.projector, self.data, self.kept)
+        storage = choose_storage(settings.solve, problem.linear_problem.A).line
+        make_solver(settings, noise_of(settings, problem, self.data)).begin(problem)
+        for line in (*self.choices, storage):
+            say(f"  {line.choice}, because {line.reason}")
+        if settings.solve.tv:
+            say(f"  total variation: {settings.solve.tv:g} in units of the {settings.solve.tv_unit}")
+        return Explanation((f"  solver    {settings.solve.name}, at most {settings.solve.iterations} iterations",))
 
 
-def new_record(task: Task) -> RunRecord:
-    """The record of a run that begins."""
-    chosen: config.Scan = task.chosen
-    name = chosen.solve.solver
-    return RunRecord.new(
-        chosen.title,
-        method=f"{name} on line integrals of a {beam_of(chosen)}",
-        config=config.resolved(chosen),
-        command=task.command,
-        seeds={"noise": getattr(chosen.data, "seed", 0)},
-        units={"loss": "1"},
-        plan=[
-            PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
-        ],
-        citations=["mitsuba3", "drjit", *CITED[name], *(["rudin_1992", "huber_1964"] if strength_of(chosen.solve) else [])],
-    )
-
-
-def settle(chosen: config.Scan, data: Projections, grid: VoxelGrid, kept: np.ndarray) -> tuple[config.Scan, list[PlanLine]]:
-    """All settings with what was left open to the solver's table, and why."""
-    solve, lines = settle_solver(chosen.solve, Projector(data.geometry, grid, kept))
-    return msgspec.structs.replace(chosen, solve=solve), lines
-
-
-def make_projector(chosen: config.Scan, data: Projections, grid: VoxelGrid) -> Projector:
+def make_projector(chosen: config.ScanExperiment, data: Projections, grid: VoxelGrid) -> Projector:
     """All rays, and the unknowns that they cross.
 
     Raises:
@@ -138,7 +184,7 @@ def make_projector(chosen: config.Scan, data: Projections, grid: VoxelGrid) -> P
     return Projector(data.geometry, unknowns)
 
 
-def make_problem(chosen: config.Scan, projector: Projector, data: Projections, kept: np.ndarray) -> ProjectionProblem:
+def make_problem(chosen: config.ScanExperiment, projector: Projector, data: Projections, kept: np.ndarray) -> ProjectionProblem:
     """What the solver minimises, over the views that are fitted.
 
     Raises:
@@ -170,7 +216,7 @@ def without_drift(problem: ProjectionProblem, data: Projections, held_out: np.nd
     return replace(data, y=data.y - drift.eval(times_of(data)))
 
 
-def start_volume(wanted: config.Solve, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
+def start_volume(wanted: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
     """Where an iterative solver begins: None for an empty volume, else by fbp or fdk, at or above 0 where that is asked for.
 
     Raises:
@@ -183,43 +229,7 @@ def start_volume(wanted: config.Solve, a: Projector, data: Projections, kept: np
     return np.maximum(x, 0) if wanted.nonnegative else x
 
 
-def solve(
-    task: Task, run: RunFolder, problem: ProjectionProblem, data: Projections, grid: VoxelGrid, best: BestIterate
-) -> SolverState:
-    """All iterations, with metrics and checkpoints; where the solver stands after them.
-
-    Raises:
-        MivolError: a checkpoint of another run, settings that the solver refuses, or projections that hold nothing.
-    """
-    chosen: config.Scan = task.chosen
-    course = Course(chosen.solve.iterations, events=(Checkpoint(every=chosen.checkpoint_every),))
-    store = CheckpointFile(run.checkpoint, {"data": data.digest(), **config.flat(run.record.config)}, task.resume)
-    noise = noise_of(chosen, problem, data)
-    fit = begin_fit(problem, make_solver(chosen, noise), course, checkpoint=store)
-    best.restore()
-    run.begin(fit.next_iteration)
-    with task.watcher.watch(course.iterations) as watch:
-
-        def observe(fit: Fit) -> None:
-            volume = voxel_means(fit.run.state.x.reshape(problem.linear_problem.A.grid.shape), grid.shape)
-            errors = {"residual": fit.run.state.residual_norm / norm_of(problem.linear_problem)}
-            if data.truth is not None:
-                errors["nrmse"] = nrmse(volume, data.truth)
-            if noise:
-                errors["discrepancy"] = fit.run.state.residual_norm / noise
-            run.append(fit.next_iteration, fit.seconds, loss=fit.history[-1]["loss"], **errors)
-            best.see(fit.next_iteration, errors, {"volume": volume})
-            if is_preview_due(fit.next_iteration, course.iterations):
-                write_preview(run.path, volume, tuple(grid.extent))
-            watch(fit)
-
-        fit.complete(observe)
-    if fit.run.stop_reason and fit.next_iteration < course.iterations:
-        run.record.notes.append(f"stopped after iteration {fit.next_iteration} of {course.iterations}: {fit.run.stop_reason}")
-    return fit.run.state
-
-
-def noise_of(chosen: config.Scan, problem: ProjectionProblem, data: Projections) -> float | None:
+def noise_of(chosen: config.ScanExperiment, problem: ProjectionProblem, data: Projections) -> float | None:
     """The norm of the residual that noise alone would leave; None where the noise is not known.
 
     Raises:
@@ -230,7 +240,7 @@ def noise_of(chosen: config.Scan, problem: ProjectionProblem, data: Projections)
     return expected_residual_norm(problem.linear_problem, chosen.solve.name) if data.is_noise_known else None
 
 
-def make_solver(chosen: config.Scan, noise: float | None) -> LinearSolve:
+def make_solver(chosen: config.ScanExperiment, noise: float | None) -> LinearSolve:
     """The solver with its settings, which stops by the noise where that is asked for."""
     wanted = chosen.solve
     shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}

@@ -56,8 +56,7 @@ def write_outputs(
 
 
 def write_best(run: RunFolder, grid: VoxelGrid, best: BestIterate) -> None:
-    """The best iterate beside the last one, and a note, where they differ."""
-    run.record.notes += best.says()
+    """Write the best iterate beside the last one, if they differ."""
     if not best.is_newest:
         write_volume(run.path / "volumes/reconstruction_best.npz", best.read()["volume"].reshape(grid.shape), grid.to_world)
 

@@ -1,44 +1,48 @@
-"""A scene fitted to images of it: from the settings of an experiment to a run folder, one call per arrow."""
+"""A fit of scene parameters to images of the scene.
+
+Conventions. References are cached by their content, so another fit of the same views renders none. A row of the metrics has the
+number of its step, and errors measured before the step; the last row has the errors of the result.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import msgspec
 import numpy as np
 
 from mivol import config
-from mivol.config import AUTO, Experiment, Rendered
+from mivol.config import AUTO, Files, Rendered, SceneExperiment
 from mivol.errors import MivolError
-from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.fit_kind import FitKind, Say, Stages
 from mivol.experiments.references import (
     References,
     camera_of,
     check_truth,
     find_references,
+    find_sensors,
     holding,
     load_experiment_scene,
     make_truth,
     put,
+    read_references,
 )
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.scene_outputs import SceneOutputs
 from mivol.experiments.start import Start, make_starts, place_of
-from mivol.experiments.task import Task
-from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import upsample
-from mivol.optim.loop import Course, Fit, begin_fit
+from mivol.optim.loop import Course, Fit
+from mivol.optim.optimizer import Optimizer
 from mivol.optim.parameters import check_names
-from mivol.optim.scenes.emissive_start import find_emissive_start
+from mivol.optim.scenes.emissive_start import check_given_start, find_emissive_start
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import HELD_OUT, RenderBatch, derive_seed, make_batches
-from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
 from mivol.scene.depth_preview import measure_depths
+from mivol.scene.explain import Explanation, examine
 from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
@@ -46,235 +50,267 @@ from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.validate.metrics import nrmse, psnr
 
+__all__ = ["SceneFit"]
 
-def scene_fit(task: Task) -> Path:
-    """Fit a scene to its views.
+REHEARSAL_SPP = 2
+"""Largest number of samples per pixel in the derivative that ``mivol explain`` takes; a noisy loss needs pairs."""
 
-    References are cached by what they show, so that another fit of the same views renders none.
 
-    Args:
-        task: with an :class:`~mivol.config.Experiment`.
+class SceneFit(FitKind):
+    """A fit of scene parameters; ``mivol explain`` describes the scene with the truth in it, or at its start if unknown.
+
+    Attributes:
+        loaded: scene of the experiment.
+        sensors, held_out: sensors of all views, and the indices of the held-out views.
+        truth: true volume (Z, Y, X, C); None if unknown.
+        depth_plan: the choice of "auto" for ``fit.max_depth``.
+        starts: parameters and their first values.
+        integrator: integrator of the renders.
+        references: images of all views.
+    """
+
+    stages = Stages("scene", "fit", "images and volumes")
+    first_row = 0
+    settings: SceneExperiment
+    problem: SceneProblem
+
+    def new_record(self) -> RunRecord:
+        settings = self.settings
+        priors = [prior for sought in settings.parameter for prior in sought.prior]
+        strategies = [settings.optimiser, settings.loss, *priors]
+        keys = ", ".join(sought.key for sought in settings.parameter)
+        emission = ["nimier_david_2022"] if any(sought.start_fit for sought in settings.parameter) else []
+        method = f"{settings.fit.integrator}, {settings.optimiser.label()} on {settings.loss.label()}; looked for: {keys}"
+        return RunRecord.new(
+            settings.title,
+            method=method,
+            config=config.resolved(settings),
+            command=self.context.command,
+            seeds={"fit": settings.seed, "references": getattr(settings.reference, "seed", 0)},
+            citations=["mitsuba3", "drjit", *emission, *dict.fromkeys(key for s in strategies for key in s.cites)],
+        )
+
+    def load(self, say: Say) -> None:
+        self.loaded = load_experiment_scene(self.settings, self.context.base)
+        scene = self.loaded.scene
+        self.sensors, self.held_out = find_sensors(self.settings, scene)
+        width, height = (int(n) for n in camera_of(self.sensors[0]).film().crop_size())
+        held_out = f", {len(self.held_out)} of them held out" if self.held_out else ""
+        say(f"  views     {len(self.sensors)} of {width} x {height} pixels{held_out}")
+        self.truth = make_truth(self.settings, self.context.base, scene)
+        self.settings, self.depth_plan = resolve_depth(self.settings, self.loaded, self.truth)
+        for line in self.depth_plan:
+            say(f"  depth     {line.choice}, because {line.reason}")
+        check_names([sought.key for sought in self.settings.parameter])
+        self.starts = make_starts(self.settings, self.context.base, scene)
+        for start in self.starts:
+            say(f"  sought    {describe_start(start)}")
+        check_truth(self.settings)
+        self.integrator = make_integrator(self.settings)
+
+    def render_data(self, run: RunFolder) -> None:
+        with run.stage("references"):
+            self.references = find_references(self.context, self.settings, self.loaded, self.truth, self.sensors, self.held_out)
+
+    def make_problem(self) -> SceneProblem:
+        return make_problem(self.settings, self.loaded.scene, self.integrator, self.starts, self.references)
+
+    def prepare(self, run: RunFolder) -> None:
+        self.measure = SceneErrors(self.settings, self.references, self.truth)
+        self.record.units = units(self.settings, self.problem)
+        self.record.notes += self.improve_starts(run)
+        plan = plan_renders(self.settings, self.problem)
+        self.record.plan = list(self.depth_plan)
+        if plan is not None:
+            self.record.plan += [PlanLine(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in plan.choices]
+            cites = SEGMENT_ESTIMATORS[plan.segment].cites
+            self.record.citations += [key for key in cites if key not in self.record.citations]
+
+    def improve_starts(self, run: RunFolder) -> list[str]:
+        """Fit emissive starts for the parameters that ask for one; return notes on them.
+
+        A run that continues from a checkpoint has its values from there.
+        """
+        if self.context.resume and run.checkpoint.exists():
+            return []
+        notes = []
+        for sought in self.settings.parameter:
+            if sought.start_fit == "emission":
+                place = place_of(sought.key, self.problem.scene)
+                start = find_emissive_start(self.problem, sought.key, place, self.settings.optimiser, self.settings.seed)
+                put(self.problem.params, sought.key, start.value)
+                self.problem.set_reals(self.problem.initial_reals())
+                notes.append(f"{sought.key} {start.text}")
+        self.context.progress.say(notes)
+        return notes
+
+    def optimizer(self) -> Optimizer:
+        return self.settings.optimiser
+
+    def course(self) -> Course:
+        return Course(self.settings.fit.iterations, self.settings.schedule, self.settings.event)
+
+    def digests(self) -> dict[str, str]:
+        return {"scene": self.loaded.content_hash, "references": self.references.digest()}
+
+    def after_step(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
+        last = fit.history[-1]
+        is_new = fit.evaluations and fit.evaluations[-1]["iteration"] == last["iteration"]
+        run.append(last["iteration"], last["seconds"], loss=last["loss"], **(fit.latest_errors() if is_new else {}))
+
+    def finish(self, fit: Fit, run: RunFolder) -> None:
+        # Once, however often a finished run is resumed.
+        run.rewind(fit.next_iteration - 1)
+        if fit.evaluations and fit.evaluations[-1]["iteration"] == fit.next_iteration and len(fit.evaluations[-1]) > 2:
+            run.append(**fit.evaluations[-1])
+        if self.references.held_out:
+            self.record.notes.append(
+                f"PSNR of the held-out views is the mean over {len(self.references.held_out)} of them, the same at each point "
+                "of the curve; the peak is the largest value of each reference."
+            )
+        self.record.notes += fit.log + ([f"stopped early: {fit.run.stop_reason}"] if fit.run.stop_reason else [])
+
+    def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
+        SceneOutputs(self.settings, run, fit, self.references, self.truth, best).write()
+
+    def rehearse(self, say: Say) -> Explanation:
+        settings, scene = self.settings, self.loaded.scene
+        if isinstance(settings.reference, Files):
+            self.references = read_references(settings, self.context.base, self.loaded, self.sensors, self.held_out)
+        else:
+            self.references = make_white_references(self.sensors, self.held_out)
+        spp = min(settings.fit.spp, REHEARSAL_SPP)
+        cheap = msgspec.structs.replace(settings, fit=msgspec.structs.replace(settings.fit, spp=spp))
+        problem = make_problem(cheap, scene, self.integrator, self.starts, self.references)
+        for sought in settings.parameter:
+            if sought.start_fit == "emission":
+                check_given_start(sought.key, np.asarray(problem.values()[sought.key]))
+        settings.optimiser.begin(problem)
+        problem.rehearse()
+        params = mi.traverse(scene)
+        for start in self.starts:
+            put(params, start.parameter.name, start.value)
+        if self.truth is not None:
+            put(params, settings.truth.key, self.truth)
+        say(f"  holding   {'the truth' if self.truth is not None else 'the start'}, in what follows")
+        return examine(scene, settings.fit.max_depth, camera_of(self.sensors[0]))
+
+
+def resolve_depth(
+    settings: SceneExperiment, loaded: LoadedScene, truth: np.ndarray | None
+) -> tuple[SceneExperiment, list[PlanLine]]:
+    """Put a number in place of ``max_depth = "auto"``.
+
+    The depth is measured from the first view, in the scene that renders the references. If the references are files and the
+    truth is unknown, nothing can be measured, and paths have no limit.
 
     Returns:
-        The page.
+        Settings with a number, and its reason; the given settings if they have a number.
+    """
+    if settings.fit.max_depth != AUTO:
+        return settings, []
+    if truth is None and not isinstance(settings.reference, Rendered):
+        depth, reason = -1, "the references are files, and what they show is not known"
+    else:
+        with nullcontext() if truth is None else holding(loaded.scene, settings.truth.key, truth):
+            sensor = camera_of(next(iter(settings.views.sensors(loaded.scene))))
+            answer = measure_depths(loaded.scene, sensor, Settings(), settings.fit.noise)
+        depth, reason = answer.depth, answer.reason
+    fit = msgspec.structs.replace(settings.fit, max_depth=depth)
+    return msgspec.structs.replace(settings, fit=fit), [PlanLine(choice=f"max_depth: {depth}", reason=reason)]
+
+
+def describe_start(start: Start) -> str:
+    """Name, shape, domain and mean of a parameter's first value."""
+    low, high = start.parameter.domain
+    shape = " x ".join(map(str, start.value.shape))
+    mean = float(np.mean(start.value))
+    return f"{start.parameter.name}: {shape}, in [{low:g}, {high:g}] {start.parameter.unit}, from {mean:.4g}"
+
+
+def make_integrator(settings: SceneExperiment) -> mi.Integrator:
+    """Load the integrator of the fit.
 
     Raises:
-        MivolError: whatever is wrong with the settings, the scene, the references or the disk.
-        KeyboardInterrupt: stopped; what is there is kept, and ``task.resume`` continues.
+        MivolError: Mitsuba has no integrator of that name, or the integrator refuses its settings.
     """
-    chosen: Experiment = task.chosen
-    choose_back_end(chosen.variant, chosen.threads)
-    run = RunFolder(task.folder, new_record(task), task.resume)
-    with run.at_work():
-        with run.stage("scene"):
-            loaded = load_experiment_scene(chosen, task.base)
-            truth = make_truth(chosen, task.base, loaded.scene)
-            task, depth = settle_depth(task, loaded, truth)
-            chosen = task.chosen
-            integrator = make_integrator(chosen)
-            check_names([sought.key for sought in chosen.parameter])
-            starts = make_starts(chosen, task.base, loaded.scene)
-            check_truth(chosen)
-        with run.stage("references"):
-            seen = find_references(task, loaded, truth)
-        with run.stage("fit"):
-            problem = make_problem(chosen, loaded.scene, integrator, starts, seen)
-            run.record.units = units(chosen, problem)
-            run.record.notes += improve_starts(task, run, problem)
-            made = plan_of(chosen, problem)
-            run.record.plan = depth + lines_of(made)
-            run.record.citations += cited(made, run.record.citations)
-            best = BestIterate(run)
-            fit = solve(task, run, loaded, problem, SceneErrors(chosen, seen, truth), best)
-        with run.stage("images and volumes"):
-            SceneOutputs(chosen, run, fit, seen, truth, best).write()
-    page = write_page(task.folder)
-    task.watcher.say([*best.says(), run.summary()])
-    return page
-
-
-def new_record(task: Task) -> RunRecord:
-    """The record of a run that begins."""
-    chosen: Experiment = task.chosen
-    priors = [prior for sought in chosen.parameter for prior in sought.prior]
-    strategies = [chosen.optimiser, chosen.loss, *priors]
-    sought = ", ".join(sought.key for sought in chosen.parameter)
-    emission = ["nimier_david_2022"] if any(sought.start_fit for sought in chosen.parameter) else []
-    return RunRecord.new(
-        chosen.title,
-        method=f"{chosen.fit.integrator}, {chosen.optimiser.label()} on {chosen.loss.label()}; looked for: {sought}",
-        config=config.resolved(chosen),
-        command=task.command,
-        seeds={"fit": chosen.seed, "references": getattr(chosen.reference, "seed", 0)},
-        citations=["mitsuba3", "drjit", *emission, *dict.fromkeys(key for s in strategies for key in s.cites)],
-    )
-
-
-def plan_of(chosen: Experiment, problem: SceneProblem) -> Plan | None:
-    """The plan of mivol's integrator for this scene; other integrators have none."""
-    if chosen.fit.integrator != "mivol":
-        return None
-    needs = find_needs(problem.scene, problem.batches[0].sensor, survey_scene(problem.scene))
-    return make_plan(needs, Settings(max_depth=chosen.fit.max_depth))
-
-
-def lines_of(plan: Plan | None) -> list[PlanLine]:
-    """The choices of a plan, with their reasons."""
-    return [] if plan is None else [PlanLine(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in plan.choices]
-
-
-def cited(plan: Plan | None, known: Sequence[str]) -> list[str]:
-    """What the estimator of a plan cites beside ``known`` keys."""
-    return [] if plan is None else [key for key in SEGMENT_ESTIMATORS[plan.segment].cites if key not in known]
-
-
-def make_integrator(chosen: Experiment) -> mi.Integrator:
-    """The integrator of the fit.
-
-    Raises:
-        MivolError: Mitsuba has none of that name, or it refuses its settings.
-    """
-    name = chosen.fit.integrator
+    name = settings.fit.integrator
     try:
-        return mi.load_dict({"type": name, "max_depth": chosen.fit.max_depth})
+        return mi.load_dict({"type": name, "max_depth": settings.fit.max_depth})
     except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise MivolError(f'fit.integrator = "{name}" cannot be loaded ({reason}): "mivol" is the usual one.') from None
 
 
+def make_white_references(sensors: Sequence[Any], held_out: frozenset[int]) -> References:
+    """White images in place of the references that a fit would render."""
+    references = References(held_out)
+    for sensor in sensors:
+        width, height = camera_of(sensor).film().crop_size()
+        references.add(sensor, np.ones((int(height), int(width), 1 if "mono" in mi.variant() else 3)))
+    return references
+
+
 def make_problem(
-    chosen: Experiment, scene: mi.Scene, integrator: mi.Integrator, starts: Sequence[Start], seen: References
+    settings: SceneExperiment, scene: mi.Scene, integrator: mi.Integrator, starts: Sequence[Start], references: References
 ) -> SceneProblem:
-    """The problem of an experiment, with the scene at its start."""
+    """Make the problem of an experiment, and put the starts into the scene."""
     params = mi.traverse(scene)
     for start in starts:
         put(params, start.parameter.name, start.value)
-    settings = {"spp": chosen.fit.spp, "samples_per_pass": chosen.fit.samples_per_pass, "seed": chosen.seed}
+    options = {"spp": settings.fit.spp, "samples_per_pass": settings.fit.samples_per_pass, "seed": settings.seed}
     parameters = [start.parameter for start in starts]
-    problem = SceneProblem(scene, seen.fitted, parameters, integrator, chosen.loss, **settings)
+    problem = SceneProblem(scene, references.fitted, parameters, integrator, settings.loss, **options)
     problem.set_reals(problem.initial_reals())
     return problem
 
 
-def improve_starts(task: Task, run: RunFolder, problem: SceneProblem) -> list[str]:
-    """Put emissive starts into the scene where they are asked for; what was found, in sentences.
-
-    A run that goes on from a checkpoint has its values from there.
-    """
-    chosen: Experiment = task.chosen
-    asked = [sought.key for sought in chosen.parameter if sought.start_fit == "emission"]
-    if task.resume and run.checkpoint.exists():
-        return []
-    notes = []
-    for key in asked:
-        found = find_emissive_start(problem, key, place_of(key, problem.scene), chosen.optimiser, chosen.seed)
-        put(problem.params, key, found.value)
-        problem.set_reals(problem.initial_reals())
-        notes.append(f"{key} {found.text}")
-    task.watcher.say(notes)
-    return notes
-
-
-def solve(
-    task: Task, run: RunFolder, loaded: LoadedScene, problem: SceneProblem, measure: SceneErrors, best: BestIterate
-) -> Fit:
-    """Fit the scene to its views; the metrics grow by a line an iteration, and the best iterate is kept."""
-    chosen: Experiment = task.chosen
-    course = Course(chosen.fit.iterations, chosen.schedule, chosen.event)
-    digests = {"scene": loaded.content_hash, "references": measure.seen.digest()}
-    store = CheckpointFile(run.checkpoint, digests | config.flat(config.resolved(chosen)), task.resume)
-
-    def judge(problem: SceneProblem) -> dict[str, float]:
-        errors = measure(problem)
-        best.see(fit.next_iteration, errors, problem.values())
-        return errors
-
-    def observe(fit: Fit) -> None:
-        write_metrics(run, fit)
-        watch(fit)
-
-    fit = begin_fit(problem, chosen.optimiser, course, measure=judge, checkpoint=store)
-    best.restore()
-    run.begin(fit.next_iteration - 1)
-    with task.watcher.watch(chosen.fit.iterations) as watch:
-        fit.complete(observe)
-    append_last(run, fit)
-    return fit
-
-
-def write_metrics(run: RunFolder, fit: Fit) -> None:
-    """One line for the iteration that has just ended, with what was measured before it."""
-    last = fit.history[-1]
-    measured = fit.latest_errors() if fit.evaluations and fit.evaluations[-1]["iteration"] == last["iteration"] else {}
-    run.append(last["iteration"], last["seconds"], loss=last["loss"], **measured)
-
-
-def append_last(run: RunFolder, fit: Fit) -> None:
-    """What was measured after the last iteration, once however often a run that is done is resumed."""
-    run.rewind(fit.next_iteration - 1)
-    if fit.evaluations and fit.evaluations[-1]["iteration"] == fit.next_iteration and len(fit.evaluations[-1]) > 2:
-        run.append(**fit.evaluations[-1])
+def plan_renders(settings: SceneExperiment, problem: SceneProblem) -> Plan | None:
+    """Return the plan of mivol's integrator for the scene; None for other integrators."""
+    if settings.fit.integrator != "mivol":
+        return None
+    needs = find_needs(problem.scene, problem.batches[0].sensor, survey_scene(problem.scene))
+    return make_plan(needs, Settings(max_depth=settings.fit.max_depth))
 
 
 class SceneErrors:
-    """What a fit does not minimise: PSNR of held-out views, the error of the volume where the truth is known, and what is
-    found of parameters that are few numbers."""
+    """Errors that a fit does not minimise.
 
-    def __init__(self, chosen: Experiment, seen: References, truth: np.ndarray | None) -> None:
-        self.seen, self.truth = seen, truth
-        self.batches = make_batches(seen.held_out, chosen.fit.samples_per_pass) if seen.held_out else []
-        self.key = chosen.truth.key if chosen.truth else ""
-        self.spp = chosen.fit.spp_shown or chosen.fit.spp
+    These are the PSNR of held-out views, the error of the volume if the truth is known, and the values of parameters of few
+    numbers.
+    """
+
+    def __init__(self, settings: SceneExperiment, references: References, truth: np.ndarray | None) -> None:
+        self.truth = truth
+        self.batches = make_batches(references.held_out, settings.fit.samples_per_pass) if references.held_out else []
+        self.key = settings.truth.key if settings.truth else ""
+        self.spp = settings.fit.spp_shown or settings.fit.spp
 
     def __call__(self, problem: SceneProblem) -> dict[str, float]:
         errors: dict[str, float] = {}
         if self.batches:
             errors["held_out_psnr"] = float(np.mean([value for batch in self.batches for value in self.psnr(problem, batch)]))
         if self.truth is not None and self.key in problem.values():
-            found = problem.values()[self.key]
-            if tuple(found.shape) != self.truth.shape:
-                found = upsample(found, self.truth.shape[:3])
-            errors["nrmse"] = nrmse(np.asarray(found), self.truth)
+            volume = problem.values()[self.key]
+            if tuple(volume.shape) != self.truth.shape:
+                volume = upsample(volume, self.truth.shape[:3])
+            errors["nrmse"] = nrmse(np.asarray(volume), self.truth)
         return errors | numbers(problem)
 
     def psnr(self, problem: SceneProblem, batch: RenderBatch) -> list[float]:
-        """PSNR [dB] of each view of a batch, of what the scene holds now."""
+        """PSNR [dB] of each view of a batch, rendered from the current scene."""
         image = np.asarray(problem.render(batch.sensor, derive_seed(problem.seed, 0, 0, HELD_OUT), self.spp))
         pairs = zip(np.split(image, batch.n_views, 1), np.split(np.asarray(batch.reference), batch.n_views, 1), strict=True)
         return [psnr(render, reference) for render, reference in pairs]
 
 
 def numbers(problem: SceneProblem) -> dict[str, float]:
-    """Each number of the parameters that are no grids or images, by key and place, as the scene holds it now."""
+    """Current numbers of all parameters that are neither grids nor images, by key and index."""
     values = {name: np.asarray(value) for name, value in problem.values().items() if value.ndim == 1}
     return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}
 
 
-def units(chosen: Experiment, problem: SceneProblem) -> dict[str, str]:
-    """Units of the loss and of each of those numbers."""
+def units(settings: SceneExperiment, problem: SceneProblem) -> dict[str, str]:
+    """Units of the loss and of :func:`numbers`."""
     known = {parameter.name: parameter.unit for parameter in problem.parameters}
-    return {"loss": chosen.loss.unit} | {name: known[name.rpartition("[")[0]] for name in numbers(problem)}
-
-
-def settle_depth(task: Task, loaded: LoadedScene, truth: np.ndarray | None) -> tuple[Task, list[PlanLine]]:
-    """Put a number in the place of ``max_depth = "auto"``.
-
-    The depth is measured from the first view, in the scene that renders the references. Where the references are files and the
-    truth is not known, nothing can be measured, and paths have no limit.
-
-    Returns:
-        The task with a number, and why it is that one; the task itself where it has one.
-    """
-    chosen: Experiment = task.chosen
-    if chosen.fit.max_depth != AUTO:
-        return task, []
-    if truth is None and not isinstance(chosen.reference, Rendered):
-        depth, reason = -1, "the references are files, and what they show is not known"
-    else:
-        with nullcontext() if truth is None else holding(loaded.scene, chosen.truth.key, truth):
-            sensor = camera_of(next(iter(chosen.views.sensors(loaded.scene))))
-            answer = measure_depths(loaded.scene, sensor, Settings(), chosen.fit.noise)
-        depth, reason = answer.depth, answer.reason
-    fit = msgspec.structs.replace(chosen.fit, max_depth=depth)
-    settled = replace(task, chosen=msgspec.structs.replace(chosen, fit=fit))
-    return settled, [PlanLine(choice=f"max_depth: {depth}", reason=reason)]
+    return {"loss": settings.loss.unit} | {name: known[name.rpartition("[")[0]] for name in numbers(problem)}

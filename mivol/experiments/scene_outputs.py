@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from mivol.config import Experiment, Sought
+from mivol.config import SceneExperiment, Sought
 from mivol.experiments.camera_pictures import pictures_of_views
 from mivol.experiments.film import film_of_volume
 from mivol.experiments.references import References
@@ -40,7 +40,7 @@ class SceneOutputs:
         best: the best iterate, where it is not the last.
     """
 
-    chosen: Experiment
+    chosen: SceneExperiment
     run: RunFolder
     fit: Fit
     seen: References
@@ -51,12 +51,6 @@ class SceneOutputs:
         """Write images, volumes and curves, and put them and the results on record."""
         record, fit = self.run.record, self.fit
         self.run.make("views", "volumes")
-        if self.seen.held_out:
-            record.notes.append(
-                f"PSNR of the held-out views is the mean over {len(self.seen.held_out)} of them, the same at each point of the "
-                "curve; the peak is the largest value of each reference."
-            )
-        record.notes += fit.log + ([f"stopped early: {fit.run.stop_reason}"] if fit.run.stop_reason else []) + self.best.says()
         for number, view in enumerate((*self.seen.fitted, *self.seen.held_out)):
             record.images += self.write_view(view, number)
         for sought in self.chosen.parameter:

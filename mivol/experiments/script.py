@@ -17,8 +17,8 @@ import numpy as np
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.experiments.runs import run_experiment
-from mivol.experiments.task import Nobody, Task, Watcher
+from mivol.experiments.fit_kind import NullProgress, Progress, RunContext
+from mivol.experiments.kinds import run_experiment
 from mivol.fields.field_files import read_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, stack_layers
@@ -214,7 +214,7 @@ def fit_photographs(
     photographs: str | os.PathLike,
     output: str | os.PathLike = "runs/field",
     settings: Mapping[str, object] | None = None,
-    watcher: Watcher | None = None,
+    progress: Progress | None = None,
 ) -> SphericalGrid:
     """Fit a radiance field to posed photographs; ``field.npz`` and its page lie in the run folder.
 
@@ -222,7 +222,7 @@ def fit_photographs(
         photographs: a folder, or its file of cameras (Blender, nerfstudio, instant-ngp, COLMAP).
         output: run folder.
         settings: of the TOML file by dotted key, as ``{"field.preset": "tiny", "photos.background": "white"}``.
-        watcher: who is told how it goes; None: nobody.
+        progress: who is told how it goes; None: nobody.
 
     Raises:
         MivolError: what ``mivol optimize`` refuses, in the same words.
@@ -230,7 +230,7 @@ def fit_photographs(
     Example:
         >>> field = mivol.fit_photographs("photographs", "runs/field", {"field.preset": "tiny"})
     """
-    fitted(photographs, output, settings, watcher, {})
+    fitted(photographs, output, settings, progress, {})
     return read_field(Path(output) / "field.npz")
 
 
@@ -238,12 +238,12 @@ def fit_gaussians(
     photographs: str | os.PathLike,
     output: str | os.PathLike = "runs/gaussians",
     settings: Mapping[str, object] | None = None,
-    watcher: Watcher | None = None,
+    progress: Progress | None = None,
 ) -> Gaussians:
     """Fit 3D Gaussians to posed photographs; ``gaussians.ply`` and its page lie in the run folder.
 
     Args:
-        photographs, output, watcher: as :func:`fit_photographs`.
+        photographs, output, progress: as :func:`fit_photographs`.
         settings: of the TOML file by dotted key, as ``{"gaussians.preset": "tiny", "photos.background": "white"}``.
 
     Raises:
@@ -252,7 +252,7 @@ def fit_gaussians(
     Example:
         >>> found = mivol.fit_gaussians("photographs", "runs/gaussians", {"gaussians.preset": "tiny"})
     """
-    fitted(photographs, output, settings, watcher, {"gaussians": {}})
+    fitted(photographs, output, settings, progress, {"gaussians": {}})
     return read_gaussians(Path(output) / "gaussians.ply")
 
 
@@ -260,7 +260,7 @@ def fitted(
     photographs: str | os.PathLike,
     output: str | os.PathLike,
     settings: Mapping[str, Any] | None,
-    watcher: Watcher | None,
+    progress: Progress | None,
     tables: dict[str, Any],
 ) -> None:
     """Do an experiment on photographs that has these tables besides."""
@@ -273,4 +273,4 @@ def fitted(
             place = place.setdefault(table, {})
         place[last] = value
     chosen = config.from_dict(raw, "settings")
-    run_experiment(Task(chosen, Path(), Path(output), watcher=watcher or Nobody()))
+    run_experiment(RunContext(chosen, Path(), Path(output), progress=progress or NullProgress()))

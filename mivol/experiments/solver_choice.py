@@ -36,14 +36,14 @@ MOST_UNKNOWNS = 1 << 24
 cores there, and a solver keeps some ten fields of so many numbers."""
 
 
-def strength_of(wanted: config.Solve) -> float:
+def strength_of(wanted: config.SolveSettings) -> float:
     """``solve.tv`` as it is meant: absent, it is 1 where "auto" chooses and the unit is the noise, else 0."""
     if wanted.tv is not None:
         return wanted.tv
     return 1.0 if wanted.name == AUTO and wanted.tv_unit == "noise" else 0.0
 
 
-def settle_solver(wanted: config.Solve, walk: Projector) -> tuple[config.Solve, list[PlanLine]]:
+def settle_solver(wanted: config.SolveSettings, walk: Projector) -> tuple[config.SolveSettings, list[PlanLine]]:
     """Put values in the places of all that was left open.
 
     Args:
@@ -62,7 +62,7 @@ def settle_solver(wanted: config.Solve, walk: Projector) -> tuple[config.Solve, 
     return settled, [PlanLine(choice=f"solver: {name}", reason=reason), *start_line, *parts_line]
 
 
-def settle_start(wanted: config.Solve, walk: Projector) -> tuple[str, list[PlanLine]]:
+def settle_start(wanted: config.SolveSettings, walk: Projector) -> tuple[str, list[PlanLine]]:
     """Where to begin, and why where it was left open to "auto"."""
     if wanted.start is not None or wanted.name != AUTO:
         return wanted.start or "empty", []
@@ -73,7 +73,7 @@ def settle_start(wanted: config.Solve, walk: Projector) -> tuple[str, list[PlanL
     return "filtered", [PlanLine(choice="start: filtered back-projection", reason="half of the iterations are saved")]
 
 
-def settle_supersampling(wanted: config.Solve, walk: Projector) -> tuple[int, list[PlanLine]]:
+def settle_supersampling(wanted: config.SolveSettings, walk: Projector) -> tuple[int, list[PlanLine]]:
     """Unknowns along an edge of a voxel, and why where it was left open to "auto"."""
     if wanted.supersampling is not None or wanted.name != AUTO:
         return wanted.supersampling or 1, []
@@ -88,7 +88,7 @@ FIELDS, FIELDS_OF_ONE_STEP = 10, 3
 """Fields of so many numbers as there are unknowns, of four bytes each, that an iterative and a direct solver keep."""
 
 
-def check_grid(chosen: config.Scan, grid: VoxelGrid) -> None:
+def check_grid(chosen: config.ScanExperiment, grid: VoxelGrid) -> None:
     """Refuse unknowns that a solver cannot keep.
 
     Raises:
@@ -121,7 +121,7 @@ class Storage:
             problem.linear_problem = replace(problem.linear_problem, A=store(problem.linear_problem.A))
 
 
-def choose_storage(wanted: config.Solve, walk: Projector) -> Storage:
+def choose_storage(wanted: config.SolveSettings, walk: Projector) -> Storage:
     """Count, and choose; nothing is stored yet.
 
     Args:
@@ -152,7 +152,7 @@ def walked(reason: str) -> Storage:
     return Storage(False, PlanLine(choice="storage: none, each product walks through the grid", reason=reason))
 
 
-def refused(wanted: config.Solve, reason: str) -> Storage:
+def refused(wanted: config.SolveSettings, reason: str) -> Storage:
     """A walk, unless stored rows were asked for by name.
 
     Raises:
@@ -167,7 +167,7 @@ PLAIN_ITERATIONS = {"filtered": 5, "empty": 20}
 """Iterations without a prior after which what is left of noiseless views is the misfit of voxels, by where they began."""
 
 
-def make_prior(wanted: config.Solve, a: Projector, data: Projections, kept: np.ndarray) -> SmoothedTV | None:
+def make_prior(wanted: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> SmoothedTV | None:
     """Total variation in the unit that was asked for, as if weights were inverse variances; None where none was."""
     if not wanted.tv:
         return None
@@ -176,7 +176,7 @@ def make_prior(wanted: config.Solve, a: Projector, data: Projections, kept: np.n
     return scale_tv_to_noise(a, data.y[kept], data.weights[kept], wanted.tv, wanted.delta)
 
 
-def settle_noise(problem: ProjectionProblem, wanted: config.Solve, data: Projections) -> list[PlanLine]:
+def settle_noise(problem: ProjectionProblem, wanted: config.SolveSettings, data: Projections) -> list[PlanLine]:
     """Where a prior's unit is a noise that is not known: take what a few iterations without a prior leave, and begin there.
 
     Variances are ``s^2 / w`` then, and s is found. Least squares with weights w need ``s^2`` times the strength that goes with

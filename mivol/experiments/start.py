@@ -14,7 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mivol.config import Experiment, Sought
+from mivol.config import SceneExperiment, Sought
 from mivol.errors import MivolError
 from mivol.files import read_volume
 from mivol.files.fetch import resolve_path as place_in
@@ -35,7 +35,7 @@ class Start:
     value: np.ndarray
 
 
-def make_starts(chosen: Experiment, base: Path, scene: mi.Scene) -> list[Start]:
+def make_starts(chosen: SceneExperiment, base: Path, scene: mi.Scene) -> list[Start]:
     """All parameters of a fit and where they start; the scene is not changed.
 
     Raises:
@@ -50,7 +50,7 @@ def make_starts(chosen: Experiment, base: Path, scene: mi.Scene) -> list[Start]:
     return starts
 
 
-def refined(shape: Sequence[int], chosen: Experiment) -> tuple[int, ...]:
+def refined(shape: Sequence[int], chosen: SceneExperiment) -> tuple[int, ...]:
     """The shape of a grid after all events of a fit."""
     factor, last = 1, chosen.fit.iterations
     for event in chosen.event:

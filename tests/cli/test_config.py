@@ -49,7 +49,7 @@ def test_resolved_settings_are_an_experiment_again() -> None:
 
 def test_every_setting_says_what_it_is() -> None:
     """Each line of the help names a setting, and each setting has one; units are said where there are any."""
-    lines = describe(config.Experiment)
+    lines = describe(config.SceneExperiment)
     assert any(line.startswith("optimiser[adam].beta_1 = 0.9: ") for line in lines)
     assert any(line.startswith("fit.spp = 16 [sample/pixel]: ") for line in lines)
     assert any(line.startswith("parameter.0.prior.0[tv].weight = 1.0: ") for line in lines)
@@ -77,7 +77,7 @@ def test_flat_names_everything_that_changes_the_result() -> None:
 @pytest.mark.parametrize("path", sorted((ROOT / "scenes").glob("*/*.toml")), ids=lambda p: f"{p.parent.name}/{p.name}")
 def test_shipped_experiments_are_valid(path: Path) -> None:
     found = config.load(path)
-    assert not isinstance(found, config.Experiment) or (path.parent / found.scene.file).exists()
+    assert not isinstance(found, config.SceneExperiment) or (path.parent / found.scene.file).exists()
 
 
 #: what is wrong -> (changes to the smallest experiment, what the sentence must say)
@@ -138,7 +138,7 @@ def test_wrong_files(tmp_path: Path) -> None:
 
 def test_the_schema_is_strict() -> None:
     """Every struct that a file can fill refuses unknown fields by itself, too."""
-    seen = [config.Experiment, config.Scan, config.FieldFit, config.GaussianFit]
+    seen = [config.SceneExperiment, config.ScanExperiment, config.FieldExperiment, config.GaussianExperiment]
     for struct in seen:
         assert struct.__struct_config__.forbid_unknown_fields, struct
         for field in msgspec.structs.fields(struct):
@@ -163,6 +163,8 @@ def test_a_word_that_is_none_of_a_setting_says_which_there_are(tmp_path: Path, c
 
 
 def test_settings_say_what_they_are_chosen_from() -> None:
-    choices = {setting.key: setting.choices for setting in settings_in(config.FieldFit)}
+    choices = {setting.key: setting.choices for setting in settings_in(config.FieldExperiment)}
     assert choices["show.way"] == ("turntable", "views", "keyframes") and choices["show.views"] == ()
-    assert "(turntable | views | keyframes)" in next(line for line in describe(config.FieldFit) if line.startswith("show.way"))
+    assert "(turntable | views | keyframes)" in next(
+        line for line in describe(config.FieldExperiment) if line.startswith("show.way")
+    )

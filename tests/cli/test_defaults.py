@@ -8,7 +8,7 @@ import math
 import msgspec
 import pytest
 
-from mivol.config import Experiment
+from mivol.config import SceneExperiment
 from mivol.optim.events import Checkpoint, Evaluate
 from mivol.optim.first_order import Adam
 from mivol.optim.losses import L2
@@ -24,7 +24,7 @@ DEFAULTS = {
         **{"detector_offset": (0.0, 0.0), "axis_offset": 0.0},
     },
     "config.Ellipsoids": {"photons": 0.0, "seed": 1, "table": "yu-ye-wang", "half_width": 1.0, "scale": 1.0},
-    "config.Experiment": {
+    "config.SceneExperiment": {
         "held_out": None,
         "truth": None,
         "variant": "llvm_ad_rgb",
@@ -32,7 +32,7 @@ DEFAULTS = {
         "threads": 0,
         "output": "runs/fit",
     },
-    "config.Field": {
+    "config.FieldSettings": {
         "preset": "cpu",
         "longest": None,
         "degree": None,
@@ -45,7 +45,13 @@ DEFAULTS = {
         "sky": None,
         "beta": None,
     },
-    "config.FieldFit": {"checkpoint_every": 500, "variant": "llvm_ad_rgb", "seed": 0, "threads": 0, "output": "runs/field"},
+    "config.FieldExperiment": {
+        "checkpoint_every": 500,
+        "variant": "llvm_ad_rgb",
+        "seed": 0,
+        "threads": 0,
+        "output": "runs/field",
+    },
     "config.Files": {"scene": "", "held_out": ()},
     "config.Grid": {"voxel_size": 1.0, "centre": (0.0, 0.0, 0.0)},
     "config.Known": {"photons": 0.0, "seed": 1, "scale": 1.0},
@@ -65,7 +71,7 @@ DEFAULTS = {
     "config.Rendered": {"spp": 1024, "standard_error": 0.0, "seed": 1, "held_out": ()},
     "config.Matrices": {"detector": (1, 128), "first_pixel": (0.0, 0.0)},
     "config.Nikon": {"find_axis": None, "air": 0, "drift": 0, "saturation": math.inf, "angles": ""},
-    "config.Scan": {
+    "config.ScanExperiment": {
         **{"grid": None, "held_out_every": 0},
         **{"checkpoint_every": 5, "variant": "llvm_ad_rgb", "threads": 0, "output": "runs/scan"},
     },
@@ -77,10 +83,10 @@ DEFAULTS = {
         "max_depth": 6,
         "integrator": "mivol",
     },
-    "config.Shown": {"views": 4, "frames": 60, "every": 250, "metrics": ("psnr", "ssim")},
+    "config.ShowSettings": {"views": 4, "frames": 60, "every": 250, "metrics": ("psnr", "ssim")},
     "config.Readings": {"find_axis": None, "air": 0, "drift": 0, "saturation": math.inf},
     "config.Simulated": {"photons": 0.0, "seed": 1},
-    "config.Solve": {
+    "config.SolveSettings": {
         **{"name": "auto", "start": None, "supersampling": None, "iterations": 20, "nonnegative": True, "subsets": 10},
         **{"relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0, "tv": None, "delta": 0.1},
         **{"tv_unit": "noise", "storage": "auto", "memory": 1.0, "discrepancy": 0.0},
@@ -185,6 +191,6 @@ def test_defaults(name: str) -> None:
 
 def test_a_fit_that_chooses_no_strategy():
     """Adam at a constant rate, squared differences, a checkpoint and a judgement every tenth iteration."""
-    chosen = {f.name: f.default for f in msgspec.structs.fields(Experiment)}
+    chosen = {f.name: f.default for f in msgspec.structs.fields(SceneExperiment)}
     assert (chosen["optimiser"], chosen["schedule"], chosen["loss"]) == (Adam(), Constant(), L2())
     assert chosen["event"] == (Checkpoint(every=10), Evaluate(every=10))

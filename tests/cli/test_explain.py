@@ -12,7 +12,7 @@ from tiny_experiment import PHOTOS, SCENE, run, write_experiment
 import mivol
 from mivol import config
 from mivol.errors import MivolError
-from mivol.experiments.explain import explain_fit
+from mivol.experiments.kinds import explain_experiment
 from mivol.files import write_volume
 
 
@@ -113,7 +113,7 @@ EXPLAIN_REFUSED = {
 @pytest.mark.parametrize("case", EXPLAIN_REFUSED)
 def test_explain_makes_the_checks_of_the_fit(variant_rgb, folder: Path, case: str) -> None:
     changes, sentence = EXPLAIN_REFUSED[case]
-    said = explain_fit(config.load(folder / "fit.toml", changes), folder)
+    said = explain_experiment(config.load(folder / "fit.toml", changes), folder)
     assert sentence in said.refusal
     assert said.text.startswith("experiment  tiny\n")
 
@@ -123,11 +123,11 @@ def test_a_scan_is_explained(variant_rgb, tmp_path: Path) -> None:
         "title": "head", "threads": 1, "held_out_every": 4, "scan": {"beam": "parallel", "views": 8, "detector": [1, 6]},
         "data": {"source": "shepp_logan"}, "grid": {"shape": [1, 6, 6], "voxel_size": 0.3}, "solve": {"iterations": 3},
     }  # fmt: skip
-    said = explain_fit(config.from_dict(scan), tmp_path)
+    said = explain_experiment(config.from_dict(scan), tmp_path)
     facts = "1 x 6 x 6 voxels of 0.3", "8 views of 1 x 6 pixels, parallel", "held out  2 views", "pcg, at most 3 iterations"
     for fact in facts:
         assert fact in said.text
     assert said.refusal == ""
-    refused = explain_fit(config.from_dict(scan | {"solve": {"name": "ml-tr"}}), tmp_path)
+    refused = explain_experiment(config.from_dict(scan | {"solve": {"name": "ml-tr"}}), tmp_path)
     assert "ml-tr needs counts" in refused.refusal
     assert "8 views" in refused.text

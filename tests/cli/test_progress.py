@@ -44,7 +44,7 @@ def test_the_newest_numbers_in_words() -> None:
 
 def test_lines_are_said_as_they_are(output: tuple) -> None:
     written, *_ = output
-    progress.Terminal().say(["[bold] 1 2 3", "x" * 150])
+    progress.TerminalProgress().say(["[bold] 1 2 3", "x" * 150])
     assert written.getvalue() == "[bold] 1 2 3\n" + "x" * 150 + "\n"
 
 
@@ -52,7 +52,7 @@ def test_items_are_tracked(output: tuple) -> None:
     """A bar with counts on a terminal; elsewhere one line at the end, with the seconds that passed."""
     written, is_terminal, clock = output
     counts = []
-    for item in progress.Terminal().track(["a", "b"], "views"):
+    for item in progress.TerminalProgress().track(["a", "b"], "views"):
         counts.append((item, written.getvalue()))
         clock.now += 1.25
     assert [item for item, _ in counts] == ["a", "b"]
@@ -68,7 +68,7 @@ def test_a_fit_is_watched(output: tuple) -> None:
     once. In the end the last numbers stand there."""
     written, is_terminal, clock = output
     figures = "loss 0.5, PSNR of the fitted views 20.12, mine 0.5"
-    with progress.Terminal().watch(8) as display:
+    with progress.TerminalProgress().watch(8) as display:
         seen = []
         for done, later, measures in ((1, 0.2, 1), (2, 0.05, 1), (3, 0.06, 2), (4, 0, 2)):
             clock.now += later
@@ -89,6 +89,6 @@ def test_a_fit_is_watched(output: tuple) -> None:
 
 def test_a_fit_that_never_began_says_nothing(output: tuple) -> None:
     written, is_terminal, _ = output
-    with progress.Terminal().watch(8):
+    with progress.TerminalProgress().watch(8):
         pass
     assert ("0/8" in written.getvalue()) == is_terminal and "iterations in" not in written.getvalue()

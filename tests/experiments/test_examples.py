@@ -13,8 +13,8 @@ import mivol
 from mivol import config
 from mivol.experiments import examples
 from mivol.experiments.examples import EXAMPLES, StandIn, examples_folder
+from mivol.experiments.fit_kind import NullProgress
 from mivol.experiments.references import load_experiment_scene
-from mivol.experiments.task import Nobody
 from mivol.files import read_volume
 from mivol.files.fetch import DATA
 
@@ -123,7 +123,7 @@ def test_where_an_example_runs(
 ) -> None:
     """-o, else --set output=..., else runs/NAME; what it needs is made there."""
     made: list[Path] = []
-    monkeypatch.setattr(examples, "prepare", lambda name, example, source, folder, watcher: made.append(folder) or [])
+    monkeypatch.setattr(examples, "prepare", lambda name, example, source, folder, progress: made.append(folder) or [])
     monkeypatch.setattr(examples, "run_experiment", lambda task: task.folder)
     assert examples.run_example("still_life", given, changes=changes) == made[0] == Path(folder)
 
@@ -141,10 +141,10 @@ def test_a_wrong_change_of_an_example_is_refused_before_anything_is_made(
 def test_a_stand_in_takes_the_place_of_public_data(tmp_path: Path, name: str) -> None:
     """Where the data is not there the settings name a seeded volume of its shape; where it is, they are left alone."""
     example, told = EXAMPLES[name], []
-    watcher = Nobody()
-    watcher.say = told.extend
+    progress = NullProgress()
+    progress.say = told.extend
     source = examples_folder() / name
-    changes = examples.prepare(name, example, source, tmp_path / "run", watcher)
+    changes = examples.prepare(name, example, source, tmp_path / "run", progress)
     assert "stands in for it" in told[0]
     chosen = config.load(source / "fit.toml", changes)
     setting = chosen.truth.file if example.stand_in.setting == "truth.file" else chosen.scene.define["volume"]
@@ -154,7 +154,7 @@ def test_a_stand_in_takes_the_place_of_public_data(tmp_path: Path, name: str) ->
     there = tmp_path / "cache" / DATA[example.stand_in.data].path
     there.parent.mkdir(parents=True)
     there.touch()
-    assert examples.prepare(name, example, source, tmp_path / "run", watcher) == []
+    assert examples.prepare(name, example, source, tmp_path / "run", progress) == []
 
 
 def test_readings_are_made_before_an_example_that_fits_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +169,7 @@ def test_readings_are_made_before_an_example_that_fits_them(tmp_path: Path, monk
     monkeypatch.setattr(examples, "run_script", make)
     source = examples_folder() / "bonsai"
     for _ in range(2):
-        changes = examples.prepare("bonsai", EXAMPLES["bonsai"], source, tmp_path / "run", Nobody())
+        changes = examples.prepare("bonsai", EXAMPLES["bonsai"], source, tmp_path / "run", NullProgress())
     chosen = config.load(source / "fit.toml", changes)
     assert calls == ["scan.py"]
     named = (chosen.scan.file, chosen.data.file, chosen.data.flats, chosen.data.darks)

@@ -13,8 +13,8 @@ from tiny_experiment import assert_explained
 
 from mivol import config
 from mivol.cli import main
-from mivol.experiments import photo_fit
-from mivol.experiments.gaussian_start import make_gaussian_plan
+from mivol.experiments.gaussian_fit import make_gaussian_plan
+from mivol.experiments.photo_fit import PhotoFit
 from mivol.files import write_png
 from mivol.optim.gaussians.gaussian_plan import PRESETS
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
@@ -109,11 +109,11 @@ def test_the_best_gaussians_are_kept_beside_the_last(
     """Judged best in the middle: that cloud lies in gaussians_best.ply, which is said and noted."""
     path, seen = toml(tmp_path, photographs), []
 
-    def judged(chosen: object, problem: GaussianProblem, *others: object) -> dict[str, float]:
-        seen.append(problem.cloud["means"].copy())
+    def judged(fit: PhotoFit) -> dict[str, float]:
+        seen.append(fit.problem.cloud["means"].copy())
         return {"few_psnr": {2: 25.0}.get(len(seen), 20.0)}
 
-    monkeypatch.setattr(photo_fit, "judge_few", judged)
+    monkeypatch.setattr(PhotoFit, "judge_few", judged)
     assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 0
     assert len(seen) == 3
     made = [read_gaussians(tmp_path / f"run/{name}.ply").means for name in ("gaussians_best", "gaussians")]
@@ -171,7 +171,7 @@ def test_the_example_is_one_of_gaussians() -> None:
     """The settings of the still life are read, and name the photographs that the radiance field beside them is fitted to."""
     folder = Path(__file__).resolve().parents[2] / "scenes/still_life"
     chosen, field = config.load(folder / "gaussians.toml"), config.load(folder / "fit.toml")
-    assert isinstance(chosen, config.GaussianFit)
+    assert isinstance(chosen, config.GaussianExperiment)
     assert chosen.photos == field.photos
     assert make_gaussian_plan(chosen) == PRESETS["minute"]
 

@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mivol.experiments import gaussian_outputs as outputs
-from mivol.experiments import judged_views
+from mivol.experiments import gaussian_fit as outputs
+from mivol.experiments import judged_views, photo_fit
 from mivol.experiments.film import Film
+from mivol.experiments.fit_kind import NullProgress
 from mivol.points import Gaussians
 from mivol.validate.images import Quality
 
@@ -57,39 +58,35 @@ def test_a_picture_stands_before_a_colour() -> None:
     assert asked == [((3, 2), 0.3)]
 
 
-def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int, frames: int) -> tuple:
-    """The outputs of a fit to so many views, what they ask of others, and the record."""
-    record = SimpleNamespace(results={}, images=[], tables=[], volumes=[])
-    run = SimpleNamespace(path=folder, record=record, written=[])
+def finished_fit(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int, frames: int) -> tuple:
+    """A fit to some views, a run folder that lists what is written, and a function that writes all outputs."""
+    run = SimpleNamespace(path=folder, written=[])
     run.make = lambda *names: [(folder / name).mkdir() for name in names]
     run.write_curves = lambda: run.written.append("curves")
-    show = SimpleNamespace(views=shown, frames=frames, metrics=("psnr", "ssim"))
-    watcher = SimpleNamespace(said=[], say=lambda lines: watcher.said.extend(lines), track=lambda items, what: iter(items))
-    task = SimpleNamespace(chosen=SimpleNamespace(show=show), watcher=watcher)
     camera = SimpleNamespace(size=(1600, 1200))
+    background = np.array([0.1, 0.2, 0.3])
     photos = SimpleNamespace(
-        views=[SimpleNamespace(camera=camera, background=np.array([0.1, 0.2, 0.3]), name=f"{k}") for k in range(views)],
-        box="box",
-        space="srgb",
+        views=[SimpleNamespace(camera=camera, background=background, name=f"{k}") for k in range(views)], space="srgb"
     )
-    plan = SimpleNamespace(low_pass=0.3, low_pass_at=lambda shrink: ("low pass at", shrink))
-    problem = SimpleNamespace(
-        exposure=None, cloud={name: getattr(cloud(), name) for name in outputs.Gaussians.__dataclass_fields__}, plan=plan
-    )
-    monkeypatch.setattr(outputs, "write_gaussians", lambda path, found: path.write_bytes(bytes(100)))
-    monkeypatch.setattr(outputs, "rectified", lambda photo: photo)
-    monkeypatch.setattr(outputs, "pictures_of_photos", lambda *given: run.written.append(given) or [])
-    written = lambda folder, photo, number, seen, space, caption, edge=None: [(photo.name, seen, caption, edge)]  # noqa: E731
+    fit = object.__new__(outputs.GaussianFit)
+    fit.record = SimpleNamespace(results={}, images=[], tables=[], volumes=[])
+    fit.settings = SimpleNamespace(show=SimpleNamespace(views=shown, frames=frames, metrics=("psnr", "ssim")))
+    fit.context = SimpleNamespace(progress=NullProgress())
+    fit.photos, fit.judged, fit.film = photos, photos if shown else None, Film(("camera",) * frames, shrink=4.0)
+    fit.plan = SimpleNamespace(low_pass=0.3, low_pass_at=lambda shrink: ("low pass at", shrink))
+    arrays = {name: getattr(cloud(), name) for name in outputs.Gaussians.__dataclass_fields__}
+    fit.problem = SimpleNamespace(exposure=None, cloud=arrays)
+    monkeypatch.setattr(outputs, "write_gaussians", lambda path, gaussians: path.write_bytes(bytes(100)))
+    monkeypatch.setattr(outputs, "rectify", lambda photo: photo)
+    monkeypatch.setattr(photo_fit, "pictures_of_photos", lambda *given: run.written.append(given) or [])
+    written = lambda folder, photo, number, seen, space, caption, edge=None: [(photo.name, seen.tolist(), caption, edge)]  # noqa: E731
     monkeypatch.setattr(judged_views, "write_view", written)
     monkeypatch.setattr(
         outputs,
         "compare",
-        lambda problem, judged, photo, metrics: (f"seen {photo.name}", Quality(photo.name, {metrics[0]: 20.0})),
+        lambda problem, judged, photo, metrics: (np.array(int(photo.name)), Quality(photo.name, {metrics[0]: 20.0})),
     )
-    monkeypatch.setattr(outputs, "named", lambda values: {f"held_out_{name}": value for name, value in values.items()})
-    fit = SimpleNamespace(problem=problem, next_iteration=77)
-    film = Film(("camera",) * frames, shrink=4.0)
-    return outputs.GaussianOutputs(task, run, fit, photos, photos if shown else None, film), record, run, watcher
+    return fit, run, lambda: fit.write_outputs(SimpleNamespace(next_iteration=77), run, None)
 
 
 @pytest.mark.parametrize(("views", "shown", "full"), [(7, 3, [0, 3, 6]), (2, 5, [0, 1]), (4, 1, [0])])
@@ -97,9 +94,10 @@ def test_judged_views_are_kept(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, views: int, shown: int, full: list[int]
 ) -> None:
     """All are judged and kept beside their photographs: as many as are asked for in full, of which the first is the worst."""
-    found, record, run, _ = fit_of(monkeypatch, tmp_path, views, shown, frames=0)
-    found.write()
-    assert [(name, seen) for name, seen, _, edge in record.images if edge is None] == [(f"{k}", f"seen {k}") for k in full]
+    fit, run, write = finished_fit(monkeypatch, tmp_path, views, shown, frames=0)
+    write()
+    record = fit.record
+    assert [(name, seen) for name, seen, _, edge in record.images if edge is None] == [(f"{k}", k) for k in full]
     assert sorted(name for name, *_ in record.images) == [f"{k}" for k in range(views)]
     assert record.images[0][2] == f"the worst of {views}: PSNR 20.00 dB"
     assert record.tables[1].title == "Judged views, at 1600 x 1200 pixels, the worst first"
@@ -107,7 +105,7 @@ def test_judged_views_are_kept(
     assert record.judged == f"{views} views at 1600 x 1200 pixels"
     assert record.results == {"views": views, "iterations": 77.0, "gaussians": 3.0, "held_out_psnr": pytest.approx(20.0)}
     # The cameras that judge are drawn beside those that were fitted to.
-    assert run.written == [(tmp_path, found.photos, found.judged), "curves"]
+    assert run.written == [(tmp_path, fit.photos, fit.judged, 1), "curves"]
     assert record.tables[0].rows[2] == ("file", "0.00 MiB")
     assert (tmp_path / "views").is_dir() and (tmp_path / "film").is_dir()
 
@@ -115,22 +113,22 @@ def test_judged_views_are_kept(
 def test_frames_are_filtered_as_the_smaller_picture_asks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A film that is four times smaller than the photographs, over the first one's background; without judged views nothing
     is judged."""
-    found, record, _, _ = fit_of(monkeypatch, tmp_path, 2, 0, frames=8)
+    fit, _, write = finished_fit(monkeypatch, tmp_path, 2, 0, frames=8)
     asked, given = [], []
     monkeypatch.setattr(outputs, "picture_of", lambda problem, *how: asked.append(how) or "picture")
-    monkeypatch.setattr(Film, "write", lambda film, folder, picture, watcher: given.append(folder) or picture("camera"))
-    found.write()
+    monkeypatch.setattr(Film, "write", lambda film, folder, picture, progress: given.append(folder) or picture("camera"))
+    write()
     ((camera, behind, low_pass),) = asked
     assert (camera, behind.tolist(), low_pass) == ("camera", [0.1, 0.2, 0.3], ("low pass at", 4.0))
-    assert given == [tmp_path] and record.images == ["picture"]
-    assert set(record.results) == {"views", "iterations", "gaussians"}
+    assert given == [tmp_path] and fit.record.images == ["picture"]
+    assert set(fit.record.results) == {"views", "iterations", "gaussians"}
 
 
 def test_a_view_is_judged_as_a_pinhole_sees_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a lens distorts is rectified, filtered as in the fit, and judged in the space of the photographs."""
     photo = SimpleNamespace(camera="bent")
     flat = SimpleNamespace(camera="flat", background="behind", image="image", mask="mask", name="name")
-    monkeypatch.setattr(outputs, "rectified", lambda given: flat if given is photo else None)
+    monkeypatch.setattr(outputs, "rectify", lambda given: flat if given is photo else None)
     monkeypatch.setattr(outputs, "picture_of", lambda *asked: asked)
     monkeypatch.setattr(outputs, "judge", lambda *given, **named: (given, named))
     problem = SimpleNamespace(plan=SimpleNamespace(low_pass=0.3))

@@ -18,7 +18,10 @@ from tiny_experiment import assert_explained
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import field_plan, photo_data, photo_fit, photo_outputs
+from mivol.experiments import field_fit, field_plan, photo_data
+from mivol.experiments.field_fit import FieldFit
+from mivol.experiments.fit_kind import RunContext
+from mivol.experiments.photo_fit import PhotoFit
 from mivol.fields.field_files import read_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr, write_png
@@ -26,7 +29,7 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS, PRESETS, RadiancePlan, RadianceStage, scale_longest
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.problem import Reals
-from mivol.photos import Camera, intrinsics
+from mivol.photos import Camera, Photos, intrinsics
 from mivol.photos.camera_path import aim_camera
 from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
@@ -144,7 +147,7 @@ def test_a_film_without_ffmpeg_is_an_animated_image(
 def test_what_a_field_takes_is_told_in_bytes_a_node(tmp_path: Path, variant_rgb: str) -> None:
     """Of 6^3 nodes: 4 numbers of a byte, 4 of four bytes; a density and 3 colours, in rows of 4, of four bytes."""
     (tmp_path / "field.npz").write_bytes(bytes(864))
-    table = photo_outputs.storage(ball(6), tmp_path / "field.npz")
+    table = field_fit.storage(ball(6), tmp_path / "field.npz")
     assert [row[2] for row in table.rows] == ["4", "16", "20", "20", "4"]
     assert [row[1] for row in table.rows][-1] == f"{864 / 2**20:.2f} MiB"
     assert table.head[0] == "216 of 216 nodes are kept (100.0%)"
@@ -158,11 +161,11 @@ def test_the_best_field_is_kept_beside_the_last(
     the console is what was saved."""
     path, seen = toml(tmp_path, photographs), []
 
-    def judged(chosen: object, problem: RadianceProblem, *others: object) -> dict[str, float]:
-        seen.append(problem.field.to_dense()[0])
+    def judged(fit: PhotoFit) -> dict[str, float]:
+        seen.append(fit.problem.field.to_dense()[0])
         return {"few_psnr": {2: 25.0}.get(len(seen), 20.0)}
 
-    monkeypatch.setattr(photo_fit, "judge_few", judged)
+    monkeypatch.setattr(PhotoFit, "judge_few", judged)
     short = ["--set", "field.effort=0.1", "--set", "show.every=10"]
     assert main(["optimize", str(path), "-o", str(tmp_path / "run"), *short]) == 0
     assert len(seen) == 3
@@ -460,17 +463,23 @@ def test_each_look_is_at_the_same_views(photographs: Path, tmp_path: Path, monke
     kept = replace(judged, views=tuple(replace(view, mask=mask) for view in judged.views))
     nothing = SphericalGrid.from_dense(np.zeros((2, 2, 2)), np.zeros((2, 2, 2, 1, 3)), np.eye(4))
     problem = SimpleNamespace(field=nothing, sky=None)
-    monkeypatch.setattr(photo_outputs, "judge", lambda *images, **asked: names.append(asked["name"]) or judge(*images, **asked))
+    monkeypatch.setattr(field_fit, "judge", lambda *images, **asked: names.append(asked["name"]) or judge(*images, **asked))
+
+    def judge_few(judged: Photos | None, *changes: str) -> dict[str, float]:
+        fit = FieldFit(RunContext(config.load(toml(tmp_path, photographs), changes), tmp_path, tmp_path))
+        fit.problem, fit.judged = problem, judged
+        return fit.judge_few()
+
     for _ in range(2):
         # The columns that count show nothing but what is behind.
-        assert photo_fit.judge_few(chosen, problem, kept) == {"held_out_psnr": np.inf}
+        assert judge_few(kept) == {"held_out_psnr": np.inf}
     assert names == ["view_3.png", "view_8.png"] * 2
-    one = photo_fit.judge_few(config.load(toml(tmp_path, photographs), ["show.judged=1"]), problem, judged)
-    both = photo_fit.judge_few(chosen, problem, judged)
-    alone = [photo_outputs.compare(problem, judged, view, ("psnr",))[1].values["psnr"] for view in judged.views]
+    one = judge_few(judged, "show.judged=1")
+    both = judge_few(judged)
+    alone = [field_fit.compare(problem, judged, view, ("psnr",))[1].values["psnr"] for view in judged.views]
     assert one == {"few_psnr": alone[0]}
     assert both == {"held_out_psnr": np.mean(alone)}
-    assert photo_fit.judge_few(chosen, problem, None) == {}
+    assert judge_few(None) == {}
     assert any("2 views are judged, the first at 48 x 48 pixels" in note for note in photo_data.notes(judged, judged))
 
 

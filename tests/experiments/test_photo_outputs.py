@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mivol.experiments import photo_outputs
+from mivol.experiments import field_fit, judged_views
 from mivol.fields.field_files import write_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
@@ -37,7 +37,7 @@ def test_what_a_field_takes(tmp_path, kept):
     """60 nodes of a box: 4 and 16 bytes each; 4 (1 + 4 x 3) with harmonics of degree 1 in rows of 12."""
     sparse = field(None if kept == 60 else np.arange(60).reshape(RES) < kept)
     write_field(tmp_path / "field.npz", sparse)
-    table = photo_outputs.storage(sparse, tmp_path / "field.npz")
+    table = field_fit.storage(sparse, tmp_path / "field.npz")
     assert table.head[0] == f"{kept} of 60 nodes are kept ({kept / 60:.1%})"
     rows = {name: each for name, _, each in table.rows}
     assert rows["every node: r, g, b and density of 8 bits"] == "4" and rows["every node: four numbers"] == "16"
@@ -45,18 +45,18 @@ def test_what_a_field_takes(tmp_path, kept):
     assert rows["this field, in memory"] == f"{sparse.bytes / 60:.3g}"
     assert rows["this field, its file"] == f"{(tmp_path / 'field.npz').stat().st_size / 60:.3g}"
     # Two digits of a MiB say nothing of so few bytes; of a thousand times as many they do.
-    big = SimpleNamespace(places=256**3, listed=lambda: range(2**20), degree=0, width=4, bytes=3 * 2**20)
-    sizes = {name: size for name, size, _ in photo_outputs.storage(big, tmp_path / "field.npz").rows}
+    big = SimpleNamespace(node_count=256**3, stored_nodes=lambda: range(2**20), degree=0, width=4, bytes=3 * 2**20)
+    sizes = {name: size for name, size, _ in field_fit.storage(big, tmp_path / "field.npz").rows}
     assert sizes["every node: four numbers"] == "256.00 MiB" and sizes["this field, in memory"] == "3.00 MiB"
 
 
 def test_densities_are_written_for_other_programs(tmp_path):
     (tmp_path / "volumes").mkdir()
-    found = photo_outputs.write_density(tmp_path, field(), 0)
+    found = field_fit.write_density(tmp_path, field(), 0)
     assert (found.path, found.role, found.size) == ("volumes/density.npz", "reconstruction", EDGES)
     for name in ("density.vol", "density.npz"):
         np.testing.assert_allclose(read_volume(tmp_path / "volumes" / name).values.ravel(), 1 + np.arange(60), rtol=1e-6)
-    outer = photo_outputs.write_density(tmp_path, field(), 2)
+    outer = field_fit.write_density(tmp_path, field(), 2)
     # A page puts together what has one caption: levels are volumes of their own.
     assert (outer.path, outer.caption) == ("volumes/density-level-2.npz", "level 2, of 4 times the extent")
 
@@ -64,7 +64,7 @@ def test_densities_are_written_for_other_programs(tmp_path):
 def test_distance_and_normals_are_pictures(tmp_path):
     (tmp_path / "views").mkdir()
     seen = FieldView(np.zeros((2, 4, 3)), np.ones((2, 4)), np.full((2, 4), 1.5))
-    found = photo_outputs.write_geometry(tmp_path, seen, camera(), (1.0, 2.0))
+    found = field_fit.write_geometry(tmp_path, seen, camera(), (1.0, 2.0))
     assert [(i.path, i.role) for i in found] == [("views/distance.png", "picture"), ("views/normals.png", "picture")]
     assert [i.caption for i in found] == [
         "distance of the first judged view: from light, 1 [length], to dark, 2 [length]",
@@ -76,19 +76,19 @@ def test_distance_and_normals_are_pictures(tmp_path):
 
 def test_judged_views_are_told_apart_the_worst_first():
     found = [Quality("a.jpg", {"psnr": 23.456, "ssim": 0.71234}), Quality("b.jpg", {"psnr": 9.0, "ssim": 0.5})]
-    table = photo_outputs.table_of_views(camera(135, 240), found, [24.0, 12.345])
+    table = judged_views.table_of_views(camera(135, 240), found, [24.0, 12.345])
     assert table.title == "Judged views, at 135 x 240 pixels, the worst first"
     assert table.rows == (("b.jpg", "9.00", "0.5000", "12.35"), ("a.jpg", "23.46", "0.7123", "24.00"))
     assert table.head[3] == "PSNR [dB], colours fitted to the photograph's"
-    bare = photo_outputs.table_of_views(camera(135, 240), found)
+    bare = judged_views.table_of_views(camera(135, 240), found)
     assert bare.head == table.head[:3] and bare.rows == tuple(row[:3] for row in table.rows)
 
 
 def test_metrics_have_the_names_of_the_record():
-    assert photo_outputs.named({"psnr": 30.0, "ssim": 0.9}) == {"held_out_psnr": 30.0, "ssim": 0.9}
+    assert judged_views.rename_metrics({"psnr": 30.0, "ssim": 0.9}) == {"held_out_psnr": 30.0, "ssim": 0.9}
 
 
 def test_behind_a_field_is_its_sky_or_the_photographs_own_background():
     photo, sky = SimpleNamespace(background="white"), object()
-    assert photo_outputs.behind(SimpleNamespace(sky=None), photo) == "white"
-    assert photo_outputs.behind(SimpleNamespace(sky=sky), photo) is sky
+    assert field_fit.behind(SimpleNamespace(sky=None), photo) == "white"
+    assert field_fit.behind(SimpleNamespace(sky=sky), photo) is sky

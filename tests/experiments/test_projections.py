@@ -85,7 +85,7 @@ def scan(**data: object) -> SimpleNamespace:
     """The settings of a measured scan in parallel light of 2 x 3 pixels of 1 x 0.5."""
     data = {"air": 0, "find_axis": False, "drift": 0, "saturation": 99.0} | data
     beam = Parallel(views=2, detector=(2, 3), pitch=(1.0, 0.5), axis_offset=0.25)
-    return SimpleNamespace(data=SimpleNamespace(**data), scan=beam, solve=config.Solve("pcg"))
+    return SimpleNamespace(data=SimpleNamespace(**data), scan=beam, solve=config.SolveSettings("pcg"))
 
 
 @pytest.fixture
@@ -174,7 +174,7 @@ def test_quanta_are_those_of_the_readings(measured: ScanReadings, monkeypatch: p
     problems = {"pcg": SimpleNamespace(problem=LeastSquares), "ml-tr": SimpleNamespace(problem=PoissonCounts)}
     monkeypatch.setattr(projections, "METHODS", problems)
     chosen = scan()
-    chosen.solve = config.Solve("ml-tr")
+    chosen.solve = config.SolveSettings("ml-tr")
     assert projections.read_measured(chosen, Path()).quanta is made
 
 

@@ -15,10 +15,10 @@ from PIL import Image
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
+from mivol.experiments.field_fit import save_found
 from mivol.experiments.field_plan import batches_of, make_plan, suited
-from mivol.experiments.judged_views import write_view
+from mivol.experiments.judged_views import judge_colour_fitted, write_view
 from mivol.experiments.photo_data import MIDDLE_GREY, exposed, notes, read_photos
-from mivol.experiments.photo_outputs import judge_fitted, save_found
 from mivol.fields.field_files import read_field
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
@@ -120,7 +120,10 @@ def test_what_is_found_is_kept_in_the_unit_of_the_files(photographs: Path, tmp_p
         np.testing.assert_allclose(shown / 255, encode_srgb(image), atol=0.51 / 255)
     # Half as bright, and otherwise the same: what is not shown white is fitted away.
     view = replace(judged.views[0], image=np.minimum(judged.views[0].image, 1))
-    assert judge_fitted(view.image / 2, view, "linear") > judge(view.image / 2, view.image, space="linear").values["psnr"] + 6
+    assert (
+        judge_colour_fitted(view.image / 2, view, "linear")
+        > judge(view.image / 2, view.image, space="linear").values["psnr"] + 6
+    )
 
 
 @pytest.mark.slow

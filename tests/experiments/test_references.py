@@ -14,6 +14,7 @@ from tiny_experiment import SCENE, refused, run
 from mivol.config import Truth
 from mivol.errors import MivolError
 from mivol.experiments import references
+from mivol.experiments.fit_kind import RunContext
 from mivol.experiments.references import check_truth, holding, make_truth
 from mivol.files import write_exr, write_volume
 from mivol.validate.reference_file import ReferenceResult
@@ -101,8 +102,8 @@ def test_a_reference_is_rendered_as_the_file_says(
         fit=SimpleNamespace(max_depth=7),
         reference=SimpleNamespace(standard_error=wanted, spp=33, seed=5, max_depth=own),
     )
-    task = SimpleNamespace(chosen=chosen, folder=tmp_path, watcher=SimpleNamespace(track=lambda items, what: iter(items)))
-    references.render_views(SimpleNamespace(add=lambda *view: kept.append(view)), task, "scene", ["a", "b"])
+    context = RunContext(chosen, Path(), tmp_path)
+    references.render_views(SimpleNamespace(add=lambda *view: kept.append(view)), context, chosen, "scene", ["a", "b"])
     settings = {"max_depth": depth, "target_se": target, "max_spp": 33, "seed": 5, "progress": False}
     assert asked == [(("scene", tmp_path / "references"), {"sensor": view, **settings}) for view in "ab"]
     assert kept == [(view, "its mean", "its error") for view in "ab"]

@@ -108,5 +108,5 @@ def test_measured_projections_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(projections, "Projector", lambda *asked: None)
     monkeypatch.setattr(projections, "check_hits", lambda projector: None)
     monkeypatch.setattr(projections, "note_rows", lambda *asked: [f"{asked[1]} upside down"])
-    chosen = SimpleNamespace(data=STACK, solve=config.Solve("pcg"))
+    chosen = SimpleNamespace(data=STACK, solve=config.SolveSettings("pcg"))
     assert projections.make_data(chosen, Path(), GRID).notes == ("noted", "geometry upside down")

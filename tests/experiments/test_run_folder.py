@@ -13,9 +13,9 @@ import pytest
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.experiments.run_folder import EARLIER, KEPT, BestIterate, FilesOfBest, RunFolder
-from mivol.experiments.runs import run_experiment
-from mivol.experiments.task import Nobody, Task
+from mivol.experiments.fit_kind import NullProgress, RunContext
+from mivol.experiments.kinds import run_experiment
+from mivol.experiments.run_folder import EARLIER, KEPT, BestFiles, BestIterate, RunFolder
 from mivol.files.atomic import whole_file
 from mivol.report.record import RunRecord, read_metrics, read_record
 
@@ -217,7 +217,7 @@ def test_the_best_iterate_is_kept(tmp_path: Path) -> None:
 def test_the_best_iterate_may_be_files(tmp_path: Path) -> None:
     """Of a field: its files are those of the best iterate, are named where the fit has become worse, else go."""
     run, now = folder(tmp_path), {"iteration": 0}
-    files = FilesOfBest(("field_best.npz",), lambda where: (where / "field_best.npz").write_text(str(now["iteration"])))
+    files = BestFiles(("field_best.npz",), lambda where: (where / "field_best.npz").write_text(str(now["iteration"])))
     best = BestIterate(run, files)
     for iteration, error in enumerate([20.0, 25.0, 22.0]):
         now["iteration"] = iteration
@@ -253,7 +253,7 @@ SCAN = {
 
 
 def test_a_run_needs_nobody_who_watches(variant_rgb: str, tmp_path: Path) -> None:
-    assert list(Nobody().track([3, 4], "items")) == [3, 4]
-    page = run_experiment(Task(config.from_dict(SCAN), tmp_path, tmp_path / "run"))
+    assert list(NullProgress().track([3, 4], "items")) == [3, 4]
+    page = run_experiment(RunContext(config.from_dict(SCAN), tmp_path, tmp_path / "run"))
     assert page == tmp_path / "run" / "report.html"
     assert len((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()) == 2

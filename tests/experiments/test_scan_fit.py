@@ -16,7 +16,7 @@ from tiny_experiment import assert_explained
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import projections, readings, scan_fit
+from mivol.experiments import kinds, projections, readings
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_fit import make_problem
 from mivol.experiments.solver_choice import Storage, choose_storage
@@ -132,7 +132,7 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
         np.save(folder / "y.npy", data.y + np.linspace(0, 0.1, 18)[:, None, None] * np.linspace(-1, 1, 14))
         changes = changes[1:]
     flags = [part for change in changes for part in ("--set", change)]
-    monkeypatch.setattr(scan_fit, "write_page", lambda folder: folder)
+    monkeypatch.setattr(kinds, "write_page", lambda folder: folder)
     monkeypatch.setattr(RunFolder, "write_curves", lambda run: None)
     assert run(folder, *flags, to="whole") == 0
     append = RunFolder.append
@@ -545,7 +545,7 @@ def test_resume_refuses_other_projections(variant_rgb, folder: Path, capsys: pyt
 
 def test_a_scan_is_read_as_one(folder: Path) -> None:
     found = config.load(folder / "fit.toml")
-    assert isinstance(found, config.Scan)
+    assert isinstance(found, config.ScanExperiment)
     assert config.from_dict(config.resolved(found)) == found
     with pytest.raises(MivolError, match="missing: give it"):
         config.from_dict({"title": "x", "scan": {"beam": "parallel"}, "grid": {"shape": [1, 2, 3]}})

@@ -301,13 +301,12 @@ def test_the_first_view_is_measured_with_the_truth_in_the_scene(monkeypatch: pyt
     monkeypatch.setattr(scene_fit, "camera_of", lambda sensor: f"camera {sensor}")
     monkeypatch.setattr(scene_fit, "measure_depths", measured)
     monkeypatch.setattr(scene_fit.msgspec.structs, "replace", lambda given, **change: SimpleNamespace(**change))
-    monkeypatch.setattr(scene_fit, "replace", lambda task, chosen: chosen)
-    settled, (line,) = scene_fit.settle_depth(SimpleNamespace(chosen=chosen), SimpleNamespace(scene="scene"), truth)
+    settled, (line,) = scene_fit.resolve_depth(chosen, SimpleNamespace(scene="scene"), truth)
     assert settled.fit.max_depth == 5 and (line.choice, line.reason) == ("max_depth: 5", "so")
     assert asked == [("scene", "camera first of scene", 0.125, 0 if truth is None else 1)]
     assert held == ([] if truth is None else [("scene", "k", "values"), "given back"])
 
 
 def test_a_depth_that_is_given_is_not_measured() -> None:
-    task = SimpleNamespace(chosen=SimpleNamespace(fit=SimpleNamespace(max_depth=3)))
-    assert scene_fit.settle_depth(task, None, None) == (task, [])
+    settings = SimpleNamespace(fit=SimpleNamespace(max_depth=3))
+    assert scene_fit.resolve_depth(settings, None, None) == (settings, [])

@@ -25,14 +25,14 @@ ROUND = np.arange(12) * np.pi / 6
 HALF = np.arange(12) * np.pi / 12
 
 
-def settled(wanted: config.Solve, geometry: Geometry) -> tuple[config.Solve, dict[str, str]]:
+def settled(wanted: config.SolveSettings, geometry: Geometry) -> tuple[config.SolveSettings, dict[str, str]]:
     found, lines = settle_solver(wanted, Projector(geometry, GRID))
     return found, {line.choice: line.reason for line in lines}
 
 
 @pytest.mark.parametrize("geometry", [ParallelBeam(HALF, (2, 9)), ConeBeam(ROUND, (2, 9), 20.0, 30.0)])
 def test_what_is_left_open_is_the_best_of_the_table(variant_rgb: str, geometry: Geometry) -> None:
-    found, said = settled(config.Solve(), geometry)
+    found, said = settled(config.SolveSettings(), geometry)
     assert (found.name, found.start, found.supersampling, found.tv, found.tv_unit) == ("pcg", "filtered", 2, 1.0, "noise")
     assert "the table of docs/benchmarks.md" in said["solver: pcg"]
     assert list(said)[1:] == [
@@ -49,7 +49,7 @@ def test_what_is_left_open_is_the_best_of_the_table(variant_rgb: str, geometry: 
     ],
 )
 def test_views_that_cannot_be_filtered_begin_empty(variant_rgb: str, geometry: Geometry, sentence: str) -> None:
-    found, said = settled(config.Solve(), geometry)
+    found, said = settled(config.SolveSettings(), geometry)
     assert found.start == "empty"
     assert said["start: empty"].startswith(sentence)
 
@@ -58,44 +58,46 @@ def test_finer_unknowns_are_taken_where_they_fit(variant_rgb: str, monkeypatch: 
     """72 voxels: 288 unknowns in a parallel beam, whose layers stay, 576 in a cone."""
     cone, parallel = ConeBeam(ROUND, (2, 9), 20.0, 30.0), ParallelBeam(HALF, (2, 9))
     monkeypatch.setattr(solver_choice, "MOST_UNKNOWNS", 288)
-    assert settled(config.Solve(), parallel)[0].supersampling == 2
-    found, said = settled(config.Solve(), cone)
+    assert settled(config.SolveSettings(), parallel)[0].supersampling == 2
+    found, said = settled(config.SolveSettings(), cone)
     assert found.supersampling == 1
     assert "solve.supersampling = 2 takes them" in said["unknowns: the voxels"]
-    assert settled(config.Solve(supersampling=3), cone)[0].supersampling == 3
+    assert settled(config.SolveSettings(supersampling=3), cone)[0].supersampling == 3
 
 
 def test_what_a_file_says_holds(variant_rgb: str) -> None:
     """A solver that is named begins empty, at the voxels and without a prior; keys of "auto" that are given stay."""
     cone = ConeBeam(ROUND, (2, 9), 20.0, 30.0)
-    found, said = settled(config.Solve("sirt"), cone)
+    found, said = settled(config.SolveSettings("sirt"), cone)
     assert (found.name, found.start, found.supersampling, found.tv) == ("sirt", "empty", 1, 0.0)
     assert list(said) == ["solver: sirt"] and "1 / (ray length)" in said["solver: sirt"]
-    found, said = settled(config.Solve(start="empty", supersampling=1, tv=0.0, iterations=7), cone)
+    found, said = settled(config.SolveSettings(start="empty", supersampling=1, tv=0.0, iterations=7), cone)
     assert (found.name, found.start, found.supersampling, found.tv, found.iterations) == ("pcg", "empty", 1, 0.0, 7)
     assert list(said) == ["solver: pcg"]
 
 
 def test_the_prior_that_is_meant() -> None:
     """Only in units of the noise is there a strength that needs no choice."""
-    assert strength_of(config.Solve()) == 1
-    assert strength_of(config.Solve(tv_unit="length")) == strength_of(config.Solve("pcg")) == 0
-    assert strength_of(config.Solve(tv=0.25)) == strength_of(config.Solve("pcg", tv=0.25)) == 0.25
-    assert (config.Solve().solver, config.Solve("ml-tr").solver) == ("pcg", "ml-tr")
+    assert strength_of(config.SolveSettings()) == 1
+    assert strength_of(config.SolveSettings(tv_unit="length")) == strength_of(config.SolveSettings("pcg")) == 0
+    assert strength_of(config.SolveSettings(tv=0.25)) == strength_of(config.SolveSettings("pcg", tv=0.25)) == 0.25
+    assert (config.SolveSettings().solver, config.SolveSettings("ml-tr").solver) == ("pcg", "ml-tr")
 
 
 COARSE_GRID = VoxelGrid((1, 16, 16), 1 / 8)
 BEAM = ParallelBeam(np.arange(20) * np.pi / 20, (1, 20), 1 / 8)
 
 
-def problem_of(weight: float, wanted: config.Solve, is_noise_known: bool = False) -> tuple[ProjectionProblem, Projections]:
+def problem_of(
+    weight: float, wanted: config.SolveSettings, is_noise_known: bool = False
+) -> tuple[ProjectionProblem, Projections]:
     a, y = Projector(BEAM, COARSE_GRID), shepp_logan().project(BEAM)
     data = Projections(BEAM, y, np.full(y.shape, weight), is_noise_known=is_noise_known)
     prior = make_prior(wanted, a, data, np.arange(20))
     return ProjectionProblem(LeastSquares(a, y, data.weights, nonnegative=True, prior=prior)), data
 
 
-WANTED = config.Solve(start="filtered", tv=2.0, delta=0.5)
+WANTED = config.SolveSettings(start="filtered", tv=2.0, delta=0.5)
 
 
 def test_the_noise_is_what_plain_iterations_leave(variant_rgb: str) -> None:
@@ -128,9 +130,11 @@ def test_weights_in_proportion_find_the_same(variant_rgb: str) -> None:
 
 @pytest.mark.parametrize(
     ("wanted", "is_noise_known"),
-    [(WANTED, True), (config.Solve(tv=2.0, tv_unit="length"), False), (config.Solve(tv=0.0), False)],
+    [(WANTED, True), (config.SolveSettings(tv=2.0, tv_unit="length"), False), (config.SolveSettings(tv=0.0), False)],
 )
-def test_nothing_is_estimated_where_nothing_is_missing(variant_rgb: str, wanted: config.Solve, is_noise_known: bool) -> None:
+def test_nothing_is_estimated_where_nothing_is_missing(
+    variant_rgb: str, wanted: config.SolveSettings, is_noise_known: bool
+) -> None:
     problem, data = problem_of(1.0, wanted, is_noise_known)
     before = problem.linear_problem
     assert settle_noise(problem, wanted, data) == []

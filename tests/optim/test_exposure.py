@@ -15,7 +15,7 @@ from ball_photos import BOX, PLAN
 from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.field_plan import GAINS, choices, make_plan
-from mivol.experiments.photo_outputs import table_of_gains
+from mivol.experiments.photo_fit import table_of_gains
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import begin_fit
 from mivol.optim.photographs import radiance_problem

@@ -16,10 +16,9 @@ from mivol import config
 from mivol.bench.harness.bars import say
 from mivol.bench.studies.gaussian_fits import Fitted, asked_of, fitted, photographs, psnr_of
 from mivol.errors import MivolError
-from mivol.experiments.gaussian_outputs import compare
-from mivol.experiments.gaussian_start import begin, make_gaussian_plan
+from mivol.experiments.gaussian_fit import begin, compare, make_gaussian_plan
+from mivol.experiments.judged_views import judge_colour_fitted
 from mivol.experiments.photo_data import boxed, read_photos
-from mivol.experiments.photo_outputs import judge_fitted
 from mivol.optim.loop import reconstruct
 from mivol.photos import load_photos, rectify
 from mivol.points import Gaussians
@@ -84,7 +83,7 @@ def exposure_gain(folder: Path, asked: Fitted, held_out: int) -> dict:
         seen = [compare(problem, judged, photo, ("psnr",)) for photo in judged.views]
         raw = [quality.values["psnr"] for _, quality in seen]
         pairs = zip(seen, judged.views, strict=True)
-        adjusted = [judge_fitted(picture, rectify(photo), judged.space) for (picture, _), photo in pairs]
+        adjusted = [judge_colour_fitted(picture, rectify(photo), judged.space) for (picture, _), photo in pairs]
         gains = problem.exposure.table() if problem.exposure is not None else np.ones(1)
         answer[name] = {
             "psnr": float(np.mean(raw)),

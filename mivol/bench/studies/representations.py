@@ -31,10 +31,10 @@ from mivol.bench.studies.radiance_field.photographs import finished, photographs
 from mivol.bench.studies.radiance_field.size import FULL as PHOTOGRAPHS
 from mivol.bench.studies.radiance_field.size import QUICK as QUICK_PHOTOGRAPHS
 from mivol.bench.studies.radiance_field.size import Size as PhotoSize
-from mivol.config import FieldFit, GaussianFit
-from mivol.experiments import gaussian_outputs, photo_outputs
+from mivol.config import FieldExperiment, GaussianExperiment
+from mivol.experiments import field_fit, gaussian_fit
 from mivol.experiments.field_plan import batches_of, make_plan, suited
-from mivol.experiments.gaussian_start import begin, make_gaussian_plan
+from mivol.experiments.gaussian_fit import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.photographs.field_view import render_view
@@ -124,7 +124,7 @@ def _fit_and_judge(folder: Path, settings: dict, size: Size) -> dict:
     chosen = config.from_dict({"title": folder.name, "photos": photos, **settings})
     shown, judged = read_photos(chosen, Path())
     shown = boxed(chosen, shown)
-    fitted = _fit_grid if isinstance(chosen, FieldFit) else _fit_gaussians
+    fitted = _fit_grid if isinstance(chosen, FieldExperiment) else _fit_gaussians
     problem, result = fitted(chosen, shown)
     done = finished(problem, size.photographs.walk_side)
     found, watch, views = result(), Stopwatch(), judged.views
@@ -154,7 +154,7 @@ def _fit_and_judge(folder: Path, settings: dict, size: Size) -> dict:
     }
 
 
-def _fit_grid(chosen: FieldFit, photos: Photos) -> tuple[RadianceProblem, Callable[[], Found]]:
+def _fit_grid(chosen: FieldExperiment, photos: Photos) -> tuple[RadianceProblem, Callable[[], Found]]:
     """The fit of a grid, and what it has found once it is over."""
     plan = suited(make_plan(chosen), photos)
     problem = RadianceProblem(batches_of(plan, photos), photos.box, plan)
@@ -162,14 +162,14 @@ def _fit_grid(chosen: FieldFit, photos: Photos) -> tuple[RadianceProblem, Callab
     def found() -> Found:
         return Found(
             lambda photo: render_view(problem.field, photo.camera, photo.background).image,
-            lambda folder: photo_outputs.save_found(folder, problem),
+            lambda folder: field_fit.save_found(folder, problem),
             problem.field.rows,
         )
 
     return problem, found
 
 
-def _fit_gaussians(chosen: GaussianFit, photos: Photos) -> tuple[GaussianProblem, Callable[[], Found]]:
+def _fit_gaussians(chosen: GaussianExperiment, photos: Photos) -> tuple[GaussianProblem, Callable[[], Found]]:
     """The fit of Gaussians, and what it has found once it is over."""
     begun = begin(chosen, photos, make_gaussian_plan(chosen))
     problem = begun.problem(chosen.seed)
@@ -178,7 +178,7 @@ def _fit_gaussians(chosen: GaussianFit, photos: Photos) -> tuple[GaussianProblem
     def found() -> Found:
         cloud = Gaussians(**problem.cloud)
         return Found(
-            lambda photo: gaussian_outputs.picture_of(problem, photo.camera, photo.background, low_pass),
+            lambda photo: gaussian_fit.picture_of(problem, photo.camera, photo.background, low_pass),
             lambda folder: write_gaussians(folder / "gaussians.ply", cloud),
             cloud.count,
         )

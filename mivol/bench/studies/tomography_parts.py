@@ -45,7 +45,7 @@ def measure_parts(n: int = 129) -> dict[str, dict[str, float]]:
         scan = make_slice(n, views, photons)
         found[kind] = {}
         for part, changes in PARTS.items():
-            wanted = msgspec.structs.replace(config.Solve(), **changes)
+            wanted = msgspec.structs.replace(config.SolveSettings(), **changes)
             *_, last = islice(default(scan, wanted), wanted.iterations)
             found[kind][part] = scan.error(last)
     return found

@@ -125,7 +125,7 @@ def ours(scan: Slice) -> dict[str, Curve]:
     walk, found = Projector(scan.beam, scan.grid), {}
 
     def run(name: str, x0: np.ndarray | None = None) -> Iterator[np.ndarray]:
-        wanted = config.Solve(name, iterations=STEPS.get(name, 1))
+        wanted = config.SolveSettings(name, iterations=STEPS.get(name, 1))
         a = store(walk) if choose_storage(wanted, walk).is_stored else walk
         problem = LeastSquares(a, scan.y, scan.weights, x0, nonnegative=name not in ("cgls", "fbp"))
         yield from (state.x for state in ALL_SOLVERS[name].run(problem))
@@ -139,9 +139,9 @@ def ours(scan: Slice) -> dict[str, Curve]:
     return {f"mivol {name}": curve for name, curve in found.items()}
 
 
-def default(scan: Slice, solve: config.Solve | None = None) -> Iterator[np.ndarray]:
+def default(scan: Slice, solve: config.SolveSettings | None = None) -> Iterator[np.ndarray]:
     """What a file leaves open: ``solve.name = "auto"``, by other settings than none where they are given."""
-    wanted, _ = settle_solver(solve or config.Solve(), Projector(scan.beam, scan.grid))
+    wanted, _ = settle_solver(solve or config.SolveSettings(), Projector(scan.beam, scan.grid))
     walk = Projector(scan.beam, subdivide(scan.grid, wanted.supersampling, scan.beam))
     data, all_views = Projections(scan.beam, scan.y, scan.weights, is_noise_known=scan.photons > 0), np.arange(len(scan.y))
     start, prior = start_volume(wanted, walk, data, all_views), make_prior(wanted, walk, data, all_views)

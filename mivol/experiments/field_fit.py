@@ -1,0 +1,165 @@
+"""A fit of a radiance field to photographs.
+
+Conventions. The loss in ``metrics.jsonl`` is the mean squared error of a step's rays. ``field.npz`` is the field, ``sky.exr``
+the sky behind it, and ``volumes/`` has its density for other programs.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mivol import config
+from mivol.config import FieldExperiment
+from mivol.experiments.field_plan import batches_of, choices, make_plan, suited
+from mivol.experiments.fit_kind import Say
+from mivol.experiments.photo_fit import PhotoFit
+from mivol.experiments.run_folder import BestFiles, RunFolder
+from mivol.fields.field_files import write_field
+from mivol.fields.sky import Sky
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.files import write_exr, write_png, write_volume
+from mivol.optim.photographs.field_view import FieldView, render_view
+from mivol.optim.photographs.radiance_plan import RadiancePlan
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.photos import Camera, Photo, Photos
+from mivol.photos.photo_file import SPACES, decode_srgb
+from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
+from mivol.report.record import Image, PlanLine, RunRecord, Table, Volume
+from mivol.validate.images import Quality, judge
+
+
+class FieldFit(PhotoFit):
+    """A fit of density and spherical harmonics on a sparse grid.
+
+    Attributes:
+        batches: photographs in the sizes of the plan.
+    """
+
+    settings: FieldExperiment
+    problem: RadianceProblem
+    fits_colours = True
+
+    def make_plan(self, settings: FieldExperiment) -> RadiancePlan:
+        return make_plan(settings)
+
+    def new_record(self) -> RunRecord:
+        preset = self.settings.field.preset
+        return RunRecord.new(
+            self.settings.title,
+            method=f"a sparse grid of density and spherical harmonics, fitted to photographs; preset {preset}",
+            config=config.resolved(self.settings),
+            command=self.context.command,
+            seeds={"fit": self.settings.seed},
+            units={"loss": "1"},
+            citations=["mitsuba3", "drjit", "plenoxels_2022", "relu_fields_2022", "max_1995"],
+        )
+
+    def load(self, say: Say) -> None:
+        super().load(say)
+        if self.photos.space == "linear":
+            self.record.citations.append("mildenhall_2022")
+
+    def plan_fit(self) -> list[PlanLine]:
+        self.plan = suited(self.plan, self.photos)
+        self.levels = self.plan.levels
+        self.batches = batches_of(self.plan, self.photos)
+        return choices(self.plan, self.photos, self.batches)
+
+    def make_problem(self) -> RadianceProblem:
+        return RadianceProblem(self.batches, self.photos.box, self.plan, self.settings.seed)
+
+    def best_files(self) -> BestFiles:
+        names = ("field_best.npz", *(["sky_best.exr"] if self.problem.sky is not None else []))
+        return BestFiles(names, lambda folder: save_found(folder, self.problem, "_best", self.photos.white))
+
+    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, Quality]:
+        return compare(self.problem, self.judged, photo, metrics)
+
+    def film_frame(self, camera: Camera) -> NDArray:
+        view = render_view(self.problem.field, camera, behind(self.problem, self.photos.views[0]))
+        return SPACES[self.photos.space, "srgb"](view.image)
+
+    def write_model(self, run: RunFolder) -> dict[str, float]:
+        run.make("volumes")
+        field, record = self.problem.field, self.record
+        save_found(run.path, self.problem, white=self.photos.white)
+        record.tables = [storage(field, run.path / "field.npz")]
+        record.volumes += [write_density(run.path, field.extract_level(number), number) for number in range(field.levels)]
+        self.levels = field.levels
+        return {"nodes": float(field.rows - (field.nodes is not None)), "bytes": field.bytes / 2**20}
+
+    def gains(self) -> NDArray | None:
+        return self.problem.exposure.table() if self.problem.has_gains else None
+
+    def write_first_view(self, run: RunFolder, view: FieldView, photo: Photo) -> list[Image]:
+        return write_geometry(run.path, view, photo.camera, self.judged.near_far)
+
+
+def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0) -> None:
+    """The field that a problem holds, and its sky where there is one, with a word in their names.
+
+    Args:
+        folder, problem, which: where, what, and the word.
+        white: by what colours are multiplied: the radiance for which 1 stood in the fit.
+    """
+    write_field(folder / f"field{which}.npz", problem.field.scale_colours(white))
+    if problem.sky is not None:
+        write_exr(folder / f"sky{which}.exr", {"": white * problem.sky.image()})
+
+
+def compare(problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, Quality]:
+    """A photograph's view of the field, and how alike they are."""
+    seen = render_view(problem.field, photo.camera, behind(problem, photo))
+    return seen, judge(seen.image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
+
+
+def behind(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:
+    """What a photograph shows where nothing is."""
+    return photo.background if problem.sky is None else problem.sky
+
+
+def storage(field: SphericalGrid, path: Path) -> Table:
+    """What the field takes, beside grids of the same box that keep every node."""
+    nodes, kept = field.node_count, len(field.stored_nodes())
+    kinds = {
+        "every node: r, g, b and density of 8 bits": 4 * nodes,
+        "every node: four numbers": 16 * nodes,
+        f"every node: harmonics of degree {field.degree}": 4 * nodes * (1 + field.width),
+        "this field, in memory": field.bytes,
+        "this field, its file": path.stat().st_size,
+    }
+    rows = [(name, f"{size / 2**20:.2f} MiB", f"{size / nodes:.3g}") for name, size in kinds.items()]
+    head = (f"{kept} of {nodes} nodes are kept ({kept / nodes:.1%})", "in all", "bytes a node of the box")
+    return Table(title="What it takes", head=head, rows=tuple(rows))
+
+
+def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
+    """The extinction at the nodes of a level, as a grid that other programs read; the innermost has no number."""
+    raw, _ = field.to_dense()
+    name = f"volumes/density{f'-level-{level}' if level else ''}"
+    sigma = np.array(field.activation_function.value_and_slope(type(field.density)(raw.ravel()))[0]).reshape(*field.res, 1)
+    write_volume(folder / f"{name}.vol", sigma, field.to_world)
+    write_volume(folder / f"{name}.npz", sigma, field.to_world)
+    size = tuple(float(edge) for edge in np.abs(np.diag(field.to_world)[:3]))
+    said = f"level {level}, of {2**level} times the extent" if level else ""
+    return Volume(path=f"{name}.npz", role="reconstruction", size=size, caption=said)
+
+
+def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
+    """Distance and normals of a view as colours."""
+    near, far = near_far
+    normals = normals_from_depth(seen.depth, camera)
+    distances = f"from light, {near:.3g} [length], to dark, {far:.3g} [length]"
+    pictures = {
+        "distance": (depth_pixels(seen.depth, near_far, seen.opacity), distances),
+        "normals": (normal_pixels(normals, seen.opacity), "x, y, z from -1 to 1 as red, green, blue"),
+    }
+    written = []
+    for name, (pixels, scale) in pictures.items():
+        write_png(folder / f"views/{name}.png", decode_srgb(pixels / 255))
+        caption = f"{name} of the first judged view: {scale}"
+        written.append(Image(path=f"views/{name}.png", role="picture", caption=caption))
+    return written

@@ -1,0 +1,201 @@
+"""What a kind of fit implements, so that one skeleton runs and explains all kinds."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+
+from mivol import config
+from mivol.experiments.run_folder import BestFiles, BestIterate, RunFolder
+from mivol.optim.loop import Course, Fit, Measure
+from mivol.optim.optimizer import Optimizer
+from mivol.optim.problem import Problem
+from mivol.report.record import RunRecord
+from mivol.scene.explain import Explanation
+
+T = TypeVar("T")
+
+Say = Callable[[str], None]
+"""Receives one line of facts."""
+
+
+class Progress(Protocol):
+    """Shows how a run proceeds: on a terminal, in a notebook, or nowhere."""
+
+    def say(self, lines: Sequence[str]) -> None:
+        """Show sentences about the run."""
+
+    def track(self, items: Sequence[T], label: str) -> Iterator[T]:
+        """Yield the items one by one, and show how many are done."""
+
+    def watch(self, iterations: int) -> AbstractContextManager[Callable[[Fit], None]]:
+        """Return the function to call after each iteration of a fit with at most ``iterations``."""
+
+
+class NullProgress:
+    """Progress that shows nothing."""
+
+    def say(self, lines: Sequence[str]) -> None:
+        """Show nothing."""
+
+    def track(self, items: Sequence[T], label: str) -> Iterator[T]:
+        """Yield the items one by one."""
+        return iter(items)
+
+    def watch(self, iterations: int) -> AbstractContextManager[Callable[[Fit], None]]:
+        """Return a function that does nothing."""
+        return nullcontext(lambda fit: None)
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """An experiment to run, and the place where it runs.
+
+    Attributes:
+        settings: all settings of the experiment.
+        base: folder from which relative paths in the settings start.
+        folder: run folder; created if missing.
+        resume: whether to continue from the folder's checkpoint.
+        progress: display of the run's progress.
+        command: command line, for the record; empty for a run from Python.
+    """
+
+    settings: config.Experiment
+    base: Path
+    folder: Path
+    resume: bool = False
+    progress: Progress = field(default_factory=NullProgress)
+    command: str = ""
+
+
+class Stages(NamedTuple):
+    """Names of the timed stages of a run, as its record lists them."""
+
+    load: str
+    fit: str
+    write: str
+
+
+class Evaluation(NamedTuple):
+    """Errors of the newest iterate by name, and its arrays for ``best.npz``; None if files hold the iterate."""
+
+    errors: dict[str, float]
+    values: dict[str, Any] | None = None
+
+
+class FitKind(ABC):
+    """One experiment of one kind, from its settings to the contents of its run folder.
+
+    :func:`mivol.experiments.kinds.run_experiment` and :func:`~mivol.experiments.kinds.explain_experiment` call the methods in
+    the order in which they stand here. A new kind is a subclass and an entry of :data:`mivol.experiments.kinds.KINDS`.
+
+    Attributes:
+        stages: names of the timed stages.
+        first_row: number of the first row in ``metrics.jsonl``: 1 if a row counts the steps taken, 0 if it names its step.
+        context: the experiment to run.
+        settings: settings of the experiment; ``load`` puts values in place of "auto".
+        record: content of ``run.json``; its settings stay as given.
+        problem: the fitted model and its data, from ``make_problem`` on.
+        measure: errors of the model at the ``evaluate`` events of the course; None: ``evaluate`` below is asked instead.
+
+    Raises:
+        MivolError: settings that need no data to be refused.
+    """
+
+    stages: ClassVar[Stages]
+    first_row: ClassVar[int] = 1
+    problem: Problem
+    measure: Measure | None = None
+
+    def __init__(self, context: RunContext) -> None:
+        self.context = context
+        self.settings: Any = context.settings
+        self.record = self.new_record()
+
+    @abstractmethod
+    def new_record(self) -> RunRecord:
+        """Return the record of a run before its first step."""
+
+    @abstractmethod
+    def load(self, say: Say) -> None:
+        """Load the data and plan the fit; put plan and notes on record.
+
+        Args:
+            say: receives the facts that ``mivol explain`` prints, as they are found.
+
+        Raises:
+            MivolError: data that cannot be read or fitted.
+        """
+
+    # -- Run -------------------------------------------------------------------------------------------------------
+
+    def announcement(self) -> list[str]:
+        """Return the lines to show before the fit."""
+        return []
+
+    def render_data(self, run: RunFolder) -> None:  # noqa: B027  (most kinds have none)
+        """Compute data that are too costly for ``mivol explain``."""
+
+    @abstractmethod
+    def make_problem(self) -> Problem:
+        """Return the problem at its start."""
+
+    def best_files(self) -> BestFiles | None:
+        """Return the files that hold the best iterate; None if ``best.npz`` holds all of it."""
+        return None
+
+    def prepare(self, run: RunFolder) -> None:  # noqa: B027
+        """Improve the start of the problem; put the rest of the plan on record."""
+
+    @abstractmethod
+    def optimizer(self) -> Optimizer:
+        """Return the optimizer of the problem.
+
+        Raises:
+            MivolError: settings that the data do not allow.
+        """
+
+    @abstractmethod
+    def course(self) -> Course:
+        """Return iterations, schedule and events of the fit."""
+
+    @abstractmethod
+    def digests(self) -> dict[str, str]:
+        """Return hashes of the data, by which a checkpoint knows its run."""
+
+    def evaluate(self, fit: Fit) -> Evaluation | None:
+        """Evaluate the newest iterate; None if no evaluation is due."""
+        return None
+
+    def after_step(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
+        """If an evaluation is due, add its row to the metrics and keep the best iterate."""
+        evaluation = self.evaluate(fit)
+        if evaluation is not None:
+            best.see(fit.next_iteration, *evaluation)
+            run.append(fit.next_iteration, fit.seconds, loss=fit.history[-1]["loss"], **evaluation.errors)
+            self.show(run, fit, evaluation)
+
+    def show(self, run: RunFolder, fit: Fit, evaluation: Evaluation) -> None:  # noqa: B027
+        """Write a preview of the newest iterate into the run folder."""
+
+    @abstractmethod
+    def finish(self, fit: Fit, run: RunFolder) -> None:
+        """Put notes and results of the fit on record."""
+
+    @abstractmethod
+    def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
+        """Write images, volumes and curves, and put them and the results on record."""
+
+    # -- Explain ---------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def rehearse(self, say: Say) -> Explanation:
+        """Begin the fit up to its first step, and write nothing; return the remaining facts.
+
+        Raises:
+            MivolError: settings or data that the first step would refuse.
+        """

@@ -1,0 +1,127 @@
+"""All kinds of experiments, and the one way to run or explain each of them.
+
+Conventions. ``explain`` begins a fit up to its first step. After that, only the disk and the run folder can refuse the fit.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mivol import config
+from mivol.errors import MivolError
+from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.field_fit import FieldFit
+from mivol.experiments.fit_kind import FitKind, RunContext
+from mivol.experiments.gaussian_fit import GaussianFit
+from mivol.experiments.photo_fit import PhotoFit
+from mivol.experiments.run_folder import CHECKPOINT, BestIterate, RunFolder
+from mivol.experiments.scan_fit import ScanFit
+from mivol.experiments.scene_fit import SceneFit
+from mivol.optim import checkpoint
+from mivol.optim.checkpoint import CheckpointFile
+from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.problem import Problem
+from mivol.report.page import write_page
+from mivol.scene.explain import Explanation
+
+KINDS: dict[type, type[FitKind]] = {
+    config.SceneExperiment: SceneFit,
+    config.ScanExperiment: ScanFit,
+    config.FieldExperiment: FieldFit,
+    config.GaussianExperiment: GaussianFit,
+}
+"""The kind of an experiment, by the type of its settings."""
+
+
+def run_experiment(context: RunContext) -> Path:
+    """Run an experiment, and write its run folder.
+
+    The settings of a checkpoint are compared before a resumed run touches its folder.
+
+    Returns:
+        The report page.
+
+    Raises:
+        MivolError: invalid settings, data or checkpoint, or a disk error.
+        KeyboardInterrupt: Ctrl-C; finished work is kept, and ``context.resume`` continues.
+    """
+    settings = context.settings
+    if context.resume:
+        checkpoint.check_settings(context.folder / CHECKPOINT, config.flat(config.resolved(settings)))
+    choose_back_end(settings.variant, settings.threads)
+    kind = KINDS[type(settings)](context)
+    run = RunFolder(context.folder, kind.record, context.resume)
+    with run.at_work():
+        with run.stage(kind.stages.load):
+            kind.load(lambda line: None)
+            context.progress.say(kind.announcement())
+        kind.render_data(run)
+        with run.stage(kind.stages.fit):
+            kind.problem = kind.make_problem()
+            best = BestIterate(run, kind.best_files())
+            kind.prepare(run)
+            fit = complete_fit(kind, run, best)
+            run.record.notes += best.says()
+        with run.stage(kind.stages.write):
+            kind.write_outputs(fit, run, best)
+    page = write_page(context.folder)
+    context.progress.say([*best.says(), run.summary()])
+    return page
+
+
+def complete_fit(kind: FitKind, run: RunFolder, best: BestIterate) -> Fit:
+    """Take all steps of a fit, with metrics and checkpoints, and keep the best iterate.
+
+    Raises:
+        MivolError: a checkpoint of another run, settings that the optimizer refuses, or a loss that is not finite.
+        KeyboardInterrupt: Ctrl-C; the checkpoint has been written.
+    """
+    course, context = kind.course(), kind.context
+    store = CheckpointFile(run.checkpoint, kind.digests() | config.flat(run.record.config), context.resume)
+
+    def measure(problem: Problem) -> dict[str, float]:
+        errors = kind.measure(problem)
+        best.see(fit.next_iteration, errors, problem.values())
+        return errors
+
+    def observe(fit: Fit) -> None:
+        kind.after_step(fit, run, best)
+        show(fit)
+
+    is_measured = kind.measure is not None
+    fit = begin_fit(kind.problem, kind.optimizer(), course, measure=measure if is_measured else None, checkpoint=store)
+    best.restore()
+    run.begin(fit.next_iteration + kind.first_row - 1)
+    with context.progress.watch(course.iterations) as show:
+        fit.complete(observe)
+    best.settle()
+    kind.finish(fit, run)
+    return fit
+
+
+def explain_experiment(settings: config.Experiment, base: Path, picture: Path | None = None) -> Explanation:
+    """Say what an experiment would do, and make every check that it makes itself.
+
+    Args:
+        settings: all settings.
+        base: folder from which relative paths in the settings start.
+        picture: image file (.png, .svg) for the cameras of photographs and the boxes; None for none.
+
+    Returns:
+        The facts found, and the reason of a refusal.
+    """
+    lines = [f"experiment  {settings.title}"]
+    kind = KINDS[type(settings)]
+    try:
+        if picture is not None and not issubclass(kind, PhotoFit):
+            raise MivolError(f"{picture} was asked for, and only cameras of photographs are drawn: leave out --output.")
+        choose_back_end(settings.variant, settings.threads)
+        fit = kind(RunContext(settings, base, Path()))
+        fit.load(lines.append)
+        rest = fit.rehearse(lines.append)
+        if isinstance(fit, PhotoFit) and picture is not None:
+            fit.draw_cameras(picture)
+            lines.append(str(picture))
+    except MivolError as error:
+        return Explanation(tuple(lines), str(error))
+    return Explanation((*lines, *rest.lines), rest.refusal)
