@@ -1,1 +1,1 @@
-"""What is where: extinction, albedo and emission as functions of position."""
+"""Extinction, albedo, emission and radiance as functions of position: analytic, on grids, as Gaussians."""

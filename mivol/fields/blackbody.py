@@ -1,17 +1,17 @@
-r"""What hot matter shines: Planck's law, and the colour that an eye makes of it.
+r"""The light of hot matter: Planck's law, and its colour for the human eye.
 
 .. math:: B_\lambda(T) = \frac{c_1}{\lambda^5 \big(e^{c_2 / \lambda T} - 1\big)}, \qquad
           X = \int B_\lambda(T)\, \bar x(\lambda)\, d\lambda \quad \text{and so on}
 
-By Kirchhoff's law this is the source function of matter that absorbs: the ``emission`` of a ``mivol_medium`` whose
-``sigma_a`` is the matter's, however thick it is.
+By Kirchhoff's law B is the source function of absorbing matter, however thick: the ``emission`` of a ``mivol_medium`` whose
+``sigma_a`` is the absorption of the matter.
 
-Conventions. Temperatures are kelvin, wavelengths nm in vacuum, spectral radiance W m^-2 sr^-1 nm^-1. XYZ and linear sRGB
-are integrals of it over the CIE 1931 functions, so W m^-2 sr^-1: Y times 683 is luminance in cd m^-2. An image is made of
-them by an exposure, a factor of one's own choice. float64 throughout.
+Conventions. Temperatures are kelvin, wavelengths nm in vacuum, spectral radiance W m^-2 sr^-1 nm^-1. XYZ and linear sRGB are
+integrals of spectral radiance over the CIE 1931 functions [W m^-2 sr^-1]; Y times 683 is luminance [cd m^-2]. An image needs an
+exposure, a free factor. Arrays are float64.
 
-References: Planck 1901; Kirchhoff 1860; CODATA 2018 (c_1 = 2 h c^2 / sr, c_2 = h c / k, exact); CIE 15:2004, table T.4 (the
-matching functions, as Mitsuba keeps them); IEC 61966-2-1 (sRGB).
+References: Planck 1901; Kirchhoff 1860; CODATA 2018 (c_1 = 2 h c^2 / sr, c_2 = h c / k, exact); CIE 15:2004, table T.4
+(matching functions, as stored in Mitsuba); IEC 61966-2-1 (sRGB).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LUMENS_PER_WATT = 683.0
 XYZ_TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 
 CHUNK_SIZE = 1 << 14
-"""Temperatures that are looked at together: 64 MB at 1 nm."""
+"""Temperatures integrated at once: 64 MB at 1 nm."""
 
 
 def planck(wavelength: np.ndarray, temperature: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ def planck(wavelength: np.ndarray, temperature: np.ndarray) -> np.ndarray:
         temperature: [K], at least 0; broadcast against the wavelengths.
 
     Returns:
-        W m^-2 sr^-1 nm^-1; 0 where it is below 1e-300, at 0 K too.
+        Spectral radiance [W m^-2 sr^-1 nm^-1]. Values below 1e-300 are 0, also at 0 K.
 
     Raises:
         MivolError: a temperature that is negative or not finite.
@@ -57,15 +57,15 @@ def blackbody_xyz(temperature: np.ndarray) -> np.ndarray:
     """CIE 1931 XYZ [W m^-2 sr^-1] of black bodies.
 
     Args:
-        temperature: [K], of any shape, at least 0.
+        temperature: [K], any shape, at least 0.
 
     Returns:
-        The shape of ``temperature``, and 3.
+        (..., 3) for temperatures of shape (...).
 
     Raises:
-        MivolError: a temperature that is negative or not finite, or no variant of Mitsuba is active.
+        MivolError: a temperature that is negative or not finite, or no active variant of Mitsuba.
 
-    Error: that of the trapezium rule at 1 nm between 360 and 830 nm, 1e-4 at 1000 K and above.
+    Error: 1e-4 at 1000 K and above, from the trapezium rule at 1 nm between 360 and 830 nm.
     """
     temperature = _check_temperature(temperature)
     nm, matching = _weighted_matching_functions()
@@ -75,13 +75,13 @@ def blackbody_xyz(temperature: np.ndarray) -> np.ndarray:
 
 
 def blackbody_rgb(temperature: np.ndarray) -> np.ndarray:
-    """Linear sRGB [W m^-2 sr^-1] of black bodies; its luminance is that of :func:`blackbody_xyz` times 683 cd m^-2.
+    """Linear sRGB [W m^-2 sr^-1] of black bodies.
 
-    Below 1900 K there is less blue in it than sRGB can show, below 900 K less green: these channels are 0, for light is not
-    negative.
+    Below 1900 K the blue of a black body lies outside sRGB, below 900 K also the green; these channels are clamped to 0.
+    Elsewhere the luminance equals 683 times the Y of :func:`blackbody_xyz` [cd m^-2].
 
     Args:
-        temperature: [K], of any shape, at least 0.
+        temperature: [K], any shape, at least 0.
 
     Raises:
         MivolError: as :func:`blackbody_xyz`.
@@ -93,7 +93,7 @@ def blackbody_rgb(temperature: np.ndarray) -> np.ndarray:
 
 
 def _weighted_matching_functions() -> tuple[np.ndarray, np.ndarray]:
-    """Wavelengths (n,) [nm] and the matching functions at them times the weight of each (n, 3) [nm]."""
+    """Wavelengths (n,) [nm], and the matching functions times the quadrature weights (n, 3) [nm]."""
     if mi.variant() is None:
         raise MivolError("no variant of Mitsuba is active, which keeps the CIE tables; call mitsuba.set_variant first.")
     nm = np.arange(360.0, 831.0)

@@ -1,7 +1,7 @@
-"""Made-up volumes that look like something: seeded fields for demos and tests, the same numbers on every machine.
+"""Procedural volumes: seeded densities for demos and tests, with the same numbers on every machine.
 
-Conventions. A recipe maps (points, generator) to values in [0, 1], points (..., 3) as (x, y, z) in the unit cube; it is
-sampled at voxel centres, so every resolution shows the same object. PROCEDURAL lists them.
+Conventions. A recipe maps points (..., 3) in the unit cube, as (x, y, z), and a generator to values in [0, 1]. Volumes sample
+the recipe at voxel centres, so every resolution shows the same object. PROCEDURAL lists the recipes.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from mivol.errors import MivolError
 
 
 def tangle(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Soft blobs with filaments wound around them: smooth regions, thin structures and empty space in one.
+    """Soft blobs with filaments wound around them: smooth regions, thin structures and empty space.
 
-    Seven anisotropic Gaussians with random frames, and three tubes of Gaussian cross-section about closed curves
+    Seven anisotropic Gaussians have random frames. Three tubes of Gaussian cross-section follow closed curves
     c + sum_k a_k cos(2 pi k s) + b_k sin(2 pi k s), k = 1, 2.
     """
     total = np.zeros(p.shape[:-1])
@@ -31,7 +31,7 @@ def tangle(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def tube(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """exp(-1/2 (distance to a random closed curve / 0.022)^2), the curve sampled at 160 points."""
+    """exp(-1/2 (distance to a random closed curve / 0.022)^2), with the curve sampled at 160 points."""
     s = 2.0 * np.pi * np.arange(160)[:, None] / 160
     curve = 0.5 + sum(
         np.outer(np.cos(k * s), rng.uniform(-0.26, 0.26, 3)) / k + np.outer(np.sin(k * s), rng.uniform(-0.26, 0.26, 3)) / k
@@ -42,7 +42,7 @@ def tube(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def inside(p: np.ndarray) -> np.ndarray:
-    """1 in the unit ball's inscribed part of the cube, smoothly 0 towards its faces: the object ends before its box."""
+    """A window: 1 inside the cube, smoothly 0 towards its faces, which keeps the object off the box."""
     from_middle = np.max(np.abs(p - 0.5), axis=-1)
     return np.clip((0.48 - from_middle) / 0.06, 0.0, 1.0)
 
@@ -51,12 +51,12 @@ PROCEDURAL: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] =
 
 
 def make_procedural(name: str, shape: Sequence[int], seed: int, peak: float) -> np.ndarray:
-    """A procedural volume.
+    """Make a procedural volume.
 
     Args:
         name: key of PROCEDURAL.
         shape: (Z, Y, X).
-        seed: chooses the object.
+        seed: selects the object.
         peak: largest possible value [unit of the field].
 
     Returns:

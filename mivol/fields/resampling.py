@@ -1,7 +1,7 @@
-"""A radiance field on other nodes: finer, or of another box along the same axes.
+"""Resampling of a radiance field: on finer nodes, or in another box along the same axes.
 
-Conventions. Raw densities and harmonics are linear between the old nodes, constant in the outer half voxel; densities keep
-their sign, so a surface that crosses 0 between two nodes stays there.
+Conventions. Raw densities and harmonics are linear between the old nodes and constant in the outer half voxel. Densities keep
+their sign, so a surface at a zero crossing keeps its position.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ __all__ = ["resample_field"]
 
 
 def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray, keep: np.ndarray) -> SphericalGrid:
-    """A sparse field of the same values on other nodes.
+    """A sparse field with the same values on other nodes.
 
     Args:
-        old: what is resampled.
-        res, to_world: of the new grid, whose axes are those of the old one.
-        keep: (Z, Y, X) of the old grid, or (levels, Z, Y, X), bool; a new node is stored where one of the 8 old ones about it
-            is kept and, of a nested field, where it is not covered by the level before.
+        old: field to resample.
+        res, to_world: nodes and box of the new grid, along the axes of the old grid.
+        keep: (Z, Y, X) of the old grid, or (levels, Z, Y, X), bool. A new node is stored if one of the 8 old nodes around it is
+            kept and, in a nested field, if the level before does not cover it.
 
     Raises:
-        MivolError: axes that differ.
+        MivolError: other axes.
     """
     axes = _AxisWeights.between(old, res, to_world)
     kept = np.flatnonzero([_select_nodes(level, axes) for level in keep.reshape(old.levels, *old.res)])
@@ -47,7 +47,7 @@ def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.n
 
 
 def _select_nodes(keep: np.ndarray, axes: list[_AxisWeights]) -> np.ndarray:
-    """Whether new nodes (Z, Y, X) have a kept one among the 8 old ones about them; one axis at a time, for memory."""
+    """New nodes (Z, Y, X) with a kept node among the 8 old nodes around them; axis by axis, to save memory."""
     for a, axis in enumerate(axes):
         low, high = axis.nodes
         keep = keep.take(low, a) | keep.take(high, a)
@@ -55,36 +55,36 @@ def _select_nodes(keep: np.ndarray, axes: list[_AxisWeights]) -> np.ndarray:
 
 
 class _AxisWeights:
-    """Along one axis, the two old nodes about each new one and their shares, (2, n)."""
+    """Along one axis: the two old nodes around each new node, and their weights, both (2, n)."""
 
     def __init__(self, q: np.ndarray, n: int) -> None:
         whole = np.rint(q)
         q = np.where(np.abs(q - whole) < 1e-9 * n, whole, q)
         low = np.floor(q)
-        # Twice the same where a new node lies on an old one: the next one is not about it.
+        # A new node on an old node has this node twice: its neighbour does not count as near.
         self.nodes = np.clip(np.stack([low, np.ceil(q)]).astype(int), 0, n - 1)
-        self.shares = np.stack([1 - (q - low), q - low]).astype(np.float32)
+        self.weights = np.stack([1 - (q - low), q - low]).astype(np.float32)
 
     @classmethod
     def between(cls, old: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray) -> list[_AxisWeights]:
-        """For z, y and x."""
+        """The weights along z, y and x."""
         move = np.linalg.inv(old.to_world) @ to_world
         if np.abs(move[:3, :3] - np.diag(np.diag(move)[:3])).max() > 1e-6 * np.abs(move[:3, :3]).max():
             raise MivolError("a grid with other axes was given; a field is resampled along its own: keep its rotation.")
-        made = []
+        axes = []
         for a, (n, m) in enumerate(zip(old.res[::-1], res[::-1], strict=True)):
-            made.append(cls((((np.arange(m) + 0.5) / m) * move[a, a] + move[a, 3]) * n - 0.5, n))
-        return made[::-1]
+            axes.append(cls((((np.arange(m) + 0.5) / m) * move[a, a] + move[a, 3]) * n - 0.5, n))
+        return axes[::-1]
 
 
 def _interpolate(old: SphericalGrid, axes: list[_AxisWeights], place: tuple) -> tuple[mi.Float, list[mi.Float]]:
-    """Values at new nodes (levels, and indices along z, y, x)."""
+    """Values at new nodes, given by levels and indices along z, y, x."""
     density, harmonics = mi.Float(0), [mi.Float(0)] * old.width
     if len(place[0]) == 0:
         return density, harmonics
     for corner in range(8):
         ends = [
-            (axis.nodes[corner >> k & 1][i], axis.shares[corner >> k & 1][i])
+            (axis.nodes[corner >> k & 1][i], axis.weights[corner >> k & 1][i])
             for k, (axis, i) in enumerate(zip(axes, place[1:], strict=True))
         ]
         node = np.ravel_multi_index([place[0], *(n for n, _ in ends)], (old.levels, *old.res))

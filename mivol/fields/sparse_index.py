@@ -1,7 +1,8 @@
-"""Which of many places are listed, and where in the list: two bits a place.
+"""The row of each stored node among many numbered nodes, with two bits a node.
 
-A list holds some of N numbered places in ascending order. The index of one of them is the number of listed places before it
-(its rank): a number that is stored for each word of 32 bits, and a population count of the bits below its own.
+The stored nodes lie in ascending order. The row of a stored node is its rank, the number of stored nodes before it. The index
+holds, for each word of 32 nodes, their bits and the rank of the first; a population count of the bits below a node's own bit
+gives the rest.
 
 References: Jacobson 1989 (the rank of a bit in constant time).
 """
@@ -18,11 +19,11 @@ __all__ = ["SparseIndex"]
 
 @dataclass
 class SparseIndex:
-    """Which places are listed.
+    """The index of stored nodes.
 
     Attributes:
-        words: UInt32, two for each 32 places: their bits, and the number of listed places before them.
-        count: of listed places.
+        words: UInt32, two for each 32 nodes: their bits, and the number of stored nodes before them.
+        count: number of stored nodes.
     """
 
     words: mi.UInt32
@@ -30,25 +31,30 @@ class SparseIndex:
 
     @property
     def bytes(self) -> int:
-        """Memory that they take."""
+        """Size of the index [bytes]."""
         return 4 * dr.width(self.words)
 
     @classmethod
-    def from_sorted(cls, listed: mi.UInt32, places: int) -> SparseIndex:
-        """From the ascending numbers of the listed ones among so many places."""
-        n = -(-max(places, 1) // 32)
+    def from_sorted(cls, stored: mi.UInt32, node_count: int) -> SparseIndex:
+        """Make the index of some nodes.
+
+        Args:
+            stored: ascending numbers of the stored nodes.
+            node_count: number of all nodes.
+        """
+        n = -(-max(node_count, 1) // 32)
         bits = dr.zeros(mi.UInt32, n)
-        if dr.width(listed):
-            dr.scatter_add(bits, mi.UInt32(1) << (listed & 31), listed >> 5)
+        if dr.width(stored):
+            dr.scatter_add(bits, mi.UInt32(1) << (stored & 31), stored >> 5)
         words = dr.zeros(mi.UInt32, 2 * n)
         word = dr.arange(mi.UInt32, n)
         before = dr.prefix_sum(dr.popcnt(bits))
         dr.scatter(words, mi.ArrayXu([bits, before]), word)
         dr.eval(words)
-        return cls(words, dr.width(listed))
+        return cls(words, dr.width(stored))
 
-    def rank(self, place: mi.UInt32, active: mi.Bool = True) -> tuple[mi.UInt32, mi.Bool]:
-        """The index of places in the list, and whether they are in it; where they are not, how many are before them."""
-        bits, before = dr.gather(mi.ArrayXu, self.words, place >> 5, active, shape=(2, 1))
-        own = mi.UInt32(1) << (place & 31)
+    def rank(self, node: mi.UInt32, active: mi.Bool = True) -> tuple[mi.UInt32, mi.Bool]:
+        """The number of stored nodes before each node, and whether the node is stored."""
+        bits, before = dr.gather(mi.ArrayXu, self.words, node >> 5, active, shape=(2, 1))
+        own = mi.UInt32(1) << (node & 31)
         return before + dr.popcnt(bits & (own - 1)), (bits & own) != 0
