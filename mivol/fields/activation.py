@@ -6,8 +6,9 @@ surface on nodes. Values are extinctions [1/length].
 
 Quadrature. Along a ray the interpolated density is a cubic in each cell, which two Gauss points integrate exactly. An
 activated density is no cubic, and a ReLU has a kink at 0. The table has the relative error (rms) of the light of 150 rays
-through 16^3 nodes of noise: mivol / midpoints (two a cell), for median optical depths of a voxel edge from 0.01 to 10. Extinctions vary by a
-factor of e; with relu the densities are normal about 0. The last column is the order of convergence at an optical depth of 0.1::
+through 16^3 nodes of noise: mivol / midpoints (two a cell), for median optical depths of a voxel edge from 0.01 to 10.
+Extinctions vary by a factor of e; with relu the densities are normal about 0. The last column is the order of convergence at
+an optical depth of 0.1::
 
               0.01               0.1                1                  10                 order
     none      7.2e-05 / 1.9e-03  4.2e-04 / 2.0e-03  5.1e-03 / 7.5e-03  1.8e-02 / 2.1e-02  4.2

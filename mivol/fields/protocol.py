@@ -43,7 +43,7 @@ class Field(Protocol):
         """
 
     def accumulate(self, p: mi.Point3f, w: mi.Vector3f, d: list[mi.Float], active: mi.Bool) -> None:
-        """Add ``d`` (d loss / d value of each channel) at points to the gradients of the parameters: the transpose of ``eval``."""
+        """Add ``d`` (d loss / d value of each channel) at points to the gradients of the parameters: the transpose of eval."""
 
     def bound(self) -> list[float]:
         """An upper bound of each channel over the box. Reads values, which ``dr.freeze`` cannot record."""
