@@ -1,15 +1,14 @@
-r"""Fields whose optical depth along a ray is known on paper.
+"""Fields of extinction with closed-form optical depths.
 
-Conventions. Positions and distances are in world units, float64 NumPy throughout. A ray is ``o + t d`` with ``d`` of
-any length but zero; ``t0`` and ``t1`` count lengths of ``d`` (distances when ``|d| = 1``); the optical depth integrates
-over the world length, so it does not change when ``d`` is rescaled. ``o`` and ``d`` have shape ``(..., 3)``, ``t0`` and
-``t1`` shape ``(...)``; all broadcast. ``t1 <= t0`` gives 0.
+Conventions. Positions and distances are in world units, in float64 NumPy arrays. A ray is ``o + t d`` with ``d`` of any length
+but 0; ``t0`` and ``t1`` count lengths of ``d`` (distances for a unit ``d``). Optical depths integrate over the world length, so
+rescaling ``d`` does not change the result. ``o`` and ``d`` have shape (..., 3), ``t0`` and ``t1`` shape (...); all broadcast.
+``t1 <= t0`` gives 0.
 
 Here: ``Constant``, ``Trilinear`` (``ramp``), ``Ellipsoid`` (``sphere``), ``Slab``, ``GaussianBlob``,
-``ExponentialAtmosphere``, and two ways to combine them: ``Within`` (a field inside a parallelepiped; ``box``), ``Sum``.
+``ExponentialAtmosphere``, and two combinations: ``Within`` (a field inside a parallelepiped; ``box``) and ``Sum``.
 
-References: Kak and Slaney 1988, Chapter 3, for projections of ellipses; the rest is elementary integration, shown in
-each class.
+References: Kak and Slaney 1988, Chapter 3, for projections of ellipses. Each class shows its integration.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ IDENTITY = tuple(map(tuple, np.eye(4).tolist()))
 
 
 class AnalyticField(ABC):
-    """Extinction sigma_t [1/length] with a closed form of its line integrals."""
+    """An extinction sigma_t [1/length] whose line integrals have a closed form."""
 
     @abstractmethod
     def eval(self, p: ArrayLike) -> Floats:
-        """Extinction at world positions ``p`` of shape (..., 3); result of shape (...) [1/length]."""
+        """Extinction [1/length] at world positions ``p`` (..., 3), of shape (...)."""
 
     @abstractmethod
     def _integral(self, o: Floats, d: Floats, t0: Floats, t1: Floats) -> Floats:
-        """Integral of ``eval(o + t d)`` over t0 < t < t1 for unit ``d``; broadcast inputs with t1 > t0."""
+        """Integral of ``eval(o + t d)`` over t0 < t < t1 for unit ``d``; arguments are broadcast and t1 > t0."""
 
     def optical_depth(self, o: ArrayLike, d: ArrayLike, t0: ArrayLike = 0.0, t1: ArrayLike = np.inf) -> Floats:
         r"""Optical depth :math:`\tau = \int_{t_0}^{t_1} \sigma_t(o + t d)\,|d|\,dt` of each ray [1].
@@ -46,13 +45,13 @@ class AnalyticField(ABC):
             o: origins (..., 3), world.
             d: directions (..., 3), world, any length but 0.
             t0: start of the segment, in lengths of ``d``.
-            t1: end of the segment, in lengths of ``d``; may be ``inf`` where the integral converges.
+            t1: end of the segment, in lengths of ``d``; may be ``inf`` if the integral converges.
 
         Returns:
-            Optical depth, shape of the broadcast rays; 0 where ``t1 <= t0``.
+            Optical depth in the shape of the broadcast rays; 0 for ``t1 <= t0``.
 
         Raises:
-            MivolError: if a direction is zero or not finite.
+            MivolError: a direction that is zero or not finite.
         """
         o, d = np.asarray(o, np.float64), np.asarray(d, np.float64)
         length = np.linalg.norm(d, axis=-1)
@@ -71,11 +70,11 @@ class AnalyticField(ABC):
 
         Args:
             shape: voxels (Z, Y, X).
-            to_world: 4x4 affine map from the unit cube to the world; x is the fastest axis of the grid.
+            to_world: (4, 4) affine map from the unit cube to the world; x is the fastest axis of the grid.
 
         Returns:
-            Grid (Z, Y, X, 1), float32 [1/length]. Its trilinear interpolation between voxel centres is exact for
-            ``Trilinear`` fields and O(h^2) for smooth ones.
+            (Z, Y, X, 1) float32 [1/length]. Trilinear interpolation between voxel centres is exact for ``Trilinear`` fields and
+            has an error O(h^2) for smooth fields.
         """
         to_world = check_affine(np.asarray(to_world))
         centres = [(np.arange(n) + 0.5) / n for n in shape]
@@ -86,7 +85,7 @@ class AnalyticField(ABC):
 
 @dataclass(frozen=True)
 class Constant(AnalyticField):
-    """The same extinction everywhere: tau = sigma_t (t1 - t0)."""
+    """Constant extinction everywhere: tau = sigma_t (t1 - t0)."""
 
     sigma_t: float
 
@@ -101,7 +100,7 @@ class Constant(AnalyticField):
 class Trilinear(AnalyticField):
     r"""f = a + b x + c y + d z + e xy + f xz + g yz + h xyz in world coordinates, of either sign, everywhere.
 
-    Along a ray f is a cubic in t. About the middle m of a segment of half length s only its even terms survive, so
+    Along a ray f is a cubic in t. About the middle m of a segment of half length s the odd terms cancel, so
     :math:`\tau = 2 s f(m) + \tfrac{2}{3} s^3 f_2`, with :math:`f_2 = e d_x d_y + f d_x d_z + g d_y d_z
     + h (m_x d_y d_z + m_y d_x d_z + m_z d_x d_y)`. A grid represents f exactly between its voxel centres. A ramp is
     ``Trilinear((a, b, c, d, 0, 0, 0, 0))``.
@@ -125,13 +124,13 @@ class Trilinear(AnalyticField):
 
 
 def ramp(value: float, gradient: tuple[float, float, float]) -> Trilinear:
-    """Linear field ``value + gradient . p`` [1/length] everywhere; tau = (mean of the end values) (t1 - t0)."""
+    """Linear extinction ``value + gradient . p`` [1/length] everywhere; tau = (mean of the end values) (t1 - t0)."""
     return Trilinear((value, *gradient, 0.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
 class _EllipsoidalField(AnalyticField):
-    """A field of the distance from ``centre``, in units of ``radii`` along the columns of ``axes`` (orthonormal)."""
+    """A field of the distance from ``centre`` in units of ``radii`` along the columns of ``axes`` (orthonormal)."""
 
     sigma_t: float
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -145,16 +144,16 @@ class _EllipsoidalField(AnalyticField):
         if axes.shape != (3, 3) or not np.allclose(axes.T @ axes, np.eye(3), rtol=0, atol=1e-9):
             raise MivolError("axes are not orthonormal; give three perpendicular unit vectors as columns.")
 
-    def _white(self, v: Floats) -> Floats:
-        """Vectors in the frame where the surface of the body is the unit sphere."""
+    def _whiten(self, v: Floats) -> Floats:
+        """Vectors in the whitened frame, in which the surface of the body is the unit sphere."""
         return v @ np.asarray(self.axes, float) / np.asarray(self.radii, float)
 
-    def _closest(self, o: Floats, d: Floats) -> tuple[Floats, Floats, Floats]:
-        """Abscissa of the point closest to the centre, its squared distance there, and |d|, all in the white frame."""
-        q, w = self._white(o - np.asarray(self.centre, float)), self._white(d)
+    def _closest_approach(self, o: Floats, d: Floats) -> tuple[Floats, Floats, Floats]:
+        """Parameter t of the point closest to the centre, its squared distance, and |d|, all in the whitened frame."""
+        q, w = self._whiten(o - np.asarray(self.centre, float)), self._whiten(d)
         speed = np.linalg.norm(w, axis=-1)
         t_c = -np.sum(q * w, axis=-1) / speed**2
-        # B^2 - A C of the textbook quadratic loses |o|^2 eps to cancellation; the closest point itself loses |o| eps.
+        # B^2 - A C of the textbook quadratic loses |o|^2 eps to cancellation; the closest point loses only |o| eps.
         b2 = np.sum((q + t_c[..., None] * w) ** 2, axis=-1)
         return t_c, b2, speed
 
@@ -163,17 +162,17 @@ class _EllipsoidalField(AnalyticField):
 class Ellipsoid(_EllipsoidalField):
     r"""Constant extinction inside an ellipsoid: tau = sigma_t L with the chord :math:`L = 2\sqrt{1 - b^2}/|Wd|`.
 
-    W whitens the ellipsoid to the unit sphere and b is the distance of the ray from its centre there, which is
-    :math:`2\sqrt{B^2 - AC}/A` of the usual quadratic (Kak and Slaney 1988, Chapter 3). ``sigma_t`` may be negative: the
-    ellipsoids of the Shepp-Logan head are.
+    W maps the ellipsoid to the unit sphere, and b is the distance of the mapped ray from the centre, equal to
+    :math:`2\sqrt{B^2 - AC}/A` of the usual quadratic (Kak and Slaney 1988, Chapter 3). ``sigma_t`` may be negative, as in the
+    Shepp-Logan head.
     """
 
     def eval(self, p: ArrayLike) -> Floats:
-        q = self._white(np.asarray(p, np.float64) - np.asarray(self.centre, float))
+        q = self._whiten(np.asarray(p, np.float64) - np.asarray(self.centre, float))
         return np.where(np.sum(q * q, axis=-1) <= 1.0, float(self.sigma_t), 0.0)
 
     def _integral(self, o: Floats, d: Floats, t0: Floats, t1: Floats) -> Floats:
-        t_c, b2, speed = self._closest(o, d)
+        t_c, b2, speed = self._closest_approach(o, d)
         half = np.sqrt(np.maximum(1.0 - b2, 0.0)) / speed
         return self.sigma_t * np.maximum(np.minimum(t1, t_c + half) - np.maximum(t0, t_c - half), 0.0)
 
@@ -192,26 +191,25 @@ class GaussianBlob(_EllipsoidalField):
     """
 
     def eval(self, p: ArrayLike) -> Floats:
-        q = self._white(np.asarray(p, np.float64) - np.asarray(self.centre, float))
+        q = self._whiten(np.asarray(p, np.float64) - np.asarray(self.centre, float))
         return self.sigma_t * np.exp(-0.5 * np.sum(q * q, axis=-1))
 
     def _integral(self, o: Floats, d: Floats, t0: Floats, t1: Floats) -> Floats:
-        t_c, b2, speed = self._closest(o, d)
+        t_c, b2, speed = self._closest_approach(o, d)
         a, b = ((t - t_c) * speed / np.sqrt(2.0) for t in (t0, t1))
         return self.sigma_t * np.exp(-0.5 * b2) * np.sqrt(np.pi / 2) / speed * _erf_difference(a, b)
 
 
 def _erf_difference(a: Floats, b: Floats) -> Floats:
-    """erf(b) - erf(a) for a <= b, with small relative error in the tails too."""
-    # Both ends beyond 1 in the same tail: erf is 1 - small there and the difference keeps only its absolute precision;
-    # erfc holds the small part itself.
+    """erf(b) - erf(a) for a <= b, with a small relative error in the tails too."""
+    # In a tail erf is 1 - small, and a difference keeps only absolute precision; erfc holds the small part.
     low, high = np.where(b < 0, -b, a), np.where(b < 0, -a, b)
     return np.where(low > 0, erfc(low) - erfc(high), erf(b) - erf(a))
 
 
 @dataclass(frozen=True)
 class Slab(AnalyticField):
-    """Constant extinction between the planes ``normal . p = low`` and ``= high``; ``normal`` of any length but 0."""
+    """Constant extinction between the planes ``normal . p = low`` and ``normal . p = high``; ``normal`` of any length but 0."""
 
     sigma_t: float
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -229,11 +227,11 @@ class Slab(AnalyticField):
 
 
 def _slab_interval(x: Floats, slope: Floats, low: float, high: float) -> tuple[Floats, Floats]:
-    """Interval of t in which low <= x + slope t <= high: (-inf, inf) or an empty one (inf, -inf) where slope is 0."""
+    """Interval of t with low <= x + slope t <= high; for slope 0 it is (-inf, inf) or empty (inf, -inf)."""
     inside = (x >= low) & (x <= high)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         one, other = (low - x) / slope, (high - x) / slope
-    # 0 * inf and 0 / 0 are NaN where the ray runs along the planes: there only being inside counts.
+    # 0 * inf and 0 / 0 are NaN for rays along the planes: for these only ``inside`` counts.
     start = np.where(slope == 0, np.where(inside, -np.inf, np.inf), np.minimum(one, other))
     end = np.where(slope == 0, np.where(inside, np.inf, -np.inf), np.maximum(one, other))
     return start, end
@@ -250,7 +248,7 @@ class Within(AnalyticField):
         check_affine(np.asarray(self.to_world))
 
     def _local(self, v: Floats, w: float) -> Floats:
-        """Points (w = 1) or vectors (w = 0) in the unit cube's frame; vectors keep their parameter t."""
+        """Points (w = 1) or vectors (w = 0) in the frame of the unit cube; vectors keep their parameter t."""
         matrix = np.asarray(self.to_world, float)
         return np.linalg.solve(matrix[:3, :3], (v - w * matrix[:3, 3])[..., None])[..., 0]
 
@@ -277,7 +275,7 @@ class ExponentialAtmosphere(AnalyticField):
     r"""Extinction sigma_0 e^{-z/H} with z along ``up``, falling by e over each ``scale_height`` H [length].
 
     With mu = d . up: :math:`\tau = \frac{\sigma_0 H}{\mu}(e^{-z_0/H} - e^{-z_1/H})`, written as
-    :math:`\sigma_0 e^{-z_0/H}\,L\,\varphi_1(L\mu/H)`, :math:`\varphi_1(x) = (1 - e^{-x})/x`: it holds through mu = 0.
+    :math:`\sigma_0 e^{-z_0/H}\,L\,\varphi_1(L\mu/H)`, :math:`\varphi_1(x) = (1 - e^{-x})/x`, which holds through mu = 0.
     """
 
     sigma_0: float
@@ -298,8 +296,8 @@ class ExponentialAtmosphere(AnalyticField):
         start = self.eval(o + t0[..., None] * d)
         level = rate == 0
         with np.errstate(invalid="ignore"):
-            climbed = -np.expm1(-rate * (t1 - t0)) / np.where(level, 1.0, rate)
-        return start * np.where(level, t1 - t0, climbed)
+            effective_length = -np.expm1(-rate * (t1 - t0)) / np.where(level, 1.0, rate)
+        return start * np.where(level, t1 - t0, effective_length)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
-"""Which Gaussians reach into which cells of a box, so that a ray asks only those that it may meet.
+"""The Gaussians of each cell of a box: lists from which a ray reads only Gaussians near its path.
 
-Conventions. The box lies along the axes of the world and holds every Gaussian up to ``reach`` standard deviations. Its lattice
-has (Z, Y, X) nodes at voxel centres, and a cell lies between two nodes along each axis, or between a node and the face of the
-box: cells are counted from 0 to N, x fastest. A Gaussian is listed in each cell that its ellipsoid touches, and in some that it
-does not: lists are never too short.
+Conventions. The box lies along the world axes and holds every Gaussian up to ``reach`` standard deviations. Its lattice has
+(Z, Y, X) nodes at voxel centres. Along each axis a cell lies between two nodes, or between a node and a face of the box; cells
+are numbered from 0 to N, x fastest. A list holds each Gaussian whose ellipsoid touches the cell, and may hold more.
 """
 
 from __future__ import annotations
@@ -18,23 +17,23 @@ from mivol.machine import available_memory
 __all__ = ["CellLists", "list_gaussians", "MAX_CHUNK_PAIRS", "find_chunk_starts", "list_box_nodes"]
 
 CELLS_PER_GAUSSIAN = 1.0
-"""Cells for each Gaussian: 22^3 for 10,000 (measured on a dense cloud of as many: line integrals take the same time from 0.4 to
-8, within a tenth; lists of 8 take four times as long to make)."""
+"""Cells for each Gaussian: 22^3 cells for 10,000 Gaussians. On a dense cloud of this size line integrals take the same time
+(within 10 %) from 0.4 to 8 cells a Gaussian; with 8 the lists take four times as long to make."""
 
 MIN_CELLS, MAX_CELLS = 8, 1 << 21
-"""Of a box."""
+"""Limits of the number of cells."""
 
 MAX_NODES = 256
-"""Along an axis."""
+"""Limit along an axis."""
 
 SLACK = 1e-3
-"""By which the box and each cell are taken larger, in edges: rounding of a ray's place in float32 may not lose a Gaussian."""
+"""Enlargement of the box and of each cell, in edges; float32 rounding of a ray's position must not lose a Gaussian."""
 
 PAIR_BYTES = 120
-"""That a cell and a Gaussian take while it is asked whether they touch."""
+"""Memory of one pair of cell and Gaussian during the touch test [bytes]."""
 
 ENTRY_BYTES = 12
-"""That an entry takes while the lists are sorted."""
+"""Memory of one list entry while the lists are sorted [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +41,10 @@ class CellLists:
     """The Gaussians of each cell.
 
     Attributes:
-        to_world: (4, 4) float64, the unit cube to the box.
-        res: nodes (Z, Y, X); there is a cell more along each axis.
-        starts: (cells + 1,) uint32; the entries of cell c are those from ``starts[c]`` to ``starts[c + 1]``.
-        entries: (n,) uint32, Gaussians.
+        to_world: (4, 4) float64, unit cube to box.
+        res: nodes (Z, Y, X); each axis has one cell more.
+        starts: (cells + 1,) uint32; cell c owns the entries from ``starts[c]`` to ``starts[c + 1]``.
+        entries: (n,) uint32, numbers of Gaussians.
     """
 
     to_world: np.ndarray
@@ -54,21 +53,21 @@ class CellLists:
     entries: np.ndarray
 
     def max_cell_sum(self, values: np.ndarray) -> float:
-        """The largest sum of a number of each Gaussian (N,) over the entries of one cell."""
+        """The largest sum over the entries of a cell of ``values`` (N,), one number a Gaussian."""
         sums = np.concatenate([[0.0], np.cumsum(values[self.entries], dtype=np.float64)])
         return float(np.diff(sums[self.starts]).max(initial=0.0))
 
 
 def list_gaussians(means: np.ndarray, whitening: np.ndarray, reach: float) -> CellLists:
-    """List the Gaussians of each cell of a box around them all.
+    """List the Gaussians of each cell of a box around all Gaussians.
 
     Args:
         means: (N, 3) float64, world [length].
-        whitening: (N, 3, 3) float64; W (x - mean) has a length of 1 at one standard deviation [1/length].
-        reach: standard deviations at which a Gaussian ends.
+        whitening: (N, 3, 3) float64 [1/length]; W (x - mean) has length 1 at one standard deviation.
+        reach: radius of a Gaussian [standard deviations].
 
     Raises:
-        MivolError: no Gaussians, or lists that take more memory than is free.
+        MivolError: no Gaussians, or lists larger than the free memory.
     """
     if not len(means):
         raise MivolError("no Gaussians were given; at least one is expected: there is nothing for rays to meet.")
@@ -94,7 +93,7 @@ def list_gaussians(means: np.ndarray, whitening: np.ndarray, reach: float) -> Ce
 
 
 def _choose_resolution(edge: np.ndarray, count: int) -> np.ndarray:
-    """Nodes (x, y, z) of a box: as near to cubes as whole numbers allow."""
+    """Nodes (x, y, z) that make the cells nearly cubic."""
     cells = np.clip(CELLS_PER_GAUSSIAN * count, MIN_CELLS, MAX_CELLS)
     return np.clip(np.rint(edge / (edge.prod() / cells) ** (1 / 3)), 1, MAX_NODES).astype(np.int64)
 
@@ -106,20 +105,20 @@ def _locate_cells(p: np.ndarray, low: np.ndarray, edge: np.ndarray, size: np.nda
 def _find_touched_cells(
     index: np.ndarray, first: np.ndarray, last: np.ndarray, means: np.ndarray, whitening: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The cells (n, 3) that some Gaussians touch, and the Gaussian of each; ``means`` and ``whitening`` count in cells."""
+    """Pairs of touched cells (n, 3) and Gaussians (n,); ``means`` and ``whitening`` are in units of cells."""
     sizes = last - first + 1
     owner = np.repeat(index, sizes.prod(axis=1))
     cell = np.repeat(first, sizes.prod(axis=1), axis=0) + list_box_nodes(sizes)
     W = whitening[owner]
-    # A point of the cell is at most this far from its middle, in standard deviations: |W| applied to half its edges.
+    # Largest distance of a point of the cell from its middle, in standard deviations: |W| applied to half the edges.
     size = np.linalg.norm(np.abs(W) @ np.full(3, 0.5 + SLACK), axis=1)
-    away = np.linalg.norm(np.einsum("nij,nj->ni", W, cell - means[owner]), axis=1)
-    touches = away - size <= reach
+    distance = np.linalg.norm(np.einsum("nij,nj->ni", W, cell - means[owner]), axis=1)
+    touches = distance - size <= reach
     return cell[touches], owner[touches]
 
 
 def _check_memory(counts: np.ndarray) -> None:
-    """Refuse lists that do not fit: at most so many entries, and those that are looked at together."""
+    """Refuse lists that exceed the free memory, counting all entries and one chunk of pairs."""
     needed, free = ENTRY_BYTES * int(counts.sum()) + PAIR_BYTES * (MAX_CHUNK_PAIRS + int(counts.max())), available_memory()
     if free is not None and needed > free:
         raise MivolError(
@@ -129,11 +128,11 @@ def _check_memory(counts: np.ndarray) -> None:
 
 
 MAX_CHUNK_PAIRS = 1 << 21
-"""Places of all boxes that are listed together, and one box more, which has no more than there are nodes."""
+"""Pairs of nodes and boxes listed at once. A chunk may exceed the limit by one box."""
 
 
 def list_box_nodes(sizes: np.ndarray) -> np.ndarray:
-    """All places (x, y, z) of boxes of these sizes (n, 3), one box after the other, each from (0, 0, 0)."""
+    """Integer offsets (x, y, z) of all nodes of boxes with the given sizes (n, 3), box by box, each from (0, 0, 0)."""
     counts = sizes.prod(axis=1)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     x, y = (np.repeat(sizes[:, axis], counts) for axis in (0, 1))
@@ -141,5 +140,5 @@ def list_box_nodes(sizes: np.ndarray) -> np.ndarray:
 
 
 def find_chunk_starts(counts: np.ndarray) -> np.ndarray:
-    """Where a list of boxes of so many places is cut so that no part has much more than ``PAIRS``."""
+    """Indices that split a list of boxes, with the given node counts, into chunks of about ``MAX_CHUNK_PAIRS`` nodes."""
     return np.flatnonzero(np.diff(np.cumsum(counts) // MAX_CHUNK_PAIRS)) + 1

@@ -1,17 +1,17 @@
-"""Gaussians that rays are traced through, as an extinction and its colours: parameters, rows, and the cells that list them.
+"""Gaussians as an extinction with colours, for rays: parameters, packed rows, and lists of Gaussians by cell.
 
-Conventions. Parameters are the pre-images of the activations, as :mod:`mivol.points.gaussians` has them, by the same names:
-"means" (N, 3), "log_scales" (N, 3), "quaternions" (N, 4), "opacity_logits" (N,). The extinction of one along a line is that of
-:mod:`mivol.fields.gaussian_line`; they add up. A Gaussian ends ``REACH`` standard deviations from its mean. "harmonics"
-(N, K, 3), which may be left out, are their colours (:mod:`mivol.fields.harmonics`).
+Conventions. Parameters are the pre-images of the activations, with the names of :mod:`mivol.points.gaussians`: "means" (N, 3),
+"log_scales" (N, 3), "quaternions" (N, 4), "opacity_logits" (N,), and optionally "harmonics" (N, K, 3), the colours
+(:mod:`mivol.fields.harmonics`). :mod:`mivol.fields.gaussian_line` has the extinction of one Gaussian along a line; extinctions
+add. A Gaussian ends ``REACH`` standard deviations from its mean.
 
-Low-pass. Splatting widens each Gaussian in the image, by 0.3 pixel^2 in published files, and keeps its opacity: a fit has
-Gaussians that are far thinner than that, and looks as it does with the filter. ``blur`` b does the same in space: the
-covariance becomes S + b^2 I. At a distance z from a camera of the focal length f [pixel] that is the filter of the image for
+Low-pass. Splatting widens each Gaussian in the image, by 0.3 pixel^2 in published files, and keeps its opacity. Fitted
+Gaussians are often far thinner than 0.3 pixel^2 and look right only with this filter. ``blur`` b is the same filter in space:
+the covariance becomes S + b^2 I. At a distance z from a camera of focal length f [pixel] it equals the filter of the image for
 b = sqrt(0.3) z / f (a 3D filter as in Yu et al., Mip-Splatting, 2024, without their compensation of the opacity).
 
-Two things are cut: an opacity above ``MOST_OPAQUE`` counts as that one (1 would be an infinite extinction), a scale below
-``LEAST_SCALE`` of the box as that one (float32 places no ray nearer). Both have no derivative there.
+Limits. An opacity above ``MAX_OPACITY`` counts as ``MAX_OPACITY`` (1 would be an infinite extinction). A scale below
+``MIN_RELATIVE_SCALE`` of the box counts as this scale (float32 resolves no smaller distance). Clipped values have derivative 0.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from mivol.space import check_affine
 __all__ = ["HARMONICS", "MIN_RELATIVE_SCALE", "EXTINCTION_PARAMETERS", "GaussianField"]
 
 EXTINCTION_PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits")
-"""The parameters of the extinction."""
+"""Parameters of the extinction."""
 
 HARMONICS = "harmonics"
-"""The parameter of the colours."""
+"""Parameter of the colours."""
 
 MIN_RELATIVE_SCALE = 1e-6
 """Smallest standard deviation, in edges of the box."""
@@ -50,19 +50,19 @@ class GaussianField:
     """A sum of Gaussians of extinction [1/length] (:class:`mivol.fields.protocol.Field`).
 
     Args:
-        tensors: the parameters by name.
-        place: (4, 4) affine map of the Gaussians to the world; their opacities stay as they are.
-        space: what colours are: "srgb" (code values, as in published files) or "linear" (radiance).
-        blur: b, the standard deviation [length of the cloud] by which each is widened.
+        tensors: parameters by name.
+        place: (4, 4) affine map of the Gaussians to the world; opacities do not change.
+        space: meaning of colours: "srgb" (code values, as in published files) or "linear" (radiance).
+        blur: b, standard deviation of the low-pass filter [length of the cloud].
 
     Raises:
-        MivolError: parameters that no Gaussian has, by the index of the first, lists that do not fit into memory, another
-            space, or a blur below 0.
+        MivolError: parameters that no Gaussian can have (the message names the first index), lists larger than the free memory,
+            another space, or a negative blur.
 
     Attributes:
-        lists: the Gaussians of each cell.
-        starts, entries: the same as arrays of the device.
-        flat: the rows of all Gaussians, without derivatives, for a scale of 1.
+        lists: Gaussians of each cell.
+        starts, entries: the lists as device arrays.
+        flat: rows of all Gaussians, detached, for a scale of 1.
     """
 
     line = EXACT_LINE
@@ -78,19 +78,19 @@ class GaussianField:
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians, place: np.ndarray, space: str = "srgb", blur: float = 0.0) -> GaussianField:
-        """The field of some Gaussians."""
+        """Make a field of Gaussians."""
         return cls(
             {name: mi.TensorXf(getattr(gaussians, name)) for name in (*EXTINCTION_PARAMETERS, HARMONICS)}, place, space, blur
         )
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> GaussianField:
-        """Read Gaussians from plugin parameters: ``filename`` or tensors, ``to_world``, ``space`` and ``blur``.
+        """Make a field from plugin parameters: ``filename`` or tensors; ``to_world``, ``space`` and ``blur``.
 
         The tensors are those in :data:`EXTINCTION_PARAMETERS`, and optionally the harmonics.
 
         Raises:
-            MivolError: none or both of the sources, half of the tensors, or numbers that no Gaussian has.
+            MivolError: both sources or none, missing tensors, or numbers that no Gaussian can have.
         """
         place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
         tensors = [name for name in (*EXTINCTION_PARAMETERS, HARMONICS) if name in props]
@@ -105,7 +105,7 @@ class GaussianField:
         return cls.from_gaussians(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place, *shown)
 
     def refresh(self) -> None:
-        """List the Gaussians anew, after parameters have changed. Reads them: not while ``dr.freeze`` records."""
+        """List the Gaussians again after changes of parameters. Reads values, which ``dr.freeze`` cannot record."""
         values = {name: np.array(dr.detach(tensor)) for name, tensor in self.tensors.items()}
         values.setdefault(HARMONICS, np.zeros((len(values["means"]), 1, 3), np.float32))
         read = Gaussians(**values).check("Gaussians of a medium")
@@ -116,11 +116,11 @@ class GaussianField:
         whitening = whitening @ np.linalg.inv(self.place[:3, :3])
         self.lists: CellLists = list_gaussians(means, whitening, REACH)
         depth = -np.log1p(-np.minimum(read.opacities().astype(np.float64), MAX_OPACITY))
-        # |W omega| is largest along the shortest axis.
+        # |W omega| is largest for omega along the shortest axis.
         largest = np.linalg.norm(whitening, ord=2, axis=(1, 2))
         self._bound = self.lists.max_cell_sum(depth * largest) / math.sqrt(2 * math.pi)
         self.starts, self.entries = mi.UInt32(self.lists.starts), mi.UInt32(self.lists.entries)
-        # Mitsuba asks media for their extinction inside of loops, where nothing can be made beforehand.
+        # Mitsuba evaluates media inside traced loops, in which no array can be prepared.
         edge, nodes = np.diag(self.to_world)[:3], self.lists.res[::-1]
         self._low = [dr.opaque(mi.Float, float(x)) for x in self.to_world[:3, 3]]
         self._pace = [dr.opaque(mi.Float, float(n / x)) for n, x in zip(nodes, edge, strict=True)]
@@ -130,16 +130,16 @@ class GaussianField:
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number of Gaussians, N."""
         return self.tensors["means"].shape[0]
 
     @property
     def to_world(self) -> np.ndarray:
-        """(4, 4) float64, the unit cube to the box that holds all Gaussians."""
+        """(4, 4) float64, unit cube to the box around all Gaussians."""
         return self.lists.to_world
 
     def rows(self, scale: mi.Float) -> mi.Float:
-        """The rows of all Gaussians (:mod:`mivol.fields.gaussian_line`), attached to the parameters and to a medium's scale."""
+        """Rows of all Gaussians (:mod:`mivol.fields.gaussian_line`), attached to the parameters and the scale of a medium."""
         means, log_scales, quaternions = (
             _unpack_columns(self.tensors[name], n) for name, n in zip(EXTINCTION_PARAMETERS, (3, 3, 4), strict=False)
         )
@@ -159,24 +159,24 @@ class GaussianField:
 
     @property
     def has_colours(self) -> bool:
-        """Whether they were given harmonics."""
+        """Whether the Gaussians have harmonics."""
         return HARMONICS in self.tensors
 
     @property
     def degree(self) -> int:
-        """Of the harmonics."""
+        """Degree of the harmonics."""
         return harmonic_degree(self.tensors[HARMONICS].shape[1])
 
     def pack_colours(self) -> mi.Float:
-        """The harmonics of all Gaussians in blocks (:mod:`mivol.fields.harmonics`), attached to the parameter."""
+        """Harmonics of all Gaussians in blocks (:mod:`mivol.fields.harmonics`), attached to the parameter."""
         return pack_harmonics(self.tensors[HARMONICS], self.degree)
 
     def eval_basis(self, d: mi.Vector3f) -> list[mi.Float]:
-        """The basis for unit directions of travel in the world."""
+        """Harmonics of unit directions of travel in the world."""
         return dr.sh_eval(rotate_direction(local_frame(self.place), d), self.degree)
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
-        """The extinction [1/length] at world points, for light that travels along ``w``; without derivatives."""
+        """Extinction [1/length] at world points for light travelling along ``w``; detached."""
 
         def add(total: mi.Float, line: WhitenedLine, index: mi.UInt32) -> mi.Float:
             return total + line.density
@@ -184,7 +184,7 @@ class GaussianField:
         return [self.visit_at_points(mi.Ray3f(p, w), active, dr.zeros(mi.Float, dr.width(p)), add)]
 
     def visit_at_points(self, ray: mi.Ray3f, active: mi.Bool, state: Any, add: Callable[..., Any]) -> Any:
-        """Visit the Gaussians that may reach the origins of rays: ``add(state, line, index) -> state``."""
+        """Visit the Gaussians that may contain the origins of rays: ``add(state, line, index) -> state``."""
         cell, inside = [], mi.Bool(active)
         for x, low, pace, n in zip(mi.Point3f(ray.o), self._low, self._pace, self.lists.res[::-1], strict=True):
             u = (x - low) * pace
@@ -200,14 +200,14 @@ class GaussianField:
         state: Any,
         add: Callable[..., Any],
     ) -> Any:
-        """Visit the Gaussians of a cell (each index from 0 to N): ``add(state, line, index) -> state``.
+        """Visit the Gaussians of a cell: ``add(state, line, index) -> state``.
 
         Args:
-            cell: of each lane.
-            through: a point of a line, and its direction, which the Gaussians see.
+            cell: cell of each lane, indices from 0 to N along each axis.
+            through: a point and the direction of the line.
             on: lanes that visit.
             state: any PyTree of Dr.Jit arrays.
-            add: called once, while the loop is traced; ``line.hits`` tells the lanes that count.
+            add: function traced once in the loop; ``line.hits`` marks the lanes that count.
         """
         _, y, x = (n + 1 for n in self.lists.res)
         number = mi.UInt32((cell.z * y + cell.y) * x + cell.x)
@@ -222,22 +222,22 @@ class GaussianField:
         return dr.while_loop((start, state), lambda at, _: on & (at < end), visit, label="Gaussians of a cell")[1]
 
     def bound(self) -> list[float]:
-        """An upper bound of the extinction [1/length]: of all that share a cell, each at its mean along its shortest axis."""
+        """An upper bound of the extinction [1/length]: the largest sum over a cell of the Gaussians' largest values."""
         return [self._bound]
 
     def parameters(self) -> dict[str, Any]:
-        """The parameters by name."""
+        """Parameters by name."""
         return self.tensors
 
 
 def _unpack_columns(tensor: mi.TensorXf, width: int) -> list[mi.Float]:
-    """The columns of a tensor (N, width)."""
+    """Columns of a tensor (N, width)."""
     index = dr.arange(mi.UInt32, tensor.shape[0]) * width
     return [dr.gather(mi.Float, tensor.array, index + c) for c in range(width)]
 
 
 def _rotation_axes(quaternions: list[mi.Float]) -> list[list[mi.Float]]:
-    """The axes of each Gaussian in the world: columns of its rotation, for quaternions (w, x, y, z) of any length but 0."""
+    """World axes of each Gaussian: columns of its rotation, for quaternions (w, x, y, z) of any length but 0."""
     inverse = dr.rsqrt(sum((q * q for q in quaternions[1:]), quaternions[0] * quaternions[0]))
     w, x, y, z = (q * inverse for q in quaternions)
     return [
@@ -253,6 +253,6 @@ def _logistic(logit: mi.Float) -> mi.Float:
 
 
 def _find_min_scale(gaussians: Gaussians) -> float:
-    """The smallest standard deviation that counts, in the Gaussians' own lengths."""
+    """Smallest standard deviation that counts [length of the cloud]."""
     spread = REACH * np.sqrt(np.diagonal(gaussians.covariances().astype(np.float64), axis1=1, axis2=2))
     return MIN_RELATIVE_SCALE * float(((gaussians.means + spread).max(axis=0) - (gaussians.means - spread).min(axis=0)).max())

@@ -1,26 +1,34 @@
-r"""Gaussians that are splatted become a grid of density and harmonics, which stands in a scene as a medium (``mivol_sh``).
+r"""Gaussians for splatting become a grid of density and harmonics (``mivol_sh``), and a grid becomes Gaussians.
 
-Splatting knows an opacity o in the image, a medium an extinction. A Gaussian of extinction with the covariance S and the mass
-m (the integral of the extinction over space [length^2]) has along the line through its centre in the direction d the optical
-depth
+Splatting uses an opacity o in the image, a medium an extinction. A Gaussian of extinction with covariance S and mass m (the
+integral of the extinction over space [length^2]) has, along the line through its centre in the direction d, the optical depth
 
 .. math:: \tau(d) = \frac{m}{2\pi A(d)}, \qquad A(d) = \sqrt{\det S \; d^T S^{-1} d},
 
-where 2 pi A is the area of its projection. Splatting gives -log(1 - o) in all directions, which no m can give unless S is
-round. The mass chosen here makes it the mean over directions, each weighed by the area that is seen from there:
+where 2 pi A is the area of its projection. Splatting has the optical depth -log(1 - o) in all directions, which no m gives
+unless S is round. :func:`gaussian_masses` matches the mean over directions, weighted by the projected area:
 
 .. math:: m = -\log(1 - o)\, 2\pi \langle A \rangle, \quad \langle A \rangle = R_G(s_1^2 s_2^2,\, s_1^2 s_3^2,\, s_2^2 s_3^2)
 
-with Carlson's R_G, since the mean projection of an ellipsoid is a quarter of its surface (Cauchy). Without the weight the
-mean would be finite for no flat Gaussian, whose edge is of infinite depth; with it, a flat one is twice as deep seen on its
-face as it was.
+with Carlson's R_G, since the mean projection of an ellipsoid is a quarter of its surface (Cauchy). Without the weight the mean
+is infinite for flat Gaussians, whose edge has infinite depth. With the weight a flat Gaussian is twice as deep face-on as
+before.
 
-Sizes below a voxel. Each covariance is widened by (half a voxel)^2, at the same mass: nothing is lost between nodes, what is
-thinner than a voxel becomes wider and fainter. A Gaussian that lies in the box by ``REACH`` standard deviations is normalised
-over the nodes, so its mass is kept to rounding. Colours are the means of the harmonics, weighed by density; those of
-overlapping Gaussians mix, where splatting shows the nearer one.
+To a grid. Each covariance is widened by (half a voxel)^2 at the same mass: no Gaussian is lost between nodes, and Gaussians
+thinner than a voxel become wider and fainter. A Gaussian inside the box up to ``DEPOSIT_REACH`` is normalised over the nodes,
+so its mass is kept to rounding. Colours are means of the harmonics, weighted by density: overlapping Gaussians mix, while
+splatting shows the nearer Gaussian.
 
-Sources: Carlson, Numerical Algorithms 10, 1995 (R_G); Zwicker et al. 2001 (the low-pass filter).
+To Gaussians. A block of voxels becomes one Gaussian of the same mass, mean and covariance. Each node stands for its tent of
+interpolation, whose variance is 1/6 of a squared voxel edge along each axis. Matter that fills part of a block, for example a
+surface, gives a flat Gaussian. The opacity inverts the formula above, o = 1 - exp(-m / (2 pi <A>)). Harmonics are means of the
+block, weighted by mass. Harmonics of a turned grid are turned, since a grid has directions of its own frame and Gaussians have
+world directions.
+
+Error. A Gaussian of opacity o hides o exp(-q/2), matter of this mass 1 - exp(-tau exp(-q/2)), which is wider in dense regions.
+Gaussians are sorted by their means, matter of a grid by position. Details below a voxel are lost.
+
+Sources: Carlson, Numerical Algorithms 10, 1995 (R_G); Zwicker et al. 2001 (splatting of volumes, the low-pass filter).
 """
 
 from __future__ import annotations
@@ -45,24 +53,24 @@ from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, Gaussians
 __all__ = ["MAX_OPACITY", "gaussian_box", "gaussians_to_grid", "gaussian_masses", "grid_to_gaussians"]
 
 MAX_OPACITY = 0.999
-"""Opacities above it become this one, an optical depth of 6.9: an opacity of 1 would be an infinite extinction."""
+"""Larger opacities count as this opacity, an optical depth of 6.9; an opacity of 1 would be an infinite extinction."""
 
 DEPOSIT_REACH = 4.0
-"""Standard deviations along each axis of the grid up to which a Gaussian is written: 2e-4 of it lies beyond."""
+"""Standard deviations along each axis of the grid up to which a Gaussian is deposited; 2e-4 of its mass lies outside."""
 
 PAIR_BYTES = 160
-"""That a pair takes while it is weighed: places, weights and their products."""
+"""Memory of one pair of node and Gaussian during the deposit: positions, weights and products [bytes]."""
 
 
 def gaussian_masses(gaussians: Gaussians) -> np.ndarray:
-    """(N,) integrals of the extinction over space [length^2], float64; opacities above :data:`MAX_OPACITY` count as that."""
+    """(N,) integrals of the extinction over space [length^2], float64; opacities are clipped at :data:`MAX_OPACITY`."""
     opacity = np.minimum(gaussians.opacities().astype(np.float64), MAX_OPACITY)
     a, b, c = (gaussians.scales().astype(np.float64) ** 2).T
     return -np.log1p(-opacity) * 2 * math.pi * elliprg(a * b, a * c, b * c)
 
 
 def gaussian_box(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,) of the box that holds three standard deviations of all Gaussians [length], float64.
+    """Corners (3,) of the box around three standard deviations of all Gaussians [length], float64.
 
     Raises:
         MivolError: no Gaussians.
@@ -74,19 +82,19 @@ def gaussian_box(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 
 
 def gaussians_to_grid(gaussians: Gaussians, low: np.ndarray, high: np.ndarray, resolution: int) -> SphericalGrid:
-    """Write Gaussians on the nodes of a grid; what reaches out of the box is cut off.
+    """Deposit Gaussians on the nodes of a grid; parts outside the box are cut off.
 
     Args:
-        gaussians: of any degree; their colours are code values, and stay so (``space`` is ``srgb``).
+        gaussians: any degree; colours stay code values (``space`` is ``srgb``).
         low, high: (3,) corners of the box [length].
-        resolution: voxels along its longest edge; they are as near to cubes as whole numbers allow.
+        resolution: voxels along the longest edge; voxels are as near to cubes as whole numbers allow.
 
     Returns:
-        A sparse field without an activation: extinctions [1/length].
+        A sparse field without an activation: its densities are extinctions [1/length].
 
     Raises:
-        MivolError: a box without volume, a resolution below 2, nothing in the box, or more memory than is free, with the
-            resolution that fits.
+        MivolError: a box without volume, a resolution below 2, an empty box, or a grid larger than the free memory (the message
+            has the resolution that fits).
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     if not (np.isfinite([low, high]).all() and (high > low).all()) or resolution < 2:
@@ -95,16 +103,16 @@ def gaussians_to_grid(gaussians: Gaussians, low: np.ndarray, high: np.ndarray, r
     size = np.maximum(np.rint((high - low) / (high - low).max() * resolution), 2).astype(np.int64)  # x, y, z
     _check_grid_memory(size, gaussians.harmonics.shape[1], resolution)
     mass, harmonics = _deposit(gaussians, (gaussians.means - low) / (high - low) * size - 0.5, size, (high - low) / size)
-    held = mass > 0
-    if not held.any():
+    occupied = mass > 0
+    if not occupied.any():
         raise MivolError("none of the Gaussians reaches into the box; give a box that holds them.")
-    harmonics[held] /= mass[held, None]
+    harmonics[occupied] /= mass[occupied, None]
     to_world = np.diag([*(high - low), 1.0])
     to_world[:3, 3] = low
     shape = tuple(int(n) for n in size[::-1])
     density = (mass / np.prod((high - low) / size)).reshape(shape)
     return SphericalGrid.from_dense(
-        density, harmonics.reshape(*shape, -1, 3), to_world, held.reshape(shape), activation="none", space="srgb"
+        density, harmonics.reshape(*shape, -1, 3), to_world, occupied.reshape(shape), activation="none", space="srgb"
     )
 
 
@@ -113,20 +121,20 @@ def _deposit(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel:
     covariances = gaussians.covariances().astype(np.float64) / np.outer(voxel, voxel) + 0.25 * np.eye(3)
     reach = DEPOSIT_REACH * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     first, last = np.ceil(centres - reach).astype(np.int64), np.floor(centres + reach).astype(np.int64)
-    seen = np.flatnonzero(((last >= 0) & (first < size)).all(axis=1) & (gaussians.opacities() > 0))
+    reaching = np.flatnonzero(((last >= 0) & (first < size)).all(axis=1) & (gaussians.opacities() > 0))
     is_whole = ((first >= 0) & (last < size)).all(axis=1)
     first, last = np.maximum(first, 0), np.minimum(last, size - 1)
-    # What reaches out of the box is normalised by its integral: beyond the box may lie more nodes than there is memory for.
+    # A Gaussian that leaves the box is normalised by its integral: its nodes outside may exceed the memory.
     integral = (2 * math.pi) ** 1.5 * np.sqrt(np.linalg.det(covariances))
     sizes = last - first + 1
     harmonics = gaussians.harmonics.reshape(gaussians.count, -1)
     rows = np.concatenate([np.ones((gaussians.count, 1)), harmonics], axis=1) * gaussian_masses(gaussians)[:, None]
     sums = np.zeros((int(np.prod(size)), rows.shape[1]))
-    for part in np.split(seen, find_chunk_starts(sizes[seen].prod(axis=1))):
+    for part in np.split(reaching, find_chunk_starts(sizes[reaching].prod(axis=1))):
         owner = np.repeat(np.arange(len(part)), sizes[part].prod(axis=1))
         node = first[part][owner] + list_box_nodes(sizes[part])
-        away = node - centres[part][owner]
-        weight = np.exp(-0.5 * np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariances[part])[owner], away))
+        offset = node - centres[part][owner]
+        weight = np.exp(-0.5 * np.einsum("ni,nij,nj->n", offset, np.linalg.inv(covariances[part])[owner], offset))
         weight /= np.where(is_whole[part], np.bincount(owner, weight, len(part)), integral[part])[owner]
         touched, place = np.unique(node @ np.array([1, size[0], size[0] * size[1]]), return_inverse=True)
         weights = csr_matrix((weight, (place, owner)), shape=(len(touched), len(part)))
@@ -135,7 +143,7 @@ def _deposit(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel:
 
 
 def _check_grid_memory(size: np.ndarray, basis: int, resolution: int) -> None:
-    """Refuse a grid that does not fit: sums, as much again for the field made of them, and one wide Gaussian's pairs."""
+    """Refuse a grid that exceeds the free memory, counting sums, the field, and the pairs of one wide Gaussian."""
     pairs = PAIR_BYTES * MAX_CHUNK_PAIRS
     needed = (16 * (1 + 3 * basis) + PAIR_BYTES) * int(np.prod(size)) + pairs
     free = available_memory()
@@ -148,29 +156,29 @@ def _check_grid_memory(size: np.ndarray, basis: int, resolution: int) -> None:
 
 
 TENT_VARIANCE = 1 / 6
-"""Variance of the tent by which a node is interpolated, along each axis [voxel^2]."""
+"""Variance of a node's tent of interpolation along each axis [voxel^2]."""
 
 BLOCK_EDGE = 2
-"""Voxels along the edge of a block where no resolution is given. On a still life of 26 x 64 x 64 nodes 5,600 such Gaussians
-came as near to the field as 25,000 of one voxel (29.3 and 29.3 dB at 256 pixels, 27.7 and 26.0 at 128): what is smaller than a
-pixel is widened by the splatter's low-pass filter, at the same opacity."""
+"""Default edge of a block [voxel]. On a still life of 26 x 64 x 64 nodes, 5,600 such Gaussians matched the field as well as
+25,000 Gaussians of one voxel (29.3 and 29.3 dB at 256 pixels, 27.7 and 26.0 dB at 128), since the splatter's low-pass filter
+widens Gaussians below a pixel at the same opacity."""
 
 MIN_OPACITY = 1 / 255
-"""Opacity below which a Gaussian is left out: no splatter draws it."""
+"""Gaussians of smaller opacity are left out; no splatter draws them."""
 
 
 def grid_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Gaussians:
-    """Gaussians of the mass, the colours and the shape of a field's matter, one a block of voxels.
+    """Make Gaussians of the mass, colours and shape of a field's matter, one a block of voxels.
 
     Args:
         field: of one level.
-        resolution: blocks along the longest edge, at most; None: blocks of 2 voxels along each edge.
+        resolution: largest number of blocks along the longest edge; None: blocks with an edge of 2 voxels.
 
     Returns:
-        Gaussians of the field's degree, but of 3 at most; colours in code values.
+        Gaussians of the field's degree, at most 3, with colours in code values.
 
     Raises:
-        MivolError: a nested field, a resolution below 1, or a field in which no block would be drawn.
+        MivolError: a nested field, a resolution below 1, or a field without a visible block.
     """
     if field.levels > 1:
         raise MivolError(f"a field of {field.levels} nested levels was given; one grid is expected: take one of its levels.")
@@ -182,8 +190,8 @@ def grid_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Ga
     total = np.bincount(owner, mass, count)
     edges = field.to_world[:3, :3] / field.res[::-1]
     mean = _sum_by_owner(owner, nodes * mass[:, None], count) / total[:, None]
-    away = nodes - mean[owner]
-    spread = _sum_by_owner(owner, (away[:, :, None] * away[:, None, :] * mass[:, None, None]).reshape(-1, 9), count)
+    offset = nodes - mean[owner]
+    spread = _sum_by_owner(owner, (offset[:, :, None] * offset[:, None, :] * mass[:, None, None]).reshape(-1, 9), count)
     covariance = (spread / total[:, None]).reshape(-1, 3, 3) + TENT_VARIANCE * np.eye(3)
     variance, axes = np.linalg.eigh(edges @ covariance @ edges.T)
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
@@ -206,19 +214,19 @@ def grid_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Ga
 
 
 def _collect_mass(field: SphericalGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes that hold anything (n, 3), (x, y, z), their masses [length^2] (n,) and harmonics (n, K, 3) of code values."""
+    """Nodes with matter (n, 3), (x, y, z), their masses [length^2] (n,) and harmonics (n, K, 3) of code values."""
     density, harmonics = field.values()
     volume = abs(float(np.linalg.det(field.to_world[:3, :3]))) / math.prod(field.res)
     mass = np.array(field.activation_function.value_and_slope(mi.Float(density))[0], np.float64) * volume
-    held = np.flatnonzero(mass > 0)
-    if not len(held):
+    occupied = np.flatnonzero(mass > 0)
+    if not len(occupied):
         raise MivolError("the field holds nothing; matter is expected: there is nothing to make Gaussians of.")
-    z, y, x = np.unravel_index(field.stored_nodes()[held], field.res)
-    return np.stack([x, y, z], axis=1).astype(np.float64), mass[held], _encode_harmonics(field, harmonics[held])
+    z, y, x = np.unravel_index(field.stored_nodes()[occupied], field.res)
+    return np.stack([x, y, z], axis=1).astype(np.float64), mass[occupied], _encode_harmonics(field, harmonics[occupied])
 
 
 def _encode_harmonics(field: SphericalGrid, harmonics: np.ndarray) -> np.ndarray:
-    """Harmonics (n, K, 3) in the world's frame, of code values less one half, as Gaussians have them, float64."""
+    """Harmonics (n, K, 3) in the world frame, of code values minus 1/2, as Gaussians hold them, float64."""
     harmonics = harmonics[:, : (HIGHEST_DEGREE + 1) ** 2].astype(np.float64)
     basis = harmonics.shape[1]
     d = _fibonacci_directions()
@@ -228,20 +236,20 @@ def _encode_harmonics(field: SphericalGrid, harmonics: np.ndarray) -> np.ndarray
         turned = np.einsum("kj,njc->nkc", back @ own, harmonics)
         turned[:, 0] += (field.offset - 0.5) / CONSTANT_HARMONIC
         return turned
-    seen = (
+    radiance = (
         np.einsum("mj,njc->nmc", own, part) + field.offset
         for part in np.array_split(harmonics, len(harmonics) // LIGHT_CHUNK + 1)
     )
-    return np.concatenate([np.einsum("km,nmc->nkc", back, encode_srgb(np.maximum(part, 0)) - 0.5) for part in seen])
+    return np.concatenate([np.einsum("km,nmc->nkc", back, encode_srgb(np.maximum(part, 0)) - 0.5) for part in radiance])
 
 
 def _stack_columns(values: Sequence[mi.Float]) -> np.ndarray:
-    """Harmonics in all directions as a matrix (directions, K), float64; the constant one is a single number."""
+    """Harmonics in all directions as a matrix (directions, K), float64; the constant harmonic is a single number."""
     return np.stack(np.broadcast_arrays(*(np.array(value, np.float64) for value in values)), axis=1)
 
 
 LIGHT_CHUNK = 1 << 14
-"""Nodes whose light is looked at together."""
+"""Nodes whose light is evaluated at once."""
 
 
 def _fibonacci_directions(count: int = 64) -> mi.Vector3f:
@@ -252,15 +260,15 @@ def _fibonacci_directions(count: int = 64) -> mi.Vector3f:
 
 
 def _group_nodes(nodes: np.ndarray, res: tuple[int, int, int], block: int) -> tuple[np.ndarray, int]:
-    """The number of each node's block, of those that hold something, and how many there are."""
+    """The number of each node's block among the blocks with matter, and the number of these blocks."""
     size = -(-np.array(res[::-1]) // block)
     at = nodes.astype(np.int64) // block
-    held, owner = np.unique((at[:, 2] * size[1] + at[:, 1]) * size[0] + at[:, 0], return_inverse=True)
-    return owner, len(held)
+    occupied, owner = np.unique((at[:, 2] * size[1] + at[:, 1]) * size[0] + at[:, 0], return_inverse=True)
+    return owner, len(occupied)
 
 
 def _sum_by_owner(owner: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
-    """(count, columns) sums of rows over those of each owner."""
+    """(count, columns) sums of the rows of each owner."""
     return np.stack([np.bincount(owner, column, count) for column in rows.T], axis=1)
 
 

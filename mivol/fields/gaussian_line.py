@@ -1,24 +1,25 @@
-r"""One Gaussian along a line: its optical depth between two points in closed form, with the derivatives by all that it has.
+r"""One Gaussian along a line: its optical depth between two points in closed form, with derivatives.
 
 .. math:: \sigma_t(x, \omega) = -\log(1 - o\,e^{-m^2/2})\;|W\omega|\;\varphi(s), \qquad
           \tau = -\log(1 - o\,e^{-m^2/2})\,\big[\Phi(s_1) - \Phi(s_0)\big]
 
-W makes the Gaussian a round one of standard deviation 1 about its mean mu: q = W (x - mu) and v = W omega. Along the line
+W maps the Gaussian to a round Gaussian of standard deviation 1 about its mean mu: q = W (x - mu) and v = W omega. Along the
+line
 
 .. math:: s = q \cdot v / |v|, \qquad p = q - (q \cdot v / |v|^2)\, v, \qquad m = |p|,
 
-s is the whitened distance from the point where the line is nearest to the mean, and m the whitened distance there. A line
-through all of it loses the share alpha = o exp(-m^2/2) of its light, which is what a splat of opacity o shows at that distance
-from its centre; what Gaussians in front of each other let through is the product of (1 - alpha) in any order, as in splatting.
+where s is the whitened distance from the point of the line nearest to the mean, and m the whitened distance of this point. A
+line through the whole Gaussian loses the share alpha = o exp(-m^2/2) of its light, as a splat of opacity o shows at the same
+distance from its centre. The transmittance of several Gaussians is the product of (1 - alpha) in any order, as in splatting.
 
-Two consequences. The extinction depends on the direction: a Gaussian is not deeper seen along its longer axis, as a splat is
-not. It is the same for a direction and its opposite, but light that turns meets another extinction than it left: with an
-isotropic phase function, camera and emitter may not change places.
+Consequences. The extinction depends on the direction: like a splat, a Gaussian is not deeper along its longer axis. Opposite
+directions have the same extinction, but scattered light meets another extinction than the incoming light. With an isotropic
+phase function, camera and emitter may therefore not be exchanged.
 
-Conventions. A row holds what is known of a Gaussian, 16 numbers: W by rows, mu, o, the scale of the medium, and two zeros.
+Conventions. A row holds the 16 numbers of a Gaussian: W by rows, mu, o, the scale of the medium, and two zeros.
 
-Source: the opacity along a ray is evaluated at its peak as in Moenne-Loccoz et al., 3D Gaussian Ray Tracing, 2024; the
-extinction of this shape and its integral were derived for mivol.
+Source: Moenne-Loccoz et al., 3D Gaussian Ray Tracing, 2024, evaluate the opacity at the peak along the ray; the extinction of
+this shape and its integral were derived for mivol.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ import mitsuba as mi
 __all__ = ["REACH", "ROW_SIZE", "SCALE_COLUMN", "WhitenedLine", "LineSlopes", "row_tangent", "intersect_gaussian", "read_row"]
 
 ROW_SIZE, SCALE_COLUMN = 16, 13
-"""Numbers of a Gaussian, and which of them is the scale of the medium."""
+"""Numbers of a Gaussian, and the column of the medium's scale."""
 
 REACH = 4.0
-"""Standard deviations at which a Gaussian ends: at most 4e-4 of its opacity lie beyond (measured on 10,000 Gaussians: an error
-of the transmittance of 1.1e-3; with 3 of 0.02)."""
+"""Radius of a Gaussian [standard deviations]; at most 4e-4 of its opacity lies outside. Measured on 10,000 Gaussians: an error
+of the transmittance of 1.1e-3, with a radius of 3 an error of 0.02."""
 
 
 INVERSE_ROOT_2, INVERSE_ROOT_2_PI = 1 / math.sqrt(2), 1 / math.sqrt(2 * math.pi)
@@ -60,18 +61,18 @@ class LineSlopes:
 
 @dataclass
 class WhitenedLine:
-    """A line through a point ``o`` in the direction of the unit vector ``d``, as one Gaussian sees it.
+    """A line through a point ``o`` in the direction of the unit vector ``d``, in the whitened frame of one Gaussian.
 
     Attributes:
-        rows: of W [1/length].
+        rows: rows of W [1/length].
         from_mean, d: o - mu [length], and the direction.
         v: W d [1/length].
-        speed: |v|: standard deviations passed in a length [1/length].
-        p: the whitened place, from the mean, where the line is nearest to it.
-        peak: distance of that place from ``o`` [length].
-        half: half the length of the chord inside of ``REACH`` [length]; 0 where the line misses.
-        opacity: of the Gaussian at its centre [1].
-        m2: m^2, the squared whitened distance of that place from the mean.
+        speed: |v|, standard deviations per length [1/length].
+        p: whitened position, from the mean, of the point of the line nearest to the mean.
+        peak: distance of this point from ``o`` [length].
+        half: half length of the chord inside ``REACH`` [length]; 0 for a line outside.
+        opacity: opacity of the Gaussian at its centre [1].
+        m2: m^2, squared whitened distance of the nearest point from the mean.
         hits: whether the line comes within ``REACH``.
     """
 
@@ -94,7 +95,7 @@ class WhitenedLine:
 
     @property
     def alpha(self) -> mi.Float:
-        """The share of light that the whole line loses [1]."""
+        """Share of light lost along the whole line [1]."""
         return self.opacity * self.falloff
 
     @property
@@ -104,22 +105,22 @@ class WhitenedLine:
 
     @property
     def chord(self) -> tuple[mi.Float, mi.Float]:
-        """Distances from ``o`` at which the line comes within ``REACH`` and leaves it [length]."""
+        """Distances from ``o`` at which the line enters ``REACH`` and leaves [length]."""
         return self.peak - self.half, self.peak + self.half
 
     def share(self, a: mi.Float, b: mi.Float) -> mi.Float:
-        """The share [1] of the depth that lies between two distances from ``o``, which lie on the chord."""
+        """Share [1] of the optical depth between two distances from ``o``, which lie on the chord."""
         low, high = ((t - self.peak) * self.speed * INVERSE_ROOT_2 for t in (a, b))
         return 0.5 * (dr.erf(high) - dr.erf(low))
 
     def share_up_to(self, a: mi.Float) -> mi.Float:
-        """The share [1] of the depth that lies before a distance from ``o``, from the far end of the line."""
+        """Share [1] of the optical depth before a distance from ``o``."""
         return 0.5 * (1 + dr.erf((a - self.peak) * self.speed * INVERSE_ROOT_2))
 
     def share_slopes(self, a: mi.Float, b: mi.Float) -> LineSlopes:
-        """Derivatives of the optical depth between two distances from ``o``, as they are cut to the chord.
+        """Derivatives of the optical depth between two distances from ``o``, which are clipped to the chord.
 
-        Where the chord ends between them the end counts as fixed: its move would add at most exp(-REACH^2 / 2) of the depth.
+        An end of the chord counts as fixed: its movement would add at most exp(-REACH^2 / 2) of the depth.
         """
         start, end = self.chord
         low = dr.select(a > start, _normal_density((a - self.peak) * self.speed), 0)
@@ -139,12 +140,12 @@ class WhitenedLine:
 
     @property
     def density(self) -> mi.Float:
-        """The extinction [1/length] at ``o``; 0 outside of the chord."""
+        """Extinction [1/length] at ``o``; 0 outside the chord."""
         return dr.select(self.contains_origin, self.depth * self.speed * _normal_density(self.peak * self.speed), 0)
 
     @property
     def density_slopes(self) -> LineSlopes:
-        """Derivatives of the extinction at ``o``, where the chord holds it."""
+        """Derivatives of the extinction at ``o``, for ``o`` on the chord."""
         s, step = -self.peak * self.speed, dr.rcp(self.speed)
         bell, depth, rise = _normal_density(s), self.depth, self._rise
         q = -bell * (self.speed * rise * self.p + depth * s * self.v)
@@ -153,12 +154,12 @@ class WhitenedLine:
 
     @property
     def _by_opacity(self) -> mi.Float:
-        """Derivative of the depth by the opacity."""
+        """Derivative of the depth with respect to the opacity."""
         return self.falloff / (1 - self.alpha)
 
     @property
     def _rise(self) -> mi.Float:
-        """Derivative of the depth by -m^2 / 2."""
+        """Derivative of the depth with respect to -m^2 / 2."""
         return self.alpha / (1 - self.alpha)
 
 
@@ -168,12 +169,11 @@ def read_row(rows: mi.Float, index: mi.UInt32) -> list[mi.Float]:
 
 
 def intersect_gaussian(row: list[mi.Float], o: mi.Point3f, d: mi.Vector3f) -> WhitenedLine:
-    """See a line through ``o`` in the direction ``d`` as a Gaussian does.
+    """Transform a line through ``o`` in the direction ``d`` to the whitened frame of a Gaussian.
 
     Args:
-        row: of the Gaussian.
-        o, d: world, ``d`` of unit length. Near the Gaussian ``o`` need not be: of a ray's place float32 keeps 1e-7 of the
-            distance to it.
+        row: numbers of the Gaussian.
+        o, d: world, ``d`` of unit length. ``o`` should lie near the Gaussian: float32 keeps 1e-7 of the distance.
     """
     rows = tuple(mi.Vector3f(*row[3 * k : 3 * k + 3]) for k in range(3))
     y = mi.Vector3f(o) - mi.Vector3f(*row[9:12])
@@ -188,17 +188,17 @@ def intersect_gaussian(row: list[mi.Float], o: mi.Point3f, d: mi.Vector3f) -> Wh
 
 
 def row_tangent(line: WhitenedLine, slopes: LineSlopes, change: list[mi.Float]) -> mi.Float:
-    """The tangent of a number with these derivatives, from the tangent of the row."""
+    """Tangent of a number with the given derivatives, from the tangent of the row."""
     return sum((s * c for s, c in zip(slopes.by_row(line), change, strict=False)), mi.Float(0))
 
 
 def minus_log_one_minus(alpha: mi.Float) -> mi.Float:
-    """-log(1 - alpha), to 1e-7 of itself: 1 - alpha alone would lose the digits of a small alpha."""
+    """-log(1 - alpha) with a relative error of 1e-7; 1 - alpha would lose the digits of a small alpha."""
     x = alpha
     series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 6, 1 / 5), 1 / 4), 1 / 3), 1 / 2), 1)
     return dr.select(x < 0.05, x * series, -dr.log(1 - x))
 
 
 def _normal_density(s: mi.Float) -> mi.Float:
-    """The density of the normal distribution."""
+    """Density of the standard normal distribution."""
     return INVERSE_ROOT_2_PI * dr.exp(-0.5 * s * s)

@@ -1,17 +1,16 @@
-r"""Colours of Gaussians as rays see them: rows of harmonics, the light of one along a direction, and its derivative.
+r"""Directional colour in spherical harmonics: the basis, sRGB code values, radiance, and the colours of Gaussians.
 
 .. math:: c(\omega) = L\Big(\max\big(0,\; \tfrac12 + \sum_b Y_b(\omega)\, k_b\big)\Big)
 
-with L the light of a code value where colours are sRGB codes, as in published files, and the number itself where they are
-radiance (``linear``).
+The colour of a Gaussian. L decodes sRGB code values, as published files hold them; for linear colours L is the identity.
 
-Conventions. The direction is that in which the ray travels, in the frame of the cloud: the rotation (and mirror image) of its
-placement is taken off. Splatting takes the direction from the camera to the mean; that of the ray needs no camera, so it
-holds behind glass and in mirrors too. Below a sum of -1/2 a channel is black, with a derivative of 0, as in
-:mod:`mivol.splatting.projection`. A row of harmonics is [basis][rgb], filled up to whole blocks of ``ROW`` numbers, so that a
-block moves as one packet.
+Conventions. The direction is the direction of travel of the ray, in the frame of the cloud: the rotation (and mirror image) of
+the placement is removed. Splatting takes the direction from the camera to the mean; the direction of the ray needs no camera,
+so the colour is also defined behind glass and in mirrors. Below a sum of -1/2 a channel is black with derivative 0, as in
+:mod:`mivol.splatting.projection`. A Gaussian's row of harmonics is [basis][rgb], padded to whole blocks of ``ROW_SIZE``
+numbers, which Dr.Jit moves as packets.
 
-Sources: Kerbl et al. 2023 (the model); Moenne-Loccoz et al. 2024 (the direction of the ray).
+References: Kerbl et al. 2023 (the model); Moenne-Loccoz et al. 2024 (the direction of the ray); Higham 1986 (the polar factor).
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ MAX_DEGREE = 4
 
 
 SPACES = ("srgb", "linear")
-"""What the colours of a field may be, as of photographs (:mod:`mivol.photos.dataset`)."""
+"""Meanings of a field's colours, as for photographs (:mod:`mivol.photos.dataset`): sRGB code values or radiance."""
 
 
 def basis_size(degree: int) -> int:
@@ -57,10 +56,10 @@ def basis_size(degree: int) -> int:
 
 
 def harmonic_degree(basis: int) -> int:
-    """The degree of so many harmonics.
+    """The degree of a number of harmonics.
 
     Raises:
-        MivolError: not 1, 4, 9, 16 or 25.
+        MivolError: a number other than 1, 4, 9, 16 or 25.
     """
     degree = math.isqrt(max(basis, 0)) - 1
     if degree < 0 or degree > MAX_DEGREE or basis_size(degree) != basis:
@@ -69,16 +68,16 @@ def harmonic_degree(basis: int) -> int:
 
 
 def row_width(basis: int) -> int:
-    """Numbers of a row of harmonics: 3 for each, filled up to a multiple of 4, so that rows move as packets."""
+    """Size of a grid's row of harmonics: 3 numbers a harmonic, padded to a multiple of 4, so that rows move as packets."""
     return -(-3 * basis // 4) * 4
 
 
 def decode_srgb_code(code: mi.Float) -> mi.Float:
-    """The light of an sRGB code value: the curve of IEC 61966-2-1, followed on above 1 and, straight, below 0.
+    """Radiance of an sRGB code value: the curve of IEC 61966-2-1, continued above 1 and, as a line, below 0.
 
     The same curve as :func:`mivol.photos.photo_file.decode_srgb`, with derivatives.
     """
-    # Below -0.055 the power is NaN. It is not selected there, and Dr.Jit takes a derivative of 0 times NaN for 0.
+    # Below -0.055 the power is NaN. The line is selected there, and Dr.Jit evaluates a derivative of 0 times NaN as 0.
     bent = dr.power((code + 0.055) / 1.055, 2.4)
     return dr.select(code <= 0.04045, code / 12.92, bent)
 
@@ -89,24 +88,24 @@ def srgb_slope(code: mi.Float) -> mi.Float:
 
 
 def local_frame(to_world: np.ndarray) -> np.ndarray:
-    """(3, 3) map of world directions to a field's own frame: the inverse of the polar factor of its placement (Higham 1986)."""
+    """(3, 3) map of world directions to a field's own frame: the inverse polar factor of the placement (Higham 1986)."""
     left, _, right = np.linalg.svd(to_world[:3, :3])
     return (left @ right).T
 
 
 def rotate_direction(frame: np.ndarray, d: mi.Vector3f) -> mi.Vector3f:
-    """Directions in another frame."""
+    """Directions multiplied by a (3, 3) matrix."""
     rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in frame]
     return mi.Vector3f(*(dr.fma(r[0], d.x, dr.fma(r[1], d.y, r[2] * d.z)) for r in rows))
 
 
 def blocks_per_gaussian(degree: int) -> int:
-    """Blocks of ``ROW`` numbers that the harmonics of one Gaussian take."""
+    """Blocks of ``ROW_SIZE`` numbers for the harmonics of one Gaussian."""
     return -(-3 * basis_size(degree) // ROW_SIZE)
 
 
 def pack_harmonics(harmonics: mi.TensorXf, degree: int) -> mi.Float:
-    """The harmonics (N, K, 3) as rows of whole blocks, with their derivatives."""
+    """The harmonics (N, K, 3) as rows of whole blocks; derivatives pass through."""
     used, width = 3 * basis_size(degree), ROW_SIZE * blocks_per_gaussian(degree)
     if used == width:
         return harmonics.array
@@ -116,7 +115,7 @@ def pack_harmonics(harmonics: mi.TensorXf, degree: int) -> mi.Float:
 
 
 def read_harmonics(rows: mi.Float, first: mi.UInt32, degree: int) -> list[mi.Float]:
-    """The harmonics of one Gaussian, whose blocks begin with number ``first``."""
+    """The harmonics of one Gaussian, whose first block has the number ``first``."""
     return [value for block in range(blocks_per_gaussian(degree)) for value in read_row(rows, first + block)]
 
 
@@ -126,12 +125,12 @@ def sum_harmonics(row: list[mi.Float], basis: list[mi.Float]) -> list[mi.Float]:
 
 
 def eval_colour(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
-    """The radiance of red, green and blue that a Gaussian shows."""
+    """The radiance of one Gaussian: red, green and blue."""
     codes = [dr.maximum(total + 0.5, 0) for total in sum_harmonics(row, basis)]
     return codes if space == "linear" else [decode_srgb_code(code) for code in codes]
 
 
 def eval_colour_slopes(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
-    """Derivatives of :func:`eval_colour` by the sums over the harmonics."""
+    """Derivatives of :func:`eval_colour` with respect to the sums of harmonics."""
     codes = [total + 0.5 for total in sum_harmonics(row, basis)]
     return [dr.select(code > 0, 1 if space == "linear" else srgb_slope(code), 0) for code in codes]

@@ -1,17 +1,14 @@
-r"""A scan lit as if it had surfaces: normals from its gradient, light that they reflect, opacity where values change.
+r"""Shading of scans: light reflected as by surfaces, with normals from the gradient of the scan.
 
 .. math:: c' = c\,(k_a + k_d\,|n \cdot l|) + k_s\,|n \cdot h|^m, \qquad n = \nabla s / |\nabla s|, \qquad
           h = (l + v) / |l + v|
 
-with c the colour of a table, l the direction to the light and v that to the eye (Levoy 1988, equation 3, without his fading
-with distance). Both sides of a surface are lit. The light is white and stands at the eye unless it has a place of its own;
-matter casts no shadow on matter, and where a scan is constant there is no normal and k_a c is left.
-Opacities may be multiplied by a table of the gradient's magnitude, which leaves boundaries between materials and takes
-their insides away (Levoy 1988; Kindlmann and Durkin 1998).
+c is the colour from a table, l the direction to the light, v the direction to the eye (Levoy 1988, equation 3, without the
+fading with distance). Both sides of a surface are lit. The light is white and stands at the eye by default; matter casts no
+shadow on matter. In constant regions of a scan the normal is undefined and the result is k_a c.
 
-Conventions. Gradients are central differences at the voxels (one-sided in the outermost layers), linear between them, per
-length of the world: exact for a field that is quadratic in space. The defaults of the coefficients are those of VTK's
-``vtkVolumeProperty``.
+Conventions. Gradients are central differences at the voxels (one-sided in the outermost layers), linear between voxels, per
+length of the world; they are exact for a quadratic field. The default coefficients are those of VTK's ``vtkVolumeProperty``.
 """
 
 from __future__ import annotations
@@ -31,11 +28,11 @@ COEFFICIENTS = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specular_power
 
 @dataclass(frozen=True)
 class Shading:
-    """The light on a scan's surfaces.
+    """The light on the surfaces of a scan.
 
     Attributes:
-        eye: where it is looked at from, a point of the world.
-        light: where the light stands, a point of the world; None: at the eye.
+        eye: position of the viewer, world.
+        light: position of the light, world; None: at the eye.
         ambient, diffuse, specular: k_a, k_d and k_s.
         specular_power: m.
     """
@@ -49,7 +46,7 @@ class Shading:
 
     @classmethod
     def from_props(cls, props: mi.Properties, name: str) -> Shading | None:
-        """Build from plugin parameters: ``shade``, ``eye``, ``light`` and the coefficients; None where nothing is shaded.
+        """Make shading from plugin parameters: ``shade``, ``eye``, ``light`` and the coefficients; None if ``shade`` is false.
 
         Raises:
             MivolError: no eye, or a coefficient that is negative or not finite.
@@ -66,12 +63,12 @@ class Shading:
         return cls(eye, light, **numbers)
 
     def shade(self, colours: list[mi.Float], gradient: mi.Vector3f, p: mi.Point3f) -> list[mi.Float]:
-        """What points reflect; attached to colours, gradient and eye.
+        """Reflected light at points; attached to colours, gradient and eye.
 
         Args:
-            colours: of the points, a list of channels.
-            gradient: of the scan there, per length.
-            p: where they are in the world.
+            colours: list of channels at the points.
+            gradient: gradient of the scan at the points, per length.
+            p: positions of the points, world.
         """
         n = _normalize(gradient)
         to_eye = _normalize(self.eye - p)
@@ -83,7 +80,7 @@ class Shading:
 
 
 def gradient_grid(field: mi.TensorXf, to_world: np.ndarray) -> mi.TensorXf:
-    """The gradient of a scan at its voxels, (Z, Y, X, 3) along x, y and z of the world; attached to the scan.
+    """The gradient of a scan at its voxels, (Z, Y, X, 3), along x, y and z of the world; attached to the scan.
 
     Args:
         field: (Z, Y, X, 1).
@@ -96,7 +93,7 @@ def gradient_grid(field: mi.TensorXf, to_world: np.ndarray) -> mi.TensorXf:
     for axis, n in zip("xyz", reversed(res), strict=True):
         ends = [dr.clip(index[axis] + step, 0, n - 1) for step in (-1, 1)]
         before, after = (dr.gather(mi.Float, values, _flat_index({**index, axis: end}, res)) for end in ends)
-        # In the unit cube a voxel is 1 / n wide; along an axis of one voxel nothing changes.
+        # In the unit cube a voxel is 1 / n wide. Along an axis of one voxel the difference is 0.
         slopes.append(n * (after - before) / dr.maximum(mi.Float(ends[1] - ends[0]), 1))
     world = np.linalg.inv(np.asarray(to_world)[:3, :3]).T
     along = [sum(float(share) * slope for share, slope in zip(row, slopes, strict=True)) for row in world]
@@ -108,18 +105,18 @@ def _flat_index(index: dict[str, mi.Int32], res: tuple[int, ...]) -> mi.UInt32:
 
 
 def _normalize(v: mi.Vector3f) -> mi.Vector3f:
-    """Vectors of length 1; those that vanish stay."""
+    """Vectors of length 1; zero vectors stay zero."""
     length = dr.norm(v)
     return v / dr.select(length > 0, length, 1)
 
 
 def _positive_power(x: mi.Float, exponent: float) -> mi.Float:
-    """x^m for x of at least 0, with a slope of 0 at 0; 0^0 is 0, since there is no surface."""
+    """x^m for x of at least 0, with slope 0 at 0; 0^0 is 0, since a zero normal means no surface."""
     return dr.select(x > 0, dr.power(dr.select(x > 0, x, 1), exponent), 0)
 
 
 def _parse_point(props: mi.Properties, key: str) -> mi.Point3f | None:
-    """A point among plugin parameters, not compiled into kernels: cameras move."""
+    """A point from plugin parameters, opaque to kernels: a moving camera compiles no new kernel."""
     if key not in props:
         return None
     point = mi.Point3f(*(float(v) for v in np.array(props[key]).ravel()))

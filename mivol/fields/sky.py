@@ -1,9 +1,10 @@
-r"""Light from far away, by direction: what is behind a field.
+r"""Light from infinity by direction: the background of a radiance field.
 
 .. math:: u = \mathrm{atan2}(d_x, -d_z) / 2\pi, \qquad v = \arccos(d_y) / \pi
 
-Conventions. Those of Mitsuba 3.9's ``envmap`` without a ``to_world``, so a sky saved as an image is one there: columns at the
-middle of their share of u, round about; rows at v = j / (rows - 1), from pole to pole. Linear between them.
+Conventions. Mitsuba 3.9's ``envmap`` without a ``to_world`` uses the same map, so the image of a sky is an environment map:
+columns lie at the middle of their share of u, periodic; rows lie at v = j / (rows - 1), from pole to pole. Values between
+texels are linear.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ from mivol.files import read_exr
 __all__ = ["Sky", "read_sky"]
 
 TEXEL = 4
-"""Numbers a texel: rgb, and one that fills a packet."""
+"""Numbers of a texel: rgb, and one number that fills a packet."""
 
 
 @dataclass(frozen=True)
 class Sky:
-    """A map of directions.
+    """Radiance by direction.
 
     Attributes:
-        rows: from pole to pole; there are twice as many columns. At least 2.
+        rows: rows from pole to pole, at least 2; the image has twice as many columns.
         texels: Float, rgb and a 0 for each texel, row by row.
     """
 
@@ -38,7 +39,7 @@ class Sky:
 
     @classmethod
     def uniform(cls, rows: int, colour: np.ndarray | float) -> Sky:
-        """The same colour in all directions: (3,), or one number for a grey.
+        """Make a sky of one colour: (3,), or one number for a grey.
 
         Raises:
             MivolError: fewer than 2 rows.
@@ -49,38 +50,38 @@ class Sky:
 
     @classmethod
     def from_image(cls, image: np.ndarray) -> Sky:
-        """The sky of an image (n, 2 n, 3)."""
+        """Make a sky from an image (n, 2 n, 3)."""
         texels = np.zeros((*image.shape[:2], TEXEL), np.float32)
         texels[..., :3] = image
         return cls(image.shape[0], mi.Float(texels.reshape(-1)))
 
     def image(self) -> np.ndarray:
-        """(rows, 2 rows, 3) float32."""
+        """The image (rows, 2 rows, 3), float32."""
         return np.array(self.texels).reshape(self.rows, 2 * self.rows, TEXEL)[..., :3]
 
     def with_texels(self, texels: mi.Float) -> Sky:
-        """Another light from the same directions."""
+        """The sky with other texels."""
         return replace(self, texels=texels)
 
     def smooth(self, share: float) -> Sky:
-        """The sky whose texels have gone a share of the way to the mean of their four neighbours.
+        """Move each texel by a share towards the mean of its four neighbours.
 
-        Done again and again, it gives texels that no ray ends at the light of those around them.
+        Repeated steps give texels without rays the light of the texels around.
         """
         columns = 2 * self.rows
         entry = dr.arange(mi.UInt32, dr.width(self.texels))
         texel, part = entry // TEXEL, entry % TEXEL
         row, column = mi.Int32(texel // columns), mi.Int32(texel % columns)
 
-        def of(row: mi.Int32, column: mi.Int32) -> mi.Float:
+        def read(row: mi.Int32, column: mi.Int32) -> mi.Float:
             at = dr.clip(row, 0, self.rows - 1) * columns + (column + columns) % columns
             return dr.gather(mi.Float, self.texels, mi.UInt32(at) * TEXEL + part)
 
-        around = of(row - 1, column) + of(row + 1, column) + of(row, column - 1) + of(row, column + 1)
+        around = read(row - 1, column) + read(row + 1, column) + read(row, column - 1) + read(row, column + 1)
         return self.with_texels(dr.lerp(self.texels, around / 4, dr.opaque(mi.Float, share)))
 
     def _corners(self, d: mi.Vector3f) -> list[tuple[mi.UInt32, mi.Float]]:
-        """The 4 texels about directions, and their shares."""
+        """The 4 texels around directions, and their weights."""
         columns = 2 * self.rows
         wide, high = dr.opaque(mi.Float, columns), dr.opaque(mi.Float, self.rows - 1)
         u, v = dr.atan2(d.x, -d.z) * dr.inv_two_pi, dr.safe_acos(d.y) * dr.inv_pi
@@ -92,33 +93,33 @@ class Sky:
         left = dr.select(left < 0, left + last, left)
         right = dr.select(left + 1 == last, 0, left + 1)
         top = mi.Int32(j) * last
-        found = []
+        corners = []
         for row, wy in ((top, 1 - fy), (top + last, fy)):
-            found += [(mi.UInt32(row + left), wy * (1 - fx)), (mi.UInt32(row + right), wy * fx)]
-        return found
+            corners += [(mi.UInt32(row + left), wy * (1 - fx)), (mi.UInt32(row + right), wy * fx)]
+        return corners
 
     def eval(self, d: mi.Vector3f) -> mi.Color3f:
-        """Radiance from where unit directions point to."""
+        """Radiance from unit directions, which point to the sky."""
         colour = mi.Color3f(0)
-        for texel, share in self._corners(d):
+        for texel, weight in self._corners(d):
             packet = dr.gather(mi.ArrayXf, self.texels, texel, shape=(TEXEL, 1))
-            colour += mi.Color3f(packet[0], packet[1], packet[2]) * share
+            colour += mi.Color3f(packet[0], packet[1], packet[2]) * weight
         return colour
 
     def texel_gradient(self, d: mi.Vector3f, by: mi.Color3f) -> mi.Float:
-        """Derivatives with respect to ``texels`` of a scalar, from those with respect to what :meth:`eval` gives."""
+        """Derivatives of a scalar by ``texels``, from its derivatives by the radiance of :meth:`eval`."""
         total = dr.zeros(mi.Float, dr.width(self.texels))
-        for texel, share in self._corners(d):
-            packet = mi.ArrayXf([by.x * share, by.y * share, by.z * share, mi.Float(0)])
+        for texel, weight in self._corners(d):
+            packet = mi.ArrayXf([by.x * weight, by.y * weight, by.z * weight, mi.Float(0)])
             dr.scatter_add(total, packet, texel)
         return total
 
 
 def read_sky(path: Path) -> Sky:
-    """A sky that a fit wrote.
+    """Read the sky that a fit wrote.
 
     Raises:
-        MivolError: an image that is no sky.
+        MivolError: an image of another kind.
     """
     channels, _ = read_exr(path)
     image = np.stack([channels[name] for name in "RGB"], axis=-1) if {"R", "G", "B"} <= channels.keys() else np.zeros((1, 1, 3))

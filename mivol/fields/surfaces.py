@@ -1,18 +1,32 @@
-r"""Where a radiance field begins to be opaque, as triangles: the surface of one extinction.
+r"""Surfaces as triangle meshes by marching cubes: of a radiance field at one extinction, and of depth images of all views.
+
+Of a field. The surface of the extinction sigma is
 
 .. math:: \{x : a(\rho(x)) = \sigma\} = \{x : \rho(x) = a^{-1}(\sigma)\}
 
-since the activation a rises: the triangles follow what is interpolated, not what is shown of its nodes. Around the box is
-vacuum, so that a field that reaches a side is closed there, half a voxel outside at most. Levels of a nested field are followed
-one by one, each where no other level is: a surface ends a triangle behind the side of a level's box, and goes on in the next.
+since the activation a rises. Triangles follow the interpolated density, not the extinction at the nodes. The box is surrounded
+by vacuum, so a field that reaches a side is closed there, at most half a voxel outside. The levels of a nested field are meshed
+separately: a surface ends one triangle beyond the side of a level's box and continues in the next level.
 
-References: Lorensen and Cline 1987 (marching cubes); Lewiner et al. 2003 (without ambiguous cells, scikit-image's).
+Of depth images. A voxel centre at depth z on the line to a surface at depth d has the signed distance s = d - z. With the
+truncation t, a view contributes
+
+.. math:: v = \min(1, s / t) \quad \text{if} \quad s > -t,
+
+and nothing to voxels further behind, which the surface hides. The mean of v over all contributing views changes sign at the
+surface. A pixel without a surface marks its whole line as free. Unseen voxels count as inside, which closes surfaces between
+surrounding cameras. A view of a surface near the voxel weighs ten times a view of free space: depths of half-transparent
+matter disagree, and a single view through the matter would otherwise tear a hole. Matter thinner than the truncation loses
+accuracy: its far side moves outwards, and its rim shrinks if some pixels see the matter and others pass by.
+
+References: Lorensen and Cline 1987 (marching cubes); Lewiner et al. 2003 (without ambiguous cells, as in scikit-image);
+Curless, Levoy, A Volumetric Method for Building Complex Models from Range Images, 1996; Newcombe et al., KinectFusion, 2011.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -26,20 +40,15 @@ from mivol.files.mesh import Mesh
 from mivol.machine import available_memory
 from mivol.photos import Camera, project
 
-__all__ = ["INVERSES", "default_level", "vertex_normals", "extract_surface", "DepthView", "fuse_depths"]
-
-INVERSES: dict[str, Callable[[float], float]] = {
-    "none": lambda sigma: sigma,
-    "relu": lambda sigma: sigma,
-    "softplus": lambda sigma: sigma + math.log(-math.expm1(-sigma)),
-    "exp": math.log,
-}
-"""Name of an activation -> the stored density of an extinction above 0."""
+__all__ = ["DepthView", "default_level", "extract_surface", "fuse_depths", "vertex_normals"]
 
 
 def default_level(field: SphericalGrid) -> float:
-    """The extinction [1/length] of a surface: where a voxel's longest edge lets half of the light through, or, in a field that
-    is thinner than that, half of what its matter has (the mean extinction of its nodes, weighted by itself)."""
+    """The default extinction of a surface [1/length].
+
+    The smaller of two values: the extinction at which a voxel's longest edge transmits half of the light, and half the mean
+    extinction of the nodes, weighted by itself.
+    """
     edges = np.linalg.norm(field.to_world[:3, :3], axis=0) / field.res[::-1]
     sigma = np.array(field.activation_function.value_and_slope(mi.Float(field.values()[0]))[0], np.float64)
     total = sigma.sum()
@@ -48,51 +57,51 @@ def default_level(field: SphericalGrid) -> float:
 
 
 def extract_surface(field: SphericalGrid, level: float | None = None) -> Mesh:
-    """The surface of one extinction, with its colours as seen from outside along the normal.
+    """The surface of one extinction, with colours as seen from outside along the normal.
 
     Args:
-        field: any; a sparse one is laid out in full.
-        level: extinction [1/length]; None: :func:`default_level`, of each of the levels of a nested field.
+        field: any field; a sparse field is laid out densely.
+        level: extinction [1/length]; None: :func:`default_level`, for each level of a nested field.
 
     Returns:
-        World coordinates, counterclockwise from outside; normals are means of the triangles around a point.
+        A mesh in world coordinates, counterclockwise from outside. Normals are means of the triangles around a point.
 
-    Error: a corner is where linear interpolation along an edge of the grid meets the level, exactly; between corners the
+    Error: a vertex lies exactly where linear interpolation along an edge of the grid meets the level. Between vertices the
         triangles differ from the trilinear field by O(voxel^2).
 
     Raises:
-        MivolError: a level that is not above 0, or one that the field does not reach.
+        MivolError: a level that is not above 0 or that the field does not reach.
     """
     if level is not None and not 0 < level < math.inf:
         raise MivolError(f"the level {level:g} was given for a surface; an extinction above 0 is expected.")
     grids = [field.extract_level(number) for number in range(field.levels)] if field.levels > 1 else [field]
-    found, most, last = [], 0.0, len(grids) - 1
+    meshes, largest, last = [], 0.0, len(grids) - 1
     for number, grid in enumerate(grids):
         density = grid.to_dense()[0].transpose(2, 1, 0)
-        wanted = default_level(grid) if level is None else float(level)
-        raw = INVERSES[grid.activation](wanted)
-        most = max(most, float(np.array(grid.activation_function.value_and_slope(mi.Float(float(density.max())))[0])[0]))
+        sigma = default_level(grid) if level is None else float(level)
+        raw = grid.activation_function.inverse(sigma)
+        largest = max(largest, float(np.array(grid.activation_function.value_and_slope(mi.Float(float(density.max())))[0])[0]))
         inner = None if number == 0 else grids[number - 1].to_world
-        found += _extract_grid_surface(grid, density, raw, inner, number == last)
-    if not found:
-        raise MivolError(f"no node of the field reaches the extinction {wanted:g}, only {most:g}; give a lower level.")
-    firsts = np.cumsum([0, *(len(mesh.points) for mesh in found)])
-    faces = np.concatenate([mesh.faces + first for mesh, first in zip(found, firsts, strict=False)])
-    points, normals, colours = (np.concatenate([getattr(m, k) for m in found]) for k in ("points", "normals", "colours"))
+        meshes += _extract_grid_surface(grid, density, raw, inner, number == last)
+    if not meshes:
+        raise MivolError(f"no node of the field reaches the extinction {sigma:g}, only {largest:g}; give a lower level.")
+    firsts = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, firsts, strict=False)])
+    points, normals, colours = (np.concatenate([getattr(m, k) for m in meshes]) for k in ("points", "normals", "colours"))
     return Mesh(points, faces, normals, colours)
 
 
 def _extract_grid_surface(
     grid: SphericalGrid, density: np.ndarray, raw: float, inner: np.ndarray | None, closes: bool
 ) -> list[Mesh]:
-    """The surface of one grid; none where nothing reaches it, or all of it is left out.
+    """The surface of one grid; an empty list if the grid does not reach the level or all triangles are left out.
 
     Args:
-        grid: the grid.
-        density: its nodes, in the order X Y Z.
-        raw: the stored density of the surface.
-        inner: a box in which it is left out; None for none.
-        closes: whether it is closed at the sides of its box; else it is cut off there, since another grid goes on behind them.
+        grid: grid of one level.
+        density: raw densities at the nodes, (X, Y, Z).
+        raw: raw density of the surface.
+        inner: box without triangles; None: no box.
+        closes: whether the surface is closed at the sides of the box. Otherwise it is cut there and continues in the next grid.
     """
     from skimage.measure import marching_cubes  # slow to import
 
@@ -105,7 +114,7 @@ def _extract_grid_surface(
     if np.linalg.det(grid.to_world[:3, :3]) < 0:
         faces = faces[:, ::-1]
     normals = vertex_normals(points, faces)
-    # Levels overlap by a triangle at the side of a box, so that no gap is seen between them.
+    # Levels overlap by one triangle at the side of a box, which leaves no visible gap.
     kept = np.ones(len(faces), bool) if closes else _find_inside(grid.to_world, points)[faces].any(axis=1)
     if inner is not None:
         kept &= ~_find_inside(inner, points)[faces].all(axis=1)
@@ -123,13 +132,13 @@ def _find_inside(box: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _to_world(field: SphericalGrid, nodes: np.ndarray) -> np.ndarray:
-    """World places of lattice coordinates (x, y, z), node n at n."""
+    """World positions of lattice coordinates (x, y, z)."""
     unit = (nodes.astype(np.float64) + 0.5) / field.res[::-1]
     return unit @ field.to_world[:3, :3].T + field.to_world[:3, 3]
 
 
 def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit means over the triangles at each point, weighted by their areas."""
+    """Unit means of the normals of the triangles at each point, weighted by area."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     total = np.zeros_like(points)
@@ -140,7 +149,7 @@ def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _eval_colours(field: SphericalGrid, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """What a ray that comes in against the normal sees; corners outside the box show the nearest place in it."""
+    """Colours seen by rays against the normals; points outside the box show the nearest point inside."""
     inverse = np.linalg.inv(field.to_world)
     inside = np.clip(points @ inverse[:3, :3].T + inverse[:3, 3], 1e-6, 1 - 1e-6) @ field.to_world[:3, :3].T
     p, d = (np.ascontiguousarray(v.T, np.float32) for v in (inside + field.to_world[:3, 3], -normals))
@@ -149,19 +158,19 @@ def _eval_colours(field: SphericalGrid, points: np.ndarray, normals: np.ndarray)
 
 
 FREE_SPACE_WEIGHT = 0.1
-"""Weight of a view that says no more than "in front", over that of one that sees a surface near."""
+"""Weight of a view of free space; a view of a near surface has weight 1."""
 
 TRUNCATION = 4.0
-"""Distance beyond which a view says no more than "in front" [voxel]."""
+"""Distance in front of a surface beyond which space counts as free [voxel]."""
 
 
 @dataclass(frozen=True)
 class DepthView:
-    """What a camera saw.
+    """A depth image of a posed camera.
 
     Attributes:
-        camera: without a distorting lens.
-        depth: (H, W) along the axis of the camera [length]; infinite where nothing is.
+        camera: camera without lens distortion.
+        depth: (H, W) depth along the axis of the camera [length]; infinite without a surface.
         colour: (H, W, 3) in 0..1.
     """
 
@@ -171,19 +180,19 @@ class DepthView:
 
 
 def fuse_depths(views: Iterable[DepthView], low: np.ndarray, high: np.ndarray, resolution: int) -> Mesh:
-    """The surface that pictures of distances agree on.
+    """The common surface of depth images.
 
     Args:
-        views: from all around; each is looked at once.
-        low, high: (3,) corners of a box [length]; what lies outside is left out.
-        resolution: voxels along its longest edge; they are cubes.
+        views: depth images from all sides; the iterable is read once.
+        low, high: (3,) corners of a box [length]; surfaces outside are left out.
+        resolution: voxels along the longest edge; voxels are cubes.
 
     Returns:
-        A mesh with colours, closed but where it is cut by the box; counterclockwise from outside.
+        A mesh with colours, counterclockwise from outside, closed except at the sides of the box.
 
     Raises:
-        MivolError: a box without volume, a resolution below 2, more memory than is free, with the resolution that fits, or
-            pictures that show no surface in the box.
+        MivolError: a box without volume, a resolution below 2, a grid larger than the free memory (the message has the
+            resolution that fits), or no surface in the box.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     if not (np.isfinite([low, high]).all() and (high > low).all()) or resolution < 2:
@@ -199,7 +208,7 @@ def fuse_depths(views: Iterable[DepthView], low: np.ndarray, high: np.ndarray, r
         fused.add(view)
     distance = fused.distance()
     if not distance.min() < 0 < distance.max():
-        raise MivolError("no surface was seen in the box; give a box that holds one, and views that see it.")
+        raise MivolError("no surface was seen in the box; give a box with a surface, and views of the surface.")
     nodes, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
     points = low + (nodes + 0.5) * voxel
     colours = np.stack([map_coordinates(channel, nodes.T, order=1, mode="nearest") for channel in fused.colours()], axis=1)
@@ -207,7 +216,7 @@ def fuse_depths(views: Iterable[DepthView], low: np.ndarray, high: np.ndarray, r
 
 
 VOXEL_BYTES = 64
-"""Of a voxel: six sums, their means, and the distances as marching cubes takes them."""
+"""Memory of a voxel [bytes]: six sums, their means, and the distances for marching cubes."""
 
 
 def _check_memory(extent: np.ndarray, resolution: int) -> None:
@@ -221,41 +230,41 @@ def _check_memory(extent: np.ndarray, resolution: int) -> None:
 
 
 class _FusedDepths:
-    """Sums over views at the centres of voxels, (X, Y, Z)."""
+    """Sums over views at voxel centres, (X, Y, Z)."""
 
     def __init__(self, low: np.ndarray, voxel: float, size: np.ndarray) -> None:
         self.low, self.voxel, self.size = low, voxel, size
-        self.total, self.said = np.zeros(size, np.float32), np.zeros(size, np.float32)
-        self.colour, self.coloured = np.zeros((3, *size), np.float32), np.zeros(size, np.float32)
+        self.total, self.weight = np.zeros(size, np.float32), np.zeros(size, np.float32)
+        self.colour, self.colour_weight = np.zeros((3, *size), np.float32), np.zeros(size, np.float32)
 
     def add(self, view: DepthView) -> None:
-        """Take a view into account, slab by slab."""
+        """Add a view, slab by slab."""
         y, z = (self.low[a] + (np.arange(self.size[a]) + 0.5) * self.voxel for a in (1, 2))
         for i in range(self.size[0]):
             x = self.low[0] + (i + 0.5) * self.voxel
-            places = np.stack(np.broadcast_arrays(x, *np.meshgrid(y, z, indexing="ij")), axis=-1).reshape(-1, 3)
-            self._add_slab(i, view, places)
+            positions = np.stack(np.broadcast_arrays(x, *np.meshgrid(y, z, indexing="ij")), axis=-1).reshape(-1, 3)
+            self._add_slab(i, view, positions)
 
-    def _add_slab(self, i: int, view: DepthView, places: np.ndarray) -> None:
-        pixel, depth = project(view.camera, places)
+    def _add_slab(self, i: int, view: DepthView, positions: np.ndarray) -> None:
+        pixel, depth = project(view.camera, positions)
         with np.errstate(invalid="ignore"):
-            seen = np.flatnonzero((depth > 0) & ((pixel >= 0) & (pixel < view.camera.size)).all(axis=1))
-        column, row = pixel[seen].astype(int).T
-        away = (view.depth[row, column] - depth[seen]) / (TRUNCATION * self.voxel)
-        told = away > -1
-        seen, row, column, away = seen[told], row[told], column[told], away[told]
-        near = away < 1
+            visible = np.flatnonzero((depth > 0) & ((pixel >= 0) & (pixel < view.camera.size)).all(axis=1))
+        column, row = pixel[visible].astype(int).T
+        distance = (view.depth[row, column] - depth[visible]) / (TRUNCATION * self.voxel)
+        in_front = distance > -1
+        visible, row, column, distance = visible[in_front], row[in_front], column[in_front], distance[in_front]
+        near = distance < 1
         weight = np.where(near, 1, FREE_SPACE_WEIGHT)
-        self.total[i].reshape(-1)[seen] += weight * np.minimum(away, 1)
-        self.said[i].reshape(-1)[seen] += weight
-        self.coloured[i].reshape(-1)[seen[near]] += 1
+        self.total[i].reshape(-1)[visible] += weight * np.minimum(distance, 1)
+        self.weight[i].reshape(-1)[visible] += weight
+        self.colour_weight[i].reshape(-1)[visible[near]] += 1
         for channel in range(3):
-            self.colour[channel, i].reshape(-1)[seen[near]] += view.colour[row[near], column[near], channel]
+            self.colour[channel, i].reshape(-1)[visible[near]] += view.colour[row[near], column[near], channel]
 
     def distance(self) -> np.ndarray:
-        """Mean signed distance [truncation], above 0 outside; -1 where no view says anything."""
-        return np.where(self.said > 0, self.total / np.maximum(self.said, 1), -1)
+        """Mean signed distance [truncation], positive outside; -1 without a view."""
+        return np.where(self.weight > 0, self.total / np.maximum(self.weight, 1), -1)
 
     def colours(self) -> np.ndarray:
         """(3, X, Y, Z) mean colours near the surface."""
-        return self.colour / np.maximum(self.coloured, 1)
+        return self.colour / np.maximum(self.colour_weight, 1)

@@ -1,19 +1,20 @@
-r"""A scalar field seen through a transfer function: what value is how opaque, and of which colour.
+r"""A scan seen through a transfer function: a table that maps scalar values to opacities or colours.
 
 .. math:: y(x) = (1 - f) y_i + f y_{i+1}, \qquad i + f = (n - 1)\, \frac{s(x) - s_0}{s_1 - s_0}
 
-for a table y of n entries at equal steps of the value s from s_0 to s_1; values beyond them have the entry at the end. Given as
-``sigma_t`` and as ``emission`` of a ``mivol_medium`` two such fields are the emission-absorption model of scans (Max 1995).
-The scan's gradient may take part: :mod:`mivol.fields.shading`.
+A table y has n entries at equal steps of the value s from s_0 to s_1 (its domain); values outside the domain use the entry at
+the end. Two such fields as ``sigma_t`` and ``emission`` of a ``mivol_medium`` are the emission-absorption model of scans (Max
+1995). The gradient of the scan can shade colours (:mod:`mivol.fields.shading`), and a second table of its magnitude can scale
+opacities, which keeps the boundaries between materials and removes their insides (Levoy 1988; Kindlmann and Durkin 1998).
 
-Conventions. The scalar grid is (Z, Y, X, 1), voxel centres, clamped borders, and may hold any finite number (Hounsfield
-units are negative in air). It is refined ``refine`` times in each direction, then looked up, and what comes out is a grid like
-any other: linear between its nodes. Classification therefore comes before that last interpolation, and what a table
-does within a voxel is resolved to 1 / refine of it. Derivatives by the table and by the scalar grid are those of the look-up.
+Conventions. The scalar grid is (Z, Y, X, 1) with values at voxel centres and clamped borders, and holds any finite numbers
+(Hounsfield units are negative in air). The grid is refined ``refine`` times in each direction, then classified. The result is
+an ordinary grid, linear between its nodes, so classification precedes the last interpolation and resolves a table within a
+voxel to 1 / refine. Derivatives with respect to table and scalar grid pass through the look-up.
 
-Bias: second order in 1 / refine, once a node's cell has one kink of the table at most (measured in
-tests/conformance/test_transfer.py: 5e-2, 1.2e-2, 5e-3 and 3e-3 at refine 1, 3, 5 and 7 for a voxel that passes one or two).
-An odd number keeps the scan's own nodes, where it has its peaks. Cost: memory grows with the cube of refine.
+Bias: second order in 1 / refine, if the cell of a node contains at most one kink of the table. Measured in
+tests/conformance/test_transfer.py: 5e-2, 1.2e-2, 5e-3 and 3e-3 at refine 1, 3, 5 and 7 for voxels with one or two kinks. An odd
+number keeps the nodes of the scan, where the scan has its peaks. Cost: memory grows with the cube of refine.
 """
 
 from __future__ import annotations
@@ -42,7 +43,13 @@ __all__ = [
 
 
 def look_up(table: mi.TensorXf, domain: tuple[float, float], s: mi.Float) -> list[mi.Float]:
-    """The table at values s, a list of channels; attached to both."""
+    """Entries of a table at values s, a list of channels; attached to both.
+
+    Args:
+        table: (n, C) entries.
+        domain: values of the first and the last entry.
+        s: values.
+    """
     n, channels = table.shape
     low, high = domain
     u = dr.clip((s - low) * ((n - 1) / (high - low)), 0, n - 1)
@@ -53,10 +60,14 @@ def look_up(table: mi.TensorXf, domain: tuple[float, float], s: mi.Float) -> lis
 
 
 def parse_table(text: object, what: str) -> np.ndarray:
-    """Rows between commas, numbers between spaces: (n, C).
+    """Entries (n, C) of a text: commas between rows, spaces between numbers.
+
+    Args:
+        text: plugin parameter.
+        what: name of the parameter in messages.
 
     Raises:
-        MivolError: other things than numbers.
+        MivolError: text other than numbers.
     """
     try:
         return np.array([[float(v) for v in row.split()] for row in str(text).split(",")])
@@ -65,10 +76,10 @@ def parse_table(text: object, what: str) -> np.ndarray:
 
 
 def parse_domain(text: object, what: str) -> tuple[float, float]:
-    """The two ends of a domain.
+    """The two ends of a domain from a text.
 
     Raises:
-        MivolError: other things than two numbers.
+        MivolError: text other than two numbers.
     """
     ends = parse_table(text, what).ravel().tolist()
     if len(ends) != 2:
@@ -77,15 +88,15 @@ def parse_domain(text: object, what: str) -> tuple[float, float]:
 
 
 def check_table(rows: np.ndarray, what: str, channels: tuple[int, ...] = (1, 3)) -> None:
-    """Refuse what is no table.
+    """Check the entries of a table.
 
     Args:
         rows: (n, C).
-        what: the table's name in a sentence.
-        channels: how many numbers an entry may have.
+        what: name of the table in messages.
+        channels: allowed numbers of channels.
 
     Raises:
-        MivolError: fewer than two entries, another number of channels, entries that are negative or not finite.
+        MivolError: fewer than two entries, another number of channels, or entries that are negative or not finite.
     """
     if rows.ndim != 2 or rows.shape[0] < 2 or rows.shape[1] not in channels or not (np.isfinite(rows) & (rows >= 0)).all():
         raise MivolError(
@@ -95,10 +106,10 @@ def check_table(rows: np.ndarray, what: str, channels: tuple[int, ...] = (1, 3))
 
 
 def check_domain(domain: tuple[float, float], what: str) -> None:
-    """Refuse ends that are not finite or not in rising order.
+    """Check the ends of a domain.
 
     Raises:
-        MivolError: such ends.
+        MivolError: ends that are not finite or not in rising order.
     """
     low, high = domain
     if not (np.isfinite([low, high]).all() and low < high):
@@ -107,29 +118,29 @@ def check_domain(domain: tuple[float, float], what: str) -> None:
 
 @dataclass(frozen=True)
 class GradientOpacity:
-    """Factors on a table's entries by the magnitude of the gradient.
+    """Factors on the entries of a table by the magnitude of the scan's gradient.
 
     Attributes:
         table: (n, 1), factors of at least 0.
-        domain: magnitudes [value of the scan per length] of the first and the last factor.
+        domain: magnitudes [value of the scan / length] of the first and the last factor.
     """
 
     table: mi.TensorXf
     domain: tuple[float, float]
 
     @classmethod
-    def from_props(cls, props: mi.Properties, name: str, most: float) -> GradientOpacity | None:
-        """Build from plugin parameters: ``gradient_opacity`` and ``gradient_domain``; None where there is no table.
+    def from_props(cls, props: mi.Properties, name: str, max_gradient: float) -> GradientOpacity | None:
+        """Make factors from plugin parameters: ``gradient_opacity`` and ``gradient_domain``; None without a table.
 
         Args:
-            props: of the plugin.
-            name: of the plugin in a sentence.
-            most: the largest magnitude of the scan's gradient: where the last factor is, unless a domain is given.
+            props: parameters of the plugin.
+            name: name of the plugin in messages.
+            max_gradient: largest magnitude of the scan's gradient, the default end of the domain.
 
         Raises:
-            MivolError: a table or a domain of another kind.
+            MivolError: an invalid table or domain.
         """
-        domain = (0.0, most or 1.0)
+        domain = (0.0, max_gradient or 1.0)
         if "gradient_domain" in props:
             domain = parse_domain(props["gradient_domain"], f"the gradient_domain of {name}")
         if "gradient_opacity" not in props:
@@ -140,23 +151,29 @@ class GradientOpacity:
         return cls(mi.TensorXf(np.ascontiguousarray(rows, dtype=np.float32)), domain)
 
     def factor(self, gradient: mi.Vector3f) -> mi.Float:
-        """The factor at points of such gradients."""
+        """Factors at points with the given gradients."""
         return look_up(self.table, self.domain, dr.norm(gradient))[0]
 
 
 @dataclass(frozen=True)
 class GradientEffects:
-    """What is made of a scan's gradient: factors, light, both or nothing."""
+    """Effects of a scan's gradient: opacity factors, shading, both or none."""
 
     opacity: GradientOpacity | None = None
     shading: Shading | None = None
 
     @classmethod
     def from_props(cls, props: mi.Properties, field: mi.TensorXf, to_world: np.ndarray, name: str) -> GradientEffects:
-        """Build from the parameters of a plugin that shows a scan (Z, Y, X, 1) in a box of the world.
+        """Make effects from the parameters of a plugin.
+
+        Args:
+            props: parameters of the plugin.
+            field: scan (Z, Y, X, 1).
+            to_world: (4, 4), unit cube to world.
+            name: name of the plugin in messages.
 
         Raises:
-            MivolError: as :class:`Shading` and :class:`GradientOpacity`.
+            MivolError: as :class:`GradientOpacity` and :class:`mivol.fields.shading.Shading`.
         """
         needs_most = "gradient_opacity" in props and "gradient_domain" not in props
         with dr.suspend_grad():
@@ -164,12 +181,12 @@ class GradientEffects:
         return cls(GradientOpacity.from_props(props, name, float(most)), Shading.from_props(props, name))
 
     @property
-    def is_flat(self) -> bool:
-        """Whether the gradient changes nothing."""
+    def is_empty(self) -> bool:
+        """Whether the gradient has no effect."""
         return self.opacity is None and self.shading is None
 
     def apply(self, entries: list[mi.Float], gradient: mi.Vector3f, p: mi.Point3f) -> list[mi.Float]:
-        """A table's entries at points of the world, times their factor, and lit."""
+        """Entries of a table at points of the world after factors and shading."""
         if self.opacity is not None:
             factor = self.opacity.factor(gradient)
             entries = [entry * factor for entry in entries]
@@ -177,19 +194,19 @@ class GradientEffects:
 
 
 class Transfer:
-    """A grid that is a table of another one.
+    """A grid classified by a table.
 
     Args:
         field: scalar values (Z, Y, X, 1), finite.
-        table: (n, C) entries, n at least 2, C 1 or 3, finite and at least 0, and the values [of the field] of the first and
-            the last entry.
-        refine: how many nodes stand for a voxel in each direction.
+        table: (n, C) entries, n at least 2, C 1 or 3, finite and at least 0; and the values [of the field] of the first and the
+            last entry.
+        refine: nodes per voxel in each direction.
         to_world: (4, 4) affine map of the unit cube to the world.
-        name: what the grid is called in a sentence that refuses it.
-        effects: what is made of the field's gradient.
+        name: name of the grid in messages.
+        effects: effects of the field's gradient.
 
     Raises:
-        MivolError: a field, a table, a domain or a placement of another kind.
+        MivolError: an invalid field, table, domain or placement.
     """
 
     def __init__(
@@ -210,10 +227,13 @@ class Transfer:
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Transfer:
-        """Build from plugin parameters: ``filename`` or ``data``; ``table``; ``domain``; ``refine``; ``to_world``; a effects's.
+        """Make a grid from plugin parameters.
+
+        The parameters are ``filename`` or ``data``, ``table``, ``domain``, ``refine``, ``to_world``, and those of
+        :class:`GradientEffects`.
 
         Raises:
-            MivolError: as the class, or a text that holds other things than numbers.
+            MivolError: as the class, or a text with other contents than numbers.
         """
         name = f"mivol_transfer {props.id()}".strip()
         sources = [k for k in ("filename", "data") if k in props]
@@ -233,22 +253,22 @@ class Transfer:
         return cls(field, (table, domain), refine, place, name, GradientEffects.from_props(props, field, place, name))
 
     def classify(self) -> mi.TensorXf:
-        """The table's entries at the nodes of the refined grid, (Z, Y, X, C), with derivatives by table and field."""
-        (s,), res = self._refined(self.field)
+        """Entries of the table at the nodes of the refined grid, (Z, Y, X, C); derivatives by table and field pass through."""
+        (s,), res = self._refine(self.field)
         rows = self._entries(s)
-        if not self.effects.is_flat:
-            gradient, _ = self._refined(gradient_grid(self.field, self.to_world))
-            rows = self.effects.apply(rows, mi.Vector3f(*gradient), self._places(res))
+        if not self.effects.is_empty:
+            gradient, _ = self._refine(gradient_grid(self.field, self.to_world))
+            rows = self.effects.apply(rows, mi.Vector3f(*gradient), self._world_positions(res))
         flat = rows[0] if len(rows) == 1 else dr.ravel(mi.Vector3f(*rows))
         return mi.TensorXf(flat, (*res, len(rows)))
 
     def interpolation_error(self) -> float:
-        """How far the classified grid is from the table half-way between its nodes: rms over its edges, in its largest entry.
+        """Difference between the classified grid and the table half-way between nodes: rms over edges / largest entry.
 
         Cost: 9 look-ups a node of the refined grid.
         """
         with dr.suspend_grad():
-            (s,), res = self._refined(self.field)
+            (s,), res = self._refine(self.field)
             values, squares = np.array(s).reshape(res), []
             for axis in range(3):
                 ends = [mi.Float(values.take(range(k, res[axis] - 1 + k), axis).ravel()) for k in (0, 1)]
@@ -259,29 +279,29 @@ class Transfer:
         return float(np.sqrt(np.concatenate(squares).mean())) / largest if squares and largest > 0 else 0.0
 
     def _entries(self, s: mi.Float) -> list[mi.Float]:
-        """The table at scalar values, a list of channels."""
+        """Entries of the table at scalar values, a list of channels."""
         return look_up(self.table, self.domain, s)
 
     def refresh(self) -> None:
-        """Take over a table or a field that was replaced from outside.
+        """Classify again after the table or the field was replaced.
 
         Raises:
-            MivolError: as the class (values are looked at, unless ``dr.freeze`` is recording).
+            MivolError: as the class; values are not checked while ``dr.freeze`` records.
         """
         if not dr.flag(dr.JitFlag.FreezingScope):
             self._check()
         self.voxels.texture.set_tensor(self.classify())
 
-    def _refined(self, grid: mi.TensorXf) -> tuple[list[mi.Float], tuple[int, int, int]]:
-        """A grid (Z, Y, X, C) at the nodes of the refined grid, a list of channels, and its resolution (Z, Y, X)."""
+    def _refine(self, grid: mi.TensorXf) -> tuple[list[mi.Float], tuple[int, int, int]]:
+        """A grid (Z, Y, X, C) at the nodes of the refined grid: a list of channels, and the resolution (Z, Y, X)."""
         k, (z, y, x, channels) = self.refine, grid.shape
         if k == 1:
             return [dr.ravel(grid)] if channels == 1 else list(dr.unravel(mi.Vector3f, grid.array)), (z, y, x)
         texture = mi.Texture3f(grid, use_accel=False, migrate=False)
         return texture.eval(_node_positions((k * z, k * y, k * x))), (k * z, k * y, k * x)
 
-    def _places(self, res: tuple[int, int, int]) -> mi.Point3f:
-        """The nodes of the refined grid in the world."""
+    def _world_positions(self, res: tuple[int, int, int]) -> mi.Point3f:
+        """World positions of the nodes of the refined grid."""
         return mi.AffineTransform4f(mi.ScalarMatrix4f(self.to_world)) @ _node_positions(res)
 
     def _check(self) -> None:
@@ -293,18 +313,18 @@ class Transfer:
 
 
 def _add_channel_axis(field: mi.TensorXf) -> mi.TensorXf:
-    """Scalar values with their axis of one channel."""
+    """Scalar values with an axis of one channel."""
     return field if len(field.shape) != 3 else mi.TensorXf(field.array, (*field.shape, 1))
 
 
 def _value_range(field: mi.TensorXf) -> tuple[float, float]:
-    """The least and the largest value."""
+    """The smallest and the largest value."""
     values = np.array(dr.detach(field))
     return (float(np.min(values)), float(np.max(values))) if values.size else (0.0, 0.0)
 
 
 def _node_positions(res: tuple[int, int, int]) -> mi.Point3f:
-    """The nodes of a grid in the unit cube."""
+    """Nodes of a grid in the unit cube."""
     z, y, x = dr.meshgrid(*[(dr.arange(mi.Float, n) + 0.5) / n for n in res], indexing="ij")
     return mi.Point3f(x, y, z)
 

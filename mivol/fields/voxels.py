@@ -1,7 +1,7 @@
-"""A dense grid of values at voxel centres, trilinear between them, constant in the outer half voxel, vacuum outside.
+"""A dense grid of values at voxel centres: trilinear between centres, constant in the outer half voxel, vacuum outside.
 
-Conventions. The same model as Mitsuba's ``gridvolume`` (clamped borders), to the last bit: values (Z, Y, X, C) over the unit
-cube, which ``to_world`` places. The tensor that ``mi.traverse`` hands out is the one that is evaluated.
+Conventions. The model of Mitsuba's ``gridvolume`` with clamped borders, equal to the last bit: values (Z, Y, X, C) over the
+unit cube under ``to_world``. ``mi.traverse`` hands out the very tensor that is evaluated.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ class Voxels:
     Args:
         values: (Z, Y, X, C), 1 or 3 channels, finite, and not negative unless ``signed``.
         to_world: (4, 4) affine map of the unit cube to the world.
-        name: what the grid is called in a sentence that refuses it.
-        to_local: the inverse that Mitsuba keeps of ``to_world``, rounded as it rounds; None to invert it here.
-        signed: values may be negative, as the ``g`` of a phase function; whoever reads them as an extinction counts those as 0.
+        name: name of the grid in messages.
+        to_local: Mitsuba's inverse of ``to_world``, with Mitsuba's rounding; None: computed here.
+        signed: whether values may be negative, as the ``g`` of a phase function. A reader that needs an extinction clamps them
+            to 0.
 
     Raises:
-        MivolError: values or a placement that no medium can have; the first bad voxel is named.
+        MivolError: values or a placement that no medium can have; the message names the first bad voxel.
     """
 
     line = EXACT_LINE
@@ -46,14 +47,14 @@ class Voxels:
         self.to_world = check_affine(to_world, f"to_world of {name}")
         tensor = values if isinstance(values, mi.TensorXf) else mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
         check_volume(np.array(dr.detach(tensor)), name=name, minimum=None if signed else 0.0)
-        # Never a texture of a GPU's hardware: its weights have 8 bits.
+        # No hardware texture of a GPU: its interpolation weights have 8 bits.
         self.texture = mi.Texture3f(tensor, use_accel=False, migrate=False)
         to_local = np.linalg.inv(self.to_world) if to_local is None else to_local
         self.to_local = mi.ScalarAffineTransform4f(mi.ScalarMatrix4f(to_local), mi.ScalarMatrix4f(self.to_world.T))
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Voxels:
-        """Build from plugin parameters: ``filename``, ``grid`` or ``data``; ``to_world``, ``use_grid_bbox``, ``signed``."""
+        """Make a grid from plugin parameters: ``filename``, ``grid`` or ``data``; box and sign options."""
         sources = [k for k in ("filename", "grid", "data") if k in props]
         name = f"mivol_voxels {props.id()}".strip()
         if len(sources) != 1:
@@ -88,10 +89,10 @@ class Voxels:
 
     @property
     def freezable_texture(self) -> mi.Texture3f | None:
-        """What a plugin shows to ``dr.freeze``, which finds arrays among a plugin's own attributes only.
+        """The texture as an attribute of a plugin; ``dr.freeze`` finds arrays only among a plugin's own attributes.
 
-        None on a GPU: Dr.Jit 1.5 then takes memory that nothing was written to for the handle of a hardware texture, which this
-        one has not, and the process is aborted ("unknown variable"; ``Texture::traverse_1_cb_ro``).
+        None on a GPU, where Dr.Jit 1.5 would read uninitialised memory as the handle of a hardware texture and abort the
+        process ("unknown variable"; ``Texture::traverse_1_cb_ro``).
         """
         return self.texture if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else None
 
@@ -100,7 +101,7 @@ class Voxels:
         """The values, (Z, Y, X, C).
 
         Raises:
-            MivolError: ``dr.freeze`` records, and cannot follow them.
+            MivolError: ``dr.freeze`` records and cannot follow the values.
         """
         if self.freezable_texture is None and dr.flag(dr.JitFlag.FreezingScope):
             advice = "render without it, use llvm_ad_rgb, or a gridvolume of Mitsuba's"
@@ -109,7 +110,7 @@ class Voxels:
 
     @property
     def channels(self) -> int:
-        """Number of values at each voxel."""
+        """Number of channels."""
         return self.tensor.shape[3]
 
     @property
@@ -118,13 +119,13 @@ class Voxels:
         return tuple(self.tensor.shape[:3])
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f | None = None, active: mi.Bool = True) -> list[mi.Float]:
-        """Values at world points, one entry a channel; 0 outside the box. The direction ``w`` changes nothing."""
+        """Values at world points, a list of channels; 0 outside the box. The direction ``w`` has no effect."""
         q = mi.AffineTransform4f(self.to_local) @ p
         inside = mi.Bool(active) & dr.all((q >= 0) & (q <= 1))
         return [dr.select(inside, v, 0) for v in self.texture.eval(q, inside)]
 
     def eval_colour(self, p: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
-        """As :meth:`eval`; an rgb grid has one channel, its luminance, in a mono variant, as ``gridvolume`` has it."""
+        """Values as :meth:`eval`; in a mono variant an rgb grid has one channel, its luminance, as in ``gridvolume``."""
         values = self.eval(p, None, active)
         return [mi.luminance(mi.Color3f(*values))] if mi.is_monochromatic and len(values) == 3 else values
 
@@ -147,13 +148,13 @@ class Voxels:
         return (unit @ self.to_world.T)[:, :3]
 
     def refresh(self) -> None:
-        """Take over values that were replaced from outside.
+        """Update the texture after values were replaced.
 
-        Values below 0 are taken, since steps of optimisers overshoot: an extinction counts them as 0, whoever else reads them
-        refuses those that it cannot use.
+        Negative values are accepted, since optimizer steps overshoot. An extinction clamps them to 0; other readers refuse
+        invalid values.
 
         Raises:
-            MivolError: NaN or infinite values (looked at, unless ``dr.freeze`` is recording).
+            MivolError: NaN or infinite values; not checked while ``dr.freeze`` records.
         """
         self.texture.update_inplace()
         if dr.flag(dr.JitFlag.FreezingScope):
@@ -167,9 +168,9 @@ class Voxels:
 
 
 def _check_inverse(to_world: np.ndarray, to_local: np.ndarray, name: str) -> None:
-    """Refuse a transform that Mitsuba goes back by another way than it came.
+    """Refuse a transform whose inverse in Mitsuba disagrees.
 
-    1e-2: a float32 inverse of edges at right angles is right to 1e-6 of them, and one of a box sheared a thousandfold to 1e-3.
+    Tolerance 1e-2: a float32 inverse has a relative error of 1e-6 for orthogonal edges, and 1e-3 for a box sheared by 1000.
     """
     edges = np.linalg.norm(to_world[:3, :3], axis=0)
     back = edges[:, None] * (to_local[:3, :3] @ to_world[:3, :3]) / edges
