@@ -12,7 +12,7 @@ from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.segment import Collision
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.event import NextDirection, PathEvent, TurnSamples, sample_next_direction
+from mivol.transport.path.event import NextDirection, PathEvent, sample_next_direction
 from scenes import camera, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -44,9 +44,10 @@ class Bench:
         hit = None if in_medium is None else Collision(mei, mi.Point3d(mei.p), mi.Spectrum(ALBEDO), on, t, mi.UInt32(0))
         around = dr.select(dr.full(mi.Bool, True, 4), mi.MediumPtr(self.fog), None)
         event = PathEvent(si, si.t, around, ~on & si.is_valid(), hit)
-        numbers = TurnSamples(mi.Float(component), mi.Point2f(0.3, 0.6))
         with dr.suspend_grad():
-            return sample_next_direction(self.estimators, ray, event, numbers, mi.Bool(may_scatter))
+            return sample_next_direction(
+                self.estimators, ray, event, mi.Float(component), mi.Point2f(0.3, 0.6), mi.Bool(may_scatter)
+            )
 
 
 def test_a_diffuse_wall_turns_paths_that_may_scatter():

@@ -76,7 +76,7 @@ class Collision:
 
     Attributes:
         mei: the point, and its medium, as Mitsuba's phase functions are evaluated at it.
-        place: the point in float64.
+        p: the point in float64.
         albedo: probability [1] that it scatters, of each colour.
         on: lanes whose flight ends so; the others reach the end of their segment.
         t: its distance on the ray [length].
@@ -84,7 +84,7 @@ class Collision:
     """
 
     mei: mi.MediumInteraction3f
-    place: mi.Point3d
+    p: mi.Point3d
     albedo: mi.Spectrum
     on: mi.Bool
     t: mi.Float64

@@ -1,1 +1,1 @@
-"""The walk of a path from the camera, the scores that it is told to, and the film."""
+"""Paths from the camera through media and surfaces, and the film that averages their radiance."""

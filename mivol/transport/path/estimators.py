@@ -1,8 +1,7 @@
-"""The table of estimators that a plan chooses from by name, and the estimators of one render.
+"""The table of segment estimators from which a plan chooses, and the estimators and settings of one render.
 
-Each entry states which scenes the estimator can render, its bias and variance, and the papers that it follows. The plan picks
-one for the segments of a path, ``mivol explain`` prints it, and tests measure what is promised.
-"""
+Each entry states the scenes that the estimator can render, its bias and variance, and the papers it follows. The plan chooses
+one entry for the segments of a path, ``mivol explain`` prints it, and tests measure its promises."""
 
 from __future__ import annotations
 
@@ -28,31 +27,31 @@ from mivol.transport.media.scene_media import SceneMedia
 __all__ = [
     "SEGMENT_ESTIMATORS",
     "Estimators",
-    "SegmentInputs",
     "SegmentEntry",
+    "SegmentInputs",
     "SegmentNeeds",
-    "choose_segment_estimator",
     "Settings",
+    "choose_segment_estimator",
 ]
 
 
 UNLIMITED = 0xFFFFFFFF
+"""Largest path depth without a limit."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How long a path may be, and how scattered light is computed.
+    """The settings of an integrator: path length, Russian roulette, quadrature and shadows.
 
     Attributes:
         max_depth: largest path depth, counted as in ``volpath``; -1 for no limit.
         rr_depth: depth from which Russian roulette may end a path.
-        hide_emitters: emitters are not seen directly by the camera.
-        deterministic: single scattering by quadrature in place of Monte Carlo.
-        shadows: with ``deterministic``, ``exact`` or interpolated in a ``grid``; else ``exact`` or ``estimated`` (ratio
-            tracking); ``auto`` leaves the choice to the plan.
-        media_light: light that media emit is ``drawn`` where paths scatter, or ``met`` by chance; ``auto`` leaves the choice to
-            the plan.
-    """
+        hide_emitters: the camera does not see emitters directly.
+        deterministic: single scattering by quadrature instead of Monte Carlo.
+        shadows: with ``deterministic``, ``exact`` or interpolated in a ``grid``; without, ``exact`` or ``estimated`` by ratio
+            tracking; ``auto`` leaves the choice to the plan.
+        media_light: ``drawn`` samples the emission of media at scattering events, ``met`` leaves it to paths passing through
+            the media; ``auto`` leaves the choice to the plan."""
 
     max_depth: int = 6
     rr_depth: int = 5
@@ -63,12 +62,12 @@ class Settings:
 
     @property
     def depth_limit(self) -> int:
-        """Largest path depth, as a number of 32 bits."""
+        """Largest path depth as an unsigned 32-bit number."""
         return self.max_depth if self.max_depth >= 0 else UNLIMITED
 
     @property
     def may_draw_emission(self) -> bool:
-        """Whether light that media emit may be drawn where paths scatter."""
+        """Whether scattering events may sample the emission of media."""
         return self.scatterings >= 1 and self.media_light != "met"
 
     @property
@@ -77,15 +76,18 @@ class Settings:
         return math.inf if self.max_depth < 0 else max(self.max_depth - 1, 0)
 
 
+# -- The table -----------------------------------------------------------------------------------------------------------
+
+
 @dataclass
 class SegmentInputs:
-    """The arguments that a segment estimator is made from.
+    """The arguments for making a segment estimator.
 
     Attributes:
-        direct: the estimator of direct lighting, at surfaces and in media.
-        count: number of scattering points on a segment, in images; derivatives have one.
-        visibility_cache: rough visibility of the emitters, which distance sampling is guided by; None for none.
-        transmittance_grid: a lattice that replaces shadow rays; None for exact shadow rays.
+        direct: estimator of direct lighting, at surfaces and in media.
+        count: number of scattering points on a segment in images; derivatives use one.
+        visibility_cache: rough visibility of the emitters, guiding distance sampling; None for no guidance.
+        transmittance_grid: lattice replacing shadow rays; None for exact shadow rays.
     """
 
     direct: DirectLighting
@@ -96,16 +98,16 @@ class SegmentInputs:
 
 @dataclass(frozen=True)
 class SegmentNeeds:
-    """What a scene and its settings ask of the segment estimator.
+    """Facts about a scene and its settings, by which the segment estimator is chosen.
 
     Attributes:
-        scatters: some medium scatters light to the camera.
-        emits: some medium emits light.
-        deterministic: images without noise were asked for.
-        is_bounded: some medium is known by a majorant only.
+        scatters: a medium scatters light to the camera.
+        emits: a medium emits light.
+        deterministic: the user has requested images without noise.
+        is_bounded: only a majorant of some medium is known.
         scatterings: largest number of scattering events between an emitter and the camera; may be infinite.
-        refracts: the boundary of some medium bends or blurs the light that passes it, so that no straight shadow ray does.
-        has_gaussians: some medium is made of Gaussians, in which no cell has a polynomial to draw a distance from.
+        refracts: the boundary of a medium refracts or blurs light, and blocks straight shadow rays.
+        has_gaussians: a medium consists of Gaussians; its cells have no polynomials for drawing distances.
     """
 
     scatters: bool
@@ -127,10 +129,10 @@ class SegmentEntry:
     """An entry of :data:`SEGMENT_ESTIMATORS`.
 
     Attributes:
-        make: builds the estimator.
-        applies: whether the estimator answers a question.
-        scatterings: number of scattering events in media between an emitter and the camera that it accounts for.
-        needs: the condition on the scene, in words.
+        make: makes the estimator.
+        applies: whether the estimator serves a scene with the given needs.
+        scatterings: largest number of scattering events in media between an emitter and the camera.
+        needs: condition on the scene, in words.
         promises: bias and variance, in words.
         cites: keys of :mod:`mivol.cite`.
     """
@@ -143,41 +145,41 @@ class SegmentEntry:
     cites: tuple[str, ...]
 
 
-def _make_quadrature(choice: SegmentInputs) -> ScatteringQuadrature:
-    drawn = SingleScattering(choice.direct, visibility_cache=choice.visibility_cache)
-    return ScatteringQuadrature(drawn, choice.transmittance_grid)
+def _make_quadrature(inputs: SegmentInputs) -> ScatteringQuadrature:
+    sampled = SingleScattering(inputs.direct, visibility_cache=inputs.visibility_cache)
+    return ScatteringQuadrature(sampled, inputs.transmittance_grid)
 
 
 SEGMENT_ESTIMATORS = {
     "absorption": SegmentEntry(
-        lambda choice: Absorption(choice.direct.media),
-        lambda asked: not asked.scatters and not asked.emits and not asked.is_bounded,
+        lambda inputs: Absorption(inputs.direct.media),
+        lambda needs: not needs.scatters and not needs.emits and not needs.is_bounded,
         0,
-        "no medium emits, or scatters light to the camera",
+        "no medium emits or scatters light to the camera",
         "no bias, no variance",
         ("amanatides_1987", "vicini_2021"),
     ),
     "tracked_absorption": SegmentEntry(
-        lambda choice: TrackedAbsorption(choice.direct.media),
-        lambda asked: asked.is_bounded and not asked.scatters and not asked.emits,
+        lambda inputs: TrackedAbsorption(inputs.direct.media),
+        lambda needs: needs.is_bounded and not needs.scatters and not needs.emits,
         0,
-        "a medium is bounded, and none emits, or scatters light to the camera",
-        "no bias, of derivatives neither; variance of ratio tracking, and of one point a segment for derivatives",
+        "a medium is bounded, and no medium emits or scatters light to the camera",
+        "no bias, also of derivatives; variance of ratio tracking, and for derivatives of one point a segment",
         ("novak_2014", "amanatides_1987", "vicini_2021"),
     ),
     "emission": SegmentEntry(
-        lambda choice: Emission(choice.direct.media),
-        lambda asked: asked.emits and not asked.scatters and not asked.is_bounded,
+        lambda inputs: Emission(inputs.direct.media),
+        lambda needs: needs.emits and not needs.scatters and not needs.is_bounded,
         0,
-        "a medium emits, and none scatters light to the camera",
+        "a medium emits, and no medium scatters light to the camera",
         "error of the fourth order in the size of a cell, no variance",
         ("max_1995", "amanatides_1987", "hairer_1996"),
     ),
     "single_scattering": SegmentEntry(
-        lambda choice: SingleScattering(choice.direct, choice.count, choice.visibility_cache),
-        lambda asked: asked.scatters and asked.is_single and not asked.deterministic,
+        lambda inputs: SingleScattering(inputs.direct, inputs.count, inputs.visibility_cache),
+        lambda needs: needs.scatters and needs.is_single and not needs.deterministic,
         1,
-        "a medium scatters once, none emits, is bounded or made of Gaussians, and no boundary refracts",
+        "light scatters once in media, no medium emits, is bounded or consists of Gaussians, and no boundary refracts",
         "no bias",
         (
             *("chao_1982", "kulla_2012", "miller_2019", "veach_1995"),
@@ -185,10 +187,10 @@ SEGMENT_ESTIMATORS = {
         ),
     ),
     "free_flight": SegmentEntry(
-        lambda choice: FreeFlight(choice.direct.media),
-        lambda asked: asked.scatters and not asked.is_single and not asked.deterministic,
+        lambda inputs: FreeFlight(inputs.direct.media),
+        lambda needs: needs.scatters and not needs.is_single and not needs.deterministic,
         math.inf,
-        "media scatter any number of times, emit beside it, are bounded or Gaussians, or lie behind boundaries that refract",
+        "media scatter any number of times, or scatter and emit, are bounded, hold Gaussians or have refracting boundaries",
         "no bias; variance of one flight a segment",
         (
             *("woodcock_1965", "hofmann_2021", "amanatides_1987", "veach_1995", "wilkie_2014", "miller_2019"),
@@ -197,39 +199,41 @@ SEGMENT_ESTIMATORS = {
     ),
     "scattering_quadrature": SegmentEntry(
         _make_quadrature,
-        lambda asked: asked.scatters and asked.is_single and asked.deterministic,
+        lambda needs: needs.scatters and needs.is_single and needs.deterministic,
         1,
-        "one medium scatters once, its grids share their cells, every emitter has one position or direction",
-        "error of the fourth order in the size of a cell where light is smooth, no variance; derivatives are drawn",
+        "light scatters once in one medium, whose grids share their cells, and every emitter has one position or direction",
+        "error of the fourth order in the size of a cell for smooth light, no variance; derivatives are Monte Carlo estimates",
         ("hairer_1996", "kulla_2012", "amanatides_1987", "vicini_2021"),
     ),
 }
-"""Estimators of what media add along a segment, by the name that a plan chooses them by. A question has one answer, or none."""
+"""Segment estimators by name. At most one entry applies to any needs."""
 
 
-def choose_segment_estimator(asked: SegmentNeeds) -> str | None:
-    """The name of the estimator that answers a question; None where none does."""
-    return next((name for name, entry in SEGMENT_ESTIMATORS.items() if entry.applies(asked)), None)
+def choose_segment_estimator(needs: SegmentNeeds) -> str | None:
+    """Choose the name of the segment estimator for the given needs; None if no estimator applies."""
+    return next((name for name, entry in SEGMENT_ESTIMATORS.items() if entry.applies(needs)), None)
+
+
+# -- The estimators of a render ------------------------------------------------------------------------------------------
 
 
 @dataclass
 class Estimators:
-    """The estimators of one render, and its settings.
+    """The estimators and the settings of one render.
 
     Attributes:
-        direct: the estimator of direct lighting, at surfaces and in media.
-        segment: the estimator of what media add and transmit along a segment.
+        direct: estimator of direct lighting, at surfaces and in media.
+        segment: estimator of the light and the transmittance of media along a segment.
         settings: depth, roulette, hidden emitters.
-        lights_surfaces: some surface scatters light, so that emitters are hit by emitter samples and by BSDF samples, which are
-            combined by multiple importance sampling.
-        lights_media: likewise where a path ends a segment in a medium. Under a constant environment alone it is not so: light
-            that is the same from everywhere is found without noise by the paths that escape.
-        lobe: mean cosine of the lobe that side flights are drawn from (:mod:`.side_flight`); None for no side flights.
-        emission: draws light of media that emit, where paths scatter; None where they find it by chance.
-        long_paths_count: long paths have as much light as short ones, where it is the same from everywhere, or more, where
-            media emit; roulette spares them.
-        media: of the scene.
-        draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, which takes a random number.
+        lights_surfaces: a surface scatters light; multiple importance sampling combines emitter samples with BSDF samples.
+        lights_media: emitter samples light the collisions in media too. Not used if a constant environment is the only emitter,
+            since escaping paths find its light without noise.
+        lobe: mean cosine of the lobe of side flights (:mod:`.side_flight`); None for no side flights.
+        emission: sampler of the emission of media at scattering events; None to leave the emission to paths passing through.
+        long_paths_count: long paths carry as much light as short ones (an even environment) or more (emitting media); roulette
+            then spares them.
+        media: media of the scene.
+        draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
     """
 
     direct: DirectLighting
@@ -248,5 +252,5 @@ class Estimators:
         self.draws_shadows = self.media.is_bounded or self.segment.ends_in_media
 
     def replayed(self) -> Estimators:
-        """Estimators of the radiance that a replay subtracts from: without light that is sampled anew for its derivatives."""
+        """The estimators of the radiance that a replay subtracts from, without light sampled anew for its derivatives."""
         return replace(self, segment=self.segment.replayed())

@@ -1,4 +1,4 @@
-"""The event at the end of a path segment: a collision with a medium, a surface, or escape from the scene."""
+"""Events: how a segment of a path ends (collision with a medium, surface or escape), and the direction sampled there."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay, Ray, spawn_ray
 
-__all__ = ["PathEvent", "NextDirection", "TurnSamples", "sample_next_direction"]
+__all__ = ["NextDirection", "PathEvent", "sample_next_direction"]
+
+
+# -- The end of a segment ------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -22,12 +25,12 @@ class PathEvent:
     """The end of a segment.
 
     Attributes:
-        si: the surface; not valid where the path has left the scene.
-        t: length of the segment to there [length].
-        medium: the medium around it.
-        at_surface: lanes that have hit a surface.
-        collision: where lanes have met a medium before; None where paths scatter at surfaces only.
-        chance: for derivatives of paths that scatter in media, a number in [0, 1) by which one of their shadow rays is kept.
+        si: surface hit; not valid in lanes whose path escapes from the scene.
+        t: length of the segment up to the surface [length].
+        medium: medium around the end of the segment.
+        at_surface: lanes hitting a surface.
+        collision: collision with a medium before the surface; None if segments never end in media.
+        chance: uniform random number in [0, 1), by which a shadow ray of the path is kept for derivatives; None in images.
     """
 
     si: mi.SurfaceInteraction3f
@@ -41,50 +44,50 @@ class PathEvent:
     def from_estimate(cls, estimate: SegmentEstimate, active: mi.Bool) -> PathEvent:
         """The event at the end of a segment."""
         end, collision = estimate.end, estimate.collision
-        arrives = active if collision is None else active & ~collision.on
+        reaches_end = active if collision is None else active & ~collision.on
         chance = None if estimate.probe is None else estimate.probe.chance
-        return cls(end.si, end.t, end.medium, arrives & end.si.is_valid(), collision, chance)
+        return cls(end.si, end.t, end.medium, reaches_end & end.si.is_valid(), collision, chance)
+
+    @classmethod
+    def from_collision(cls, collision: Collision, chance: mi.Float | None = None) -> PathEvent:
+        """The event of a path beginning at a collision."""
+        n = dr.width(collision.on)
+        si, t, nowhere = dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), dr.full(mi.Bool, False, n)
+        return cls(si, t, collision.mei.medium, nowhere, collision, chance)
 
     @property
     def in_medium(self) -> mi.Bool:
-        """Lanes that have met a medium."""
+        """Lanes colliding with a medium."""
         return mi.Bool(False) if self.collision is None else self.collision.on
 
     def vertex(self, media: SceneMedia) -> Vertex:
         """The point at which light is scattered."""
         if self.collision is None:
-            return self.surface_vertex(media)
-        inside = MediumVertex(media, self.collision.mei, self.collision.place)
-        return MixedVertex(self.surface_vertex(media), inside, self.collision.on) if media.has_surfaces else inside
-
-    def surface_vertex(self, media: SceneMedia) -> SurfaceVertex:
-        """The point of the surface."""
-        return SurfaceVertex(media, self.si, self.si.bsdf(), self.medium)
+            return SurfaceVertex(media, self.si, self.si.bsdf(), self.medium)
+        inside = MediumVertex(media, self.collision.mei, self.collision.p)
+        if not media.has_surfaces:
+            return inside
+        return MixedVertex(SurfaceVertex(media, self.si, self.si.bsdf(), self.medium), inside, self.collision.on)
 
 
-@dataclass
-class TurnSamples:
-    """The random numbers of a direction, uniform in [0, 1): of the component, and of the direction."""
-
-    component: mi.Float
-    direction: mi.Point2f
+# -- The direction onwards -----------------------------------------------------------------------------------------------
 
 
 @dataclass
 class NextDirection:
-    """How a path goes on.
+    """The direction in which a path continues after an event.
 
     Attributes:
-        ray: of the next segment.
-        medium: around its origin.
-        weight: value over density of the direction.
-        pdf: that density [1/sr].
-        delta: lanes in which no emitter sample could have found what lies there.
-        eta: relative index of refraction.
-        origin: where the direction was sampled.
-        on: lanes that go on.
-        through: lanes that pass a surface undeviated.
-        factors: the weight with its derivatives.
+        ray: ray of the next segment.
+        medium: medium around the origin of the ray.
+        weight: BSDF (times cosine) or phase function times albedo, over ``pdf`` [1].
+        pdf: density of the sampled direction [1/sr].
+        delta: lanes in which no emitter sample can find the light from this direction.
+        eta: relative index of refraction [1].
+        origin: interaction at which the direction was sampled.
+        on: lanes that continue.
+        through: lanes passing a surface without deviation.
+        factors: BSDF and phase function with their derivatives.
     """
 
     ray: FineRay
@@ -99,64 +102,77 @@ class NextDirection:
     factors: list[TrackedFactor]
 
 
+PER_LANE = ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "through")
+"""Attributes of :class:`NextDirection` with a value for each lane."""
+
+
 def sample_next_direction(
-    estimators: Estimators, ray: Ray, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool
+    estimators: Estimators, ray: Ray, event: PathEvent, u: mi.Float, u2: mi.Point2f, may_scatter: mi.Bool
 ) -> NextDirection:
-    """Sample the direction in which a path goes on.
+    """Sample the direction in which a path continues.
 
     Args:
-        estimators: of the render.
-        ray: of the segment that has ended.
-        event: its end.
-        samples: random numbers.
-        may_scatter: lanes whose path may scatter once more; the others pass surfaces undeviated or end.
+        estimators: estimators of the render.
+        ray: ray of the segment ending in the event.
+        event: end of the segment.
+        u: uniform random number in [0, 1) for the component of the BSDF or phase function.
+        u2: two uniform random numbers in [0, 1) for the direction.
+        may_scatter: lanes allowed to scatter once more; paths of other lanes pass through a surface or end.
     """
     if event.collision is None:
-        return _sample_bsdf(estimators, ray, event, samples, may_scatter)
-    inside = _sample_phase_function(estimators, event.collision, samples, may_scatter)
+        return _sample_bsdf(estimators, ray, event, u, u2, may_scatter)
+    inside = _sample_phase_function(estimators, event.collision, u, u2, may_scatter)
     if not estimators.media.has_surfaces:
         return inside
-    outside = _sample_bsdf(estimators, ray, event, samples, may_scatter)
-    here, names = event.in_medium, ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "through")
-    either = {name: dr.select(here, getattr(inside, name), getattr(outside, name)) for name in names}
-    return NextDirection(**either, factors=outside.factors + inside.factors)
+    outside = _sample_bsdf(estimators, ray, event, u, u2, may_scatter)
+    selected = {name: dr.select(event.in_medium, getattr(inside, name), getattr(outside, name)) for name in PER_LANE}
+    return NextDirection(**selected, factors=outside.factors + inside.factors)
 
 
 def _sample_bsdf(
-    estimators: Estimators, ray: Ray, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool
+    estimators: Estimators, ray: Ray, event: PathEvent, u: mi.Float, u2: mi.Point2f, may_scatter: mi.Bool
 ) -> NextDirection:
-    """Sample a direction of the BSDF; the null transmission of a surface leaves the ray as it is."""
+    """Sample a direction of the BSDF; a null component transmits the ray without deviation."""
     media, si = estimators.media, event.si
-    vertex = event.surface_vertex(media)
-    sample, weight = vertex.bsdf.sample(mi.BSDFContext(), si, samples.component, samples.direction, event.at_surface)
+    bsdf = si.bsdf()
+    sample, weight = bsdf.sample(mi.BSDFContext(), si, u, u2, event.at_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-    # A sampled direction of density 0 has weight 0; its path ends where beta is 0.
+    # A sampled direction of density 0 has weight 0; its path ends at the roulette, where beta is 0.
     on = event.at_surface & (may_scatter | through)
     onward = spawn_ray(si, si.to_world(sample.wo), media.size)
-    # A ray that is transmitted undeviated keeps its end (the sensor's far_clip).
+    # A ray transmitted without deviation keeps its end (the sensor's far_clip).
     onward.maxt = dr.select(through, dr.minimum(ray.maxt - event.t, onward.maxt), onward.maxt)
-    medium = dr.select(si.is_medium_transition(), si.target_medium(onward.d), event.medium)
-    delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    factor = _bsdf_factor(vertex, sample.wo, on & ~through)
     return NextDirection(
-        FineRay.from_ray(onward), medium, weight, sample.pdf, delta, sample.eta, mi.Interaction3f(si), on, through, [factor]
+        ray=FineRay.from_ray(onward),
+        medium=dr.select(si.is_medium_transition(), si.target_medium(onward.d), event.medium),
+        weight=weight,
+        pdf=sample.pdf,
+        delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
+        eta=sample.eta,
+        origin=mi.Interaction3f(si),
+        on=on,
+        through=through,
+        factors=[TrackedFactor(lambda: bsdf.eval(mi.BSDFContext(), si, sample.wo, on & ~through), on & ~through)],
     )
 
 
 def _sample_phase_function(
-    estimators: Estimators, collision: Collision, samples: TurnSamples, may_scatter: mi.Bool
+    estimators: Estimators, collision: Collision, u: mi.Float, u2: mi.Point2f, may_scatter: mi.Bool
 ) -> NextDirection:
-    """Sample a direction of the phase function. The derivative of the albedo belongs to the flight that has ended here."""
+    """Sample a direction of the phase function. The flight ending here differentiates the albedo."""
     media, mei = estimators.media, collision.mei
     on = collision.on & may_scatter
-    wo, weight, pdf = sample_phase(media, mei, samples.component, samples.direction, on)
-    ray, n = FineRay.from_point(collision.place, wo, mei), dr.width(wo)
-    never, alone = dr.full(mi.Bool, False, n), dr.full(mi.Bool, not estimators.lights_media, n)
-    factor = TrackedFactor(lambda: MediumVertex(media, mei, collision.place).eval(wo, on), on)
-    weight = collision.albedo * weight
-    return NextDirection(ray, mei.medium, weight, pdf, alone, mi.Float(1), mi.Interaction3f(mei), on, never, [factor])
-
-
-def _bsdf_factor(vertex: SurfaceVertex, wo: mi.Vector3f, active: mi.Bool) -> TrackedFactor:
-    """The BSDF as a factor of all light ahead, with its derivatives."""
-    return TrackedFactor(lambda: vertex.bsdf.eval(mi.BSDFContext(), vertex.interaction, wo, active), active)
+    wo, weight, pdf = sample_phase(media, mei, u, u2, on)
+    n = dr.width(wo)
+    return NextDirection(
+        ray=FineRay.from_point(collision.p, wo, mei),
+        medium=mei.medium,
+        weight=collision.albedo * weight,
+        pdf=pdf,
+        delta=dr.full(mi.Bool, not estimators.lights_media, n),
+        eta=mi.Float(1),
+        origin=mi.Interaction3f(mei),
+        on=on,
+        through=dr.full(mi.Bool, False, n),
+        factors=[TrackedFactor(lambda: MediumVertex(media, mei, collision.p).eval(wo, on), on)],
+    )

@@ -1,10 +1,10 @@
-r"""The rays of a sensor, the film that averages their radiance, and the transpose from image gradients to ray gradients.
+r"""The rays of a sensor, the film averaging their radiance, and the transpose from image gradients to ray gradients.
 
 .. math:: I_p = \frac{\sum_s w_{ps} L_s}{\sum_s w_{ps}}
 
-Conventions. The samples of a render are split into passes of at most ``pass_rays`` rays. The film sums all passes before it
-divides by the filter weights, so the image depends on the split only through the order of sums, and a render may have more than
-the 2^32 samples that one launch can hold. The samples of a sampler that stratifies stay stratified over all passes.
+Conventions. The samples of a render are split into passes of at most ``pass_rays`` rays. The film sums all passes before
+dividing by the filter weights, so the image depends on the split only through the order of sums, and a render may have more
+than the 2^32 samples of one launch. The samples of a stratifying sampler stay stratified over all passes.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ __all__ = ["CameraRays", "RenderSamples", "adjoint_rays", "film_passes", "render
 
 
 PLAIN, SPREAD, TILED = "none", "spread", "tiled"
-"""Layouts of the lanes of a pass: see :func:`film_passes`."""
+"""Layouts of the lanes of a pass (:class:`RenderSamples`)."""
 
 TILE_EDGE = 4
-"""Edge of a tile of pixels: 16 lanes of one packet."""
+"""Edge of a tile [pixels]; its 16 pixels fill the lanes of one packet."""
 
 
 @dataclass
@@ -33,13 +33,14 @@ class RenderSamples:
     """The samples of a render.
 
     Attributes:
-        sensor: its film, filter, crop and sampler are used as they are.
-        seed: of the sampler.
-        spp: samples a pixel; 0 for the sampler's own count.
+        sensor: sensor, with its film, filter, crop and sampler.
+        seed: seed of the sampler.
+        spp: samples per pixel; 0 for the sample count of the sensor's sampler.
         pass_rays: largest number of rays in a pass.
-        layout: ``PLAIN``: independent positions in the pixel. ``SPREAD``: the samples of a pixel are stratified over its area.
-            ``TILED``: besides, the lanes of a tile of pixels lie side by side, and directions are stratified. The last two need
-            an independent sampler, and ``TILED`` a film of whole tiles; elsewhere the layout is the next simpler one.
+        layout: ``PLAIN``: independent positions in a pixel. ``SPREAD``: the samples of a pixel are stratified over its area.
+            ``TILED``: additionally, the lanes of a tile of pixels lie side by side, and directions are stratified. ``SPREAD``
+            and ``TILED`` need an independent sampler, and ``TILED`` a film of whole tiles; without these, the next simpler
+            layout applies.
     """
 
     sensor: mi.Sensor
@@ -54,12 +55,12 @@ class CameraRays:
     """The camera rays of one pass.
 
     Attributes:
-        sampler: what the pass draws its numbers from.
-        ray: world space.
-        weight: the sensor's importance.
-        position: of the sample on the film [pixel].
-        on_film: that position as a share of the crop [1]; in [0, 1) but for samples beside it that a wide filter asks for.
-        strata: the stratum that each lane draws directions from; None where lanes have none.
+        sampler: source of the random numbers of the pass.
+        ray: rays in world space.
+        weight: importance of the sensor.
+        position: position of the sample on the film [pixel].
+        on_film: position as a share of the crop [1], in [0, 1); samples in the border of a wide filter lie outside.
+        strata: stratum of each lane for drawing directions; None without strata.
     """
 
     sampler: mi.Sampler
@@ -71,14 +72,14 @@ class CameraRays:
 
 
 RadianceFunction = Callable[[CameraRays], tuple]
-"""``sample(rays) -> (radiance, alpha, AOVs)``; alpha in [0, 1] is what the film's alpha sees, without derivatives."""
+"""``sample(rays) -> (radiance, alpha, AOVs)``, with the alpha for the film in [0, 1], without derivatives."""
 
 
 def film_passes(samples: RenderSamples) -> Iterator[CameraRays]:
     """Generate the rays of a render, pass by pass.
 
     Raises:
-        MivolError: one sample a pixel is more than a launch can hold (2^32).
+        MivolError: one sample per pixel exceeds a launch (2^32 samples).
     """
     base, pixels, per_pass = _plan_passes(samples.sensor, samples.spp, samples.pass_rays)
     base.set_samples_per_wavefront(per_pass)
@@ -89,41 +90,41 @@ def film_passes(samples: RenderSamples) -> Iterator[CameraRays]:
 
 
 def _seed_pass(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
-    """Seed a sampler for one pass, so that it does not depend on how much the passes before have drawn.
+    """Seed a sampler for one pass, independently of the numbers drawn by earlier passes.
 
-    A replay may draw fewer numbers than the pass that it repeats.
+    A replay may draw fewer numbers than the pass it repeats.
     """
     if sampler.class_name() == "IndependentSampler":
         sampler.seed(seed if index == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0], count)
         return
-    # A sampler that stratifies has one permutation for all passes; ``advance`` moves on in it to the next pass.
+    # A stratifying sampler has one permutation for all passes; ``advance`` moves on to the next pass.
     sampler.seed(seed, count)
     for _ in range(index):
         sampler.advance()
 
 
 def count_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> int:
-    """Number of passes that :func:`film_passes` makes."""
+    """Number of passes generated by :func:`film_passes`."""
     sampler, _, per_pass = _plan_passes(sensor, spp, pass_rays)
     return sampler.sample_count() // per_pass
 
 
 def _plan_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> tuple[mi.Sampler, int, int]:
-    """A copy of the sensor's sampler, the number of pixels of the film, and the samples of a pixel in one pass."""
+    """A copy of the sensor's sampler, the number of pixels of the film, and the samples per pixel in one pass."""
     sampler = sensor.sampler().clone()
     if spp:
         sampler.set_sample_count(spp)
     width, height = _sampled_size(sensor.film())
     pixels = width * height
     if pixels > 2**32:
-        raise MivolError(f"a film of {width}x{height} pixels was asked for; a launch holds 2^32: render crops of it.")
+        raise MivolError(f"a film of {width}x{height} pixels exceeds the 2^32 samples of a launch; render crops of the film.")
     spp = sampler.sample_count()
     room = max(1, pass_rays // pixels)
     return sampler, pixels, max(d for d in range(1, min(room, spp) + 1) if spp % d == 0)
 
 
 def _sampled_size(film: mi.Film) -> tuple[int, int]:
-    """Pixels that are sampled: the crop, and the border that a wide filter may ask for."""
+    """Width and height of the sampled pixels: the crop, and the border of a wide filter."""
     border = 2 * film.rfilter().border_size() if film.sample_border() else 0
     width, height = film.crop_size()
     return int(width) + border, int(height) + border
@@ -134,7 +135,7 @@ def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pa
     film = sensor.film()
     width, height = _sampled_size(film)
     lane, strata = dr.arange(mi.UInt32, count), None
-    # Opaque, since a kernel that contains the seed as a literal would be compiled anew in every render.
+    # Opaque: with the seed as a literal, the kernel would be compiled anew in every render.
     salt = mi.UInt32(samples.seed)
     dr.make_opaque(salt)
     salt += 0x9E3779B9
@@ -156,8 +157,8 @@ def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pa
     pixel += mi.Vector2i(film.crop_offset())
     u = sampler.next_2d()
     if shares:
-        # The strata of a pixel are visited in another order in each tile (or pixel); otherwise each stratum of directions would
-        # be tied to one part of the pixel.
+        # Each tile (or pixel) visits the strata of its pixels in its own order. In a common order, each stratum of directions
+        # would belong to one part of the pixel.
         cell = mi.permute_kensler(sample, per_pass, other)
         u = Strata(cell, across, per_pass // across).jitter(u)
     position = mi.Vector2f(pixel) + u
@@ -170,7 +171,7 @@ def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pa
         time += sampler.next_1d() * sensor.shutter_open_time()
     on_film = dr.fma(position, scale, offset)
     ray, weight = sensor.sample_ray_differential(time, mi.Float(0), on_film, aperture)
-    # A box filter gives a sample to its pixel, whatever its position in it.
+    # A box filter adds a sample to its pixel, for any position inside the pixel.
     place = mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
     return CameraRays(sampler, ray, weight, place, mi.Point2f(on_film), strata)
 
@@ -179,12 +180,12 @@ def render_on_film(samples: RenderSamples, names: list[str], sample: RadianceFun
     """Render an image: sample the rays of all passes, and average them on the sensor's film.
 
     Args:
-        samples: of the render.
-        names: of the AOVs, in the order in which ``sample`` returns them.
+        samples: samples of the render.
+        names: names of the AOVs, in the order returned by ``sample``.
         sample: :data:`RadianceFunction`.
 
     Returns:
-        (height, width, colours + AOVs).
+        Image (height, width, colours + AOVs).
     """
     film = samples.sensor.film()
     film.prepare(names)
@@ -204,11 +205,11 @@ def adjoint_rays(
     """Turn a gradient image into a gradient for each ray, pass by pass: the transpose of the film.
 
     Args:
-        samples, names: as :func:`render_on_film`.
+        samples, names: as in :func:`render_on_film`.
         grad_image: d loss / d image.
 
     Yields:
-        The rays of a pass, d loss / d L of each, and d loss / d AOV.
+        The rays of a pass, d loss / d L of each ray, and d loss / d AOV.
     """
     film = samples.sensor.film()
     several = count_passes(samples.sensor, samples.spp, samples.pass_rays) > 1
@@ -221,8 +222,8 @@ def adjoint_rays(
             dr.enable_grad(L, aovs)
             film.prepare(names)
             block = _new_block(film, rays)
-            # A pixel is divided by the filter weights of all passes. Where there are several, the weights are therefore summed
-            # beforehand, in a block of their own.
+            # The film divides a pixel by the filter weights of all passes. With several passes, a block of its own holds their
+            # sum.
             weight = mi.Float(0 if several else 1)
             _add_samples(block, film, rays, _FilmSample(L * rays.weight, weight, mi.Float(0), aovs))
             film.put_block(block)
@@ -239,7 +240,7 @@ def adjoint_rays(
 
 
 def _sum_filter_weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlock:
-    """An image block with the filter weights of all passes and no light."""
+    """An image block with the filter weights of all passes, without light."""
     film = samples.sensor.film()
     film.prepare(names)
     block = None
@@ -253,19 +254,19 @@ def _sum_filter_weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlo
 
 def _new_block(film: mi.Film, rays: CameraRays) -> mi.ImageBlock:
     block = film.create_block()
-    # Coalescing sums the samples of a pixel before it writes them. It pays from 4 samples on (Mitsuba's own rule), and needs
-    # them in neighbouring lanes, which tiles do not give.
+    # Coalescing sums the samples of a pixel before writing. It pays from 4 samples on (Mitsuba's rule), and needs them in
+    # neighbouring lanes; tiles have them apart.
     block.set_coalesce(block.coalesce() and rays.sampler.sample_count() >= 4 and rays.strata is None)
     return block
 
 
 @dataclass
 class _FilmSample:
-    """What a ray adds to the film.
+    """Values of rays on the film.
 
     Attributes:
-        L: radiance times the sensor's importance.
-        weight: what its filter weight is multiplied with in the sum that the film divides by.
+        L: radiance times the importance of the sensor.
+        weight: factor on the filter weight in the divisor of the film.
         alpha, aovs: alpha, and the AOVs in their order.
     """
 
@@ -276,7 +277,7 @@ class _FilmSample:
 
 
 def _add_samples(block: mi.ImageBlock, film: mi.Film, rays: CameraRays, sample: _FilmSample) -> None:
-    """Add samples to a block, in the order of channels of the film."""
+    """Add samples to a block, in the channel order of the film."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         count = block.channel_count()
         how = {"weight": sample.weight, "alpha": sample.alpha}

@@ -1,18 +1,18 @@
-r"""A second technique for light that scatters twice in peaked phase functions: a side flight towards the light.
+r"""Side flights: a second sampling technique for light scattered twice by peaked phase functions.
 
-At a vertex x of a path in a medium the direction w of an emitter sample is drawn for the *next* vertex x'. The path's own
-direction comes from the phase function at x, with density p; x' then scatters little of the light from w, unless that
-direction happens to be near w. A side flight leaves x in a direction from a lobe about w, with density q, and looks at the
-emitter along w from where it collides. Given w, both estimate the light that goes from w over x' to x, so they are combined by
-the balance heuristic: the direct light at x' counts p / (p + q), that at the end of the side flight q / (p + q).
+At a vertex x of a path in a medium, the direction w of an emitter sample is drawn for the *next* vertex x'. The path leaves x
+in a direction of the phase function, with density p. Vertex x' scatters little light from w unless this direction lies near w.
+A side flight leaves x in a direction of a lobe about w, with density q, and receives the emitter's light along w at its
+collision. Given w, both techniques estimate the light travelling from w over x' to x. The balance heuristic combines them: the
+direct light at x' has the weight p / (p + q), and the light at the end of the side flight q / (p + q).
 
-Emitters are at infinity here, so that w is as probable at x' as at x.
+All emitters are at infinity, so w has the same density at x' and at x.
 
-For derivatives a side flight is walked back like the path's own flights, and its shadow ray is offered to the path's reservoir.
-The light that is missed where there is no extinction is found by the probes of the path alone
-(:mod:`mivol.transport.estimators.flights.flight_derivatives`), since their points are drawn without those weights.
+For derivatives, a side flight is walked back like the path's own flights, and its shadow ray is offered to the path's
+reservoir. Only the probes of the path estimate derivatives in regions without extinction
+(:mod:`mivol.transport.estimators.flights.flight_derivatives`), since the points of probes are drawn without these weights.
 
-Source: the balance heuristic of Veach & Guibas 1995, applied to next-event estimation with a direction drawn one vertex early.
+Source: the balance heuristic (Veach & Guibas 1995), applied to next-event estimation with a direction drawn one vertex early.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay
 
 __all__ = [
-    "WeightedEmitterSample",
     "SideFlight",
     "SideFlightLight",
     "SideFlightSamples",
+    "WeightedEmitterSample",
     "estimate_side_flight",
     "weigh_emitter_sample",
 ]
@@ -43,11 +43,11 @@ __all__ = [
 
 @dataclass
 class WeightedEmitterSample:
-    """The emitter sample that the next vertex takes.
+    """The emitter sample of the next vertex.
 
     Attributes:
-        sample: it.
-        weight: of the direct light there, in a medium.
+        sample: emitter sample.
+        weight: weight of the direct light at a vertex in a medium [1].
     """
 
     sample: DistantEmitterSample
@@ -56,7 +56,7 @@ class WeightedEmitterSample:
 
 @dataclass
 class SideFlightSamples:
-    """The random numbers of a side flight: of the lobe, of the flight, and the generator of the shadow at its end."""
+    """Random numbers of a side flight: for the lobe, for the flight, and the generator of the shadow ray at its end."""
 
     lobe: mi.Point2f
     flight: tuple[mi.Float, mi.UInt32]
@@ -64,12 +64,12 @@ class SideFlightSamples:
 
 
 class SideFlightLight(TrackedTerm):
-    """The light at the end of a side flight, as a term, but for the derivatives of the media along its shadow ray.
+    """The light at the end of a side flight, as a term without the derivatives of the media along its shadow ray.
 
     Args:
-        value: as the camera sees it, attached to the phase functions and the emitter.
-        flown: the transmittance of the flight, and the albedo at its end, as a factor.
-        active: lanes that receive it.
+        value: radiance at the camera, attached to the phase functions and the emitter.
+        flown: factor with the derivatives of the transmittance of the flight and of the albedo at its end.
+        active: lanes receiving light.
     """
 
     def __init__(self, value: mi.Spectrum, flown: Factor, active: mi.Bool) -> None:
@@ -77,12 +77,10 @@ class SideFlightLight(TrackedTerm):
         self.flown = flown
 
     def vjp(self, dL: mi.Spectrum) -> None:
-        """Derivatives of the phase functions and the emitter, and of the flight."""
         super().vjp(dL)
         self.flown.vjp(dL * self.value)
 
     def jvp(self) -> mi.Spectrum:
-        """Tangent of both."""
         return super().jvp() + self.value * self.flown.jvp()
 
 
@@ -91,9 +89,9 @@ class SideFlight:
     """A side flight.
 
     Attributes:
-        light: that it finds.
-        shadow: the shadow ray at its end.
-        chance: for derivatives, a number in [0, 1) by which one of a path's shadow rays is kept; None for pictures.
+        light: light at its end.
+        shadow: shadow ray at its end.
+        chance: uniform random number in [0, 1), by which a shadow ray of the path is kept for derivatives; None in images.
     """
 
     light: SideFlightLight
@@ -106,63 +104,73 @@ def estimate_side_flight(
     collision: Collision,
     beta: mi.Spectrum,
     depth: mi.UInt32,
-    aim: DistantEmitterSample,
-    samples: SideFlightSamples,
+    sample: DistantEmitterSample,
+    numbers: SideFlightSamples,
     purpose: str,
     active: mi.Bool,
 ) -> SideFlight:
-    """Estimate the light that scatters twice by a side flight.
+    """Estimate light scattered twice by a side flight.
 
     Args:
-        estimators: of the render; their ``lobe`` is the mean cosine of the lobe.
-        collision: the vertex that the flight leaves.
-        beta: throughput to there.
-        depth: number of scattering events before it.
-        aim: the emitter sample, which the next vertex takes too.
-        samples: random numbers.
-        purpose: IMAGE, or that of derivatives, which keeps the values attached.
-        active: lanes whose path may scatter here and once more.
+        estimators: estimators of the render; ``lobe`` is the mean cosine of the lobe.
+        collision: vertex at which the flight starts.
+        beta: throughput up to the vertex [1].
+        depth: number of scattering events before the vertex.
+        sample: emitter sample, used by the next vertex of the path too.
+        numbers: random numbers.
+        purpose: IMAGE, REVERSE or FORWARD; values stay attached for derivatives.
+        active: lanes whose path may scatter at the vertex and once more.
 
     Returns:
-        The light; where the flight meets no medium there is none.
+        The side flight; its light is 0 in lanes without a collision.
 
     Cost: one flight and one shadow ray.
     """
     media, mei, attached = estimators.media, collision.mei, purpose != IMAGE
-    w = _direction_to_emitter(aim)
-    wo = scattered_direction(-w, sample_hg(samples.lobe.x, estimators.lobe), samples.lobe.y)
-    vertex = MediumVertex(media, mei, collision.place)
+    # -- The direction: from the lobe about the emitter ------------------------------------------------------------------
+    w = _direction_to_emitter(sample)
+    wo = scattered_direction(-w, sample_hg(numbers.lobe.x, estimators.lobe), numbers.lobe.y)
+    vertex = MediumVertex(media, mei, collision.p)
     f, p = vertex.eval_and_pdf(wo, active)
-    reached = beta * collision.albedo * dr.rcp(p + eval_hg(angle_between(-w, wo), estimators.lobe))
-    ray = FineRay.from_point(collision.place, wo, mei)
-    ahead = PathSegment(ray, mei.medium, reached * f, active, samples.flight, depth, is_side_flight=True)
-    flown = estimators.segment.estimate(ahead, purpose, active)
-    there = flown.collision
-    on = active & there.on
-    end = MediumVertex(media, there.mei, there.place)
-    direct = estimators.direct.estimate_at_vertex(end, aim.at_point(there.mei), attached, on, samples.shadow)
+    # beta albedo f / q, times the weight q / (p + q): q cancels.
+    weight = beta * collision.albedo * dr.rcp(p + eval_hg(angle_between(-w, wo), estimators.lobe))
+
+    # -- The flight ------------------------------------------------------------------------------------------------------
+    ray = FineRay.from_point(collision.p, wo, mei)
+    segment = PathSegment(ray, mei.medium, weight * f, active, numbers.flight, depth, is_side_flight=True)
+    flight = estimators.segment.estimate(segment, purpose, active)
+
+    # -- The emitter's light at its end ----------------------------------------------------------------------------------
+    hit = flight.collision
+    on = active & hit.on
+    end = MediumVertex(media, hit.mei, hit.p)
+    direct = estimators.direct.estimate_at_vertex(end, sample.at_point(hit.mei), attached, on, numbers.shadow)
     with dr.resume_grad(when=attached):
         if attached:
             f = vertex.eval(wo, active)
-        value = reached * f * (flown.T * there.albedo) * direct.value
+        value = weight * f * (flight.T * hit.albedo) * direct.value
     lit = on & direct.on
-    chance = None if flown.probe is None else flown.probe.chance
-    return SideFlight(
-        SideFlightLight(value, flown.transmittance, lit), DirectLight(media, direct.ray_segment, value, lit), chance
-    )
+    light = SideFlightLight(value, flight.transmittance, lit)
+    shadow = DirectLight(media, direct.ray_segment, value, lit)
+    return SideFlight(light, shadow, None if flight.probe is None else flight.probe.chance)
 
 
 def weigh_emitter_sample(
-    estimators: Estimators, sample: DistantEmitterSample, wo: mi.Vector3f, p: mi.Float, active: mi.Bool
+    estimators: Estimators, sample: DistantEmitterSample, wo: mi.Vector3f, pdf: mi.Float, active: mi.Bool
 ) -> WeightedEmitterSample:
-    """The aim of the next vertex; ``active`` lanes have made a side flight for it.
+    """Weigh the emitter sample for the next vertex.
 
-    The path leaves this vertex in the direction ``wo``, of density ``p``.
+    Args:
+        estimators: estimators of the render.
+        sample: emitter sample.
+        wo: direction in which the path leaves the vertex.
+        pdf: density of ``wo`` [1/sr].
+        active: lanes with a side flight at the vertex; the weight is 1 in other lanes.
     """
     q = eval_hg(angle_between(-_direction_to_emitter(sample), wo), estimators.lobe)
-    return WeightedEmitterSample(sample, dr.select(active, p * dr.rcp(p + q), 1))
+    return WeightedEmitterSample(sample, dr.select(active, pdf * dr.rcp(pdf + q), 1))
 
 
-def _direction_to_emitter(aim: DistantEmitterSample) -> mi.Vector3f:
-    # Where an emitter has no light to sample, the direction is 0; its light is 0, whatever the lobe is about.
-    return dr.select(dr.squared_norm(aim.d) > 0.5, aim.d, mi.Vector3f(0, 0, 1))
+def _direction_to_emitter(sample: DistantEmitterSample) -> mi.Vector3f:
+    # The direction is 0 if an emitter has no light to sample. The light is 0 then, so the axis of the lobe does not matter.
+    return dr.select(dr.squared_norm(sample.d) > 0.5, sample.d, mi.Vector3f(0, 0, 1))

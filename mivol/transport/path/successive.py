@@ -1,10 +1,10 @@
-r"""Paths that a lane walks one after the other.
+r"""Successive paths: each lane walks several paths, one after another (path regeneration).
 
-A packet of lanes (8 or 16 on a CPU, 32 on a GPU) walks until the longest of its paths ends. Where lengths differ widely most
-lanes wait: if they are exponential, the longest of 16 is 3.4 times the mean. A lane that begins its next path as soon as one
-has ended waits at the end of its last only: sums of 16 lengths differ by a quarter of their mean.
+A packet of lanes (8 or 16 on a CPU, 32 on a GPU) walks until its longest path ends. If path lengths differ widely, most lanes
+wait: the longest of 16 exponentially distributed lengths is 3.4 times the mean. Here a lane starts its next path as soon as a
+path ends, and waits only after its last path. Sums of 16 such lengths deviate by a quarter of their mean.
 
-Each path has a generator of random numbers of its own, so that no path depends on those before it in its lane.
+Each path has its own random number generator, so no path depends on earlier paths of its lane.
 
 References: Novák et al. 2010 (path regeneration); O'Neill 2014 (generators).
 """
@@ -24,27 +24,28 @@ from mivol.transport.traversal.rays import clip_camera_ray
 
 __all__ = ["paths_per_lane", "walk_successively"]
 
+
 MIN_LANES = {"llvm": 1 << 13, "cuda": 1 << 20, "metal": 1 << 20}
-"""Fewest lanes. Dr.Jit deals them out to the threads of a CPU by packets, of which these are 512 at least; a GPU holds
-some 2^18. The number of threads does not enter: the same seed means the same picture on every machine."""
+"""Smallest number of lanes, by backend. On a CPU, Dr.Jit distributes packets of lanes over threads (at least 512 packets here);
+a GPU holds about 2^18 lanes. The number of threads does not enter, so a seed gives the same image on every machine."""
 
 
 @dataclass
 class _PathStarts:
-    """How paths leave the camera, one for each sample.
+    """Starts of paths at the camera, one for each sample.
 
     Attributes:
-        ray: of the camera, ended at its ``far_clip``.
-        medium: around its origin.
-        seeds: of its random numbers.
+        ray: camera rays, ended at the sensor's ``far_clip``.
+        medium: media around their origins.
+        seeds: two seeds of the random numbers of each path.
     """
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
     seeds: tuple[mi.UInt32, mi.UInt32]
 
-    def of(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, LaneSampler]:
-        """The departures with these numbers."""
+    def gather(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, LaneSampler]:
+        """Gather ray, medium and sampler of paths by their numbers."""
         ray = self.ray
         o, d, maxt, time = (gather_lanes(values, index, active) for values in (ray.o, ray.d, ray.maxt, ray.time))
         seeds = [gather_lanes(seed, index, active) for seed in self.seeds]
@@ -52,41 +53,41 @@ class _PathStarts:
         return ray, gather_lanes(self.medium, index, active), LaneSampler.seeded(*seeds, index)
 
 
-def paths_per_lane(most: int, paths: int) -> int:
-    """How many of ``paths`` a lane walks one after the other, at most ``most``: fewer where lanes would become too few."""
+def paths_per_lane(limit: int, paths: int) -> int:
+    """Number of successive paths in a lane: at most ``limit``, and fewer if ``paths`` would fill too few lanes."""
     backend = mi.variant().split("_")[0]
-    return max(1, min(most, paths // MIN_LANES[backend]))
+    return max(1, min(limit, paths // MIN_LANES[backend]))
 
 
 def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f, count: int) -> tuple[mi.Spectrum, mi.Float]:
-    """Walk paths from the camera, ``count`` one after the other in each lane.
+    """Walk paths from the camera, ``count`` in succession in each lane.
 
     Args:
-        estimators: as of :func:`mivol.transport.path.walk.walk_path`.
-        sampler: two numbers a path, which seed the path's own.
-        ray: world space, unit direction, one for each path.
-        count: paths of a lane.
+        estimators: estimators of the render.
+        sampler: random numbers: two for each path, seeding the path's own generator.
+        ray: camera rays in world space with unit directions, one for each path.
+        count: number of paths in a lane.
 
     Returns:
-        The radiance of each path, and what the film's alpha sees, in [0, 1].
+        The radiance and the alpha (in [0, 1]) of each path.
 
-    Bias, variance: of the paths. Memory: 12 numbers a path.
+    Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`. Memory: 12 numbers a path.
     """
     n = dr.width(ray)
     lanes, per_lane = -(-n // count), dr.opaque(mi.UInt32, count)
     seeds = draw_seeds(sampler)
-    departure = _PathStarts(clip_camera_ray(ray), estimators.media.medium_at(ray), seeds)
+    starts = _PathStarts(clip_camera_ray(ray), estimators.media.medium_at(ray), seeds)
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
-    dr.eval(departure, L, alpha)
+    dr.eval(starts, L, alpha)
     index = dr.arange(mi.UInt32, lanes) * per_lane
     end = dr.minimum(index + per_lane, dr.opaque(mi.UInt32, n))
 
     def start(index: mi.UInt32, active: mi.Bool) -> Path:
-        ray, medium, sampler = departure.of(index, active)
+        ray, medium, sampler = starts.gather(index, active)
         path = start_path(estimators, ray, Primal(dr.zeros(mi.Spectrum, lanes)), sampler, None, active)
         return leave_camera(estimators, path, medium)
 
-    def walk_on(path: Path, index: mi.UInt32) -> tuple[Path, mi.UInt32]:
+    def advance(path: Path, index: mi.UInt32) -> tuple[Path, mi.UInt32]:
         path = advance_path(estimators, path)
         ended = ~path.active
         dr.scatter(L, path.score.L, index, ended)
@@ -95,7 +96,7 @@ def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f
         return dr.select(ended, start(index, ended & (index < end)), path), index
 
     dr.while_loop(
-        state=(start(index, index < end), index), cond=lambda path, _: path.active, body=walk_on, label="successive paths"
+        state=(start(index, index < end), index), cond=lambda path, _: path.active, body=advance, label="successive paths"
     )
     dr.eval(L, alpha)
     return L, alpha

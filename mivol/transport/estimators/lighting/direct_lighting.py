@@ -218,7 +218,7 @@ class DirectLighting:
         emitters, mei = self.emitters, vertex.interaction
         wo, weight, pdf = sample_phase(self.media, mei, samples.component, samples.direction, active)
         on = active & (pdf > 0)
-        ray = FineRay.from_point(vertex.place, wo, mei)
+        ray = FineRay.from_point(vertex.p, wo, mei)
         end, _, light = find_transmittance(self.media, ray, mei.medium, on, rng)
         si = end.si
         emitter = si.emitter(self.media.scene, on)

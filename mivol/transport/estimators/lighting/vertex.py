@@ -69,12 +69,12 @@ class MediumVertex:
     Attributes:
         media: of the scene.
         interaction: the point, as Mitsuba's phase functions and emitters see it.
-        place: the point in float64, from which rays leave.
+        p: the point in float64, from which rays leave.
     """
 
     media: SceneMedia
     interaction: mi.MediumInteraction3f
-    place: mi.Point3d
+    p: mi.Point3d
 
     @property
     def phase(self) -> mi.PhaseFunctionPtr:
@@ -82,7 +82,7 @@ class MediumVertex:
         return self.interaction.medium.phase_function()
 
     def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
-        return self.place, self.interaction.medium
+        return self.p, self.interaction.medium
 
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         return self.phase.eval_pdf(mi.PhaseFunctionContext(None), self.interaction, d, active)[0]
