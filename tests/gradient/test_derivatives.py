@@ -136,7 +136,9 @@ def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their random numbers do, and those of any two stems."""
     made = []
     real = derivatives._Branches.split.__func__
-    monkeypatch.setattr(derivatives._Branches, "split", classmethod(lambda cls, *args: made.append(real(cls, *args)) or made[0]))
+    monkeypatch.setattr(
+        derivatives._Branches, "split", classmethod(lambda cls, *args: made.append(real(cls, *args)) or made[0])
+    )
     monkeypatch.setattr(derivatives, "BALANCE", 100.0)
     back(smoky(), KEYS["density"], 64, fresh(3))
     stem, seeds = np.array(made[0].stem), np.array(made[0].seeds[:2])
