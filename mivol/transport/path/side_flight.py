@@ -77,10 +77,12 @@ class SideFlightLight(TrackedTerm):
         self.flown = flown
 
     def vjp(self, dL: mi.Spectrum) -> None:
+        """Add the derivatives of the phase functions, the emitter and the flight, weighted by ``dL``."""
         super().vjp(dL)
         self.flown.vjp(dL * self.value)
 
     def jvp(self) -> mi.Spectrum:
+        """Tangent of the light."""
         return super().jvp() + self.value * self.flown.jvp()
 
 
