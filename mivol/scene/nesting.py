@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.traversal.box import read_box
+from mivol.transport.traversal.box import fit_box
 from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["OrientedBox", "bounds", "box_around", "extent", "nesting_fault"]
@@ -69,7 +69,7 @@ class OrientedBox:
 def box_around(shape: mi.Shape) -> OrientedBox:
     """A box around a shape."""
     if shape.class_name() == "Cube":
-        box = read_box(shape)
+        box = fit_box(shape)
         edges = box.to_world[:3, :3].T
         return OrientedBox(box.corners(), edges / np.linalg.norm(edges, axis=1, keepdims=True))
     low, high = bounds(shape)

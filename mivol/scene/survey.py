@@ -13,7 +13,7 @@ from mivol.scene.facts import Boundary
 from mivol.scene.nesting import OrientedBox, box_around, extent, nesting_fault
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.medium_view import nested_field
-from mivol.transport.traversal.box import Box, read_box
+from mivol.transport.traversal.box import Box, fit_box
 
 __all__ = ["AROUND", "SceneSurvey", "find_around", "is_instance", "survey_scene"]
 
@@ -173,7 +173,7 @@ def is_instance(shape: mi.Shape) -> bool:
 def _boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox]) -> Boundary:
     alone = not any(box.shares(boxes[shape.ptr]) for other, box in boxes.items() if other != shape.ptr)
     is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
-    return Boundary(shape.interior_medium(), name, shape.class_name(), read_box(shape) if is_box else None)
+    return Boundary(shape.interior_medium(), name, shape.class_name(), fit_box(shape) if is_box else None)
 
 
 def find_around(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:

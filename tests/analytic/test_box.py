@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.traversal.box import Box, read_box
+from mivol.transport.traversal.box import Box, fit_box
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -38,4 +38,4 @@ def test_box_of_a_sheared_cube():
     shear = np.array([[1, 0.5, 0, 3], [0, 2, 0, -1], [0.25, 0, 1, 0], [0, 0, 0, 1.0]])
     cube = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f(shear)})
     ends = np.array([[x, y, z, 1] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)])
-    np.testing.assert_allclose(read_box(cube).corners(), (ends @ shear.T)[:, :3], atol=8 * 2.0**-24 * 6)
+    np.testing.assert_allclose(fit_box(cube).corners(), (ends @ shear.T)[:, :3], atol=8 * 2.0**-24 * 6)

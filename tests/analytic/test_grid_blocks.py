@@ -144,7 +144,7 @@ def test_coarse_grids_skip_what_is_empty_where_the_fine_one_does(skip):
 def test_blocks_that_hold_anything_are_listed(shift):
     """Every block with a node that is not 0; none that is further than a block from one."""
     values, edge = sparse(1)[..., 0], 1 << shift
-    held = np.array(coarsen_grid(make_lattice(mi.TensorXf(values[..., None]), TWO), shift, True).held)
+    held = np.array(coarsen_grid(make_lattice(mi.TensorXf(values[..., None]), TWO), shift, True).occupied_blocks)
     blocks = [(n >> shift) + 1 for n in SIZE]
     nodes = [np.clip(np.arange(b * edge + 1)[None] - 1, 0, n - 1)[0] for b, n in zip(blocks, SIZE, strict=True)]
     padded = values[np.ix_(*nodes)] > 0

@@ -15,7 +15,7 @@ from mivol.transport.media import medium_view
 from mivol.transport.media.extinction import ConstantExtinction
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView, find_grid_place, view_medium
-from mivol.transport.traversal.box import Box, read_box
+from mivol.transport.traversal.box import Box, fit_box
 from mivol.transport.traversal.lattice import Lattice
 from scenes import FRAMES, box_of, centred, grid_volume, medium, refused
 
@@ -74,7 +74,7 @@ def test_a_stock_grid_that_fills_its_boundary_is_placed_exactly(draw):
     turned = scenes.rotation(rng.normal(size=3), rng.uniform(0.3, 3)) @ np.diag(rng.uniform(1, 3, 3))
     place = scenes.centred(turned, rng.uniform(1, 3, 3))
     cube = mi.load_dict(box_of(medium("heterogeneous", grid_volume("gridvolume", VALUES, place)), place))
-    found = view_medium(cube.interior_medium(), read_box(cube)).parts[0].lattice.to_world
+    found = view_medium(cube.interior_medium(), fit_box(cube)).parts[0].lattice.to_world
     # Vertices of size 6 at most, each rounded to half an ulp (2^-22) once in the transform and once in the product; the fit
     # over 24 of them averages. Six digits would leave 5e-6.
     assert np.abs(found - place).max() <= 2 * 2.0**-22

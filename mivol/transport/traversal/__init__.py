@@ -1,1 +1,1 @@
-"""Geometry only: the cells that a ray crosses, interpolation and quadrature in one cell, ray spawning, random numbers."""
+"""Geometry of rays in grids and boxes, with interpolation and quadrature in a cell, and random numbers for each lane."""

@@ -1,4 +1,7 @@
-"""Boundaries that are boxes (parallelepipeds), which rays are cut to by a slab test instead of being traced."""
+"""Boxes in the world (parallelepipeds), and the slab test that clips a ray to a box.
+
+References: Kay & Kajiya 1986 (slab test).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["Box", "read_box", "clip_to_box"]
+__all__ = ["Box", "fit_box", "clip_to_box"]
 
 
 @dataclass
@@ -18,16 +21,16 @@ class Box:
     to_world: np.ndarray
 
     def rows(self) -> list[list[mi.Float64]]:
-        """The (3, 4) map from the world to the unit cube, as opaque arrays, so that boxes in other places share one kernel.
+        """The (3, 4) map from the world to the unit cube, as opaque arrays, so that boxes in different places share a kernel.
 
-        They are made anew for each render: ``dr.freeze`` cannot record a function that uses arrays made before the recording
-        without being passed to it.
+        The arrays are made anew for each render: ``dr.freeze`` cannot record a function using arrays that were made before the
+        recording and are not passed to the function.
         """
         return [[dr.opaque(mi.Float64, float(v)) for v in row] for row in np.linalg.inv(self.to_world)[:3]]
 
     @property
     def edge(self) -> float:
-        """Length of an edge of the cube of the same volume."""
+        """Edge length of the cube of the same volume."""
         return float(abs(np.linalg.det(self.to_world[:3, :3])) ** (1 / 3))
 
     def corners(self) -> np.ndarray:
@@ -36,20 +39,20 @@ class Box:
         return (unit @ self.to_world.T)[:, :3]
 
     def contains(self, other: np.ndarray, tolerance: float) -> bool:
-        """Whether another box lies inside this one, to ``tolerance`` of this one's edges."""
+        """Whether another box lies inside this box, up to ``tolerance`` of the edges of this box."""
         local = np.c_[Box(other).corners(), np.ones(8)] @ np.linalg.inv(self.to_world).T
         return bool((local[:, :3] >= -tolerance).all() and (local[:, :3] <= 1 + tolerance).all())
 
     def matches(self, other: np.ndarray, tolerance: float) -> bool:
-        """Whether another box has the same corners, to ``tolerance`` of its size."""
+        """Whether another box has the same corners, up to ``tolerance`` of the size of the other box."""
         theirs = Box(other).corners()
         size = np.ptp(theirs, axis=0).max()
         apart = np.linalg.norm(self.corners()[:, None] - theirs[None], axis=-1).min(axis=1)
         return bool(apart.max() <= tolerance * size)
 
 
-def read_box(shape: mi.Shape) -> Box:
-    """The box of a ``cube`` shape. It reads the vertices on the host, which is not possible inside ``dr.freeze``."""
+def fit_box(shape: mi.Shape) -> Box:
+    """Fit the box of a ``cube`` shape. The vertices are read on the host, which is not possible inside ``dr.freeze``."""
     world = _vertices(shape)
     unit = (_vertices(mi.load_dict({"type": "cube"})) + 1) / 2
     fit, *_ = np.linalg.lstsq(np.c_[unit, np.ones(len(unit))], world, rcond=None)
@@ -65,16 +68,17 @@ def _vertices(shape: mi.Shape) -> np.ndarray:
 def clip_to_box(
     rows: list, low: tuple, high: tuple, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: mi.Float64
 ) -> tuple[list[mi.Float64], list[mi.Float64], mi.Float64, mi.Float64]:
-    """Cut [t0, t1] of a ray to a box, in float64 (the slab test of Kay & Kajiya 1986).
+    """Clip [t0, t1] of a ray to a box, in float64.
 
     Args:
-        rows: (3, 4) map from the world to the box's coordinates.
-        low, high: the box there.
+        rows: (3, 4) map from the world to the coordinates of the box.
+        low, high: corners of the box in these coordinates.
         o, d: world ray.
-        t0, t1: the interval of the ray to cut [length].
+        t0, t1: interval of the ray [length].
 
     Returns:
-        The ray's origin and direction in the box's coordinates, and the interval inside; t1 <= t0 where there is none.
+        Origin and direction of the ray in the coordinates of the box, and the interval inside; t1 <= t0 if the ray misses the
+        box.
     """
     f64 = mi.Float64
     o, d = [f64(o[a]) for a in range(3)], [f64(d[a]) for a in range(3)]

@@ -5,26 +5,26 @@ r"""Emission and absorption in one cell of a ray: fourth-order quadrature with t
           x = \frac{\tau}{\sqrt 3}
 
 with :math:`\tau = \tfrac{\Delta}{2} (\sigma_1 + \sigma_2)`, exact for a cubic. This is the two-stage Gauss collocation method
-(Hairer & Wanner 1996, table IV.5.1): its optical depths in front of the two points differ by :math:`\tau / \sqrt 3`, so the
-source functions are weighted by :math:`\sigma_1` and :math:`\sigma_2 e^{-x}`. Two things are changed:
+(Hairer & Wanner 1996, table IV.5.1): its optical depths in front of the two points differ by :math:`\tau / \sqrt 3`, so
+:math:`\sigma_1` and :math:`\sigma_2 e^{-x}` weigh the source functions. Two things are changed:
 
-* The weights are scaled to sum to the cell's opacity. A constant source function then gives c (1 - T) to rounding at any
+* The weights are scaled to sum to the opacity of the cell. A constant source function then gives c (1 - T) to rounding at any
   optical depth.
-* exp(x) is replaced by Q, which agrees with it beyond the order of the method but grows only quadratically. The reason is the
-  derivative with respect to sigma_1 of a cell that is opaque behind its first point: it grows as Q does, so with the
-  exponential it would be of the size of exp(tau / sqrt 3) and useless to an optimiser. (The price, measured at an optical depth
-  of 0.5 a cell: 1.9 times the error of the exponential. With 1 + x + x^2 / 2 it is 4.5 times.)
+* Q replaces exp(x). Q agrees with exp(x) beyond the order of the method but grows only quadratically. The derivative with
+  respect to sigma_1 of a cell that is opaque behind its first point grows as Q; with the exponential it would be of the size of
+  exp(tau / sqrt 3) and useless to an optimizer. The price is 1.9 times the error of the exponential at an optical depth of 0.5
+  a cell (4.5 times with 1 + x + x^2 / 2).
 
-An emission density j (radiance per length that does not go with the extinction) is taken at the same points,
+An emission density j (radiance per length, independent of the extinction) is taken at the same points,
 
 .. math:: \int_0^\Delta j\, e^{-\tau(t)} dt \approx N \big( (1 - v) j_1 + v j_2 \big)
 
-N is the integral of the transmittance over the cell, and v follows from the mean position of the light that leaves it. Both
+N is the integral of the transmittance over the cell, and v follows from the mean position of the light leaving the cell. Both
 come from the moments E_n of :mod:`mivol.numerics`, to second and to first order in the slope of the extinction.
 
-Conventions. Points 1 and 2 are the first and second Gauss point along the ray (:data:`GAUSS_POINT`). Nothing is divided by an
-extinction or by a transmittance, so values and derivatives are finite for every sigma >= 0, 0 included. Derivatives are
-returned in closed form; Dr.Jit tracks none of them.
+Conventions. Points 1 and 2 are the first and second Gauss point along the ray (:data:`GAUSS_POINT`). No division by an
+extinction or by a transmittance occurs, so values and derivatives are finite for every sigma >= 0, 0 included. Derivatives are
+returned in closed form; Dr.Jit tracks no derivatives.
 
 References: Max 1995 (emission and absorption along a ray); Hochbruck & Ostermann 2010 (phi functions); Abramowitz &
 Stegun 25.4.30 (Gauss points).
@@ -45,20 +45,21 @@ __all__ = ["DensityWeights", "OpacityShares", "share_opacity", "weigh_emission_d
 
 
 STEEP = 1e12
-"""Largest x that is used. Beyond it Q would overflow float32; at it, 1 / Q is already negligible beside any ratio of two
-float32 extinctions, so the clamp changes no result."""
+"""Largest used x. Beyond it Q would overflow float32; at it, 1 / Q is negligible beside any ratio of two float32 extinctions,
+so the clamp changes no result.
+"""
 
 
 @dataclass
 class OpacityShares:
-    """How the opacity of a cell is divided between the source functions at its two points.
+    """Division of the opacity of a cell between the source functions at its two points.
 
     Attributes:
         tau, T, alpha: optical depth, transmittance and opacity of the cell [1].
-        f: the fraction of the opacity that goes to the first point.
+        f: fraction of the opacity of the first point.
         half: half the length of the cell.
-        lean: the part of the derivative by which that fraction shifts: d (alpha f) / d sigma_q is ``half * (T f + lean[q])``.
-        per_sigma: each weight divided by the extinction at its point [length]; finite where the extinction is 0.
+        lean: shift of the fraction in the derivative: d (alpha f) / d sigma_q is ``half * (T f + lean[q])``.
+        per_sigma: each weight divided by the extinction at its point [length]; finite for an extinction of 0.
     """
 
     tau: mi.Float
@@ -71,11 +72,11 @@ class OpacityShares:
 
     @property
     def weights(self) -> tuple[mi.Float, mi.Float]:
-        """Weights of the source functions at the two points; they sum to the opacity."""
+        """Weights of the source functions at the two points; their sum is the opacity."""
         return self.alpha * self.f, self.alpha * (1 - self.f)
 
     def sent(self, c1: mi.Float, c2: mi.Float) -> mi.Float:
-        """Radiance S that leaves the cell towards the ray's origin, for source functions c1 and c2 [radiance]."""
+        """Radiance S leaving the cell towards the origin of the ray, for source functions c1 and c2 [radiance]."""
         return self.alpha * dr.fma(self.f, c1 - c2, c2)
 
     def slopes(self, c1: mi.Float, c2: mi.Float) -> tuple[mi.Float, mi.Float]:
@@ -89,7 +90,7 @@ def share_opacity(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> OpacitySh
 
     Args:
         dt: length of the cell [length], finite.
-        sigma1, sigma2: extinction [1/length] at its Gauss points, finite and at least 0.
+        sigma1, sigma2: extinction [1/length] at the Gauss points, finite and at least 0.
 
     Bias: O(dt^5) a cell for smooth fields; none for a constant source function.
     """
@@ -112,11 +113,11 @@ def share_opacity(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> OpacitySh
 
 @dataclass
 class DensityWeights:
-    """How much of the emission density in a cell leaves it.
+    """Weights of the emission density of a cell in the light leaving the cell.
 
     Attributes:
         weights: [length], of the emission density at the two points.
-        slopes: their derivatives with respect to the extinction, [weight][point of the extinction].
+        slopes: derivatives of the weights with respect to the extinction, [weight][point of the extinction].
     """
 
     weights: tuple[mi.Float, mi.Float]
@@ -127,7 +128,7 @@ def weigh_emission_density(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> 
     """Weigh the emission density [radiance/length] at the two points of a cell.
 
     Args:
-        dt, sigma1, sigma2: as :func:`share_opacity`.
+        dt, sigma1, sigma2: as of :func:`share_opacity`.
 
     Bias: O(dt^5) a cell for smooth fields; none for a constant emission density in a constant extinction. Weights are never
         negative.

@@ -1,7 +1,8 @@
-"""Empty-space skipping: the distance of each block of a grid's cells from the nearest block that is not empty.
+"""Blocks of cells of a grid: distances to the nearest non-empty block, minorants and majorants, and means.
 
-From a block at distance k a ray may cross everything within k - 1 blocks in one step. Distances are Chebyshev distances (the
-largest of the three axes' distances), counted in blocks.
+Conventions. Block b of an axis holds the cells b 2^shift - 1 to (b + 1) 2^shift - 2, and all nodes touching these cells.
+Distances are Chebyshev distances (the largest of the distances along the three axes), counted in blocks. From a block at
+distance k a ray may cross k - 1 blocks in a step.
 
 References: Cohen & Sheffer 1994 (proximity clouds); Szirmay-Kalos et al. 2011 (super-grids).
 """
@@ -41,20 +42,21 @@ SHIFT = 2
 """log2 of the edge of a block."""
 
 BLOCK = 1 << SHIFT
-"""Edge of a block, in cells (measured on threads in a grid of 512^3: an edge of 2 is no faster)."""
+"""Edge of a block [cells]. (An edge of 2 is no faster on threads in a grid of 512^3.)"""
 
 REACH = 15
-"""Largest distance that is stored [blocks]; what is further counts as so far. In an empty box of 128^3 cells a ray takes 3
-steps with it."""
+"""Largest stored distance [blocks]; larger distances count as this distance. A ray crosses an empty box of 128^3 cells in 3
+steps.
+"""
 
 
 def bound_blocks(values: mi.TensorXf) -> mi.Float:
-    """Bound |values| over each block of ``BLOCK``^3 cells (all nodes that its cells touch), all channels together.
+    """Bound |values| over each block of ``BLOCK``^3 cells, all channels together.
 
     Returns:
-        Flat array over (blocks in z, y, x), ceil((N + 1) / BLOCK) of them along an axis. A block with bound 0 is empty.
+        Flat array over the blocks (z, y, x), ceil((N + 1) / BLOCK) along an axis of N voxels. A block with bound 0 is empty.
 
-    Cost: 5/4 look-ups a voxel along x, fewer along the others.
+    Cost: 5/4 look-ups a voxel along x, fewer along y and z.
     """
     flat = _channel_max(dr.abs(dr.detach(values.array)), values.shape[3])
     return reduce_blocks(flat, values.shape[:3], SHIFT, Reduction(dr.maximum, 0))
@@ -66,20 +68,20 @@ def count_blocks(n: int, shift: int = SHIFT) -> int:
 
 
 class Reduction(NamedTuple):
-    """An associative function of two arrays, and its neutral element."""
+    """An associative function of two arrays, with its neutral element."""
 
     combine: Callable[[mi.Float, mi.Float], mi.Float]
     neutral: float
 
 
 def reduce_blocks(flat: mi.Float, res: tuple[int, int, int], shift: int, reduction: Reduction) -> mi.Float:
-    """Reduce the values at all nodes that each block of cells touches, one axis after the other.
+    """Reduce the values at all nodes of each block of cells, axis by axis.
 
     Args:
-        flat: one number a voxel (Z, Y, X).
+        flat: a number for each voxel (Z, Y, X).
         res: (Z, Y, X).
         shift: log2 of the edge of a block [cells].
-        reduction: of the values.
+        reduction: function that combines two values.
 
     Returns:
         Flat array over the blocks (z, y, x).
@@ -117,30 +119,29 @@ def _over_axis(flat: mi.Float, shape: tuple[int, int, int], shift: int, reductio
 
 
 def find_empty_distances(values: mi.TensorXf) -> mi.UInt8:
-    """The :func:`find_distances_of_bounds` of a grid (Z, Y, X, C)."""
+    """Find the distances of :func:`find_distances_of_bounds` for a grid (Z, Y, X, C)."""
     return find_distances_of_bounds(bound_blocks(values), values.shape[:3])
 
 
 def find_distances_of_bounds(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UInt8:
-    """Measure how far each block is from the nearest one that is not empty.
+    """Find the distance of each block to the nearest non-empty block.
 
     Args:
         bounds: from :func:`bound_blocks`.
-        res: of the grid (Z, Y, X).
+        res: resolution of the grid (Z, Y, X).
 
     Returns:
-        Flat array over the blocks: Chebyshev distances [blocks], 0 for a block that is not empty, at most ``REACH``. From a
-        block at distance k a ray may cross k - 1 more blocks along each axis.
+        Flat array over the blocks: Chebyshev distances [blocks], 0 for a non-empty block, at most ``REACH``.
 
-    Cost: 6 ``REACH`` look-ups a block at most.
+    Cost: at most 6 ``REACH`` look-ups a block.
     """
     return find_distances(bounds > 0, tuple(count_blocks(n) for n in res))
 
 
 def find_distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
-    """The Chebyshev distance of each of (Z, Y, X) blocks from the nearest occupied one, at most ``REACH``.
+    """Find the Chebyshev distance of each of (Z, Y, X) blocks to the nearest occupied block, at most ``REACH``.
 
-    Cost: 6 ``REACH`` look-ups each at most, one axis after the other.
+    Cost: at most 6 ``REACH`` look-ups a block, axis by axis.
     """
     z, y, x = counts
     far = dr.select(occupied, mi.UInt8(0), mi.UInt8(REACH))
@@ -153,10 +154,10 @@ def find_distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
 
 @dr.syntax
 def _nearest(far: mi.UInt8, stride: int, n: int) -> mi.UInt8:
-    """Extend distances that are right across the axes before to one more axis.
+    """Extend distances across the previous axes to another axis.
 
-    The distance of a place is the smallest, over its neighbours along the axis, of the larger of two numbers: how far the
-    neighbour is along the axis, and the neighbour's own distance ``far`` across the other axes.
+    The new distance of a block is a minimum over its neighbours along the axis. The term of a neighbour is the larger of two
+    numbers: its distance along the axis, and its own distance ``far`` across the previous axes.
     """
     here = dr.arange(mi.Int32, dr.width(far))
     place = here // stride % n
@@ -173,17 +174,18 @@ def _nearest(far: mi.UInt8, stride: int, n: int) -> mi.UInt8:
 
 
 SMALL = 96
-"""Largest grid, in voxels along an axis, whose blocks are of 4 cells: their bounds are tighter, and a ray crosses few of them
-(measured on delta tracking: up to 64^3 blocks of 4 cost less than blocks of 8, from 128^3 on more)."""
+"""Largest grid [voxels along an axis] with blocks of 4 cells. (Delta tracking: blocks of 4 cost less than blocks of 8 up to
+64^3, and more from 128^3 on.)
+"""
 
 
 @dataclass
 class BlockRanges:
-    """The smallest value (minorant) and the range up to the largest (majorant) in each block of cells of a grid.
+    """The smallest value (minorant) and the range up to the largest value (majorant) of each block of cells.
 
     Attributes:
-        table: flat (blocks in z, y, x; then the smallest value of each channel, and last one range for all channels: the
-            largest difference that any of them has between its largest and its smallest value).
+        table: flat; blocks (z, y, x), then the smallest value of each channel, then a range shared by the channels: the largest
+            difference of any channel between its largest and its smallest value.
         res: number of blocks along Z, Y, X.
         channels: number of channels of the grid.
         shift: log2 of the edge of a block [cells].
@@ -195,7 +197,7 @@ class BlockRanges:
     shift: int
 
     def at(self, block: mi.Vector3i, active: mi.Bool) -> tuple[list[mi.Float], mi.Float]:
-        """The smallest value of each channel in a block, and the range above it."""
+        """Read the smallest value of each channel in a block, and the range above the smallest values."""
         _, y, x = self.res
         n = self.channels + 1
         index = mi.UInt32((block.z * y + block.y) * x + block.x)
@@ -208,7 +210,8 @@ def find_block_ranges(values: mi.TensorXf, shift: int | None = None) -> BlockRan
 
     Args:
         values: (Z, Y, X, C), finite.
-        shift: log2 of the edge of a block [cells]; None for 2 in a grid of at most ``SMALL`` voxels an axis, else 3.
+        shift: log2 of the edge of a block [cells]; by default 2 for a grid of at most ``SMALL`` voxels an axis, 3 for larger
+            grids.
 
     Cost: 9/8 reads a voxel along each axis, since neighbouring blocks share a layer of nodes.
     """
@@ -238,22 +241,22 @@ class CoarseGrid:
     """The means of a grid over blocks of voxels, as a grid in the same place.
 
     Attributes:
-        lattice: voxel i holds the mean of the voxels 2^shift i to 2^shift (i + 1) - 1, along each axis; the last one repeats
+        lattice: voxel i holds the mean of the voxels 2^shift i to 2^shift (i + 1) - 1 along each axis; the last voxel repeats
             the border of the grid.
-        held: flat indices (z, y, x) of the non-empty blocks, for a visibility cache; None where no list was asked for.
+        occupied_blocks: flat indices (z, y, x) of the non-empty blocks, for a visibility cache; None without a list.
     """
 
     lattice: Lattice
-    held: mi.UInt32 | None
+    occupied_blocks: mi.UInt32 | None
 
 
 def coarsen_grid(lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
-    """Take means over blocks of 2^shift voxels along each axis.
+    """Average a grid over blocks of 2^shift voxels along each axis.
 
     Args:
         lattice: the grid.
         shift: log2 of the edge of a block [voxels].
-        lists: whether to list the blocks that are not empty, too.
+        lists: whether to list the non-empty blocks.
 
     Cost: 8/7 look-ups a voxel, 8 a block.
     """
@@ -267,7 +270,7 @@ def coarsen_grid(lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
     scale = np.diag([edge * m / n for m, n in zip(shape[::-1], lattice.res[::-1], strict=True)] + [1.0])
     empty_distances = find_empty_distances(values) if lattice.empty_distances is not None else None
     return CoarseGrid(
-        Lattice(values, lattice.to_world @ scale, empty_distances), _held(values, lattice.res, shift) if lists else None
+        Lattice(values, lattice.to_world @ scale, empty_distances), _list_occupied(values, lattice.res, shift) if lists else None
     )
 
 
@@ -284,13 +287,14 @@ def _mean_along(flat: mi.Float, n: int, inner: int, edge: int) -> mi.Float:
     return total
 
 
-def _held(means: mi.TensorXf, res: tuple[int, int, int], shift: int) -> mi.UInt32:
-    """List the blocks of cells that have a node above 0.
+def _list_occupied(means: mi.TensorXf, res: tuple[int, int, int], shift: int) -> mi.UInt32:
+    """List the blocks of cells with a node above 0.
 
-    A block of cells lies across two mean voxels along each axis (one at the border), so it is empty where all 8 means are 0.
+    A block of cells lies across two mean voxels along each axis (a single voxel at the border), so a block with 8 zero means is
+    empty.
     """
     c, sizes = means.shape[3], [(n >> shift) + 1 for n in res]
-    i, found = dr.arange(mi.UInt32, sizes[0] * sizes[1] * sizes[2]), mi.Bool(False)
+    i, is_occupied = dr.arange(mi.UInt32, sizes[0] * sizes[1] * sizes[2]), mi.Bool(False)
     block = (i // (sizes[1] * sizes[2]), i // sizes[2] % sizes[1], i % sizes[2])
     for corner in range(8):
         z, y, x = (
@@ -298,5 +302,5 @@ def _held(means: mi.TensorXf, res: tuple[int, int, int], shift: int) -> mi.UInt3
         )
         node = mi.UInt32((z * means.shape[1] + y) * means.shape[2] + x) * c
         for channel in range(c):
-            found |= dr.gather(mi.Float, means.array, node + channel) > 0
-    return dr.compress(found)
+            is_occupied |= dr.gather(mi.Float, means.array, node + channel) > 0
+    return dr.compress(is_occupied)

@@ -1,13 +1,13 @@
-"""The walk through the cells of a grid that a ray crosses, one after the other.
+"""The walk through the cells of a grid, or of a box, along a ray.
 
-The walk knows the geometry only. What is done with a cell is decided by a visitor, ``visit(state, cell, active) -> state``,
-which sums an optical depth, its tangent, its transpose, or keeps a candidate of a reservoir.
+The walk knows the geometry only. A visitor, ``visit(state, cell, active) -> state``, decides what to compute in a cell: an
+optical depth, its tangent, its transpose, or a candidate of a reservoir.
 
 Conventions. Cells are those of :mod:`mivol.transport.traversal.lattice`. The state inside the grid is an integer cell and a
-fraction in it, so the error of a position does not grow with its coordinate.
+fraction in the cell, so the error of a position does not grow with its coordinate.
 
-References: Amanatides & Woo 1987 (the traversal); Szirmay-Kalos et al. 2011 (super-grids: empty blocks are skipped whole);
-Cohen & Sheffer 1994 (proximity clouds: as many blocks are skipped as are empty all around).
+References: Amanatides & Woo 1987 (digital differential analyser); Szirmay-Kalos et al. 2011 (super-grids: empty blocks are
+skipped whole); Cohen & Sheffer 1994 (proximity clouds: a ray skips all blocks within the empty distance).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks
 from mivol.transport.traversal.lattice import Lattice, Mask3, Segment
 from mivol.transport.traversal.rays import Ray
 
-__all__ = ["Cell", "NodeArray", "corner_nodes", "read_nodes", "walk_cells", "CellVisitor", "walk_box_cells"]
+__all__ = ["Cell", "NodeArray", "corner_nodes", "read_nodes", "walk_box_cells", "walk_cells"]
 
 
 @dataclass
 class NodeArray:
-    """An array over the nodes of a lattice that a walk reads: flat, channels fastest, then x."""
+    """An array over the nodes of a lattice for a walk to read: flat, channels fastest, then x."""
 
     array: mi.Float
     channels: int = 1
@@ -38,12 +38,17 @@ class NodeArray:
 
 @dataclass
 class Cell:
-    """What a visitor sees of one cell, in the direction of the ray.
+    """A cell as a visitor sees it, in the direction of the ray.
 
-    ``corners`` holds [read][channel][corner] values, bits 0, 1, 2 of the corner: near (0) or far (1) in x, y, z; where
-    ``ahead`` is false, near is the upper node of the axis. ``lower`` is the lower node of the cell, -1 to N - 1. ``frac`` is
-    where the ray enters, from the near planes, and ``step`` how far it goes, in fractions of the cell; ``s`` is the world
-    length walked before the cell and ``dt`` in it.
+    Attributes:
+        corners: [array][channel][corner] values; bits 0, 1, 2 of the corner are near (0) or far (1) in x, y, z. Where
+            ``ahead`` is false, near is the upper node of the axis.
+        lower: lower node of the cell, -1 to N - 1.
+        ahead: axes along which the ray runs upwards.
+        frac: entry point of the ray, as fractions of the cell from the near planes.
+        step: distance to the exit, in fractions of the cell.
+        s: world length walked before the cell [length].
+        dt: world length in the cell [length].
     """
 
     corners: list
@@ -66,24 +71,24 @@ def walk_cells(
     until: Callable[[Any], mi.Bool] | None = None,
     halts: bool = False,
 ) -> Any:
-    """Visit the cells that a segment crosses, in order, and return the last state.
+    """Visit the cells along a segment, in order, and return the last state.
 
-    A ray that leaves a cell through a face keeps the four corners of that face, so only the four new ones are read.
+    A ray leaving a cell through a face keeps the four corners of the face, so the next cell reads four corners only.
 
     Args:
-        lattice: the grid; where it has ``empty_distances``, empty blocks are crossed without a visit, as many at once as are
-            empty all around.
-        segment: from :func:`clip_to_grid`.
-        visit: ``visit(state, cell, active) -> state``; called once, while the loop is traced.
+        lattice: the grid. With ``empty_distances``, a step without a visit crosses an empty block and all empty blocks around
+            it.
+        segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
+        visit: ``visit(state, cell, active) -> state``; called once, while Dr.Jit traces the loop.
         state: any PyTree of Dr.Jit arrays.
-        reads: arrays over the nodes; the visitor finds their corners in ``cell.corners``.
+        reads: arrays over the nodes; their values arrive in ``cell.corners``.
         active: lanes to walk.
-        until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to walk to the end.
-        halts: the visitor may stop inside a cell: it returns its state and how far it went, at most ``cell.dt``, and is called
-            again from there.
+        until: ``until(state) -> mask`` of lanes to stop, evaluated after each cell; None to walk to the end.
+        halts: whether the visitor may stop inside a cell. It then returns its state and the walked distance, at most
+            ``cell.dt``, and is called again from there.
 
-    Cost: one step per cell or empty region, at most X + Y + Z + 6 of them; 4 reads a step and channel (8 a visited cell
-        where blocks are skipped).
+    Cost: a step for each cell or empty region, at most X + Y + Z + 6 steps; 4 reads a step and channel (8 a visited cell if
+        empty blocks are skipped).
     """
     # Dr.Jit makes every object that a loop's body names part of the loop's state: so the body names these two arrays only,
     # and neither the lattice nor the segment.
@@ -130,11 +135,11 @@ def walk_cells(
         plane = lesser(lesser(reach.x, reach.y), reach.z)
         left = (length - s) - s_rest
         dt = lesser(plane, left)
-        here = Cell(corners, cell, ahead, frac, speed * dt, s, dt)
+        visited = Cell(corners, cell, ahead, frac, speed * dt, s, dt)
         if halts:
-            state, dt = visit(state, here, active & full)
+            state, dt = visit(state, visited, active & full)
         else:
-            state = visit(state, here, active & full)
+            state = visit(state, visited, active & full)
 
         # -- Leave through one face: a tie is a step of length 0 through the next ------------------------------------------
         through_x = reach.x <= plane
@@ -151,8 +156,8 @@ def walk_cells(
 
         # -- Advance: one plane further, or as many as the empty region has ----------------------------------------------
         if skip:
-            there = dr.fma(speed, dt, frac)
-            jump = dr.select(through, span + 1, dr.clip(mi.Vector3i(dr.floor(there)), 0, span))
+            arrival = dr.fma(speed, dt, frac)
+            jump = dr.select(through, span + 1, dr.clip(mi.Vector3i(dr.floor(arrival)), 0, span))
             passed += mi.Vector3f(jump)
             cell = dr.clip(cell + sign * jump, -1, top)
         else:
@@ -170,10 +175,12 @@ def walk_cells(
 
 
 def _add(total: mi.Float, rest: mi.Float, term: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Add to a compensated sum (Knuth's two-sum): float32 alone lets the end of a walk of 256 cells drift by 8e-4 of one."""
+    """Add to a compensated sum (Knuth's two-sum): with float32 alone the end of a walk of 256 cells drifts by 8e-4 of a
+    cell.
+    """
     after = total + term
-    took = after - total
-    return after, rest + ((total - (after - took)) + (term - took))
+    added = after - total
+    return after, rest + ((total - (after - added)) + (term - added))
 
 
 def _strides(res: tuple[int, int, int]) -> tuple[mi.Vector3i, mi.Vector3i]:
@@ -201,7 +208,7 @@ def _box(near: mi.Vector3i, far: mi.Vector3i) -> list[mi.UInt32]:
 def _far_face(near: mi.Vector3i, far: mi.Vector3i, through: Mask3) -> list[mi.UInt32]:
     """Flat node indices of the 4 far corners across the axis ``through``.
 
-    In the order of the two other axes, the lower one fastest: (y, z), (x, z) or (x, y).
+    The order is that of the two other axes, the lower axis fastest: (y, z), (x, z) or (x, y).
     """
     base = dr.select(through, far, near)
     base = base.x + base.y + base.z
@@ -212,7 +219,9 @@ def _far_face(near: mi.Vector3i, far: mi.Vector3i, through: Mask3) -> list[mi.UI
 
 
 def _shift(old: list, through: Mask3, fresh: list) -> list:
-    """[read][channel][corner] after leaving through a face: far corners become near ones, the 4 ``fresh`` are the far ones."""
+    """Corners [array][channel][corner] after leaving through a face: far corners become near corners, and ``fresh`` are the
+    far ones.
+    """
     if old and isinstance(old[0], list):
         return [_shift(o, through, f) for o, f in zip(old, fresh, strict=True)]
     if not old:
@@ -234,23 +243,23 @@ def read_nodes(reads: Sequence[NodeArray], nodes: list[mi.UInt32], active: mi.Bo
     ]
 
 
-CellVisitor = Callable[..., Any]
-"""``visit(state, cell, t0, t1, on) -> state``: what to do with the interval of a ray in one cell (x, y, z)."""
-
-
-def walk_box_cells(rows: list[list[mi.Float64]], count: int, ray: Ray, visit: CellVisitor, state: Any, active: mi.Bool) -> Any:
-    """Visit the cells of a box in the order of a ray that has no end.
+def walk_box_cells(
+    rows: list[list[mi.Float64]], count: int, ray: Ray, visit: Callable[..., Any], state: Any, active: mi.Bool
+) -> Any:
+    """Visit the equal cells of a box along a ray without end; the box has no grid of values.
 
     Args:
-        rows: (3, 4) map from the world to the box, where a cell has the edge 1.
+        rows: (3, 4) map from the world to the box, in which a cell has the edge 1.
         count: cells along each axis.
         ray: world space.
-        visit: :data:`OccupiedCell`.
+        visit: ``visit(state, cell, t0, t1, on) -> state`` for the interval of the ray in a cell (x, y, z).
         state: any PyTree of Dr.Jit arrays.
         active: lanes to walk.
 
     Returns:
-        The last state. Cost: at most 3 ``count`` - 2 cells.
+        The last state.
+
+    Cost: at most 3 ``count`` - 2 cells.
     """
     q, v, t0, t1 = clip_to_box(rows, (0.0,) * 3, (float(count),) * 3, ray.o, ray.d, mi.Float64(0), mi.Float64(dr.inf))
     q, v = mi.Point3f(*map(mi.Float, q)), mi.Vector3f(*map(mi.Float, v))

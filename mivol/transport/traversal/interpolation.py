@@ -1,7 +1,10 @@
-"""Trilinear interpolation in a cell, its transpose, and the two Gauss points of a ray's interval in it.
+"""A trilinear function in a cell: its value, its transpose, and the cubic along a ray.
 
-Conventions. Bits 0, 1, 2 of the number of a corner are x, y, z. Along a line a trilinear function is a cubic in each cell, so
-two Gauss points integrate it exactly.
+Along a line a trilinear function is a cubic in each cell. Two Gauss points integrate the cubic exactly, and its integral, a
+quartic, is inverted to sample distances.
+
+Conventions. Bits 0, 1, 2 of the index of a corner are x, y, z. A cubic covers a piece of a ray of length ``dt`` [length]; x in
+[0, 1] is a fraction of the piece.
 
 References: Abramowitz & Stegun 25.4.30 (Gauss points).
 """
@@ -30,11 +33,11 @@ __all__ = [
 
 
 GAUSS_POINT = 0.5 - math.sqrt(3) / 6
-"""First of the two Gauss-Legendre points on [0, 1]; the other is 1 minus it. The rule is exact for cubics."""
+"""First of the two Gauss-Legendre points on [0, 1]; the second is 1 - GAUSS_POINT. The rule is exact for cubics."""
 
 
 def gauss_points(cell: Cell) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """The two Gauss points of a ray's interval in a cell, as fractions from the cell's near planes."""
+    """The two Gauss points of the interval of a ray in a cell, as fractions from the near planes of the cell."""
     return dr.fma(cell.step, GAUSS_POINT, cell.frac), dr.fma(cell.step, 1 - GAUSS_POINT, cell.frac)
 
 
@@ -58,24 +61,25 @@ def trilinear_weights(frac: mi.Vector3f) -> list[mi.Float]:
 
 
 def node_weights(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> list[mi.Float]:
-    """The 8 trilinear weights at a point of a cell (from its near planes), in the order of the grid's own axes."""
+    """The 8 trilinear weights at a point of a cell (from its near planes), in the order of the axes of the grid."""
     return trilinear_weights(_natural_frac(frac, cell, res))
 
 
 def _natural_frac(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> mi.Vector3f:
-    """Fractions along the grid's own axes, from fractions along the ray; see :func:`fraction_from_lower`."""
+    """Fractions along the axes of the grid, from fractions along the ray; see :func:`fraction_from_lower`."""
     return fraction_from_lower(dr.select(cell.ahead, frac, 1 - frac), cell.lower, res)
 
 
 def fraction_from_lower(frac: mi.Vector3f, lower: mi.Vector3i, res: tuple[int, int, int]) -> mi.Vector3f:
-    """Fractions from the lower node of a cell; in the outer half voxel they put all weight on the only node that exists."""
+    """Fractions from the lower node of a cell; in the outer half voxel all weight goes to the only node there."""
     z, y, x = res
     return dr.select(lower < 0, 1, dr.select(lower >= mi.Vector3i(x - 1, y - 1, z - 1), 0, frac))
 
 
 NEWTON_STEPS = 8
-"""Each step doubles the number of right digits. Where the extinction vanishes at an end of the piece the steps are bisections;
-these leave an error of 2^-8 of a cell in a place that holds hardly any light."""
+"""Each step doubles the number of right digits. If the extinction vanishes at an end of the piece the steps are bisections,
+which leave an error of 2^-8 of a cell in a place of hardly any light.
+"""
 
 
 def fit_cubic(f0: mi.Float, f1: mi.Float, f2: mi.Float, f3: mi.Float) -> list[mi.Float]:
@@ -94,18 +98,18 @@ def eval_cubic(c: list[mi.Float], x: mi.Float) -> mi.Float:
 
 
 def integrate_cubic(c: list[mi.Float], dt: mi.Float, x: mi.Float) -> mi.Float:
-    """The integral from 0 to x over a piece of the length ``dt``; rounding makes it no less than 0."""
+    """The integral from 0 to x over a piece of length ``dt``; clamped to at least 0 against rounding."""
     return dr.maximum(dt * x * dr.fma(x, dr.fma(x, dr.fma(x, 0.25 * c[3], c[2] / 3), 0.5 * c[1]), c[0]), 0)
 
 
 def invert_cubic_integral(c: list[mi.Float], dt: mi.Float, goal: mi.Float, whole: mi.Float) -> mi.Float:
-    """Find the x at which the integral of a cubic that is nowhere negative is ``goal``, by Newton steps in a bracket.
+    """Find the x at which the integral of a non-negative cubic is ``goal``, by Newton steps in a bracket.
 
     Args:
         c: coefficients.
         dt: length of the piece.
         goal: at most ``whole``.
-        whole: the integral over all of the piece.
+        whole: the integral over the whole piece.
     """
     low, high, x = mi.Float(0), mi.Float(1), dr.clip(goal / dr.maximum(whole, 1e-30), 0, 1)
     for _ in range(NEWTON_STEPS):

@@ -1,10 +1,10 @@
 """A grid placed in the world, and the part of a ray inside its box.
 
-Conventions. A cell (i, j, k), each index from -1 to N - 1, lies between the nodes i and i + 1; node indices are clamped
-to the grid, so that the outer half voxel is constant and a single voxel needs no special case. A ray is o + t d with t in
-world length for a unit d. Its direction is mapped to the lattice without being normalised again, so t remains a world length
-under any scale, shear or mirroring. Box entry and exit are found in float64: in float32 the entry point of a ray that starts
-1e4 scene sizes away is off by 3e-3 of a cell.
+Conventions. A cell (i, j, k), each index from -1 to N - 1, lies between the nodes i and i + 1. Node indices are clamped to the
+grid, so the outer half voxel is constant and a single voxel needs no special case. A ray is o + t d with t in world length for
+a unit d. The mapped direction is not normalised, so t remains a world length under any scale, shear or mirroring. Entry and
+exit of the box are found in float64: in float32 the entry point of a ray starting 1e4 scene sizes away is off by 3e-3 of a
+cell.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ class Lattice:
     Attributes:
         values: TensorXf (Z, Y, X, C), at voxel centres.
         to_world: (4, 4) float64, unit cube to world.
-        empty_distances: how far each block of cells is from the nearest that holds anything, or None where no block is to be
-            skipped (:mod:`mivol.transport.traversal.grid_blocks`).
-        block_ranges: :class:`mivol.transport.traversal.grid_blocks.BlockRanges`, or None where every cell is walked.
-        from_world: (3, 4) map from the world to lattice coordinates, made where it is not given.
+        empty_distances: distance of each block of cells to the nearest non-empty block
+            (:mod:`mivol.transport.traversal.grid_blocks`); None to walk all blocks.
+        block_ranges: :class:`mivol.transport.traversal.grid_blocks.BlockRanges` for tracking; None to walk every cell.
+        from_world: (3, 4) map from the world to lattice coordinates; made from ``to_world`` by default.
     """
 
     values: mi.TensorXf
@@ -77,14 +77,14 @@ class Lattice:
 
 @dataclass
 class Segment:
-    """The part of a ray inside the box of a lattice: where it enters, and how far it goes.
+    """The part of a ray inside the box of a lattice.
 
     Attributes:
-        cell, frac: the entry point: its cell, and the fraction from the cell's lower node.
+        cell, frac: cell of the entry point, and the fraction from the lower node of the cell.
         d: lattice distance per world length.
-        d_rest: the rounding error of ``d``, so that d + d_rest has double precision.
-        t0: distance of the entry from the ray's origin [length].
-        t0_rest: the rounding error of ``t0``.
+        d_rest: rounding error of ``d``; d + d_rest has double precision.
+        t0: distance of the entry from the origin of the ray [length].
+        t0_rest: rounding error of ``t0``.
         length: length inside the box [length].
     """
 
@@ -98,25 +98,25 @@ class Segment:
 
     @property
     def start(self) -> mi.Float64:
-        """Distance from the ray's origin to the entry [length]."""
+        """Distance from the origin of the ray to the entry [length]."""
         return mi.Float64(self.t0) + mi.Float64(self.t0_rest)
 
     @property
     def end(self) -> mi.Float64:
-        """Distance from the ray's origin to the exit [length]."""
+        """Distance from the origin of the ray to the exit [length]."""
         return self.start + mi.Float64(self.length)
 
 
 def clip_to_grid(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max: mi.Float) -> Segment:
-    """Cut a ray to the box of a grid, in float64.
+    """Clip a ray to the box of a grid, in float64.
 
     Args:
         lattice: the grid and its place.
-        o, d: world ray; t is world length where |d| = 1.
-        t_min, t_max: the interval of the ray to cut [length]; ``t_max`` may be infinite.
+        o, d: world ray; t is world length for a unit d.
+        t_min, t_max: interval of the ray [length]; ``t_max`` may be infinite.
 
     Returns:
-        The part inside the box; its ``length`` is 0 where there is none.
+        The part inside the box; ``length`` is 0 if the ray misses the box.
     """
     n = lattice.res[::-1]
     high = tuple(k - 0.5 for k in n)
@@ -127,7 +127,7 @@ def clip_to_grid(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Floa
 def segment_between(
     q: list[mi.Float64], v: list[mi.Float64], n: tuple[int, int, int], t0: mi.Float64, t1: mi.Float64
 ) -> Segment:
-    """The part from t0 to t1 of the line q + t v in a lattice of n nodes (X, Y, Z); of length 0 where t1 <= t0."""
+    """The part from t0 to t1 of the line q + t v in a lattice of n nodes (X, Y, Z); ``length`` is 0 if t1 <= t0."""
     hit = t1 > t0
     t0 = dr.select(hit, t0, 0)
     cell, frac = mi.Vector3i(), mi.Vector3f()
@@ -142,7 +142,7 @@ def segment_between(
 
 
 def split_float64(x: mi.Float64 | mi.Float) -> tuple[mi.Float, mi.Float]:
-    """A number as the nearest float32 and what that leaves over."""
+    """Split a number into the nearest float32 and the remainder."""
     near = mi.Float(x)
     return near, mi.Float(mi.Float64(x) - mi.Float64(near))
 
@@ -151,7 +151,7 @@ def locate_cell(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) ->
     """Find the cell of a point of a ray, in float64.
 
     Returns:
-        Its lower node (-1 to N - 1), the fractions from there, and whether the point is in the box.
+        The lower node of the cell (-1 to N - 1), the fractions from the lower node, and whether the point is in the box.
     """
     n, t = lattice.res[::-1], mi.Float64(t)
     cell, frac, inside = mi.Vector3i(), mi.Vector3f(), mi.Bool(True)
@@ -169,16 +169,16 @@ def locate_cell(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) ->
 def points_of_piece(
     lattice: Lattice, ray: Ray, start: mi.Float64, dt: mi.Float, active: mi.Bool
 ) -> tuple[mi.Vector3i, list[mi.Vector3f], mi.Bool]:
-    """Four points of a piece of a ray that lies in one cell, at 0, 1/3, 2/3 and 1 of its length.
+    """Four points of a piece of a ray in a cell, at 0, 1/3, 2/3 and 1 of its length.
 
     Args:
         lattice: the grid.
         ray: world space, unit direction.
-        start, dt: where the piece begins on the ray, and its length [length].
-        active: lanes that have a piece.
+        start, dt: distance of the beginning of the piece on the ray, and length of the piece [length].
+        active: lanes with a piece.
 
     Returns:
-        The lower node of the cell, the points as fractions from there, and the lanes whose piece lies in the box.
+        The lower node of the cell, the points as fractions from the lower node, and the lanes whose piece lies in the box.
     """
     segment = clip_to_grid(lattice, ray.o, ray.d, start, start + mi.Float64(dt))
     # The cell is that of the middle of the piece: its ends lie in faces of the cell, and rounding may put them on either side.

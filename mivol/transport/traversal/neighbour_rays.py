@@ -1,7 +1,7 @@
-"""An order of rays in which neighbours cross the same cells of a grid, for walks that would wait for memory.
+"""An order of rays in which neighbours cross the same cells of a grid, to reduce waits for memory.
 
-Rays that enter the box in one place and leave it in one place cross the same cells in between. So rays are sorted by both: by
-the numbers of two coarse cells, the bits of their six indices interleaved (Morton 1966).
+Rays entering the box in the same place and leaving it in the same place cross the same cells in between. Rays are therefore
+sorted by two coarse cells, those of entry and exit, with the bits of the six indices interleaved (Morton 1966).
 """
 
 from __future__ import annotations
@@ -19,14 +19,16 @@ from mivol.transport.traversal.occupied_cells import OccupiedCells
 __all__ = ["FEWEST", "RayOrder"]
 
 BITS = 3
-"""A coarse cell is an eighth of the box along each axis. Processor time of a step of 65,536 rays through a fog of 128^3 nodes
-against that of unsorted rays, for one run of each: 0.82 so, 0.86 with a sixteenth, 0.84 with 1/64; 0.86 to 0.88 where all bits
-of the entry come before those of the exit."""
+"""Bits of an index: a coarse cell is an eighth of the box along each axis. (Processor time of a step of 65,536 rays through a
+fog of 128^3 nodes over that of unsorted rays, a single run each: 0.82 with 3 bits, 0.86 with 4, 0.84 with 6; 0.86 to 0.88 with
+all bits of the entry before the bits of the exit.)
+"""
 
 FEWEST = 32768
-"""Fewer rays are left as they are. Processor time of sorted over unsorted rays, the sorting among it, for 65,536, 16,384 and
-4096 rays: 0.84, 0.91, 0.95 through a fog of 128^3 nodes; 0.95, 0.98, 1.01 through a thin shell, there 0.94 and 1.05 for the
-first two on two busy threads."""
+"""Least number of rays to sort. (Processor time of sorted over unsorted rays, sorting included, for 65,536, 16,384 and 4096
+rays: 0.84, 0.91, 0.95 through a fog of 128^3 nodes; 0.95, 0.98, 1.01 through a thin shell, where two busy threads give 0.94
+and 1.05 for the first two.)
+"""
 
 
 @dataclass
@@ -34,8 +36,8 @@ class RayOrder:
     """An order of the rays of a call.
 
     Attributes:
-        places: the ray that comes first, the second one, and so on.
-        back: where each ray has come to.
+        places: index of the first ray, of the second ray, and so on.
+        back: position of each ray in the order.
     """
 
     places: mi.UInt32
@@ -43,14 +45,14 @@ class RayOrder:
 
     @classmethod
     def find(cls, cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> RayOrder | None:
-        """The order of rays through a grid; None where there are too few to gain by one, and on GPUs, where it is not measured.
+        """Find the order of rays through a grid; None for too few rays to gain, and on GPUs, where no gain is measured.
 
         Args:
-            cells: of the grid.
+            cells: occupied cells of the grid.
             o, d: world rays.
-            t_max: where they end [length]; may be infinite.
+            t_max: end of the rays [length]; may be infinite.
 
-        Cost: 24 bytes a ray read, 4 sorted by NumPy.
+        Cost: 24 bytes a ray read, 4 bytes a ray sorted by NumPy.
         """
         count = dr.width((o, d))
         if count < FEWEST or dr.backend_v(mi.Float) != dr.JitBackend.LLVM:
@@ -67,7 +69,7 @@ class RayOrder:
 
 
 def _key(cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> mi.UInt32:
-    """The coarse cells in which rays enter and leave the outermost box; rays that miss it come last."""
+    """The coarse cells at which rays enter and leave the outermost box; rays missing the box come last."""
     n, size = cells.res[::-1], 2 ** (cells.levels - 1)
     low, high = (tuple(0.5 * (k - 1) + side * size * 0.5 * k for k in n) for side in (-1, 1))
     q, v, t0, t1 = clip_to_box(cells.from_world, low, high, o, d, mi.Float64(0), mi.Float64(t_max))

@@ -1,18 +1,19 @@
-"""The non-empty cells of a grid, and a walk along rays that visits only these.
+"""The occupied cells of a grid: their list, an index into the list, and the empty distance around each cell.
 
 Conventions. Cells and nodes are those of :mod:`mivol.transport.traversal.lattice`: a cell lies between two nodes along each
-axis, -1 to N - 1, border nodes are repeated. ``Cells.index`` tells of each cell of the box whether it is occupied and where it
-stands in the list, or how far a ray may go from there in one step. That takes four bytes for 64 cells of the box, and all else
-goes with the occupied ones.
+axis, -1 to N - 1, and border nodes are repeated. The index counts cells from 0 to N along an axis of N nodes.
 
-Levels. A grid may be one of several nested ones (:mod:`mivol.fields.spherical_grid`): all have the same nodes, and their cells
-are counted one level after the other. A walk goes through one of them; :mod:`mivol.transport.traversal.occupied_walk` says
-which piece of a ray lies in which.
+Index. Cells lie in bricks of 4 x 4 x 4. A brick with a listed cell has a number and a bit for each of its cells. Every other
+brick has only its Chebyshev distance [bricks] to the nearest brick with a listed cell. Memory grows with the bricks around
+listed cells, plus four bytes for 64 cells of the box. Listed cells are numbered brick by brick, and within a brick by their
+bits. The number of a cell (its rank) is the stored number of listed cells before its brick plus the count of set bits below
+its own bit.
 
-The search for the next occupied cell is an inner loop of its own. Lanes of a packet then wait for each other in the search,
-where a step costs one read, and visit cells, which costs far more, together.
+Levels. A grid may be a level of several nested grids (:mod:`mivol.fields.spherical`). All levels have the same nodes, and their
+cells are counted level by level. A walk (:mod:`mivol.transport.traversal.occupied_walk`) stays in a level.
 
-References: Amanatides & Woo 1987 (the traversal); Cohen & Sheffer 1994 (proximity clouds: distances that a ray may skip).
+References: Cohen & Sheffer 1994 (proximity clouds: distances for a ray to skip); Jacobson 1989 (rank of a bit in constant
+    time).
 """
 
 from __future__ import annotations
@@ -40,11 +41,12 @@ class OccupiedCells:
         res: nodes (Z, Y, X).
         to_world: (4, 4) float64, unit cube to world.
         count: number of occupied cells.
-        index: of the (Z + 1) (Y + 1) (X + 1) cells of each level: which of ``corners`` each is, and ways through empty ones.
+        index: index of the (Z + 1) (Y + 1) (X + 1) cells of each level: position of a cell in ``corners``, and ways through
+            empty cells.
         corners: UInt32, 8 a cell: indices of its nodes in ``rows``; bits 0, 1, 2 of the corner are x, y, z.
         rows: UInt32, the rows of the nodes of listed cells, each once.
         from_world: (3, 4) map from the world to lattice coordinates of the innermost level.
-        levels: nested grids.
+        levels: number of nested grids.
     """
 
     res: tuple[int, int, int]
@@ -72,16 +74,16 @@ class OccupiedCells:
         Args:
             res: nodes (Z, Y, X).
             to_world: (4, 4) affine map of the unit cube.
-            row_of: the row of nodes of all levels, by their flat numbers, x fastest.
+            row_of: maps flat node numbers of all levels (x fastest) to rows.
             occupied: ``occupied(rows of the 8 corners) -> mask`` of cells to list; called once.
-            most: rows that there are.
-            levels: nested grids.
-            stored: flat numbers of all nodes that may make a cell occupied; None for any.
+            most: number of rows.
+            levels: number of nested grids.
+            stored: flat numbers of all nodes that may make a cell occupied; by default every node.
 
         Raises:
             MivolError: more cells than a 32-bit number counts.
 
-        Cost: 8 reads and what ``occupied`` reads for each cell of the bricks of 4^3 cells at ``stored`` nodes.
+        Cost: 8 reads, and the reads of ``occupied``, for each cell of the bricks of 4^3 cells at ``stored`` nodes.
         """
         z, y, x = res
         total = levels * (z + 1) * (y + 1) * (x + 1)
@@ -92,10 +94,10 @@ class OccupiedCells:
         count = dr.width(listed)
         # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive. Where no cell is occupied the arrays
         # hold one cell, to which no number points.
-        named = _corner_rows(listed if count else mi.UInt32(0), row_of, res)
-        used, place = _numbered(named, most)
+        corner_rows = _corner_rows(listed if count else mi.UInt32(0), row_of, res)
+        used, place = _numbered(corner_rows, most)
         corners = dr.zeros(mi.UInt32, 8 * max(count, 1))
-        for q, row in enumerate(named):
+        for q, row in enumerate(corner_rows):
             dr.scatter(corners, dr.gather(mi.UInt32, place, row), dr.arange(mi.UInt32, max(count, 1)) * 8 + q)
         to_world = check_affine(to_world)
         to_lattice = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in lattice_from_world(to_world, res)]
@@ -103,7 +105,7 @@ class OccupiedCells:
         return cls(res, to_world, count, index, corners, used, to_lattice, levels)
 
     def nodes(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
-        """The 8 corners of listed cells, in ``rows``."""
+        """The indices in ``rows`` of the 8 corners of listed cells."""
         return list(dr.gather(mi.ArrayXu, self.corners, number, active, shape=(8, 1)))
 
     def node_rows(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
@@ -112,7 +114,7 @@ class OccupiedCells:
 
 
 def _numbered(rows: list[mi.UInt32], most: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """The distinct numbers among ``rows`` (each at most ``most``), ascending, and for each number its index among them."""
+    """The distinct numbers among ``rows`` (each at most ``most``), ascending, and the index of each number among them."""
     used = dr.zeros(mi.UInt8, most + 1)
     for row in rows:
         dr.scatter(used, mi.UInt8(1), row)
@@ -123,19 +125,19 @@ def _numbered(rows: list[mi.UInt32], most: int) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def _apart(cell: mi.UInt32, res: tuple[int, int, int]) -> tuple[mi.Int32, mi.Int32, mi.Int32]:
-    """Indices along x, y, z of cells within their level, from their flat index; index 0 is the outer half voxel."""
+    """Indices along x, y, z of cells within their level, from flat indices; index 0 is the outer half voxel."""
     z, y, x = res
     across, slab = x + 1, (x + 1) * (y + 1)
     return mi.Int32(cell % across), mi.Int32(cell // across % (y + 1)), mi.Int32(cell // slab % (z + 1))
 
 
 def _between(place: mi.Int32, n: int) -> tuple[mi.Int32, mi.Int32]:
-    """The lower and the upper node of cells along one axis, clamped to the grid; cell 0 is the outer half voxel."""
+    """The lower and the upper node of cells along an axis, clamped to the grid; cell 0 is the outer half voxel."""
     return dr.maximum(place - 1, 0), dr.minimum(place, n - 1)
 
 
 def _corner_rows(cell: mi.UInt32, row_of: Callable[[mi.UInt32], mi.UInt32], res: tuple[int, int, int]) -> list[mi.UInt32]:
-    """Rows of the 8 corners of cells, from their flat index."""
+    """Rows of the 8 corners of cells, from flat indices."""
     z, y, x = res
     i, j, k = (_between(a, n) for a, n in zip(_apart(cell, res), (x, y, z), strict=True))
     level = mi.Int32(cell // math.prod(n + 1 for n in res)) * z
@@ -143,7 +145,7 @@ def _corner_rows(cell: mi.UInt32, row_of: Callable[[mi.UInt32], mi.UInt32], res:
 
 
 FILLED = 1 << 31
-"""Set in the entry of a brick that has a number."""
+"""Flag in the entry of a numbered brick."""
 
 CELLS = BLOCK**3
 """Cells of a brick: the bits of two words."""
@@ -151,13 +153,13 @@ CELLS = BLOCK**3
 
 @dataclass
 class CellIndex:
-    """The listed cells of nested grids of one resolution.
+    """An index of the listed cells of nested grids of one resolution.
 
     Attributes:
         counts: bricks (Z, Y, X) of a level.
-        bricks: UInt32, of each brick of all levels: its distance, or ``FILLED`` and its number.
-        bits: UInt32, two for each brick that has a number: of its cells with z of 0, 1 and of 2, 3, x fastest.
-        before: UInt32, for each of these how many listed cells are before it.
+        bricks: UInt32, for each brick of all levels: its distance, or ``FILLED`` and its number.
+        bits: UInt32, two for each numbered brick: its cells of z = 0, 1 and of z = 2, 3, x fastest.
+        before: UInt32, for each numbered brick the number of listed cells before it.
     """
 
     counts: tuple[int, int, int]
@@ -167,7 +169,7 @@ class CellIndex:
 
     @property
     def bytes(self) -> int:
-        """Memory that it takes."""
+        """Memory of the index [bytes]."""
         return 4 * (dr.width(self.bricks) + dr.width(self.bits) + dr.width(self.before))
 
     @classmethod
@@ -178,28 +180,28 @@ class CellIndex:
         is_listed: Callable[[mi.UInt32], mi.Bool],
         nodes: mi.UInt32 | None = None,
     ) -> tuple[CellIndex, mi.UInt32]:
-        """The index, and the listed cells in the order of their numbers.
+        """Build the index, and list the cells in the order of their numbers.
 
         Args:
             res: nodes (Z, Y, X).
-            levels: nested grids.
-            is_listed: of cells, by their flat numbers: x fastest, levels slowest.
-            nodes: flat numbers of all nodes that listed cells have among their corners; None for any.
+            levels: number of nested grids.
+            is_listed: maps flat cell numbers (x fastest, levels slowest) to a mask of cells to list.
+            nodes: flat numbers of all nodes among the corners of listed cells; by default every node.
 
-        Cost: one question a cell of the bricks at these nodes.
+        Cost: a call of ``is_listed`` for each cell of the bricks at these nodes.
         """
         counts = tuple(count_blocks(n) for n in res)
         total = levels * math.prod(counts)
-        # Where there is no node the brick of the first one is asked about: Dr.Jit has no arithmetic for arrays of length 0.
+        # Without a node, take the brick of the first node: Dr.Jit has no arithmetic for arrays of length 0.
         nodes = mi.UInt32(0) if nodes is not None and dr.width(nodes) == 0 else nodes
-        asked = dr.arange(mi.UInt32, total) if nodes is None else _bricks_at(nodes, res, counts, total)
-        lane = dr.arange(mi.UInt32, CELLS * dr.width(asked))
-        cell, is_inside = _cell_of(dr.gather(mi.UInt32, asked, lane // CELLS), lane % CELLS, res, counts)
-        is_held = is_listed(cell) & is_inside
-        dr.eval(is_held, cell)
-        listed = dr.gather(mi.UInt32, cell, dr.compress(is_held))
-        words = dr.block_sum(dr.select(is_held, mi.UInt32(1) << (lane & 31), 0), 32)
-        low, high = (dr.gather(mi.UInt32, words, 2 * dr.arange(mi.UInt32, dr.width(asked)) + k) for k in (0, 1))
+        candidates = dr.arange(mi.UInt32, total) if nodes is None else _bricks_at(nodes, res, counts, total)
+        lane = dr.arange(mi.UInt32, CELLS * dr.width(candidates))
+        cell, is_inside = _cell_of(dr.gather(mi.UInt32, candidates, lane // CELLS), lane % CELLS, res, counts)
+        is_occupied = is_listed(cell) & is_inside
+        dr.eval(is_occupied, cell)
+        listed = dr.gather(mi.UInt32, cell, dr.compress(is_occupied))
+        words = dr.block_sum(dr.select(is_occupied, mi.UInt32(1) << (lane & 31), 0), 32)
+        low, high = (dr.gather(mi.UInt32, words, 2 * dr.arange(mi.UInt32, dr.width(candidates)) + k) for k in (0, 1))
         before = dr.prefix_sum(dr.popcnt(low) + dr.popcnt(high))
         filled = dr.compress((low | high) != 0)
         count = dr.width(filled)
@@ -207,7 +209,7 @@ class CellIndex:
             # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive.
             far = find_distances(dr.zeros(mi.Bool, total), counts)
             return cls(counts, mi.UInt32(far), dr.zeros(mi.UInt32, 2), dr.zeros(mi.UInt32, 1)), listed
-        place, is_filled, bits = dr.gather(mi.UInt32, asked, filled), dr.zeros(mi.UInt8, total), dr.zeros(mi.UInt32, 2 * count)
+        place, is_filled, bits = dr.gather(mi.UInt32, candidates, filled), dr.zeros(mi.UInt8, total), dr.zeros(mi.UInt32, 2 * count)
         dr.scatter(is_filled, mi.UInt8(1), place)
         dr.scatter(bits, mi.ArrayXu([dr.gather(mi.UInt32, word, filled) for word in (low, high)]), dr.arange(mi.UInt32, count))
         bricks = mi.UInt32(find_distances(is_filled > 0, counts))
@@ -219,16 +221,17 @@ class CellIndex:
     def look_up(
         self, cell: mi.Vector3i, level: mi.Int32 | int, ahead: mi.Array3b, active: mi.Bool
     ) -> tuple[mi.UInt32, mi.Vector3i]:
-        """The number of the brick of cells, and how many cells a ray may cross along each axis, its own among them.
+        """Look up the number of the brick of cells, and the number of cells a ray may cross along each axis, the own cell
+        included.
 
         Args:
-            cell: along x, y and z, from 0.
-            level: that it lies in.
-            ahead: whether the ray runs upwards along each axis.
-            active: lanes that look.
+            cell: index along x, y and z, from 0.
+            level: level of the cell.
+            ahead: axes along which the ray runs upwards.
+            active: lanes to look up.
 
         Returns:
-            The number has no meaning where the brick has none; 0 cells along all axes where the cell is listed.
+            The number (undefined for a brick without a number), and the cells to cross; 0 along all axes for a listed cell.
         """
         z, y, x = self.counts
         place = cell >> SHIFT
@@ -238,15 +241,15 @@ class CellIndex:
         number = entry & (FILLED - 1)
         low, high = dr.gather(mi.ArrayXu, self.bits, number, active & is_filled, shape=(2, 1))
         bits = dr.select((cell.z & 2) == 0, low, high)
-        here = mi.Int32(1 - ((bits >> _bit(cell)) & 1))
+        own = mi.Int32(1 - ((bits >> _bit(cell)) & 1))
         inside = cell & (BLOCK - 1)
         within = dr.select(ahead, BLOCK - inside, inside + 1)
         is_free = ~is_filled | _is_free(low, high, inside, ahead)
         distance = mi.Int32(dr.select(is_filled, 1, entry))
-        return number, dr.select(is_free, within + BLOCK * (distance - 1), here)
+        return number, dr.select(is_free, within + BLOCK * (distance - 1), own)
 
     def rank(self, cell: mi.Vector3i, number: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        """The number of listed cells, from that of their brick."""
+        """The number of listed cells, from the number of their brick."""
         low, high = dr.gather(mi.ArrayXu, self.bits, number, active, shape=(2, 1))
         before = dr.gather(mi.UInt32, self.before, number, active)
         below = (mi.UInt32(1) << _bit(cell)) - 1
@@ -255,24 +258,24 @@ class CellIndex:
 
 
 def _bit(cell: mi.Vector3i) -> mi.UInt32:
-    """The bit of a cell in the word that has it."""
+    """The bit of a cell in its word."""
     return mi.UInt32((cell.x & 3) | (cell.y & 3) << 2 | (cell.z & 1) << 4)
 
 
 def _is_free(low: mi.UInt32, high: mi.UInt32, inside: mi.Vector3i, ahead: mi.Array3b) -> mi.Bool:
-    """Whether bricks hold no listed cell from cells on along all axes, where a ray may still go."""
+    """Whether bricks hold no listed cell from ``inside`` on along all axes, in the direction of the ray."""
     i, j, k = (mi.UInt32(a) for a in inside)
     row = dr.select(ahead.x, (0xF << i) & 0xF, mi.UInt32(0xF) >> (3 - i)) * 0x11111111
     rows = dr.select(ahead.y, (0xFFFF << (4 * j)) & 0xFFFF, mi.UInt32(0xFFFF) >> (12 - 4 * j)) * 0x00010001
     every, second = mi.UInt32(0xFFFFFFFF), 16 * (k & 1)
     planes, beyond = dr.select(ahead.z, every << second, every >> (16 - second)), dr.select(ahead.z, every, 0)
     is_low = k < 2
-    seen = dr.select(is_low, low & planes, low & ~beyond) | dr.select(is_low, high & beyond, high & planes)
-    return (seen & row & rows) == 0
+    ahead_bits = dr.select(is_low, low & planes, low & ~beyond) | dr.select(is_low, high & beyond, high & planes)
+    return (ahead_bits & row & rows) == 0
 
 
 def _bricks_at(nodes: mi.UInt32, res: tuple[int, int, int], counts: tuple[int, int, int], total: int) -> mi.UInt32:
-    """The bricks, ascending, that hold a cell of which some of the nodes is a corner."""
+    """The bricks, ascending, with a cell of which some of the nodes is a corner."""
     (z, y, x), (b_z, b_y, b_x) = res, counts
     level = nodes // (x * y * z)
     i, j, k = nodes % x, nodes // x % y, nodes // (x * y) % z
@@ -287,7 +290,7 @@ def _bricks_at(nodes: mi.UInt32, res: tuple[int, int, int], counts: tuple[int, i
 def _cell_of(
     brick: mi.UInt32, bit: mi.UInt32, res: tuple[int, int, int], counts: tuple[int, int, int]
 ) -> tuple[mi.UInt32, mi.Bool]:
-    """Flat numbers of cells, some cell's of the grid where they lie beyond it, and whether they do not."""
+    """Flat numbers of cells, clamped to the grid, and whether the cells lie in the grid."""
     (z, y, x), (b_z, b_y, b_x) = res, counts
     i = brick % b_x * BLOCK + (bit & 3)
     j = brick // b_x % b_y * BLOCK + (bit >> 2 & 3)

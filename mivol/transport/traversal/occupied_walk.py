@@ -1,4 +1,16 @@
-"""TODO: one sentence."""
+"""The walk of a ray through the occupied cells of a grid, or of nested grids.
+
+The search for the next occupied cell is an inner loop of its own. Lanes of a packet wait for each other in the search, where a
+step costs a read, and then visit cells, which costs far more, together.
+
+Nested boxes. Boxes have the same middle and twice the extent from level to level; an outer level leaves out the box of the
+level inside. A ray through k levels crosses at most 2 k - 1 pieces: inwards through the levels k - 1, ..., 1, through the
+innermost level, and out again. Piece p lies in the level |p - (k - 1)|. A single box (k = 1) has a single piece. A level is
+walked in its *own* lengths, 2^-l of the lengths of the world, so all levels have the same lattice. Entries and exits are found
+in float64.
+
+References: Amanatides & Woo 1987 (the traversal); Cohen & Sheffer 1994 (proximity clouds: distances for a ray to skip).
+"""
 
 from __future__ import annotations
 
@@ -20,20 +32,19 @@ __all__ = ["OccupiedCell", "walk_occupied_cells", "find_last_cell", "reverse_seg
 
 @dataclass
 class OccupiedCell:
-    """What a visitor is told of one occupied cell.
+    """An occupied cell as a visitor sees it.
 
     Attributes:
         number: index in the list of occupied cells.
-        points: the two Gauss points, as fractions along the grid's own axes, in the order in which the ray meets them.
+        points: the two Gauss points, as fractions along the axes of the grid, in the order of the ray.
         t: length walked before the cell [length].
         dt: length in the cell [length].
-        along: the points, as fractions along each axis in the sense of the ray.
-        cell: the lower node of the cell.
-        level: that the cell lies in.
-        ahead: for each axis whether the ray runs upwards along it.
-        entered: the axis whose face the ray has come through from the cell that was visited before; -1 where it has come from
-            another cell, or along an edge.
-        leaves: the axis whose face the ray leaves through; the first of them at an edge.
+        along: the two Gauss points, as fractions along each axis in the direction of the ray.
+        cell: lower node of the cell.
+        level: level of the cell.
+        ahead: axes along which the ray runs upwards.
+        entered: axis of the face between this cell and the previously visited cell; -1 after an unvisited cell or an edge.
+        leaves: axis of the face of exit; the first axis at an edge.
     """
 
     number: mi.UInt32
@@ -58,22 +69,22 @@ def walk_occupied_cells(
     until: Callable[[Any], mi.Bool] | None = None,
     level: mi.Int32 | int = 0,
 ) -> tuple[Any, mi.Vector3i, mi.Float]:
-    """Visit the occupied cells that a segment crosses, in order.
+    """Visit the occupied cells along a segment, in order.
 
     Args:
-        cells: the list.
+        cells: list of the occupied cells.
         segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`, or :func:`reverse_segment`.
-        visit: ``visit(state, here, active) -> state``, called once, while the loop is traced.
+        visit: ``visit(state, cell, active) -> state``, called once, while Dr.Jit traces the loop.
         state: any PyTree of Dr.Jit arrays.
         active: lanes to walk.
-        until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to walk to the end.
-        level: that the segment lies in, in the level's own lattice coordinates.
+        until: ``until(state) -> mask`` of lanes to stop, evaluated after each cell; None to walk to the end.
+        level: level of the segment, which is in the lattice coordinates of this level.
 
     Returns:
-        The last state, the last cell visited (lower node), and where the ray left it [length from the segment's start].
+        The last state, the last visited cell (lower node), and the distance of its exit from the start of the segment [length].
 
     Error: positions are off by at most 2^-23 (X + Y + Z) of a cell.
-    Cost: two reads a search step, at most X + Y + Z + 3 of them, fewer where all around is empty.
+    Cost: two reads a search step, at most X + Y + Z + 3 steps, fewer in empty surroundings.
     """
     # -- State: n counts the cells crossed since the first, along each axis ----------------------------------------------
     index, length = cells.index, segment.length
@@ -105,12 +116,12 @@ def walk_occupied_cells(
             ends = n + free
             reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
             exit = lesser(lesser(reach.x, reach.y), reach.z)
-            there = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
-            there = dr.select(reach <= exit, ends, there)
+            arrival = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
+            arrival = dr.select(reach <= exit, ends, arrival)
             t = dr.select(searching, exit, t)
-            n = dr.select(searching, there, n)
+            n = dr.select(searching, arrival, n)
             entered = dr.select(searching, -1, entered)
-            inside = (exit < length) & dr.all(there <= most)
+            inside = (exit < length) & dr.all(arrival <= most)
             active &= inside | ~searching
             searching &= inside
 
@@ -124,8 +135,8 @@ def walk_occupied_cells(
         through = reach <= exit
         leaves = dr.select(through.x, 0, dr.select(through.y, 1, mi.Int32(2)))
         cell = segment.cell + sign * n
-        here = OccupiedCell(index.rank(cell + 1, brick, active), points, t, dt, along, cell, level, ahead, entered, leaves)
-        state = visit(state, here, active)
+        visited = OccupiedCell(index.rank(cell + 1, brick, active), points, t, dt, along, cell, level, ahead, entered, leaves)
+        state = visit(state, visited, active)
         last = dr.select(active, cell, last)
         left = dr.select(active, t + dt, left)
         n = dr.select(through, n + 1, n)
@@ -138,7 +149,7 @@ def walk_occupied_cells(
 
 
 def find_last_cell(segment: Segment) -> mi.Vector3i:
-    """The cell (lower node) in which a segment ends, found in float64: one of the two that a face divides."""
+    """The cell (lower node) at the end of a segment, found in float64: either of the two cells at a face."""
     cell = mi.Vector3i()
     for a in range(3):
         speed = mi.Float64(segment.d[a]) + mi.Float64(segment.d_rest[a])
@@ -155,12 +166,12 @@ def reverse_segment(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.
 
 @dataclass
 class Piece:
-    """The part of a ray in the box of one level and not in that of the level before.
+    """The part of a ray in the box of a level and outside the box of the level inside.
 
     Attributes:
-        level: counted from the innermost, 0.
-        segment: in the level's own lattice and lengths; its length is 0 where the ray has no such part.
-        scale: own lengths times this are lengths of the world: 2^level.
+        level: counted from the innermost level, 0.
+        segment: in the lattice and the lengths of the level; its length is 0 if the ray has no such part.
+        scale: factor from lengths of the level to lengths of the world, 2^level.
     """
 
     level: mi.Int32
@@ -169,18 +180,18 @@ class Piece:
 
 
 def count_pieces(cells: OccupiedCells) -> int:
-    """Number of pieces that a ray through nested boxes may have."""
+    """Largest number of pieces of a ray through nested boxes."""
     return 2 * cells.levels - 1
 
 
 def find_piece(cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float, number: mi.Int32) -> Piece:
-    """A piece of rays.
+    """Find a piece of rays.
 
     Args:
-        cells: whose place and levels they cross.
+        cells: place and levels of the boxes.
         o, d: world rays, |d| = 1.
-        t_max: where the rays end [length]; may be infinite.
-        number: of the piece, from 0 in the order of the ray.
+        t_max: end of the rays [length]; may be infinite.
+        number: index of the piece, from 0 in the order of the ray.
     """
     if cells.levels == 1:
         return Piece(mi.Int32(0), clip_to_grid(cells, o, d, mi.Float(0), t_max), mi.Float(1))

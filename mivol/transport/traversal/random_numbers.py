@@ -1,7 +1,7 @@
-"""A random number generator for each lane (PCG32), for walks that draw a number in every cell.
+"""Random number generators (PCG32) for each lane, and strata for the directions of a pass.
 
-Mitsuba's samplers are not used there: the number of dimensions that a walk consumes differs from lane to lane, and samplers
-that stratify have only few. One sampler dimension seeds the generator.
+A walk that draws a number in every cell does not use Mitsuba's samplers: the number of dimensions differs from lane to lane,
+and stratified samplers have few dimensions. A single sampler dimension seeds the generator.
 
 References: O'Neill 2014 (permuted congruential generators, RXS-M-XS 32).
 """
@@ -20,9 +20,9 @@ def seed_pcg32(u: mi.Float, width: int, number: int = 0) -> mi.UInt32:
     """Seed a generator for each lane.
 
     Args:
-        u: a uniform number in [0, 1), which may be the same in all lanes.
+        u: uniform number in [0, 1); may be the same in all lanes.
         width: number of lanes.
-        number: generators with different numbers are independent although ``u`` is the same.
+        number: index of the generator; generators of different indices are independent for equal ``u``.
 
     Returns:
         The states.
@@ -35,9 +35,9 @@ def draw_pcg32(state: mi.UInt32, count: int) -> tuple[mi.UInt32, list[mi.Float]]
     """Draw uniform numbers from a permuted congruential generator (RXS-M-XS 32).
 
     Returns:
-        The next state, and ``count`` numbers in the open interval (0, 1). They are never 0: a reservoir keeps a candidate where
-        u times the sum of weights is below its weight, so u = 0 would keep any; and -log(u), the distance to the next collision
-        of a tracker, would be infinite.
+        The next state, and ``count`` numbers in the open interval (0, 1). The numbers are never 0. A reservoir keeps a
+        candidate if u times the sum of weights is below the weight of the candidate, so u = 0 would keep every candidate. A
+        tracker would get an infinite distance -log(0) to the next collision.
     """
     numbers = []
     for _ in range(count):
@@ -50,42 +50,41 @@ def draw_pcg32(state: mi.UInt32, count: int) -> tuple[mi.UInt32, list[mi.Float]]
 
 @dataclass
 class LaneSampler:
-    """Random numbers of paths that begin at different times: each brings its own generator along.
+    """Random numbers of paths that begin at different times; each path carries its own generator.
 
     Attributes:
-        generator: of 64 bits of state, so that paths of any length do not meet in it.
+        generator: generator of 64 bits of state, enough for long paths not to share numbers.
     """
 
     generator: mi.PCG32
 
     @classmethod
     def seeded(cls, a: mi.UInt32, b: mi.UInt32, stream: mi.UInt32) -> LaneSampler:
-        """A generator for each lane, by two seeds of 24 bits and the number of its sequence."""
+        """Seed a generator for each lane with two numbers of 24 bits and the index of the sequence."""
         state = (mi.UInt64(a) << 32) | mi.UInt64(b)
         generator = mi.PCG32(size=dr.width(stream))
         generator.seed(state, mi.UInt64(stream))
         return cls(generator)
 
     def next_1d(self, active: mi.Bool = True) -> mi.Float:
-        """A uniform number in [0, 1)."""
+        """Draw a uniform number in [0, 1)."""
         return self.generator.next_float32(active)
 
     def next_state(self, active: mi.Bool = True) -> mi.UInt32:
-        """The state of another generator."""
+        """Draw the state of another generator."""
         return self.generator.next_uint32(active)
 
     def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
-        """Two of them."""
+        """Draw two uniform numbers in [0, 1)."""
         x = self.next_1d(active)
         return mi.Point2f(x, self.next_1d(active))
 
 
 def draw_state(sampler: mi.Sampler | LaneSampler, active: mi.Bool = True) -> mi.UInt32:
-    """The state of a generator for each lane.
+    """Draw the state of a generator for each lane.
 
-    Of a ``LaneSampler`` it has 32 bits of its own and does not depend on the number of the lane, so that a path may be walked
-    again in another one. A number of Mitsuba's samplers has 24 bits, too few to tell millions of lanes apart: the number of the
-    lane helps.
+    A ``LaneSampler`` gives 32 bits that do not depend on the index of the lane, so another lane can walk the same path again. A
+    number of Mitsuba's samplers has 24 bits, too few to tell millions of lanes apart, so the index of the lane is mixed in.
     """
     if isinstance(sampler, LaneSampler):
         return sampler.next_state(active)
@@ -94,20 +93,19 @@ def draw_state(sampler: mi.Sampler | LaneSampler, active: mi.Bool = True) -> mi.
 
 
 def draw_seeds(sampler: mi.Sampler) -> tuple[mi.UInt32, mi.UInt32]:
-    """Two seeds of 24 bits for each lane, of a ``LaneSampler``."""
+    """Draw two seeds of 24 bits for each lane, to seed a ``LaneSampler``."""
     return mi.UInt32(sampler.next_1d() * (1 << 24)), mi.UInt32(sampler.next_1d() * (1 << 24))
 
 
 @dataclass
 class Strata:
-    """The stratum of the unit square that each lane of a pass draws its directions from.
+    """The stratum of the unit square from which each lane of a pass draws its directions.
 
-    The samples of a pixel divide the square among them, into the cells of an ``across`` by ``down`` grid. All lanes of a tile
-    of pixels have the same cell, so that neighbouring lanes trace nearly parallel shadow rays (measured on smoke at 64 samples:
-    1.9 times less variance in constant light, 1.7 times with a sun in a sky, in the same time).
+    The samples of a pixel divide the square into the cells of an ``across`` by ``down`` grid. All lanes of a tile of pixels
+    share a cell, so neighbouring lanes trace nearly parallel shadow rays.
 
     Attributes:
-        cell: index of each lane's cell.
+        cell: index of the cell of each lane.
         across, down: size of the grid of cells.
     """
 
@@ -116,6 +114,6 @@ class Strata:
     down: int
 
     def jitter(self, u: mi.Point2f) -> mi.Point2f:
-        """Map two uniform numbers in [0, 1) into the lane's cell."""
+        """Map two uniform numbers in [0, 1) into the cell of the lane."""
         i, j = self.cell % self.across, self.cell // self.across
         return mi.Point2f((mi.Float(i) + u.x) / self.across, (mi.Float(j) + u.y) / self.down)

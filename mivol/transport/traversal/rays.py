@@ -1,8 +1,9 @@
-"""Rays whose origin keeps its digits: scattering points of dense media, far from the origin of the world.
+"""Rays: origins in float64, spawned rays behind surfaces, and distances along the ray of the camera.
 
-A float32 coordinate of 100 is rounded by up to 4e-6. For an extinction of 1e5 that is 0.4 optical depths, and light that
-leaves such a point is too bright, since a shorter way counts for more than a longer one. Boxes and grids are cut in float64, so
-an origin in float64 is all that they need. Shapes are traced by Mitsuba, in float32.
+A float32 coordinate of 100 is rounded by up to 4e-6. At an extinction of 1e5 this error is an optical depth of 0.4, and light
+leaving a rounded point is too bright on average, since a shorter way counts for more than a longer one. Scattering points of
+dense media far from the origin of the world therefore keep their origin in float64. Boxes and grids are clipped in float64;
+Mitsuba traces shapes in float32.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ __all__ = ["FineRay", "Ray", "point_along", "to_mitsuba_ray", "clip_camera_ray",
 
 @dataclass
 class FineRay:
-    """A ray with the attributes of ``mi.Ray3f``, and an origin in float64.
+    """A ray with the attributes of ``mi.Ray3f`` and an origin in float64.
 
     Attributes:
-        o: origin, in world space.
+        o: origin in world space.
         d: unit direction.
-        maxt: where it ends [length]; may be infinite.
-        time, wavelengths: as Mitsuba's.
+        maxt: end of the ray [length]; may be infinite.
+        time, wavelengths: as of Mitsuba's rays.
     """
 
     o: mi.Point3d
@@ -35,21 +36,21 @@ class FineRay:
 
     @classmethod
     def from_ray(cls, ray: Ray) -> FineRay:
-        """A copy of a ray."""
+        """Copy a ray."""
         return cls(mi.Point3d(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Float(ray.time), ray.wavelengths)
 
     @classmethod
     def from_point(cls, o: mi.Point3d, d: mi.Vector3f, at: mi.Interaction3f, maxt: mi.Float = dr.inf) -> FineRay:
-        """A ray that leaves a point, at the time of an interaction there."""
+        """Make a ray from a point, at the time of an interaction at the point."""
         return cls(o, mi.Vector3f(d), mi.Float(maxt), mi.Float(at.time), mi.Color0f())
 
     def __call__(self, t: mi.Float | mi.Float64) -> mi.Point3f:
-        """The point at a distance [length], rounded once."""
+        """The point at a distance [length], rounded once to float32."""
         return mi.Point3f(point_along(self, t))
 
 
 Ray = Union["mi.Ray3f", FineRay]
-"""What walks through media: it has an origin ``o``, a direction ``d``, an end ``maxt``, and points ``ray(t)``."""
+"""A ray through media: origin ``o``, direction ``d``, end ``maxt``, and points ``ray(t)``."""
 
 
 def point_along(ray: Ray, t: mi.Float | mi.Float64) -> mi.Point3d:
@@ -58,16 +59,17 @@ def point_along(ray: Ray, t: mi.Float | mi.Float64) -> mi.Point3d:
 
 
 def to_mitsuba_ray(ray: Ray) -> mi.Ray3f:
-    """A copy of a ray, as Mitsuba traces it: with an origin in float32."""
+    """Copy a ray for Mitsuba's ray tracing, with the origin rounded to float32."""
     return mi.Ray3f(mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Float(ray.time), ray.wavelengths)
 
 
 def hit_distance(ray: Ray, hit: mi.SurfaceInteraction3f) -> mi.Float:
-    """Distance of a hit along the ray that began at the camera.
+    """Distance of a surface hit along the first ray of a path segment [length].
 
-    The lengths of the spawned rays are not summed: each of them starts an epsilon (1e-4 of a length) further on and to the
-    side, so the hit lies beside the first ray. Instead the first ray is intersected with the tangent plane of the surface at
-    the hit. At grazing incidence that intersection is ill-conditioned, and the point of the ray nearest to the hit is taken.
+    Lengths of spawned rays are not summed. Each spawned ray starts an epsilon (1e-4 of a length) further on and to the side,
+    so the hit lies beside the first ray. The first ray is therefore intersected with the tangent plane of the surface at the
+    hit. At grazing incidence this intersection is ill-conditioned, and the point of the ray nearest to the hit is taken
+    instead.
     """
     slope = dr.dot(hit.n, ray.d)
     steep = dr.abs(slope) > 1e-2
@@ -76,10 +78,10 @@ def hit_distance(ray: Ray, hit: mi.SurfaceInteraction3f) -> mi.Float:
 
 
 def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi.Ray3f:
-    """Spawn a ray that continues in direction ``d`` and begins a little behind the surface.
+    """Spawn a ray in direction ``d`` that begins a little behind the surface.
 
-    Mitsuba offsets the origin by 1e-4 (1 + the largest coordinate), which can step over whole shapes in a scene that is small.
-    Here the 1 is replaced by a quarter of the scene's ``size`` [length], where that is less.
+    Mitsuba offsets the origin by 1e-4 (1 + largest coordinate), which can step over whole shapes of a small scene. Here a
+    quarter of the ``size`` of the scene [length] replaces the 1 where the quarter is smaller.
     """
     step = (dr.minimum(0.25 * size, 1) + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon
     ray = si.spawn_ray(d)
@@ -88,6 +90,6 @@ def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi
 
 
 def clip_camera_ray(ray: mi.Ray3f) -> mi.Ray3f:
-    """The ray of a sensor, ended at the sensor's ``far_clip``; ``maxt`` is infinite where that is not finite."""
+    """End the ray of a sensor at the ``far_clip`` of the sensor; ``maxt`` becomes infinite without a finite ``far_clip``."""
     end = dr.select(ray.maxt < dr.largest(mi.Float), ray.maxt, dr.inf)
     return mi.Ray3f(ray.o, ray.d, end, ray.time, ray.wavelengths)

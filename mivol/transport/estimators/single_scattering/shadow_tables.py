@@ -112,7 +112,7 @@ def build_visibility_cache(
     blocks = tuple((n >> shift) + 1 for n in lattice.res)
     n, k = blocks[0] * blocks[1] * blocks[2], len(emitters.sampled)
     coarse = take(lattice, shift, lists)
-    index = coarse.held if lists else dr.arange(mi.UInt32, n)
+    index = coarse.occupied_blocks if lists else dr.arange(mi.UInt32, n)
     weights = dr.full(mi.Float, 1, n * k)
     if dr.width(index):
         far = _replace_grid(media, coarse.lattice)
