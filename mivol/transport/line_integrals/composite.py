@@ -24,7 +24,7 @@ from mivol.transport.line_integrals.body_sweep import BodySweep
 from mivol.transport.line_integrals.integrand import LineIntegral, check_cells_shared
 from mivol.transport.media.compositing import BodyIntegral, transmittance_of, zeros
 from mivol.transport.media.gaussian_sweep import GaussianSweep
-from mivol.transport.media.ray_intervals import MediumInterval, find_boxed_intervals, revisit_media
+from mivol.transport.media.ray_intervals import MediumInterval, find_boxed_intervals, trace_boundaries
 
 __all__ = ["Composite", "composite_ray", "vjp_composite"]
 
@@ -112,8 +112,6 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
         boxes.append(_BoxedMedium(interval, middle, own, zeros(mi.Float64, rows), [], zeros(mi.Float, rows)))
 
     def visit_traced(t: _TracedSums, interval: MediumInterval) -> _TracedSums:
-        if interval.body.box is not None:
-            return t
         own, middle = make_sweep(line, interval, tangent).integrate(skip), interval.middle()
         seen = _multiply_transmittance(_add_rows(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
         opaque = [one_minus_exp(mi.Float(x)) for x in own.tau[: integrand.rows]]
@@ -134,7 +132,8 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
         mi.Float(0),
     )
     if media.traced:
-        traced = revisit_media(media, ray_segment, visit_traced, traced, line.active)
+        ray, medium, passes_null = ray_segment.ray, ray_segment.medium, ray_segment.passes_null
+        _, traced = trace_boundaries(media, ray, medium, visit_traced, traced, line.active, passes_null)
     return _composite_media(boxes, traced, end, integrand.rows, rows)
 
 
@@ -185,8 +184,6 @@ def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Floa
         make_sweep(line, box.interval).vjp(weight, ahead, behind)
 
     def visit(passed: BodyIntegral, interval: MediumInterval) -> BodyIntegral:
-        if interval.body.box is not None:
-            return passed
         sweep, middle = make_sweep(line, interval), interval.middle()
         own = sweep.integrate(False)
         front = _add_rows(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
@@ -201,7 +198,8 @@ def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Floa
 
     if media.traced:
         nothing = BodyIntegral(zeros(mi.Float64, integrand.rows), zeros(mi.Float, integrand.rows))
-        revisit_media(media, ray_segment, visit, nothing, line.active)
+        ray, medium, passes_null = ray_segment.ray, ray_segment.medium, ray_segment.passes_null
+        trace_boundaries(media, ray, medium, visit, nothing, line.active, passes_null)
 
 
 # -- Rows of media in the order of the ray -----------------------------------------------------------------------------

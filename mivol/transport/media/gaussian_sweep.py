@@ -43,7 +43,7 @@ RGB = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
 
 
 @dataclass
-class _Seen:
+class _CrossedGaussian:
     """A Gaussian as a ray meets it.
 
     Attributes:
@@ -95,13 +95,14 @@ class GaussianSweep:
         rows = self.rows * (1 if self.change is None else 2)
 
         def add(integral: BodyIntegral, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> BodyIntegral:
-            seen = self._see(line, index, ends)
+            crossed = self._cross(line, index, ends)
             if self.change is None:
-                return composite_over(integral, seen.integrals(), [], [])
-            moved = self.part.jvp_value(line, line.share_slopes(*ends), seen.own, self.change, index)
-            return composite_over(integral, seen.integrals(), [[moved]] * self.rows, self._jvp_colour(seen))
+                return composite_over(integral, crossed.integrals(), [], [])
+            moved = self.part.jvp_value(line, line.share_slopes(*ends), crossed.own, self.change, index)
+            return composite_over(integral, crossed.integrals(), [[moved]] * self.rows, self._jvp_colour(crossed))
 
-        return self._sweep(BodyIntegral(zeros(mi.Float64, rows), zeros(mi.Float, rows)), add)
+        empty = BodyIntegral(zeros(mi.Float64, rows), zeros(mi.Float, rows))
+        return visit_far_to_near(self.part, self.interval, empty, add)
 
     def vjp(self, weight: list[mi.Float], ahead: list[mi.Float64], behind: list[mi.Float]) -> None:
         """Add ``weight`` times the derivatives of N to the gradients of the medium; arguments as of ``BodySweep``.
@@ -111,52 +112,49 @@ class GaussianSweep:
         gradient = self.body.gradients[0]
 
         def add(sweep: ReverseState, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> ReverseState:
-            seen = self._see(line, index, ends)
-            sweep, slopes, weights = pass_cell(sweep, seen.integrals(), weight, behind)
+            crossed = self._cross(line, index, ends)
+            sweep, slopes, weights = pass_cell(sweep, crossed.integrals(), weight, behind)
             by_tau = sum((row[0] for row in slopes), mi.Float(0))
-            self.part.vjp_value(gradient, line, line.share_slopes(*ends), (seen.own, by_tau), index, mi.Bool(True))
-            self._vjp_colour(gradient, seen, weights)
+            self.part.vjp_value(gradient, line, line.share_slopes(*ends), (crossed.own, by_tau), index, mi.Bool(True))
+            self._vjp_colour(gradient, crossed, weights)
             return sweep
 
         start = ReverseState(zeros(mi.Float, self.rows), [mi.Float64(a) for a in ahead], zeros(mi.Float, self.rows))
-        self._sweep(start, add)
+        visit_far_to_near(self.part, self.interval, start, add)
 
-    def _sweep(self, state: object, add: object) -> object:
-        return visit_far_to_near(self.part, self.interval, state, add)
-
-    def _see(self, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> _Seen:
+    def _cross(self, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> _CrossedGaussian:
         own, colour = line.depth * line.share(*ends), [mi.Float(0)] * self.rows
         if self.part.shows:
             rgb = eval_colour(self._harmonics(self.part.colours, index, 0), self.basis, self.part.field.space)
             colour = [_dot(weights, rgb) for weights in self.channels]
-        return _Seen(line, index, ends, own, self.scale * own, colour)
+        return _CrossedGaussian(line, index, ends, own, self.scale * own, colour)
 
     def _harmonics(self, rows: mi.Float, index: mi.UInt32, before: int) -> list[mi.Float]:
         """The harmonics of a Gaussian in an array in which so many blocks lie before those of colours."""
         return read_harmonics(rows, before + index * self.part.blocks, self.part.field.degree)
 
-    def _slopes(self, seen: _Seen) -> list[mi.Float]:
+    def _slopes(self, crossed: _CrossedGaussian) -> list[mi.Float]:
         """Derivatives of red, green and blue by the sums over the harmonics."""
-        return eval_colour_slopes(self._harmonics(self.part.colours, seen.index, 0), self.basis, self.part.field.space)
+        return eval_colour_slopes(self._harmonics(self.part.colours, crossed.index, 0), self.basis, self.part.field.space)
 
-    def _jvp_colour(self, seen: _Seen) -> list[mi.Float]:
+    def _jvp_colour(self, crossed: _CrossedGaussian) -> list[mi.Float]:
         """Tangents of N of one Gaussian by its harmonics."""
         if not self.part.shows:
             return [mi.Float(0)] * self.rows
-        change = sum_harmonics(self._harmonics(self.change, seen.index, self.part.field.count), self.basis)
-        rgb = [slope * moved for slope, moved in zip(self._slopes(seen), change, strict=True)]
-        return [seen.alpha * _dot(weights, rgb) for weights in self.channels]
+        change = sum_harmonics(self._harmonics(self.change, crossed.index, self.part.field.count), self.basis)
+        rgb = [slope * moved for slope, moved in zip(self._slopes(crossed), change, strict=True)]
+        return [crossed.alpha * _dot(weights, rgb) for weights in self.channels]
 
-    def _vjp_colour(self, gradient: mi.Float, seen: _Seen, weights: list[mi.Float]) -> None:
+    def _vjp_colour(self, gradient: mi.Float, crossed: _CrossedGaussian, weights: list[mi.Float]) -> None:
         """Add the derivatives by the harmonics of one Gaussian, from those by its N."""
         if not self.part.shows:
             return
         by_rgb = [
-            slope * seen.alpha * sum((row[c] * w for row, w in zip(self.channels, weights, strict=True)), mi.Float(0))
-            for c, slope in enumerate(self._slopes(seen))
+            slope * crossed.alpha * sum((row[c] * w for row, w in zip(self.channels, weights, strict=True)), mi.Float(0))
+            for c, slope in enumerate(self._slopes(crossed))
         ]
         entries = [y * by for y in self.basis for by in by_rgb]
-        first = self.part.field.count + seen.index * self.part.blocks
+        first = self.part.field.count + crossed.index * self.part.blocks
         for block in range(self.part.blocks):
             add_to_block(gradient, entries[ROW_SIZE * block : ROW_SIZE * (block + 1)], first + block, mi.Bool(True))
 

@@ -11,16 +11,15 @@ import numpy as np
 
 from mivol.fields.activation import Activation
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
-from mivol.transport.media.grid_integral import (
-    ActivatedNodes,
-    NodeGradient,
-    backproject_activated,
-    backproject_segment,
-    integrate_activated,
-    integrate_segment,
+from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_segment
+from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, walk_cells
+from mivol.transport.traversal.interpolation import (
+    fraction_from_lower,
+    gauss_points,
+    interpolate,
+    node_weights,
+    trilinear_weights,
 )
-from mivol.transport.traversal.grid_walk import NodeArray, corner_nodes
-from mivol.transport.traversal.interpolation import fraction_from_lower, interpolate, trilinear_weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid, locate_cell
 from mivol.transport.traversal.rays import Ray
 
@@ -135,7 +134,7 @@ def add_to_cell(gradient: NodeGradient, lower: mi.Vector3i, terms: list[tuple], 
     """
     for c in range(gradient.channels):
         values = [sum(w[c] * corners[q] for w, corners in terms) for q in range(8)]
-        gradient.add_at(c, lower, values, active)
+        gradient.add(c, lower, values, active)
 
 
 @dataclass
@@ -152,14 +151,43 @@ class ActivatedGridExtinction(NodeValues):
     volume: ClassVar[None] = None
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
-        return integrate_activated(self._nodes(), clip_interval(self.lattice, interval), interval.active, enough)
+        return self._integrate(self.lattice, interval, enough)
 
     def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
-        nodes = replace(self._nodes(), lattice=replace(self.lattice, empty_distances=None))
-        return integrate_activated(nodes, clip_interval(nodes.lattice, interval), interval.active, None, tangent)
+        return self._integrate(replace(self.lattice, empty_distances=None), interval, tangent=tangent)
 
     def vjp(self, gradient: NodeGradient, weight: list[mi.Float], interval: RayInterval) -> None:
-        backproject_activated(self._nodes(), gradient, weight[0], clip_interval(self.lattice, interval), interval.active)
+        def visit(state: None, cell: Cell, on: mi.Bool) -> None:
+            row = [mi.Float(0)] * 8
+            for p in gauss_points(cell):
+                _, slope = self.activation.value_and_slope(interpolate(cell.corners[0][0], p))
+                row = [r + slope * w for r, w in zip(row, node_weights(p, cell, self.lattice.res), strict=True)]
+            gradient.add(0, cell.lower, [0.5 * cell.dt * weight[0] * r for r in row], on)
+            return state
+
+        lattice, reads = replace(self.lattice, empty_distances=None), [NodeArray(dr.detach(self.values))]
+        walk_cells(lattice, clip_interval(lattice, interval), visit, None, reads, interval.active)
+
+    def _integrate(
+        self,
+        lattice: Lattice,
+        interval: RayInterval,
+        enough: mi.Float | None = None,
+        tangent: mi.Float | None = None,
+    ) -> list[mi.Float]:
+        """Integrate the extinction, or its tangent along a ``tangent`` of the node values, by two Gauss points a cell."""
+
+        def visit(tau: list[mi.Float], cell: Cell, on: mi.Bool) -> list[mi.Float]:
+            half, total = dr.select(on, 0.5 * cell.dt, 0), mi.Float(0)
+            for p in gauss_points(cell):
+                value, slope = self.activation.value_and_slope(interpolate(cell.corners[0][0], p))
+                total += value if tangent is None else slope * interpolate(cell.corners[1][0], p)
+            return [dr.fma(half, total, tau[0])]
+
+        arrays = [dr.detach(self.values)] if tangent is None else [dr.detach(self.values), tangent]
+        until = None if enough is None else lambda tau: tau[0] > enough
+        segment, reads = clip_interval(lattice, interval), [NodeArray(a) for a in arrays]
+        return walk_cells(lattice, segment, visit, [mi.Float(0)], reads, interval.active, until)
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         (value,) = interpolate_at(self.lattice, dr.detach(self.scaled(scale)), ray, t, active)
@@ -172,9 +200,6 @@ class ActivatedGridExtinction(NodeValues):
 
     def vjp_at(self, gradient: NodeGradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         self.add_at_point(gradient, [self._slope(ray, t, active) * weight[0]], ray, t, active)
-
-    def _nodes(self) -> ActivatedNodes:
-        return ActivatedNodes(self.lattice, dr.detach(self.values), self.activation)
 
     def _slope(self, ray: Ray, t: mi.Float, active: mi.Bool) -> mi.Float:
         """Derivative of the extinction with respect to the interpolated value, at a point of a ray."""

@@ -21,18 +21,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.fields.activation import Activation
 from mivol.numerics import least_of
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, walk_cells
 from mivol.transport.traversal.interpolation import gauss_points, interpolate, node_weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
 
 __all__ = [
-    "ActivatedNodes",
     "NodeGradient",
-    "backproject_activated",
     "backproject_segment",
-    "integrate_activated",
     "integrate_segment",
     "integrate_tau",
 ]
@@ -109,70 +105,6 @@ def integrate_segment(
 
 
 @dataclass
-class ActivatedNodes:
-    """An extinction that is a function of the interpolated values of a grid of one channel.
-
-    Attributes:
-        lattice: where the grid lies, and which blocks are empty.
-        values: flat node values before the activation, detached.
-        activation: the function of the interpolated value.
-    """
-
-    lattice: Lattice
-    values: mi.Float
-    activation: Activation
-
-
-def integrate_activated(
-    nodes: ActivatedNodes,
-    segment: Segment,
-    active: mi.Bool = True,
-    enough: mi.Float | None = None,
-    tangent: mi.Float | None = None,
-) -> list[mi.Float]:
-    """Integrate an extinction that is a function of interpolated node values, or its tangent.
-
-    Args:
-        nodes: the grid and the function.
-        segment, active, enough: as :func:`integrate_segment`.
-        tangent: of the values; None for the integral itself.
-
-    Returns:
-        The integral, in a list of one.
-
-    Bias: two points a cell are exact for polynomials of degree 3 only; the error falls with the fourth power of a cell where
-        the activation is smooth, with the second at the edge that a ``relu`` cuts.
-    """
-
-    def visit(tau: list[mi.Float], cell: Cell, on: mi.Bool) -> list[mi.Float]:
-        half, total = dr.select(on, 0.5 * cell.dt, 0), mi.Float(0)
-        for p in gauss_points(cell):
-            value, slope = nodes.activation.value_and_slope(interpolate(cell.corners[0][0], p))
-            total += value if tangent is None else slope * interpolate(cell.corners[1][0], p)
-        return [dr.fma(half, total, tau[0])]
-
-    reads = [NodeArray(nodes.values)] if tangent is None else [NodeArray(nodes.values), NodeArray(tangent)]
-    until = None if enough is None else lambda tau: tau[0] > enough
-    return walk_cells(nodes.lattice, segment, visit, [mi.Float(0)], reads, active, until)
-
-
-def backproject_activated(
-    nodes: ActivatedNodes, target: NodeGradient, weight: mi.Float, segment: Segment, active: mi.Bool = True
-) -> None:
-    """The transpose of the tangent of :func:`integrate_activated`: add ``weight`` (d loss / d tau) times it to ``target``."""
-
-    def visit(state: None, cell: Cell, on: mi.Bool) -> None:
-        row = [mi.Float(0)] * 8
-        for p in gauss_points(cell):
-            _, slope = nodes.activation.value_and_slope(interpolate(cell.corners[0][0], p))
-            row = [r + slope * w for r, w in zip(row, node_weights(p, cell, nodes.lattice.res), strict=True)]
-        target.add(0, cell, [0.5 * cell.dt * weight * r for r in row], on)
-        return state
-
-    walk_cells(replace(nodes.lattice, empty_distances=None), segment, visit, None, [NodeArray(nodes.values)], active)
-
-
-@dataclass
 class NodeGradient:
     """The derivative of a scalar with respect to the nodes of a grid, to which the transpose adds.
 
@@ -202,12 +134,8 @@ class NodeGradient:
         buffer = dr.zeros(mi.Float, 8 * cells if packed else z * y * x * lattice.channels)
         return cls(buffer, lattice.res, lattice.channels, packed)
 
-    def add(self, channel: int, cell: Cell, corners: list[mi.Float], active: mi.Bool) -> None:
-        """Add 8 values, in the order of the grid's own axes, to the corners of a cell."""
-        self.add_at(channel, cell.lower, corners, active)
-
-    def add_at(self, channel: int, lower: mi.Vector3i, corners: list[mi.Float], active: mi.Bool) -> None:
-        """As :meth:`add`, for the cell behind the node ``lower``."""
+    def add(self, channel: int, lower: mi.Vector3i, corners: list[mi.Float], active: mi.Bool) -> None:
+        """Add 8 values, in the order of the axes of the grid, to the corners of the cell with the lower node ``lower``."""
         _, y, x = self.res
         if self.packed:
             index = ((lower.z + 1) * (y + 1) + lower.y + 1) * (x + 1) + lower.x + 1
@@ -261,7 +189,7 @@ def backproject_segment(
         a, b = (node_weights(p, cell, lattice.res) for p in gauss_points(cell))
         row = [0.5 * cell.dt * (wa + wb) for wa, wb in zip(a, b, strict=True)]
         for channel, w in enumerate(weight):
-            target.add(channel, cell, [w * r for r in row], on)
+            target.add(channel, cell.lower, [w * r for r in row], on)
         return state
 
     walk_cells(replace(lattice, empty_distances=None), segment, visit, None, (), active)

@@ -31,6 +31,7 @@ __all__ = [
     "find_end",
     "is_transparent",
     "revisit_media",
+    "trace_boundaries",
     "visit_media",
 ]
 
@@ -134,7 +135,7 @@ def visit_media(
     Returns:
         The end of the ray, and the last state.
     """
-    end, state = _trace(media, ray, medium, visit, state, active, passes_null)
+    end, state = trace_boundaries(media, ray, medium, visit, state, active, passes_null)
     for interval in find_boxed_intervals(media, ray, end.t, active):
         state = visit(state, interval)
     return end, state
@@ -153,7 +154,7 @@ def revisit_media(
 
 def find_end(media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool) -> SegmentEnd:
     """Follow a ray to the first opaque surface or to ``ray.maxt``, without a visit to the media on the way."""
-    return _trace(media, ray, medium, lambda state, _: state, (), active, False)[0]
+    return trace_boundaries(media, ray, medium, lambda state, _: state, (), active, False)[0]
 
 
 def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: mi.Bool) -> list[MediumInterval]:
@@ -183,7 +184,7 @@ def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: m
 
 
 @dr.syntax
-def _trace(
+def trace_boundaries(
     media: SceneMedia,
     ray: Ray,
     medium: mi.MediumPtr,

@@ -269,9 +269,8 @@ def coarsen_grid(lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
     values = mi.TensorXf(flat, (*shape, c))
     scale = np.diag([edge * m / n for m, n in zip(shape[::-1], lattice.res[::-1], strict=True)] + [1.0])
     empty_distances = find_empty_distances(values) if lattice.empty_distances is not None else None
-    return CoarseGrid(
-        Lattice(values, lattice.to_world @ scale, empty_distances), _list_occupied(values, lattice.res, shift) if lists else None
-    )
+    occupied_blocks = _list_occupied(values, lattice.res, shift) if lists else None
+    return CoarseGrid(Lattice(values, lattice.to_world @ scale, empty_distances), occupied_blocks)
 
 
 def _mean_along(flat: mi.Float, n: int, inner: int, edge: int) -> mi.Float:

@@ -209,7 +209,8 @@ class CellIndex:
             # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive.
             far = find_distances(dr.zeros(mi.Bool, total), counts)
             return cls(counts, mi.UInt32(far), dr.zeros(mi.UInt32, 2), dr.zeros(mi.UInt32, 1)), listed
-        place, is_filled, bits = dr.gather(mi.UInt32, candidates, filled), dr.zeros(mi.UInt8, total), dr.zeros(mi.UInt32, 2 * count)
+        place = dr.gather(mi.UInt32, candidates, filled)
+        is_filled, bits = dr.zeros(mi.UInt8, total), dr.zeros(mi.UInt32, 2 * count)
         dr.scatter(is_filled, mi.UInt8(1), place)
         dr.scatter(bits, mi.ArrayXu([dr.gather(mi.UInt32, word, filled) for word in (low, high)]), dr.arange(mi.UInt32, count))
         bricks = mi.UInt32(find_distances(is_filled > 0, counts))
