@@ -40,7 +40,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
     first, second = folder(tmp_path), folder(tmp_path)
     second.record.title = "another run"
     with pytest.raises(KeyError), first.at_work():
-        with pytest.raises(MivolError, match='another run is at work in "run"'), second.at_work():
+        with pytest.raises(MivolError, match='another run uses the folder "run"'), second.at_work():
             pass
         assert read_record(first.path).title == "a run"
         raise KeyError
