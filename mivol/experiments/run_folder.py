@@ -74,7 +74,7 @@ class RunFolder:
         The record of an earlier run is left alone by a run that is refused before it begins.
 
         Raises:
-            MivolError: another run is at work in the folder.
+            MivolError: another run uses the folder.
         """
         with lock_folder(self.path):
             remove_temporaries(self.path)
