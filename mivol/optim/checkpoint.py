@@ -1,8 +1,8 @@
-"""A run on disk, from which it continues as if it had not stopped.
+"""Checkpoints: files from which a run continues as if it had never stopped.
 
-Conventions. One ``.npz`` file, written whole: the arrays of the optimiser and the problem, and one JSON text,
-``about``, with the next iteration, the history and the fingerprint (every setting that changes the result, and the scene's
-hash, by dotted key). A file of another fingerprint is refused; only the number of iterations may grow. No pickles.
+Conventions. One ``.npz`` file, written whole. It holds the arrays of the optimizer and the problem, and one JSON text ``about``
+with the next iteration, the history and the fingerprint (all settings that change the result, and the scene's hash, by dotted
+key). A file with another fingerprint is refused; only the number of iterations may grow. No pickles.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from mivol.files.npy import read_archive
 ABOUT = "about"
 
 DIGESTS = ("scene", "references", "photos", "data")
-"""Keys of fingerprints that are no settings: digests of what a run reads."""
+"""Fingerprint keys that are not settings: digests of input data."""
 
-NEEDED = ("fingerprint",)
-"""What every checkpoint says of itself."""
+REQUIRED_KEYS = ("fingerprint",)
+"""Keys of every checkpoint."""
 
-GROWING = ("fit.iterations", "solve.iterations")
-"""Settings that a run may be resumed with a larger value of: it goes on from where it ended."""
+GROWABLE_SETTINGS = ("fit.iterations", "solve.iterations")
+"""Settings that may grow on resuming: the run continues from its old end."""
 
 
 @dataclass(frozen=True)
 class CheckpointFile:
-    """Where a run is kept, and what tells it from others.
+    """The checkpoint file of one run.
 
     Attributes:
         path: the file.
-        fingerprint: what the result depends on, by name; JSON values.
-        resume: continue from what is there.
+        fingerprint: inputs of the result by name; JSON values.
+        resume: whether the run continues from this file.
     """
 
     path: Path
@@ -45,29 +45,29 @@ class CheckpointFile:
     resume: bool = False
 
     def write(self, arrays: dict[str, np.ndarray], about: dict[str, object]) -> None:
-        """Write a checkpoint of this run; refusals as :func:`write`."""
+        """Write a checkpoint of this run; raises as :func:`write`."""
         write(self.path, arrays, {**about, "fingerprint": self.fingerprint})
 
     def read(self) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-        """Arrays and ``about`` of the checkpoint; refusals as :func:`read`."""
+        """Arrays and ``about`` of the checkpoint; raises as :func:`read`."""
         return read(self.path, self.fingerprint)
 
 
 def write(path: Path, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> None:
-    """Write a checkpoint, never half.
+    """Write a checkpoint, whole or not at all.
 
     Raises:
-        MivolError: the disk is full, or the like.
+        MivolError: the file cannot be written, as on a full disk.
     """
     text = np.array(json.dumps(about))
     write_whole(path, lambda file: np.savez(file, **{ABOUT: text}, **arrays))
 
 
 def read(path: Path, fingerprint: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and ``about`` of a checkpoint of this very run.
+    """Arrays and ``about`` of a checkpoint of this run.
 
     Raises:
-        MivolError: there is none, it is no checkpoint, or it is one of another scene or other settings.
+        MivolError: the file is missing, is no checkpoint, or belongs to another scene or other settings.
     """
     arrays, about = _load(path)
     check_same(path, about["fingerprint"], fingerprint)
@@ -75,25 +75,25 @@ def read(path: Path, fingerprint: dict[str, Any]) -> tuple[dict[str, np.ndarray]
 
 
 def check_settings(path: Path, settings: dict[str, Any]) -> None:
-    """Refuse a checkpoint of other settings, before the run reads its data or touches its folder.
+    """Check the settings of a checkpoint, before the run reads its data or changes its folder.
 
     Raises:
-        MivolError: there is none, it is no checkpoint, or it is one of other settings.
+        MivolError: the file is missing, is no checkpoint, or has other settings.
     """
-    there = _load(path)[1]["fingerprint"]
-    check_same(path, {key: value for key, value in there.items() if key not in DIGESTS}, settings)
+    saved = _load(path)[1]["fingerprint"]
+    check_same(path, {key: value for key, value in saved.items() if key not in DIGESTS}, settings)
 
 
 def _load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and ``about`` of a checkpoint.
 
     Raises:
-        MivolError: there is none, or it is no checkpoint.
+        MivolError: the file is missing or is no checkpoint.
     """
     try:
         arrays = read_archive(path)
         about = json.loads(str(arrays.pop(ABOUT)))
-        missing = [key for key in NEEDED if key not in about]
+        missing = [key for key in REQUIRED_KEYS if key not in about]
     except FileNotFoundError:
         raise MivolError(f"found no checkpoint {path} to resume from: run without --resume first.") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -103,18 +103,18 @@ def _load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return arrays, about
 
 
-def check_same(path: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
-    """Refuse a checkpoint of another run, naming the first setting that differs.
+def check_same(path: Path, saved: dict[str, Any], current: dict[str, Any]) -> None:
+    """Check that a checkpoint belongs to this run; the message names the first different setting.
 
     Raises:
-        MivolError: with both values.
+        MivolError: another run, with both values.
     """
-    here = json.loads(json.dumps(here))
-    for key in sorted({*there, *here}):
-        if key in GROWING and there.get(key, 0) <= here.get(key, 0):
+    current = json.loads(json.dumps(current))
+    for key in sorted({*saved, *current}):
+        if key in GROWABLE_SETTINGS and saved.get(key, 0) <= current.get(key, 0):
             continue
-        if there.get(key) != here.get(key):
+        if saved.get(key) != current.get(key):
             raise MivolError(
-                f"{path} belongs to another run: {key} is {there.get(key)!r} there and {here.get(key)!r} here; "
+                f"{path} belongs to another run: {key} is {saved.get(key)!r} there and {current.get(key)!r} here; "
                 "restore the setting, or run without --resume."
             )

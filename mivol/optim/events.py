@@ -1,7 +1,7 @@
-"""What happens to a fit besides its steps: refine the grid, write a checkpoint, measure the error.
+"""Events between the steps of a fit: refine the grid, write a checkpoint, measure the error.
 
-Conventions. An event is asked before each iteration whether it is ``due`` and, if so, applied; what it says, if anything,
-goes into the log. Events of one iteration are applied in the order given, checkpoints first. EVENTS lists them.
+Conventions. Before each iteration the fit asks each event whether it is ``due``, and applies it if so. The returned message
+goes into the log. Events of one iteration are applied in the given order, checkpoints first.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from mivol.optim.strategy import Strategy, make_table, setting
 
 
 class RunningFit(Protocol):
-    """What an event may know and do of a fit.
+    """Attributes and methods of a fit for its events.
 
     Attributes:
-        problem: what is minimised.
-        run: the optimiser at work, with the reals.
-        next_iteration: the iteration that comes after the event.
+        problem: the problem to minimise.
+        run: the optimizer run, which owns the reals.
+        next_iteration: the iteration after the event.
     """
 
     problem: Problem
@@ -35,60 +35,61 @@ class RunningFit(Protocol):
         """Write the checkpoint."""
 
     def evaluate(self) -> None:
-        """Measure, and remember."""
+        """Measure the errors and record them."""
 
 
 def upsample(field: mi.TensorXf, shape: tuple[int, int, int]) -> mi.TensorXf:
-    r"""A field on a grid of another resolution, with the same total mass and no new extremum but by the mass's factor.
+    """Resample a field to another resolution with the same total mass; new extrema come from the mass factor only.
 
-    Linear interpolation of the voxel centres with clamped borders (weights >= 0: no overshoot), then all values times
-    one factor per channel. The mass of a trilinear field with clamped borders is the mean of its voxels times the
-    volume of its box, exactly: each voxel's hat, with its border half, integrates to one cell.
+    The field is interpolated linearly between voxel centres with clamped borders (weights >= 0: no overshoot), then multiplied
+    by one factor per channel. The mass of a trilinear field with clamped borders is exactly the mean of its voxels times the
+    volume of its box: each voxel's hat, with its border half, integrates to one cell.
 
     Args:
         field: (Z, Y, X, C), finite.
         shape: the new (Z, Y, X).
 
     Returns:
-        (*shape, C). The mass of each channel is that of ``field`` to float32 rounding; where linear interpolation
-        leaves no mass at all (a checkerboard of both signs), the interpolation itself.
+        (*shape, C). The mass of each channel equals the mass in ``field`` to float32 rounding. If linear interpolation leaves
+        no
+            mass (a checkerboard of both signs), the result is the interpolation itself.
     """
     fine = np.asarray(dr.resample(field, (*shape, field.shape[3]), filter="linear"), dtype=np.float64)
     mass = np.asarray(field, dtype=np.float64).mean(axis=(0, 1, 2))
-    found = fine.mean(axis=(0, 1, 2))
-    # Of each channel by its own values: an albedo may stand beside a density that is 1e15 times as small.
+    fine_mass = fine.mean(axis=(0, 1, 2))
+    # Scales are per channel: an albedo may stand beside a density smaller by 1e15.
     largest = np.abs(fine).max(axis=(0, 1, 2), initial=0.0)
-    factor = np.divide(mass, found, out=np.ones_like(mass), where=np.abs(found) > 1e-12 * largest)
+    factor = np.divide(mass, fine_mass, out=np.ones_like(mass), where=np.abs(fine_mass) > 1e-12 * largest)
     return mi.TensorXf((fine * factor).astype(np.float32))
 
 
 class Event(Strategy, tag="event"):
-    """Something that happens between iterations."""
+    """An action between iterations."""
 
     def due(self, iteration: int) -> bool:
-        """Whether it happens before this iteration."""
+        """Whether the event happens before this iteration."""
         raise NotImplementedError
 
     def apply(self, fit: RunningFit) -> str:
-        """Let it happen; what a reader of the report must know, or ""."""
+        """Apply the event; the returned message, if not empty, goes into the log and the report."""
         raise NotImplementedError
 
 
 def check_for_grids(count: int) -> None:
-    """Refuse to refine parameters of which none is a grid.
+    """Check that at least one parameter is a grid.
 
     Raises:
-        MivolError: there are none.
+        MivolError: no parameter is a grid.
     """
     if count == 0:
-        raise MivolError("upsample found no grid among the parameters: take the event out.")
+        raise MivolError("the event 'upsample' found no grid among the parameters: remove the event.")
 
 
 class Upsample(Event, tag="upsample"):
-    """Refine every grid: coarse first, since large structures converge there in few cheap steps."""
+    """Refine every grid. Large structures converge on a coarse grid in few cheap steps."""
 
-    at: Annotated[tuple[int, ...], setting("iteration", "before which iterations")]
-    factor: Annotated[int, setting("1", "new voxels per old one and axis", ge=2, le=8)] = 2
+    at: Annotated[tuple[int, ...], setting("iteration", "iterations before which the event happens")]
+    factor: Annotated[int, setting("1", "new voxels per old voxel and axis", ge=2, le=8)] = 2
 
     def due(self, iteration: int) -> bool:
         return iteration in self.at
@@ -106,49 +107,50 @@ class Upsample(Event, tag="upsample"):
 
 
 class CoarseToFine(Event, tag="coarse_to_fine"):
-    """Begin the next stage of a problem that has stages: finer unknowns, and only where something was found."""
+    """Begin the next stage of a problem: finer unknowns, and only around nonempty regions."""
 
-    at: Annotated[tuple[int, ...], setting("iteration", "before which the second stage begins, the third, ...")]
+    at: Annotated[tuple[int, ...], setting("iteration", "first iterations of the second stage, the third, ...")]
 
     def due(self, iteration: int) -> bool:
         return iteration in self.at
 
     def apply(self, fit: RunningFit) -> str:
-        return _go_over(fit, 1 + self.at.index(fit.next_iteration))
+        return _change_stage(fit, 1 + self.at.index(fit.next_iteration))
 
 
 class DropUnseen(Event, tag="drop_unseen"):
-    """Go on without the unknowns of a stage that nothing sees: what is left takes less time and memory."""
+    """Remove the unknowns of a stage that no view sees, to save time and memory."""
 
-    at: Annotated[tuple[int, ...], setting("iteration", "before which iterations")]
+    at: Annotated[tuple[int, ...], setting("iteration", "iterations before which the event happens")]
 
     def due(self, iteration: int) -> bool:
         return iteration in self.at
 
     def apply(self, fit: RunningFit) -> str:
-        return _go_over(fit, fit.problem.stage)
+        return _change_stage(fit, fit.problem.stage)
 
 
-def _go_over(fit: RunningFit, stage: int) -> str:
-    """Begin a stage, or the one at work anew; what it says.
+def _change_stage(fit: RunningFit, stage: int) -> str:
+    """Begin a stage, or begin the current stage again; returns the message.
 
-    Dr.Jit keeps arrays that were let go for others of their size, rounded up to a power of two. Those of the last steps are of
-    no use to what comes between, nor those to the next steps.
+    Dr.Jit keeps freed arrays for later arrays of the same size, rounded up to a power of two. The change of stage cannot reuse
+    the arrays of the last steps, and the next steps cannot reuse the arrays of the change, so the
+    cache is flushed before and after.
     """
     dr.flush_malloc_cache()
     fit.problem.set_reals(fit.run.reals)
     refinement = fit.problem.refine(stage)
     fit.run.refine(refinement)
-    says = refinement.message
-    del refinement  # holds the old unknowns
+    message = refinement.message
+    del refinement  # it holds the old unknowns
     dr.flush_malloc_cache()
-    return says
+    return message
 
 
 class UpdateOccupancy(Event, tag="update_occupancy"):
-    """Let a problem look again for what the next steps can leave out without a change: cells that have become empty."""
+    """Let a problem update the list of cells that steps can skip without changing their result."""
 
-    every: Annotated[int, setting("iteration", "how often", ge=1)] = 64
+    every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 64
 
     def due(self, iteration: int) -> bool:
         return iteration > 0 and iteration % self.every == 0
@@ -160,11 +162,11 @@ class UpdateOccupancy(Event, tag="update_occupancy"):
 
 
 class ControlDensity(Event, tag="control_density"):
-    """Let a problem have more Gaussians where the pictures need them, and fewer where nobody sees them."""
+    """Let a problem add Gaussians where images need them and remove invisible ones."""
 
-    every: Annotated[int, setting("iteration", "how often", ge=1)] = 100
-    begin: Annotated[int, setting("iteration", "before which it is first done", ge=1)] = 500
-    end: Annotated[int, setting("iteration", "from which on it is not done", ge=1)] = 15000
+    every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 100
+    begin: Annotated[int, setting("iteration", "first iteration", ge=1)] = 500
+    end: Annotated[int, setting("iteration", "end, exclusive", ge=1)] = 15000
 
     def due(self, iteration: int) -> bool:
         return self.begin <= iteration < self.end and iteration % self.every == 0
@@ -177,9 +179,9 @@ class ControlDensity(Event, tag="control_density"):
 
 
 class Checkpoint(Event, tag="checkpoint"):
-    """Write everything that the next iteration depends on."""
+    """Write all inputs of the next iteration."""
 
-    every: Annotated[int, setting("iteration", "how often", ge=1)] = 10
+    every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 10
 
     def due(self, iteration: int) -> bool:
         return iteration > 0 and iteration % self.every == 0
@@ -190,9 +192,9 @@ class Checkpoint(Event, tag="checkpoint"):
 
 
 class Evaluate(Event, tag="evaluate"):
-    """Measure what the fit does not minimise: held-out views, error of the volume."""
+    """Measure errors that the fit does not minimise: held-out views, error of the volume."""
 
-    every: Annotated[int, setting("iteration", "how often", ge=1)] = 10
+    every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 10
 
     def due(self, iteration: int) -> bool:
         return iteration % self.every == 0
@@ -210,5 +212,5 @@ PLAN_EVENTS = make_table(CoarseToFine, DropUnseen, UpdateOccupancy, ControlDensi
 
 
 def checkpoints_first(events: tuple[Event, ...]) -> list[Event]:
-    """Checkpoints first, so that they hold the state before the others."""
+    """Events in their order, checkpoints first, so that a checkpoint holds the state before the other events."""
     return sorted(events, key=lambda event: not isinstance(event, Checkpoint))

@@ -21,17 +21,17 @@ from mivol.optim.strategy import setting
 
 
 class Adam(FirstOrder, tag="adam"):
-    """Mitsuba's Adam (``mi.ad.Adam``), with each parameter's own learning rate and projection.
+    """Mitsuba's Adam (``mi.ad.Adam``), with a learning rate and a projection for each parameter.
 
-    ``epsilon`` is taken relative to the largest gradient of the first step: behind dense matter gradients vanish, and
-    an absolute 1e-8 would have Adam walk at full pace on rounding noise. Source: Kingma and Ba 2015, Algorithm 1.
+    ``epsilon`` is relative to the largest gradient of the first step. Behind dense matter gradients vanish, and an absolute
+    1e-8 would let Adam follow rounding noise at the full rate. Source: Kingma and Ba 2015, Algorithm 1.
     """
 
     cites = ("kingma_2015",)
 
     beta_1: Annotated[float, setting("1", "memory of the gradient", ge=0, lt=1)] = 0.9
-    beta_2: Annotated[float, setting("1", "memory of its square", ge=0, lt=1)] = 0.999
-    epsilon: Annotated[float, setting("largest gradient", "gradients well below this hardly move anything", gt=0)] = 1e-6
+    beta_2: Annotated[float, setting("1", "memory of the squared gradient", ge=0, lt=1)] = 0.999
+    epsilon: Annotated[float, setting("largest gradient", "gradients well below this value cause small steps", gt=0)] = 1e-6
 
     def begin(self, problem: DifferentiableProblem) -> OptimizerRun:
         return AdamRun(self, problem)
@@ -82,7 +82,7 @@ class AdamRun(OptimizerRun):
         self.scale = 0.0
 
     def refine(self, refinement: Refinement) -> None:
-        """Both moments are carried over like the reals; the count of steps, by which they are corrected, goes on."""
+        """Carry both moments over to the new unknowns; the count of steps, which corrects them, continues."""
         states = {name: self.adam.state[name][3] for name in self.reals}
         shapes = {name: value.shape for name, value in self.reals.items()}
         moments = [
@@ -99,27 +99,27 @@ class AdamRun(OptimizerRun):
 
 
 UNIT = 64.0
-"""Fourth roots are held times this. A half has 11 bits from 2^-14 to 2^16, and fewer down to 2^-24: derivatives whose root mean
-square is between 1e-12 and 1e6 [loss / real] keep their precision, and from 1e-18 on they are known. Smaller ones are
-forgotten: the next such derivative moves its number by a whole rate, as the first does."""
+"""Factor on stored fourth roots. A half has 11 bits from 2^-14 to 2^16, and fewer bits down to 2^-24. Derivatives with a root
+mean square between 1e-12 and 1e6 [loss / real] keep full precision, and those above 1e-18 are stored. Smaller ones are lost:
+the next derivative then moves its number by a whole learning rate, as a first derivative does."""
 
 LARGEST = 65504.0
-"""The largest half. Larger roots are held as this: steps against derivatives above 1e6 are longer than the rate, not 0."""
+"""The largest half. A larger root is stored as this value, so a derivative above 1e6 takes a step above the rate."""
 
 LONGEST_MEMORY = 0.98
-"""The longest memory of means that are held in halves. These are rounded by at most 4 x 2^-11 = 0.2 % a step; with a longer
-memory the 1 - memory that a step adds would not be ten times as much, and means would stay where they were."""
+"""The longest memory of means in half precision. Rounding changes a mean by at most 4 x 2^-11 = 0.2 % a step. With a longer
+memory the share 1 - memory of a step would be less than ten times the rounding, and means would not follow."""
 
 
 class RMSprop(FirstOrder, tag="rmsprop"):
-    """RMSprop without momentum, on the numbers that have a derivative; the first derivative is its own mean.
+    """RMSprop without momentum, on numbers with a derivative; the first derivative is its own mean.
 
-    Rows of a field are touched by a few views at a time, and what a row remembers of others pulls it away (measured on the
-    chair at 32^3, 400 steps: 25.7 dB so, 21.0 dB with Adam's momentum). Source: Hinton 2012, lecture 6e.
+    A row of a field is reached by a few views at a time. Momentum from earlier views would pull the row away. Source: Hinton
+    2012, lecture 6e.
     """
 
-    memory: Annotated[float, setting("1", "of the running mean of squared derivatives", ge=0, lt=1)] = 0.95
-    half: Annotated[bool, setting("1", "these means take half the memory, as fourth roots in half precision")] = False
+    memory: Annotated[float, setting("1", "memory of the running mean of squared derivatives", ge=0, lt=1)] = 0.95
+    half: Annotated[bool, setting("1", "store the running means as fourth roots in half precision")] = False
 
     def begin(self, problem: DifferentiableProblem) -> OptimizerRun:
         """Start from the values that the problem holds.
@@ -129,46 +129,46 @@ class RMSprop(FirstOrder, tag="rmsprop"):
         """
         if self.half and self.memory > LONGEST_MEMORY:
             raise MivolError(
-                f"means in half precision were asked for with a memory of {self.memory:g}, which they would not follow: "
-                f"at most {LONGEST_MEMORY:g} is expected, or half = false."
+                f"found memory = {self.memory:g} with half = true, expected at most {LONGEST_MEMORY:g}: running means in half "
+                "precision could not follow; lower the memory or set half = false."
             )
         return RMSpropRun(self, problem)
 
 
 class RMSpropRun(OptimizerRun):
-    """State: the reals, and the running means of their squared derivatives (0: there was none yet) as they are held."""
+    """State: the reals, and the running means of their squared derivatives as stored (0: no derivative yet)."""
 
     def __init__(self, settings: RMSprop, problem: DifferentiableProblem) -> None:
         super().__init__(problem)
         self.settings = settings
-        self.squares = {name: self._held(dr.zeros(mi.TensorXf, value.shape)) for name, value in self.reals.items()}
+        self.squares = {name: self._store(dr.zeros(mi.TensorXf, value.shape)) for name, value in self.reals.items()}
 
     def step(self, iteration: int, factor: float) -> float | mi.Float:
         loss, slopes = self.problem.loss_and_gradient(self.reals, iteration, self.settings.views)
         rates = self.problem.learning_rates(iteration)
-        reals, squares = self._moved(slopes, {name: rate * factor for name, rate in rates.items()})
-        del slopes  # as large as the reals, and of no more use
-        # Squares and reals are sums of the same terms: scheduled here, they are evaluated in the kernels of the reals.
+        reals, squares = self._step(slopes, {name: rate * factor for name, rate in rates.items()})
+        del slopes  # as large as the reals
+        # Squares and reals share terms: scheduled here, both are evaluated in the same kernels.
         dr.schedule(squares)
         reals = self.problem.after_step(reals, iteration)
         dr.eval(reals, squares)
         self.reals, self.squares = reals, squares
         return loss
 
-    def _moved(self, slopes: Reals, rates: dict[str, float]) -> tuple[Reals, Reals]:
-        """Reals and squares after a step down slopes."""
+    def _step(self, slopes: Reals, rates: dict[str, float]) -> tuple[Reals, Reals]:
+        """Reals and squares after a step."""
         reals, squares = {}, {}
         for name, value in self.reals.items():
-            known, slope = self._known(self.squares[name]).array, slopes[name].array
+            known, slope = self._load(self.squares[name]).array, slopes[name].array
             moved = descend(value.array, known, slope, rates[name], self.settings.memory)
             reals[name], means = (mi.TensorXf(array, value.shape) for array in moved)
-            squares[name] = self._held(means)
+            squares[name] = self._store(means)
         return reals, squares
 
-    def _held(self, means: mi.TensorXf) -> mi.TensorXf | mi.TensorXf16:
-        return halved(means) if self.settings.half else means
+    def _store(self, means: mi.TensorXf) -> mi.TensorXf | mi.TensorXf16:
+        return to_halves(means) if self.settings.half else means
 
-    def _known(self, held: mi.TensorXf | mi.TensorXf16) -> mi.TensorXf:
+    def _load(self, held: mi.TensorXf | mi.TensorXf16) -> mi.TensorXf:
         return from_halves(held) if self.settings.half else held
 
     def pack(self) -> dict[str, np.ndarray]:
@@ -185,34 +185,34 @@ class RMSpropRun(OptimizerRun):
 
     def replace(self, name: str, reals: mi.TensorXf) -> None:
         super().replace(name, reals)
-        self.squares = {**self.squares, name: self._held(dr.zeros(mi.TensorXf, reals.shape))}
+        self.squares = {**self.squares, name: self._store(dr.zeros(mi.TensorXf, reals.shape))}
 
     def refine(self, refinement: Refinement) -> None:
-        """Squares are carried over like the reals: without them the first step would move every number by a whole rate.
+        """Carry the squares over to the new unknowns: without them, the first step would move every number by a whole rate.
 
-        The old reals are let go first: means are as large while they are carried over.
+        The old reals are released first, since the carried means need as much memory.
         """
         self.reals = refinement.reals
-        means = refinement.carry({name: self._known(held) for name, held in self.squares.items()})
+        means = refinement.carry({name: self._load(held) for name, held in self.squares.items()})
         for name, shrink in refinement.derivative_factors.items():
             means[name] = mi.TensorXf(means[name].array * dr.opaque(mi.Float, shrink**2), means[name].shape)
-        self.squares = {name: self._held(mean) for name, mean in means.items()}
+        self.squares = {name: self._store(mean) for name, mean in means.items()}
         dr.eval(self.squares)
 
 
-def halved(means: mi.TensorXf) -> mi.TensorXf16:
-    """Running means as fourth roots in half precision, which have the range for it (``UNIT``)."""
+def to_halves(means: mi.TensorXf) -> mi.TensorXf16:
+    """Running means as fourth roots in half precision, scaled by ``UNIT``."""
     roots = dr.minimum(UNIT * dr.sqrt(dr.sqrt(means.array)), LARGEST)
     return mi.TensorXf16(mi.Float16(roots), means.shape)
 
 
 def from_halves(roots: mi.TensorXf16) -> mi.TensorXf:
-    """Running means from what :func:`halved` gave, to 0.2 % of each."""
+    """Running means from :func:`to_halves`, to 0.2 % of each."""
     return mi.TensorXf(dr.square(dr.square(mi.Float(roots.array) * (1 / UNIT))), roots.shape)
 
 
 def descend(values: mi.Float, squares: mi.Float, slope: mi.Float, rate: float, memory: float) -> tuple[mi.Float, mi.Float]:
-    """Values and running means of squared derivatives after a step of ``rate`` where there is a derivative."""
+    """Values and running means of squared derivatives after a step of ``rate``, where the derivative is not 0."""
     square = dr.square(slope)
     mean = dr.select(squares == 0, square, dr.fma(memory, squares - square, square))
     touched = mean > 0

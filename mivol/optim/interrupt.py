@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM wait for the next safe point, where nothing is half done.
+"""Ctrl-C and SIGTERM stop a run at its next safe point.
 
-Conventions. The first signal is noted and raised by :meth:`InterruptGuard.check` between kernels, before any state has changed;
-the second one acts at once. Kernels are kept to seconds (``samples_per_pass``), and so is the wait. A signal that this
-process was started to ignore (Ctrl-C, for one that a script put into the background) stays ignored.
+Conventions. The first signal is recorded, and :meth:`InterruptGuard.check` raises between kernels, before any state changes.
+The second signal raises at once. Kernels take at most seconds (``samples_per_pass``), so the wait does too. A signal that the
+process was started to ignore (Ctrl-C of a background job of a script) stays ignored.
 """
 
 from __future__ import annotations
@@ -13,38 +13,42 @@ from types import FrameType
 
 
 class Interrupted(KeyboardInterrupt):
-    """The run was asked to stop and did so at a safe point."""
+    """The run was interrupted at a safe point."""
 
 
 class InterruptGuard:
-    """Context manager that turns signals into a question; outside the main thread it only answers."""
+    """Context manager that records signals; outside the main thread it records nothing.
+
+    Attributes:
+        is_requested: whether a signal has arrived.
+    """
 
     signals = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self) -> None:
-        self.asked = False
-        self._before: dict[int, object] = {}
+        self.is_requested = False
+        self._previous: dict[int, object] = {}
 
     def __enter__(self) -> InterruptGuard:
         if threading.current_thread() is threading.main_thread():
-            heard = [number for number in self.signals if signal.getsignal(number) is not signal.SIG_IGN]
-            self._before = {number: signal.signal(number, self._note) for number in heard}
+            handled = [number for number in self.signals if signal.getsignal(number) is not signal.SIG_IGN]
+            self._previous = {number: signal.signal(number, self._note) for number in handled}
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for number, handler in self._before.items():
+        for number, handler in self._previous.items():
             signal.signal(number, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
+        if self.is_requested:
             raise KeyboardInterrupt
-        self.asked = True
+        self.is_requested = True
 
     def check(self) -> None:
-        """A safe point.
+        """Stop here if a signal has arrived.
 
         Raises:
-            Interrupted: a signal has come.
+            Interrupted: a signal has arrived.
         """
-        if self.asked:
+        if self.is_requested:
             raise Interrupted

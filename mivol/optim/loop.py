@@ -1,9 +1,8 @@
-"""The fit from its first iteration to its last: steps, events, history, and a clean stop at any moment.
+"""One fit from its first iteration to its last: steps, events, history, and a clean stop at any moment.
 
-Conventions. What happens in iteration i is a function of the problem, the optimizer's state and i alone; the state is
-saved before an iteration or, on Ctrl-C and SIGTERM, as it was before the iteration that was cut short. A resumed run
-therefore equals an uninterrupted one: bit for bit with one Dr.Jit thread, to about 1e-5 with several, whose float sums
-have no fixed order.
+Conventions. Iteration i depends on the problem, the optimizer's state and i only. A checkpoint holds the state before an
+iteration; Ctrl-C and SIGTERM save the state before the interrupted iteration. A resumed run therefore equals an uninterrupted
+run: bit for bit with one Dr.Jit thread, to about 1e-5 with several threads, whose float sums have no fixed order.
 """
 
 from __future__ import annotations
@@ -27,20 +26,20 @@ from mivol.shown import curve_html
 from mivol.threads import check_one_thread
 
 SAVED_FIELDS = ("next_iteration", "events_done", "history", "evaluations", "log", "has_warned", "seconds")
-"""What a checkpoint keeps of a fit beside the run and the problem."""
+"""Fields of a fit in a checkpoint, beside the arrays of the optimizer run and the problem."""
 
 Measure = Callable[[Problem], dict[str, float]]
-"""Errors by name, of what a problem holds."""
+"""Error measures of the problem's model, by name."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """What a fit goes through.
+    """Iterations of a fit, their schedule, and the events between iterations.
 
     Attributes:
-        iterations: at most so many.
+        iterations: maximum number of iterations.
         schedule: factor on the learning rates.
-        events: what happens between iterations.
+        events: events between iterations.
     """
 
     iterations: int
@@ -50,21 +49,21 @@ class Course:
 
 @dataclass(repr=False)
 class Fit:
-    """A fit at work, or done.
+    """A fit in progress or a completed fit.
 
     Attributes:
-        problem: what is minimised.
-        run: the optimizer at work, with the reals.
-        course: what the fit goes through.
-        measure: what ``evaluate`` calls; None measures nothing.
-        checkpoint: where the checkpoint lies; None keeps none.
-        next_iteration: the next iteration.
-        events_done: how many of its events have been applied.
+        problem: the problem to minimise.
+        run: the optimizer run, which owns the reals.
+        course: iterations, schedule and events.
+        measure: error measures for :meth:`evaluate`; None measures nothing.
+        checkpoint: file of the checkpoint; None writes no checkpoint.
+        next_iteration: number of the next iteration, which equals the number of completed iterations.
+        events_done: number of applied events of the next iteration.
         history: one record (iteration, loss, seconds) per iteration.
         evaluations: one record (iteration, seconds, ...) per evaluation.
-        log: what the events said, and what the noise of renders does to the loss, once.
-        has_warned: whether it has been said.
-        seconds: time spent, interruptions not counted.
+        log: messages of events, and one message about the noise of renders in the loss.
+        has_warned: whether the log holds the message about noise.
+        seconds: time of all iterations [s], without interruptions.
     """
 
     problem: Problem
@@ -86,45 +85,45 @@ class Fit:
             self.restore()
 
     def __repr__(self) -> str:
-        newest = {**({"loss": self.history[-1]["loss"]} if self.history else {}), **self.latest_errors()}
-        figures = "".join(f", {name} {value:.4g}" for name, value in newest.items())
+        latest = {**({"loss": self.history[-1]["loss"]} if self.history else {}), **self.latest_errors()}
+        figures = "".join(f", {name} {value:.4g}" for name, value in latest.items())
         return f"Fit({self.next_iteration} of {self.course.iterations} iterations in {self.seconds:.1f} s{figures})"
 
     def _repr_html_(self) -> str:
-        """For notebooks: the loss against the iteration and, where the problem can show them, views of what was found."""
-        pictures = getattr(self.problem, "pictures", None)
-        shown = ""
-        if pictures is not None:
+        """Show the loss against the iteration in a notebook, with views of the result if the problem has images."""
+        images = getattr(self.problem, "images", None)
+        views = ""
+        if images is not None:
             self.problem.set_reals(self.run.reals)
-            shown = pairs_html(pictures())
-        return curve_html([row["loss"] for row in self.history], repr(self)) + shown
+            views = pairs_html(images())
+        return curve_html([row["loss"] for row in self.history], repr(self)) + views
 
     @property
     def is_done(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether no iteration remains or the optimizer has stopped."""
         return self.next_iteration >= self.course.iterations or bool(self.run.stop_reason)
 
     def values(self) -> dict[str, mi.TensorXf]:
-        """What was found, by parameter; the problem's model holds it too."""
+        """Values of the result by parameter; the problem's model holds the same values afterwards."""
         self.problem.set_reals(self.run.reals)
         return self.problem.values()
 
     def evaluate(self) -> None:
-        """Measure now, and remember."""
+        """Measure the errors now and record them."""
         if self.measure is None:
             return
         self.problem.set_reals(self.run.reals)
         self.evaluations.append({"iteration": self.next_iteration, "seconds": self.seconds, **self.measure(self.problem)})
 
     def latest_errors(self) -> dict[str, float]:
-        """What was measured last, without when; none before the first evaluation."""
-        newest = self.evaluations[-1] if self.evaluations else {}
-        return {name: value for name, value in newest.items() if name not in ("iteration", "seconds")}
+        """Errors of the last evaluation by name; empty before the first evaluation."""
+        latest = self.evaluations[-1] if self.evaluations else {}
+        return {name: value for name, value in latest.items() if name not in ("iteration", "seconds")}
 
     # -- Steps --------------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
-        """The events of the next iteration, then its step; nothing counts as done before it is.
+        """Apply the events of the next iteration, then take its step. An interrupted step changes nothing.
 
         Raises:
             MivolError: the loss is not finite.
@@ -148,11 +147,11 @@ class Fit:
         self.next_iteration, self.events_done = self.next_iteration + 1, 0
 
     def complete(self, observer: Callable[[Fit], None] = lambda fit: None) -> Fit:
-        """Take all steps that are left; what was found is in the problem's model and, where there is one, in the store.
+        """Take all remaining steps. The problem's model and the checkpoint hold the result afterwards.
 
         Raises:
             MivolError: as :meth:`advance`.
-            Interrupted: Ctrl-C or SIGTERM; the checkpoint has been written.
+            Interrupted: Ctrl-C or SIGTERM; the checkpoint is written.
         """
         check_one_thread()
         with InterruptGuard() as stop:
@@ -175,39 +174,44 @@ class Fit:
         return self
 
     def _apply(self, event: Event) -> None:
-        says = event.apply(self)
-        self.log += [f"iteration {self.next_iteration}: {says}"] if says else []
+        message = event.apply(self)
+        self.log += [f"iteration {self.next_iteration}: {message}"] if message else []
 
     def _warn(self) -> None:
-        """Say once how much of the loss is the noise of renders, as soon as that is notable."""
-        says = "" if self.has_warned else self.problem.warning()
-        if says:
-            self.log.append(f"iteration {self.next_iteration}: {says}")
+        """Log once that the noise of renders makes up a large share of the loss."""
+        message = "" if self.has_warned else self.problem.warning()
+        if message:
+            self.log.append(f"iteration {self.next_iteration}: {message}")
             self.has_warned = True
 
     # -- On disk ------------------------------------------------------------------------------------------------------
 
     def save(self) -> None:
-        """Write the checkpoint, where there is a place for one."""
+        """Write the checkpoint, if the fit has a file for it."""
         if self.checkpoint is None:
             return
         problem = {f"problem/{name}": array for name, array in self.problem.pack(self.run.reals).items()}
-        about = {name: getattr(self, name) for name in SAVED_FIELDS}
-        self.checkpoint.write(self.run.pack() | problem, {**about, "iterations": self.course.iterations})
+        fields = {name: getattr(self, name) for name in SAVED_FIELDS}
+        self.checkpoint.write(self.run.pack() | problem, {**fields, "iterations": self.course.iterations})
 
     def restore(self) -> None:
         """Continue from the checkpoint.
 
         Raises:
-            MivolError: there is none, or it is of another run.
+            MivolError: the file is missing, belongs to another run, or was written by another version of mivol.
         """
-        arrays, about = self.checkpoint.read()
+        arrays, saved = self.checkpoint.read()
+        missing = [name for name in SAVED_FIELDS if name not in saved]
+        if missing:
+            raise MivolError(
+                f"{self.checkpoint.path} holds no {missing[0]}: another version of mivol wrote it; run without --resume."
+            )
         self.run.unpack(arrays)
         problem = {name.removeprefix("problem/"): arrays[name] for name in arrays if name.startswith("problem/")}
         self.problem.unpack(problem, self.run.reals)
         for name in SAVED_FIELDS:
-            setattr(self, name, about[name])
-        planned, now = about["iterations"], self.course.iterations
+            setattr(self, name, saved[name])
+        planned, now = saved["iterations"], self.course.iterations
         if planned < now and not isinstance(self.course.schedule, Constant):
             self.log.append(
                 f"iteration {self.next_iteration}: the schedule was planned for {planned} iterations and continues for {now}; "
@@ -216,7 +220,7 @@ class Fit:
 
 
 def _number(loss: float | mi.Float) -> float:
-    """A loss that may still be on its way through Dr.Jit's queue."""
+    """The loss as a float; waits for Dr.Jit if necessary."""
     return float(loss[0]) if isinstance(loss, mi.Float) else float(loss)
 
 
@@ -228,10 +232,10 @@ def begin_fit(
     measure: Measure | None = None,
     checkpoint: CheckpointFile | None = None,
 ) -> Fit:
-    """A fit before its first step, or where its checkpoint has it; arguments as :func:`reconstruct`.
+    """A fit before its first step, or at its checkpoint; arguments as :func:`reconstruct`.
 
     Raises:
-        MivolError: an optimizer that begins no :class:`mivol.optim.optimizer.OptimizerRun`.
+        MivolError: the optimizer starts no :class:`mivol.optim.optimizer.OptimizerRun`.
     """
     course = course if isinstance(course, Course) else Course(course)
     run = optimizer.begin(problem)
@@ -252,19 +256,19 @@ def reconstruct(
     observer: Callable[[Fit], None] = lambda fit: None,
     checkpoint: CheckpointFile | None = None,
 ) -> Fit:
-    """Fit a model to what was seen.
+    """Fit a model to images, photographs or projections.
 
     Args:
         problem: model, data and parameters; the model holds the start and, afterwards, the result.
-        optimizer: one of OPTIMISERS.
+        optimizer: one of OPTIMIZERS.
         course: iterations, schedule and events, or the number of iterations only.
-        measure: errors by name, for ``evaluate``.
+        measure: error measures by name, for evaluations.
         observer: called after each iteration (progress bars).
-        checkpoint: file, and whether to continue from it; None keeps none.
+        checkpoint: file of the checkpoint, and whether to resume; None writes no checkpoint.
 
     Raises:
         MivolError: a loss that is not finite, or a checkpoint of another run.
-        Interrupted: Ctrl-C or SIGTERM; the checkpoint has been written.
+        Interrupted: Ctrl-C or SIGTERM; the checkpoint is written.
 
     Example:
         >>> problem = SceneProblem(scene, views, [Parameter("medium.sigma_t.data", domain=(0, 50))])

@@ -22,14 +22,15 @@ from mivol.optim.strategy import Strategy, make_table, setting
 class Loss(Strategy, tag="loss"):
     """A penalty per pixel and channel.
 
-    ``is_squared`` tells that it is W/2 r^2: then pairs take the render's noise out exactly, and its gradient, carried
-    back by samples of its own, has no bias in any case. ``unit`` is that of a penalty, for labels ("": not known).
+    ``is_squared`` marks penalties of the form W/2 r^2. For these, pairs remove the render's noise exactly, and the gradient,
+    carried back by independent samples, has no bias even without pairs. ``unit`` is the unit of a penalty, for labels ("":
+    unknown).
     """
 
     is_squared: ClassVar[bool] = False
     unit: ClassVar[str] = ""
 
-    pairs: Annotated[bool, setting("1", "take the noise of renders out of the loss, by two renders of half the samples")] = (
+    pairs: Annotated[bool, setting("1", "remove the noise of renders from the loss, by two renders of half the samples")] = (
         False
     )
 
@@ -38,7 +39,7 @@ class Loss(Strategy, tag="loss"):
         raise NotImplementedError
 
     def weight(self, reference: mi.TensorXf) -> mi.TensorXf:
-        """W of the form 1/2 W (I - I_ref)^2, for Gauss-Newton; only quadratic losses have one.
+        """W of the form 1/2 W (I - I_ref)^2, for Gauss-Newton.
 
         Raises:
             MivolError: the loss is not quadratic in the image.
@@ -59,10 +60,10 @@ class Loss(Strategy, tag="loss"):
 
 
 def check_shapes(image: mi.TensorXf, reference: mi.TensorXf) -> None:
-    """Refuse an image and a reference that differ in shape.
+    """Check that an image and its reference have the same shape.
 
     Raises:
-        MivolError: with both.
+        MivolError: different shapes.
     """
     if image.shape != reference.shape:
         raise MivolError(
@@ -72,7 +73,7 @@ def check_shapes(image: mi.TensorXf, reference: mi.TensorXf) -> None:
 
 
 class L1(Loss, tag="l1"):
-    """|r|: the median of noisy references; robust against outliers."""
+    """|r|: fits the median of noisy references; robust against outliers."""
 
     unit = "radiance"
 
@@ -81,7 +82,7 @@ class L1(Loss, tag="l1"):
 
 
 class L2(Loss, tag="l2"):
-    """r^2: the mean of noisy references; maximum likelihood for equal Gaussian noise."""
+    """r^2: fits the mean of noisy references; maximum likelihood for equal Gaussian noise."""
 
     is_squared = True
     unit = "radiance²"
@@ -94,17 +95,17 @@ class L2(Loss, tag="l2"):
 
 
 class RelativeL2(Loss, tag="relative_l2"):
-    """r^2 / (I_ref^2 + floor^2): dark and bright pixels count alike.
+    """r^2 / (I_ref^2 + floor^2): equal weight for dark and bright pixels.
 
-    The noise of the reference enters the weight, which favours pixels that came out too dark: keep ``floor`` above the
-    noise. Source: Lehtinen et al. 2018, Noise2Noise, section 3.3 (there with the prediction in the denominator, held
-    fixed, which a line search does not allow).
+    Noise of the reference enters the weight and favours pixels that are too dark: keep ``floor`` above the noise. Source:
+    Lehtinen et al. 2018, Noise2Noise, section 3.3 (their denominator is the prediction, held fixed, which a line search does
+    not allow).
     """
 
     is_squared = True
     unit = "1"
 
-    floor: Annotated[float, setting("radiance", "pixels darker than this count as if they were this bright", gt=0)] = 1e-2
+    floor: Annotated[float, setting("radiance", "smallest radiance in the weight of a pixel", gt=0)] = 1e-2
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.square(image - reference) / (dr.square(reference) + self.floor**2)
@@ -114,7 +115,7 @@ class RelativeL2(Loss, tag="relative_l2"):
 
 
 class Huber(Loss, tag="huber"):
-    """r^2 / 2 where |r| <= delta, delta (|r| - delta / 2) beyond: quadratic inside the noise, linear outside it.
+    """r^2 / 2 for |r| <= delta, delta (|r| - delta / 2) beyond: quadratic inside the noise, linear outside.
 
     Source: Huber 1964, Annals of Mathematical Statistics 35(1).
     """
@@ -122,7 +123,7 @@ class Huber(Loss, tag="huber"):
     cites = ("huber_1964",)
     unit = "radiance²"
 
-    delta: Annotated[float, setting("radiance", "residual at which the parabola goes over into a line", gt=0)] = 0.1
+    delta: Annotated[float, setting("radiance", "residual at which the parabola turns into a line", gt=0)] = 0.1
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         size = dr.abs(image - reference)
@@ -132,39 +133,41 @@ class Huber(Loss, tag="huber"):
 def log_radiance(radiance: mi.TensorXf, floor: float) -> mi.TensorXf:
     """log(radiance), continued below ``floor`` by its tangent.
 
-    The tangent keeps value and slope finite for radiance that underflowed to 0 or that noise made negative, and keeps
-    the slope (1 / floor) that leads back; the function is monotone and once continuously differentiable.
+    The tangent keeps value and slope finite for radiance of 0 or below, from underflow or noise. Its slope 1 / floor leads back
+    above the floor. The function is monotone and once continuously differentiable.
     """
     tangent = math.log(floor) + (radiance - floor) / floor
     return dr.select(radiance > floor, dr.log(dr.maximum(radiance, floor)), tangent)
 
 
 class Log(Loss, tag="log"):
-    """w (log I - log I_ref)^2: linear in the optical depth of a pencil ray, whatever its transmittance.
+    """w (log I - log I_ref)^2: linear in the optical depth of a single ray at every transmittance.
 
-    The weight w = I_ref^2 / (I_ref^2 + floor^2) is the delta method's (the variance of log I_ref is var(I) / I^2) for
-    constant noise of ``floor``: saturated pixels count for nothing, and so do negative ones. Pixels brighter than the
-    light are negative optical depths, and are kept. Source: Elbakri and Fessler 2002, IEEE TMI 21(2).
+    The weight w = I_ref^2 / (I_ref^2 + floor^2) follows from the delta method (the variance of log I_ref is var(I) / I^2) for
+    constant noise of ``floor``. Saturated pixels (I_ref far below ``floor``) and negative pixels have no weight. Pixels
+    brighter than the light have negative optical depths and keep their weight. Source: Elbakri and Fessler 2002, IEEE TMI
+    21(2).
     """
 
     unit = "1"
 
-    floor: Annotated[float, setting("radiance", "noise of a pixel; below it the log goes on as its tangent", gt=0)] = 1e-3
+    floor: Annotated[float, setting("radiance", "noise of a pixel; the log continues below as its tangent", gt=0)] = 1e-3
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
-        seen = dr.square(dr.maximum(reference, 0.0))
-        weight = seen / (seen + self.floor**2)
+        signal = dr.square(dr.maximum(reference, 0.0))
+        weight = signal / (signal + self.floor**2)
         return weight * dr.square(log_radiance(image, self.floor) - log_radiance(reference, self.floor))
 
 
 LOSSES = make_table(L1, L2, RelativeL2, Huber, Log)
+"""Losses that a file can name."""
 
 
 class FunctionLoss(Loss, tag="given", kw_only=True):
-    """A function (image, reference) -> number, of one view at a time: it may look at neighbours, which views side by side would
-    give it wrong ones of.
+    """A function (image, reference) -> number, evaluated for one view at a time: it may read neighbouring pixels, which views
+    in one image would mix.
 
-    Both are tensors (height, width, channels); the number is differentiable through Dr.Jit in ``image``.
+    Both arguments are tensors (height, width, channels); the number is differentiable through Dr.Jit in ``image``.
     """
 
     function: Callable[[mi.TensorXf, mi.TensorXf], Any]
@@ -173,7 +176,7 @@ class FunctionLoss(Loss, tag="given", kw_only=True):
         """The function's number.
 
         Raises:
-            MivolError: image and reference differ in shape, or it gives something else, or nothing that depends on the image.
+            MivolError: image and reference differ in shape, or the result is no number, or does not depend on the image.
         """
         check_shapes(image, reference)
         value = self.function(image, reference)
@@ -181,24 +184,24 @@ class FunctionLoss(Loss, tag="given", kw_only=True):
         if not dr.is_array_v(value) or dr.width(value) != 1 or not dr.is_float_v(value):
             size = f" of shape {tuple(value.shape)}" if hasattr(value, "shape") else ""
             raise MivolError(
-                f'the loss "{name}" gave a {type(value).__name__}{size}, expected one number that Dr.Jit holds: end it with '
+                f'the loss "{name}" returned a {type(value).__name__}{size}, expected one Dr.Jit number: end it with '
                 "dr.mean(..., axis=None)."
             )
         if dr.grad_enabled(image) and not dr.grad_enabled(value):
             raise MivolError(
-                f'no derivative leads from the loss "{name}" to the image: compute it by Dr.Jit, without detach or NumPy.'
+                f'the loss "{name}" has no derivative by the image: compute it with Dr.Jit, without detach or NumPy.'
             )
         return value.array if dr.is_tensor_v(value) else value
 
 
 def to_loss(given: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any]) -> Loss:
-    """One of LOSSES as it is, any other function of two images as a loss.
+    """A loss of mivol unchanged; another function of two images as a loss.
 
     Raises:
-        MivolError: it cannot be called.
+        MivolError: the object cannot be called.
     """
     if isinstance(given, Loss):
         return given
     if not callable(given):
-        raise MivolError(f"a loss is one of mivol's or a function of image and reference, found {type(given).__name__}.")
+        raise MivolError(f"found {type(given).__name__}, expected a loss of mivol or a function of image and reference.")
     return FunctionLoss(function=given)

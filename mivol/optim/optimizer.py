@@ -17,12 +17,12 @@ from mivol.optim.strategy import Strategy, setting
 
 
 class OptimizerRun:
-    """An optimiser at work.
+    """An optimizer in progress.
 
     Attributes:
-        problem: what is minimised.
-        reals: the newest point.
-        stop_reason: why there is nothing left to gain, or "".
+        problem: the problem to minimise.
+        reals: the latest point.
+        stop_reason: why no further step helps, or "".
     """
 
     stop_reason = ""
@@ -32,27 +32,27 @@ class OptimizerRun:
         self.reals: Reals = problem.initial_reals()
 
     def step(self, iteration: int, factor: float) -> float | mi.Float | None:
-        """One iteration with the learning rate times ``factor``.
+        """Take one iteration with learning rates times ``factor``.
 
         Returns:
-            The loss as the step met it; None where there was nothing left to gain and no step was taken.
+            The loss before the step; None if the optimizer stopped without a step.
         """
         raise NotImplementedError
 
     def pack(self) -> dict[str, np.ndarray]:
-        """Everything that the next step depends on, as arrays."""
+        """All inputs of the next step, as arrays."""
         return {f"reals/{name}": np.array(value) for name, value in self.reals.items()}
 
     def unpack(self, arrays: dict[str, np.ndarray]) -> None:
-        """Continue from what :meth:`pack` gave."""
+        """Continue from the arrays of :meth:`pack`."""
         self.reals = {name: mi.TensorXf(arrays[f"reals/{name}"]) for name in self.reals}
 
     def replace(self, name: str, reals: mi.TensorXf) -> None:
-        """Give a parameter another value, of another shape perhaps: what was learnt about its old one is dropped."""
+        """Give a parameter another value, possibly of another shape, and drop its moments."""
         self.reals = {**self.reals, name: reals}
 
     def refine(self, refinement: Refinement) -> None:
-        """Go over to other unknowns: what was learnt about the old ones is dropped, unless the optimiser can carry it over."""
+        """Change to other unknowns. Moments are dropped unless the optimizer can carry them over."""
         for name, value in refinement.reals.items():
             self.replace(name, value)
 
@@ -66,7 +66,7 @@ class Optimizer(Strategy, tag="optimiser"):
 
 
 class FirstOrder(Optimizer, tag="first order"):
-    """Settings of a minimisation along gradients, of some of the views at a time where that is asked for."""
+    """Settings of a minimisation along gradients, optionally of a few views per iteration."""
 
     views: Annotated[
         int, setting("view", "views per iteration, drawn without replacement; 0 leaves it to the problem", ge=0)

@@ -16,67 +16,68 @@ from mivol.optim.second_order import GaussNewton, Lbfgs
 from mivol.optim.strategy import make_table
 
 OPTIMIZERS = make_table(Adam, RMSprop, Lbfgs, GaussNewton)
+"""Optimizers that a file can name."""
 
 
 class MitsubaOptimizer(Optimizer, tag="given", kw_only=True):
-    """An optimiser of ``mi.ad``, at the learning rate that it was made with.
+    """An optimizer of ``mi.ad`` with its own learning rates.
 
-    Its state is its own, so that such a fit has no checkpoint.
+    Mivol cannot save its state, so a fit with it has no checkpoint.
     """
 
-    optimiser: Any
+    optimizer: Any
 
     def begin(self, problem: DifferentiableProblem) -> OptimizerRun:
         return MitsubaOptimizerRun(self, problem)
 
 
 class MitsubaOptimizerRun(OptimizerRun):
-    """State: the reals, and whatever the optimiser keeps."""
+    """State: the reals, and the state of the Mitsuba optimizer."""
 
     def __init__(self, settings: MitsubaOptimizer, problem: DifferentiableProblem) -> None:
         super().__init__(problem)
-        self.optimiser = settings.optimiser
-        self.optimiser.update(self.reals)
-        self.rates = {name: self.optimiser.learning_rate(name) for name in self.reals}
+        self.optimizer = settings.optimizer
+        self.optimizer.update(self.reals)
+        self.rates = {name: self.optimizer.learning_rate(name) for name in self.reals}
 
     def step(self, iteration: int, factor: float) -> float | mi.Float:
         loss, gradients = self.problem.loss_and_gradient(self.reals, iteration)
         if factor != 1.0:
-            self.optimiser.set_learning_rate({name: rate * factor for name, rate in self.rates.items()})
+            self.optimizer.set_learning_rate({name: rate * factor for name, rate in self.rates.items()})
         for name, gradient in gradients.items():
-            dr.enable_grad(self.optimiser[name])
-            dr.set_grad(self.optimiser[name], gradient)
-        self.optimiser.step()
-        stepped = {name: dr.detach(self.optimiser[name]) for name in self.reals}
+            dr.enable_grad(self.optimizer[name])
+            dr.set_grad(self.optimizer[name], gradient)
+        self.optimizer.step()
+        stepped = {name: dr.detach(self.optimizer[name]) for name in self.reals}
         self.reals = self.problem.after_step(stepped, iteration)
         for name, value in self.reals.items():
-            self.optimiser[name] = value
+            self.optimizer[name] = value
         return loss
 
     def pack(self) -> dict[str, np.ndarray]:
         raise MivolError(
-            f"the state of {type(self.optimiser).__name__} is its own, and cannot be kept in a checkpoint: leave store out, or "
-            "take one of mivol's optimisers."
+            f"mivol cannot save the state of {type(self.optimizer).__name__} in a checkpoint: leave checkpoint out, or "
+            "choose one of mivol's optimizers."
         )
 
     def replace(self, name: str, reals: mi.TensorXf) -> None:
         super().replace(name, reals)
-        self.optimiser[name] = reals
-        self.optimiser.reset(name)
+        self.optimizer[name] = reals
+        self.optimizer.reset(name)
 
 
 def to_optimizer(given: Optimizer | mi.ad.Optimizer) -> Optimizer:
-    """One of OPTIMISERS as it is, one of ``mi.ad`` as an optimiser.
+    """An optimizer of mivol unchanged; an optimizer of ``mi.ad`` in its adapter.
 
     Raises:
-        MivolError: it is neither, or a class of which no object was made.
+        MivolError: an object of another type, or a class in place of an object.
     """
     if isinstance(given, type):
-        raise MivolError(f"an optimiser is an object, found the class {given.__name__}: call it, as {given.__name__}(...).")
+        raise MivolError(f"found the class {given.__name__}, expected an optimizer object: write {given.__name__}(...).")
     if hasattr(given, "begin"):
         return given
     if not isinstance(given, mi.ad.Optimizer):
         raise MivolError(
-            f"an optimiser is one of mivol's, one of mi.ad, or has a method begin(problem), found {type(given).__name__}."
+            f"found {type(given).__name__}, expected an optimizer of mivol or of mi.ad, or an object with begin(problem)."
         )
-    return MitsubaOptimizer(optimiser=given)
+    return MitsubaOptimizer(optimizer=given)

@@ -1,7 +1,7 @@
-"""What is being looked for: a scene parameter, its domain, and the real numbers an optimiser moves instead.
+"""Parameters of a scene: their domains, priors, and the real numbers that an optimizer moves.
 
-Conventions. ``name`` is the key of ``mi.traverse(scene)``. A map takes the domain [low, high] to the reals and back;
-optimisers step in the reals and project there, so that no loop asks what kind of parameter it holds. MAPS lists them.
+Conventions. ``name`` is a key of ``mi.traverse(scene)``. A map takes the domain [low, high] to the reals and back. Optimizers
+step and project in the reals, so the fit loop is the same for all parameters. MAPS lists the maps.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from mivol.optim.priors import Prior
 from mivol.optim.strategy import suggest_name
 
 GRID = 4
-"""Axes of a grid (Z, Y, X, C); harmonics of directions have one more."""
+"""Axes of a grid (Z, Y, X, C); spherical harmonics have one more axis."""
 
 
 @dataclass(frozen=True)
 class Map:
-    """A monotone bijection between a domain and (part of) the reals.
+    """A monotone bijection between a domain and a part of the reals.
 
     Attributes:
         to_reals: value, low, high -> reals; Dr.Jit or float, element by element.
         from_reals: reals, low, high -> value; differentiable through Dr.Jit.
-        domains: which (low, high) it can serve, in words.
-        serves: whether it can serve (low, high).
-        says: what it does, with its source.
+        domains: supported (low, high), in words.
+        supports: whether the map supports (low, high).
+        description: effect and source of the map.
     """
 
     to_reals: Callable
     from_reals: Callable
     domains: str
-    serves: Callable[[float, float], bool]
-    says: str
+    supports: Callable[[float, float], bool]
+    description: str
 
 
 def log1p_unit(x: mi.Float) -> mi.Float:
-    """log(1 + x) for x in [0, 1] by 2 atanh(x / (2 + x)), in a form that AD differentiates without cancellation.
+    """log(1 + x) for x in [0, 1] as 2 atanh(x / (2 + x)), differentiable without cancellation.
 
-    The ratio s is at most 1/3: the first omitted term, s^17 / 17, is below 2e-9 of s, so the error is float32 rounding.
+    The ratio s is at most 1/3. The first omitted term, s^17 / 17, is below 2e-9 of s, so the error is float32 rounding.
     """
     s = x / (2.0 + x)
     square = s * s
@@ -58,7 +58,7 @@ def log1p_unit(x: mi.Float) -> mi.Float:
 def softplus(u: mi.Float) -> mi.Float:
     """log(1 + e^u) = max(u, 0) + log1p(e^-|u|): no overflow above, full relative precision below.
 
-    Written with selections, since max(u, 0) and |u| have no slope at 0, where this has 1/2.
+    Written with selections, since max(u, 0) and |u| have no slope at 0; the slope there is 1/2.
     """
     rises = u >= 0.0
     return dr.select(rises, u, 0.0) + log1p_unit(dr.exp(dr.select(rises, -u, u)))
@@ -67,7 +67,7 @@ def softplus(u: mi.Float) -> mi.Float:
 def inverse_softplus(x: mi.Float) -> mi.Float:
     """log(e^x - 1) = x + log(1 - e^-x), x > 0.
 
-    1 - e^-x loses 6e-8 / x in float32: below 1/2 its series serves, cut after x^8 / 8! (the next term is below 1e-8).
+    1 - e^-x loses 6e-8 / x in float32. Below 1/2 its series is used, cut after x^8 / 8! (the next term is below 1e-8).
     """
     series = 1.0 / 40320.0
     for factorial in (-5040.0, 720.0, -120.0, 24.0, -6.0, 2.0, -1.0):
@@ -109,16 +109,16 @@ MAPS: dict[str, Map] = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """One scene parameter that is being looked for.
+    """A scene parameter to fit.
 
     Attributes:
         name: key of ``mi.traverse(scene)``.
-        unit: of the value, for labels.
-        domain: (low, high), closed; infinite ends are fine.
+        unit: unit of the value, for labels.
+        domain: (low, high), closed; ends may be infinite.
         map: key of MAPS.
         lr: step of Adam, in the map's reals (identity: the parameter's own unit).
-        extent: edges (z, y, x) of a grid's box [length], for the voxel size that priors see.
-        priors: what is known of the field before anything is measured.
+        extent: edges (z, y, x) of a grid's box [length], for the voxel size in priors.
+        priors: prior knowledge about the field.
     """
 
     name: str
@@ -135,7 +135,7 @@ class Parameter:
             raise MivolError(f"{self.name}: domain [{low}, {high}] is empty: give the smaller bound first.")
         if self.map not in MAPS:
             raise MivolError(f'{self.name}: unknown map "{self.map}": {suggest_name(self.map, list(MAPS))}')
-        if not MAPS[self.map].serves(low, high):
+        if not MAPS[self.map].supports(low, high):
             raise MivolError(
                 f'{self.name}: map "{self.map}" serves {MAPS[self.map].domains}, found [{low}, {high}]: '
                 "change the domain or the map."
@@ -144,11 +144,11 @@ class Parameter:
             raise MivolError(f"{self.name}: learning rate {self.lr} is not positive: give a step size above 0.")
 
     def to_reals(self, value: mi.TensorXf) -> mi.TensorXf:
-        """Value -> reals.
+        """Reals of a value.
 
         Raises:
-            MivolError: a value is not finite, lies outside the domain, or on a bound that the map sends to infinity; or a
-                prior that compares neighbours has no grid to look at.
+            MivolError: a value is not finite, lies outside the domain, or lies on a bound that the map sends to infinity; or a
+                prior that compares neighbours acts on a parameter that is no grid.
         """
         self.check(np.asarray(value))
         self.check_priors(value.shape)
@@ -161,7 +161,7 @@ class Parameter:
         return reals
 
     def spacing(self, shape: tuple[int, ...]) -> tuple[float, float, float]:
-        """Voxel size (z, y, x) [length] of a grid of that shape; numbers and images have none, and count as 1 apart."""
+        """Voxel size (z, y, x) [length] of a grid of this shape; 1 for numbers and images."""
         if len(shape) < GRID:
             return 1.0, 1.0, 1.0
         return tuple(edge / n for edge, n in zip(self.extent, shape[:3], strict=True))
@@ -174,7 +174,7 @@ class Parameter:
         return total
 
     def from_reals(self, u: mi.TensorXf) -> mi.TensorXf:
-        """Reals -> value, differentiable."""
+        """Value of reals, differentiable."""
         return MAPS[self.map].from_reals(u, *self.domain)
 
     def map_derivative(self, u: mi.TensorXf) -> mi.TensorXf:
@@ -185,7 +185,7 @@ class Parameter:
         return dr.grad(u)
 
     def bounds(self) -> tuple[float, float]:
-        """The domain as an interval of the reals: infinite where the map never reaches the bound."""
+        """The domain as an interval of the reals: infinite if the map never reaches the bound."""
         low, high = self.domain
         if self.map == "identity":
             return low, high
@@ -201,7 +201,7 @@ class Parameter:
         return dr.minimum(u, high) if high < math.inf else u
 
     def check_priors(self, shape: tuple[int, ...]) -> None:
-        """Refuse a prior that compares neighbours where the parameter is no grid: an image's third axis is its colours.
+        """Check that priors that compare neighbours act on a grid: an image's third axis holds its colours.
 
         Raises:
             MivolError: with the prior.
@@ -214,10 +214,10 @@ class Parameter:
             )
 
     def check(self, value: np.ndarray) -> None:
-        """Refuse values that are not finite or lie outside the domain, naming the first one.
+        """Check that all values are finite and inside the domain.
 
         Raises:
-            MivolError: with index and value.
+            MivolError: with index and value of the first invalid number.
         """
         low, high = self.domain
         bad = ~(np.isfinite(value) & (value >= low) & (value <= high))
@@ -230,7 +230,7 @@ class Parameter:
 
 
 def as_tensor(value: object) -> mi.TensorXf:
-    """A scene value (tensor, float or colour) as a tensor; attached as it was."""
+    """A scene value (tensor, float or colour) as a tensor; gradients stay attached."""
     if isinstance(value, mi.TensorXf):
         return value
     flat = dr.ravel(value)
@@ -243,22 +243,22 @@ def like(tensor: mi.TensorXf, value: object) -> object:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Refuse a fit that looks for one parameter twice.
+    """Check that no parameter appears twice in a fit.
 
     Raises:
         MivolError: with its name.
     """
     twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
     if twice is not None:
-        raise MivolError(f"the fit looks for {twice} twice: give it one domain, start and map.")
+        raise MivolError(f"the parameter {twice} appears twice: keep one entry with one domain, start and map.")
 
 
 def find(name: str, params: mi.SceneParameters) -> str:
-    """The key of ``params`` of that name.
+    """The key of ``params`` with this name.
 
     Raises:
-        MivolError: there is none (the nearest is offered), its id is a memory address that changes from run to run, or no
-            derivative leads to what it is.
+        MivolError: no such key (the message offers the nearest), an id that is a memory address and changes from run to run, or
+            a value without derivatives.
     """
     keys = list(params.keys())
     if name not in keys:
@@ -267,7 +267,7 @@ def find(name: str, params: mi.SceneParameters) -> str:
         raise MivolError(f'"{name}" begins with a memory address, which changes from run to run: give the object an id.')
     if not (dr.is_array_v(params[name]) and dr.is_float_v(params[name])):
         raise MivolError(
-            f'"{name}" is a {type(params[name]).__name__}, and a fit looks for numbers, colours, points and tensors of '
-            "floating point that Dr.Jit holds: choose another parameter."
+            f'"{name}" is a {type(params[name]).__name__}, expected a number, colour, point or tensor of floating point that '
+            "Dr.Jit can differentiate: choose another parameter."
         )
     return name

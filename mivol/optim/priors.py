@@ -10,7 +10,8 @@ energy also gives the parabola that touches it from above (lagged diffusivity), 
 A :class:`DecoupledPrior` moves the values of a radiance field after each step, as decoupled weight decay does. Inside RMSprop's
 quotient even a weak prior would move an untouched row by a whole learning rate. The move is a share of the learning rate,
 because photographs that agree move a value by about one learning rate. Differences go to the next node along each axis (0 at
-the border; a node without a row holds the vacuum). PRIORS lists both kinds.
+the border; a node without a row holds the vacuum). PRIORS lists energies that a
+file can name, DECOUPLED_PRIORS the others.
 
 References: Rudin, Osher & Fatemi 1992; Fridovich-Keil, Yu et al. 2022 (runs of voxels; the Cauchy prior of Hedman et al. 2021);
 Loshchilov & Hutter 2019 (decoupling).
@@ -33,7 +34,7 @@ Spacing = tuple[float, float, float]
 
 
 def next_along(x: mi.TensorXf, axis: int) -> mi.Float:
-    """The value one voxel further along ``axis``; at the far border the voxel's own (clamp)."""
+    """The value of the next voxel along ``axis``; at the far border the voxel's own value (clamp)."""
     shape = x.shape
     stride = int(np.prod(shape[axis + 1 :]))
     flat = dr.arange(mi.UInt32, int(np.prod(shape)))
@@ -42,7 +43,7 @@ def next_along(x: mi.TensorXf, axis: int) -> mi.Float:
 
 
 def previous_along(x: mi.TensorXf, axis: int) -> mi.Float:
-    """The value one voxel back along ``axis``; at the near border the voxel's own (clamp)."""
+    """The value of the previous voxel along ``axis``; at the near border the voxel's own value (clamp)."""
     shape = x.shape
     stride = int(np.prod(shape[axis + 1 :]))
     flat = dr.arange(mi.UInt32, int(np.prod(shape)))
@@ -63,18 +64,18 @@ def laplacian(x: mi.TensorXf, spacing: Spacing) -> mi.Float:
 
 
 class Prior(Strategy, tag="prior"):
-    """An energy of a field; ``is_spatial`` tells that it compares neighbours."""
+    """An energy of a field; ``is_spatial`` marks priors that compare neighbours."""
 
     is_spatial: ClassVar[bool] = True
 
-    weight: Annotated[float, setting("1", "factor in front of the energy, beside the mean loss", ge=0)] = 1.0
+    weight: Annotated[float, setting("1", "factor on the energy, which is added to the mean loss", ge=0)] = 1.0
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         """Mean energy of the field, without the weight."""
         raise NotImplementedError
 
     def quadratic(self, x: mi.TensorXf, v: mi.TensorXf, spacing: Spacing) -> mi.Float:
-        """1/2 v^T H v, H >= 0 the curvature of the majorising parabola at ``x`` (detached)."""
+        """1/2 v^T H v, with H >= 0 the curvature of the majorising parabola at ``x`` (detached)."""
         raise NotImplementedError
 
     def curvature(self, x: mi.TensorXf, v: mi.TensorXf, spacing: Spacing) -> mi.TensorXf:
@@ -98,7 +99,7 @@ class Prior(Strategy, tag="prior"):
             MivolError: ``x`` has another rank.
         """
         if x.ndim not in (3, 4):
-            raise MivolError(f"a prior takes a field (Z, Y, X) or (Z, Y, X, C), found shape {x.shape}: reshape it.")
+            raise MivolError(f"found a field of shape {x.shape}, expected (Z, Y, X) or (Z, Y, X, C): reshape the field.")
         field = mi.TensorXf(np.ascontiguousarray(x.reshape(*x.shape[:3], -1), dtype=np.float32))
         dr.enable_grad(field)
         energy = self.weight * self.energy(field, spacing)
@@ -107,7 +108,7 @@ class Prior(Strategy, tag="prior"):
 
 
 class TotalVariation(Prior, tag="tv"):
-    """|grad x|, rounded off at ``edge``: flat regions with sharp borders.
+    """|grad x|, rounded at ``edge``: favours flat regions with sharp borders.
 
     sqrt(|g|^2 + edge^2) - edge. Source: Rudin, Osher and Fatemi 1992, Physica D 60; quadratic form: Vogel and Oman
     1996, SIAM J. Sci. Comput. 17(1).
@@ -115,7 +116,7 @@ class TotalVariation(Prior, tag="tv"):
 
     cites = ("rudin_1992",)
 
-    edge: Annotated[float, setting("value/length", "gradients below this are smoothed quadratically", gt=0)] = 1e-2
+    edge: Annotated[float, setting("value/length", "gradients below this value are smoothed quadratically", gt=0)] = 1e-2
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return dr.mean(dr.sqrt(squared_gradient(x, spacing) + self.edge**2) - self.edge)
@@ -125,18 +126,19 @@ class TotalVariation(Prior, tag="tv"):
 
 
 class HuberTotalVariation(Prior, tag="huber_tv"):
-    """|g| - edge / 2 where |g| = |grad x| > edge, |g|^2 / (2 edge) below: as tv, but exactly quadratic in the noise.
+    """|g| - edge / 2 for |g| = |grad x| > edge, |g|^2 / (2 edge) below: total variation that is exactly quadratic inside the
+    noise.
 
     Source: Huber 1964 for the function; Fessler and others use it as "edge-preserving" penalty.
     """
 
     cites = ("rudin_1992", "huber_1964")
 
-    edge: Annotated[float, setting("value/length", "gradient at which the parabola goes over into a line", gt=0)] = 1e-1
+    edge: Annotated[float, setting("value/length", "gradient at which the parabola turns into a line", gt=0)] = 1e-1
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         g2 = squared_gradient(x, spacing)
-        # sqrt has no slope at 0: the branch that uses it never sees less than edge^2.
+        # sqrt has no slope at 0: its argument is at least edge^2.
         line = dr.sqrt(dr.maximum(g2, self.edge**2)) - 0.5 * self.edge
         return dr.mean(dr.select(g2 <= self.edge**2, g2 / (2.0 * self.edge), line))
 
@@ -146,7 +148,7 @@ class HuberTotalVariation(Prior, tag="huber_tv"):
 
 
 class Laplacian(Prior, tag="laplacian"):
-    """1/2 (Laplace x)^2: no wiggles; straight ramps cost nothing."""
+    """1/2 (Laplace x)^2: penalises oscillations; straight ramps have no energy."""
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return 0.5 * dr.mean(dr.square(laplacian(x, spacing)))
@@ -156,11 +158,11 @@ class Laplacian(Prior, tag="laplacian"):
 
 
 class Sparse(Prior, tag="l1"):
-    """|x|: empty where nothing says otherwise. Its majorising parabola rounds off below ``knee``."""
+    """|x|: favours empty regions. The majorising parabola is rounded below ``knee``."""
 
     is_spatial = False
 
-    knee: Annotated[float, setting("value", "values below this are pulled to 0 quadratically by Gauss-Newton", gt=0)] = 1e-3
+    knee: Annotated[float, setting("value", "Gauss-Newton pulls smaller values to 0 quadratically", gt=0)] = 1e-3
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return dr.mean(dr.abs(x.array))
@@ -170,12 +172,12 @@ class Sparse(Prior, tag="l1"):
 
 
 class Bounds(Prior, tag="bounds"):
-    """1/2 distance^2 to [low, high]: a soft wall for values that should, but need not, stay inside."""
+    """1/2 distance^2 to [low, high]: a soft bound, which values may cross."""
 
     is_spatial = False
 
-    low: Annotated[float, setting("value", "lower wall")] = 0.0
-    high: Annotated[float, setting("value", "upper wall")] = float("inf")
+    low: Annotated[float, setting("value", "lower bound")] = 0.0
+    high: Annotated[float, setting("value", "upper bound")] = float("inf")
 
     def outside(self, x: mi.TensorXf) -> mi.Float:
         """Signed distance to the interval."""
@@ -190,46 +192,46 @@ class Bounds(Prior, tag="bounds"):
 
 @dataclass
 class Neighbours:
-    """Rows of the nodes around those that have a row.
+    """Rows of the nodes beside each node with a row.
 
     Attributes:
-        after: UInt32 each, of the next node along x, y and z: the vacuum's where that is not stored, its own at the border and
-            where an inner level covers the next.
-        before: of the last node along x, y and z: its own where that is not stored and at the border.
+        after: UInt32 each, row of the next node along x, y and z: the vacuum's row for a node that is not stored, the own row
+            at the border and at an inner level that covers the next node.
+        before: row of the previous node along x, y and z: the own row for a node that is not stored and at the border.
     """
 
     after: list[mi.UInt32]
     before: list[mi.UInt32]
 
     @classmethod
-    def of(cls, field: SphericalGrid) -> Neighbours:
-        """Look them up."""
+    def from_field(cls, field: SphericalGrid) -> Neighbours:
+        """Find the neighbours of all rows of a field."""
         z, y, x = field.res
         node = mi.UInt32(field.stored_nodes().astype(np.uint32))
         own = dr.arange(mi.UInt32, dr.width(node))
-        found = cls([], [])
+        neighbours = cls([], [])
         for stride, n in ((1, x), (x, y), (x * y, z)):
             place = node // stride % n
             following = dr.select(place < n - 1, node + stride, node)
             following = dr.select(is_covered_by_inner(following, field.res), node, following)
-            found.after.append(field.look_up_rows(following))
+            neighbours.after.append(field.look_up_rows(following))
             before = field.look_up_rows(dr.select(place > 0, node - stride, node))
-            found.before.append(dr.select(before < dr.width(node), before, own))
-        dr.eval(found)
-        return found
+            neighbours.before.append(dr.select(before < dr.width(node), before, own))
+        dr.eval(neighbours)
+        return neighbours
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Where a prior acts: one parameter of a field, of so many numbers a row.
+    """The rows of one parameter of a field, for a decoupled prior.
 
     Attributes:
-        width: numbers a row.
+        width: numbers per row.
         neighbours: the rows beside each row.
-        rate: learning rate over the number of photographs, times ``unit``: what one photograph is worth in a step.
-        unit: values times this have no unit.
-        first: the row at which a prior begins that looks at a share of them.
-        step: number of the step after which it acts.
+        rate: learning rate over the number of photographs, times ``unit``: the move that one photograph causes in a step.
+        unit: factor that makes values dimensionless.
+        first: first row of a prior that moves a share of the rows.
+        step: number of the preceding step.
     """
 
     width: int
@@ -241,30 +243,28 @@ class Rows:
 
 
 class DecoupledPrior(Strategy, tag="decoupled prior"):
-    """A move of the values of one parameter after each step; ``is_spatial`` tells that it compares neighbours."""
+    """A move of the values of one parameter after each step; ``is_spatial`` marks priors that compare neighbours."""
 
     is_spatial: ClassVar[bool] = False
 
-    weight: Annotated[float, setting("photograph", "how many photographs, all asking for the same, hold against it", ge=0)] = (
-        1.0
-    )
+    weight: Annotated[float, setting("photograph", "number of agreeing photographs that balance the prior", ge=0)] = 1.0
 
     def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
-        """Values after the move; a spatial prior takes them evaluated."""
+        """Values after the move; a spatial prior takes evaluated values."""
         raise NotImplementedError
 
 
 class Smoothness(DecoupledPrior, tag="smoothness"):
-    """Total variation over a share of the rows at a time. Source: Rudin, Osher and Fatemi 1992.
+    """Total variation, applied to a share of the rows at a time. Source: Rudin, Osher and Fatemi 1992.
 
-    To look at a share of the rows copies all of them: every few steps, at as many shares at once, says the same for less.
+    Each application copies all rows. Applying the prior every few steps, to a larger share, costs less for the same effect.
     """
 
     is_spatial = True
     cites = ("rudin_1992",)
 
-    share: Annotated[float, setting("1", "of the rows that are looked at, a step", gt=0, le=1)] = 1 / 8
-    every: Annotated[int, setting("step", "from one look to the next, which takes the shares of all between", ge=1)] = 1
+    share: Annotated[float, setting("1", "share of the rows per step", gt=0, le=1)] = 1 / 8
+    every: Annotated[int, setting("step", "steps between applications, each to the shares of all these steps", ge=1)] = 1
 
     def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
         if rows.step % self.every:
@@ -282,7 +282,7 @@ class Sparsity(DecoupledPrior, tag="sparsity"):
 
 
 class ViewDependence(DecoupledPrior, tag="view_dependence"):
-    """Decay of what goes with the direction: few photographs say more about it than there is."""
+    """Weight decay on the view-dependent coefficients. With few photographs they overfit."""
 
     def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
         return decay_view_dependence(values, rows.width, rows.rate * self.weight)
@@ -291,50 +291,50 @@ class ViewDependence(DecoupledPrior, tag="view_dependence"):
 def smooth(values: mi.Float, rows: Rows, weight: float, share: float) -> None:
     """Move a run of rows down the slope of the total variation.
 
-    A step down a slope of 1 has the length amount = rate * weight / unit. A row is in four terms, its own and those of the
-    three nodes before it. With delta = 6 amount / share none of them moves it by more than a sixth of a difference, so what
-    was between the smallest and the largest value stays there.
+    A step down a slope of 1 has the length amount = rate * weight / unit. A row appears in four terms, its own and the terms of
+    the three previous nodes. With delta = 6 amount / share no term moves the row by more than a sixth of a difference, so
+    values stay between their former minimum and maximum.
 
     Args:
         values: moved in place.
-        rows: how they lie.
-        weight: of the prior; 0 moves nothing.
-        share: of the rows that are moved; they stand for all.
+        rows: width, neighbours and rate of the rows.
+        weight: weight of the prior; 0 moves nothing.
+        share: share of the rows to move; these rows stand for all rows.
 
-    Cost: 13 rows read a row that is moved, and one written: by one lane, so nothing is added at once.
+    Cost: 13 rows read and one row written per moved row. One lane writes each row, so no atomic addition is needed.
     """
     amount = rows.rate * weight / rows.unit
     if amount == 0:
         return
-    around, width = rows.neighbours, rows.width
-    count = dr.width(around.after[0])
+    next_rows, width = rows.neighbours.after, rows.width
+    count = dr.width(next_rows[0])
     row = (dr.arange(mi.UInt32, max(int(count * share), 1)) + dr.opaque(mi.UInt32, rows.first)) % count
     length = dr.opaque(mi.Float, amount / share)
 
     def numbers(row: mi.UInt32) -> mi.ArrayXf:
         return dr.gather(mi.ArrayXf, values, row, shape=(width, 1))
 
-    here = numbers(row)
-    terms = [(here, [numbers(dr.gather(mi.UInt32, after, row)) for after in around.after])]
-    for axis, before in enumerate(around.before):
-        # Where there is none it is the row itself, and its difference to the row 0.
+    own_values = numbers(row)
+    terms = [(own_values, [numbers(dr.gather(mi.UInt32, after, row)) for after in next_rows])]
+    for axis, before in enumerate(rows.neighbours.before):
+        # Without a previous node, `node` is the row itself, and its difference to the row is 0.
         node = dr.gather(mi.UInt32, before, row)
-        ends = [here if a == axis else numbers(dr.gather(mi.UInt32, after, node)) for a, after in enumerate(around.after)]
-        terms.append((numbers(node), ends))
+        after = [own_values if a == axis else numbers(dr.gather(mi.UInt32, next_, node)) for a, next_ in enumerate(next_rows)]
+        terms.append((numbers(node), after))
     moved = []
     for c in range(width):
         own, *others = (_slopes([end[c] - at[c] for end in ends], 6 * length) for at, ends in terms)
-        moved.append(dr.fma(length, sum(own) - sum(slopes[axis] for axis, slopes in enumerate(others)), here[c]))
+        moved.append(dr.fma(length, sum(own) - sum(slopes[axis] for axis, slopes in enumerate(others)), own_values[c]))
     dr.scatter(values, mi.ArrayXf(moved), row)
 
 
 def _slopes(steps: list[mi.Float], delta: mi.Float) -> list[mi.Float]:
-    """Derivatives of the length of a difference with respect to its parts."""
+    """Derivatives of the length of a difference by its components."""
     return [s * dr.rsqrt(dr.square(delta) + sum(dr.square(s) for s in steps)) for s in steps]
 
 
 def sparsify(density: mi.Float, amount: float, unit: float) -> mi.Float:
-    """Density after a step of ``amount`` [1] down the Cauchy prior's slope, in units of 1 / ``unit``; it ends at 0."""
+    """Density after a step of ``amount`` [1] down the Cauchy prior's slope, in units of 1 / ``unit``, and at least 0."""
     if amount == 0:
         return density
     sigma = dr.maximum(density * unit, 0)
@@ -343,11 +343,11 @@ def sparsify(density: mi.Float, amount: float, unit: float) -> mi.Float:
 
 
 def decay_view_dependence(harmonics: mi.Float, width: int, share: float) -> mi.Float:
-    """Coefficients, ``width`` a row, of which all but the three constant ones have lost a share."""
+    """Coefficients, ``width`` per row, after all but the three constant ones lost the share ``share``."""
     if share == 0:
         return harmonics
-    kept = dr.opaque(mi.Float, 1 - min(share, 1))
-    return dr.select(dr.arange(mi.UInt32, dr.width(harmonics)) % width < 3, harmonics, harmonics * kept)
+    factor = dr.opaque(mi.Float, 1 - min(share, 1))
+    return dr.select(dr.arange(mi.UInt32, dr.width(harmonics)) % width < 3, harmonics, harmonics * factor)
 
 
 PRIORS = make_table(TotalVariation, HuberTotalVariation, Laplacian, Sparse, Bounds)

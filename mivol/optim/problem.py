@@ -1,13 +1,13 @@
-r"""What can be fitted: the questions that the loop, first-order optimisers and events ask of a model and its data.
+r"""Protocols of problems: the methods that the fit loop, optimizers and events call on a model and its data.
 
 .. math:: \min_u f(u), \qquad f(u) = \mathrm{loss}(x(u)) + \mathrm{energy}(x(u))
 
-Conventions. ``u`` are the *reals*, tensors by the name of the parameter; ``x`` is what the model makes of them. A scene that is
-compared with images, a radiance field that is compared with rays of photographs and a volume behind projections are problems;
-a network, a hash grid or a set of Gaussians is one more class with these methods, and an event for whatever changes its shape.
+Conventions. ``u`` are the *reals*, tensors by the name of their parameter; the model turns them into values ``x``. A scene with
+images, a radiance field with rays of photographs, Gaussians with photographs, and a volume with projections are problems. A
+network or a hash grid would be another class with these methods, and an event for changes of its shape.
 
-What a problem answers in iteration i depends on the reals, what :meth:`Problem.pack` gives, and i; all its random numbers are a
-function of its seed and i.
+Iteration i depends on the reals, on the arrays of :meth:`Problem.pack`, and on i. All random numbers are a function of the
+problem's seed and i.
 """
 
 from __future__ import annotations
@@ -22,66 +22,66 @@ import numpy as np
 from mivol.optim.parameters import Parameter
 
 Reals: TypeAlias = "dict[str, mi.TensorXf]"
-"""What an optimiser moves: one tensor for each parameter."""
+"""The unknowns of an optimizer: one tensor for each parameter."""
 
 
 class Problem(Protocol):
-    """What the loop asks of whatever is fitted.
+    """Methods for the fit loop.
 
     Attributes:
-        safe_point: called between kernels, where a run may be stopped: nothing that outlives the call under way has changed.
+        safe_point: called between kernels, where an interrupt may raise; only state of the current call has changed.
     """
 
     safe_point: Callable[[], None]
 
     def initial_reals(self) -> Reals:
-        """Where the fit begins: the reals of what the model holds now."""
+        """Reals of the values that the model holds now."""
 
     def set_reals(self, reals: Reals) -> None:
-        """Let the model hold what these reals stand for."""
+        """Give the model the values of these reals."""
 
     def values(self) -> dict[str, mi.TensorXf]:
-        """What the model holds now, by parameter."""
+        """Values of the model by parameter."""
 
     def warning(self) -> str:
-        """What a reader of the newest loss must know, in a sentence, or ""."""
+        """A sentence about the noise of the latest loss, or ""."""
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
-        """What the next step depends on beside the reals: where a sparse field has nodes, for one.
+        """Inputs of the next step beside the reals, as the nodes of a sparse field.
 
-        Whatever is found anew by :meth:`unpack` is found anew here too, or a resumed run would go on otherwise.
+        State that :meth:`unpack` rebuilds is rebuilt here as well, so that a resumed run equals an uninterrupted run.
         """
 
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
-        """Continue from what :meth:`pack` gave, with the reals of the same moment."""
+        """Continue from the arrays of :meth:`pack`, with the reals of the same moment."""
 
 
 class DifferentiableProblem(Problem, Protocol):
-    """What optimisers of first order ask for besides."""
+    """Additional methods for first-order optimizers."""
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float | mi.Float, Reals]:
-        """f(u), a number or a Dr.Jit array of width 1 that is not waited for, and its gradient.
+        """f(u) and its gradient. A loss of type ``mi.Float`` has width 1 and may still be waiting for evaluation.
 
         Args:
             reals: u.
-            iteration: which random numbers, and which part of the data.
-            views: how many views are looked at; 0 leaves it to the problem.
+            iteration: selects random numbers and the part of the data.
+            views: number of views; 0 leaves the choice to the problem.
         """
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
         """Learning rate of each parameter in an iteration, in the unit of its reals."""
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
-        """What becomes of the reals of a step: on to their domain, and moved by priors that act apart from the gradient.
+        """Project reals onto their domain after a step, and apply priors that act apart from the gradient.
 
         Args:
-            reals: of the step; the problem may take them out: while the dictionary holds them, the gradient is in memory.
-            iteration: that of the newest :meth:`loss_and_gradient`.
+            reals: of the step; the problem may empty this dictionary, since its entries keep the gradient in memory.
+            iteration: of the latest :meth:`loss_and_gradient`.
         """
 
 
 class BoundedProblem(DifferentiableProblem, Protocol):
-    """Additional methods for L-BFGS: bounds of the reals, and the loss alone.
+    """Additional methods for L-BFGS: bounds of the reals, and the loss without derivatives.
 
     Attributes:
         parameters: the unknowns, with learning rates and bounds.
@@ -90,7 +90,7 @@ class BoundedProblem(DifferentiableProblem, Protocol):
     parameters: Sequence[Parameter]
 
     def loss_value(self, reals: Reals, iteration: int) -> float:
-        """f(u), without derivatives."""
+        """f(u)."""
 
 
 class Linearization(Protocol):
@@ -124,13 +124,13 @@ class LinearizableProblem(BoundedProblem, Protocol):
 
 @dataclass(frozen=True)
 class Refinement:
-    """How a problem goes over to other unknowns.
+    """A change of a problem to other unknowns.
 
     Attributes:
         reals: of the new unknowns, for the same model.
-        carry: what is known of the old unknowns, tensors shaped like their reals, to the new ones.
-        derivative_factors: by how much derivatives become smaller, by parameter; 1 for those that are not named.
-        message: a sentence for the log.
+        carry: maps tensors shaped like the old reals, as moments of an optimizer, to the new unknowns.
+        derivative_factors: factor on derivatives by parameter; 1 for parameters without an entry.
+        message: sentence for the log.
     """
 
     reals: Reals
@@ -140,13 +140,13 @@ class Refinement:
 
 
 class StagedProblem(DifferentiableProblem, Protocol):
-    """What :class:`~mivol.optim.events.CoarseToFine`, ``DropUnseen`` and ``UpdateOccupancy`` ask for besides."""
+    """Additional methods for :class:`~mivol.optim.events.CoarseToFine`, ``DropUnseen`` and ``UpdateOccupancy``."""
 
     def refine(self, stage: int) -> Refinement:
-        """Begin a stage, with the model at the newest reals; the problem has the stage's unknowns from here on.
+        """Begin a stage, with the model at the latest reals; the problem has the stage's unknowns afterwards.
 
-        The stage at work is begun again, without what is not seen.
+        The number of the current stage removes its unseen unknowns.
         """
 
     def update_occupancy(self) -> None:
-        """Look again for what can be left out of the next steps without changing them."""
+        """Update the list of cells that the next steps can skip without changing their result."""

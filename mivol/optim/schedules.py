@@ -1,7 +1,7 @@
-"""How the step shrinks as the fit goes on: a factor on the learning rate.
+"""Schedules: factors on the learning rate by iteration.
 
-Conventions. ``factor(iteration, iterations)`` with ``iteration`` in 0 .. iterations - 1; every schedule starts at 1.
-SCHEDULES lists them.
+Conventions. ``factor(iteration, iterations)`` takes ``iteration`` in 0 .. iterations - 1; every schedule starts at 1. SCHEDULES
+lists the schedules that a file can name.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Schedule(Strategy, tag="schedule"):
 
 
 class Constant(Schedule, tag="constant"):
-    """1 throughout."""
+    """A constant factor of 1."""
 
     def factor(self, iteration: int, iterations: int) -> float:
         return 1.0
@@ -38,9 +38,9 @@ class Cosine(Schedule, tag="cosine"):
 
 
 class Step(Schedule, tag="step"):
-    """Multiplied by ``ratio`` at each of the fractions ``at`` of the run."""
+    """A product of factors ``ratio``, one after each fraction ``at`` of the run."""
 
-    at: Annotated[tuple[float, ...], setting("fraction of the run", "where the rate drops")] = (0.75, 0.85, 0.95)
+    at: Annotated[tuple[float, ...], setting("fraction of the run", "points at which the rate drops")] = (0.75, 0.85, 0.95)
     ratio: Annotated[float, setting("1", "factor at each drop", gt=0, le=1)] = 0.5
 
     def factor(self, iteration: int, iterations: int) -> float:
@@ -48,10 +48,10 @@ class Step(Schedule, tag="step"):
 
 
 class Exponential(Schedule, tag="exponential"):
-    """1 for the first ``delay`` iterations, then a geometric decay that reaches ``final`` at the last one."""
+    """1 for the first ``delay`` iterations, then geometric decay to ``final`` in the last iteration."""
 
     final: Annotated[float, setting("1", "factor of the last iteration", gt=0, le=1)] = 0.1
-    delay: Annotated[int, setting("iteration", "how long the rate stays", ge=0)] = 0
+    delay: Annotated[int, setting("iteration", "iterations at the full rate", ge=0)] = 0
 
     def factor(self, iteration: int, iterations: int) -> float:
         progress = max(iteration - self.delay, 0) / max(iterations - 1 - self.delay, 1)

@@ -27,7 +27,7 @@ from mivol.optim.strategy import setting
 
 
 class Packing:
-    """All reals as one float64 vector, each parameter in units of its learning rate, and back."""
+    """Conversion of all reals to one float64 vector, each parameter in units of its learning rate, and back."""
 
     def __init__(self, problem: BoundedProblem, reals: Reals) -> None:
         self.parts = [(p.name, p.lr, tuple(reals[p.name].shape)) for p in problem.parameters]
@@ -38,12 +38,12 @@ class Packing:
         return np.concatenate([np.full(int(np.prod(s)), e) for e, (_, _, s) in zip(ends, self.parts, strict=True)])
 
     def vector(self, tensors: Reals, power: int = -1) -> np.ndarray:
-        """Tensors -> vector; ``power`` -1 for points, +1 for gradients."""
+        """Vector of tensors; ``power`` -1 for points, +1 for gradients."""
         flat = [np.asarray(tensors[name]).ravel().astype(np.float64) * lr**power for name, lr, _ in self.parts]
         return np.concatenate(flat)
 
     def tensors(self, vector: np.ndarray, power: int = 1) -> Reals:
-        """Vector -> tensors; ``power`` +1 for points, -1 for gradients."""
+        """Tensors of a vector; ``power`` +1 for points, -1 for gradients."""
         parts, start = {}, 0
         for name, lr, shape in self.parts:
             size = int(np.prod(shape))
@@ -57,7 +57,7 @@ class Packing:
         return np.clip(x, self.low, self.high)
 
     def free(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
-        """False where a bound is met and the gradient presses against it (Bertsekas 1982, Eq. 32)."""
+        """False at a bound against which the gradient presses (Bertsekas 1982, Eq. 32)."""
         return ~(((x <= self.low) & (g > 0.0)) | ((x >= self.high) & (g < 0.0)))
 
 
@@ -67,7 +67,7 @@ def search_line(
     """Armijo's rule along the projected path P(x + alpha p), alpha = 1, 1/2, 1/4, ... 2^-9.
 
     Returns:
-        The first point with f(new) <= f + 1e-4 g.(new - x), and alpha; (x, 0) where none has it.
+        The first point with f(new) <= f + 1e-4 g.(new - x), and alpha; (x, 0) without such a point.
 
     References: Bertsekas 1982, SIAM J. Control Optim. 20(2), Eq. 37.
     """
@@ -82,13 +82,13 @@ def search_line(
 class Lbfgs(Optimizer, tag="lbfgs"):
     """Limited-memory BFGS on the free variables, with a projected line search and the same samples in every iteration.
 
-    SciPy's L-BFGS-B keeps its memory between iterations where no checkpoint can reach it; hence these forty lines.
-    Source: Nocedal and Wright 2006, Algorithm 7.4 (two loops); bounds: Bertsekas 1982.
+    SciPy's L-BFGS-B keeps its memory out of reach of a checkpoint. Source: Nocedal and Wright 2006, Algorithm 7.4 (two loops);
+    bounds: Bertsekas 1982.
     """
 
     cites = ("liu_1989",)
 
-    memory: Annotated[int, setting("pair", "steps remembered", ge=1, le=100)] = 10
+    memory: Annotated[int, setting("pair", "number of stored steps", ge=1, le=100)] = 10
 
     def begin(self, problem: BoundedProblem) -> OptimizerRun:
         return LbfgsRun(self, problem)
@@ -115,7 +115,7 @@ class LbfgsRun(OptimizerRun):
             p = -g * free / max(np.abs(g * free).max(), 1e-300)
         new, alpha = search_line(lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, loss, g, p)
         if alpha == 0.0 or not p.any():
-            # The remembered curvature misled the search: forget it once, and give up where it is not to blame.
+            # The stored curvature misled the search: drop it once, and stop if the search fails without it.
             self.stop_reason = "" if steps else "no step lowers the loss"
             steps, changes, x, g = [], [], None, None
         self.steps, self.changes, self.last = steps, changes, None if x is None else (x, g)
@@ -123,7 +123,7 @@ class LbfgsRun(OptimizerRun):
         return loss
 
     def _remember(self, x: np.ndarray, g: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """The pairs with the newest one, if its curvature is positive beyond rounding."""
+        """The stored pairs with the latest pair, if its curvature is positive beyond rounding."""
         if self.last is None:
             return self.steps, self.changes
         s, y = x - self.last[0], g - self.last[1]
@@ -147,7 +147,7 @@ class LbfgsRun(OptimizerRun):
 
 
 def apply_inverse_hessian(g: np.ndarray, steps: list[np.ndarray], changes: list[np.ndarray]) -> np.ndarray:
-    """H g for the limited-memory inverse Hessian H; without pairs, g scaled so that its largest entry is 1."""
+    """H g for the limited-memory inverse Hessian H; without pairs, g scaled to a largest entry of 1."""
     pairs = [(s, y, 1.0 / (s @ y)) for s, y in zip(steps, changes, strict=True) if s @ y > 0.0]
     if not pairs:
         return g / max(np.abs(g).max(), 1e-300)
@@ -163,7 +163,7 @@ def apply_inverse_hessian(g: np.ndarray, steps: list[np.ndarray], changes: list[
 
 
 class GaussNewton(Optimizer, tag="gauss_newton"):
-    """Gauss-Newton on pixel means, conjugate gradients inside, Levenberg-Marquardt damping, projection onto the bounds.
+    """Gauss-Newton on pixel means, with conjugate gradients, Levenberg-Marquardt damping and projection onto the bounds.
 
     Source: Nocedal and Wright 2006, sections 10.3 and 7.1; D is the separable surrogate of Erdogan and Fessler 1999,
     Eq. 21, exact for media that only absorb, whose J has one sign.
@@ -172,15 +172,14 @@ class GaussNewton(Optimizer, tag="gauss_newton"):
     cites = ("hestenes_1952", "erdogan_1999")
 
     inner: Annotated[int, setting("iteration", "conjugate-gradient steps per linearisation", ge=1)] = 6
-    damping: Annotated[float, setting("1", "first mu, relative to D", ge=0)] = 1e-3
+    damping: Annotated[float, setting("1", "initial damping mu, relative to D", ge=0)] = 1e-3
 
     def begin(self, problem: LinearizableProblem) -> OptimizerRun:
         return GaussNewtonRun(self, problem)
 
 
 class GaussNewtonRun(OptimizerRun):
-    """State: the reals and the damping. Image, J and J^T use the same samples in every iteration: one set of them, and
-    another for the gradient where light is sampled."""
+    """State: the reals and the damping."""
 
     def __init__(self, settings: GaussNewton, problem: LinearizableProblem) -> None:
         super().__init__(problem)
@@ -198,7 +197,7 @@ class GaussNewtonRun(OptimizerRun):
             return packing.vector(linear.curvature(packing.tensors(v)), 1)
 
         diagonal = np.abs(curvature(np.ones_like(x)))
-        # A voxel that no ray meets has no curvature and no gradient: the floor keeps it where it is, not at 0 / 0.
+        # A voxel that no ray meets has no curvature and no gradient: the floor avoids 0 / 0 and leaves the voxel unchanged.
         diagonal = np.maximum(diagonal, 1e-6 * diagonal.max() + 1e-300)
         p = conjugate_gradients(
             lambda v: free * (curvature(free * v) + self.damping * diagonal * v),
@@ -223,7 +222,7 @@ class GaussNewtonRun(OptimizerRun):
 def conjugate_gradients(
     apply: Callable[[np.ndarray], np.ndarray], b: np.ndarray, diagonal: np.ndarray, iterations: int
 ) -> np.ndarray:
-    """x with A x = b for A >= 0, Jacobi-preconditioned, from 0; stops early where the residual is rounding.
+    """Solve A x = b for A >= 0 from 0, with Jacobi preconditioner; stops early when the residual is rounding error.
 
     References: Hestenes and Stiefel 1952; Nocedal and Wright 2006, Algorithm 5.3.
     """

@@ -1,8 +1,8 @@
-"""A named choice with its settings: the form that losses, priors, schedules, events and optimisers share.
+"""Named choices with checked settings: the common form of losses, priors, schedules, events and optimizers.
 
-Conventions. A strategy is a frozen msgspec struct; its ``name`` is the tag under which a TOML file asks for it; each
-setting has its unit, domain and meaning on one line, ``Annotated[float, setting("unit", "meaning", gt=0)]``, from which the
-checks and ``mivol optimize --help`` come. Tables of strategies are plain dicts, made by :func:`make_table`.
+Conventions. A strategy is a frozen msgspec struct. Its ``name`` is the tag for TOML files. Each setting has its unit, domain
+and meaning on one line, ``Annotated[float, setting("unit", "meaning", gt=0)]``; the checks and ``mivol optimize --help`` are
+made from these lines. Tables of strategies are plain dicts from :func:`make_table`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class Strategy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @classmethod
     def label(cls) -> str:
-        """The name by which files and command lines ask for this strategy."""
+        """Name of the strategy in files and on the command line."""
         return cls.__struct_config__.tag
 
 
 def make_table(*strategies: type[S]) -> dict[str, type[S]]:
-    """Strategies by name; two of one name are a mistake of the program."""
+    """Strategies by name; two strategies of one name are a programming error."""
     named = {strategy.label(): strategy for strategy in strategies}
     if len(named) != len(strategies):
         raise AssertionError("two strategies of one table share a name")
@@ -42,31 +42,31 @@ def make_table(*strategies: type[S]) -> dict[str, type[S]]:
 
 
 def union_type(strategies: dict[str, type[S]]) -> Any:
-    """The type of a setting that is any strategy of a table."""
+    """The type of a setting that can be each strategy of a table."""
     return Union[tuple(strategies.values())]  # noqa: UP007  (the members are known only at run time)
 
 
 def suggest_name(word: str, known: list[str]) -> str:
-    """The way out of a misspelt word: the nearest known one, or all of them."""
+    """A hint for a misspelt word: the nearest known word, or all known words."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
     return f'did you mean "{close[0]}"?' if close else "known are: " + ", ".join(sorted(known)) + "."
 
 
-def choose(strategies: dict[str, type[S]], name: str, what: str, **settings: Any) -> S:
-    """The strategy of that name with checked settings.
+def choose(strategies: dict[str, type[S]], name: str, kind: str, **settings: Any) -> S:
+    """The strategy of a name, with checked settings.
 
     Args:
         strategies: one of the tables (``LOSSES``, ``PRIORS``, ...).
         name: key of the table.
-        what: what is being chosen, for the message ("loss").
+        kind: kind of strategy for the message ("loss").
         settings: fields of the strategy.
 
     Raises:
-        MivolError: unknown name (the nearest is offered), unknown setting or a value outside its domain.
+        MivolError: unknown name (the message offers the nearest), unknown setting, or a value outside its domain.
     """
     if name not in strategies:
-        raise MivolError(f'unknown {what} "{name}": {suggest_name(name, list(strategies))}')
+        raise MivolError(f'unknown {kind} "{name}": {suggest_name(name, list(strategies))}')
     try:
         return msgspec.convert({**settings, "name": name}, strategies[name])
     except msgspec.ValidationError as error:
-        raise MivolError(f'{what} "{name}": {error}.') from None
+        raise MivolError(f'{kind} "{name}": {error}.') from None

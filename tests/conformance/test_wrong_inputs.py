@@ -238,6 +238,8 @@ def test_a_domain_has_two_ends() -> None:
 def test_a_grid_to_refine_and_a_prior_that_nothing_takes() -> None:
     problem = SimpleNamespace(parameters=[SimpleNamespace(name="x")])
     fit = SimpleNamespace(problem=problem, run=SimpleNamespace(reals={"x": mi.TensorXf(np.zeros(3, np.float32))}))
-    assert refusal_of(Upsample(at=(1,)).apply, fit) == "upsample found no grid among the parameters: take the event out."
+    assert (
+        refusal_of(Upsample(at=(1,)).apply, fit) == "the event 'upsample' found no grid among the parameters: remove the event."
+    )
     least = SimpleNamespace(A=None, prior=object())
     assert refusal_of(lambda: next(fdk(least))).startswith("found a prior with filtered back-projection, expected none")

@@ -110,7 +110,7 @@ OPTIMIZE_REFUSED = {
     "an integrator that sees no media": (['fit.integrator="path"'], "no derivative leads from the images to cube"),
     "no grid to refine": (
         ['parameter=[{key="cube.interior_medium.albedo.value.value"}]', 'event=[{name="upsample", at=[1]}]'],
-        "upsample found no grid",
+        "the event 'upsample' found no grid",
     ),
     "a grid beyond the memory": (["parameter.0.shape=[20000,20000,20000]"], "of 20000 x 20000 x 20000 x 1 numbers"),
     "a grid without voxels": (["parameter.0.shape=[3,0,3]"], "parameter.0.shape.1 = 0"),

@@ -119,16 +119,16 @@ def test_what_a_script_gets_wrong_is_said(scene: mi.Scene) -> None:
         Problem(scene, [seen()], [3])
     with refuses("found int"):
         Problem(scene, [seen()], [KEY], loss=3)
-    with refuses(r"found the class Adam: call it, as Adam\(\.\.\.\)"):
+    with refuses(r"found the class Adam, expected an optimizer object: write Adam\(\.\.\.\)"):
         optimize(Problem(scene, [seen()], [KEY]), mivol.Adam, 1)
     with refuses("Silent.begin returned a NoneType, expected a mivol.optim.optimizer.OptimizerRun"):
         optimize(Problem(scene, [seen()], [KEY]), Silent(), 1)
     with refuses("found str"):
         optimize(Problem(scene, [seen()], [KEY]), "adam", 1)
     for loss, sentence in (
-        (lambda image, reference: 0.5, "gave a float"),
-        (lambda image, reference: image - reference, r"gave a TensorXf of shape \(6, 8, 3\)"),
-        (lambda image, reference: mi.Float(0.5), "no derivative leads"),
+        (lambda image, reference: 0.5, "returned a float"),
+        (lambda image, reference: image - reference, r"returned a TensorXf of shape \(6, 8, 3\)"),
+        (lambda image, reference: mi.Float(0.5), "has no derivative by the image"),
     ):
         problem = Problem(scene, [seen()], [KEY], loss=loss)
         with refuses(sentence):

@@ -14,7 +14,7 @@ from mivol.optim.priors import Neighbours, Rows, Smoothness, decay_view_dependen
 
 def smoothed(values: mi.Float, field: SphericalGrid, amount: float, share: float = 1.0, first: int = 7) -> None:
     """Smooth a density: a step down a slope of 1 is ``amount`` long."""
-    smooth(values, Rows(1, Neighbours.of(field), amount, 1.0, first), 1.0, share)
+    smooth(values, Rows(1, Neighbours.from_field(field), amount, 1.0, first), 1.0, share)
 
 
 def test_priors_move_values_down_their_slopes(variant_rgb: str) -> None:
@@ -87,7 +87,7 @@ def test_smoothing_every_few_steps_looks_at_all_their_shares(variant_rgb: str) -
     """A row is moved as far by one look at four shares as by a look at one; between two looks nothing moves."""
     density = np.random.default_rng(3).normal(size=(4, 4, 8)).astype(np.float32)
     field = SphericalGrid.from_dense(density, np.zeros((4, 4, 8, 1, 3)), CUBE)
-    around = Neighbours.of(field)
+    around = Neighbours.from_field(field)
     often, seldom = Smoothness(share=1 / 8), Smoothness(share=1 / 8, every=4)
     looks = [Rows(1, around, 0.05, 1.0, first, 8) for first in (7, 23, 39, 55)]
     moved = np.array(seldom.apply(field.density, looks[0]))

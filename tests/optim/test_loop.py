@@ -316,7 +316,7 @@ def test_stop_waits_for_a_safe_point(ctrl_c) -> None:
     with InterruptGuard() as stop:
         stop.check()
         os.kill(os.getpid(), signal.SIGTERM)
-        assert stop.asked
+        assert stop.is_requested
         with pytest.raises(Interrupted):
             stop.check()
         with pytest.raises(KeyboardInterrupt):
@@ -329,9 +329,9 @@ def test_what_was_ignored_stays_ignored(ctrl_c) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with InterruptGuard() as stop:
         os.kill(os.getpid(), signal.SIGINT)
-        assert not stop.asked
+        assert not stop.is_requested
         os.kill(os.getpid(), signal.SIGTERM)
-        assert stop.asked
+        assert stop.is_requested
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 

@@ -93,7 +93,7 @@ def test_find_offers_the_nearest_key(variant_rgb) -> None:
     with pytest.raises(MivolError, match=f'did you mean "{KEY}"'):
         find("cube.interior_medium.sigma_t.dat", params)
     emitter = mi.traverse(mi.load_dict({"type": "scene", "emitter": {"type": "spot"}}))
-    with pytest.raises(MivolError, match="AffineTransform4f, and a fit looks for numbers"):
+    with pytest.raises(MivolError, match="AffineTransform4f, expected a number"):
         find("emitter.to_world", emitter)
     nameless = mi.traverse(mi.load_dict({"type": "scene", "s": {"type": "sphere"}}))
     addressed = next((key for key in list(nameless.keys()) if key.startswith("object_")), None)

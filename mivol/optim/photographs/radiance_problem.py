@@ -318,7 +318,7 @@ class RadianceProblem:
         self._cells = find_occupied_cells(self.field)
 
     def _look_around(self) -> None:
-        self._neighbours = Neighbours.of(self.field)
+        self._neighbours = Neighbours.from_field(self.field)
         self.update_occupancy()
 
     def seen_nodes(self) -> np.ndarray:

@@ -155,7 +155,7 @@ class SceneProblem:
             self._finish(total)
         return total / spp
 
-    def pictures(self, most: int = 3) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    def images(self, most: int = 3) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """The first views, for notebooks: the name of each, what was seen, and a render of what the scene holds now."""
         seen = self.views[:most]
         return [(view.name, np.array(view.reference), np.array(self.render(view.sensor, self.seed))) for view in seen]
