@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mivol.validate import bounded_means, statistics
+from mivol.validate import statistics
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate, Significance, effective_dof
 
@@ -83,9 +83,9 @@ def assert_same_bounded_mean(
     mean: np.ndarray, n: int, truth: np.ndarray, *, bounds: tuple[float, float] = (0.0, 1.0), what: str = "the means"
 ) -> None:
     """Means of n samples between two bounds agree with exact answers, by Hoeffding's bound: no normality is assumed."""
-    p = bounded_means.bounded_p_value(mean, n, truth, bounds)
+    p = statistics.bounded_p_value(mean, n, truth, bounds)
     note(ALPHA, what, min(1.0, float(np.min(p)) * np.size(p)))
-    bounded_means.assert_same_bounded_mean(mean, n, truth, bounds=bounds, level=Significance(ALPHA), what=what)
+    statistics.assert_same_bounded_mean(mean, n, truth, bounds=bounds, level=Significance(ALPHA), what=what)
 
 
 def assert_rate(hits: int, runs: int, rate: float, at_least: float | None = None) -> None:

@@ -21,7 +21,7 @@ from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.shown import briefly
 from mivol.tomography.fan_axis import axis_from_fans, offset_of_cone
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
-from mivol.tomography.panel_views import COLUMNS, PanelViews
+from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_of_matrices
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import (
     Quanta,
@@ -30,7 +30,6 @@ from mivol.tomography.preprocess import (
     line_integrals,
     normalise_air,
 )
-from mivol.tomography.projection_matrices import panels_of_matrices
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import find_axis
 

@@ -16,8 +16,7 @@ from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nik
 from mivol.files.source import refusal
 from mivol.shown import briefly
 from mivol.tomography.geometry import ConeBeam, FlatDetector, VoxelGrid
-from mivol.tomography.nikon import nikon_geometry
-from mivol.tomography.panel_views import PanelViews
+from mivol.tomography.panel_views import PanelViews, nikon_geometry
 from mivol.tomography.preprocess import Transmission, correct_transmission, of_unknown_noise
 
 

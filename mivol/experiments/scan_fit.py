@@ -37,10 +37,9 @@ from mivol.report.pixel_scale import is_preview_due, write_preview
 from mivol.report.record import PlanLine, RunRecord
 from mivol.scene.explain import Explanation
 from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
-from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide, voxel_means
 from mivol.tomography.preprocess import bridge_gaps
 from mivol.tomography.projector import Projector
-from mivol.tomography.supersampling import subdivide, voxel_means
 from mivol.validate.metrics import nrmse
 
 CITED = {

@@ -13,9 +13,8 @@ from mivol.experiments.projections import Projections
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.files import write_exr, write_volume
 from mivol.report.record import LINES, SINOGRAM, Image, Volume
-from mivol.tomography.geometry import VoxelGrid
+from mivol.tomography.geometry import VoxelGrid, voxel_means
 from mivol.tomography.projector import Projector
-from mivol.tomography.supersampling import voxel_means
 from mivol.validate.metrics import nrmse
 
 

@@ -26,10 +26,9 @@ from mivol.optim.projections.smoothed_tv import SmoothedTV, scale_tv_to_noise
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions
-from mivol.tomography.geometry import VoxelGrid
+from mivol.tomography.geometry import VoxelGrid, subdivide
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import bytes_to_store, is_worth_storing, store
-from mivol.tomography.supersampling import subdivide
 
 MOST_UNKNOWNS = 1 << 24
 """More unknowns than 256^3 are taken only where they are asked for: with a hundred views an iteration takes ten seconds on two

@@ -24,7 +24,6 @@ from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.threads import check_one_thread, owner_waits
 from mivol.tomography.geometry import Geometry, VoxelGrid, view_index
-from mivol.tomography.ray_order import order_rays
 from mivol.tomography.recorded_kernels import RecordedKernels
 from mivol.transport.traversal.grid_blocks import find_empty_distances
 
@@ -380,3 +379,20 @@ def _as_array(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndar
     if np.iscomplexobj(a):
         raise MivolError("Found complex numbers, expected real ones: project the real and the imaginary part apart.")
     return np.ascontiguousarray(a, np.float32).reshape(-1), flat
+
+
+TILE = (2, 8)
+"""Rows and columns of a tile: 16 lanes, one vector of 512 bits."""
+
+
+def order_rays(views: int, rows: int, columns: int) -> np.ndarray:
+    """The numbers of rays (view, row, column) in the order in which they are walked.
+
+    Returns:
+        (views * rows * columns,), each number once.
+    """
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    in_view = np.lexsort((column % TILE[1], row % TILE[0], column // TILE[1], row // TILE[0]))
+    first = np.arange(views)[:, None] * (rows * columns)
+    bands = np.split(in_view, range(TILE[0] * columns, len(in_view), TILE[0] * columns))
+    return np.concatenate([(first + band).ravel() for band in bands])

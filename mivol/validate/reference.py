@@ -3,7 +3,7 @@
 Conventions. A reference is the mean of independent batches, each one render of ``pass_spp`` samples a pixel with a seed of
 its own, and the variance of that mean, both float64 (:mod:`mivol.validate.reference_file` says how they are stored). An
 integrator of mivol's never makes a reference. Where the extinction differs between channels, each channel is rendered alone
-(:mod:`mivol.validate.rgb_extinction`).
+(:mod:`mivol.validate.reference`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from mivol.scene.content_hash import content_hash
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
 from mivol.scene.parsing import check_variant
 from mivol.scene.sensors import check_film, find_sensor
+from mivol.transport.media.medium_view import traverse_medium
 from mivol.validate.moments import Moments
 from mivol.validate.reference_file import (
     ReferenceResult,
@@ -38,10 +39,9 @@ from mivol.validate.reference_file import (
     state_path,
     write_reference,
 )
-from mivol.validate.rgb_extinction import RgbExtinction, find_rgb_extinctions, with_channel
 from mivol.validate.trust import Doubt, trust
 
-__all__ = ["INTEGRATORS", "render_reference"]
+__all__ = ["INTEGRATORS", "render_reference", "RgbExtinction", "find_rgb_extinctions", "with_channel"]
 
 # Who may judge: Mitsuba's forward integrators for media.
 INTEGRATORS = ("volpath", "volpathmis")
@@ -300,9 +300,7 @@ def _render_until(
 
 def _result(setup: _Setup, run: _Run, path: Path, doubts: tuple[Doubt, ...]) -> ReferenceResult:
     m = run.moments
-    return ReferenceResult(
-        m.mean, m.variance_of_mean, m.n, m.n * run.pass_spp, setup.identity, path, doubts, run.seconds
-    )
+    return ReferenceResult(m.mean, m.variance_of_mean, m.n, m.n * run.pass_spp, setup.identity, path, doubts, run.seconds)
 
 
 @contextmanager
@@ -392,3 +390,53 @@ def _judge(scene: mi.Scene, sensor: mi.Sensor, accept: bool) -> tuple[Doubt, ...
     for doubt in doubts:
         warnings.warn(doubt.sentence, RuntimeWarning, stacklevel=3)
     return tuple(doubts)
+
+
+@dataclass(frozen=True)
+class RgbExtinction:
+    """The parameters of one medium that make its extinction differ between channels, with their values."""
+
+    params: mi.SceneParameters
+    values: dict[str, np.ndarray]
+
+    def assign(self, values: dict[str, np.ndarray]) -> None:
+        """Put other values, one for each key of ``values``, into the medium."""
+        for key, value in values.items():
+            kind = type(self.params[key])
+            self.params[key] = kind(*value.tolist()) if kind is mi.Color3f else kind(np.ascontiguousarray(value))
+        self.params.update()
+
+
+def find_rgb_extinctions(scene: mi.Scene) -> list[RgbExtinction]:
+    """Media whose extinction differs between channels."""
+    media = [m for s in scene.shapes() for m in (s.interior_medium(), s.exterior_medium()) if m is not None]
+    media += [m for s in scene.sensors() if (m := s.get_medium()) is not None]
+    found = []
+    for i, medium in enumerate(media):
+        if any(medium is other for other in media[:i]):
+            continue
+        params = traverse_medium(medium)
+        keys = [k for k in params.keys() if k.partition(".")[0] in ("sigma_t", "sigma_a", "sigma_s")]  # noqa: SIM118
+        values = {key: _array(params[key]) for key in keys}
+        values = {k: v for k, v in values.items() if v.ndim and v.shape[-1] == 3 and np.any(v != v[..., :1])}
+        if values:
+            found.append(RgbExtinction(params, values))
+    return found
+
+
+def _array(value: Any) -> np.ndarray:
+    """A copy of the values, channels last."""
+    array = np.array(value)
+    return array.reshape(-1) if isinstance(value, mi.Color3f) else array
+
+
+@contextmanager
+def with_channel(media: list[RgbExtinction], channel: int) -> Iterator[None]:
+    """Give all channels the extinction of one, inside of a ``with`` block."""
+    try:
+        for medium in media:
+            medium.assign({k: np.repeat(v[..., channel : channel + 1], 3, axis=-1) for k, v in medium.values.items()})
+        yield
+    finally:
+        for medium in media:
+            medium.assign(medium.values)

@@ -7,8 +7,7 @@ import pytest
 from scipy.stats import binom
 
 from mivol.errors import MivolError
-from mivol.validate.bounded_means import assert_same_bounded_mean, bounded_p_value
-from mivol.validate.statistics import Estimate, assert_same_mean
+from mivol.validate.statistics import Estimate, assert_same_bounded_mean, assert_same_mean, bounded_p_value
 
 
 @pytest.mark.parametrize("p", [1e-4, 0.03, 0.5, 0.97])

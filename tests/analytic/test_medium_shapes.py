@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from mivol.validate.medium_shapes import _crossings
+from mivol.validate.trust import _crossings
 
 
 def cube() -> np.ndarray:

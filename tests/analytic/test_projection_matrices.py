@@ -11,8 +11,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments import projections
 from mivol.tomography.geometry import ConeBeam
-from mivol.tomography.panel_views import PanelViews
-from mivol.tomography.projection_matrices import panels_of_matrices
+from mivol.tomography.panel_views import PanelViews, panels_of_matrices
 
 BEAM = ConeBeam(np.array([0.2, 1.9, 4.0]), (5, 4), 7.0, 11.0, (0.3, 0.4), axis_offset=0.6, detector_offset=(-0.2, 0.7))
 

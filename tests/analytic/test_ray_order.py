@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mivol.tomography.ray_order import order_rays
+from mivol.tomography.projector import order_rays
 
 
 @pytest.mark.parametrize("shape", [(3, 4, 16), (2, 5, 9), (1, 1, 7), (4, 3, 1)])

@@ -10,10 +10,9 @@ import pytest
 from mivol.optim.projections.iterative import projected_cg
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.tomography.filtered import feldkamp
-from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
+from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid, subdivide, voxel_means
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
-from mivol.tomography.supersampling import subdivide, voxel_means
 from mivol.validate.metrics import nrmse
 
 GRID = VoxelGrid((2, 3, 4), (0.5, 0.25, 0.75), (1.0, 2.0, 3.0))

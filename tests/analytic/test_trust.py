@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mivol.validate import trust
-from mivol.validate.medium_shapes import ON_FACE, MediumShape
+from mivol.validate.trust import ON_FACE, MediumShape
 from scenes import affine, rotation
 
 CORNERS = np.array(list(product((0.0, 1.0), repeat=3)))

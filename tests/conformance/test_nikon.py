@@ -15,7 +15,7 @@ from mivol.experiments import projections
 from mivol.files import read_volume
 from mivol.files.nikon import read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.tomography.geometry import ConeBeam, VoxelGrid
-from mivol.tomography.nikon import nikon_geometry
+from mivol.tomography.panel_views import nikon_geometry
 from mivol.tomography.projector import Projector
 
 VIEWS, ROWS, COLUMNS, WHITE = 16, 10, 12, 60000.0

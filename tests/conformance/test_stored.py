@@ -11,7 +11,7 @@ import pytest
 from mivol.errors import MivolError
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.solvers import SOLVERS
-from mivol.tomography import slice_matrix
+from mivol.tomography import stored
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import bytes_to_store, is_worth_storing, store
@@ -75,7 +75,7 @@ def test_many_layers_are_multiplied_in_parts(seed: int) -> None:
 @pytest.mark.parametrize("block", [1, 1 << 19])
 def test_a_subset_is_the_rows_of_its_views(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
     """In any order, over the borders of blocks (a view each, or all in one), and a subset of a subset."""
-    monkeypatch.setattr(slice_matrix, "BLOCK", block)
+    monkeypatch.setattr(stored, "BLOCK", block)
     a = store(Projector(BEAMS["parallel, rows between layers"], GRID))
     x, y = numbers(*GRID.shape), numbers(3, 7, 9)
     part = a.subset([4, 0, 1])

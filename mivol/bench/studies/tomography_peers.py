@@ -31,11 +31,10 @@ from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.filtered import filtered_backprojection
-from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide, voxel_means
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import store
-from mivol.tomography.supersampling import subdivide, voxel_means
 from mivol.validate.metrics import nrmse
 
 KINDS = {"few views": (30, 0.0), "noisy": (90, 1e4), "many": (360, 1e4)}
