@@ -227,9 +227,8 @@ def render(scene: mi.Scene, integrator: dict | mi.Integrator, spp: int, seed: in
 
 def media_of(scene: mi.Scene) -> object:
     """The media of a scene as transport walks through them, planned for the first sensor at depth 2."""
-    from mivol.scene.build import build_media
     from mivol.scene.needs import find_needs
-    from mivol.scene.plan import make_plan
+    from mivol.scene.plan import build_media, make_plan
     from mivol.scene.survey import survey_scene
     from mivol.transport.path.estimators import Settings
 

@@ -107,7 +107,7 @@ def test_a_mark_without_a_comparison_and_a_comparison_without_a_mark_are_red(tmp
     assert "marked statistical and compares nothing" in said and "mark the test with @pytest.mark.statistical" in said
 
 
-JUDGES = {"mivol.validate.statistics", "mivol.validate.statistics"}
+JUDGES = {"mivol.validate.statistics"}
 
 
 def test_all_comparisons_are_counted():

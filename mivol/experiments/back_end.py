@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.scene.parsing import check_variant
+from mivol.scene.description import check_variant
 from mivol.threads import check_one_thread, set_thread_count
 
 

@@ -14,8 +14,8 @@ from mivol.photos import PhotoFrame, Photos, PhotoSurvey
 from mivol.report.cameras import PARTS, list_parts, plot_cameras
 from mivol.report.record import Image
 from mivol.report.scanner import plot_scanner, select_views
-from mivol.scene.cameras import find_box
-from mivol.scene.photographs import camera_of
+from mivol.scene.camera_rigs import find_box
+from mivol.scene.sensors import camera_of
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
 __all__ = ["pictures_of_photos", "pictures_of_scan", "pictures_of_views", "survey_of"]

@@ -29,8 +29,8 @@ from mivol.points.cloud import PointCloud, read_points
 from mivol.points.conversions import points_to_gaussians
 from mivol.points.gaussian_files import is_gaussian_file, read_gaussians
 from mivol.points.gaussians import Gaussians
+from mivol.scene.description import reason_of
 from mivol.scene.explain import settings_of
-from mivol.scene.parsing import reason_of
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.splatting import Splatter, to_tensors
 

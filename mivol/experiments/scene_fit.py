@@ -41,11 +41,11 @@ from mivol.optim.scenes.emissive_start import check_given_start, find_emissive_s
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import HELD_OUT, RenderBatch, derive_seed, make_batches
 from mivol.report.record import PlanLine, RunRecord
-from mivol.scene.depth_preview import measure_depths
 from mivol.scene.explain import Explanation, examine
 from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
+from mivol.scene.previews import measure_depths
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.validate.metrics import nrmse, psnr

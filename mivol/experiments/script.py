@@ -198,7 +198,7 @@ def explain(
         max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
         sensor: the sensor asked about, or its number.
         noise: measure which ``max_depth`` leaves out less than this noise of a pixel, over the mean radiance
-            (:mod:`mivol.scene.depth_preview`); None to measure nothing.
+            (:mod:`mivol.scene.previews`); None to measure nothing.
 
     Returns:
         Facts, choices with their reasons, and at the end what is refused, where something is.

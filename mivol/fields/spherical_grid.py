@@ -38,7 +38,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, select_activation
 from mivol.fields.harmonics import (
@@ -52,6 +51,7 @@ from mivol.fields.harmonics import (
 )
 from mivol.fields.sparse_index import SparseIndex
 from mivol.files.notebook import slices_html
+from mivol.kernel_recording import copy_aligned
 from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
@@ -231,7 +231,7 @@ class SphericalGrid:
         rows[: len(density), : 3 * sh.shape[1]] = sh.reshape(len(density), -1)
         flat = np.append(density, np.float32(function.vacuum)) if vacuum else density
         # Dr.Jit reads NumPy's memory in place, and gathers rows as packets only from aligned memory.
-        packed = mi.Float(aligned(np.ascontiguousarray(flat))), mi.Float(aligned(rows.reshape(-1)))
+        packed = mi.Float(copy_aligned(np.ascontiguousarray(flat))), mi.Float(copy_aligned(rows.reshape(-1)))
         return cls(tuple(res), to_world, degree, *packed, nodes, activation, offset, clamp, levels, space)
 
     @classmethod

@@ -29,6 +29,7 @@ from mivol.errors import MivolError
 from mivol.fields.shading import Shading, gradient_grid
 from mivol.fields.voxels import Voxels
 from mivol.files import read_volume
+from mivol.kernel_recording import is_recording
 
 __all__ = [
     "Transfer",
@@ -288,7 +289,7 @@ class Transfer:
         Raises:
             MivolError: as the class; values are not checked while ``dr.freeze`` records.
         """
-        if not dr.flag(dr.JitFlag.FreezingScope):
+        if not is_recording():
             self._check()
         self.voxels.texture.set_tensor(self.classify())
 

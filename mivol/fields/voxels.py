@@ -13,6 +13,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.protocol import EXACT_LINE, accumulate_tracked
 from mivol.files import check_volume, read_volume
+from mivol.kernel_recording import is_recording
 from mivol.space import check_affine
 
 __all__ = ["Voxels"]
@@ -103,7 +104,7 @@ class Voxels:
         Raises:
             MivolError: ``dr.freeze`` records and cannot follow the values.
         """
-        if self.freezable_texture is None and dr.flag(dr.JitFlag.FreezingScope):
+        if self.freezable_texture is None and is_recording():
             advice = "render without it, use llvm_ad_rgb, or a gridvolume of Mitsuba's"
             raise MivolError(f"dr.freeze records {self.name} in {mi.variant()}, and cannot follow its values there: {advice}.")
         return self.texture.tensor()
@@ -157,7 +158,7 @@ class Voxels:
             MivolError: NaN or infinite values; not checked while ``dr.freeze`` records.
         """
         self.texture.update_inplace()
-        if dr.flag(dr.JitFlag.FreezingScope):
+        if is_recording():
             # A recording cannot read values.
             return
         check_volume(np.array(dr.detach(self.tensor)), name=self.name, minimum=None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mivol.kernel_recording import is_recording
 from mivol.scene.coefficients import Coefficients, check_constant
 
 
@@ -35,7 +36,7 @@ class MivolMedium(mi.Medium):
         self.refresh()
 
     def refresh(self) -> None:
-        if not dr.flag(dr.JitFlag.FreezingScope):
+        if not is_recording():
             self.coefficients.check_constants()
             check_constant(self.scale, "scale", " of a mivol_medium")
         self.majorant = self.coefficients.bound()

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.kernel_recording import is_recording
 from mivol.phase.closed_forms import eval_draine, eval_hg, eval_rayleigh, sample_draine, sample_hg, sample_rayleigh
 from mivol.phase.domain import DOMAINS
 from mivol.phase.mixture import choose_lobe, normalise_weights
@@ -155,7 +156,7 @@ class Tabulated(TurningPhase):
         values = self.parameters["values"]
         if dr.width(values) != len(self.table.values):
             raise MivolError(f"values of {self._name()} became {dr.width(values)}; its {len(self.table.values)} cosines stay.")
-        if not dr.flag(dr.JitFlag.FreezingScope):
+        if not is_recording():
             check_values(np.array(dr.detach(values), dtype=np.float64), f"values of {self._name()}")
         self.values, self.integral, self.cumulative = self.nodes.normalise(values)
         dr.make_opaque(self.values, self.integral, self.cumulative)
@@ -197,7 +198,7 @@ class Mixture(mi.PhaseFunction):
     def refresh(self) -> None:
         _take_over(self.weights, "mivol_mixture")
         numbers = [w for w in self.weights.values() if not isinstance(w, mi.Volume)]
-        if len(numbers) == len(self.weights) and not dr.flag(dr.JitFlag.FreezingScope) and not any(w[0] > 0 for w in numbers):
+        if len(numbers) == len(self.weights) and not is_recording() and not any(w[0] > 0 for w in numbers):
             raise MivolError("the weights of mivol_mixture are all 0; at least one above 0 is expected.")
 
     def component_count(self, active: mi.Bool = True) -> int:
@@ -313,13 +314,13 @@ def _brief(value: mi.Float | mi.Volume) -> str:
     """A value in words; a recording cannot read numbers."""
     if isinstance(value, mi.Volume):
         return value.class_name()
-    return "recorded" if dr.flag(dr.JitFlag.FreezingScope) else str(dr.detach(value))
+    return "recorded" if is_recording() else str(dr.detach(value))
 
 
 def _take_over(parameters: dict[str, mi.Float | mi.Volume], owner: str) -> None:
     """Refuse values that can be read, and make arrays of numbers, which recordings and recompilations do not bake in."""
     for name, value in parameters.items():
-        if not dr.flag(dr.JitFlag.FreezingScope):
+        if not is_recording():
             for known in _known_values(value):
                 _check_channels(known, f"{name} of {owner}")
                 DOMAINS[name.split("_")[0]].check(np.array(dr.detach(known)), f"{name} of {owner}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mivol.scene.facts import MediumFacts, Needs
+from mivol.scene.needs import MediumFacts, Needs
 from mivol.transport.media.body import flight_parts
 from mivol.transport.path.estimators import Settings
 

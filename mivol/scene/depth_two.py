@@ -35,7 +35,7 @@ from mivol.transport.media.optical_depth import integrate_optical_depth
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
 
-__all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "draw_lines", "mean_albedo", "mean_cosine", "scattering_depth"]
+__all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "draw_lines", "mean_albedo", "scattering_depth"]
 
 ALBEDOS = (0.2, 0.5, 0.75, 0.9, 0.99, 1.0)
 TAUS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -215,14 +215,3 @@ def _mean_value(part: ExactExtinction) -> float:
     values = part.constant if part.is_constant else part.lattice.values
     host = np.asarray(dr.detach(values), np.float64)
     return float(host.reshape(-1, part.channels).mean(axis=0).max()) if not part.is_constant else float(host.max())
-
-
-def mean_cosine(phase: mi.PhaseFunction, n: int = 1 << 12) -> float:
-    """Mean cosine [1] of a phase function by its own samples, to 1 / sqrt(n), in the middle of the world."""
-    mei = dr.zeros(mi.MediumInteraction3f, n)
-    mei.wi = mi.Vector3f(0, 0, 1)
-    mei.sh_frame = mi.Frame3f(mei.wi)
-    k = dr.arange(mi.Float, n)
-    u = mi.Point2f((k + 0.5) / n, k * 0.6180340 - dr.floor(k * 0.6180340))
-    wo, _, _ = phase.sample(mi.PhaseFunctionContext(None), mei, k * 0.7548777 - dr.floor(k * 0.7548777), u)
-    return float(dr.mean(-wo.z)[0])

@@ -16,6 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.kernel_recording import is_recording
 from mivol.transport.media.medium_view import traverse_medium
 
 __all__ = ["carry_tangents", "recompute_derived"]
@@ -76,7 +77,7 @@ def carry_tangents(scene: mi.Scene) -> Iterator[None]:
 
 def _find_asked(scene: mi.Scene) -> list[_Asked]:
     """Arrays with derivatives, by the plugin that they belong to."""
-    if dr.flag(dr.JitFlag.FreezingScope):
+    if is_recording():
         return []
     inside = [shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None]
     owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _parts_of(m))]

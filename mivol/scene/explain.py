@@ -14,15 +14,12 @@ import numpy as np
 
 from mivol.cite import citations
 from mivol.errors import MivolError
-from mivol.scene.build import build_media
 from mivol.scene.choices import is_lit, shares_cells
-from mivol.scene.depth_preview import measure_depths
-from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
-from mivol.scene.draw_preview import measure_draws
-from mivol.scene.facts import MediumFacts, Needs
-from mivol.scene.needs import find_needs
+from mivol.scene.depth_two import depth_two_error, mean_albedo, scattering_depth
+from mivol.scene.needs import MediumFacts, Needs, find_needs, mean_cosine
 from mivol.scene.nesting import bounds
-from mivol.scene.plan import Plan, make_plan
+from mivol.scene.plan import Plan, build_media, make_plan
+from mivol.scene.previews import measure_depths, measure_draws
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.emitters import SceneEmitters

@@ -17,18 +17,19 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.scene.content_hash import hash_object, hash_state
-from mivol.scene.explain import examine
-from mivol.scene.parsing import (
+from mivol.scene.description import (
     NO_TEXT,
     as_text,
     check_variant,
+    hash_object,
+    hash_state,
     named_files,
     parse_dict,
     parse_file,
     reason_of,
     resolving_beside,
 )
+from mivol.scene.explain import examine
 from mivol.shown import briefly, text_html
 from mivol.threads import set_thread_count
 

@@ -15,15 +15,15 @@ isotropic, and nothing dims the light or stands in its way: the answer decides a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.scene.facts import MediaLight, Needs
+from mivol.kernel_recording import without_garbage_collection
 from mivol.scene.nesting import bounds
-from mivol.scene.recording import without_collections
-from mivol.scene.survey import AROUND, SceneSurvey, is_instance
+from mivol.scene.survey import AROUND, Boundary, SceneSurvey, is_instance
 from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
 from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
@@ -33,7 +33,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.uniform_points import draw_uniform_point
 from mivol.transport.traversal.box import Box
 
-__all__ = ["find_emitting_boxes", "predict_gain", "read_media_light"]
+__all__ = ["find_emitting_boxes", "predict_gain", "read_media_light", "MediaLight"]
 
 
 COST = 2.0
@@ -43,32 +43,31 @@ SIDE, DIRECTIONS, SEED = 32, 32, 0xF12E
 """Camera rays along an edge of the film, directions at each point, seed of both."""
 
 
-def read_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey) -> MediaLight | None:
+def read_media_light(
+    media: SceneMedia, boundaries: Sequence[Boundary], scattering: Sequence[Body], sensor: mi.Sensor, survey: SceneSurvey
+) -> MediaLight | None:
     """Read where media emit, and predict what draws of it gain, once for each state of the media.
 
     Returns:
         None where the place of some medium that emits is not known: where it fills no shape, or shapes are instances.
     """
-    bodies = [boundary.body(view) for boundary, view in zip(needs.boundaries, needs.views, strict=True)]
-    media = needs.media_of(scene, bodies, survey.size)
-    boxes = find_emitting_boxes(scene, media, needs)
+    boxes = find_emitting_boxes(media, boundaries)
     if boxes is None:
         return None
     # Arrays are kept with what was made of them, so that their numbers cannot be given to others.
     arrays = [array for box in boxes for array in _arrays_of(box.body.view)]
     state = (*(a.index if dr.is_array_v(a) else a for a in arrays), *(box.box.to_world.tobytes() for box in boxes))
     if survey.media_light is None or survey.media_light[0] != state:
-        with without_collections(), dr.suspend_grad():
+        with without_garbage_collection(), dr.suspend_grad():
             table = tabulate_emission(boxes, media.channels)
-            scattering = [b for b, facts in zip(bodies, needs.media, strict=True) if facts.is_scattering]
             gain = predict_gain(media, table, sensor, scattering)
         survey.media_light = (state, arrays, MediaLight(table.density, table.cumulative, gain))
     return survey.media_light[2]
 
 
-def find_emitting_boxes(scene: mi.Scene, media: SceneMedia, needs: Needs) -> list[EmittingBox] | None:
+def find_emitting_boxes(media: SceneMedia, boundaries: Sequence[Boundary]) -> list[EmittingBox] | None:
     """The media that emit, each with a box that all of its light comes from; None where that is not known of one."""
-    lost = {b.medium.ptr for b in needs.boundaries if b.shape == AROUND}
+    scene, lost = media.scene, {b.medium.ptr for b in boundaries if b.shape == AROUND}
     has_instances, boxes = any(is_instance(s) for s in scene.shapes()), []
     for body in media.bodies:
         if not body.view.emits:
@@ -182,3 +181,17 @@ def _noise(table: EmissionTable, p: mi.Point3f, normal: mi.Vector3f | None, on: 
     rows = [np.array(v, dtype=np.float64).reshape(points, DIRECTIONS) for v in (met.light, met_weighed, drawn)]
     by_chance, weighed, found = (float(row.var(axis=1).sum()) for row in rows)
     return by_chance, weighed + found
+
+
+@dataclass
+class MediaLight:
+    """What was read of the light that media emit.
+
+    Attributes:
+        density, cumulative: of :class:`mivol.transport.estimators.lighting.emission_sampling.EmissionTable`.
+        gain: how much sooner draws of it reach an error than chance does [1], as predicted.
+    """
+
+    density: mi.Float
+    cumulative: mi.Float
+    gain: float

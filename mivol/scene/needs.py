@@ -7,23 +7,25 @@ been replaced, and never while a function is being recorded by ``dr.freeze``.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.scene.depth_two import mean_cosine
-from mivol.scene.facts import Boundary, MediumFacts, Needs
-from mivol.scene.media_light import read_media_light
+from mivol.kernel_recording import is_recording
+from mivol.scene.description import check_variant
+from mivol.scene.media_light import MediaLight, read_media_light
 from mivol.scene.nesting import bounds
-from mivol.scene.parsing import check_variant
 from mivol.scene.readings import Reading, check_light, check_numbers, is_scattering, read_part
-from mivol.scene.survey import AROUND, SceneSurvey, find_around, is_instance, survey_scene
+from mivol.scene.survey import AROUND, Boundary, SceneSurvey, find_around, is_instance, survey_scene
+from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.medium_view import MediumView, medium_kind
+from mivol.transport.media.scene_media import SceneMedia
 
-__all__ = ["find_needs"]
+__all__ = ["find_needs", "MediumFacts", "Needs", "mean_cosine"]
 
 
 def find_needs(
@@ -43,7 +45,7 @@ def find_needs(
     """
     check_variant()
     survey = survey or survey_scene(scene)
-    recording = bool(dr.flag(dr.JitFlag.FreezingScope))
+    recording = is_recording()
     start = [] if sensor.get_medium() is None else [sensor.get_medium()]
     boundaries = (*survey.boundaries, *find_around(start, survey.boundaries))
     views = tuple(b.view(survey.places) for b in boundaries)
@@ -73,7 +75,10 @@ def find_needs(
     refused = any(m.bounded or m.gaussians for m in media)
     if recording or refused or not (reads_emission and scatters and any(m.emits for m in media)):
         return needs
-    return replace(needs, media_light=read_media_light(scene, sensor, needs, survey))
+    bodies = [boundary.body(view) for boundary, view in zip(boundaries, views, strict=True)]
+    scattering = [body for body, facts in zip(bodies, media, strict=True) if facts.is_scattering]
+    light = read_media_light(needs.media_of(scene, bodies, survey.size), boundaries, scattering, sensor, survey)
+    return replace(needs, media_light=light)
 
 
 def _is_place(key: str, owner: object) -> bool:
@@ -152,3 +157,117 @@ def _tau_max(boundary: Boundary, view: MediumView, reads: list[Reading]) -> floa
     diagonal = max(np.linalg.norm(corners[i] - corners[7 - i]) for i in range(4))
     scale = float(np.max(np.array(dr.detach(view.scale))))
     return scale * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * float(diagonal)
+
+
+@dataclass(frozen=True)
+class MediumFacts:
+    """What one medium is made of.
+
+    Attributes:
+        name: of the shape that it fills.
+        kind: class of the medium.
+        boundary: where it is, in words.
+        extinction: ``grey`` or ``rgb``.
+        resolutions: of its grids (Z, Y, X); none for a homogeneous medium.
+        is_scattering: some albedo or ``sigma_s`` is above 0, or its derivative is asked for.
+        emits: it has an emission or an emission density.
+        phase: kind of its phase function.
+        occupied: fraction of its blocks of cells that are not empty; of its emptiest grid.
+        tau_max: upper bound of the optical depth [1] through its box; None where its boundary is no box.
+        unread: values could not be read, because ``dr.freeze`` records.
+        mean_cosine: of its phase function [1], when it was first asked; None where it does not scatter, or where some emitter
+            is not at infinity and nothing depends on it.
+        bounded: class of a field of which no more than a majorant is known along a ray; None where optical depths are exact.
+        gaussians: how many Gaussians it is made of that rays are traced through; 0 for none.
+    """
+
+    name: str
+    kind: str
+    boundary: str
+    extinction: str
+    resolutions: tuple[tuple[int, int, int], ...]
+    is_scattering: bool
+    emits: bool
+    phase: str
+    occupied: float
+    tau_max: float | None
+    unread: bool = False
+    bounded: str | None = None
+    gaussians: int = 0
+    mean_cosine: float | None = None
+
+
+@dataclass(frozen=True)
+class Needs:
+    """The facts of a scene that a plan is made from.
+
+    Attributes:
+        variant: the active variant.
+        boundaries: media and where they are.
+        views: their extinction, in the same order, with its gradients.
+        media: what each is made of, in the same order.
+        surfaces: class names of the shapes that are more than boundaries.
+        has_null_transmission: some surface lets light through undeviated and is more than a boundary.
+        emitters: class names.
+        emitter_kinds: ``uniform`` (an environment that is the same in all directions), ``delta`` (one position or direction) or
+            ``extended``, of each emitter.
+        are_emitters_far: every emitter is at infinity, and one of them is not ``uniform``.
+        refractive: names of the boundaries that bend or blur the light that passes them.
+        is_sealed: every medium lies behind such boundaries and no light passes them undeviated; emitters lie outside of them,
+            and paths can hit each. No emitter sample finds light from a point in a medium.
+        start: medium that the sensor names.
+        camera_inside: the camera may be inside the box around a boundary.
+        parameters: keys whose derivatives are asked for.
+        places: those of them that are of shapes and sensors.
+        film_samples: pixels times samples of the sensor asked about.
+        are_samples_independent: its sampler stratifies nothing, so that other random numbers may stand for its own.
+        media_light: what was read of the light that media emit; None where none does, where nothing scatters it, or where it
+            could not be read.
+    """
+
+    variant: str
+    boundaries: tuple[Boundary, ...]
+    views: tuple[MediumView, ...]
+    media: tuple[MediumFacts, ...]
+    surfaces: tuple[str, ...]
+    has_null_transmission: bool
+    emitters: tuple[str, ...]
+    emitter_kinds: tuple[str, ...]
+    are_emitters_far: bool
+    refractive: tuple[str, ...]
+    is_sealed: bool
+    start: mi.Medium | None
+    camera_inside: bool
+    parameters: tuple[str, ...]
+    places: tuple[str, ...]
+    film_samples: int
+    are_samples_independent: bool = True
+    media_light: MediaLight | None = None
+
+    def media_of(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
+        """The media of the scene among its surfaces, as these facts have them.
+
+        Args:
+            bodies: one for each of ``boundaries``, in the same order.
+            size: of the scene [length].
+        """
+        return SceneMedia(
+            scene,
+            bodies,
+            has_surfaces=bool(self.surfaces),
+            has_null_transmission=self.has_null_transmission,
+            start=self.start,
+            locates_camera=self.camera_inside and self.start is None,
+            size=size,
+        )
+
+
+def mean_cosine(phase: mi.PhaseFunction, n: int = 1 << 12) -> float:
+    """Mean cosine [1] of a phase function by its own samples, to 1 / sqrt(n), in the middle of the world."""
+    mei = dr.zeros(mi.MediumInteraction3f, n)
+    mei.wi = mi.Vector3f(0, 0, 1)
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    k = dr.arange(mi.Float, n)
+    u = mi.Point2f((k + 0.5) / n, k * 0.6180340 - dr.floor(k * 0.6180340))
+    wo, _, _ = phase.sample(mi.PhaseFunctionContext(None), mei, k * 0.7548777 - dr.floor(k * 0.7548777), u)
+    return float(dr.mean(-wo.z)[0])

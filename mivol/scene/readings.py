@@ -18,6 +18,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation
 from mivol.files import check_volume
+from mivol.kernel_recording import is_recording
 from mivol.scene.coefficients import check_constant
 from mivol.scene.survey import SceneSurvey
 from mivol.transport.media.extinction import ExactExtinction
@@ -52,7 +53,7 @@ def _once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], 
 
     While a function is being recorded it is made anew: a recording can use no array that was made before it.
     """
-    if dr.flag(dr.JitFlag.FreezingScope):
+    if is_recording():
         return make()
     key = (*kind, array.index)
     if key not in survey.values:

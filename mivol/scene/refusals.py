@@ -9,7 +9,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.scene.choices import choose_media_light, is_lit, shares_cells
-from mivol.scene.facts import Needs
+from mivol.scene.needs import Needs
 from mivol.transport.line_integrals.aovs import AOVS
 from mivol.transport.media.grid_extinction import have_same_cells
 from mivol.transport.media.medium_view import MediumView

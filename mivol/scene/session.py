@@ -12,12 +12,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.scene.build import build_estimators
+from mivol.kernel_recording import is_recording, without_garbage_collection
 from mivol.scene.derived import carry_tangents, recompute_derived
-from mivol.scene.draw_preview import measure_draws
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import Plan, make_plan
-from mivol.scene.recording import without_collections
+from mivol.scene.plan import Plan, build_estimators, make_plan
+from mivol.scene.previews import measure_draws
 from mivol.scene.refusals import check_aovs
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
@@ -78,7 +77,7 @@ class Session:
         if not develop:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
         sensor = _sensor_with_room(scene, sensor)
-        with without_collections(), dr.suspend_grad():
+        with without_garbage_collection(), dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, pictures=True)
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
             image = render_on_film(samples, self.aovs, lambda rays: self._primal(estimators, rays, plan.successive))
@@ -89,7 +88,7 @@ class Session:
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients that were set on the parameters."""
         sensor = _sensor_with_room(scene, sensor)
-        with without_collections(), dr.suspend_grad(), carry_tangents(scene):
+        with without_garbage_collection(), dr.suspend_grad(), carry_tangents(scene):
             with dr.resume_grad():
                 estimators, plan = self._open(scene, sensor, spp)
                 estimators.media.start_tangent()
@@ -102,7 +101,7 @@ class Session:
         Cost: a render and its replay; memory independent of the samples, beyond those of a pass.
         """
         sensor = _sensor_with_room(scene, sensor)
-        with without_collections(), dr.suspend_grad():
+        with without_garbage_collection(), dr.suspend_grad():
             with dr.resume_grad():
                 recompute_derived(scene)
                 estimators, plan = self._open(scene, sensor, spp)
@@ -163,7 +162,7 @@ class Session:
     ) -> None:
         prepare_derivatives(estimators, rays.ray, rays.on_film)
         # Branches are counted, which a recording of Dr.Jit cannot do.
-        if branches and not dr.flag(dr.JitFlag.FreezingScope):
+        if branches and not is_recording():
             replay_branches(estimators, rays, dL)
         else:
             self._replay_whole(estimators, rays, dL)

@@ -9,13 +9,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.scene.facts import Boundary
+from mivol.kernel_recording import is_recording
 from mivol.scene.nesting import OrientedBox, box_around, extent, nesting_fault
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
-from mivol.transport.media.medium_view import nested_field
+from mivol.transport.media.body import Body
+from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
 from mivol.transport.traversal.box import Box, fit_box
 
-__all__ = ["AROUND", "SceneSurvey", "find_around", "is_instance", "survey_scene"]
+__all__ = ["AROUND", "SceneSurvey", "find_around", "is_instance", "survey_scene", "Boundary"]
 
 
 AROUND = "space around shapes"
@@ -27,7 +28,7 @@ class SceneSurvey:
 
     Attributes:
         boundaries, surfaces, has_null_transmission, emitters, emitter_kinds, are_emitters_far, refractive, is_sealed: as in
-            :class:`mivol.scene.facts.Needs`.
+            :class:`mivol.scene.needs.Needs`.
         marks: boundaries, each with what another place would change of it: its vertices or its box.
         size: diagonal of the box around all shapes [length].
         looked_up: stock grids whose look-up was compared with mivol's, by pointer.
@@ -38,7 +39,7 @@ class SceneSurvey:
         warned: grids whose values below 0 were told of.
         media_light: what was read of the light that media emit, with the arrays that it was read of
             (:mod:`mivol.scene.media_light`); None where nothing was.
-        gain_of_draws: how much sooner draws of that light reach an error [1] (:mod:`mivol.scene.draw_preview`); None where it
+        gain_of_draws: how much sooner draws of that light reach an error [1] (:mod:`mivol.scene.previews`); None where it
             was not measured.
     """
 
@@ -65,7 +66,7 @@ class SceneSurvey:
     @property
     def is_current(self) -> bool:
         """Whether no boundary has been moved since. While ``dr.freeze`` records, which cannot be told, all count as unmoved."""
-        return dr.flag(dr.JitFlag.FreezingScope) or all(_is_at(shape, mark) for shape, mark in self.marks)
+        return is_recording() or all(_is_at(shape, mark) for shape, mark in self.marks)
 
 
 def survey_scene(scene: mi.Scene) -> SceneSurvey:
@@ -94,7 +95,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
     boxed = {b.medium.ptr for b in boundaries if b.box is not None}
     edges = [s for s in shapes if s.is_medium_transition() and not (s.interior_medium() and s.interior_medium().ptr in boxed)]
-    fault = None if dr.flag(dr.JitFlag.FreezingScope) else nesting_fault(scene, edges)
+    fault = None if is_recording() else nesting_fault(scene, edges)
     if fault is not None:
         raise MivolError(fault)
     around = find_around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
@@ -214,3 +215,36 @@ def _levels(boundary: Boundary) -> list[Boundary]:
 
 FITS = 1e-6
 """How far a level may stand out of its boundary, in edges: the boundary's vertices are float32."""
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """One medium and where it is.
+
+    Attributes:
+        medium: Mitsuba's object.
+        name: of the shape that it fills.
+        shape: class of that shape; ``AROUND`` for a medium that fills none (around other shapes or the camera, in instances).
+        box: the shape, where it is a box that no other boundary overlaps; None where it has to be traced.
+        level: of a nested radiance field, each level of which is a medium of its own.
+        hole: the box in which that level is not, for the level before is there; None of all other media.
+    """
+
+    medium: mi.Medium
+    name: str
+    shape: str
+    box: Box | None
+    level: int = 0
+    hole: Box | None = None
+
+    def view(self, places: dict) -> MediumView:
+        """Its medium as a sum of fields; ``places`` as in :func:`mivol.transport.media.medium_view.view_medium`.
+
+        Raises:
+            MivolError: a medium that mivol does not render.
+        """
+        return view_medium(self.medium, self.box, places, self.level)
+
+    def body(self, view: MediumView, estimates_shadows: bool = False) -> Body:
+        """A view of its medium, where it is."""
+        return Body(view, self.box, estimates_shadows, self.hole)

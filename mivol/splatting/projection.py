@@ -26,8 +26,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.device_arrays import aligned
 from mivol.errors import MivolError
+from mivol.kernel_recording import copy_aligned
 from mivol.photos.camera import FLIP, Camera
 
 __all__ = ["Cloud", "Filter", "Splats", "project", "View", "pack_view"]
@@ -284,4 +284,4 @@ def pack_view(camera: Camera, size: tuple[int, int]) -> mi.Float:
     focal, centre = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
     beyond = REACH * 0.5 * np.array(size) / focal
     numbers = [camera.origin, *axes.T, focal, centre, -centre / focal - beyond, (size - centre) / focal + beyond]
-    return mi.Float(aligned(np.concatenate(numbers).astype(np.float32)))
+    return mi.Float(copy_aligned(np.concatenate(numbers).astype(np.float32)))

@@ -17,8 +17,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.device_arrays import aligned, kept_aligned
 from mivol.errors import MivolError
+from mivol.kernel_recording import copy_aligned, ensure_aligned
 from mivol.machine import available_memory
 from mivol.photos.camera import Camera
 from mivol.points import Gaussians
@@ -154,7 +154,7 @@ class Splatter:
         """
         check_one_thread()
         shapes = _checked_shapes(reals, self.degree)
-        cloud = Cloud(*[kept_aligned(dr.detach(reals[name].array)) for name in NAMES])
+        cloud = Cloud(*[ensure_aligned(dr.detach(reals[name].array)) for name in NAMES])
         view = pack_view(camera, self.size)
         n = shapes["means"][0]
         if n == 0:
@@ -249,8 +249,8 @@ class Splatter:
         np.cumsum(counts[order], out=offsets[1:])
         if len(order):
             target = dr.opaque(mi.Int32, 0, int(offsets[-1]))
-            begins = aligned(offsets[:-1].astype(np.uint32))
-            tiles = self._write(shape, mi.UInt32(aligned(order)), mi.UInt32(begins), target, self._grid)
+            begins = copy_aligned(offsets[:-1].astype(np.uint32))
+            tiles = self._write(shape, mi.UInt32(copy_aligned(order)), mi.UInt32(begins), target, self._grid)
             made = list_tiles(np.array(tiles), order, offsets, self.n_tiles)
         else:
             made = TileLists(np.zeros(0, np.uint32), np.zeros(self.n_tiles + 1, np.uint32))
@@ -259,7 +259,7 @@ class Splatter:
         np.cumsum(-(-lengths.astype(np.int64) // CHUNK), out=chunks[1:])
         tiles = np.argsort(-lengths.astype(np.int64), kind="stable").astype(np.uint32)
         entries = made.entries if len(made.entries) else np.zeros(1, np.uint32)
-        return Lists(*[mi.UInt32(aligned(a)) for a in (entries, made.starts, chunks, tiles)])
+        return Lists(*[mi.UInt32(copy_aligned(a)) for a in (entries, made.starts, chunks, tiles)])
 
     def _check_room(self, counts: np.ndarray) -> None:
         total = int(counts.sum(dtype=np.int64))

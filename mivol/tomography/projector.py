@@ -20,8 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.device_arrays import aligned
 from mivol.errors import MivolError
+from mivol.kernel_recording import copy_aligned
 from mivol.threads import check_one_thread, owner_waits
 from mivol.tomography.geometry import Geometry, VoxelGrid, view_index
 from mivol.tomography.recorded_kernels import RecordedKernels
@@ -219,11 +219,11 @@ class Projector:
 
     def _project_array(self, x: np.ndarray) -> np.ndarray:
         """``A x``, flat."""
-        return np.array(self._project(mi.Float(aligned(x))))
+        return np.array(self._project(mi.Float(copy_aligned(x))))
 
     def _backproject_array(self, y: np.ndarray) -> np.ndarray:
         """``A^T y``, flat."""
-        return np.array(self._backproject(mi.Float(aligned(y))))
+        return np.array(self._backproject(mi.Float(copy_aligned(y))))
 
     # -- Passes over the rays ---------------------------------------------------------------------------------------------
 
@@ -300,8 +300,8 @@ class Projector:
             order = order_rays(len(views), *self.projection_shape[1:]) if self._is_ordered else np.arange(len(o))
             for start in range(0, len(o), budget):
                 part = order[start : start + budget]
-                origin, direction = ([mi.Float(aligned(c)) for c in a[part].T] for a in (o, d))
-                numbers = mi.UInt32(aligned((first * per_view + part).astype(np.uint32)))
+                origin, direction = ([mi.Float(copy_aligned(c)) for c in a[part].T] for a in (o, d))
+                numbers = mi.UInt32(copy_aligned((first * per_view + part).astype(np.uint32)))
                 yield RayPass(numbers, mi.Point3f(*origin), mi.Vector3f(*direction), self._is_ordered)
 
     @property

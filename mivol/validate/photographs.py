@@ -16,8 +16,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.photos.transforms import write_transforms
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
-from mivol.scene.photographs import camera_of
-from mivol.scene.sensors import find_sensor
+from mivol.scene.sensors import camera_of, find_sensor
 from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult
 

@@ -22,9 +22,8 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.interrupt import InterruptGuard
-from mivol.scene.content_hash import content_hash
+from mivol.scene.description import check_variant, content_hash
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
-from mivol.scene.parsing import check_variant
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.transport.media.medium_view import traverse_medium
 from mivol.validate.moments import Moments

@@ -22,8 +22,8 @@ from mivol.files.mesh import Mesh, write_mesh
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera_path import aim_camera
 from mivol.photos.transforms import write_transforms
-from mivol.scene.content_hash import content_hash
-from mivol.scene.photographs import sensor_of
+from mivol.scene.description import content_hash
+from mivol.scene.sensors import sensor_of
 
 import mitsuba as mi
 import numpy as np

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scattering_scenes import close_up, smoke
 
-from mivol.scene.build import build_media
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
+from mivol.scene.plan import build_media, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
 from scenes import sky

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from radiance_rays import CUBE, TO_WORLD, aim, derive, make, rays_of, see
 
-from mivol.device_arrays import ALIGNMENT
 from mivol.fields.spherical_grid import SphericalGrid
+from mivol.kernel_recording import ALIGNMENT
 from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
 from mivol.transport.line_integrals.radiance_source import Exact, make_exact
 from mivol.transport.traversal.occupied_cells import OccupiedCells

@@ -9,9 +9,8 @@ import pytest
 from scattering_scenes import PLACE, close_up, point, smoke
 from scipy.interpolate import RegularGridInterpolator
 
-from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
+from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.single_scattering import control_variates
 from mivol.transport.estimators.single_scattering.control_variates import (

@@ -14,7 +14,8 @@ from scipy import stats
 
 from mivol.experiments.script import explain
 from mivol.scene import depth_two
-from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, mean_cosine, scattering_depth
+from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, scattering_depth
+from mivol.scene.needs import mean_cosine
 from mivol.transport.media.medium_view import view_medium
 from mivol.transport.traversal.box import Box
 from mivol.validate.moments import Moments

@@ -32,7 +32,7 @@ def table_of(scene: mi.Scene) -> EmissionTable:
     needs = find_needs(scene, scene.sensors()[0])
     bodies = [Body(view, boundary.box) for boundary, view in zip(needs.boundaries, needs.views, strict=True)]
     media = SceneMedia(scene, bodies, has_surfaces=False)
-    return tabulate_emission(find_emitting_boxes(scene, media, needs), media.channels)
+    return tabulate_emission(find_emitting_boxes(media, needs.boundaries), media.channels)
 
 
 def numbers(n: int, count: int, seed: int) -> list[mi.Float]:

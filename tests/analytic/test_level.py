@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scattering_scenes import PLACE
 
-from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
+from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.flights.flight_derivatives import Baseline
 from mivol.transport.path.derivatives import prepare_derivatives

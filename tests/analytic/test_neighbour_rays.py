@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from radiance_rays import CUBE, TO_WORLD, aim, make, rays_of
 
-from mivol.device_arrays import ALIGNMENT
 from mivol.fields.spherical_grid import SphericalGrid
+from mivol.kernel_recording import ALIGNMENT
 from mivol.transport.line_integrals.radiance_field import (
     RayBundle,
     RayGradient,

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scattering_scenes import aimed, pencils, smoke, sun
 
-from mivol.scene.build import build_media
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
+from mivol.scene.plan import build_media, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
 from mivol.transport.estimators.single_scattering.shadow_tables import (

@@ -9,9 +9,8 @@ import pytest
 from scattering_scenes import close_up, mivol, rough_grid, smoke, sun
 
 from mivol.experiments.script import explain
-from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
+from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.single_scattering.shadow_tables import (
     TransmittanceGrid,

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from mivol.scene import choices
-from mivol.scene.facts import MediumFacts
+from mivol.scene.needs import MediumFacts
 from mivol.transport.path.estimators import Settings
 
 LIT = Settings(max_depth=2)

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.scene.content_hash import content_hash
+from mivol.scene.description import NO_TEXT, content_hash, reason_of
 from mivol.scene.load import load_scene
-from mivol.scene.parsing import NO_TEXT, reason_of
 from mivol.threads import run_child
 
 INCLUDED = """<scene version="3.0.0">

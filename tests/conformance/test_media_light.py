@@ -11,10 +11,10 @@ from media_light_scenes import PLACE, SCENES, burning, drawn, floor, met, seen, 
 from scattering_scenes import assert_same_whole, close_up, moments, pencils, volpath
 
 from mivol.experiments.script import explain
-from mivol.scene.draw_preview import gain_of_draws, measure_draws
 from mivol.scene.media_light import COST
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
+from mivol.scene.previews import gain_of_draws, measure_draws
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
 from scenes import ball_of, box_of, centred, medium, refused, render, skip_recorded_grids_on_a_gpu, sky, tensor

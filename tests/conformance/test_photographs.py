@@ -11,7 +11,7 @@ from photo_sets import look_at, ring
 
 from mivol.errors import MivolError
 from mivol.photos import Camera, Lens, intrinsics, load_photos, project, rays
-from mivol.scene.photographs import camera_of, sensor_of
+from mivol.scene.sensors import camera_of, sensor_of
 from mivol.validate.photographs import photograph
 
 EPS = float(np.finfo(np.float32).eps)

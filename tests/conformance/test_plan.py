@@ -9,7 +9,7 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.scene import plan
-from mivol.scene.facts import MediumFacts
+from mivol.scene.needs import MediumFacts
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path.estimators import Settings
 

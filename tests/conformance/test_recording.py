@@ -10,8 +10,8 @@ import pytest
 from scattering_scenes import close_up, mivol, rough_grid, smoke
 
 import scenes
+from mivol.kernel_recording import without_garbage_collection
 from mivol.scene import session
-from mivol.scene.recording import without_collections
 
 KEY = "smoke.interior_medium.sigma_t.data"
 
@@ -19,13 +19,13 @@ KEY = "smoke.interior_medium.sigma_t.data"
 def test_collections_are_put_off_for_a_while() -> None:
     """After an error too; and they stay off where they were."""
     assert gc.isenabled()
-    with pytest.raises(ZeroDivisionError), without_collections():
+    with pytest.raises(ZeroDivisionError), without_garbage_collection():
         assert not gc.isenabled()
         raise ZeroDivisionError
     assert gc.isenabled()
     gc.disable()
     try:
-        with without_collections():
+        with without_garbage_collection():
             pass
         assert not gc.isenabled()
     finally:

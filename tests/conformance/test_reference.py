@@ -27,7 +27,7 @@ from scipy import stats
 
 from mivol.errors import MivolError
 from mivol.files.image_files import read_exr, write_exr
-from mivol.scene.cameras import Ring
+from mivol.scene.camera_rigs import Ring
 from mivol.validate import reference
 from mivol.validate.compare import compare
 from mivol.validate.moments import Moments

@@ -9,9 +9,8 @@ from false_alarms import assert_precise, assert_same_mean, over_pixels
 from scattering_scenes import moments
 
 import scenes
-from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
+from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.walk import LONG_PATH

@@ -26,7 +26,7 @@ from mivol.photos.lens import Fisheye, Panorama
 from mivol.photos.region import count_views, find_focus, silhouette_box
 from mivol.photos.transforms import write_transforms as write_cameras
 from mivol.report.cameras import outline
-from mivol.scene.photographs import sensor_of
+from mivol.scene.sensors import sensor_of
 from mivol.splatting.projection import pack_view
 
 LENS = Fisheye(-0.01, 0.0005, 0.00002, 0.000001)

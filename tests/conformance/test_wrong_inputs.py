@@ -25,10 +25,10 @@ from mivol.phase.measured import NAMES, named_medium
 from mivol.phase.table import Table
 from mivol.photos import Camera
 from mivol.photos.camera import PIXELS_LOST
-from mivol.scene.cameras import Ring, rig_from
-from mivol.scene.parsing import parse_dict, parse_file
-from mivol.scene.photographs import sensor_of
+from mivol.scene.camera_rigs import Ring, rig_from
+from mivol.scene.description import parse_dict, parse_file
 from mivol.scene.refusals import refuse_quadrature
+from mivol.scene.sensors import sensor_of
 from mivol.transport.path.estimators import Settings
 from mivol.validate.images import judge
 from mivol.validate.reference_file import check_identity

@@ -13,7 +13,7 @@ from tiny_experiment import SCENE, write_experiment
 
 from mivol.experiments import camera_pictures
 from mivol.photos import PhotoSurvey, survey_photos
-from mivol.scene.cameras import find_box
+from mivol.scene.camera_rigs import find_box
 
 
 @pytest.fixture

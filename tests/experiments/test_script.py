@@ -21,7 +21,7 @@ from mivol.files import encode_srgb, read_exr, write_exr
 from mivol.optim.losses import L2
 from mivol.photos.camera import Camera
 from mivol.photos.transforms import write_transforms
-from mivol.scene.photographs import sensor_of
+from mivol.scene.sensors import sensor_of
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "docs" / "scripts"
 

@@ -201,8 +201,8 @@ def test_gradient_where_prbvolpath_has_none():
 
 def test_replay_counts_down_to_zero():
     """The adjoint passes all the light by that the render found: what is left is rounding."""
-    from mivol.scene.build import build_estimators
     from mivol.scene.needs import find_needs
+    from mivol.scene.plan import build_estimators
     from mivol.scene.survey import survey_scene
     from mivol.transport.estimators.scores import Primal, Replay
     from mivol.transport.path.estimators import Settings

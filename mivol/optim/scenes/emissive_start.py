@@ -39,7 +39,7 @@ from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 from mivol.photos import Photo
-from mivol.scene.photographs import camera_of
+from mivol.scene.sensors import camera_of
 
 __all__ = ["FACTORS", "EmissiveStart", "average_density", "find_emissive_start", "fit_emission", "to_photographs"]
 

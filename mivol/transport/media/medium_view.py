@@ -20,6 +20,7 @@ from mivol.errors import MivolError
 from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.protocol import BOUNDED, Field
 from mivol.fields.spherical_grid import SphericalGrid
+from mivol.kernel_recording import is_recording
 from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, Extinction
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
@@ -169,7 +170,7 @@ def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
         return None
     flat = dr.ravel(next(v for k, v in mi.traverse(phase) if k.startswith("S.")))
     rows = [dr.gather(mi.Float, flat, mi.UInt32(c)) for c in range(6)]
-    if not dr.flag(dr.JitFlag.FreezingScope):
+    if not is_recording():
         host = np.array(dr.detach(flat)).reshape(-1, 6)
         if not (host == host[0]).all():
             raise MivolError(
@@ -276,7 +277,7 @@ def _field_part(
         raise MivolError(
             f"{name} is a {type(field).__name__} that declares {field.line!r}; media read {BOUNDED!r} fields and Gaussians."
         )
-    if dr.flag(dr.JitFlag.FreezingScope):
+    if is_recording():
         what = "whose cells cannot be listed" if has_lists else "whose majorant cannot be read"
         raise MivolError(f"{name} is a {type(field).__name__}, {what} while dr.freeze records: render without it.")
     if has_lists:

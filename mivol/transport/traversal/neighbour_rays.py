@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.device_arrays import aligned
+from mivol.kernel_recording import copy_aligned
 from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.occupied_cells import OccupiedCells
 
@@ -65,7 +65,7 @@ class RayOrder:
         back = np.empty_like(places)
         back[places] = np.arange(count, dtype=np.uint32)
         # Dr.Jit compiles a kernel for arrays at aligned addresses, and another for others.
-        return cls(*(mi.UInt32(aligned(a)) for a in (places, back)))
+        return cls(*(mi.UInt32(copy_aligned(a)) for a in (places, back)))
 
 
 def _key(cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> mi.UInt32:

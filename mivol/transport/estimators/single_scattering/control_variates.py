@@ -25,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.kernel_recording import is_recording
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, DirectSample
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER, EventSamples
 from mivol.transport.estimators.lighting.vertex import MediumVertex
@@ -221,7 +222,7 @@ def _limit_near_light(sample: DirectSample, apart: float) -> mi.Spectrum:
 
 def _merge_equal(rows: list[mi.Float]) -> list[mi.Float]:
     """One channel where all are the same; a recording by ``dr.freeze`` cannot read the values, and keeps all channels."""
-    if dr.flag(dr.JitFlag.FreezingScope) or any(dr.any(row != rows[0]) for row in rows[1:]):
+    if is_recording() or any(dr.any(row != rows[0]) for row in rows[1:]):
         return rows
     return rows[:1]
 

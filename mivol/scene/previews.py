@@ -21,15 +21,25 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mivol.scene.build import build_estimators
-from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
+from mivol.kernel_recording import without_garbage_collection
+from mivol.scene.media_light import COST
+from mivol.scene.needs import Needs, find_needs
+from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.walk import walk_path
 
-__all__ = ["DEPTHS", "NOISE", "DepthAnswer", "LeftOut", "leaves_out", "measure_depths"]
+__all__ = [
+    "DEPTHS",
+    "NOISE",
+    "DepthAnswer",
+    "LeftOut",
+    "leaves_out",
+    "measure_depths",
+    "gain_of_draws",
+    "measure_draws",
+]
 
 DEPTHS = (2, 3, 6, -1)
 """Depths that are compared; the last one, which has no limit, judges the others."""
@@ -37,10 +47,10 @@ DEPTHS = (2, 3, 6, -1)
 NOISE = 0.02
 """Noise of a pixel over the mean radiance, where none is asked for."""
 
-SIDE, BATCHES, SAMPLES = 32, 8, 16
+DEPTH_SIDE, DEPTH_BATCHES, DEPTH_SAMPLES = 32, 8, 16
 """Cells along an edge of the preview, batches, and samples of a cell in each."""
 
-SEED = 0xDE97
+DEPTH_SEED = 0xDE97
 """Of all depths: what their paths share cancels in the differences."""
 
 
@@ -104,7 +114,7 @@ def measure_depths(scene: mi.Scene, sensor: mi.Sensor, settings: Settings, noise
     """
     with dr.suspend_grad():
         survey = survey_scene(scene)
-        seen = [_preview(scene, sensor, survey, replace(settings, max_depth=depth)) for depth in DEPTHS]
+        seen = [_render_depth_preview(scene, sensor, survey, replace(settings, max_depth=depth)) for depth in DEPTHS]
     return DepthAnswer(tuple(leaves_out(depth, some, seen[-1]) for depth, some in zip(DEPTHS, seen[:-1], strict=False)), noise)
 
 
@@ -127,20 +137,71 @@ def _mean_square(lost: NDArray) -> float:
     return float(np.mean(np.square(lost.sum(axis=0)) - np.square(lost).sum(axis=0)) / (count * (count - 1)))
 
 
-def _preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey, settings: Settings) -> NDArray:
+def _render_depth_preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey, settings: Settings) -> NDArray:
     """Mean radiance of all colours of each cell (batches, cells)."""
-    cells = SIDE * SIDE
-    needs = find_needs(scene, sensor, survey, cells * BATCHES * SAMPLES, settings.may_draw_emission)
+    cells = DEPTH_SIDE * DEPTH_SIDE
+    needs = find_needs(scene, sensor, survey, cells * DEPTH_BATCHES * DEPTH_SAMPLES, settings.may_draw_emission)
     plan = make_plan(needs, settings)
     estimators = build_estimators(scene, needs, plan, settings, survey, pictures=True)
-    n = BATCHES * cells * SAMPLES
+    n = DEPTH_BATCHES * cells * DEPTH_SAMPLES
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(SEED, n)
-    cell = dr.arange(mi.UInt32, n) // SAMPLES % cells
-    place = (mi.Vector2f(cell % SIDE, cell // SIDE) + sampler.next_2d()) / SIDE
+    sampler.seed(DEPTH_SEED, n)
+    cell = dr.arange(mi.UInt32, n) // DEPTH_SAMPLES % cells
+    place = (mi.Vector2f(cell % DEPTH_SIDE, cell // DEPTH_SIDE) + sampler.next_2d()) / DEPTH_SIDE
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
     time = mi.Float(sensor.shutter_open())
     ray, weight = sensor.sample_ray_differential(time, mi.Float(0), mi.Point2f(place), aperture)
     score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
     seen = np.array(score.L * weight, np.float64).reshape(-1, n).mean(axis=0)
-    return seen.reshape(BATCHES, cells, SAMPLES).mean(axis=2)
+    return seen.reshape(DEPTH_BATCHES, cells, DEPTH_SAMPLES).mean(axis=2)
+
+
+DRAW_SIDE, DRAW_SAMPLES, DRAW_SEED = 24, 48, 0xD3A4
+"""Cells along an edge of the preview, samples of each, seed."""
+
+
+def measure_draws(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
+    """The needs of a scene with the gain of draws as it is measured, where it is predicted to be above 1.
+
+    Args:
+        scene, sensor: what is seen.
+        needs: of the scene.
+        survey: keeps what was measured; where a fit changes the scene, what is made of this stays unbiased.
+        settings: of the integrator.
+
+    Cost: 2 x 27648 paths once, and two kernels.
+    """
+    light = needs.media_light
+    if light is None or light.gain <= 1 or settings.media_light != "auto":
+        return needs
+    if survey.gain_of_draws is None:
+        with without_garbage_collection(), dr.suspend_grad():
+            met, drawn = (
+                _render_draw_preview(scene, sensor, needs, survey, replace(settings, media_light=m)) for m in ("met", "drawn")
+            )
+        survey.gain_of_draws = gain_of_draws(met, drawn)
+    return replace(needs, media_light=replace(light, gain=survey.gain_of_draws))
+
+
+def gain_of_draws(met: NDArray, drawn: NDArray) -> float:
+    """How much sooner draws reach an error than chance does [1], from samples (cells, n) of both; 0 where all is black."""
+    n = met.shape[1]
+    missed = n * np.square(met.mean(axis=1) - drawn.mean(axis=1))
+    noise = np.maximum(met.var(axis=1, ddof=1), missed)
+    rest = COST * drawn.var(axis=1, ddof=1)
+    lit = (noise > 0) | (rest > 0)
+    with np.errstate(divide="ignore"):
+        return float(np.median(noise[lit] / rest[lit])) if lit.any() else 0.0
+
+
+def _render_draw_preview(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> NDArray:
+    """Mean radiance of all colours of each sample (cells, DRAW_SAMPLES), along the middle of each cell."""
+    cells, n = DRAW_SIDE * DRAW_SIDE, DRAW_SIDE * DRAW_SIDE * DRAW_SAMPLES
+    estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, pictures=True)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(DRAW_SEED, n)
+    cell = dr.arange(mi.UInt32, n) // DRAW_SAMPLES
+    place = (mi.Point2f(cell % DRAW_SIDE, cell // DRAW_SIDE) + 0.5) / DRAW_SIDE
+    ray, weight = sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))
+    score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
+    return np.array(score.L * weight, np.float64).reshape(-1, n).mean(axis=0).reshape(cells, DRAW_SAMPLES)

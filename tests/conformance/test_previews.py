@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.experiments.script import explain
-from mivol.scene.depth_preview import DEPTHS, DepthAnswer, LeftOut, leaves_out, measure_depths
+from mivol.scene.previews import DEPTHS, DepthAnswer, LeftOut, leaves_out, measure_depths
 from mivol.transport.path.estimators import Settings
 from scenes import box_of, camera, centred, medium, sky
 
