@@ -146,7 +146,7 @@ def test_sorted_rays_keep_their_pinholes(sorts: None, monkeypatch: pytest.Monkey
     source = bake(field, find_occupied_cells(field), np.float64([[0, 0, 5], [5, 0, 0]]), view)
     plain = numbers(render_rays(find_occupied_cells(field), source, make_model(field), rays))
     monkeypatch.setattr(neighbour_rays, "FEWEST", 1)
-    monkeypatch.setattr(Baked, "gains_by_order", True)
+    monkeypatch.setattr(Baked, "gains_by_sorting", True)
     seen = render_rays(find_occupied_cells(field), source, make_model(field), rays)
     assert seen.order is not None
     for a, b in zip(numbers(seen), plain, strict=True):

@@ -55,7 +55,7 @@ class Source(Protocol):
     What a ray carries from cell to cell is any PyTree, and belongs to the source: a ray starts with that of :meth:`start`.
 
     Attributes:
-        gains_by_order: whether reads take so long that rays are worth sorting.
+        gains_by_sorting: whether reads take so long that rays are worth sorting.
     """
 
     gains_by_sorting: ClassVar[bool]

@@ -1,1 +1,1 @@
-"""Participating media: coefficients at a point, extinction along a ray, and the order of media along it."""
+"""Participating media: extinction along rays and at points, and the order of media along a ray."""

@@ -1,9 +1,9 @@
-r"""One medium in its boundary: its extinction at a point and over an interval of a ray, with jvp and vjp.
+r"""One medium in its boundary: its coefficients at a point and its extinction over an interval of a ray, with jvp and vjp.
 
 .. math:: \sigma_t(x, \omega) = s\,A(\omega) \sum_k f_k(x), \qquad A(\omega) = \sqrt{\omega^T S\, \omega}
 
-with the medium's scale s, its parts f_k (:mod:`mivol.transport.media.extinction`) and the projected area A of microflakes of
-the matrix S; A = 1 without microflakes. Each method computes the sum over the parts and multiplies it with s and A.
+with the scale s of the medium, its parts f_k (:mod:`mivol.transport.media.extinction`) and the projected area A of microflakes
+of the matrix S; A = 1 without microflakes. Each method sums over the parts and multiplies the sum with s and A.
 
 References: Heitz et al. 2015, Eq. 6 (the projected area).
 """
@@ -38,14 +38,14 @@ class Body:
     """One medium in its boundary.
 
     Attributes:
-        view: the medium's extinction.
-        box: the boundary, where it is a box; None where it has to be traced.
-        edge: mean length of an edge of the box [length], as an opaque array; None without one.
-        exact_parts: the parts whose integral along a ray is known.
-        flight_parts: the parts that free flights are drawn from in one walk: constants, and grids that share their cells.
-        estimates_shadows: whether shadow rays through grids whose block ranges are known are estimated, and not exact.
-        hole: a box in which the medium is not: a level of a nested field has one. None without.
-        cuts_grids: whether the boundary is smaller than what lies in it, so that intervals must be cut to it.
+        view: extinction of the medium.
+        box: the boundary, if the boundary is a box; None for a traced boundary.
+        edge: mean length of an edge of the box [length], as an opaque array; None without a box.
+        exact_parts: the parts with a known integral along a ray.
+        flight_parts: the parts from which a single walk draws free flights: constants, and grids that share their cells.
+        estimates_shadows: whether shadow rays through grids with known block ranges are estimated instead of exact.
+        hole: a box without the medium, in a level of a nested field; None without a hole.
+        cuts_grids: whether the boundary is smaller than its content, so intervals must be clipped to the boundary.
     """
 
     def __init__(self, view: MediumView, box: Box | None, estimates_shadows: bool = False, hole: Box | None = None) -> None:
@@ -65,11 +65,11 @@ class Body:
 
     @property
     def is_bounded(self) -> bool:
-        """Whether the integral of some part along a ray is not known."""
+        """Whether some part has no known integral along a ray."""
         return len(self.exact_parts) < len(self.view.parts)
 
     def area(self, d: mi.Vector3f) -> mi.Float | float:
-        """A(d) [1], the factor on the extinction for light that travels along the unit vector ``d``; 1 without microflakes."""
+        """A(d) [1], the factor on the extinction for light along the unit vector ``d``; 1 without microflakes."""
         if self.view.microflakes is None:
             return 1.0
         return dr.safe_sqrt(dr.dot(d, self.apply_microflakes(d)))
@@ -80,7 +80,7 @@ class Body:
         return mi.Vector3f(xx * d.x + xy * d.y + xz * d.z, xy * d.x + yy * d.y + yz * d.z, xz * d.x + yz * d.y + zz * d.z)
 
     def _area_slopes(self, d: mi.Vector3f) -> list[mi.Float]:
-        """d log A / d S_k for the six entries (xx, yy, zz, xy, xz, yz); 0 where A is 0. Extinction is proportional to A."""
+        """d log A / d S_k for the six entries (xx, yy, zz, xy, xz, yz); 0 for A = 0. Extinction is proportional to A."""
         square = dr.dot(d, self.apply_microflakes(d))
         half = dr.select(square > 0, 0.5 * dr.rcp(dr.select(square > 0, square, 1)), 0)
         twice = 2 * half
@@ -97,7 +97,7 @@ class Body:
         return sum((s * t for s, t in zip(self._area_slopes(d), self.microflakes_tangent, strict=True)), mi.Float(0))
 
     def extinction(self, ray: Ray, parts: list[ExactExtinction] | None = None) -> SummedExtinction:
-        """The sum of ``parts`` (None: all), whose grids share their cells, along a ray; without derivatives."""
+        """The sum along a ray of ``parts`` (by default all parts), whose grids share their cells; without derivatives."""
         parts = self.view.parts if parts is None else parts
         return SummedExtinction(parts, [dr.detach(p.values) for p in parts], dr.detach(self.view.scale) * self.area(ray.d))
 
@@ -111,16 +111,16 @@ class Body:
         """Optical depth [1] of each channel over an interval.
 
         Args:
-            interval: of a ray.
-            channels: of the scene, 1 or 3.
-            parts: of the medium; None for all of them.
-            enough: a walk of a grid may stop where the grid's own optical depth exceeds this in every channel.
+            interval: interval of a ray.
+            channels: channels of the scene, 1 or 3.
+            parts: parts of the medium; by default all parts.
+            enough: number at which the walk of a grid may stop, once the optical depth of the grid exceeds it in every channel.
 
         Returns:
             ``channels`` numbers a lane, without derivatives.
 
         Raises:
-            MivolError: of all parts, and one of them is bounded.
+            MivolError: the default parts include a bounded part.
         """
         if parts is None and self.is_bounded:
             raise MivolError("the optical depth of a bounded field was asked for; only its transmittance can be estimated.")
@@ -133,7 +133,7 @@ class Body:
         return [scale * tau for tau in total]
 
     def jvp_optical_depth(self, interval: RayInterval, channels: int) -> list[mi.Float]:
-        """Derivative of the optical depth of the exact parts along the tangent that :meth:`SceneMedia.start_tangent` took."""
+        """Tangent of the optical depth of the exact parts, from the tangents of :meth:`SceneMedia.start_tangent`."""
         pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.exact_line]
         area = self.area(interval.ray.d)
         total = [mi.Float(0) for _ in range(channels)]
@@ -156,7 +156,7 @@ class Body:
                 part.vjp(gradient, to_part_channels(weight, part.channels), interval)
 
     def jvp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
-        """Tangent of one part's coefficient [1/length] at a point of a ray."""
+        """Tangent of the coefficient [1/length] of a part at a point of a ray."""
         change = next(v for p, v in zip(self.view.parts, self.tangents, strict=True) if p is part)
         return to_scene_channels(part.jvp_at(change, ray, t, active), channels)
 
@@ -166,7 +166,9 @@ class Body:
         part.vjp_at(gradient, to_part_channels(weight, part.channels), ray, t, active)
 
     def extinction_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
-        """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of those called ``name``."""
+        """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of the parts whose name starts with
+        ``name``.
+        """
         total = [mi.Float(0) for _ in range(channels)]
         for part in self.view.parts:
             if part.name.startswith(name):
@@ -174,7 +176,7 @@ class Body:
         return [self.area(ray.d) * row for row in total]
 
     def jvp_extinction_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
-        """As :meth:`extinction_at`, of the tangent that :meth:`SceneMedia.start_tangent` took from the parameters."""
+        """Tangent of :meth:`extinction_at`, from the tangents of :meth:`SceneMedia.start_tangent`."""
         total = [mi.Float(0) for _ in range(channels)]
         for part, change in zip(self.view.parts, self.tangents, strict=True):
             if part.name.startswith(name):
@@ -195,13 +197,13 @@ class Body:
                 part.vjp_at(gradient, to_part_channels(weight, part.channels), ray, t, active)
 
     def add_to_grid(self, part: ExactExtinction, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
-        """Add to the gradient of a grid, in one packet for each channel, at the cell behind a node.
+        """Add to the gradient of a grid, in a packet for each channel, at the cell behind a node.
 
         Args:
             part: the grid.
             lower: lower node of the cell.
-            terms: (d loss of each channel of the scene, 8 weights of the corners) pairs.
-            active: lanes that add.
+            terms: pairs (d loss of each channel of the scene, 8 weights of the corners).
+            active: lanes to add.
         """
         gradient = next(g for p, g in zip(self.view.parts, self.gradients, strict=True) if p is part)
         add_to_cell(gradient, lower, [(to_part_channels(weight, part.channels), corners) for weight, corners in terms], active)
@@ -215,13 +217,13 @@ class Body:
 
 
 def is_followed(microflakes: list[mi.Float] | None) -> bool:
-    """Whether a derivative of the microflakes is asked for."""
+    """Whether derivatives of the microflakes are enabled."""
     with dr.resume_grad():
         return microflakes is not None and dr.grad_enabled(microflakes)
 
 
 def flight_parts(parts: list[Extinction]) -> list[ExactExtinction]:
-    """The parts that one walk of cells can sum: constants, and grids that share the cells of ``sigma_s`` (or the first)."""
+    """The parts for a single walk of cells: constants, and grids with the cells of ``sigma_s`` (or of the first grid)."""
     grids = [p for p in parts if p.lattice is not None]
     lead = next((p for p in grids if p.name == "sigma_s"), grids[0] if grids else None)
     return [p for p in parts if p.is_constant or (p.lattice is not None and have_same_cells(p.lattice, lead.lattice))]
@@ -232,14 +234,14 @@ def _add(a: list[mi.Float], b: list[mi.Float]) -> list[mi.Float]:
 
 
 def _fits(part: Extinction, box: Box) -> bool:
-    """Whether a grid lies inside its boundary, to the rounding of the boundary's float32 vertices."""
+    """Whether a grid lies inside its boundary, up to the rounding of the float32 vertices of the boundary."""
     if part.lattice is None:
         return False
     return box.contains(part.lattice.to_world, 1e-6)
 
 
 def medium_interaction(ray: Ray, t: mi.Float | mi.Float64, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
-    """A point of a ray as Mitsuba evaluates volumes and phase functions at it, found in float64 and rounded once."""
+    """A point of a ray for Mitsuba's volumes and phase functions, found in float64 and rounded once."""
     mei = dr.zeros(mi.MediumInteraction3f, dr.width(ray))
     mei.t, mei.p, mei.wi = mi.Float(t), mi.Point3f(point_along(ray, t)), -ray.d
     mei.sh_frame = mi.Frame3f(mei.wi)
@@ -256,9 +258,10 @@ def eval_albedo(body: Body, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spec
 
 
 def eval_emission(body: Body, ray: Ray, t: mi.Float64, channels: int, on: mi.Bool) -> mi.Spectrum:
-    """The light that a body emits at a point of a ray towards its origin [radiance/length].
+    """The light emitted by a body at a point of a ray towards the origin of the ray [radiance/length].
 
-    It carries the derivatives of the emission and of the albedo; those of the extinction are :func:`emission_slope`.
+    The result carries the derivatives of the emission and of the albedo; :func:`emission_slope` has the derivatives of the
+    extinction.
     """
     total = mi.Spectrum(0)
     if body.view.emission is not None:
@@ -270,7 +273,9 @@ def eval_emission(body: Body, ray: Ray, t: mi.Float64, channels: int, on: mi.Boo
 
 
 def emission_slope(body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
-    """The coefficient that the ``emission`` of a body goes with, and the derivative of the emitted light by it [radiance]."""
+    """The name of the coefficient proportional to the ``emission`` of a body, and the derivative of the light by it
+    [radiance].
+    """
     Le = _at(body, body.view.emission, ray, t, on)
     if body.view.albedo is None:
         return "sigma_a", Le

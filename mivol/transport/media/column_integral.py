@@ -1,7 +1,16 @@
-r"""Exact line integrals of a grid, and their transpose, for rays that seldom cross one of its axes.
+"""Exact line integrals of a grid, and their transpose, for rays that seldom cross one of its axes.
 
-They are those of :mod:`mivol.transport.media.grid_integral` to rounding, for one channel and no empty blocks, by the shorter
-walk of :mod:`mivol.transport.media.column_integral`. Two Gauss points a cell integrate the cubic exactly.
+Rays of a scanner are such rays: the rows of the detector lie across the axis. A cell is four columns of two nodes along the
+axis. A ray moves between columns where it crosses another axis. Where it crosses a layer of the axis, and after every PIECE
+voxels, it starts afresh from its place in float64. The loop over cells then has two planes to look for, two columns to change
+and no compensated sums: half the instructions of the general walk (:mod:`mivol.transport.traversal.grid_walk`). The integrals
+are those of :mod:`mivol.transport.media.grid_integral` to rounding, for one channel and no empty blocks.
+
+Conventions. Axes are numbered x, y, z. The nodes are padded by one on each side with the values of the outermost nodes, so no
+index is clamped. Cells are those of :mod:`mivol.transport.traversal.lattice`. Columns of a cell are numbered near (0) or far
+(1) along the ray in the first and the second other axis, bits 0 and 1.
+
+References: Amanatides & Woo 1987 (the traversal).
 """
 
 from __future__ import annotations
@@ -35,7 +44,7 @@ Columns = tuple[list, list]
 
 
 def pad_nodes(values: mi.Float, grid: ColumnGrid) -> mi.Float:
-    """Node values (flat, Z Y X) with a margin of one, where the outermost values go on."""
+    """Pad node values (flat, Z Y X) by a margin of one, which repeats the outermost values."""
     z, y, x = grid.padded
     node = dr.arange(mi.UInt32, z * y * x)
     place = (node % x, (node // x) % y, node // (x * y))
@@ -47,9 +56,9 @@ def integrate_columns(grid: ColumnGrid, padded: mi.Float, line: Line) -> mi.Floa
     """Integrate along lines.
 
     Args:
-        grid: where the nodes are.
+        grid: place of the nodes.
         padded: node values of :func:`pad_nodes`.
-        line: from a ray, in the coordinates of the nodes.
+        line: lines in the coordinates of the nodes.
 
     Bias: none but rounding, |error| <= 2e-6 int (sigma + h |grad sigma|) dt, h the size of a voxel.
     Cost: 4 reads a cell.
@@ -83,17 +92,18 @@ def integrate_columns(grid: ColumnGrid, padded: mi.Float, line: Line) -> mi.Floa
 
 
 def zero_nodes(grid: ColumnGrid) -> mi.Float:
-    """What :func:`backproject_columns` adds to: foot and head of the column above each padded node, and a layer around them.
+    """The zero target of :func:`backproject_columns`: foot and head of the column above each padded node, and a layer around
+    them.
 
-    The layer is for columns ahead of a ray that has ended, to which nothing but zeros is added.
+    The layer is for columns ahead of a ray that has ended, to which only zeros are added.
     """
     return dr.zeros(mi.Float, 2 * (grid.size + 2 * _spare(grid)))
 
 
 def backproject_columns(grid: ColumnGrid, target: mi.Float, weight: mi.Float, line: Line) -> None:
-    """Add ``weight`` times the row of each line to ``target``, the transpose of :func:`integrate_columns`.
+    """Add ``weight`` times the row of each line to ``target``: the transpose of :func:`integrate_columns`.
 
-    A column's sums are kept while a ray is beside it, and written once: two pairs a cell.
+    The sums of a column are kept while a ray is beside the column, and written once: two pairs a cell.
     """
     spare = _spare(grid)
 
@@ -137,7 +147,7 @@ def backproject_columns(grid: ColumnGrid, target: mi.Float, weight: mi.Float, li
 
 
 def fold_nodes(target: mi.Float, grid: ColumnGrid) -> mi.Float:
-    """The sums at the nodes of the grid (flat, Z Y X); those of the margin are its outermost nodes'."""
+    """The sums at the nodes of the grid (flat, Z Y X); sums of the margin are added to the outermost nodes."""
     above = dr.arange(mi.UInt32, grid.size) + _spare(grid)
     nodes = dr.gather(mi.Float, target, 2 * above) + dr.gather(mi.Float, target, 2 * (above - grid.rise) + 1)
     inner, outer = 1, grid.size
@@ -169,7 +179,7 @@ def _interpolate(columns: Columns, point: list[mi.Float]) -> mi.Float:
 
 
 def _enter(old: list[mi.Float], through: mi.Bool, fresh: mi.Float, aside: mi.Float) -> list[mi.Float]:
-    """Numbers of the columns of the next cell: far ones become near ones, two are fresh."""
+    """Numbers of the columns of the next cell: far columns become near columns, two columns are new."""
     return [
         dr.select(through, old[1], old[2]),
         dr.select(through, fresh, old[3]),
@@ -179,7 +189,7 @@ def _enter(old: list[mi.Float], through: mi.Bool, fresh: mi.Float, aside: mi.Flo
 
 
 PIECE = 32.0
-"""Voxels along a ray's fastest axis between two fresh starts: float32 errs by 3e-8 of a cell in a step, by 1e-6 in 32."""
+"""Voxels along the fastest axis of a ray between two fresh starts: float32 errs by 3e-8 of a cell in a step, by 1e-6 in 32."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +198,7 @@ class ColumnGrid:
 
     Attributes:
         res: (Z, Y, X), without the margin.
-        along: axis of the columns; rays cross its layers seldom.
+        along: axis of the columns; rays seldom cross its layers.
     """
 
     res: tuple[int, int, int]
@@ -223,7 +233,7 @@ class ColumnGrid:
 
 
 class Line(NamedTuple):
-    """The part of a ray in a grid: from ``q`` along ``v`` for ``length``, in coordinates of the grid's nodes, float64."""
+    """The part of a ray in a grid: from ``q`` along ``v`` for ``length``, in coordinates of the nodes, float64."""
 
     q: list[mi.Float64]
     v: list[mi.Float64]
@@ -231,7 +241,7 @@ class Line(NamedTuple):
 
 
 class Corner(NamedTuple):
-    """Where the columns of a cell are: the flat node at the foot of column 0, and the steps to the columns 1 and 2."""
+    """Position of the columns of a cell: the flat node at the foot of column 0, and the steps to the columns 1 and 2."""
 
     base: mi.Int32
     first: mi.Int32
@@ -239,9 +249,9 @@ class Corner(NamedTuple):
 
 
 class ColumnCell(NamedTuple):
-    """What a visitor sees of a cell: where the ray enters and how far it goes, in fractions of the cell, and the length.
+    """A cell as a visitor sees it: entry and step of the ray as fractions of the cell, and the length in the cell.
 
-    Fractions across are from the near columns, those along the columns from their feet.
+    Fractions across are from the near columns; fractions along the columns are from their feet.
     """
 
     frac: tuple[mi.Float, mi.Float, mi.Float]
@@ -250,14 +260,14 @@ class ColumnCell(NamedTuple):
 
 
 class Hooks(NamedTuple):
-    """What is done on the way; ``columns`` is any PyTree, usually four numbers of each kind.
+    """Functions of a walk; ``columns`` is any PyTree, usually four numbers of each kind.
 
     Attributes:
-        open: ``open(corner, on) -> columns``, where a ray starts afresh.
+        open: ``open(corner, on) -> columns``, at a fresh start of a ray.
         visit: ``visit(state, columns, cell) -> (state, columns)``.
-        cross: ``cross(columns, corner, through, on) -> columns``: the cell at ``corner`` is left through its first axis where
-            ``through`` is true, else through the second.
-        close: ``close(state, columns, corner, on) -> state``, before a fresh start and in the end.
+        cross: ``cross(columns, corner, through, on) -> columns``: the ray leaves the cell at ``corner`` through its first axis
+            where ``through`` is true, else through the second axis.
+        close: ``close(state, columns, corner, on) -> state``, before a fresh start and at the end.
     """
 
     open: Callable[[Corner, mi.Bool], Any]
@@ -268,15 +278,15 @@ class Hooks(NamedTuple):
 
 @dr.syntax
 def walk_columns(grid: ColumnGrid, line: Line, hooks: Hooks, state: Any) -> Any:
-    """Visit the cells that a line crosses, in order, and return the last state.
+    """Visit the cells along a line, in order, and return the last state.
 
     Args:
-        grid: its strides are those of the nodes that the hooks read or write.
+        grid: its strides belong to the nodes of the hooks.
         line: inside the box, half a voxel around the outermost nodes.
-        hooks: called once, while the loops are traced.
+        hooks: called once, while Dr.Jit traces the loops.
         state: any PyTree of Dr.Jit arrays.
 
-    Cost: a step a cell, and a fresh start a layer that is crossed and PIECE voxels.
+    Cost: a step a cell, and a fresh start for each crossed layer and PIECE voxels.
     """
     # Objects that a loop's body names become part of its state: the body names arrays and functions only.
     begin, visit, cross, close = hooks
@@ -337,7 +347,7 @@ def _signed(up: mi.Bool, stride: int) -> mi.Int32:
 
 
 def _place_between(p: mi.Float64, up: mi.Bool, last: int, stride: int) -> tuple[mi.Float, mi.Int32]:
-    """The fraction of a cell from its near plane, and what that plane adds to the flat index of a padded node."""
+    """The fraction of a cell from its near plane, and the term of this plane in the flat index of a padded node."""
     lower = dr.clip(dr.floor(p), -1, last)
     frac = mi.Float(p - lower)
     return dr.select(up, frac, 1 - frac), (mi.Int32(lower) + dr.select(up, 1, 2)) * stride

@@ -1,10 +1,10 @@
-r"""One piece of a ray over what lies behind it: emission-absorption compositing from the far end, with tangent and transpose.
+r"""One piece of a ray over the pieces behind it: emission-absorption compositing from the far end, with tangent and transpose.
 
 .. math:: N \leftarrow N_i + T_i N
 
-Conventions. Rows are the sums that are followed: channels or colours; where tangents are asked for, their rows follow. A piece
-is a cell of a grid, a region of constant extinction, or a Gaussian; its N depends on a few numbers of its extinction (its
-points), by which derivatives are given.
+Conventions. Rows are the followed sums: channels or colours; rows of tangents come after them. A piece is a cell of a grid, a
+region of constant extinction, or a Gaussian. N of a piece depends on a few numbers of its extinction (its points), and
+derivatives are given by these numbers.
 
 References: Max 1995 (the discrete emission-absorption integral); Porter & Duff 1984 (``over``, from back to front).
 """
@@ -29,11 +29,11 @@ __all__ = [
 
 @dataclass
 class CellIntegral:
-    """One row of a cell, as seen from its near end.
+    """A row of a cell, as seen from its near end.
 
     Attributes:
         tau, T: optical depth and transmittance [1].
-        N: what the cell adds.
+        N: contribution of the cell.
         dtau, dN: derivatives of ``tau`` and ``N`` with respect to the extinction at each point of the integrand.
     """
 
@@ -46,10 +46,10 @@ class CellIntegral:
 
 @dataclass
 class BodyIntegral:
-    """The rows of one medium by itself.
+    """The rows of a medium by itself.
 
     Attributes:
-        tau: optical depth [1], in float64 since parts of it are subtracted again.
+        tau: optical depth [1], in float64 since parts of the sum are subtracted again.
         N: the sum, as seen from the near end.
     """
 
@@ -62,8 +62,8 @@ class ReverseState:
     """State of a reverse sweep.
 
     Attributes:
-        N: of what has been swept.
-        ahead: optical depth between the camera and the last cell that was passed.
+        N: sum over the swept cells.
+        ahead: optical depth between the camera and the last swept cell.
         constant: derivatives with respect to the constants, so far.
     """
 
@@ -75,13 +75,13 @@ class ReverseState:
 def composite_over(
     integral: BodyIntegral, integrals: list[CellIntegral], changes: list[list[mi.Float]], jvp: list[mi.Float]
 ) -> BodyIntegral:
-    """Composite a cell over what has been swept: it adds its own N and dims the rest.
+    """Composite a cell over the swept cells: the cell adds its own N and attenuates the rest.
 
     Args:
-        integral: what has been swept.
+        integral: sum over the swept cells.
         integrals: rows of the cell.
-        changes: [row][point] tangents of its extinction; empty where no tangents are followed.
-        jvp: tangent of N of each row from the integrand's other parameters.
+        changes: [row][point] tangents of the extinction; empty without tangents.
+        jvp: tangent of N of each row by the other parameters of the integrand.
     """
     tau = [t + mi.Float64(s.tau) for t, s in zip(integral.tau, integrals, strict=False)]
     N = [dr.fma(s.T, n, s.N) for n, s in zip(integral.N, integrals, strict=False)]
@@ -98,7 +98,7 @@ def pass_cell(
     """Pass a cell in a reverse sweep.
 
     Returns:
-        The state, the derivatives with respect to the cell's extinction [row][point], and those with respect to its own N.
+        The state, the derivatives with respect to the extinction of the cell [row][point], and with respect to its own N.
     """
     ahead = [a - mi.Float64(s.tau) for a, s in zip(sweep.ahead, integrals, strict=True)]
     weights = [w * transmittance_of(a) for w, a in zip(weight, ahead, strict=True)]
@@ -118,7 +118,7 @@ def transmittance_of(tau: mi.Float64) -> mi.Float:
 
 
 def zeros(kind: type, rows: int) -> list:
-    """A number of zeros of a type, one for each row."""
+    """A list of zeros of a type, one for each row."""
     return [kind(0) for _ in range(rows)]
 
 

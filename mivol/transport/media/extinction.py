@@ -1,13 +1,15 @@
-r"""One additive part of the extinction of a medium, as transport asks for it: at points of rays and along them.
+r"""One additive part of the extinction of a medium, at points of rays and along rays.
 
 .. math:: \sigma_t(x) = s \sum_k f_k(x)
 
-The scale s belongs to the medium, a part is one f_k. Each kind of field has an adapter that answers these questions, so that
-what walks through media does not ask for the kind. An :class:`ExactExtinction` also knows its integral along a ray.
+The scale s belongs to the medium; a part is a single f_k. An adapter for each kind of field implements :class:`Extinction`, so
+code walking through media does not depend on the kind. An :class:`ExactExtinction` also knows its integral along a ray.
+Adapters for grids and for Gaussians are in :mod:`mivol.transport.media.grid_extinction` and
+:mod:`mivol.transport.media.gaussian_extinction`.
 
-Conventions. Distances are along the ray, from its origin [length]; rows are lists of one ``Float`` for each channel of the
-part. Values come without derivatives. Tangents and gradients are those of ``scaled(s)``, the array that the scale and the
-parameters behind the part are found through: ``jvp`` multiplies by the derivative, ``vjp`` by its transpose.
+Conventions. Distances are along the ray, from its origin [length]. Rows are lists with a ``Float`` for each channel of the
+part. Values come without derivatives. Tangents and gradients belong to ``scaled(s)``, the array through which Dr.Jit reaches
+the scale and the parameters of the part: ``jvp`` multiplies by the derivative, ``vjp`` by its transpose.
 """
 
 from __future__ import annotations
@@ -29,12 +31,12 @@ __all__ = ["ExactExtinction", "Extinction", "RayInterval", "ConstantExtinction",
 
 @dataclass
 class RayInterval:
-    """An interval of a ray, over which an extinction is integrated.
+    """An interval of a ray for the integration of an extinction.
 
     Attributes:
         ray: world space, unit direction.
-        t0, t1: distances from its origin [length]; ``t1`` may be infinite.
-        active: lanes that have the interval.
+        t0, t1: distances from the origin of the ray [length]; ``t1`` may be infinite.
+        active: lanes with the interval.
     """
 
     ray: Ray
@@ -48,9 +50,9 @@ class Extinction(Protocol):
 
     Attributes:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
-        exact_line: whether it is an :class:`ExactExtinction`.
-        is_constant: whether it is the same number everywhere in its boundary.
-        lattice: the cells that one walk may follow; None where it needs none.
+        exact_line: whether the part is an :class:`ExactExtinction`.
+        is_constant: whether the part is the same number everywhere in its boundary.
+        lattice: the cells for a walk to follow; None without cells.
         channels: 1 (grey) or 3 (rgb).
     """
 
@@ -61,16 +63,16 @@ class Extinction(Protocol):
     channels: int
 
     def scaled(self, scale: mi.Float) -> mi.Float | mi.Color3f:
-        """What tangents are taken from in a forward pass, attached to the scale and to the parameters."""
+        """The array whose tangents a forward pass takes, attached to the scale and to the parameters."""
 
     def start_gradient(self) -> Any:
-        """A gradient of zero, which the ``vjp`` methods add to."""
+        """A gradient of zero for the ``vjp`` methods to add to."""
 
     def deliver(self, scale: mi.Float, gradient: Any) -> mi.Float:
-        """A scalar whose derivative by the scale and the parameters is what was added to a gradient."""
+        """A scalar whose derivative by the scale and the parameters is the accumulated gradient."""
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        """``scale`` times the coefficient [1/length] at a point of a ray; 0 outside of the part."""
+        """``scale`` times the coefficient [1/length] at a point of a ray; 0 outside the part."""
 
     def jvp_at(self, tangent: Any, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """Tangent of :meth:`eval_at`."""
@@ -83,7 +85,7 @@ class ExactExtinction(Extinction, Protocol):
     """A part whose integral over an interval of a ray is known: in closed form, or cell by cell."""
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
-        """Optical depth [1] for a scale of 1; it may stop where every channel has more than ``enough``."""
+        """Optical depth [1] for a scale of 1; the walk may stop where every channel exceeds ``enough``."""
 
     def jvp(self, tangent: Any, interval: RayInterval) -> list[mi.Float]:
         """Tangent of the optical depth, the scale included."""
@@ -94,11 +96,11 @@ class ExactExtinction(Extinction, Protocol):
 
 @dataclass
 class ConstantExtinction:
-    """A number, grey or rgb (:class:`mivol.transport.media.extinction.ExactExtinction`).
+    """A constant, grey or rgb (:class:`ExactExtinction`).
 
     Attributes:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
-        constant: its value [1/length], with its derivatives.
+        constant: the value [1/length], with its derivatives.
     """
 
     name: str
@@ -114,7 +116,7 @@ class ConstantExtinction:
 
     @property
     def values(self) -> mi.Float | mi.Color3f:
-        """The number."""
+        """The value [1/length]."""
         return self.constant
 
     def scaled(self, scale: mi.Float) -> mi.Float | mi.Color3f:
@@ -162,21 +164,23 @@ def _length(interval: RayInterval) -> mi.Float:
 
 
 def _finite(length: mi.Float) -> mi.Float:
-    """A length for derivatives: 0 for an interval without end, whose transmittance stays 0 whatever the constant is."""
+    """Lengths for derivatives: 0 for an interval without end, whose transmittance stays 0 for every constant."""
     return dr.select(length < 1e30, length, 0)
 
 
 @dataclass
 class BoundedExtinction:
-    """A field of unknown line integrals (:class:`mivol.transport.media.extinction.Extinction`).
+    """A field of unknown line integrals with a known majorant (:class:`Extinction`).
 
-    Its gradient is that of the medium's scale; those of the field's parameters are with Dr.Jit.
+    The gradient of this part is the gradient of the scale of the medium. Dr.Jit tracks the gradients of the parameters of the
+    field.
 
     Attributes:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
-        field: its values [1/length] for a scale of 1.
-        scale: of the medium, without derivatives.
-        majorant: the field's largest value [1/length] in any channel; an opaque array, so that kernels do not depend on it.
+        field: values [1/length] for a scale of 1.
+        scale: scale of the medium, without derivatives.
+        majorant: largest value of the field [1/length] in all channels; an opaque array, so kernels do not depend on the
+            number.
     """
 
     name: str
@@ -206,7 +210,7 @@ class BoundedExtinction:
         return dr.sum(scale * gradient)
 
     def clip(self, interval: RayInterval) -> tuple[mi.Float, mi.Float]:
-        """The part [t0, t1] of an interval of a ray that lies in the field's box; t1 <= t0 where there is none."""
+        """The part [t0, t1] of an interval of a ray inside the box of the field; t1 <= t0 if the interval misses the box."""
         ray, t0, t1 = interval.ray, mi.Float64(interval.t0), mi.Float64(interval.t1)
         _, _, t0, t1 = clip_to_box(self._rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
         return mi.Float(t0), mi.Float(t1)

@@ -1,4 +1,4 @@
-"""The extinction of Gaussians: each is met once along a ray, in the cell where the ray enters it."""
+"""The extinction of Gaussians: a ray visits each Gaussian once, in the cell of its entry."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Passage:
     """The part of an interval of a ray inside the box of the Gaussians.
 
     Attributes:
-        segment: in their lattice.
-        o, d: the point where it begins, and its direction; distances are from there [length].
-        active: lanes that have it.
+        segment: in the lattice of the Gaussians.
+        o, d: start and direction; distances are from the start [length].
+        active: lanes with a passage.
     """
 
     segment: Segment
@@ -44,10 +44,10 @@ class GaussianExtinction:
     Attributes:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
         field: the Gaussians.
-        scale: of the medium, without derivatives.
-        shows: whether the medium emits their colours. Tangents and gradients then hold the rows of the harmonics behind those
-            of the extinction, in one array.
-        colours: the rows of the harmonics, without derivatives; None where they are not shown.
+        scale: scale of the medium, without derivatives.
+        shows: whether the medium emits the colours of the Gaussians. Tangents and gradients then hold the rows of the
+            harmonics behind the rows of the extinction, in the same array.
+        colours: rows of the harmonics, without derivatives; None if not shown.
     """
 
     name: str
@@ -68,7 +68,7 @@ class GaussianExtinction:
 
     @property
     def blocks(self) -> int:
-        """Blocks of ``ROW`` numbers that the harmonics of one Gaussian take."""
+        """Blocks of ``ROW`` numbers for the harmonics of a Gaussian."""
         return blocks_per_gaussian(self.field.degree) if self.shows else 0
 
     def scaled(self, scale: mi.Float) -> mi.Float:
@@ -124,7 +124,7 @@ class GaussianExtinction:
         self.field.visit_at_points(mi.Ray3f(ray(t), ray.d), active, (), add)
 
     def enter(self, interval: RayInterval) -> Passage:
-        """The part of an interval inside the box, seen from where it begins: far from the origin float32 has few digits."""
+        """The part of an interval inside the box, from its start on: far from the origin float32 has few digits."""
         ray = interval.ray
         segment = clip_to_grid(self.cells, ray.o, ray.d, interval.t0, interval.t1)
         there = (dr.fma(segment.start, mi.Float64(v), mi.Float64(x)) for x, v in zip(ray.o, ray.d, strict=True))
@@ -138,17 +138,17 @@ class GaussianExtinction:
         until: Callable[[Any], mi.Bool] | None = None,
         leave: Callable[[Any, Cell], Any] | None = None,
     ) -> Any:
-        """Visit once each Gaussian that a passage meets, in the cell where it enters it.
+        """Visit each Gaussian on a passage once, in the cell of its entry.
 
         Args:
             passage: from :meth:`enter`.
             state: any PyTree of Dr.Jit arrays.
-            add: ``add(state, line, index, ends) -> state`` with the distances at which the passage enters the Gaussian and
-                leaves it. Called once, while the loop is traced.
-            until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to go to the end.
-            leave: ``leave(state, cell) -> state``, after the Gaussians of a cell; None for nothing.
+            add: ``add(state, line, index, ends) -> state`` with the distances at which the passage enters and leaves the
+                Gaussian. Called once, while Dr.Jit traces the loop.
+            until: ``until(state) -> mask`` of lanes to stop, evaluated after each cell; None to go to the end.
+            leave: ``leave(state, cell) -> state``, after the Gaussians of a cell; by default nothing.
 
-        Cost: a cell asks each Gaussian of its list whether the line meets it, and where; ``add`` runs for those that it does.
+        Cost: a test of each Gaussian in the list of a cell; ``add`` runs for each Gaussian on the line.
         """
         field, through, length = self.field, (passage.o, passage.d), passage.segment.length
 
@@ -169,7 +169,7 @@ class GaussianExtinction:
     def jvp_value(
         self, line: WhitenedLine, slopes: LineSlopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32
     ) -> mi.Float:
-        """The tangent of the scale times a value that has these derivatives."""
+        """The tangent of the scale times a value with these derivatives."""
         change = read_row(tangent, index)
         return self.scale * row_tangent(line, slopes, change) + value * change[SCALE_COLUMN]
 
@@ -182,7 +182,9 @@ class GaussianExtinction:
         index: mi.UInt32,
         on: mi.Bool,
     ) -> None:
-        """Add to the gradient of a row: ``value`` is a number with these derivatives, and d loss / d (scale times it)."""
+        """Add to the gradient of a row: ``value`` holds a number with these derivatives, and d loss / d (scale times the
+        number).
+        """
         own, weight = value
         entries = [self.scale * weight * slope for slope in slopes.by_row(line)]
         add_to_block(gradient, [*entries, weight * own], index, on)

@@ -2,18 +2,25 @@ r"""Emission and absorption of Gaussians along a ray: a sweep from the farthest 
 
 .. math:: N = \sum_i c_i(\omega)\,\alpha_i \prod_{j < i} (1 - \alpha_j), \qquad \alpha_i = 1 - e^{-\tau_i}
 
-with i in the order of the peaks along the ray (:mod:`mivol.transport.media.gaussian_sweep`), tau_i the optical depth of that
-part of a Gaussian that lies in the interval of the ray (:mod:`mivol.fields.gaussian_line`; alpha_i is o exp(-m^2/2) where all
-of it does), and c_i its colour (:mod:`mivol.fields.harmonics`). So the opacity of an interval is that of the extinction,
-in any order, and a Gaussian that a surface or the camera cuts fades as it is passed.
+The index i follows the peaks along the ray. tau_i is the optical depth of the part of Gaussian i in the interval of the ray
+(:mod:`mivol.fields.gaussian_line`; alpha_i is o exp(-m^2/2) for a whole Gaussian), and c_i is its colour. The opacity of an
+interval equals the opacity of the extinction, in any order, and a Gaussian cut by a surface or by the camera fades gradually.
 
-Where two peaks swap, N jumps by alpha_i alpha_j |c_i - c_j| times what is let through in front of them; derivatives are those
-at a fixed order.
+Order. The peak of a Gaussian on a line lies in its ellipsoid, so the cell of the peak lists the Gaussian. A walk that takes
+each Gaussian in the cell of its peak visits them cell by cell in order, and sorts only the Gaussians of a cell. A cell keeps
+the ``SLOTS`` farthest peaks of its list in registers; for more peaks the list is read again behind the last of them. Peaks are
+ordered by (t, index), with t the distance in float32 from the entry of the ray into the box. No two keys are equal, so a list
+read again continues at the right peak, and every walk of a ray finds the same order. A Gaussian with its peak outside the
+interval and a part inside is taken in the first or the last cell.
 
-Conventions. Those of :mod:`mivol.transport.line_integrals.body_sweep`, a Gaussian in the place of a cell: its optical depth is
-the one number that N depends on beside its colour. Gaussians whose colours are not shown dim what is behind them.
+Where two peaks swap, N jumps by alpha_i alpha_j |c_i - c_j| times the transmittance in front of them; derivatives are taken at
+a fixed order.
 
-Source: compositing in the order of peaks, Moenne-Loccoz et al., 3D Gaussian Ray Tracing, 2024, Eq. 5.
+Conventions. As of :mod:`mivol.transport.line_integrals.body_sweep`, with a Gaussian in the place of a cell: N depends on its
+optical depth and its colour. Gaussians without shown colours absorb the light behind them.
+
+Source: sorting and compositing by peaks, Moenne-Loccoz et al., 3D Gaussian Ray Tracing, 2024, Eq. 5 (they sort in a buffer for
+the whole ray).
 """
 
 from __future__ import annotations
@@ -44,14 +51,14 @@ RGB = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
 
 @dataclass
 class _CrossedGaussian:
-    """A Gaussian as a ray meets it.
+    """A Gaussian on a ray.
 
     Attributes:
-        line, index: it, and its number.
-        ends: distances at which the interval enters it and leaves it [length].
-        own: its optical depth there, for a scale of 1 [1].
-        tau: with the scale of the medium [1].
-        colour: of each row [radiance].
+        line, index: the line in its own coordinates, and its number.
+        ends: distances at which the interval enters and leaves it [length].
+        own: optical depth for a scale of 1 [1].
+        tau: optical depth with the scale of the medium [1].
+        colour: colour of each row [radiance].
     """
 
     line: WhitenedLine
@@ -63,22 +70,22 @@ class _CrossedGaussian:
 
     @property
     def alpha(self) -> mi.Float:
-        """What it hides [1]."""
+        """Opacity [1]."""
         return one_minus_exp(self.tau)
 
     def integrals(self) -> list[CellIntegral]:
-        """Its rows, with derivatives by its optical depth."""
+        """Rows of the Gaussian, with derivatives by its optical depth."""
         T, alpha = dr.exp(-self.tau), self.alpha
         return [CellIntegral(self.tau, T, c * alpha, [mi.Float(1)], [c * T]) for c in self.colour]
 
 
 class GaussianSweep:
-    """The sweep over a medium of Gaussians, as :class:`mivol.transport.line_integrals.body_sweep.BodySweep` is over cells.
+    """The sweep over a medium of Gaussians, like :class:`mivol.transport.line_integrals.body_sweep.BodySweep` over cells.
 
     Args:
-        interval: of the ray in the medium.
-        rows: of light: colours, or sums that Gaussians add nothing to where they are not shown.
-        tangent: follow tangents too, from those that the media took from the parameters.
+        interval: interval of the ray in the medium.
+        rows: number of rows of light: colours, or sums to which Gaussians without shown colours add nothing.
+        tangent: whether to follow tangents, from the tangents that the media took from the parameters.
     """
 
     def __init__(self, interval: MediumInterval, rows: int, tangent: bool = False) -> None:
@@ -91,7 +98,7 @@ class GaussianSweep:
         self.basis = self.part.field.eval_basis(interval.ray.d) if self.part.shows else []
 
     def integrate(self, skip: bool) -> BodyIntegral:
-        """Sum the rows of the medium; ``skip`` has no meaning here: what is empty is never asked."""
+        """Sum the rows of the medium; ``skip`` has no effect, since no cell list holds an empty Gaussian."""
         rows = self.rows * (1 if self.change is None else 2)
 
         def add(integral: BodyIntegral, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> BodyIntegral:
@@ -107,7 +114,7 @@ class GaussianSweep:
     def vjp(self, weight: list[mi.Float], ahead: list[mi.Float64], behind: list[mi.Float]) -> None:
         """Add ``weight`` times the derivatives of N to the gradients of the medium; arguments as of ``BodySweep``.
 
-        Cost: a walk of the medium, and a packed write of 16 for each Gaussian that is met and each block of its harmonics.
+        Cost: a walk of the medium, and a packed write of 16 numbers for each visited Gaussian and each block of its harmonics.
         """
         gradient = self.body.gradients[0]
 
@@ -130,7 +137,7 @@ class GaussianSweep:
         return _CrossedGaussian(line, index, ends, own, self.scale * own, colour)
 
     def _harmonics(self, rows: mi.Float, index: mi.UInt32, before: int) -> list[mi.Float]:
-        """The harmonics of a Gaussian in an array in which so many blocks lie before those of colours."""
+        """Read the harmonics of a Gaussian from an array with ``before`` blocks in front of the colours."""
         return read_harmonics(rows, before + index * self.part.blocks, self.part.field.degree)
 
     def _slopes(self, crossed: _CrossedGaussian) -> list[mi.Float]:
@@ -138,7 +145,7 @@ class GaussianSweep:
         return eval_colour_slopes(self._harmonics(self.part.colours, crossed.index, 0), self.basis, self.part.field.space)
 
     def _jvp_colour(self, crossed: _CrossedGaussian) -> list[mi.Float]:
-        """Tangents of N of one Gaussian by its harmonics."""
+        """Tangents of N of a Gaussian by its harmonics."""
         if not self.part.shows:
             return [mi.Float(0)] * self.rows
         change = sum_harmonics(self._harmonics(self.change, crossed.index, self.part.field.count), self.basis)
@@ -146,7 +153,7 @@ class GaussianSweep:
         return [crossed.alpha * _dot(weights, rgb) for weights in self.channels]
 
     def _vjp_colour(self, gradient: mi.Float, crossed: _CrossedGaussian, weights: list[mi.Float]) -> None:
-        """Add the derivatives by the harmonics of one Gaussian, from those by its N."""
+        """Add the derivatives by the harmonics of a Gaussian, from the derivatives by its N."""
         if not self.part.shows:
             return
         by_rgb = [
@@ -164,25 +171,25 @@ def _dot(weights: list[float], values: list[mi.Float]) -> mi.Float:
 
 
 SLOTS = 8
-"""Gaussians of a cell that are sorted at once (measured, processor time over that of 8: 10,000 in a dense cloud, 2 peaks a
-cell, 4 slots 1.2, 12 1.1; 10,000 fitted ones, flat and wide, 2 slots 2.6, 4 1.5, 12 and 16 0.9)."""
+"""Gaussians of a cell sorted at once. (Processor time relative to 8: 10,000 Gaussians in a dense cloud, 2 peaks a cell, 1.2
+with 4 slots and 1.1 with 12; 10,000 fitted Gaussians, flat and wide, 2.6 with 2 slots, 1.5 with 4, 0.9 with 12 and 16.)
+"""
 
 LAST_PLACE = 1 - 1e-6
-"""Share of a passage at which a peak beyond its end is looked for: the last cell holds it, whatever rounding did to its end."""
+"""Position of a peak beyond the end, as a fraction of the passage: inside the last cell despite the rounding of its end."""
 
 
 def visit_far_to_near(part: GaussianExtinction, interval: RayInterval, state: Any, add: Callable[..., Any]) -> Any:
-    """Visit once each Gaussian that an interval of a ray meets, that of the farthest peak first.
+    """Visit each Gaussian on an interval of a ray once, the farthest peak first.
 
     Args:
         part: the Gaussians.
-        interval: of the ray; its end may be infinite.
+        interval: interval of the ray; its end may be infinite.
         state: any PyTree of Dr.Jit arrays.
-        add: ``add(state, line, index, ends) -> state`` with the distances at which the interval enters the Gaussian and leaves
-            it, from where it enters the box. Called once, while the loops are traced.
+        add: ``add(state, line, index, ends) -> state`` with the distances, from the entry into the box, at which the interval
+            enters and leaves the Gaussian. Called once, while Dr.Jit traces the loops.
 
-    Cost: a cell asks each Gaussian of its list where its peak is, once for each ``SLOTS`` peaks in it; ``add`` runs once for
-        each of these.
+    Cost: a test of each Gaussian in the list of a cell, once for each ``SLOTS`` peaks in the cell; ``add`` runs once a peak.
     """
     passage = part.enter(interval)
     ray = interval.ray
@@ -224,12 +231,12 @@ def visit_far_to_near(part: GaussianExtinction, interval: RayInterval, state: An
 
 
 def _is_farther(a: tuple[mi.Float, mi.UInt32], b: tuple[mi.Float, mi.UInt32]) -> mi.Bool:
-    """Whether the peak (t, index) of ``a`` is behind that of ``b``."""
+    """Whether the peak (t, index) of ``a`` is behind the peak of ``b``."""
     return (a[0] > b[0]) | ((a[0] == b[0]) & (a[1] > b[1]))
 
 
 def _insert(slots: list, peak: tuple[mi.Float, mi.UInt32]) -> list:
-    """Put a peak in its place among those that are kept, the farthest first; the nearest one falls out."""
+    """Insert a peak into the sorted slots, the farthest first; the nearest peak falls out."""
     kept = []
     for own in slots:
         ahead = _is_farther(peak, own)

@@ -1,4 +1,12 @@
-"""An extinction that is trilinear between the nodes of a grid, and vacuum outside of its box."""
+r"""An extinction stored at the nodes of a grid, and vacuum outside the box of the grid.
+
+An extinction is trilinear between the nodes, or an activation of the trilinear values (a radiance field). The sum of several
+parts in a cell includes constants:
+
+.. math:: \sigma(x) = s \sum_k f_k(x)
+
+Conventions. Values are detached arrays; channels are 1 (grey) or 3 (rgb), and a grey part counts in each channel.
+"""
 
 from __future__ import annotations
 
@@ -38,11 +46,11 @@ __all__ = [
 
 @dataclass
 class NodeValues:
-    """The part of an extinction that is stored at the nodes of a grid, and the gradient of what is stored.
+    """The part of an extinction at the nodes of a grid, with the gradient of the node values.
 
     Attributes:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
-        lattice: node values, with their derivatives, and their place.
+        lattice: place of the grid, and node values with their derivatives.
     """
 
     name: str
@@ -83,7 +91,7 @@ class GridExtinction(NodeValues):
     """A grid of extinction [1/length], grey or rgb (:class:`mivol.transport.media.extinction.ExactExtinction`).
 
     Attributes:
-        volume: the stock grid that ``lattice`` stands for, which may look its voxels up in another way; None elsewhere.
+        volume: the stock grid of these values, which may look up voxels in another way; None without a stock grid.
     """
 
     volume: mi.Volume | None = None
@@ -116,7 +124,7 @@ def clip_interval(lattice: Lattice, interval: RayInterval) -> Segment:
 
 
 def interpolate_at(lattice: Lattice, values: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
-    """Each channel of flat node values at a point of a ray; 0 outside the grid's box."""
+    """Each channel of flat node values at a point of a ray; 0 outside the box of the grid."""
     cell, frac, inside = locate_cell(lattice, ray.o, ray.d, t)
     upward = dr.full(dr.mask_t(mi.Vector3f), True)
     nodes, on, n = corner_nodes(cell, upward, lattice.res), inside & active, lattice.channels
@@ -124,13 +132,13 @@ def interpolate_at(lattice: Lattice, values: mi.Float, ray: Ray, t: mi.Float, ac
 
 
 def add_to_cell(gradient: NodeGradient, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
-    """Add to the gradient of a grid, in one packet for each channel.
+    """Add to the gradient of a grid, in a packet for each channel.
 
     Args:
-        gradient: what is added to.
+        gradient: gradient of the nodes.
         lower: lower node of the cell.
-        terms: (d loss / d value of each channel, 8 weights of the corners) pairs.
-        active: lanes that add.
+        terms: pairs (d loss / d value of each channel, 8 weights of the corners).
+        active: lanes to add.
     """
     for c in range(gradient.channels):
         values = [sum(w[c] * corners[q] for w, corners in terms) for q in range(8)]
@@ -139,12 +147,16 @@ def add_to_cell(gradient: NodeGradient, lower: mi.Vector3i, terms: list[tuple], 
 
 @dataclass
 class ActivatedGridExtinction(NodeValues):
-    """A grey grid seen through an activation (:class:`mivol.transport.media.extinction.ExactExtinction`).
+    """An activation of a grey grid (:class:`mivol.transport.media.extinction.ExactExtinction`): the density of a radiance
+    field.
 
-    It is alone in its medium, whose scale is 1. The integral is a quadrature (:func:`.grid_integral.integrate_activated`).
+    The part is alone in its medium, whose scale is 1. The integral is a quadrature.
+
+    Bias: two points a cell are exact for polynomials of degree 3 only. The error falls with the fourth power of a cell where
+        the activation is smooth, and with the second power at the edge of a ``relu``.
 
     Attributes:
-        activation: what makes an extinction [1/length] of an interpolated value.
+        activation: maps an interpolated value to an extinction [1/length].
     """
 
     activation: Activation
@@ -208,13 +220,13 @@ class ActivatedGridExtinction(NodeValues):
 
 
 class SummedExtinction:
-    """The sum of the parts of an extinction for each channel: in a cell of their grids, and outside the grids.
+    """The sum of the parts of an extinction for each channel, in a cell of their grids and outside the grids.
 
     Args:
         parts: constants, and grids that share their cells.
         values: node values or constant of each part.
         scale: factor on the sum.
-        linear: whether the values are tangents, which no activation is applied to.
+        linear: whether the values are tangents, which skip the activation.
     """
 
     def __init__(self, parts: list[ExactExtinction], values: list, scale: mi.Float, linear: bool = False) -> None:
@@ -227,7 +239,9 @@ class SummedExtinction:
         self.constant = [scale * sum((k[c % len(k)] for k in constants), mi.Float(0)) for c in range(self.channels)]
 
     def along(self, corners: list, points: list[mi.Vector3f]) -> list[list[mi.Float]]:
-        """[channel][point] values at points of a cell (fractions from its near planes), from [read][channel][corner]."""
+        """Values [channel][point] at points of a cell (fractions from its near planes), from [array][channel][corner]
+        values.
+        """
         pairs = list(zip(corners, self.activations, strict=False))
         grids = [[[activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)]
         return [
@@ -235,7 +249,9 @@ class SummedExtinction:
         ]
 
     def slopes(self, corners: list, points: list[mi.Vector3f]) -> list[mi.Float] | None:
-        """Slope of the activation at points of a cell; None without one. A radiance field is the only part of its medium."""
+        """Slope of the activation at points of a cell; None without an activation. A radiance field is the only part of its
+        medium.
+        """
         if not any(self.activations):
             return None
         return [self.activations[0].value_and_slope(interpolate(corners[0][0], p))[1] for p in points]

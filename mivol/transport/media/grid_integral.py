@@ -2,14 +2,13 @@ r"""Exact optical depth of a ray through a grid, with its tangent and its transp
 
 .. math:: \tau = \int_{t_0}^{t_1} \sigma(o + t\,\omega)\,dt = (A \sigma)_{ray}
 
-Along a line a trilinear function is a cubic in each cell, so two Gauss points a cell integrate it exactly; the sum over
-the cells is linear in the values at the nodes, and ``A``, its tangent (``A`` again) and its transpose are visitors of one
-walk.
+Along a line a trilinear function is a cubic in each cell, so two Gauss points a cell integrate it exactly. The sum over the
+cells is linear in the values at the nodes. ``A``, its tangent (``A`` again) and its transpose are visitors of the same walk.
 
-Conventions. Optical depth is returned, and not transmittance: in float32 exp(-tau) underflows to 0 beyond tau = 103.
+Conventions. Functions return optical depth instead of transmittance: in float32 exp(-tau) underflows to 0 beyond tau = 103.
 
-References: Amanatides & Woo 1987 (the walk); Abramowitz & Stegun 25.4.30 (Gauss points); matched adjoints: De Man & Basu
-2004.
+References: Amanatides & Woo 1987 (the walk); Abramowitz & Stegun 25.4.30 (Gauss points); De Man & Basu 2004 (matched
+adjoints).
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ __all__ = [
 
 
 PACKED_LIMIT = 4 << 30
-"""Largest size of a packed gradient [bytes]; a larger grid adds to its nodes one by one."""
+"""Largest size of a packed gradient [bytes]; a larger grid adds to its nodes individually."""
 
 
 def integrate_tau(
@@ -45,14 +44,14 @@ def integrate_tau(
     t_max: mi.Float = math.inf,
     active: mi.Bool = True,
 ) -> mi.Float | mi.Color3f:
-    """Integrate a grid along rays: optical depth where the grid is an extinction.
+    """Integrate a grid along rays: the optical depth if the grid is an extinction.
 
     Args:
         lattice: values [1/length] of 1 or 3 channels, and their place. Derivatives (reverse and forward) reach
             ``lattice.values``; outside its box the grid is vacuum.
-        o, d: world rays, |d| = 1; they and ``t_max`` carry no derivatives.
-        t_max: where the interval [0, t_max] of the ray ends [length]; may be infinite.
-        active: lanes to integrate; the others return 0.
+        o, d: world rays, |d| = 1; neither the rays nor ``t_max`` carry derivatives.
+        t_max: end of the interval [0, t_max] of the ray [length]; may be infinite.
+        active: lanes to integrate; the other lanes return 0.
 
     Returns:
         tau [1]: ``Float`` for one channel, ``Color3f`` for three.
@@ -61,7 +60,7 @@ def integrate_tau(
         MivolError: another number of channels, or rays with gradients enabled.
 
     Bias: none but rounding, |error| <= 2e-6 int (sigma + h |grad sigma|) dt, h the size of a voxel.
-    Cost: 4 reads a cell and channel forwards, one packed write of 8 a cell and channel in reverse.
+    Cost: 4 reads a cell and channel forwards, a packed write of 8 a cell and channel in reverse.
 
     Example:
         >>> tau = integrate_tau(Lattice(mi.TensorXf(sigma_t), to_world), ray.o, ray.d)
@@ -81,16 +80,16 @@ def integrate_segment(
     """Integrate node values along a segment: a row of ``A`` for each lane.
 
     Args:
-        lattice: where the grid lies, and which blocks are empty.
-        values: flat node values (the lattice's own, or a tangent of them).
+        lattice: place and empty blocks of the grid.
+        values: flat node values (the values of the lattice, or a tangent of these).
         segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
-        active: lanes to integrate; the others return 0.
-        enough: stop where every channel has more than this; None to walk to the end.
+        active: lanes to integrate; the other lanes return 0.
+        enough: number at which the walk may stop, once every channel exceeds it; None to walk to the end.
 
     Returns:
-        The integral for each channel.
+        The integral for each channel. Dr.Jit tracks no derivatives.
 
-    Bias, cost: as :func:`integrate_tau`. Derivatives are not tracked here.
+    Bias, cost: as of :func:`integrate_tau`.
     """
 
     def visit(tau: list[mi.Float], cell: Cell, on: mi.Bool) -> list[mi.Float]:
@@ -106,16 +105,16 @@ def integrate_segment(
 
 @dataclass
 class NodeGradient:
-    """The derivative of a scalar with respect to the nodes of a grid, to which the transpose adds.
+    """The derivative of a scalar with respect to the nodes of a grid, for the transpose to add to.
 
-    On the CPU a cell adds its 8 corners as one packet to a buffer that has 8 numbers a cell and a copy for each thread, so that
-    no atomics are needed. The cells are summed to the nodes once, at the end (5 times faster than adding 8 numbers to the
-    nodes). Where that buffer is too large, or on a GPU, the corners are added to the nodes as they come.
+    On the CPU a cell adds its 8 corners as a packet to a buffer with 8 numbers a cell and a copy for each thread, without
+    atomics. The cells are summed to the nodes once, at the end (5 times faster than adding 8 numbers to the nodes). On a GPU,
+    or if the buffer is too large, the corners are added to the nodes directly.
 
     Attributes:
-        buffer: flat sums; corners of cells where ``packed``, else nodes.
-        res: of the grid (Z, Y, X).
-        channels: of the grid.
+        buffer: flat sums; corners of cells if ``packed``, else nodes.
+        res: resolution of the grid (Z, Y, X).
+        channels: channels of the grid.
         packed: whether the buffer holds cells.
     """
 
@@ -165,7 +164,7 @@ class NodeGradient:
 
 
 def gradient_bytes(res: tuple[int, int, int], channels: int) -> int:
-    """Bytes that a packed gradient takes: its buffer and one copy a thread."""
+    """Size of a packed gradient [bytes]: its buffer, and a copy for each thread."""
     z, y, x = res
     return 32 * (z + 1) * (y + 1) * (x + 1) * channels * (1 + dr.thread_count())
 
@@ -176,13 +175,13 @@ def backproject_segment(
     """Add ``weight`` times the row of ``A`` of each lane to a gradient: the transpose ``A^T``.
 
     Args:
-        lattice: where the grid lies. Empty blocks are walked too, since an empty voxel has a derivative.
-        target: the gradient to add to.
-        weight: d loss / d tau of each lane, one entry a channel.
+        lattice: place of the grid. Empty blocks are walked too, since an empty voxel has a derivative.
+        target: the gradient.
+        weight: d loss / d tau of each lane, an entry a channel.
         segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
         active: lanes to project back.
 
-    Cost: one packed write of 8 a cell and channel.
+    Cost: a packed write of 8 a cell and channel.
     """
 
     def visit(state: None, cell: Cell, on: mi.Bool) -> None:

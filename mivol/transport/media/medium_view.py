@@ -1,10 +1,14 @@
-r"""The extinction of a medium as a sum of fields, each in its place, the same for our plugins and for stock ones.
+r"""Mitsuba's media as sums of fields, each in its place, the same for the plugins of mivol and of Mitsuba.
 
 .. math:: \sigma_t(x) = s \sum_k f_k(x)
 
-with a scale s and parts f_k that are a grid or a constant (``sigma_t`` alone, or ``sigma_a`` and ``sigma_s``). Optical depth
-is linear in each of them, so it is integrated part by part (:mod:`mivol.transport.media.extinction`): a homogeneous medium
-stores no grid and two grids need not share a resolution.
+with a scale s and parts f_k that are a grid or a constant (``sigma_t`` alone, or ``sigma_a`` and ``sigma_s``). Optical depth is
+linear in each part and is integrated part by part (:mod:`mivol.transport.media.extinction`). A homogeneous medium therefore
+stores no grid, and two grids need not share a resolution.
+
+Conventions. A grid is vacuum outside its own box. A constant fills the boundary of its medium, except under a stock
+``heterogeneous``, which clips a constant to the box of its ``constvolume``. Values are read from the arrays of ``mi.traverse``,
+with their gradients.
 """
 
 from __future__ import annotations
@@ -32,24 +36,24 @@ __all__ = ["MediumView", "find_children", "nested_field", "traverse_medium", "vi
 
 @dataclass
 class MediumView:
-    """The extinction of one medium, as transport sees it.
+    """The extinction of a medium, as transport sees it.
 
     Attributes:
         medium: the Mitsuba object.
-        parts: their sum, times ``scale``, is sigma_t.
-        scale: dimensionless factor, differentiable where the plugin makes it so.
-        albedo_arrays: the arrays behind the albedo, or behind the ``sigma_s`` part.
-        albedo: the albedo itself, a volume or a constant; None where ``sigma_s`` is a part.
-        microflakes: the matrix S (xx, yy, zz, xy, xz, yz) of an ``sggx`` phase function, which makes the extinction depend on
-            the direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6), with derivatives; None elsewhere.
-        emission: Le [radiance], a volume or a constant; its source function is (1 - albedo) Le. None where there is none.
-        emission_density: [radiance/length], which does not depend on the extinction; likewise.
-        emission_lattice: the grid of ``emission_density``, ``emission`` or ``albedo``, whose cells are walked where the
+        parts: fields; their sum, times ``scale``, is sigma_t.
+        scale: dimensionless factor, differentiable if the plugin makes it so.
+        albedo_arrays: the arrays of the albedo, or of the ``sigma_s`` part.
+        albedo: the albedo, a volume or a constant; None if ``sigma_s`` is a part.
+        microflakes: the matrix S (xx, yy, zz, xy, xz, yz) of an ``sggx`` phase function, with derivatives; else None.
+            The extinction then depends on the direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6).
+        emission: Le [radiance], a volume or a constant; its source function is (1 - albedo) Le. None without emission.
+        emission_density: emitted light [radiance/length], independent of the extinction; None without it.
+        emission_lattice: the grid of ``emission_density``, ``emission`` or ``albedo``, whose cells are walked if the
             extinction has no grid. Its values are zeros.
-        emission_arrays: the arrays behind ``emission`` and ``emission_density``.
-        numbers: the constants among ``scale`` and the coefficients of the extinction, as ``mi.traverse`` hands them out.
-        stock_boxes: the boxes of stock grids of emission and albedo, by the volume's pointer. Mitsuba repeats the border of
-            such a grid outside of its box, where mivol has no emission.
+        emission_arrays: the arrays of ``emission`` and ``emission_density``.
+        numbers: the constants among ``scale`` and the coefficients of the extinction, as in ``mi.traverse``.
+        stock_boxes: the boxes of stock grids of emission and albedo, by the pointer of the volume. Mitsuba repeats the border
+            of a stock grid outside its box, where mivol has no emission.
     """
 
     medium: mi.Medium
@@ -66,7 +70,7 @@ class MediumView:
     numbers: dict[str, float | mi.Float | mi.Color3f] = field(default_factory=dict)
 
     def holds(self, volume: mi.Volume, p: mi.Point3f) -> mi.Bool:
-        """Whether a point lies in the box of a stock volume of emission; our volumes are 0 outside, and always hold it."""
+        """Whether a point lies in the box of a stock volume of emission; true for volumes of mivol, which are 0 outside."""
         if volume.ptr not in self.stock_boxes:
             return mi.Bool(True)
         rows = self.stock_boxes[volume.ptr].rows()
@@ -80,22 +84,22 @@ class MediumView:
 
     @property
     def gaussians(self) -> GaussianExtinction | None:
-        """The Gaussians that the medium is made of, which are then its only part; None elsewhere."""
+        """The Gaussians of the medium, which are then its only part; None without Gaussians."""
         return next((part for part in self.parts if isinstance(part, GaussianExtinction)), None)
 
     @property
     def shows_gaussians(self) -> bool:
-        """Whether the medium shows the colours of its Gaussians: light in an order along a ray, and no function of place."""
+        """Whether the medium shows the colours of its Gaussians: light in an order along a ray, and no function of a point."""
         return self.gaussians is not None and self.gaussians.shows
 
     @property
     def channels(self) -> int:
-        """1 where every part is grey, 3 where one is rgb."""
+        """1 if every part is grey, 3 if some part is rgb."""
         return max(part.channels for part in self.parts)
 
     @property
     def walked_lattice(self) -> Lattice | None:
-        """The grid whose cells a sweep follows; None where everything is a constant."""
+        """The grid whose cells a sweep follows; None without a grid."""
         return next((p.lattice for p in self.parts if p.lattice is not None), self.emission_lattice)
 
 
@@ -108,10 +112,10 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     Args:
         medium: ``mivol_medium``, ``homogeneous`` or ``heterogeneous`` (over ``gridvolume``, ``constvolume`` or
             ``mivol_voxels``).
-        boundary: the box that bounds it, if it is one. Mitsuba prints the place of a stock grid to 6 digits only; a grid that
-            fills its boundary to these digits is put exactly there.
-        places: a cache of where grids lie, by volume and boundary, which is added to; None for none.
-        level: of a radiance field that is nested.
+        boundary: the boundary, if the boundary is a box. Mitsuba prints the place of a stock grid to 6 digits only; a grid
+            filling its boundary to these digits is put exactly there.
+        places: a cache of the places of grids, by volume and boundary, to read and to extend; by default empty.
+        level: level of a nested radiance field.
 
     Raises:
         MivolError: a medium or a volume of another kind.
@@ -159,7 +163,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
 
 
 def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
-    """The matrix S of the microflakes of a medium with an ``sggx`` phase function; None for all others.
+    """The matrix S of the microflakes of a medium with an ``sggx`` phase function; otherwise None.
 
     Raises:
         MivolError: a matrix that varies in space.
@@ -181,7 +185,7 @@ def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
 
 
 def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.Color3f | None:
-    """The coefficient of a medium under a name: a constant with its gradient, or a volume; None where there is none."""
+    """The coefficient of a medium under a name: a constant with its gradient, or a volume; None without the coefficient."""
     if f"{name}.value.value" in params.properties:
         return params[f"{name}.value.value"]
     key = next((k for k in params.properties if k.startswith(name + ".")), None)
@@ -189,7 +193,7 @@ def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.C
 
 
 def _part_of_field(volume: mi.Volume, level: int) -> ActivatedGridExtinction | GaussianExtinction:
-    """The extinction of a medium that is a radiance field: Gaussians, or the activation of a level of ``mivol_sh``."""
+    """The extinction of a medium made of a radiance field: Gaussians, or the activation of a level of ``mivol_sh``."""
     if hasattr(volume, "mivol_extinction"):
         return _field_part("emission", volume.mivol_extinction, mi.Float(1), shows=True)
     lattice = Lattice(volume.mivol_densities[level], volume.mivol_field.level_to_world(level))
@@ -197,7 +201,7 @@ def _part_of_field(volume: mi.Volume, level: int) -> ActivatedGridExtinction | G
 
 
 def _emission_lattice(emission_density: object, others: list, boundary: Box | None, places: dict) -> Lattice | None:
-    """The grid of the emission density, else the finest of other fields, as a lattice of zeros; None without a grid."""
+    """The grid of the emission density, or the finest grid of the other fields, as a lattice of zeros; None without a grid."""
     grids = [v for v in others if _is_grid(v)]
     lead = (
         emission_density if _is_grid(emission_density) else max(grids, key=lambda v: int(np.prod(v.resolution())), default=None)
@@ -218,7 +222,7 @@ def _repeats_border(volume: object) -> bool:
 
 
 def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:
-    """Where a grid lies (4x4, unit cube to world), from the cache ``places`` or by :func:`find_grid_place`."""
+    """Place of a grid (4x4, unit cube to world), from the cache ``places`` or by :func:`find_grid_place`."""
     key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
     if key not in places:
         places[key] = find_grid_place(volume, boundary)
@@ -226,12 +230,12 @@ def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:
 
 
 def medium_kind(medium: mi.Medium) -> str:
-    """Name of a medium's class; ``mivol_medium`` for ours (Mitsuba calls every Python class by its base)."""
+    """Class name of a medium; ``mivol_medium`` for media of mivol (Mitsuba names every Python class after its base)."""
     return "mivol_medium" if hasattr(medium, "coefficients") else medium.class_name()
 
 
 def find_children(medium: mi.Medium) -> dict[str, mi.Object]:
-    """The volumes and the phase function of a medium, by name; one object may stand under several names."""
+    """The volumes and the phase function of a medium, by name; an object may occur under several names."""
     found = {}
 
     class Children(mi.TraversalCallback):  # in here, since Mitsuba has no such class before a variant is set
@@ -244,7 +248,7 @@ def find_children(medium: mi.Medium) -> dict[str, mi.Object]:
 
 
 def nested_field(medium: mi.Medium) -> SphericalGrid | None:
-    """The radiance field that a medium is, where that has more than one level; None of all other media."""
+    """The radiance field of a medium, if the field has more than one level; otherwise None."""
     field = getattr(find_children(medium).get("emission"), "mivol_field", None)
     return field if field is not None and field.levels > 1 else None
 
@@ -252,8 +256,8 @@ def nested_field(medium: mi.Medium) -> SphericalGrid | None:
 def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
     """The parameters of a medium, each coefficient under its own name.
 
-    ``mi.traverse`` visits an object once: a volume that is both ``sigma_t`` and ``albedo`` (by a ``ref``, or because Mitsuba
-    merges equal objects of a scene) it lists under one of the names, and here it is listed under both.
+    ``mi.traverse`` visits an object once. A volume used as both ``sigma_t`` and ``albedo`` (by a ``ref``, or because Mitsuba
+    merges equal objects of a scene) is listed under a single name there, and under both names here.
     """
     params = mi.traverse(medium)
     for name, child in find_children(medium).items():
@@ -266,11 +270,11 @@ def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
 def _field_part(
     name: str, field: Field | GaussianField, scale: mi.Float, shows: bool = False
 ) -> BoundedExtinction | GaussianExtinction:
-    """The part of an extinction that a field of a shell of ours is.
+    """The part of an extinction for a field from a plugin of mivol.
 
     Raises:
-        MivolError: a field of another kind, a majorant that is none, or a recording, in which no majorant can be read, and no
-            Gaussians be listed.
+        MivolError: a field of another kind; a majorant that is negative or not finite; or a recording, in which no majorant
+            can be read and no Gaussians can be listed.
     """
     has_lists = isinstance(field, GaussianField)
     if field.line != BOUNDED and not has_lists:
@@ -291,7 +295,7 @@ def _field_part(
 def _part(
     name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, boundary: Box | None, places: dict
 ) -> Extinction:
-    """The part of an extinction under ``name`` among a medium's parameters."""
+    """The part of an extinction under ``name`` among the parameters of a medium."""
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
         lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places))
@@ -318,11 +322,11 @@ def _tensor(values: mi.TensorXf) -> mi.TensorXf:
 
 
 def find_grid_place(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:
-    """Find where a grid volume lies: the (4, 4) float64 map of the unit cube to the world.
+    """Find the place of a grid volume: the (4, 4) float64 map of the unit cube to the world.
 
-    A ``mivol_voxels`` hands its own map out. A stock ``gridvolume`` only prints its transform, to 6 digits, and returns its
-    bounding box, in float32. The two together are exact for boxes along the axes. A turned grid is exact where it fills its
-    boundary, and elsewhere right to 5e-6 of its size.
+    A ``mivol_voxels`` has its own map. A stock ``gridvolume`` only prints its transform, to 6 digits, and returns its bounding
+    box, in float32. Together they are exact for boxes along the axes. A rotated grid is exact if it fills its boundary, and
+    otherwise right to 5e-6 of its size.
     """
     if hasattr(volume, "mivol_to_world"):
         return volume.mivol_to_world
@@ -340,7 +344,7 @@ def find_grid_place(volume: mi.Volume, boundary: Box | None = None) -> np.ndarra
 
 
 def _same_axes(exact: np.ndarray, rough: np.ndarray) -> np.ndarray:
-    """The exact box, with its axes in the order and the direction of those of the rough one."""
+    """The exact box, with its axes in the order and the direction of the axes of the rough box."""
     edges = exact[:3, :3]
     permutation = np.linalg.solve(edges, rough[:3, :3])  # of the axes, with signs, to the digits of ``rough``
     axes = edges @ np.round(permutation)

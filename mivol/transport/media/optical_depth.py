@@ -1,6 +1,6 @@
 """The optical depth of the media along a ray, with its tangent and its transpose.
 
-Conventions. Rows are one number for each channel of the scene's extinction; spectra have one for each colour.
+Conventions. Rows have a number for each channel of the extinction of the scene; spectra have a number for each colour.
 """
 
 from __future__ import annotations
@@ -80,18 +80,18 @@ def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectru
     """Add the derivatives of the optical depth of a segment, times ``weight``, to the gradients of its media.
 
     Args:
-        media: of the scene.
-        segment: the ray, which has been walked before.
+        media: media of the scene.
+        segment: the ray, of known length.
         weight: d loss / d tau of each colour.
-        active: lanes that add; lanes of weight 0 are left out.
+        active: lanes to add; lanes of weight 0 are left out.
 
-    Cost: one walk of each medium, with one packed write of 8 a cell and channel.
+    Cost: a walk of each medium, with a packed write of 8 a cell and channel.
     """
     vjp_rows(media, segment, colours_to_channels(weight, media.channels), active & dr.any(weight != 0))
 
 
 def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
-    """As :func:`vjp_optical_depth`, ``weight`` one number for each channel."""
+    """Like :func:`vjp_optical_depth`, with a ``weight`` for each channel."""
 
     bounded = bounded_parts(media.bodies)
 
@@ -107,12 +107,12 @@ def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], act
 
 
 def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> mi.Spectrum:
-    """Tangent of the optical depth of a segment, from the parameters' tangents that :meth:`SceneMedia.start_tangent` took."""
+    """Tangent of the optical depth of a segment, from the tangents of :meth:`SceneMedia.start_tangent`."""
     return to_spectrum(jvp_rows(media, segment, active))
 
 
 def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
-    """As :func:`jvp_optical_depth`, one number for each channel."""
+    """Like :func:`jvp_optical_depth`, with a number for each channel."""
 
     bounded, zero = bounded_parts(media.bodies), [mi.Float(0) for _ in range(media.channels)]
 
@@ -131,7 +131,7 @@ def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi
 
 
 def _pass(points: list[PointReservoir], bounded: list[tuple], interval: MediumInterval) -> list[PointReservoir]:
-    """Pass an interval of one medium with the points of all bounded parts."""
+    """Pass an interval of a medium with the points of all bounded parts."""
     return [
         offer_medium_interval(point, part, interval) if owner is interval.body else point
         for (owner, part), point in zip(bounded, points, strict=True)

@@ -1,9 +1,14 @@
-"""The media along a ray: the interval of each, their order, and the surface at which the ray ends.
+"""The media along a ray: the interval of each medium, and the surface at the end of the ray.
 
-A ray is followed to the first opaque surface, and each medium on the way is visited with its interval [t0, t1]. Boundaries that
-are boxes are cut by slab tests in float64; others are traced. Media are disjoint, so the middles of their intervals order them.
+A ray is followed to the first opaque surface, and each medium on the way is visited with its interval [t0, t1]. Slab tests in
+float64 find the intervals of media in boxes; the intervals behind other boundaries are traced. Media are disjoint, so the
+middles of their intervals order them.
 
-Conventions. Distances are world lengths from the origin of the camera's own ray, and not from the last boundary, so that entry
+Dr.Jit records a loop by calling its body once. A loop over boundaries is a recorded loop of unknown length, so
+:func:`visit_media` takes the function for an interval as an argument; for media in boxes the function is called from a Python
+loop.
+
+Conventions. Distances are world lengths from the origin of the ray of the segment, and not from the last boundary, so entry
 points keep their digits.
 """
 
@@ -37,18 +42,18 @@ __all__ = [
 
 
 UNIT = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-"""Two corners of the cube that a boundary's rows map it to."""
+"""Two corners of the unit cube, in the coordinates of a boundary's rows."""
 
 
 @dataclass
 class SegmentEnd:
-    """Where a segment ends: at an opaque surface (``si`` valid), or at the distance asked for.
+    """The end of a segment: at an opaque surface (``si`` valid), or at ``ray.maxt``.
 
     Attributes:
         si: the surface.
         t: length of the segment [length].
-        medium: the medium around its end.
-        null_transmission: fraction of the light that surfaces on the way transmit without changing its direction.
+        medium: the medium around the end.
+        null_transmission: fraction of the light that surfaces on the way transmit undeviated.
     """
 
     si: mi.SurfaceInteraction3f
@@ -59,15 +64,14 @@ class SegmentEnd:
 
 @dataclass
 class RaySegment:
-    """A segment that has been walked before.
+    """A segment of known length.
 
     Attributes:
         ray: world space, unit direction.
-        medium: the medium around its origin.
-        length: how far it went [length].
-        passes_null: whether it passed surfaces that transmit part of the light undeviated.
-        u: a number in [0, 1) that draws the points at which derivatives of bounded media are estimated; None where all optical
-            depths are exact.
+        medium: the medium around the origin.
+        length: length of the segment [length].
+        passes_null: whether the ray passes surfaces that transmit part of the light undeviated.
+        u: number in [0, 1) that draws the points for derivatives of bounded media; None if all optical depths are exact.
     """
 
     ray: Ray
@@ -84,10 +88,10 @@ class RaySegment:
 
 @dataclass
 class MediumInterval(RayInterval):
-    """The interval of a ray in one medium.
+    """The interval of a ray in a medium.
 
-    Where the boundary is a box that all grids of the medium fit into, the grids' own boxes are enough, and the interval is that
-    of the whole ray.
+    If the boundary is a box around all grids of the medium, the boxes of the grids suffice, and the interval covers the whole
+    ray.
 
     Attributes:
         body: the medium in its boundary.
@@ -101,7 +105,7 @@ class MediumInterval(RayInterval):
         return 0.5 * (t0 + t1)
 
     def inside(self) -> tuple[mi.Float64, mi.Float64]:
-        """The interval inside the boundary [length]; the end is not behind the start where it misses it."""
+        """The interval inside the boundary [length]; the end is not behind the start if the ray misses the boundary."""
         t0, t1 = mi.Float64(self.t0), mi.Float64(self.t1)
         if self.body.box is not None and not self.body.cuts_grids:
             _, _, t0, t1 = clip_to_box(self.body.rows, *UNIT, self.ray.o, self.ray.d, t0, t1)
@@ -158,16 +162,17 @@ def find_end(media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool)
 
 
 def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: mi.Bool) -> list[MediumInterval]:
-    """Find the intervals of the media in boxes between the ray's origin and ``t_end``.
+    """Find the intervals of the media in boxes between the origin of the ray and ``t_end``.
 
     Args:
-        media: of the scene.
+        media: media of the scene.
         ray: world space, unit direction.
-        t_end: where the ray ends [length]; may be infinite.
-        active: lanes to cut.
+        t_end: end of the ray [length]; may be infinite.
+        active: lanes to clip.
 
     Returns:
-        One interval for each of ``media.boxed``, in their order; two for one with a hole: before it and behind it.
+        An interval for each of ``media.boxed``, in their order; two intervals for a medium with a hole, before and behind the
+        hole.
     """
     found = []
     for body in media.boxed:
@@ -193,7 +198,11 @@ def trace_boundaries(
     active: mi.Bool,
     passes_null: bool,
 ) -> tuple[SegmentEnd, Any]:
-    """Trace through transparent surfaces to the first opaque one; visit the media whose boundary is traced."""
+    """Trace through transparent surfaces to the first opaque surface, and visit the media behind traced boundaries.
+
+    Arguments and results are as of :func:`visit_media`. Without surfaces and traced boundaries the ray goes on to
+    ``ray.maxt``.
+    """
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
     si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
     if dr.hint(not media.traces, mode="scalar"):
@@ -237,10 +246,10 @@ def trace_boundaries(
 
 
 def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether a surface is nothing but a boundary: a ``null`` BSDF and no emitter."""
+    """Whether a surface is only a boundary: a ``null`` BSDF and no emitter."""
     components = si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))
     return (components == int(mi.BSDFFlags.Null)) & ~si.shape.is_emitter()
 
 
 OWN_SURFACE = 1 - 1e-3
-"""Fraction of the length of a shadow ray beyond which a hit is the emitter's own surface (Mitsuba shortens its rays alike)."""
+"""Fraction of the length of a shadow ray beyond which a hit is the surface of the emitter (Mitsuba shortens its rays alike)."""

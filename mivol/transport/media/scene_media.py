@@ -1,6 +1,7 @@
-"""The media of a scene, and the start and end of derivatives that are taken with respect to them.
+"""The media of a scene, and the start and end of a pass of derivatives with respect to them.
 
-Conventions. A body is one medium behind one boundary. Boundaries that are boxes are cut by slab tests; others are traced.
+Conventions. A body is a medium behind a boundary. Slab tests clip rays to boundaries that are boxes; other boundaries are
+traced.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ __all__ = ["SceneMedia"]
 
 
 class SceneMedia:
-    """The media of a scene, and what of Mitsuba's scene has to be traced.
+    """The media of a scene, with the parts of Mitsuba's scene that have to be traced.
 
     Args:
         scene: Mitsuba's scene: surfaces and boundaries.
         bodies: the media.
-        has_surfaces: some shape is more than the boundary of a medium.
-        has_null_transmission: some surface lets part of the light through undeviated.
-        start: the medium that the sensor names, or None.
-        locates_camera: the camera may be inside a boundary that has to be traced, and the sensor names no medium.
-        size: of the scene [length], by which rays start anew behind a surface.
+        has_surfaces: whether some shape is more than the boundary of a medium.
+        has_null_transmission: whether some surface transmits part of the light undeviated.
+        start: the medium named by the sensor, or None.
+        locates_camera: whether the camera may be inside a traced boundary while the sensor names no medium.
+        size: size of the scene [length], which scales the offset of spawned rays.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class SceneMedia:
         return self.boxed + self.traced
 
     def bodies_at(self, index: mi.UInt32, on: mi.Bool) -> list[tuple[Body, mi.Bool]]:
-        """The media, each with the lanes of ``on`` whose ``index`` among ``bodies`` is its own."""
+        """The media, each with the lanes of ``on`` whose ``index`` among ``bodies`` is that medium."""
         return [(body, on & (index == k)) for k, body in enumerate(self.bodies)]
 
     def medium_of(self, index: mi.UInt32, on: mi.Bool) -> mi.MediumPtr:
@@ -72,7 +73,7 @@ class SceneMedia:
 
     @property
     def is_single(self) -> bool:
-        """Whether one walk of cells passes all extinction in its order: one medium, whose grids share their cells."""
+        """Whether a single walk of cells passes all extinction in order: one medium, whose grids share their cells."""
         return len(self.bodies) == 1 and len(self.bodies[0].flight_parts) == len(self.bodies[0].view.parts)
 
     def to_channels(self, values: list[mi.Float]) -> list[mi.Float]:
@@ -80,22 +81,22 @@ class SceneMedia:
         return to_scene_channels(values, self.channels)
 
     def sum_channels(self, rows: list[mi.Float]) -> list[mi.Float]:
-        """Derivatives by the channels of the scene, from those by colours: the transpose of :meth:`to_channels`."""
+        """Derivatives by the channels of the scene, from derivatives by colours: the transpose of :meth:`to_channels`."""
         return rows if len(rows) == self.channels else [sum(rows[1:], rows[0])]
 
     @property
     def tracks_shadows(self) -> bool:
-        """Whether tracking estimates transmittance along shadow rays: in bounded fields always."""
+        """Whether tracking estimates the transmittance of shadow rays: always in bounded fields."""
         return self.estimates_shadows or self.is_bounded
 
     @property
     def estimates_shadows(self) -> bool:
-        """Whether the transmittance of some medium may be estimated in pictures, since its blocks are known."""
+        """Whether images may estimate the transmittance of some medium, whose block ranges are known."""
         return any(b.estimates_shadows for b in self.bodies)
 
     @property
     def is_bounded(self) -> bool:
-        """Whether the optical depth of some medium is not known along a ray, so that its transmittance is estimated."""
+        """Whether some medium has no known optical depth along a ray, so its transmittance is estimated."""
         return any(b.is_bounded for b in self.bodies)
 
     @property
@@ -118,13 +119,13 @@ class SceneMedia:
         return dr.zeros(mi.MediumPtr, n)
 
     def start_gradients(self) -> None:
-        """Begin a reverse pass: gradients of zero for each part."""
+        """Begin a reverse pass: set the gradient of each part to zero."""
         for body in self.bodies:
             body.microflakes_gradient = dr.zeros(mi.Float, 6) if is_followed(body.view.microflakes) else None
             body.gradients = [part.start_gradient() for part in body.view.parts]
 
     def deliver_gradients(self) -> None:
-        """End a reverse pass: hand the gradients of the parts to the parameters behind them."""
+        """End a reverse pass: deliver the gradients of the parts to their parameters."""
         total = mi.Float(0)
         for body in self.bodies:
             for part, gradient in zip(body.view.parts, body.gradients, strict=True):
@@ -154,7 +155,7 @@ class SceneMedia:
 
 @dr.syntax
 def _locate(scene: mi.Scene, ray: mi.Ray3f, size: mi.Float) -> mi.MediumPtr:
-    """Find the medium around a point: the near side of the first boundary along a ray, through all else."""
+    """Find the medium around a point: the near side of the first boundary along a ray, through all other surfaces."""
     probe = mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths)  # the boundary may lie beyond the sensor's far_clip
     medium = dr.zeros(mi.MediumPtr, dr.width(ray))
     going = dr.full(mi.Bool, True, dr.width(ray))

@@ -1,10 +1,11 @@
-r"""A point of each bounded extinction along a segment, drawn uniformly, for the derivative of its optical depth.
+r"""A point drawn uniformly from the intervals of a segment in some media.
+
+A uniform point estimates the derivative of the optical depth of a bounded extinction,
 
 .. math:: \partial \tau = \int \partial \sigma\,dt = E[\ell\; \partial \sigma(t)], \qquad t \sim \mathrm{uniform}
 
-with the length l of all the segment's intervals in the field's box. A segment may leave a boundary and enter it again: one of
-its intervals is kept with a probability proportional to its length, by weighted reservoir sampling, which reuses the one random
-number of the segment.
+with the length l of all intervals of the segment in the box of the field. A segment may leave a boundary and enter it again. A
+reservoir keeps an interval with a probability proportional to its length, and reuses the single random number of the segment.
 
 References: Chao 1982 (weighted reservoir sampling).
 """
@@ -35,12 +36,12 @@ __all__ = [
 
 @dataclass
 class PointReservoir:
-    """The reservoir of one bounded extinction.
+    """A reservoir that keeps an interval of several.
 
     Attributes:
-        total: length [length] of the intervals so far.
-        begin, length: the one that was kept.
-        u: what is left of the random number, uniform in [0, 1).
+        total: length of the intervals so far [length].
+        begin, length: the kept interval.
+        u: remainder of the random number, uniform in [0, 1).
     """
 
     total: mi.Float
@@ -60,10 +61,10 @@ def bounded_parts(bodies: list[Body]) -> list[tuple[Body, BoundedExtinction]]:
 
 
 def start_reservoirs(count: int, u: mi.Float | None, width: int) -> list[PointReservoir]:
-    """Begin a segment with ``count`` bounded extinctions.
+    """Start a segment with ``count`` bounded extinctions.
 
     Raises:
-        MivolError: there are some, and the segment has no random number.
+        MivolError: ``count`` is not 0, and the segment has no random number.
     """
     if count and u is None:
         raise MivolError("the derivative of an optical depth through a bounded field was asked for, which is estimated only.")
@@ -72,12 +73,12 @@ def start_reservoirs(count: int, u: mi.Float | None, width: int) -> list[PointRe
 
 
 def offer_medium_interval(point: PointReservoir, part: BoundedExtinction, interval: RayInterval) -> PointReservoir:
-    """Offer one more interval to the reservoir."""
+    """Offer the part of an interval inside the box of a field to a reservoir."""
     return offer_interval(point, *part.clip(interval), interval.active)[0]
 
 
 def offer_interval(point: PointReservoir, begin: mi.Float, end: mi.Float, on: mi.Bool) -> tuple[PointReservoir, mi.Bool]:
-    """Offer the interval between two distances to the reservoir; besides, the lanes that keep it."""
+    """Offer the interval between two distances to a reservoir; also returns the lanes keeping the interval."""
     length = dr.select(on & (end > begin), end - begin, 0)
     total = point.total + length
     share = length / dr.select(total > 0, total, 1)
@@ -89,19 +90,20 @@ def offer_interval(point: PointReservoir, begin: mi.Float, end: mi.Float, on: mi
 
 
 ENDLESS = 1e30
-"""Distance [length] from which a ray counts as one without end: those that start at a surface are as long as the largest
-float32, the others infinite."""
+"""Distance [length] from which a ray counts as endless: rays from a surface are as long as the largest float32, others
+infinite.
+"""
 
 
 @dataclass
 class UniformPoint:
-    """A point of a segment, and the length that it stands for.
+    """A point of a segment, and the length of its intervals.
 
     Attributes:
-        t: its distance on the ray [length].
-        length: of all intervals together [length]; a function times this has the mean of its integral over them.
-        body: index of its medium.
-        on: lanes that have one.
+        t: distance of the point on the ray [length].
+        length: length of all intervals together [length]; a function times this length has the mean of its integral over them.
+        body: index of the medium.
+        on: lanes with a point.
     """
 
     t: mi.Float64
@@ -111,13 +113,13 @@ class UniformPoint:
 
 
 def draw_uniform_point(media: SceneMedia, passed: RaySegment, among: list[Body], u: mi.Float, active: mi.Bool) -> UniformPoint:
-    """Draw a point evenly from the intervals of a segment in some media.
+    """Draw a point uniformly from the intervals of a segment in some media.
 
     Args:
-        media: of the scene.
-        passed: the segment, which has been walked before.
-        among: the media asked about. Intervals without end count as empty.
-        u: a number in [0, 1).
+        media: media of the scene.
+        passed: the segment, of known length.
+        among: the media to draw from. Intervals without end count as empty.
+        u: number in [0, 1).
         active: lanes to draw for.
     """
     width, bodies = dr.width(passed.ray), media.bodies
