@@ -132,8 +132,8 @@ def _load(folder: Path, image: Image) -> NDArray:
 
 def _exr(path: Path, layer: str) -> NDArray:
     stacked = stack_layers(read_exr(path)[0])
-    wanted = [layer] if layer else ["", "Y", *(stacked if len(stacked) == 1 else ())]
-    name = next((name for name in wanted if name in stacked), None)
+    names = [layer] if layer else ["", "Y", *(stacked if len(stacked) == 1 else ())]
+    name = next((name for name in names if name in stacked), None)
     if name is None:
         listed = ", ".join(f'"{name}"' for name in stacked)
         raise MivolError(f"{path.name} has the layers {listed}; name one of these layers in the record.")
@@ -176,8 +176,8 @@ def _are_linear(roles: dict[str, NDArray], *names: str) -> bool:
 def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, pixel_scale.Scale]:
     """Scales by role, shared by all views: values by the references, differences symmetric, z-images fixed."""
     views = [{role: image for role, image in roles.items() if _are_linear(roles, role)} for roles in views]
-    shown = [roles.get("reference", roles.get("render")) for roles in views]
-    values = [image for image in shown if image is not None]
+    radiances = [roles.get("reference", roles.get("render")) for roles in views]
+    values = [image for image in radiances if image is not None]
     differences = [roles["difference"] for roles in views if "difference" in roles]
     scales = {}
     if values:
