@@ -1,8 +1,8 @@
-"""Each file format against bytes made by hand, round trips, whole writes, and the real files.
+"""Every file format: bytes made by hand, round trips, atomic writes, and real files.
 
 Values are compared exactly: every format here stores float32 or small integers, which float32 holds exactly. Places are
 compared to 1e-12 relative to their size (a few float64 roundings of numbers below 100), or to float32 rounding (1e-6)
-where the file itself stores float32.
+for files that store float32.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def assert_volume(volume: files.VolumeData, values: np.ndarray, place: np.ndarra
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"])
 @pytest.mark.parametrize("suffix", ["nrrd", "mha", "nii", "vti"])
 def test_every_type_of_numbers(tmp_path: Path, suffix: str, dtype: str) -> None:
-    """Large ones with the sign that the type has: another width or sign gives others. float32 holds each exactly."""
+    """Large values with the sign of the type: another width or sign would change them. float32 holds each exactly."""
     make = {"nrrd": made.nrrd, "mha": made.mha, "nii": partial(made.nifti, sform=SFORM), "vti": made.vti}[suffix]
     bits, small = 8 * int(dtype[1]), made.numbered() // 4
     whole = np.float32(2.0 ** (bits - 2)) + small * np.float32(2.0 ** max(bits - 10, 0))
@@ -70,7 +70,7 @@ def test_vol_by_hand(tmp_path: Path, channels: int) -> None:
     np.testing.assert_allclose(volume.origin, (-0.5, -1, -1))
 
 
-def test_vol_other_encodings(tmp_path: Path) -> None:
+def test_vol_encodings(tmp_path: Path) -> None:
     """float16 holds these integers exactly; uint8 255 stands for 1, rounded once by the product in float32."""
     values = made.numbered()
     np.testing.assert_array_equal(read(tmp_path, "h.vol", made.vol(values, encoding=2)).values, values)
@@ -85,8 +85,8 @@ def test_vol_is_written_byte_for_byte(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_vol_is_what_mitsuba_means(tmp_path: Path, variant_rgb: str, channels: int) -> None:
-    """Our file under stock gridvolume shows voxel (x, y, z) at to_world((i + .5)/N), and Mitsuba's file reads back.
+def test_vol_agrees_with_mitsuba(tmp_path: Path, variant_rgb: str, channels: int) -> None:
+    """Stock gridvolume shows voxel (x, y, z) of a mivol file at to_world((i + .5)/N), and mivol reads Mitsuba's file.
 
     gridvolume interpolates in float32: at a voxel centre the fraction is off by at most a few float32 roundings of the
     world position (|p| < 8, voxels of 1 or more), times the largest difference of neighbours (64).
@@ -117,7 +117,7 @@ def test_npy_types(tmp_path: Path, dtype: str) -> None:
     assert_volume(files.read_volume(tmp_path / "a.npy"), values, np.eye(4))
 
 
-def test_npz_of_others(tmp_path: Path) -> None:
+def test_foreign_npz_by_array_name(tmp_path: Path) -> None:
     values = made.numbered(channels=3)
     np.savez(tmp_path / "a.npz", rho=values, mask=values[..., 0] > 3, axis=np.arange(3))
     assert_volume(files.read_volume(tmp_path / "a.npz", "rho"), values, np.eye(4))
@@ -145,7 +145,7 @@ def test_nrrd_channels_first_or_last(tmp_path: Path) -> None:
 
 
 def test_nrrd_rotated(tmp_path: Path) -> None:
-    """x runs along world y, y along -x, with a shear in z."""
+    """x points along world y, y along -x, with a shear in z."""
     values = made.numbered()
     volume = read(tmp_path, "a.nrrd", made.nrrd(values, space_directions="(0,1.5,0) (-2,0,0) (1,0,2.5)"))
     np.testing.assert_allclose(volume.steps, [[0, -2, 1], [1.5, 0, 0], [0, 0, 2.5]], atol=1e-12)
@@ -153,7 +153,7 @@ def test_nrrd_rotated(tmp_path: Path) -> None:
 
 
 def test_nrrd_without_a_space(tmp_path: Path) -> None:
-    """Spacings alone; cell-centred axis mins are the border, half a voxel before the first centre."""
+    """Spacings only; axis mins of cells are the border, half a voxel before the first centre."""
     plain = {"space": "", "space_directions": "", "space_origin": "", "spacings": "1.5 2 2.5"}
     volume = read(tmp_path, "a.nrrd", made.nrrd(made.numbered(), **plain))
     np.testing.assert_allclose((volume.spacing, volume.origin), ((1.5, 2, 2.5), (0, 0, 0)), atol=1e-12)
@@ -163,7 +163,7 @@ def test_nrrd_without_a_space(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("encoding", ["raw", "gzip"])
 def test_nrrd_detached(tmp_path: Path, encoding: str) -> None:
-    """Line skip before decompression, byte skip after it."""
+    """The line skip precedes decompression, the byte skip follows it."""
     values = made.numbered()
     body = b"\1\2\3" + made.packed(made.in_order(values), "i2", ">")
     (tmp_path / "data").write_bytes(b"one line\nanother\n" + made.PACK[encoding](body))
@@ -178,7 +178,7 @@ def test_nrrd_byte_skip_from_the_end(tmp_path: Path) -> None:
     assert_volume(read(tmp_path, "a.nhdr", head.encode()), values)
 
 
-def test_nrrd_that_is_longer_than_it_says_is_not_cut_at_either_end(tmp_path: Path) -> None:
+def test_a_too_long_nrrd_is_refused(tmp_path: Path) -> None:
     """Only a negative byte skip counts from the end."""
     with pytest.raises(MivolError, match="longer than its header says"):
         read(tmp_path, "a.nrrd", made.nrrd(made.numbered()) + b"and more")
@@ -205,7 +205,7 @@ def test_metaimage_by_hand(tmp_path: Path, keys: dict[str, str]) -> None:
 
 
 def test_metaimage_rows_of_the_matrix_are_the_axes(tmp_path: Path) -> None:
-    """Axis x runs along world y, y along -x: a transposed reading would give y along +x."""
+    """Axis x points along world y, y along -x: the transposed matrix would give y along +x."""
     volume = read(tmp_path, "a.mha", made.mha(made.numbered(), TransformMatrix="0 1 0 -1 0 0 0 0 1"))
     np.testing.assert_allclose(volume.steps, [[0, -2, 0], [1.5, 0, 0], [0, 0, 2.5]], atol=1e-12)
     np.testing.assert_allclose(volume.origin, (10, 20, 30))
@@ -240,7 +240,7 @@ def test_nifti_by_hand(tmp_path: Path, version: int, name: str, channels: int) -
 
 
 @pytest.mark.parametrize("axis", [4, 5, 6, 7])
-def test_nifti_channels_on_any_further_axis(tmp_path: Path, axis: int) -> None:
+def test_nifti_channels_on_every_further_axis(tmp_path: Path, axis: int) -> None:
     values = made.numbered(channels=3)
     assert_volume(read(tmp_path, "a.nii", made.nifti(values, sform=SFORM, axis=axis)), values)
 
@@ -259,7 +259,7 @@ def test_nifti_sform_comes_before_qform(tmp_path: Path) -> None:
 
 
 def test_nifti_scale(tmp_path: Path) -> None:
-    """Slope and intercept that binary numbers hold exactly; a slope of 0 means none."""
+    """Slope and intercept are exact binary numbers; a slope of 0 means no scaling."""
     data = made.nifti(made.numbered(), dtype="i2", sform=SFORM, scale=(0.5, -3))
     assert_volume(read(tmp_path, "a.nii", data), made.numbered() * 0.5 - 3)
     data = made.nifti(made.numbered(), dtype="i2", sform=SFORM, scale=(0, 7))
@@ -273,7 +273,7 @@ def test_nifti_colours(tmp_path: Path) -> None:
 
 
 def test_ras_and_lps_agree(tmp_path: Path) -> None:
-    """The same head in NIfTI and in MetaImage lies in the same place once both frames have one name."""
+    """The same head in NIfTI and in MetaImage has the same placement in the same frame."""
     ras = read(tmp_path, "a.nii", made.nifti(made.numbered(), version=2, sform=SFORM))
     lps = read(tmp_path, "a.mha", made.mha(made.numbered(), Offset="-10 -20 30", TransformMatrix="-1 0 0 0 -1 0 0 0 1"))
     np.testing.assert_allclose(files.to_space(lps, "RAS").to_world, ras.to_world, atol=1e-12)
@@ -295,14 +295,14 @@ def test_vti_by_hand(tmp_path: Path, compressor: str | None, mode: str) -> None:
 
 
 @pytest.mark.parametrize("header_type", ["UInt32", "UInt64"])
-def test_vti_length_padded_on_its_own(tmp_path: Path, header_type: str) -> None:
+def test_vti_with_separately_padded_lengths(tmp_path: Path, header_type: str) -> None:
     values = made.numbered()
     data = made.vti(values, mode="inline", split=True, header_type=header_type)
     assert_volume(read(tmp_path, "a.vti", data), values)
 
 
-def test_vti_place(tmp_path: Path) -> None:
-    """The extent begins at (2, -1, 5); its first point is origin + direction @ (spacing * first); cells lie half in."""
+def test_vti_placement(tmp_path: Path) -> None:
+    """The extent starts at (2, -1, 5); its first point is origin + direction @ (spacing * first); cells lie half a step in."""
     turned = {"direction": "0 -1 0 1 0 0 0 0 1", "first": (2, -1, 5)}
     volume = read(tmp_path, "a.vti", made.vti(made.numbered(), **turned))
     np.testing.assert_allclose(volume.steps, [[0, -2, 0], [1.5, 0, 0], [0, 0, 2.5]], atol=1e-12)
@@ -319,8 +319,8 @@ def test_legacy_vtk_by_hand(tmp_path: Path, binary: bool, kind: str) -> None:
     assert_volume(read(tmp_path, "a.vtk", made.vtk(values, binary=binary, kind=kind)), values)
 
 
-def test_legacy_vtk_of_cells_and_of_several_arrays(tmp_path: Path) -> None:
-    """Cell centres lie half a step in; an array after a binary one is found by its name."""
+def test_legacy_vtk_with_cells_and_several_arrays(tmp_path: Path) -> None:
+    """Cell centres are half a step inside; an array after a binary array is found by name."""
     volume = read(tmp_path, "a.vtk", made.vtk(made.numbered(), cells=True))
     assert volume.meta["centering"] == "cell"
     assert read(tmp_path, "c.vtk", made.vtk(made.numbered())).meta["centering"] == "point"
@@ -338,7 +338,7 @@ def test_pbrt_by_hand(tmp_path: Path) -> None:
 
 
 def test_les_by_hand(tmp_path: Path) -> None:
-    """Extinction 1.5 lwc / reff: g/m^3 over um is 1/m; dry cells may have radius 0."""
+    """Extinction 1.5 lwc / reff: g/m^3 over um is 1/m; dry cells may have a radius of 0."""
     data = made.les([(3, 2, 1, 0.5, 10.0), (0, 1, 0, 0.25, 5.0), (1, 1, 1, 0.0, 0.0)])
     volume = read(tmp_path, "a.txt", data)
     expected = np.zeros((2, 3, 4, 1), np.float32)
@@ -350,7 +350,7 @@ def test_les_by_hand(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cells_by_their_other_name.values, expected)
 
 
-def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+def test_slices_are_ordered_by_number(tmp_path: Path) -> None:
     values = made.numbered(nz=3)
     for z, name in enumerate(("s.2", "s.9", "s.10")):
         (tmp_path / name).write_bytes(b"head" + made.packed(made.in_order(values[z : z + 1]), "u2", ">"))
@@ -363,7 +363,7 @@ def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
 
 
 def make_exchange(path: Path, **changes: object) -> Path:
-    """A Data Exchange file of 4 views of 2 x 3 pixels; ``changes`` replace datasets (None leaves one out)."""
+    """Write a Data Exchange file of 4 views of 2 x 3 pixels; ``changes`` replace datasets, or remove them by None."""
     import h5py
 
     arrays = {
@@ -395,8 +395,8 @@ def test_hdf5_volume_by_name(tmp_path: Path) -> None:
     assert_volume(files.read_volume(tmp_path / "a.h5", "/exchange/data_white"), made.numbered(channels=3), np.eye(4))
 
 
-def test_names_and_units_of_hdf5_that_are_no_text(tmp_path: Path) -> None:
-    """Bytes that are not UTF-8: a unit is read with what stands for them, and a list of names can be printed."""
+def test_hdf5_names_and_units_outside_utf8(tmp_path: Path) -> None:
+    """Invalid bytes are replaced in units and names, so refusals can be printed."""
     import h5py
 
     path = make_exchange(tmp_path / "a.h5", data_white=None)
@@ -418,8 +418,8 @@ def test_names_and_units_of_hdf5_that_are_no_text(tmp_path: Path) -> None:
 # -- Frames and round trips -----------------------------------------------------------------------------------------
 
 
-def test_voxel_centres_are_where_the_steps_say() -> None:
-    """Local ((i + .5)/Nx, ...) goes to origin + steps @ (i, j, k), for a sheared, mirrored frame."""
+def test_steps_place_the_voxel_centres() -> None:
+    """Local ((i + .5)/Nx, ...) maps to origin + steps @ (i, j, k), for a sheared, mirrored frame."""
     steps, origin = np.array([[0, -2.0, 0.5], [1.5, 0, 0], [0, 0.25, -2.5]]), np.array([10.0, 20, 30])
     to_world = files.frame_from_steps((4, 3, 2), steps, origin)
     for index in np.ndindex(4, 3, 2):
@@ -440,7 +440,7 @@ def test_unit_frame_ignores_the_header(tmp_path: Path) -> None:
     seed=st.integers(0, 2**32 - 1),
 )
 def test_round_trip(tmp_path: Path, shape: tuple[int, ...], suffix: str, compress: bool, seed: int) -> None:
-    """Any finite float32 values, any frame: bitwise back, the frame to float64 rounding (NRRD stores steps)."""
+    """Arbitrary finite float32 values and frames: equal bits, and the frame to float64 rounding (NRRD stores steps)."""
     rng = np.random.default_rng(seed)
     values = rng.integers(0, 2**32, shape, np.uint32).view(np.float32)
     values = np.where(np.isfinite(values), values, 0).astype(np.float32)
@@ -459,7 +459,7 @@ def test_npy_round_trip_of_a_strided_array(tmp_path: Path) -> None:
     assert_volume(files.read_volume(tmp_path / "a.npy"), values, np.eye(4))
 
 
-def test_npz_carries_metadata_as_json(tmp_path: Path) -> None:
+def test_npz_stores_metadata_as_json(tmp_path: Path) -> None:
     files.write_volume(tmp_path / "a.npz", made.numbered(), metadata={"unit": "1/m", "seeds": [1, 2]})
     with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
         assert archive["metadata"].ndim == 0
@@ -487,7 +487,7 @@ def test_exr_round_trip_with_layers_and_header(tmp_path: Path) -> None:
     assert read_header["spp"] == 16
 
 
-def test_exr_is_read_by_mitsuba_and_back(tmp_path: Path, two_threads: None) -> None:
+def test_exr_is_exchanged_with_mitsuba(tmp_path: Path, two_threads: None) -> None:
     import mitsuba as mi
 
     rng = np.random.default_rng(2)
@@ -501,7 +501,7 @@ def test_exr_is_read_by_mitsuba_and_back(tmp_path: Path, two_threads: None) -> N
 
 
 def test_png_is_srgb(tmp_path: Path) -> None:
-    """Codes of IEC 61966-2-1 worked out by hand: 0.5 -> 187.5 -> 188, 0.002 -> 6.59 -> 7; alpha stays linear."""
+    """Codes of IEC 61966-2-1 by hand: 0.5 -> 187.5 -> 188, 0.002 -> 6.59 -> 7; alpha stays linear."""
     row = np.array([[[0.5, 0.002, 2.0, 0.5], [-1.0, 1.0, 0.0, 1.0]]])
     files.write_png(tmp_path / "a.png", row)
     assert np.array(Image.open(tmp_path / "a.png")).tolist() == [[[188, 7, 255, 128], [0, 255, 0, 255]]]
@@ -510,7 +510,7 @@ def test_png_is_srgb(tmp_path: Path) -> None:
         assert np.array(Image.open(tmp_path / "b.png")).tolist() == [[188] * 3] * 2
 
 
-def test_png_names_the_pixel_that_is_no_number(tmp_path: Path) -> None:
+def test_png_refuses_nan_with_its_pixel(tmp_path: Path) -> None:
     for shape in ((4, 5), (4, 5, 3)):
         image = np.zeros(shape)
         image[2, 3] = np.nan
@@ -519,7 +519,7 @@ def test_png_names_the_pixel_that_is_no_number(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 3, 2), (2, 3, 5), (0, 3), (1, 2, 3, 3)])
-def test_png_is_no_other_array(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_png_refuses_other_shapes(tmp_path: Path, shape: tuple[int, ...]) -> None:
     with pytest.raises(MivolError, match="convert the array|choose channels"):
         files.write_png(tmp_path / "c.png", np.zeros(shape))
 
@@ -528,11 +528,11 @@ def test_png_is_no_other_array(tmp_path: Path, shape: tuple[int, ...]) -> None:
 
 
 class Stop(BaseException):
-    """As Ctrl-C: not an Exception."""
+    """A BaseException like Ctrl-C."""
 
 
 @pytest.mark.parametrize("fault", [RuntimeError("no"), Stop(), OSError(errno.ENOSPC, "full")], ids=lambda e: repr(e))
-def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, fault: BaseException) -> None:
+def test_a_failed_write_keeps_the_earlier_file(tmp_path: Path, fault: BaseException) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"before")
 
@@ -546,7 +546,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, fault: BaseExc
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.bin"]
 
 
-def test_the_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:
+def test_a_file_appears_only_when_complete(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
 
     def writer(file: io.BufferedWriter) -> None:
@@ -557,7 +557,7 @@ def test_the_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:
     assert path.read_bytes() == b"new"
 
 
-def test_the_file_is_synced_before_it_takes_its_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_is_synced_before_its_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events: list[str] = []
     sync, replace = os.fsync, Path.replace
     monkeypatch.setattr(os, "fsync", lambda handle: (events.append("sync"), sync(handle)))
@@ -567,7 +567,7 @@ def test_the_file_is_synced_before_it_takes_its_place(tmp_path: Path, monkeypatc
     assert (tmp_path / "a.txt").read_text("utf-8") == "größer"
 
 
-def test_a_link_stays_a_link_and_the_mask_is_kept(tmp_path: Path) -> None:
+def test_links_and_the_umask_are_kept(tmp_path: Path) -> None:
     (tmp_path / "real").write_bytes(b"old")
     (tmp_path / "link").symlink_to(tmp_path / "real")
     before = os.umask(0o027)
@@ -601,8 +601,8 @@ else:
 @pytest.mark.slow_for(".exr", ".npz", ".nrrd", ".png", ".vol")
 @pytest.mark.skipif(sys.platform == "win32", reason="needs the resource module of POSIX")
 @pytest.mark.parametrize("suffix", [".vol", ".npy", ".npz", ".nrrd", ".exr", ".png"])
-def test_every_writer_notices_that_the_system_stops_it(tmp_path: Path, suffix: str) -> None:
-    """A limit on file size stands in for a full disk: same path through the system, no special disk needed."""
+def test_every_writer_reports_errors_of_the_system(tmp_path: Path, suffix: str) -> None:
+    """A limit on the file size acts as a full disk: the same error path without a special disk."""
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"before")
     done = subprocess.run([sys.executable, "-c", WRITE_TOO_MUCH, suffix, str(path)], capture_output=True, text=True, check=True)
@@ -633,7 +633,7 @@ REAL = {
 @pytest.mark.slow_for("ct_mri/bonsai.vti")
 @pytest.mark.parametrize("name", REAL)
 def test_real_volume(data_dir: Path, name: str) -> None:
-    """Ranges and spacings are quoted with 4 to 5 digits."""
+    """Ranges and spacings have 4 to 5 digits."""
     shape, low, high, spacing = REAL[name]
     volume = files.read_volume(data_dir / name)
     assert volume.values.shape == shape
@@ -651,7 +651,7 @@ def test_real_vol_against_mitsuba(data_dir: Path, variant_rgb: str) -> None:
     np.testing.assert_array_equal(files.read_volume(path).values, np.array(stock).reshape(53, 45, 44, 1))
 
 
-def test_real_negative_volume_is_refused_twice(data_dir: Path) -> None:
+def test_a_real_signed_distance_grid_is_refused(data_dir: Path) -> None:
     path = data_dir / "volumes_vol/torus_sdfgrid.vol"
     with pytest.raises(MivolError, match="degenerate box"):
         files.read_volume(path)
@@ -687,8 +687,8 @@ def test_real_projections(data_dir: Path) -> None:
     np.testing.assert_allclose((ratio.min(), ratio.max(), np.median(ratio)), (0.14, 1.10, 0.985), atol=5e-3)
 
 
-def test_nothing_warns(tmp_path: Path) -> None:
-    """Readers that go through NumPy's text parser turn its warnings into refusals and leave no filter behind."""
+def test_readers_emit_no_warnings(tmp_path: Path) -> None:
+    """Readers turn warnings of NumPy's text parser into refusals and leave no filter behind."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read(tmp_path, "a.nrrd", made.nrrd(made.numbered(), encoding="ascii"))

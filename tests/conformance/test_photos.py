@@ -1,4 +1,4 @@
-"""Posed photographs: what is read is what was written, in the conventions that are said."""
+"""Posed photographs are read as written, in the documented conventions."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ EPS = float(np.finfo(np.float32).eps)
 
 @pytest.fixture
 def blender(tmp_path: Path) -> Path:
-    """Four training and two test views of 12 x 8 pixels with alpha."""
+    """A data set of four training and two test views of 12 x 8 pixels with alpha."""
     return write_blender(tmp_path / "set")
 
 
@@ -57,18 +57,18 @@ def blender(tmp_path: Path) -> Path:
 
 
 def test_rays_of_corners_and_centre() -> None:
-    """By hand: 90 degrees over 4 pixels, so fx = 2; the camera stands at (1, 2, 3) unrotated and looks along -z."""
+    """90 degrees over 4 pixels give fx = 2; the camera stands at (1, 2, 3) without rotation and looks along -z."""
     pose = np.eye(4)
     pose[:3, 3] = 1, 2, 3
     camera = Camera(intrinsics(2, 2, 2, 1), (4, 2), pose)
     o, d = rays(camera, np.array([[2, 1], [0, 1], [4, 1], [2, 0]]))
     np.testing.assert_array_equal(o, np.tile([1, 2, 3], (4, 1)))
     root = math.sqrt(0.5)
-    wanted = [[0, 0, -1], [-root, 0, -root], [root, 0, -root], [0, 1 / math.sqrt(5), -2 / math.sqrt(5)]]
-    np.testing.assert_allclose(d, wanted, atol=1e-15)  # a few float64 roundings
+    expected = [[0, 0, -1], [-root, 0, -root], [root, 0, -root], [0, 1 / math.sqrt(5), -2 / math.sqrt(5)]]
+    np.testing.assert_allclose(d, expected, atol=1e-15)  # a few float64 roundings
 
 
-def test_pixel_centres_lie_half_a_pixel_in() -> None:
+def test_pixel_centres_are_half_a_pixel_inside() -> None:
     centres = pixel_centres((3, 2))
     assert centres.shape == (2, 3, 2)
     np.testing.assert_array_equal(centres[1, 2], (2.5, 1.5))
@@ -89,7 +89,7 @@ def test_project_inverts_rays() -> None:
     assert np.isnan(behind).all() and (negative < 0).all()
 
 
-def test_resized_camera_sees_the_same() -> None:
+def test_a_resized_camera_has_the_same_rays() -> None:
     camera = Camera(intrinsics(50, 50, 31, 22), (64, 48), look_at(np.array([3.0, -2, 1])))
     half = camera.resized((32, 24))
     np.testing.assert_allclose(rays(half, np.array([8.0, 6.0]))[1], rays(camera, np.array([16.0, 12.0]))[1], atol=1e-15)
@@ -114,24 +114,24 @@ def test_blender_splits_cameras_and_pixels(blender: Path) -> None:
 
 
 @pytest.mark.parametrize("background", ["white", (0.2, 0.5, 0.9)])
-def test_alpha_over_a_background(blender: Path, background: object) -> None:
+def test_alpha_blends_over_a_background(blender: Path, background: object) -> None:
     view = load_photos(blender, background=background).views[2]
     stored = pixels(12, 8, 2) / 255
     colour = np.ones(3) if background == "white" else np.array(background)
-    wanted = stored[..., :3] * stored[..., 3:] + (1 - stored[..., 3:]) * colour
-    np.testing.assert_allclose(view.image, wanted, atol=4 * EPS)
+    expected = stored[..., :3] * stored[..., 3:] + (1 - stored[..., 3:]) * colour
+    np.testing.assert_allclose(view.image, expected, atol=4 * EPS)
     other = stored[..., :3] * stored[..., 3:] + (1 - stored[..., 3:]) * [1, 0, 0.5]
     np.testing.assert_allclose(view.over([1, 0, 0.5]), other, atol=8 * EPS)
 
 
-def test_random_backgrounds_differ_between_views_and_follow_the_seed(blender: Path) -> None:
+def test_random_backgrounds_depend_on_view_and_seed(blender: Path) -> None:
     colours = [view.background for view in load_photos(blender, background="random", seed=3).views]
     assert len({tuple(colour) for colour in colours}) == 4
     again = [view.background for view in load_photos(blender, background="random", seed=3).views]
     np.testing.assert_array_equal(colours, again)
 
 
-def test_linear_on_request(blender: Path) -> None:
+def test_codes_become_linear_on_request(blender: Path) -> None:
     view = load_photos(blender, background="black", space="linear").views[0]
     stored = pixels(12, 8, 0) / 255
     # The formula of IEC 61966-2-1, written again; 1e-6: float32 and a power.
@@ -140,19 +140,19 @@ def test_linear_on_request(blender: Path) -> None:
 
 
 @pytest.mark.parametrize(("scale", "size"), [(0.5, (6, 4)), (0.25, (3, 2)), (0.4, (5, 3))])
-def test_shrunk_by_exact_means_with_alpha(blender: Path, scale: float, size: tuple[int, int]) -> None:
-    """Against a sum over the overlaps of all old with all new pixels; a transparent pixel's colour counts for nothing."""
+def test_photographs_shrink_by_exact_means(blender: Path, scale: float, size: tuple[int, int]) -> None:
+    """Compared with sums over the overlaps of all old and new pixels; transparent pixels have no weight."""
     view = load_photos(blender, background="black", scale=scale).views[0]
     assert view.camera.size == size
     stored = pixels(12, 8, 0) / 255
     multiplied = stored[..., :3] * stored[..., 3:]
-    wanted = np.einsum("ai,bj,ijc->abc", overlaps(8, size[1]), overlaps(12, size[0]), multiplied)
-    np.testing.assert_allclose(view.image, wanted, atol=4 * EPS)
+    expected = np.einsum("ai,bj,ijc->abc", overlaps(8, size[1]), overlaps(12, size[0]), multiplied)
+    np.testing.assert_allclose(view.image, expected, atol=4 * EPS)
     np.testing.assert_allclose(rays(view.camera, np.zeros(2)), rays(survey_photos(blender).frames[0].camera, np.zeros(2)))
 
 
 def overlaps(old: int, new: int) -> np.ndarray:
-    """(new, old) share of each new cell that an old one covers."""
+    """Return the share (new, old) of each new cell covered by an old cell."""
     edge = np.arange(new + 1)[:, None] * old / new
     low, high = np.maximum(edge[:-1], np.arange(old)), np.minimum(edge[1:], np.arange(old) + 1)
     return np.maximum(high - low, 0) * new / old
@@ -163,7 +163,7 @@ def test_shrink_keeps_the_mean() -> None:
     assert shrink(image, (4, 5)).mean() == pytest.approx(image.mean(), abs=4 * EPS)
 
 
-def test_missing_photographs_are_skipped_by_name(blender: Path) -> None:
+def test_missing_photographs_are_skipped_and_listed(blender: Path) -> None:
     (blender / "train" / "r_1.png").unlink()
     photos = load_photos(blender, background="white")
     assert photos.skipped == ("./train/r_1",)
@@ -171,7 +171,7 @@ def test_missing_photographs_are_skipped_by_name(blender: Path) -> None:
     assert "./train/r_1" in photos.describe()
 
 
-def test_held_out_photographs_are_neither_trained_on_nor_lost(blender: Path) -> None:
+def test_held_out_photographs_leave_the_training_split(blender: Path) -> None:
     names = {
         split: [view.name for view in load_photos(blender, split=split, held_out=2, background="white").views]
         for split in ("train", "held_out")
@@ -185,7 +185,7 @@ def test_exr_is_linear_and_multiplied(tmp_path: Path) -> None:
     folder = write_blender(tmp_path / "set", train=2)
     values = np.random.default_rng(0).random((8, 12, 4), np.float32) * 2
     values[..., 3] = np.minimum(values[..., 3], 1)
-    values[0, 0, 3] = 0  # a glow that hides nothing keeps its light
+    values[0, 0, 3] = 0  # emission without opacity stays
     for i in range(2):
         (folder / "train" / f"r_{i}.png").unlink()
         write_exr(folder / "train" / f"r_{i}.exr", {"": values})
@@ -198,12 +198,12 @@ def test_decode_inverts_the_curve_of_png() -> None:
     from mivol.files import encode_srgb
 
     code = np.arange(256) / 255
-    # The standard's two branches meet to 1e-5 only, at code 0.04045, which no 8-bit value is.
+    # The two branches of the standard differ by 1e-5 at code 0.04045, which is no 8-bit value.
     np.testing.assert_allclose(encode_srgb(decode_srgb(code)), code, atol=1e-9)
 
 
-def test_box_of_cameras_about_a_sphere() -> None:
-    """Many cameras about the origin share its ball of radius distance sin(half the angle), and little more."""
+def test_shared_box_of_cameras_around_a_sphere() -> None:
+    """Many cameras around the origin share its ball of radius distance sin(half the angle), and little more."""
     rng = np.random.default_rng(5)
     places = rng.normal(size=(200, 3))
     places *= 4 / np.linalg.norm(places, axis=1, keepdims=True)
@@ -211,7 +211,7 @@ def test_box_of_cameras_about_a_sphere() -> None:
     np.testing.assert_allclose(region.find_focus(cameras), 0, atol=1e-12)
     radius = 4 * math.sin(math.atan(0.4))  # 1.486
     box = region.shared_box(cameras)
-    # The region is the ball's hull by planes, cut by 90 % of the views: a bound from both sides, one cell (1/32) included.
+    # The planes of 90 % of the views bound the region from both sides, up to one cell (1/32).
     assert (np.abs(box) > radius * (1 - 1 / 16)).all() and (np.abs(box) < 1.25 * radius).all()
     near, far = region.near_and_far(cameras, box)
     distances = [np.linalg.norm(np.clip(p, *box) - p) for p in places]
@@ -224,7 +224,7 @@ LENS = {"k1": 0.06, "k2": -0.03, "k3": 0.004, "k4": 0.001, "p1": -0.002, "p2": 0
 
 
 def through_lens(x: np.ndarray, y: np.ndarray, k: list[float], p: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """OpenCV's formula in polar form, written apart from the code: the radius grows, the tangential part is added."""
+    """Evaluate OpenCV's formula in polar form, independent of the code: radial growth plus tangential shift."""
     r = np.hypot(x, y)
     grown = r + sum(c * r ** (2 * i + 3) for i, c in enumerate(k))
     cos, sin = np.divide(x, r, where=r > 0, out=np.ones_like(r)), np.divide(y, r, where=r > 0, out=np.zeros_like(r))
@@ -250,14 +250,14 @@ def test_transforms_intrinsics_of_file_and_frame(tmp_path: Path) -> None:
         ({"fl_x": 20, "camera_angle_x": 1.0}, intrinsics(20, 20, 6, 4)),
     ],
 )
-def test_transforms_with_less(tmp_path: Path, settings: dict, K: np.ndarray) -> None:
+def test_intrinsics_from_partial_settings(tmp_path: Path, settings: dict, K: np.ndarray) -> None:
     folder = write_transforms(tmp_path / "set", settings)
     np.testing.assert_allclose(load_photos(folder).views[0].camera.K, K, rtol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [-1.0, 0.0, 3.15, 60.0])
-def test_angles_of_no_lens_are_refused(tmp_path: Path, angle: float) -> None:
-    """60 is an angle in degrees: the focal length of its tangent would be negative, or any other number."""
+def test_invalid_angles_of_view_are_refused(tmp_path: Path, angle: float) -> None:
+    """60 is an angle in degrees; the tangent of 60 radians would give a negative or arbitrary focal length."""
     folder = write_transforms(tmp_path / "set", {"camera_angle_x": angle})
     with pytest.raises(MivolError, match=f"camera_angle_x = {angle:g}, expected an angle between 0 and pi"):
         load_photos(folder)
@@ -270,8 +270,8 @@ def test_transforms_with_lists_of_splits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("prefix", ["", "./", "../set/"])
-def test_lists_of_splits_are_of_files_however_they_are_written(tmp_path: Path, prefix: str) -> None:
-    """A test view that the list writes otherwise than its frame stays one; views that no list names are not trained on."""
+def test_lists_of_splits_accept_every_spelling_of_a_path(tmp_path: Path, prefix: str) -> None:
+    """A test view stays a test view with another spelling of its path; views outside all lists are not trained on."""
     names = [f"{prefix}images/{n:04d}.png" for n in (0, 1, 2)]
     folder = write_transforms(tmp_path / "set", {"fl_x": 20, "train_filenames": names, "test_filenames": names[2:]})
     assert [view.name for view in load_photos(folder).views] == ["0000.png", "0001.png"]
@@ -283,8 +283,8 @@ PLY = "ply\nformat ascii 1.0\nelement vertex {}\n{}end_header\n{}"
 PLACES = "".join(f"property float {axis}\n" for axis in "xyz") + "property uchar red\n"
 
 
-def test_transforms_name_points_in_the_frame_of_their_cameras(tmp_path: Path) -> None:
-    """nerfstudio's ``ply_file_path``, written on Windows; without the key no points are known."""
+def test_transforms_with_points_in_the_frame_of_the_cameras(tmp_path: Path) -> None:
+    """nerfstudio's ``ply_file_path``, written on Windows; without the key the survey has no points."""
     points = np.random.default_rng(0).normal(size=(300, 3)).round(4)
     folder = write_transforms(tmp_path / "set", {"fl_x": 20, "ply_file_path": "sparse\\sparse_pc.ply"})
     (folder / "sparse").mkdir()
@@ -305,7 +305,7 @@ def test_transforms_name_points_in_the_frame_of_their_cameras(tmp_path: Path) ->
         ("a.ply", PLY.format(2, PLACES, "1 2 3 7\n1 nan 3 7\n"), "a.ply: found point 1 at .*nan"),
     ],
 )
-def test_points_that_cannot_be_read_are_refused(tmp_path: Path, name: object, text: str | None, message: str) -> None:
+def test_invalid_points_are_refused(tmp_path: Path, name: object, text: str | None, message: str) -> None:
     folder = write_transforms(tmp_path / "set", {"fl_x": 20, "ply_file_path": name})
     if text is not None:
         (folder / str(name)).write_text(text)
@@ -313,8 +313,8 @@ def test_points_that_cannot_be_read_are_refused(tmp_path: Path, name: object, te
         survey_photos(folder)
 
 
-def test_names_of_another_system_are_found(tmp_path: Path) -> None:
-    """A data set that was written on Windows: backslashes in frames and lists lead to the same files."""
+def test_paths_with_backslashes_are_found(tmp_path: Path) -> None:
+    """A data set written on Windows: frames and lists with backslashes name the same files."""
     folder = write_transforms(tmp_path / "set", {"fl_x": 20, "test_filenames": ["images\\0002.png"]})
     file = folder / "transforms.json"
     file.write_text(file.read_text().replace("images/", "images\\\\"))
@@ -322,7 +322,7 @@ def test_names_of_another_system_are_found(tmp_path: Path) -> None:
     assert len(load_photos(folder).views) == 3
 
 
-def test_masks_are_black_where_nothing_counts(tmp_path: Path) -> None:
+def test_black_pixels_of_a_mask_are_ignored(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path / "set", {"fl_x": 20})
     mask = np.full((8, 12), 255, np.uint8)
     mask[:, :3] = 0
@@ -341,7 +341,7 @@ def test_masks_are_black_where_nothing_counts(tmp_path: Path) -> None:
         load_photos(folder)
 
 
-def test_written_cameras_are_read_the_same(tmp_path: Path) -> None:
+def test_written_cameras_are_read_unchanged(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path / "set", {"fl_x": 20.0, "fl_y": 21.0, "cx": 5.5, "cy": 4.5, **LENS})
     cameras = {f"images/{f.file.name}": f.camera for f in survey_photos(folder).frames}
     photos.write_transforms(folder / "transforms.json", cameras, test=["images/0001.png"])
@@ -373,7 +373,7 @@ def test_bad_cameras_are_refused(tmp_path: Path, settings: dict, message: str) -
         load_photos(folder)
 
 
-def test_no_focal_length_no_frames_no_json(tmp_path: Path) -> None:
+def test_transforms_without_focal_length_frames_or_json_are_refused(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path / "set", {})
     with pytest.raises(MivolError, match="no focal length"):
         load_photos(folder)
@@ -392,18 +392,18 @@ def test_no_focal_length_no_frames_no_json(tmp_path: Path) -> None:
 def test_lens_against_the_polar_formula() -> None:
     lens = Lens(**LENS)
     x, y = np.random.default_rng(2).uniform(-0.8, 0.8, (2, 100))
-    wanted = through_lens(x, y, [lens.k1, lens.k2, lens.k3, lens.k4], [lens.p1, lens.p2])
-    np.testing.assert_allclose(distort(lens, np.stack([x, y], -1)), np.stack(wanted, -1), atol=1e-15)
+    expected = through_lens(x, y, [lens.k1, lens.k2, lens.k3, lens.k4], [lens.p1, lens.p2])
+    np.testing.assert_allclose(distort(lens, np.stack([x, y], -1)), np.stack(expected, -1), atol=1e-15)
 
 
-def test_undistort_is_exact() -> None:
+def test_undistort_inverts_distort() -> None:
     lens = Lens(**LENS)
     xy = np.random.default_rng(3).uniform(-0.8, 0.8, (500, 2))
     np.testing.assert_allclose(undistort(lens, distort(lens, xy)), xy, atol=2e-12)  # Newton stops at 1e-12
 
 
-def test_the_fold_of_a_barrel_is_seen() -> None:
-    """r - r^3 / 3 grows up to r = 1, where it is 2/3: what lies beyond has another original, and it must not be taken."""
+def test_points_beyond_the_fold_are_refused() -> None:
+    """r - r^3 / 3 grows up to r = 1, to 2/3. Points beyond have an original on the other branch, which is invalid."""
     lens = Lens(k1=-1 / 3)
     assert lens.fold == pytest.approx(1)
     assert undistort(lens, np.array([0.66, 0]))[0] < 1
@@ -414,8 +414,8 @@ def test_the_fold_of_a_barrel_is_seen() -> None:
     assert np.isnan(project(camera, np.array([1.1, 0, -1]))[0]).all()
 
 
-def test_rectified_photograph_is_what_a_pinhole_sees() -> None:
-    """A picture that is linear in the direction has the same values for the pinhole, wherever a pixel was there to see it."""
+def test_a_rectified_photograph_equals_the_view_of_a_pinhole() -> None:
+    """An image that is linear in the direction has the same values for the pinhole wherever the photograph has pixels."""
     bent = Camera(intrinsics(40, 42, 31, 22), (64, 48), np.eye(4), Lens(**LENS))
     photo = Photo("p", linear_picture(bent), np.ones((48, 64), np.float32), None, bent, np.zeros(3, np.float32))
     flat = rectify(photo)
@@ -426,7 +426,7 @@ def test_rectified_photograph_is_what_a_pinhole_sees() -> None:
     assert 0.9 < flat.mask.mean() < 1
     np.testing.assert_allclose(flat.alpha, 1)
     assert rectify(flat) is flat
-    # What is masked stays so: each pixel that a masked one has a share in, and no other.
+    # A masked pixel masks exactly the new pixels that it contributes to.
     assert np.array_equal(rectify(dataclasses.replace(photo, mask=np.ones((48, 64), bool))).mask, flat.mask)
     mask = np.ones((48, 64), bool)
     mask[20, 40] = False
@@ -437,7 +437,7 @@ def test_rectified_photograph_is_what_a_pinhole_sees() -> None:
 
 
 def linear_picture(camera: Camera) -> np.ndarray:
-    """(H, W, 3) values that change linearly over the plane in front of the camera."""
+    """Return an image (H, W, 3) that is linear over the plane in front of the camera."""
     d = rays(camera, pixel_centres(camera.size))[1]
     x, y = d[..., 0] / -d[..., 2], d[..., 1] / -d[..., 2]
     return np.stack([0.5 + 0.3 * x, 0.5 - 0.2 * y, 0.5 + 0.1 * x + 0.1 * y], -1).astype(np.float32)
@@ -448,7 +448,7 @@ def linear_picture(camera: Camera) -> np.ndarray:
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
 @pytest.mark.parametrize("model", COLMAP_CAMERAS)
-def test_colmap_projects_as_its_manual_says(tmp_path: Path, model: str, encoding: str) -> None:
+def test_colmap_cameras_project_as_in_its_manual(tmp_path: Path, model: str, encoding: str) -> None:
     folder = write_colmap(tmp_path / "set", model, encoding)
     views = load_photos(folder, box=[[-1] * 3, [1] * 3]).views
     assert [view.name for view in views] == [f"a view {i}.png" for i in range(4)]
@@ -478,7 +478,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
-def test_colmap_points_make_the_box_without_outliers(tmp_path: Path, encoding: str) -> None:
+def test_the_box_of_colmap_points_excludes_outliers(tmp_path: Path, encoding: str) -> None:
     rng = np.random.default_rng(6)
     cloud = np.concatenate([rng.uniform(-1, 1, (990, 3)), rng.uniform(50, 90, (5, 3)), rng.uniform(-90, -50, (5, 3))])
     survey = survey_photos(write_colmap(tmp_path / "set", "PINHOLE", encoding, points=cloud))
@@ -489,8 +489,8 @@ def test_colmap_points_make_the_box_without_outliers(tmp_path: Path, encoding: s
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
-def test_colmap_tells_in_which_photographs_points_were_found(tmp_path: Path, encoding: str) -> None:
-    """Points go with the numbers of images, and these run backwards through the views; a photograph without any has none."""
+def test_colmap_points_belong_to_their_photographs(tmp_path: Path, encoding: str) -> None:
+    """Tracks use image ids, which run backwards through the views; a photograph without tracks has no points."""
     cloud, tracks = np.random.default_rng(6).normal(size=(5, 3)), [(2, 3), (2,), (), (3, 2, 3), (2,)]
     folder = write_colmap(tmp_path / "set", "PINHOLE", encoding, points=cloud, tracks=tracks)
     named = {frame.file.name: frame for frame in survey_photos(folder, box=[[-9] * 3, [9] * 3]).frames}
@@ -502,27 +502,27 @@ def test_colmap_tells_in_which_photographs_points_were_found(tmp_path: Path, enc
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
-def test_points_of_colmap_that_are_nowhere_are_refused(tmp_path: Path, encoding: str) -> None:
+def test_colmap_points_without_a_position_are_refused(tmp_path: Path, encoding: str) -> None:
     folder = write_colmap(tmp_path / "set", "PINHOLE", encoding, points=np.array([[0.0, 0, 0], [1, np.nan, 2]]))
     with pytest.raises(MivolError, match=rf"points3D.{encoding}: found .*nan"):
         survey_photos(folder, box=[[-9] * 3, [9] * 3])
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
-def test_colmap_need_not_tell_its_points(tmp_path: Path, encoding: str) -> None:
+def test_colmap_points_are_optional(tmp_path: Path, encoding: str) -> None:
     folder = write_colmap(tmp_path / "set", "PINHOLE", encoding)
     (folder / "sparse" / "0" / f"points3D.{encoding}").unlink()
     assert survey_photos(folder).points is None
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
-def test_colmap_lenses_that_are_not_known_are_refused_by_name(tmp_path: Path, encoding: str) -> None:
+def test_unknown_colmap_cameras_are_refused(tmp_path: Path, encoding: str) -> None:
     with pytest.raises(MivolError, match="the camera model FULL_OPENCV, expected one of SIMPLE_PINHOLE"):
         load_photos(write_colmap(tmp_path / "set", "FULL_OPENCV", encoding))
 
 
 @pytest.mark.parametrize(("file", "cut"), [("cameras.bin", 20), ("images.bin", 100), ("images.bin", 76), ("points3D.bin", 30)])
-def test_colmap_truncated(tmp_path: Path, file: str, cut: int) -> None:
+def test_truncated_colmap_files_are_refused(tmp_path: Path, file: str, cut: int) -> None:
     folder = write_colmap(tmp_path / "set", points=np.zeros((3, 3)))
     path = folder / "sparse" / "0" / file
     path.write_bytes(path.read_bytes()[:cut])
@@ -539,7 +539,7 @@ def test_colmap_truncated(tmp_path: Path, file: str, cut: int) -> None:
         ("images.txt", " 7 a view 2.png", "", "expected id, quaternion"),
     ],
 )
-def test_colmap_text_that_is_wrong(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
+def test_invalid_colmap_text_is_refused(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
     folder = write_colmap(tmp_path / "set", encoding="txt")
     path = folder / "sparse" / "0" / file
     assert old in path.read_text()
@@ -548,7 +548,7 @@ def test_colmap_text_that_is_wrong(tmp_path: Path, file: str, old: str, new: str
         load_photos(folder)
 
 
-def test_colmap_by_the_folder_of_its_model(tmp_path: Path) -> None:
+def test_colmap_from_the_folder_of_the_model(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path / "set")
     assert len(load_photos(folder / "sparse" / "0").views) == len(load_photos(folder).views) == 4
 
@@ -564,11 +564,11 @@ def test_colmap_masks_and_wrong_size(tmp_path: Path) -> None:
         load_photos(folder)
 
 
-# -- Where things are ---------------------------------------------------------------------------------------------
+# -- Boxes -------------------------------------------------------------------------------------------------------
 
 
-def test_silhouette_box_holds_the_thing_and_little_more() -> None:
-    """An ellipsoid seen by 12 cameras, each with the exact outline."""
+def test_silhouette_box_tightly_contains_the_subject() -> None:
+    """An ellipsoid seen by 12 cameras with exact outlines."""
     radii = np.array([0.5, 0.3, 0.4])
     cameras, alphas = [], []
     for place in np.random.default_rng(8).normal(size=(12, 3)):
@@ -584,8 +584,8 @@ def test_silhouette_box_holds_the_thing_and_little_more() -> None:
     assert (np.abs(box) < 1.3 * radii + 0.05).all()
 
 
-def test_silhouettes_are_looked_through_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A search of the whole box, and one of what it left: each costs a projection of all cells to every view."""
+def test_silhouette_box_searches_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each search projects all cells to every view: first the whole box, then the box found."""
     camera = Camera(intrinsics(16, 16, 8, 8), (16, 16), look_at(np.array([0.0, -4, 0])))
     searched, count = [], region.count_views
     monkeypatch.setattr(region, "count_views", lambda cameras, cells: searched.append(len(cells)) or count(cameras, cells))
@@ -593,10 +593,10 @@ def test_silhouettes_are_looked_through_twice(monkeypatch: pytest.MonkeyPatch) -
     assert searched == [region.SILHOUETTE_CELLS**3] * 2
 
 
-def test_a_cell_is_kept_for_the_last_pixel_that_its_sphere_covers() -> None:
-    """One point of the sphere is all that is seen, 8 pixels from the one that sees its middle.
+def test_a_cell_is_kept_for_the_outermost_pixel_of_its_sphere() -> None:
+    """Only one point of the sphere is visible, 8 pixels from the centre.
 
-    A pinhole would show it 7 pixels away at most; the lens magnifies by 1 + 3 k r^2 = 1.24 there.
+    A pinhole would show it at most 7 pixels away; the lens magnifies by 1 + 3 k r^2 = 1.24.
     """
     camera = Camera(intrinsics(100, 100, 64, 4), (128, 8), np.eye(4), Lens(k1=0.35))
     cell, radius = np.array([48.0, 0.0, -100.0]), 5.0
@@ -619,11 +619,11 @@ def test_parallel_cameras_have_no_focus(blender: Path) -> None:
     assert load_photos(blender, background="white", box=[[-1] * 3, [1] * 3]).survey.box_from == "as given"
 
 
-# -- What is refused ----------------------------------------------------------------------------------------------
+# -- Refusals -----------------------------------------------------------------------------------------------------
 
 
 def spoil(key: str, value: object) -> object:
-    """A change of frame 1 of a JSON file."""
+    """Return a change of frame 1 of a JSON file."""
     return lambda table: table["frames"][1].__setitem__(key, value)
 
 
@@ -643,7 +643,7 @@ BAD_FRAMES = {
 
 
 @pytest.mark.parametrize("case", BAD_FRAMES)
-def test_bad_frames_are_refused_in_a_sentence(blender: Path, case: str) -> None:
+def test_invalid_frames_are_refused_in_a_sentence(blender: Path, case: str) -> None:
     key, value, message = BAD_FRAMES[case]
     edit(blender / "transforms_train.json", spoil(key, value))
     with pytest.raises(MivolError, match=message) as caught:
@@ -651,14 +651,14 @@ def test_bad_frames_are_refused_in_a_sentence(blender: Path, case: str) -> None:
     assert str(caught.value).count("\n") == 0 and "expected" in str(caught.value)
 
 
-def test_a_rotation_of_rounded_numbers_passes(blender: Path) -> None:
-    """Six decimals are off by 3e-6; at 14 pixels of focal length that moves no pixel by 1e-4."""
+def test_a_rounded_rotation_is_accepted(blender: Path) -> None:
+    """Six decimals are off by 3e-6, which moves no pixel by 1e-4 at 14 pixels of focal length."""
     edit(blender / "transforms_train.json", spoil("transform_matrix", np.round(ring(4)[1], 6).tolist()))
     pose = load_photos(blender, background="white").views[1].camera.to_world[:3, :3]
     np.testing.assert_allclose(pose.T @ pose, np.eye(3), atol=1e-15)
 
 
-def test_images_and_backgrounds_must_fit(blender: Path, tmp_path: Path) -> None:
+def test_a_background_needs_alpha_and_the_reverse(blender: Path, tmp_path: Path) -> None:
     with pytest.raises(MivolError, match="image with alpha"):
         load_photos(blender)
     plain = write_blender(tmp_path / "plain", alpha=False)
@@ -670,7 +670,7 @@ def test_images_and_backgrounds_must_fit(blender: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["webp", "tif", "bmp"])
-def test_a_photograph_of_another_suffix_is_not_said_to_be_missing(tmp_path: Path, suffix: str) -> None:
+def test_photographs_with_other_suffixes_are_found(tmp_path: Path, suffix: str) -> None:
     folder, image = write_transforms(tmp_path / "set", {"fl_x": 20.0}), pixels(12, 8, 5, alpha=False)
     Image.fromarray(image).save(folder / f"other.{suffix}", lossless=True)
     edit(folder / "transforms.json", spoil("file_path", f"other.{suffix}"))
@@ -679,7 +679,7 @@ def test_a_photograph_of_another_suffix_is_not_said_to_be_missing(tmp_path: Path
     np.testing.assert_array_equal(np.round(read.views[1].image * 255), image)
 
 
-def test_a_set_without_images_is_refused(blender: Path) -> None:
+def test_a_data_set_without_images_is_refused(blender: Path) -> None:
     for file in (blender / "train").iterdir():
         file.unlink()
     with pytest.raises(MivolError, match=r"none of the 4 listed photographs \(the first is \./train/r_0\)"):
@@ -693,7 +693,7 @@ def test_a_damaged_image_is_refused(blender: Path) -> None:
         load_photos(blender, background="white")
 
 
-def test_images_of_two_sizes_in_one_blender_set_are_refused(blender: Path) -> None:
+def test_blender_images_of_two_sizes_are_refused(blender: Path) -> None:
     Image.fromarray(pixels(6, 4)).save(blender / "train" / "r_2.png")
     with pytest.raises(MivolError, match="6 x 4 pixels, expected 12 x 8"):
         load_photos(blender, background="white")
@@ -714,7 +714,7 @@ def test_images_of_two_sizes_in_one_blender_set_are_refused(blender: Path) -> No
         ({"box": [[0, 0, 0], [0, 1, 1]]}, "low below high"),
     ],
 )
-def test_bad_settings_are_refused(blender: Path, settings: dict, message: str) -> None:
+def test_invalid_settings_are_refused(blender: Path, settings: dict, message: str) -> None:
     with pytest.raises(MivolError, match=message):
         load_photos(blender, **{"background": "white", **settings})
 
@@ -731,7 +731,7 @@ def test_no_data_set(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_chair(data_dir: Path) -> None:
-    """The middle of the scene lies within the chair in every view; the 175 test images that are not there are named."""
+    """The centre of the scene is opaque in every view; the 175 missing test images are listed."""
     chair = data_dir / "multiview" / "chair"
     survey = survey_photos(chair)
     assert len(survey.frames) == 125 and len(survey.skipped) == 175
@@ -745,7 +745,7 @@ def test_chair(data_dir: Path) -> None:
 
 
 def test_fox(data_dir: Path) -> None:
-    """25 of 67 photographs are there; each pixel's ray goes back through the lens to its pixel."""
+    """25 of 67 photographs exist; the ray of each pixel projects back to the pixel."""
     survey = survey_photos(data_dir / "multiview" / "fox")
     assert len(survey.frames) == 25 and len(survey.skipped) == 42
     assert survey.skipped[0] == "images/0002.jpg" and "images/0002.jpg" in survey.describe()
@@ -755,10 +755,10 @@ def test_fox(data_dir: Path) -> None:
         np.testing.assert_allclose(project(frame.camera, o + 3 * d)[0], pixel, atol=1e-8)  # the focal length times 1e-12
 
 
-def test_fox_photographs_agree_where_a_stalk_ends(data_dir: Path) -> None:
-    """The end of a stalk on the wallpaper, found by eye in two photographs to a pixel: its rays meet to two pixels' width.
+def test_fox_photographs_agree_on_the_end_of_a_stalk(data_dir: Path) -> None:
+    """The end of a stalk on the wallpaper, located by eye to a pixel in two photographs: its rays meet within two pixels.
 
-    Mirrored in x or y they pass each other by 110 to 190 pixels.
+    Mirrored in x or y the rays miss by 110 to 190 pixels.
     """
     cameras = {frame.file.name: frame.camera for frame in survey_photos(data_dir / "multiview" / "fox").frames}
     (o1, d1), (o2, d2) = rays(cameras["0001.jpg"], [681, 1163]), rays(cameras["0042.jpg"], [834.4, 1208.1])
@@ -770,15 +770,15 @@ def test_fox_photographs_agree_where_a_stalk_ends(data_dir: Path) -> None:
 
 @pytest.mark.parametrize("channels", [3, 4])
 def test_png_of_16_bits_is_read_at_full_depth(tmp_path: Path, channels: int) -> None:
-    """Pillow alone keeps the high byte of each number: steps of 1/255. Here only float32 rounds."""
+    """Pillow alone keeps the high byte, with steps of 1/255. Here only float32 rounds."""
     codes = np.random.default_rng(3).integers(0, 65536, (3, 5, channels), np.uint16)
     (tmp_path / "a.png").write_bytes(png_of_16_bits(codes))
     colour, alpha = read_photo(tmp_path / "a.png", "srgb")
-    wanted = codes / 65535
+    expected = codes / 65535
     if channels == 4:
-        np.testing.assert_allclose(alpha, wanted[..., 3], rtol=2e-7)
-        wanted = wanted[..., :3] * wanted[..., 3:]
-    np.testing.assert_allclose(colour, wanted, rtol=4e-7)
+        np.testing.assert_allclose(alpha, expected[..., 3], rtol=2e-7)
+        expected = expected[..., :3] * expected[..., 3:]
+    np.testing.assert_allclose(colour, expected, rtol=4e-7)
 
 
 def test_grey_png_of_16_bits_is_read_at_full_depth(tmp_path: Path) -> None:
@@ -789,8 +789,8 @@ def test_grey_png_of_16_bits_is_read_at_full_depth(tmp_path: Path) -> None:
     np.testing.assert_allclose(colour, np.repeat(codes[..., None] / 65535, 3, axis=2), rtol=2e-7)
 
 
-def turned_by_exif(folder: Path, orientation: int) -> None:
-    """Photographs of 12 x 8 pixels that a viewer turns."""
+def rotate_by_exif(folder: Path, orientation: int) -> None:
+    """Set the EXIF orientation of all photographs."""
     for file in folder.rglob("*.png"):
         with Image.open(file) as image:
             tags = image.getexif()
@@ -798,10 +798,10 @@ def turned_by_exif(folder: Path, orientation: int) -> None:
             image.save(file, exif=tags)
 
 
-def test_pictures_that_viewers_turn(tmp_path: Path) -> None:
-    """Taken where the cameras are of the pixels as they are stored, which their size shows; refused by name elsewhere."""
+def test_photographs_rotated_by_exif(tmp_path: Path) -> None:
+    """Accepted if the size of the cameras proves that they describe stored pixels, otherwise refused."""
     write_transforms(tmp_path, {"fl_x": 10.0, "cx": 6.0, "cy": 4.0})
-    turned_by_exif(tmp_path, 6)
+    rotate_by_exif(tmp_path, 6)
     assert load_photos(tmp_path).views[0].camera.size == (12, 8)
     edit(tmp_path / "transforms.json", lambda table: table.update(w=8.0, h=12.0))
     with pytest.raises(MivolError, match="EXIF orientation 6 turns them"):
@@ -811,16 +811,16 @@ def test_pictures_that_viewers_turn(tmp_path: Path) -> None:
         load_photos(tmp_path)
 
 
-def test_a_half_turn_of_exif_does_not_show_in_sizes(tmp_path: Path) -> None:
+def test_a_half_turn_by_exif_is_refused(tmp_path: Path) -> None:
     write_transforms(tmp_path, {"fl_x": 10.0, "w": 12, "h": 8})
-    turned_by_exif(tmp_path, 3)
+    rotate_by_exif(tmp_path, 3)
     with pytest.raises(MivolError, match="EXIF orientation 3, by which viewers turn"):
         load_photos(tmp_path)
 
 
 @pytest.mark.parametrize("background", [None, "white"])
-def test_mixed_alpha_is_answered_once(tmp_path: Path, background: str | None) -> None:
-    """With a background and without, the sentence is the same and names both kinds; one led to the other before."""
+def test_mixed_alpha_has_one_refusal(tmp_path: Path, background: str | None) -> None:
+    """With and without a background the sentence is the same and names both kinds."""
     write_blender(tmp_path, alpha=True)
     file = tmp_path / "train" / "r_0.png"
     with Image.open(file) as image:
@@ -829,8 +829,8 @@ def test_mixed_alpha_is_answered_once(tmp_path: Path, background: str | None) ->
         load_photos(tmp_path, background=background)
 
 
-def test_a_view_that_is_fitted_and_judged_is_refused(tmp_path: Path) -> None:
-    """By its file, and by its pose and bytes under another name; the fit alone goes on."""
+def test_a_test_view_in_the_training_split_is_refused(tmp_path: Path) -> None:
+    """By its file, and by pose and bytes under another name; reading the training split still works."""
     write_blender(tmp_path, alpha=False)
     edit(tmp_path / "transforms_test.json", lambda table: table["frames"][0].update(file_path="./train/r_1"))
     with pytest.raises(MivolError, match=r"also fitted as \./train/r_1"):
@@ -843,16 +843,16 @@ def test_a_view_that_is_fitted_and_judged_is_refused(tmp_path: Path) -> None:
         load_photos(tmp_path, split="test")
 
 
-def test_an_empty_list_of_points_is_colmaps_own_recipe(tmp_path: Path) -> None:
-    """COLMAP's manual makes an empty points3D.txt where poses are known ("Reconstruct sparse/dense model from known poses")."""
+def test_an_empty_file_of_colmap_points_is_valid(tmp_path: Path) -> None:
+    """COLMAP's manual creates an empty points3D.txt for known poses ("Reconstruct sparse/dense model from known poses")."""
     write_colmap(tmp_path, encoding="txt")
     (tmp_path / "sparse/0/points3D.txt").write_bytes(b"")
     photos = load_photos(tmp_path)
     assert "% of 4 cameras" in photos.survey.box_from
 
 
-def test_photographs_of_any_size_are_surveyed(tmp_path: Path) -> None:
-    """180 million pixels: Pillow refuses them by itself, in an exception of its own; memory is counted here."""
+def test_photographs_of_unlimited_size_are_surveyed(tmp_path: Path) -> None:
+    """180 million pixels: Pillow alone refuses such images; here the memory limit refuses their pixels."""
     write_transforms(tmp_path, {"fl_x": 1e4, "w": 15000, "h": 12000}, n=1)
     (file,) = tmp_path.rglob("*.png")
     Image.new("1", (15000, 12000)).save(file)

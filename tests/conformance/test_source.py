@@ -1,4 +1,4 @@
-"""Compressed bytes: streams that are joined, and limits that the header sets."""
+"""Checked bytes and numbers: compressed streams, suggested names, tables of numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mivol.errors import MivolError
-from mivol.files import source
+from mivol.files import read_columns, source
 
 PATH, DATA = Path("a.nrrd"), bytes(range(200)) * 3
 PACK = {"zlib": zlib.compress, "gzip": gzip.compress, "bzip2": bz2.compress}
@@ -36,7 +36,7 @@ def test_damaged_streams_are_refused() -> None:
         source.decompress(gzip.compress(DATA)[:-20], "gzip", len(DATA), PATH)
 
 
-def test_the_nearest_name_is_offered_where_one_is_near(tmp_path: Path) -> None:
+def test_a_missing_file_suggests_a_similar_name(tmp_path: Path) -> None:
     (tmp_path / "density.nrrd").write_bytes(b"")
     for name, way_out in {
         "densty.nrrd": "did you mean density.nrrd",
@@ -49,7 +49,7 @@ def test_the_nearest_name_is_offered_where_one_is_near(tmp_path: Path) -> None:
     assert source.select_dataset(PATH, "density", names) == "density" and source.select_dataset(PATH, None, ["one"]) == "one"
     for asked, way_out in {
         "densty": "did you mean 'density'",
-        "qqqq": "choose one of those",
+        "qqqq": "choose another array",
         None: r"2 arrays \('density', 'temperature'\).*dataset=",
     }.items():
         with pytest.raises(MivolError, match=way_out):
@@ -57,5 +57,25 @@ def test_the_nearest_name_is_offered_where_one_is_near(tmp_path: Path) -> None:
     with pytest.raises(MivolError, match="0 arrays"):
         source.select_dataset(PATH, None, [])
     source.refuse_dataset(PATH, None)
-    with pytest.raises(MivolError, match="leave it out"):
+    with pytest.raises(MivolError, match="remove dataset"):
         source.refuse_dataset(PATH, "density")
+
+
+def test_a_table_skips_comments_and_column_names(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x, y\n# a remark\n1, 2\n\n3 4e-1\n")
+    assert read_columns(tmp_path / "a.csv", 2).tolist() == [[1.0, 2.0], [3.0, 0.4]]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("1 2\n3\n", "'3' in line 2, expected 2 finite numbers"),
+        ("1 nan\n", "'1 nan' in line 1, expected 2 finite numbers"),
+        ("1 2\n3 four\n", "'3 four' in line 2, expected numbers"),
+        ("x y\n", "no line of numbers"),
+    ],
+)
+def test_invalid_lines_of_a_table_are_refused(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(MivolError, match=sentence):
+        read_columns(tmp_path / "a.txt", 2)

@@ -37,8 +37,8 @@ def survey(tmp_path: Path) -> PhotoSurvey:
 
 
 @pytest.mark.parametrize(("up", "order"), [("x", (1, 2, 0)), ("y", (2, 0, 1)), ("z", (0, 1, 2))])
-def test_up_is_up_and_the_picture_is_right_handed(survey: PhotoSurvey, up: str, order: tuple[int, int, int]) -> None:
-    """Cameras stand on a ring about the axis that is up. Seen from the side it is vertical; the plan shows the others."""
+def test_up_is_vertical_and_the_axes_are_right_handed(survey: PhotoSurvey, up: str, order: tuple[int, int, int]) -> None:
+    """Cameras on a ring around the up axis: vertical in the side view, and the plan shows the other axes."""
     stands = turned(survey, up)
     side, plan = plot_cameras(stands).axes
     assert [side.get_xlabel(), side.get_ylabel(), side.get_zlabel()] == [f"{'xyz'[k]} [length]" for k in order]
@@ -63,8 +63,8 @@ def test_up_is_up_and_the_picture_is_right_handed(survey: PhotoSurvey, up: str, 
         np.testing.assert_allclose(edges[:, :2].max(axis=(0, 1)), stands.box[1][list(axes)])
 
 
-def test_the_side_view_is_in_true_proportions(survey: PhotoSurvey) -> None:
-    """A unit is as long along each axis, and nothing that is drawn lies outside."""
+def test_the_side_view_has_equal_scales(survey: PhotoSurvey) -> None:
+    """A unit has the same length along each axis, and all strokes lie inside."""
     side, plan = plot_cameras(survey).axes
     limits = np.array([side.get_xlim(), side.get_ylim(), side.get_zlim()]).T
     drawn = np.concatenate([np.array(line.get_data_3d()).T for line in side.lines])
@@ -76,8 +76,8 @@ def test_the_side_view_is_in_true_proportions(survey: PhotoSurvey) -> None:
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_stands_alone(survey: PhotoSurvey, part: str) -> None:
-    """On a page the two stand one below the other, where a figure of both would be too small to read."""
+def test_a_panel_can_stand_alone(survey: PhotoSurvey, part: str) -> None:
+    """On a page the panels are stacked, because a figure of both would be too small."""
     (alone,) = plot_cameras(survey, part=part).axes
     both = plot_cameras(survey).axes[PARTS.index(part)]
     assert (alone.name, len(alone.lines)) == (both.name, len(both.lines))
@@ -127,8 +127,8 @@ def edges_of(axes: Axes) -> list[float]:
     return [float(np.nanmax(line.get_xdata())) for line in axes.lines if line.get_color() == INK]
 
 
-def test_nested_boxes_are_shown_as_far_as_the_cameras_stand_and_once_all_of_them(survey: PhotoSurvey) -> None:
-    """Points are shown in the boxes that a part shows; of three dimensions nothing is cut off at the frame."""
+def test_a_third_panel_shows_all_nested_boxes(survey: PhotoSurvey) -> None:
+    """The first panels show the boxes up to the farthest camera. Each panel shows the points inside its boxes."""
     points = np.array([[0.0, 0, 0], [5.0, 0, 0], [20, 0, 0], [30, 0, 0]])
     nested = replace(survey, box=CUBE, levels=5, points=points)
     side, plan, far = plot_cameras(nested).axes
@@ -145,8 +145,8 @@ def test_nested_boxes_are_shown_as_far_as_the_cameras_stand_and_once_all_of_them
     assert edges_of(alone) == edges_of(far) and len(alone.figure.legends) == 1
 
 
-def test_boxes_that_all_reach_no_farther_than_the_cameras_need_no_part_of_their_own(survey: PhotoSurvey) -> None:
-    """Two hold none of the cameras, three hold all: either way the first parts show every box."""
+def test_a_third_panel_is_unnecessary_for_few_boxes(survey: PhotoSurvey) -> None:
+    """Two boxes hold no camera, three boxes hold all: in both cases the first panels show every box."""
     for levels in (2, 3):
         found = replace(survey, box=CUBE, levels=levels)
         assert list_parts(found) == PARTS and len(edges_of(plot_cameras(found).axes[1])) == levels

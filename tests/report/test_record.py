@@ -11,8 +11,8 @@ from mivol.errors import MivolError
 from mivol.report import record
 
 
-def test_a_machine_is_described_by_what_the_system_tells(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Memory in GiB, to a tenth; the processor's own name. Where the system has no such files, none and the architecture."""
+def test_a_machine_is_described_by_proc_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Memory in GiB to a tenth, and the model of the processor. Without the files: no memory, and the architecture."""
     monkeypatch.setattr(record, "cores", lambda: 3)
     monkeypatch.setattr(record, "Path", lambda name: tmp_path / Path(name).name)
     assert record.describe_machine() == record.Machine(3, None, platform.machine())
@@ -22,15 +22,15 @@ def test_a_machine_is_described_by_what_the_system_tells(monkeypatch: pytest.Mon
     assert record.describe_machine("A GPU").device == "A GPU"
 
 
-def test_packages_that_are_not_there_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_have_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(record, "PACKAGES", ("numpy", "no-such-package"))
     found = record.package_versions()
     assert list(found) == ["python", "system", "numpy"]
     assert found["python"] == platform.python_version() and found["system"].endswith(platform.machine())
 
 
-def test_a_number_has_the_unit_that_its_run_knows() -> None:
-    """Known names keep their labels. A parameter keeps its key, and even steps; what nobody knows is named in plain words."""
+def test_a_quantity_has_the_unit_of_the_run() -> None:
+    """Known keys keep their labels. A parameter keeps its key and a linear axis; other keys become words."""
     units = {"loss": "radiance²", "lamp_1.position[0]": "length", "g[0]": "1"}
     loss, place, g, other, psnr = (
         record.find_quantity(name, units) for name in ("loss", "lamp_1.position[0]", "g[0]", "my_number", "psnr")
@@ -43,8 +43,8 @@ def test_a_number_has_the_unit_that_its_run_knows() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_a_line_that_the_disk_has_no_room_for_is_said_by_its_file(tmp_path: Path) -> None:
-    """The system's own error names none."""
+def test_a_full_disk_is_reported_with_the_file(tmp_path: Path) -> None:
+    """The error of the system names no file."""
     (tmp_path / "metrics.jsonl").symlink_to("/dev/full")
     with pytest.raises(MivolError, match=r"metrics\.jsonl: found no space left on the disk while writing, expected room for"):
         record.append_metrics(tmp_path, 1, 0.1, loss=2.0)

@@ -57,8 +57,8 @@ def around(places: NDArray) -> NDArray:
 
 
 def test_a_point_source_opens_towards_its_detector() -> None:
-    """Each pyramid begins where all rays of its view begin, and its edges run to the corners of the detector; along its axis it
-    is EDGE of the median distance of the sources from the voxels."""
+    """Each pyramid starts at the common origin of the rays of its view, and its edges run to the corners of the detector. Its
+    length along the axis is EDGE of the median distance of the sources from the voxels."""
     found = strokes_of(plot_scanner(CONE, GRID, HELD_OUT))
     assert list(found) == LABELS
     for label, views in SPLITS.items():
@@ -79,7 +79,7 @@ def test_a_point_source_opens_towards_its_detector() -> None:
 
 
 def test_parallel_light_points_along_its_rays() -> None:
-    """It has no place along the beam: tips stand BEAM_REACH radii before the middle of the voxels, detectors as far behind."""
+    """Markers are BEAM_REACH radii in front of the centre of the voxels, detectors equally far behind it."""
     found = strokes_of(plot_scanner(PARALLEL, GRID, HELD_OUT))
     assert list(found) == LABELS
     away, centre = BEAM_REACH * GRID.radius, np.array(GRID.centre)
@@ -101,7 +101,7 @@ def test_parallel_light_points_along_its_rays() -> None:
 
 
 def test_up_is_along_the_columns_of_the_detector() -> None:
-    """A scanner that turns about x, as a table; without views held out nothing is drawn of them."""
+    """A table of views that rotates about x; without held-out views their label is missing."""
     u, w = (
         np.stack([np.zeros(12), *pair], axis=1)
         for pair in ((np.cos(ANGLES), np.sin(ANGLES)), (-np.sin(ANGLES), np.cos(ANGLES)))
@@ -113,8 +113,8 @@ def test_up_is_along_the_columns_of_the_detector() -> None:
 
 
 @pytest.mark.parametrize(("count", "every"), [(MOST_VIEWS, 5), (10 * MOST_VIEWS, 2)])
-def test_of_many_views_some_are_drawn(count: int, every: int) -> None:
-    """Spread evenly, the first of each kind among them."""
+def test_drawn_views_are_evenly_spread(count: int, every: int) -> None:
+    """Of many views, including the first of each kind."""
     held_out = np.arange(0, count, every)
     for shown, kind in zip(select_views(count, held_out), (np.setdiff1d(np.arange(count), held_out), held_out), strict=True):
         assert len(shown) == min(len(kind), MOST_VIEWS)
@@ -123,8 +123,8 @@ def test_of_many_views_some_are_drawn(count: int, every: int) -> None:
         assert kind[-1] - shown[-1] < 2 * count / len(shown)
 
 
-def test_a_page_says_how_many_views_are_drawn(tmp_path: Path) -> None:
-    """Of few views all; what is drawn of a source or of parallel light is said."""
+def test_captions_state_the_number_of_drawn_views(tmp_path: Path) -> None:
+    """A source and parallel light have different captions."""
     images = pictures_of_scan(tmp_path, CONE, GRID, HELD_OUT)
     assert [(i.path, i.role) for i in images] == [("scanner_side.png", "picture"), ("scanner_plan.png", "picture")]
     assert images[0].caption == "Where the source stands in 12 views, some detectors, and the box of the voxels"
@@ -134,8 +134,8 @@ def test_a_page_says_how_many_views_are_drawn(tmp_path: Path) -> None:
     assert all((tmp_path / image.path).is_file() for image in images)
 
 
-def test_a_flat_drawing_has_room_for_one_tick() -> None:
-    """Of a slice that is seen from the side: labels of its height would lie on one another."""
+def test_a_flat_side_view_has_one_vertical_tick() -> None:
+    """The labels of more ticks would overlap."""
     slices = VoxelGrid((1, 6, 8), (0.5, 0.5, 0.01))
     side, _ = plot_scanner(ParallelBeam(ANGLES, (1, 7), (0.01, 0.5)), slices, np.arange(0)).axes
     ticks = [

@@ -30,20 +30,20 @@ def folder(tmp_path: Path) -> Path:
     [({"caption": "A ramp", "view": "v"}, "A ramp"), ({"view": "v"}, "v"), ({}, "ramp")],
     ids=["caption", "view", "file"],
 )
-def test_a_picture_is_called_by_its_caption_else_its_view_else_its_file(folder: Path, said: dict, name: str) -> None:
+def test_an_image_is_named_by_caption_view_or_file(folder: Path, said: dict, name: str) -> None:
     found = encode_image(folder, Image(path="ramp.npy", role="picture", **said))
     assert (found.name, found.width, found.height, found.aspect) == (name, 4, 3, 4 / 3)
 
 
 @pytest.mark.parametrize(("name", "kind", "animated"), [("film.mp4", "video/mp4", False), ("film.gif", "image/gif", True)])
-def test_a_film_is_called_by_its_caption_else_its_view(folder: Path, name: str, kind: str, animated: bool) -> None:
+def test_a_film_is_named_by_caption_or_view(folder: Path, name: str, kind: str, animated: bool) -> None:
     caption, uri, is_image = encode_film(folder, Image(path=name, role="film", caption="Round", view="v"))
     assert (caption, is_image) == ("Round", animated) and uri.startswith(f"data:{kind};base64,")
     assert encode_film(folder, Image(path=name, role="film", view="v"))[0] == "v"
 
 
 @pytest.mark.parametrize(("width", "height", "coarse"), [(320, 1, True), (1, 320, True), (321, 1, False), (1, 321, False)])
-def test_pictures_of_320_pixels_and_less_are_coarse(width: int, height: int, coarse: bool) -> None:
+def test_images_up_to_320_pixels_show_their_pixels(width: int, height: int, coarse: bool) -> None:
     assert PageImage("a", "", width, height, width / height).is_coarse == coarse
 
 
@@ -51,8 +51,8 @@ def test_pictures_of_320_pixels_and_less_are_coarse(width: int, height: int, coa
     ("shape", "name", "aspect"),
     [((1, 8), "p", 8.0), ((1, 9), "p, stretched", 8.0), ((8, 1), "p", 1 / 8), ((90, 2), "p, stretched", 1 / 8)],
 )
-def test_a_picture_of_few_rows_is_stretched_and_says_so(tmp_path: Path, shape: tuple, name: str, aspect: float) -> None:
-    """Two rows of a detector of 640 columns would be a line of a pixel or two on a page."""
+def test_an_image_of_few_rows_is_stretched(tmp_path: Path, shape: tuple, name: str, aspect: float) -> None:
+    """Two rows of a detector of 640 columns would be one or two pixels high on a page."""
     np.save(tmp_path / "p.npy", np.zeros(shape))
     found = encode_image(tmp_path, Image(path="p.npy", role="picture"))
     assert (found.name, found.aspect, found.width, found.height) == (name, aspect, *shape[::-1])
@@ -62,8 +62,8 @@ def pixels(picture: PageImage) -> np.ndarray:
     return imread(io.BytesIO(base64.b64decode(picture.uri.partition(",")[2])))[..., :3]
 
 
-def test_a_volume_is_shown_layer_by_layer(tmp_path: Path) -> None:
-    """From the lowest on, the second axis upwards; the truth and the difference beside it, each on the scale of the slices."""
+def test_layers_show_truth_reconstruction_and_difference(tmp_path: Path) -> None:
+    """From the lowest layer, the second axis up, each image on the scale of the middle slices."""
     truth, found = np.random.default_rng(0).random((2, 3, 4, 5, 1), np.float32)
     write_volume(tmp_path / "t.npz", truth)
     write_volume(tmp_path / "r.npz", found)
@@ -78,8 +78,8 @@ def test_a_volume_is_shown_layer_by_layer(tmp_path: Path) -> None:
             assert np.array_equal(np.round(pixels(picture) * 255), pixel_scale.to_pixels(values[k, ::-1], on))
 
 
-def test_large_volumes_show_some_of_their_layers_with_fewer_pixels(tmp_path: Path) -> None:
-    """Each in the middle of its share of the height; a flat volume has no layers to go through."""
+def test_large_volumes_show_few_layers_with_few_pixels(tmp_path: Path) -> None:
+    """Each layer is the middle of its share of the height; a volume of one layer has no scrollable layers."""
     for name, shape in (("tall", (40, 3, LAYER_EDGE + 1)), ("flat", (1, 3, 3))):
         write_volume(tmp_path / f"{name}.npz", np.ones(shape, np.float32))
     tall, flat = (make_volume_views(tmp_path, [Volume(path=f"{n}.npz", role="reconstruction")])[0] for n in ("tall", "flat"))
@@ -89,8 +89,8 @@ def test_large_volumes_show_some_of_their_layers_with_fewer_pixels(tmp_path: Pat
     assert pixels(tall.layers[0]["pictures"][0]).shape == (2, LAYER_EDGE // 2 + 1, 3)
 
 
-def test_pixels_of_photographs_have_an_error_beside_them(tmp_path: Path) -> None:
-    """Means over the colours of what 8 bits differ by, on one scale of all views, whichever of the two is brighter."""
+def test_8_bit_views_show_their_absolute_error(tmp_path: Path) -> None:
+    """The error is averaged over RGB, and all views share its scale."""
     images = []
     for view, codes in {"a": (51, 102), "b": (102, 51)}.items():
         for role, code in zip(("reference", "render"), codes, strict=True):

@@ -14,8 +14,8 @@ from mivol.files import npy
 from mivol.files.npy import read_archive
 
 
-def test_what_was_saved_is_read(tmp_path: Path) -> None:
-    """Numbers of every kind, text, empty arrays, columns first; compressed or not."""
+def test_saved_arrays_are_read_unchanged(tmp_path: Path) -> None:
+    """Numbers of every kind, text, empty arrays, Fortran order; compressed or not."""
     given = {
         "a": np.arange(12, dtype=np.float16).reshape(3, 4),
         "b": np.asfortranarray(np.arange(6, dtype=">i4").reshape(2, 3)),
@@ -32,8 +32,8 @@ def test_what_was_saved_is_read(tmp_path: Path) -> None:
             assert np.array_equal(found[name], array)
 
 
-def test_what_does_not_fit_is_not_inflated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A megabyte of zeros in a kilobyte, where half of it is free: refused by what the archive says, before it is unpacked."""
+def test_an_archive_larger_than_the_free_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A megabyte of zeros in a kilobyte, with half a megabyte free: the sizes in the archive refuse it."""
     np.savez_compressed(tmp_path / "a.npz", a=np.zeros(2**17))
     assert (tmp_path / "a.npz").stat().st_size < 4096
     monkeypatch.setattr(npy, "available_memory", lambda: 2**19)
@@ -69,7 +69,7 @@ LIES = {
 
 
 @pytest.mark.parametrize("case", LIES)
-def test_archives_that_lie_are_refused(tmp_path: Path, case: str) -> None:
+def test_inconsistent_archives_are_refused(tmp_path: Path, case: str) -> None:
     content, said = LIES[case]
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
         file.writestr("a.npy", content)
@@ -78,7 +78,7 @@ def test_archives_that_lie_are_refused(tmp_path: Path, case: str) -> None:
     assert len(str(refusal.value)) < 600
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
+def test_foreign_and_truncated_files_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "one.npy", np.zeros(3))
     (tmp_path / "one.npy").rename(tmp_path / "one.npz")
     (tmp_path / "text.npz").write_text("no archive")
@@ -91,8 +91,8 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         read_archive(tmp_path / "none.npz")
 
 
-def test_flipped_bytes_end_in_a_sentence_or_are_read(tmp_path: Path) -> None:
-    """Two hundred archives with a few bytes changed at seeded places: read, or refused by mivol; nothing else is raised."""
+def test_archives_with_random_bytes_are_read_or_refused(tmp_path: Path) -> None:
+    """Two hundred archives with three bytes changed at seeded positions raise no other error."""
     np.savez_compressed(tmp_path / "a.npz", a=np.arange(50.0), b=np.array("text"), c=np.arange(6).reshape(2, 3))
     whole, rng, refused = (tmp_path / "a.npz").read_bytes(), np.random.default_rng(0), 0
     for _ in range(200):

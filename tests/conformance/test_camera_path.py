@@ -1,0 +1,68 @@
+"""Camera paths of films: circles, paths through views and keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from photo_sets import look_at, ring
+
+from mivol.errors import MivolError
+from mivol.photos import Camera, aim_camera, interpolate_cameras, intrinsics, project, turntable
+
+LIKE = Camera(intrinsics(90, 100, 30, 20), (64, 48), np.eye(4))
+BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
+
+
+def cameras_of(poses: list[np.ndarray]) -> list[Camera]:
+    """Return cameras like LIKE at the given poses."""
+    return [Camera(LIKE.K, LIKE.size, pose) for pose in poses]
+
+
+def test_aim_camera_centres_the_target_and_keeps_up() -> None:
+    camera = aim_camera(LIKE, np.array([3.0, 1, 2]), np.array([0.5, 0, 0]), np.array([0, 0, 1]))
+    np.testing.assert_allclose(project(camera, np.array([0.5, 0, 0]))[0], (32, 24), atol=1e-12)
+    x, y = project(camera, np.array([0.5, 0, 0.1]))[0]
+    assert x == pytest.approx(32, abs=1e-12) and y < 24
+    assert camera.K[0, 0] == camera.K[1, 1] == 100
+    with pytest.raises(MivolError, match="along the upward direction"):
+        aim_camera(LIKE, np.array([0.0, 0, 2]), np.zeros(3), np.array([0, 0, 1]))
+
+
+@pytest.mark.parametrize("middle", [(0, 0, 0), (5.0, -3.0, 2.0)])
+def test_turntable_around_a_ring_is_the_ring(middle: tuple[float, ...]) -> None:
+    """Photographs at distance 4 and height 1 around z give a path at the same distance and height, in equal steps."""
+    poses = np.array(ring(12))
+    poses[:, :3, 3] += middle
+    found = turntable(cameras_of(list(poses)), BOX + middle, 5)
+    places = np.array([camera.origin for camera in found]) - middle
+    np.testing.assert_allclose(places[:, 2], 1, atol=1e-12)
+    np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 1]), 4, atol=1e-12)
+    steps = np.diff(np.unwrap(np.arctan2(places[:, 1], places[:, 0])))
+    np.testing.assert_allclose(np.abs(steps), 2 * np.pi / 5, atol=1e-12)
+    for camera in found:
+        np.testing.assert_allclose(project(camera, np.array(middle, float))[0], (32, 24), atol=1e-12)
+
+
+def test_turntable_of_an_arc_swings_between_its_ends() -> None:
+    """Photographs between azimuth 20 and 120: the path reaches both ends and stays between them."""
+    azimuths = np.radians(np.linspace(20, 120, 6))
+    poses = [look_at(np.array([4 * np.cos(a), 4 * np.sin(a), 0.5])) for a in azimuths]
+    found = turntable(cameras_of(poses), BOX, 40)
+    angles = np.degrees([np.arctan2(camera.origin[1], camera.origin[0]) for camera in found])
+    assert angles.min() == pytest.approx(20, abs=1e-3) and angles.max() == pytest.approx(120, abs=1e-3)
+
+
+def test_a_path_between_views_passes_through_each_view() -> None:
+    given = cameras_of(ring(4))
+    found = interpolate_cameras(given, 7)
+    for camera, wanted in zip(found[::2], given, strict=True):
+        np.testing.assert_allclose(camera.to_world, wanted.to_world, atol=1e-9)
+    np.testing.assert_allclose(interpolate_cameras(given[:2], 3)[2].to_world, given[1].to_world, atol=1e-9)
+    with pytest.raises(MivolError, match="found 1 cameras"):
+        interpolate_cameras(given[:1], 5)
+
+
+def test_turntable_needs_a_common_upward_direction() -> None:
+    turned = [pose @ np.diag([-1.0, -1, 1, 1]) for pose in ring(4)]
+    with pytest.raises(MivolError, match="common upward direction"):
+        turntable(cameras_of(ring(4) + turned), BOX, 4)
