@@ -1,8 +1,8 @@
-"""An experiment in TOML: every setting with its unit, domain and meaning on one line.
+"""The settings of an experiment, as a TOML file gives them: each with its unit, domain and meaning on one line.
 
-Conventions. Physics stays in Mitsuba's XML; this file says what is looked for, from which views, and how. Unknown keys
-are errors that offer the nearest valid one; the command line (``--set a.b=c``) overrides the file; paths are relative
-to the TOML file. :func:`resolved` is what ``run.json`` keeps.
+Conventions. The physics stays in Mitsuba's XML. The TOML file names the parameters, the views and the method. An unknown key
+is an error that offers the nearest valid key. The command line (``--set a.b=c``) overrides the file. Paths are relative to the
+TOML file. ``run.json`` keeps the settings of :func:`resolved`.
 """
 
 from __future__ import annotations
@@ -28,44 +28,74 @@ from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.optim.schedules import SCHEDULES, Constant
 from mivol.optim.strategy import setting, suggest_name, union_type
 from mivol.scene.camera_rigs import Hemisphere, LookAts, Ring, SceneSensors
-from mivol.schema import check_keys, sentence
+from mivol.schema import check_keys, explain_error
 from mivol.tomography.ramp import WINDOWS
 from mivol.validate.images import METRICS
 
 INFINITY = math.inf
 
-AnyOptimizer, AnySchedule, AnyLoss = union_type(OPTIMIZERS), union_type(SCHEDULES), union_type(LOSSES)
-AnyPrior, AnyEvent = union_type(PRIORS), union_type(EVENTS)
+AUTO = "auto"
+"""Value of settings that mivol chooses itself."""
 
 DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
-"""A hundred names with dots between them; tomllib takes the square of their number as time, a minute for a file of 200 kB."""
-
-Count = Annotated[int, msgspec.Meta(ge=1)]
-"""Voxels or pixels along an edge."""
+"""A key of a hundred names with dots between them. The time of tomllib grows with the square of their number: a file of 200 kB
+takes a minute."""
 
 LONGEST_SENTENCE = 600
-"""Characters of a refusal, which quotes what it found: that may be as long as its file."""
+"""Characters of an error message, which quotes values of any length."""
+
+# -- Settings that several kinds of experiments share --------------------------------------------------------------------
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+"""Number of voxels or pixels along an edge."""
+
+Depth = Annotated[int, msgspec.Meta(ge=-1)]
+"""Length of the longest path, as Mitsuba's ``volpath`` counts it; -1 for no limit."""
+
+Size = tuple[Count, Count, Count]
+Vector = tuple[float, float, float]
+Title = Annotated[str, setting("1", "heading of the report", min_length=1)]
+Variant = Annotated[str, setting("1", "Mitsuba variant", min_length=1)]
+Seed = Annotated[int, setting("1", "root of the fit's random numbers", ge=0)]
+Threads = Annotated[int, setting("thread", "threads of the CPU back end; 0: all cores", ge=0)]
+Output = Annotated[str, setting("path", "run folder, relative to the working directory", min_length=1)]
+HeldOut = Annotated[tuple[int, ...], setting("view", "indices of views that are evaluated but not fitted")]
+DetectorSize = Annotated[tuple[Count, Count], setting("pixel", "(rows, columns) of computed projections")]
+CheckpointSteps = Annotated[int, setting("step", "steps between two checkpoints", ge=1)]
+
+
+def check_word(word: str, known: Sequence[str] | dict[str, Any], what: str) -> None:
+    """Refuse a word that is not among the known ones, and offer the nearest.
+
+    Raises:
+        ValueError: with the word.
+    """
+    if word not in known:
+        raise ValueError(f'unknown {what} "{word}": {suggest_name(word, list(known))}'.rstrip("."))
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A table of the file."""
 
 
+# -- Images of a scene -----------------------------------------------------------------------------------------------------
+
+
 class Scene(Section):
-    """What is rendered."""
+    """The rendered scene."""
 
     file: Annotated[str, setting("path", "Mitsuba XML", min_length=1)]
     define: Annotated[dict[str, str | int | float | bool], setting("1", "values of the XML's $parameters")] = {}
 
 
 class Truth(Section):
-    """What the references show, where it is known: a volume that is put into the scene before they are rendered."""
+    """The true volume, if it is known: the references are rendered from it."""
 
     key: Annotated[str, setting("1", "key of mi.traverse(scene)", min_length=1)]
     file: Annotated[str, setting("path", "volume file; empty: procedural")] = ""
     procedural: Annotated[str, setting("1", "key of mivol.fields.procedural.PROCEDURAL; empty: file")] = ""
-    shape: Annotated[tuple[Count, Count, Count], setting("voxel", "(Z, Y, X) of a procedural volume")] = (48, 48, 48)
-    seed: Annotated[int, setting("1", "which procedural volume", ge=0)] = 0
+    shape: Annotated[Size, setting("voxel", "(Z, Y, X) of a procedural volume")] = (48, 48, 48)
+    seed: Annotated[int, setting("1", "seed of a procedural volume", ge=0)] = 0
     peak: Annotated[float, setting("unit of the field", "largest value of a procedural volume", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
@@ -74,65 +104,60 @@ class Truth(Section):
 
 
 class Rendered(Section, tag_field="source", tag="render"):
-    """References that Mitsuba's own path tracer renders."""
+    """References rendered by Mitsuba's path tracer."""
 
-    spp: Annotated[int, setting("sample/pixel", "most samples per pixel and view", ge=1)] = 1024
-    standard_error: Annotated[float, setting("radiance", "stop earlier at this RMS error of the mean; 0: never", ge=0)] = 0.0
+    spp: Annotated[int, setting("sample/pixel", "largest number of samples per pixel and view", ge=1)] = 1024
+    standard_error: Annotated[
+        float, setting("radiance", "stop earlier at this RMS standard error of the mean; 0: never", ge=0)
+    ] = 0.0
     seed: Annotated[int, setting("1", "root of the references' random numbers", ge=0)] = 1
-    max_depth: Annotated[
-        Annotated[int, msgspec.Meta(ge=-1)] | None, setting("1", "as Mitsuba's volpath; -1: unlimited; absent: that of the fit")
-    ] = None
-    held_out: Annotated[tuple[int, ...], setting("view", "views that are compared but not fitted")] = ()
+    max_depth: Annotated[Depth | None, setting("1", "longest path, as in volpath; -1: unlimited; absent: the fit's")] = None
+    held_out: HeldOut = ()
 
 
 class Files(Section, tag_field="source", tag="files"):
     """References from OpenEXR files, one per view."""
 
-    paths: Annotated[tuple[str, ...], setting("path", "files in the order of the views, then of those held out", min_length=1)]
-    scene: Annotated[str, setting("path", "XML that they are references of; empty: the scene's")] = ""
-    held_out: Annotated[tuple[int, ...], setting("view", "views that are compared but not fitted")] = ()
+    paths: Annotated[tuple[str, ...], setting("path", "files in the order of the views, then of held_out", min_length=1)]
+    scene: Annotated[str, setting("path", "XML of the scene in the files; empty: the fit's")] = ""
+    held_out: HeldOut = ()
 
 
 class Sought(Section):
-    """A parameter that is looked for."""
+    """A parameter to fit."""
 
     key: Annotated[str, setting("1", "key of mi.traverse(scene)", min_length=1)]
-    unit: Annotated[str, setting("1", "unit of the value, for labels; empty: that which its key tells")] = ""
+    unit: Annotated[str, setting("1", "unit of the value; empty: the usual unit of the key")] = ""
     domain: Annotated[tuple[float, float], setting("unit", "smallest and largest value")] = (0.0, INFINITY)
-    map: Annotated[str, setting("1", "what the optimiser moves: key of MAPS")] = "identity"
-    lr: Annotated[float, setting("unit", "typical change per step, in the map's reals", gt=0)] = 0.1
+    map: Annotated[str, setting("1", "map from the optimizer's numbers: key of MAPS")] = "identity"
+    lr: Annotated[float, setting("unit", "learning rate: typical change per step", gt=0)] = 0.1
     start: Annotated[
-        float | tuple[float, ...] | None, setting("unit", "start: one number for all, or each; absent: what the scene holds")
+        float | tuple[float, ...] | None, setting("unit", "first value: one number, or one per channel; absent: the scene's")
     ] = None
-    start_file: Annotated[str, setting("path", "volume to start from; empty: start")] = ""
+    start_file: Annotated[str, setting("path", "volume with the first value; empty: start")] = ""
     start_fit: Annotated[
-        Literal["", "emission"],
-        setting("1", "emission: the start is given the shape of an emissive volume fitted to the views"),
+        Literal["", "emission"], setting("1", "emission: fit an emissive volume first, and give the first value its shape")
     ] = ""
-    shape: Annotated[tuple[Count, Count, Count] | None, setting("voxel", "(Z, Y, X) of a constant start")] = None
-    prior: Annotated[tuple[AnyPrior, ...], setting("1", "what is known before")] = ()
+    shape: Annotated[Size | None, setting("voxel", "(Z, Y, X) of a constant first value")] = None
+    prior: Annotated[
+        tuple[union_type(PRIORS), ...],
+        setting("1", "regularization of the parameter"),
+    ] = ()
 
     def __post_init__(self) -> None:
-        if self.map not in MAPS:
-            raise ValueError(f'unknown map "{self.map}": {suggest_name(self.map, list(MAPS))}'.rstrip("."))
-
-
-AUTO = "auto"
-"""A depth that is measured before the fit."""
+        check_word(self.map, MAPS, "map")
 
 
 class SceneFitSettings(Section):
-    """How long and how finely."""
+    """Length and precision of the fit."""
 
-    iterations: Annotated[int, setting("iteration", "at most so many", ge=1)] = 100
+    iterations: Annotated[int, setting("iteration", "largest number of iterations", ge=1)] = 100
     spp: Annotated[int, setting("sample/pixel", "samples of an image and of its derivative", ge=1)] = 16
-    spp_shown: Annotated[int, setting("sample/pixel", "of images kept, 16 or more for z-images; 0: as spp", ge=0)] = 0
-    samples_per_pass: Annotated[int, setting("sample", "most samples in one kernel: Ctrl-C waits for one", ge=1)] = 1 << 20
-    max_depth: Annotated[
-        Annotated[int, msgspec.Meta(ge=-1)] | str, setting("1", "as Mitsuba's volpath; -1: unlimited; auto: measured")
-    ] = 6
-    noise: Annotated[float, setting("1", "of a pixel over the mean radiance: max_depth = auto leaves out less", gt=0)] = 0.02
-    integrator: Annotated[str, setting("1", "Mitsuba integrator that differentiates", min_length=1)] = "mivol"
+    spp_shown: Annotated[int, setting("sample/pixel", "of report images, 16 or more for z-images; 0: spp", ge=0)] = 0
+    samples_per_pass: Annotated[int, setting("sample", "most samples in one kernel; Ctrl-C waits for it", ge=1)] = 1 << 20
+    max_depth: Annotated[Depth | str, setting("1", "longest path, as in volpath; -1: unlimited; auto: measured")] = 6
+    noise: Annotated[float, setting("1", "noise over mean radiance; max_depth = auto neglects less", gt=0)] = 0.02
+    integrator: Annotated[str, setting("1", "Mitsuba integrator with derivatives", min_length=1)] = "mivol"
 
     def __post_init__(self) -> None:
         if isinstance(self.max_depth, str) and self.max_depth != AUTO:
@@ -140,148 +165,134 @@ class SceneFitSettings(Section):
 
 
 class SceneExperiment(Section):
-    """All of ``fit.toml``."""
+    """A fit of scene parameters to images: a file with a table ``[scene]``."""
 
-    title: Annotated[str, setting("1", "heading of the report", min_length=1)]
-    scene: Annotated[Scene, setting("1", "what is rendered")]
-    parameter: Annotated[tuple[Sought, ...], setting("1", "what is looked for", min_length=1)]
-    views: Annotated[Ring | Hemisphere | LookAts | SceneSensors, setting("1", "where it is seen from")] = SceneSensors()
+    title: Title
+    scene: Annotated[Scene, setting("1", "the rendered scene")]
+    parameter: Annotated[tuple[Sought, ...], setting("1", "the parameters to fit", min_length=1)]
+    views: Annotated[Ring | Hemisphere | LookAts | SceneSensors, setting("1", "the cameras")] = SceneSensors()
     held_out: Annotated[
-        Ring | Hemisphere | LookAts | SceneSensors | None, setting("1", "more views, after the others: compared but not fitted")
+        Ring | Hemisphere | LookAts | SceneSensors | None, setting("1", "more cameras, evaluated but not fitted")
     ] = None
-    reference: Annotated[Rendered | Files, setting("1", "what was seen")] = Rendered()
-    truth: Annotated[Truth | None, setting("1", "what the references show, where known")] = None
-    fit: Annotated[SceneFitSettings, setting("1", "how long and how finely")] = SceneFitSettings()
-    optimiser: Annotated[AnyOptimizer, setting("1", "how to walk downhill")] = Adam()
-    schedule: Annotated[AnySchedule, setting("1", "factor on the learning rate")] = Constant()
-    loss: Annotated[AnyLoss, setting("1", "distance of image and reference")] = L2()
-    event: Annotated[tuple[AnyEvent, ...], setting("1", "what happens between iterations")] = (
+    reference: Annotated[Rendered | Files, setting("1", "the images to fit")] = Rendered()
+    truth: Annotated[Truth | None, setting("1", "the true volume in the references, if known")] = None
+    fit: Annotated[SceneFitSettings, setting("1", "length and precision of the fit")] = SceneFitSettings()
+    optimiser: Annotated[union_type(OPTIMIZERS), setting("1", "the optimizer")] = Adam()
+    schedule: Annotated[union_type(SCHEDULES), setting("1", "factor on the learning rate")] = Constant()
+    loss: Annotated[union_type(LOSSES), setting("1", "distance between image and reference")] = L2()
+    event: Annotated[tuple[union_type(EVENTS), ...], setting("1", "actions between iterations")] = (
         Checkpoint(),
         Evaluate(),
     )
-    variant: Annotated[str, setting("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
-    seed: Annotated[int, setting("1", "root of the fit's random numbers", ge=0)] = 0
-    threads: Annotated[int, setting("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
-    output: Annotated[str, setting("path", "run folder, relative to where the command runs", min_length=1)] = "runs/fit"
+    variant: Variant = "llvm_ad_rgb"
+    seed: Seed = 0
+    threads: Threads = 0
+    output: Output = "runs/fit"
 
 
-# -- Tomography -------------------------------------------------------------------------------------------------------
+# -- Projections -----------------------------------------------------------------------------------------------------------
 
 
 class Detector(Section, tag_field="beam"):
-    """What both kinds of beam share; the detector's size and the angles come from the data where it is measured."""
+    """Settings of both circular beams; measured data bring the detector's size and the angles."""
 
     views: Annotated[int, setting("view", "number of views, evenly over the arc", ge=1)] = 90
-    arc: Annotated[float, setting("degree", "angle covered", gt=0, le=360)] = 180.0
+    arc: Annotated[float, setting("degree", "angle of the whole scan", gt=0, le=360)] = 180.0
     detector: Annotated[tuple[Count, Count], setting("pixel", "(rows, columns)")] = (1, 128)
-    pitch: Annotated[
-        float | tuple[float, float], setting("length", "distance of pixel centres: one, or of (rows, columns)")
-    ] = 1.0
+    pitch: Annotated[float | tuple[float, float], setting("length", "pixel distance: one, or (rows, columns)")] = 1.0
     detector_offset: Annotated[
         tuple[float, float], setting("length", "shift of the detector's middle along (rows, columns)")
-    ] = (
-        0.0,
-        0.0,
-    )
+    ] = (0.0, 0.0)
     axis_offset: Annotated[float, setting("length", "rotation axis from the middle, along the columns")] = 0.0
 
 
 class Parallel(Detector, tag="parallel"):
-    """Parallel light."""
+    """A parallel beam."""
 
 
 class Cone(Detector, kw_only=True, tag="cone"):
-    """A point source."""
+    """A cone beam."""
 
     source_to_axis: Annotated[float, setting("length", "source to rotation axis", gt=0)]
     source_to_detector: Annotated[float, setting("length", "source to detector", gt=0)]
 
 
 class Table(Section, kw_only=True, tag_field="beam", tag="table"):
-    """A point source and a flat detector on any trajectory; of measured projections, the detector's size is the data's."""
+    """A point source and a flat detector on any trajectory; measured data bring the detector's size."""
 
-    file: Annotated[str, setting("path", "text, 12 lengths a view: source, detector's middle, steps to next column and row")]
-    detector: Annotated[tuple[Count, Count], setting("pixel", "(rows, columns) of computed projections")] = (1, 128)
+    file: Annotated[str, setting("path", "12 lengths per view: source, detector's middle, steps to next column and row")]
+    detector: DetectorSize = (1, 128)
 
 
 class Matrices(Section, kw_only=True, tag_field="beam", tag="matrices"):
     """A point source and a flat detector on any trajectory, as projection matrices: (column, row, 1) ~ P (x, y, z, 1)."""
 
-    file: Annotated[str, setting("path", "text, 12 numbers a view: P, 3 x 4, row by row", min_length=1)]
-    detector: Annotated[tuple[Count, Count], setting("pixel", "(rows, columns) of computed projections")] = (1, 128)
-    first_pixel: Annotated[
-        tuple[float, float], setting("pixel", "(column, row) that P gives to the middle of the first pixel")
-    ] = (
+    file: Annotated[str, setting("path", "text, 12 numbers per view: P, row by row", min_length=1)]
+    detector: DetectorSize = (1, 128)
+    first_pixel: Annotated[tuple[float, float], setting("pixel", "(column, row) of the first pixel's middle under P")] = (
         0.0,
         0.0,
     )
 
 
 class OfData(Section, tag_field="beam", tag="data"):
-    """The geometry that comes with the data; source = "nikon" has one."""
+    """The geometry in the data; only source = "nikon" has a geometry."""
 
 
 class Simulated(Section):
-    """Noise of projections that are computed."""
+    """Noise of computed projections."""
 
-    photons: Annotated[float, setting("quantum/pixel", "of the light without an object; 0: no noise", ge=0)] = 0.0
-    seed: Annotated[int, setting("1", "root of the noise", ge=0)] = 1
+    photons: Annotated[float, setting("quantum/pixel", "quanta per pixel without an object; 0: no noise", ge=0)] = 0.0
+    seed: Annotated[int, setting("1", "root of the noise's random numbers", ge=0)] = 1
 
 
 class Ellipsoids(Simulated, tag_field="source", tag="shepp_logan"):
-    """Exact chords through the Shepp-Logan head: no grid takes part in the data."""
+    """Exact line integrals of the Shepp-Logan head, without a grid."""
 
     table: Annotated[str, setting("1", "kak-slaney, yu-ye-wang or toft-schabel", min_length=1)] = "yu-ye-wang"
-    half_width: Annotated[float, setting("length", "half of the head's box", gt=0)] = 1.0
-    scale: Annotated[float, setting("1/length", "factor on its values", gt=0)] = 1.0
+    half_width: Annotated[float, setting("length", "half the width of the head's box", gt=0)] = 1.0
+    scale: Annotated[float, setting("1/length", "factor on the table's values", gt=0)] = 1.0
 
 
 class Known(Simulated, kw_only=True, tag_field="source", tag="volume"):
-    """Projections of a volume file, by the projector that also reconstructs."""
+    """Projections of a volume file, by the projector of the reconstruction."""
 
-    file: Annotated[str, setting("path", "volume of the grid's shape", min_length=1)]
-    scale: Annotated[float, setting("1/length", "factor on its values", gt=0)] = 1.0
+    file: Annotated[str, setting("path", "volume with the shape of the grid", min_length=1)]
+    scale: Annotated[float, setting("1/length", "factor on the volume's values", gt=0)] = 1.0
 
 
 class Readings(Section):
-    """What measured projections share."""
+    """Settings of all measured projections."""
 
     find_axis: Annotated[
-        bool | None,
-        setting("1", "find the axis of a parallel or cone beam; absent: where scan.axis_offset is 0; false: it holds"),
+        bool | None, setting("1", "find the rotation axis; false: scan.axis_offset holds; absent: find it if that offset is 0")
     ] = None
-    air: Annotated[int, setting("pixel", "columns at either edge that see no object; 0: light does not drift", ge=0)] = 0
-    drift: Annotated[
-        int, setting("iteration", "how often the drift of the light since the flats is fitted to each pixel; 0: never", ge=0)
-    ] = 0
-    saturation: Annotated[float, setting("reading", "readings from here on are saturated, not used; inf: none", gt=0)] = (
-        INFINITY
-    )
+    air: Annotated[int, setting("pixel", "columns without object at each edge, for the drift of the light", ge=0)] = 0
+    drift: Annotated[int, setting("iteration", "fits of a drift of the light to each pixel; 0: none", ge=0)] = 0
+    saturation: Annotated[float, setting("reading", "smallest saturated reading, not used", gt=0)] = INFINITY
 
 
 class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
     """A Data Exchange file (HDF5) with flat and dark fields."""
 
-    file: Annotated[str, setting("path", "HDF5", min_length=1)]
-    group: Annotated[str, setting("1", "where data, data_white, data_dark and theta lie")] = "exchange"
+    file: Annotated[str, setting("path", "HDF5 file", min_length=1)]
+    group: Annotated[str, setting("1", "group with data, data_white, data_dark and theta")] = "exchange"
 
 
 class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
-    """Projections as images or arrays, with flat and dark fields beside them."""
+    """Projections as images or arrays, with flat and dark fields in other files."""
 
-    file: Annotated[
-        str, setting("path", "TIFF, .npy, .npz or HDF5, (views, rows, cols); a pattern of TIFF files", min_length=1)
-    ]
+    file: Annotated[str, setting("path", "TIFF, .npy, .npz, HDF5 (views, rows, cols), or a TIFF pattern", min_length=1)]
     reading: Annotated[
         Literal["intensity", "transmission", "line_integral"],
-        setting("1", "what a pixel holds; an intensity needs flats and darks"),
+        setting("1", "quantity of a pixel; an intensity needs flats and darks"),
     ]
-    dataset: Annotated[str, setting("1", "which array of an .npz or HDF5 file")] = ""
-    flats: Annotated[str, setting("path", "readings of light without an object, as file")] = ""
+    dataset: Annotated[str, setting("1", "name of the array in an .npz or HDF5 file")] = ""
+    flats: Annotated[str, setting("path", "readings of light without object, as file")] = ""
     darks: Annotated[str, setting("path", "readings without light, as file")] = ""
-    angles: Annotated[str, setting("path", "text with an angle for each view; empty: evenly over scan.arc")] = ""
-    angle_unit: Annotated[Literal["degree", "radian"], setting("1", "of the angles' file")] = "degree"
-    first_row: Annotated[Literal["lowest", "highest"], setting("1", "which row of the detector a file's first is")] = "lowest"
+    angles: Annotated[str, setting("path", "text with one angle per view; empty: evenly over scan.arc")] = ""
+    angle_unit: Annotated[Literal["degree", "radian"], setting("1", "unit of the angles in the file")] = "degree"
+    first_row: Annotated[Literal["lowest", "highest"], setting("1", "row of the detector that the file has first")] = "lowest"
 
     def __post_init__(self) -> None:
         if (self.reading == "intensity") != bool(self.flats and self.darks):
@@ -291,89 +302,85 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
 
 
 class Nikon(Readings, kw_only=True, tag_field="source", tag="nikon"):
-    """A scan of a Nikon (X-Tek) laboratory scanner: settings, and TIFF files beside them [mm]."""
+    """A scan of a Nikon (X-Tek) laboratory scanner [mm]: a settings file, and TIFF files beside the settings."""
 
-    file: Annotated[str, setting("path", ".xtekct; geometry, white level and default grid are its", min_length=1)]
-    angles: Annotated[str, setting("path", "list of angles, as _ctdata.txt or .ang; empty: the settings' even steps")] = ""
+    file: Annotated[str, setting("path", ".xtekct: geometry, white level and default grid", min_length=1)]
+    angles: Annotated[str, setting("path", "_ctdata.txt or .ang; empty: even steps of the file")] = ""
 
 
 class Grid(Section):
-    """Where the voxels lie."""
+    """The voxels of the reconstruction."""
 
-    shape: Annotated[tuple[Count, Count, Count], setting("voxel", "(Z, Y, X)")]
-    voxel_size: Annotated[float | tuple[float, float, float], setting("length", "edges of a voxel: one, or (x, y, z)")] = 1.0
-    centre: Annotated[tuple[float, float, float], setting("length", "(x, y, z) of the box's middle")] = (0.0, 0.0, 0.0)
+    shape: Annotated[Size, setting("voxel", "(Z, Y, X)")]
+    voxel_size: Annotated[float | Vector, setting("length", "edges of a voxel: one number, or (x, y, z)")] = 1.0
+    centre: Annotated[Vector, setting("length", "(x, y, z) of the box's middle")] = (0.0, 0.0, 0.0)
 
 
 class SolveSettings(Section):
-    """How the projections are inverted."""
+    """Inversion of the projections."""
 
-    name: Annotated[str, setting("1", "auto, or a key of mivol.optim.projections.solvers.ALL_SOLVERS", min_length=1)] = "auto"
+    name: Annotated[str, setting("1", "auto, or a key of mivol.optim.projections.solvers.ALL_SOLVERS", min_length=1)] = AUTO
     start: Annotated[
         Literal["empty", "filtered"] | None,
-        setting(
-            "1", "first volume: empty, or by fbp or fdk; absent: auto begins filtered where the views allow it, others empty"
-        ),
+        setting("1", "first volume; absent: auto takes filtered if the views allow it, others empty"),
     ] = None
-    iterations: Annotated[int, setting("iteration", "at most so many", ge=1)] = 20
+    iterations: Annotated[int, setting("iteration", "largest number of iterations", ge=1)] = 20
     nonnegative: Annotated[bool, setting("1", "keep every voxel at or above 0")] = True
     subsets: Annotated[int, setting("1", "subsets of views, for os-sart", ge=1)] = 10
     relaxation: Annotated[float, setting("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
-    decay: Annotated[float, setting("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
-    window: Annotated[str, setting("1", "filter of fbp and fdk: key of mivol.tomography.ramp.WINDOWS", min_length=1)] = (
+    decay: Annotated[float, setting("1", "factor on the relaxation per sweep", gt=0, le=1)] = 0.99
+    window: Annotated[str, setting("1", "window of fbp and fdk: key of mivol.tomography.ramp.WINDOWS", min_length=1)] = (
         "ram-lak"
     )
-    cutoff: Annotated[float, setting("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
-    supersampling: Annotated[
-        int | None, setting("1", "unknowns along each edge of a voxel, which is their mean; absent: auto takes 2, others 1")
-    ] = None
-    tv: Annotated[float | None, setting("tv_unit", "strength of the total variation; absent: auto takes 1, others 0: none")] = (
-        None
-    )
+    cutoff: Annotated[float, setting("1", "end of the window, over the Nyquist frequency", gt=0, le=1)] = 1.0
+    supersampling: (
+        Annotated[int, setting("1", "unknowns along each edge of a voxel, which is their mean; absent: auto 2, others 1", ge=1)]
+        | None
+    ) = None
+    tv: Annotated[float, setting("tv_unit", "strength of total variation; absent: auto 1, others 0", ge=0)] | None = None
     delta: Annotated[float, setting("tv_unit", "slope below which noise is smoothed", gt=0)] = 0.1
     tv_unit: Annotated[
         Literal["length", "noise"],
         setting(
-            "1", "noise: tv in parts of what balances the noise, delta of the mean value a voxel; length: 1/length, 1/length^2"
+            "1",
+            "units of tv and delta; noise: the strength that balances the noise, and the mean value per voxel; "
+            "length: 1/length and 1/length^2",
         ),
     ] = "noise"
     storage: Annotated[
         Literal["auto", "walk", "matrix"],
-        setting("1", "matrix: a layer's rows are stored (parallel beams, fans); auto: where they fit and it pays"),
+        setting(
+            "1",
+            "matrix: keep the rows of a layer as a sparse matrix (parallel beams, fans); walk: walk through the grid in each "
+            "product; auto: matrix if it fits the memory and saves time",
+        ),
     ] = "auto"
-    memory: Annotated[float, setting("GiB", "most that stored rows may take", gt=0)] = 1.0
-    discrepancy: Annotated[float, setting("1", "stop where the residual is so many times the noise; 0: never", ge=0)] = 0.0
+    memory: Annotated[float, setting("GiB", "most memory of stored rows", gt=0)] = 1.0
+    discrepancy: Annotated[float, setting("1", "stop at this residual over that of the noise; 0: never", ge=0)] = 0.0
+
+    def __post_init__(self) -> None:
+        check_word(self.name, [AUTO, *ALL_SOLVERS], "solver")
+        check_word(self.window, WINDOWS, "window")
 
     @property
     def solver(self) -> str:
-        """Key of ``mivol.optim.solvers.METHODS``; "auto" stands for pcg."""
+        """Key of ``mivol.optim.projections.solvers.ALL_SOLVERS``; "auto" stands for pcg."""
         return "pcg" if self.name == AUTO else self.name
-
-    def __post_init__(self) -> None:
-        if self.name != AUTO and self.name not in ALL_SOLVERS:
-            raise ValueError(f'unknown solver "{self.name}": {suggest_name(self.name, [AUTO, *ALL_SOLVERS])}'.rstrip("."))
-        # NaN fails every comparison.
-        if self.tv is not None and not self.tv >= 0:
-            raise ValueError(f"tv is {self.tv}: a number from 0 on is expected")
-        if self.supersampling is not None and self.supersampling < 1:
-            raise ValueError(f"supersampling is {self.supersampling}: a whole number from 1 on is expected")
-        if self.window not in WINDOWS:
-            raise ValueError(f'unknown window "{self.window}": {suggest_name(self.window, list(WINDOWS))}'.rstrip("."))
 
 
 class ScanExperiment(Section):
-    """All of a TOML file for tomography: it has a table ``[scan]`` in place of ``[scene]``."""
+    """A reconstruction from projections: a file with a table ``[scan]``."""
 
-    title: Annotated[str, setting("1", "heading of the report", min_length=1)]
+    title: Title
     scan: Annotated[Parallel | Cone | Table | Matrices | OfData, setting("1", "beam and detector")]
-    data: Annotated[Ellipsoids | Known | Measured | Stack | Nikon, setting("1", "what was seen")]
-    grid: Annotated[Grid | None, setting("1", "where the voxels lie; absent: where a Nikon file says")] = None
-    solve: Annotated[SolveSettings, setting("1", "how it is inverted")] = SolveSettings()
-    held_out_every: Annotated[int, setting("view", "every so many is predicted, not fitted; 0: none", ge=0)] = 0
-    checkpoint_every: Annotated[int, setting("iteration", "how often", ge=1)] = 5
-    variant: Annotated[str, setting("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
-    threads: Annotated[int, setting("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
-    output: Annotated[str, setting("path", "run folder, relative to where the command runs", min_length=1)] = "runs/scan"
+    data: Annotated[Ellipsoids | Known | Measured | Stack | Nikon, setting("1", "the projections")]
+    grid: Annotated[Grid | None, setting("1", "the voxels; absent: the grid of a Nikon file")] = None
+    solve: Annotated[SolveSettings, setting("1", "the inversion")] = SolveSettings()
+    held_out_every: Annotated[int, setting("view", "step between views that are not fitted; 0: none", ge=0)] = 0
+    checkpoint_every: Annotated[int, setting("iteration", "iterations between two checkpoints", ge=1)] = 5
+    variant: Variant = "llvm_ad_rgb"
+    threads: Threads = 0
+    output: Output = "runs/scan"
 
     def __post_init__(self) -> None:
         if isinstance(self.scan, OfData) != isinstance(self.data, Nikon):
@@ -382,233 +389,218 @@ class ScanExperiment(Section):
             raise ValueError('the key "grid" is missing: give it')
 
 
-# -- Photographs --------------------------------------------------------------------------------------------------
+# -- Photographs -----------------------------------------------------------------------------------------------------------
 
 
 class Photographs(Section):
     """Posed photographs."""
 
-    path: Annotated[str, setting("path", "folder or file of cameras: Blender, nerfstudio, instant-ngp, COLMAP", min_length=1)]
-    scale: Annotated[float, setting("1", "of width and height, by exact means over area", gt=0, le=1)] = 1.0
-    largest: Annotated[int | None, setting("pixel", "longest edge of any photograph; absent: as scale says")] = None
+    path: Annotated[str, setting("path", "folder or cameras: Blender, nerfstudio, instant-ngp, COLMAP", min_length=1)]
+    scale: Annotated[float, setting("1", "factor on width and height, by exact area means", gt=0, le=1)] = 1.0
+    largest: Annotated[int, setting("pixel", "longest edge of a photograph; absent: scale", ge=16)] | None = None
     background: Annotated[
-        str | tuple[float, float, float],
+        str | Vector,
         setting(
             "1",
-            "where nothing is, white, black or an rgb triple; of images with alpha also random (a colour for each), of those "
-            "without also sky (learned with the field) or nested (boxes of twice the extent each, and a sky); empty: no alpha, "
-            "and what the preset has, else black",
+            "colour behind the model: white, black or an rgb triple; with alpha also random (a colour per image); without "
+            "alpha also sky (fitted with the field) or nested (a sky, and boxes of twice the extent each); empty: no alpha, "
+            "and the preset's, else black",
         ),
     ] = ""
-    held_out: Annotated[int, setting("view", "every so many of the training views is compared, not fitted; 0: none", ge=0)] = 8
+    held_out: Annotated[int, setting("view", "step between training views that are not fitted; 0: none", ge=0)] = 8
     box: Annotated[
-        str | tuple[tuple[float, float, float], tuple[float, float, float]],
+        str | tuple[Vector, Vector],
         setting(
             "1",
-            "where matter may be: silhouettes (of alpha), cameras (what they look at), middle (of nested boxes), found "
-            "(silhouettes where all photographs have alpha, else cameras), or two corners [length]",
+            "box of the matter: silhouettes (around the opaque pixels), cameras (what they look at), middle (innermost of "
+            "nested boxes), found (silhouettes if all photographs have alpha, else cameras), or two corners [length]",
         ),
     ] = "found"
-    judged: Annotated[str, setting("1", "views to report at the end: held_out, val or test", min_length=1)] = "held_out"
+    judged: Annotated[str, setting("1", "views that judge the fit: held_out, val or test", min_length=1)] = "held_out"
     space: Annotated[
         Literal["srgb", "linear"] | None,
-        setting("1", "values that are fitted: srgb (codes) or linear (radiance); absent: what the photographs hold"),
+        setting("1", "fitted values: srgb (codes) or linear (radiance); absent: as stored in the photographs"),
     ] = None
     stored: Annotated[
         Literal["srgb", "linear"] | None,
-        setting("1", "what PNG and JPEG hold; absent: linear where a PNG says so (gAMA 1), else srgb; OpenEXR is linear"),
+        setting("1", "values in PNG and JPEG files; absent: linear for a PNG of gAMA 1, else srgb; OpenEXR is always linear"),
     ] = None
 
     def __post_init__(self) -> None:
-        if self.largest is not None and self.largest < 16:
-            raise ValueError(f"largest is {self.largest}: at least 16 pixels are expected")
         colour = self.background
         if not isinstance(colour, str) and not all(0 <= c <= 1 for c in colour):  # NaN fails every comparison
             raise ValueError(f"background is {list(colour)}: three numbers from 0 to 1 are expected, codes of 8 bits over 255")
 
 
 MOST_LEVELS = 12
-"""Nested boxes that may be asked for: the largest is then 2048 times the innermost."""
+"""Largest number of nested boxes; the largest box is then 2048 times the innermost."""
 
 
 class FieldSettings(Section):
-    """The radiance field and how it is fitted."""
+    """The radiance field and its fit."""
 
-    preset: Annotated[str, setting("1", "nodes, steps, rates and priors: tiny, cpu, fine, capture or gpu", min_length=1)] = (
-        "cpu"
-    )
-    longest: Annotated[int | None, setting("voxel", "along the longest edge in the end; absent: the preset's")] = None
-    degree: Annotated[int | None, setting("1", "of the spherical harmonics; absent: the preset's")] = None
-    first_degree: Annotated[int | None, setting("1", "of the first stage, raised from there; absent: degree")] = None
+    preset: Annotated[str, setting("1", "nodes, steps, rates, priors: tiny, cpu, fine, capture or gpu", min_length=1)] = "cpu"
+    longest: Annotated[int, setting("voxel", "voxels along the longest edge; absent: preset", ge=8)] | None = None
+    degree: Annotated[int, setting("1", "of the spherical harmonics; absent: preset", ge=0, le=4)] | None = None
+    first_degree: Annotated[int, setting("1", "degree of the first stage; absent: degree", ge=0, le=4)] | None = None
     effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
-    tv_density: Annotated[float | None, setting("photograph", "total variation of the density; absent: the preset's")] = None
-    tv_sh: Annotated[float | None, setting("photograph", "total variation of the colours; absent: the preset's")] = None
-    sparsity: Annotated[float | None, setting("photograph", "of the density; absent: the preset's")] = None
-    matte: Annotated[
-        float | None,
-        setting(
-            "photograph", "colours that change little with the direction; absent: the preset's (capture of less than 50: 0)"
-        ),
-    ] = None
-    depth: Annotated[
-        float | None, setting("1", "weight of the distances that a model's points tell; absent: the preset's (only capture)")
-    ] = None
-    levels: Annotated[
-        int | None, setting("1", "nested boxes; absent: the preset's (1, capture 5), fewer where a model's points need no more")
-    ] = None
-    sky: Annotated[int | None, setting("row", "of a map of what is behind the box, learned with the field; 0: none")] = None
+    tv_density: Annotated[float, setting("photograph", "total variation of the density; absent: preset", ge=0)] | None = None
+    tv_sh: Annotated[float, setting("photograph", "total variation of the colours; absent: preset", ge=0)] | None = None
+    sparsity: Annotated[float, setting("photograph", "sparsity of the density; absent: preset", ge=0)] | None = None
+    matte: (
+        Annotated[
+            float,
+            setting(
+                "photograph",
+                "decay of view-dependent colours; absent: preset (capture with fewer than 50 photographs: 0)",
+                ge=0,
+            ),
+        ]
+        | None
+    ) = None
+    depth: (
+        Annotated[float, setting("1", "weight of the depths of reconstructed points; absent: preset (only capture)", ge=0)]
+        | None
+    ) = None
+    levels: (
+        Annotated[
+            int,
+            setting(
+                "1",
+                "nested boxes; absent: preset (1, capture 5), or fewer if they hold all reconstructed points",
+                ge=1,
+                le=MOST_LEVELS,
+            ),
+        ]
+        | None
+    ) = None
+    sky: Annotated[int, setting("row", "rows of the fitted map behind the box; 0: none", ge=0, le=4096)] | None = None
     exposure: Annotated[
-        bool | None, setting("1", "gains of each photograph, left out where they agree; absent: the preset's (only capture)")
+        bool | None, setting("1", "gains of each photograph, dropped if they agree; absent: preset (only capture)")
     ] = None
-    beta: Annotated[float | None, setting("1", "asks rays to end in matter or to pass; absent: the preset's")] = None
+    beta: Annotated[float, setting("1", "favours rays of opacity 0 or 1; absent: preset", ge=0)] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("degree", "first_degree"):
-            if not 0 <= (getattr(self, name) or 0) <= 4:
-                raise ValueError(f"{name} is {getattr(self, name)}: 0 to 4 is expected")
-        if not math.isfinite(self.effort):
-            raise ValueError(f"effort is {self.effort}: a finite number above 0 is expected")
-        if self.sky is not None and self.sky != 0 and not 2 <= self.sky <= 4096:
-            raise ValueError(f"sky is {self.sky}: 0, or 2 to 4096 rows are expected")
-        if self.longest is not None and self.longest < 8:
-            raise ValueError(f"longest is {self.longest}: at least 8 is expected")
-        if self.levels is not None and not 1 <= self.levels <= MOST_LEVELS:
-            raise ValueError(f"levels is {self.levels}: 1 to {MOST_LEVELS} is expected")
-        for name in ("tv_density", "tv_sh", "sparsity", "matte", "depth", "beta"):
-            if not 0 <= (getattr(self, name) or 0) < math.inf:  # NaN fails every comparison
-                raise ValueError(f"{name} is {getattr(self, name)}: a finite number of at least 0 is expected")
+        if self.sky == 1:
+            raise ValueError("sky is 1: 0, or 2 to 4096 rows are expected")
 
 
 Keyframe = tuple[float, float, float, float, float, float]
 
 
 class ShowSettings(Section):
-    """What is made of a fitted field."""
+    """Images, film and curve of a fit of photographs."""
 
-    views: Annotated[int, setting("view", "judged views that are shown beside their photographs", ge=0)] = 4
-    frames: Annotated[int, setting("frame", "of a film; 0: none", ge=0, le=65536)] = 60
+    views: Annotated[int, setting("view", "judged views that the report shows in full", ge=0)] = 4
+    frames: Annotated[int, setting("frame", "frames of the film; 0: no film", ge=0, le=65536)] = 60
     way: Annotated[
         Literal["turntable", "views", "keyframes"],
-        setting("1", "of the film's camera: around the box, through the photographs' places in their order, or past keyframes"),
+        setting("1", "path of the film's camera: around the box, through the photographs' places in order, or past keyframes"),
     ] = "turntable"
     keyframes: Annotated[
-        tuple[Keyframe, ...],
-        setting("length", "where the film's camera stands and what it looks at, at least two, in equal times"),
+        tuple[Keyframe, ...], setting("length", "camera and target points of the film, two or more, at equal intervals of time")
     ] = ()
-    every: Annotated[int, setting("step", "between two points of the curve of held-out views", ge=1)] = 250
-    judged: Annotated[int, setting("view", "held-out views in that curve, the same at each point; 0: all", ge=0)] = 4
-    metrics: Annotated[tuple[str, ...], setting("1", "of the judged views: psnr, ssim, flip", min_length=1)] = ("psnr", "ssim")
+    every: Annotated[int, setting("step", "steps between two points of the held-out curve", ge=1)] = 250
+    judged: Annotated[int, setting("view", "held-out views in the curve, the same at each point; 0: all", ge=0)] = 4
+    metrics: Annotated[tuple[str, ...], setting("1", "of the judged views: psnr, ssim, flip", min_length=1)] = (
+        "psnr",
+        "ssim",
+    )
 
     def __post_init__(self) -> None:
         if self.way == "keyframes" and len(self.keyframes) < 2:
             raise ValueError(f"{len(self.keyframes)} keyframes were given: at least 2 are expected")
         if self.keyframes and self.way != "keyframes":
             raise ValueError(f'keyframes were given beside way = "{self.way}": "keyframes" is expected')
-        unknown = next((name for name in self.metrics if name not in METRICS), None)
-        if unknown is not None:
-            raise ValueError(f'unknown metric "{unknown}": {suggest_name(unknown, list(METRICS))}'.rstrip("."))
+        for name in self.metrics:
+            check_word(name, METRICS, "metric")
 
 
 class FieldExperiment(Section):
-    """All of ``fit.toml`` of a radiance field."""
+    """A fit of a radiance field to photographs: a file with a table ``[photos]``."""
 
-    title: Annotated[str, setting("1", "heading of the report", min_length=1)]
-    photos: Annotated[Photographs, setting("1", "what was seen")]
-    field: Annotated[FieldSettings, setting("1", "what is looked for")] = FieldSettings()
-    show: Annotated[ShowSettings, setting("1", "what is made of it")] = ShowSettings()
-    checkpoint_every: Annotated[int, setting("step", "how often", ge=1)] = 500
-    variant: Annotated[str, setting("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
-    seed: Annotated[int, setting("1", "root of the fit's random numbers", ge=0)] = 0
-    threads: Annotated[int, setting("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
-    output: Annotated[str, setting("path", "run folder, relative to where the command runs", min_length=1)] = "runs/field"
+    title: Title
+    photos: Annotated[Photographs, setting("1", "the photographs")]
+    field: Annotated[FieldSettings, setting("1", "the radiance field and its fit")] = FieldSettings()
+    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
+    checkpoint_every: CheckpointSteps = 500
+    variant: Variant = "llvm_ad_rgb"
+    seed: Seed = 0
+    threads: Threads = 0
+    output: Output = "runs/field"
 
 
 class GaussianSettings(Section):
-    """The Gaussians and how they are fitted."""
+    """The Gaussians and their fit."""
 
     preset: Annotated[str, setting("1", "steps, sizes, rates: tiny, minute, minutes, fine, finest or gpu", min_length=1)] = (
         "minute"
     )
     effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
-    minutes: Annotated[
-        float | None, setting("min", "as many steps as take about so long on two idle cores; no clock is asked")
-    ] = None
-    start: Annotated[int | None, setting("1", "Gaussians at first, where no points are known; absent: the preset's")] = None
-    most: Annotated[int | None, setting("1", "Gaussians at the end of growth; absent: the preset's")] = None
-    degree: Annotated[int | None, setting("1", "of the spherical harmonics; absent: the preset's")] = None
-    control: Annotated[str | None, setting("1", "of the density: clone_split or relocation; absent: the preset's")] = None
-    ssim: Annotated[float | None, setting("1", "share of SSIM in the loss; absent: the preset's")] = None
-    mip: Annotated[bool, setting("1", "what is smaller than a pixel keeps its light, so that other sizes look right, too")] = (
-        False
-    )
-    exposure: Annotated[bool, setting("1", "gains of each photograph, of those without alpha")] = False
+    minutes: (
+        Annotated[float, setting("min", "as many steps as take about this time on two idle cores; no clock is read", gt=0)]
+        | None
+    ) = None
+    start: Annotated[int, setting("1", "first Gaussians without known points; absent: preset", ge=4)] | None = None
+    most: Annotated[int, setting("1", "Gaussians at the end of growth; absent: preset", ge=4)] | None = None
+    degree: Annotated[int, setting("1", "of the spherical harmonics; absent: preset", ge=0, le=3)] | None = None
+    control: Annotated[str | None, setting("1", "density control: clone_split or relocation; absent: preset")] = None
+    ssim: Annotated[float, setting("1", "weight of SSIM in the loss; absent: preset", ge=0, le=1)] | None = None
+    mip: Annotated[bool, setting("1", "keep the light of Gaussians smaller than a pixel, for other sizes")] = False
+    exposure: Annotated[bool, setting("1", "gains of each photograph, for photographs without alpha")] = False
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.effort):
-            raise ValueError(f"effort is {self.effort}: a finite number above 0 is expected")
-        if self.minutes is not None and not (0 < self.minutes < math.inf and self.effort == 1):
-            found = f"minutes is {self.minutes} beside effort {self.effort}"
-            raise ValueError(f"{found}: a finite number above 0, and no effort, are expected")
-        for name in ("start", "most"):
-            value = getattr(self, name)
-            if value is not None and value < 4:
-                raise ValueError(f"{name} is {value}: at least 4 is expected")
-        if not 0 <= (self.degree or 0) <= 3:
-            raise ValueError(f"degree is {self.degree}: 0 to 3 is expected")
-        if not 0 <= (self.ssim or 0) <= 1:  # NaN fails every comparison
-            raise ValueError(f"ssim is {self.ssim}: a number from 0 to 1 is expected")
+        if self.minutes is not None and self.effort != 1:
+            raise ValueError(f"minutes is {self.minutes} beside effort {self.effort}: only one of the two is expected")
 
 
 class GaussianExperiment(Section):
-    """All of a TOML file that fits Gaussians to photographs: it has a table ``[gaussians]`` in place of ``[field]``."""
+    """A fit of Gaussians to photographs: a file with tables ``[photos]`` and ``[gaussians]``."""
 
-    title: Annotated[str, setting("1", "heading of the report", min_length=1)]
-    photos: Annotated[Photographs, setting("1", "what was seen")]
-    gaussians: Annotated[GaussianSettings, setting("1", "what is looked for")]
-    show: Annotated[ShowSettings, setting("1", "what is made of it")] = ShowSettings()
-    checkpoint_every: Annotated[int, setting("step", "how often", ge=1)] = 500
-    variant: Annotated[str, setting("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
-    seed: Annotated[int, setting("1", "root of the fit's random numbers", ge=0)] = 0
-    threads: Annotated[int, setting("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
-    output: Annotated[str, setting("path", "run folder, relative to where the command runs", min_length=1)] = "runs/gaussians"
+    title: Title
+    photos: Annotated[Photographs, setting("1", "the photographs")]
+    gaussians: Annotated[GaussianSettings, setting("1", "the Gaussians and their fit")]
+    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
+    checkpoint_every: CheckpointSteps = 500
+    variant: Variant = "llvm_ad_rgb"
+    seed: Seed = 0
+    threads: Threads = 0
+    output: Output = "runs/gaussians"
 
 
 PhotoExperiment = FieldExperiment | GaussianExperiment
-"""A fit of photographs, of either model."""
+"""A fit of photographs, with either model."""
 
 Experiment = SceneExperiment | ScanExperiment | PhotoExperiment
-"""Settings of an experiment of any kind."""
+"""An experiment of any kind."""
 
-TITLES: dict[str, type[Section]] = {
-    "images": SceneExperiment,
-    "projections": ScanExperiment,
-    "photographs": FieldExperiment,
-    "photographs, to Gaussians": GaussianExperiment,
+KINDS: dict[str, type[Section]] = {
+    "scene": SceneExperiment,
+    "scan": ScanExperiment,
+    "gaussians": GaussianExperiment,
+    "photos": FieldExperiment,
 }
-"""Kinds of experiments, by the data that they fit."""
-
-#: Table of the file that tells which experiment it is; without any of them it is one on a scene.
-KINDS: dict[str, type] = {"scan": ScanExperiment, "gaussians": GaussianExperiment, "photos": FieldExperiment}
+"""Kinds of experiments by the table of the file that tells them apart; the first table found decides."""
 
 CAPTURE = {
     "photos": {"largest": 240, "box": "middle"},
     "show": {"views": 64},
 }
-"""What a file with ``field.preset = "capture"`` need not say: the size that its grids tell, nested boxes, all views shown."""
+"""Defaults of a file with ``field.preset = "capture"``: photograph size that its grids resolve, nested boxes, views."""
 
-#: Settings that change how a run is stored or how fast it is, not what comes out.
 NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "show")
+"""Settings that change neither the result nor its checkpoint."""
 
 
 def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
-    """Read an experiment.
+    """Read an experiment from a TOML file.
 
     Args:
         path: TOML file.
-        changes: ``a.b=c`` from the command line; entries of a list by number, ``parameter.0.lr=0.1``.
+        changes: ``a.b=c`` from the command line; entries of a list by index, ``parameter.0.lr=0.1``.
 
     Raises:
-        MivolError: no such file, not TOML, an unknown key, a wrong type, or a value outside its domain.
+        MivolError: a missing file, invalid TOML, an unknown key, a wrong type, or a value outside its domain.
     """
     path = Path(path)
     try:
@@ -628,10 +620,14 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
 
 
 def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
-    """An experiment from plain dicts and lists; its tables tell which it is (``KINDS``).
+    """Make an experiment from dicts and lists; its tables tell its kind (``KINDS``).
+
+    Args:
+        raw: tables and settings as TOML holds them.
+        name: beginning of an error message.
 
     Raises:
-        MivolError: as :func:`load`; ``name`` begins the sentence.
+        MivolError: as :func:`load`.
     """
     kind = next((KINDS[table] for table in KINDS if table in raw), SceneExperiment)
     raw = _with_capture(raw)
@@ -639,12 +635,17 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
-        said = textwrap.shorten(sentence(raw, str(error)), LONGEST_SENTENCE, placeholder=" ...")
-        raise MivolError(f"{name}: {said}") from None
+        reason = textwrap.shorten(explain_error(raw, str(error)), LONGEST_SENTENCE, placeholder=" ...")
+        raise MivolError(f"{name}: {reason}") from None
 
 
 def of_photographs(path: Path, preset: str, changes: Sequence[str] = ()) -> FieldExperiment:
-    """The experiment of a folder of photographs, or of a file of cameras, that has no file of its own.
+    """Make the experiment of photographs without a TOML file.
+
+    Args:
+        path: folder of photographs, or file of cameras.
+        preset: value of ``field.preset``.
+        changes: as in :func:`load`.
 
     Raises:
         MivolError: as :func:`load`.
@@ -656,39 +657,39 @@ def of_photographs(path: Path, preset: str, changes: Sequence[str] = ()) -> Fiel
 
 
 def _with_capture(raw: dict[str, Any]) -> dict[str, Any]:
-    """Settings with those of ``CAPTURE`` where that is the preset and they are not given."""
+    """Add the defaults of ``CAPTURE`` to a file with that preset."""
     field = raw.get("field")
     if "photos" not in raw or not isinstance(field, dict) or field.get("preset") != "capture":
         return raw
-    given = {table: raw.get(table, {}) for table in CAPTURE}
-    return raw | {name: CAPTURE[name] | held if isinstance(held, dict) else held for name, held in given.items()}
+    tables = {table: raw.get(table, {}) for table in CAPTURE}
+    return raw | {name: CAPTURE[name] | table if isinstance(table, dict) else table for name, table in tables.items()}
 
 
 def resolved(experiment: Experiment) -> dict[str, Any]:
-    """Every setting, defaults included, as plain dicts and lists."""
+    """Return all settings, defaults included, as dicts and lists."""
     return msgspec.to_builtins(experiment)
 
 
 def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """The same by dotted key, without what does not change the result."""
+    """Return the settings that change the result, by dotted key."""
     if isinstance(tree, dict | list | tuple) and len(tree):
         items = tree.items() if isinstance(tree, dict) else enumerate(tree)
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for key, value in items:
             if prefix or key not in NOT_RESULT:
-                found |= flat(value, f"{prefix}.{key}" if prefix else str(key))
-        return found
+                values |= flat(value, f"{prefix}.{key}" if prefix else str(key))
+        return values
     return {prefix: tree}
 
 
-# -- Command line -------------------------------------------------------------------------------------------------
+# -- Command line ----------------------------------------------------------------------------------------------------------
 
 
 def apply_change(raw: dict[str, Any], change: str) -> None:
-    """Put ``a.b=c`` into ``raw``; c is read as TOML where it is TOML, else as text.
+    """Put ``a.b=c`` into ``raw``; a value that is no TOML is a text.
 
     Raises:
-        MivolError: no "=", or a step into something that has no parts.
+        MivolError: no "=", or a key below a value without parts.
     """
     dotted, equals, text = change.partition("=")
     if not equals or not dotted.strip():

@@ -1,11 +1,13 @@
-"""A tree of dicts and lists against a schema of msgspec structs: the first fault in a sentence, and every setting on a line.
+"""A tree of dicts and lists against msgspec structs: the first fault in a sentence, and every setting on a line.
 
-Conventions. A place in the tree is a dotted key; entries of lists are counted from 0. Where a setting may be one of several
-structs, their tag says which.
+Conventions. A place in the tree is a dotted key; entries of lists count from 0. If a setting may be one of several structs,
+their tag tells which. msgspec checks types and domains; this module adds the nearest valid name, and refuses infinite numbers
+for settings without an infinite default.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
@@ -15,18 +17,24 @@ import msgspec
 from mivol.errors import MivolError
 from mivol.optim.strategy import setting, suggest_name
 
-__all__ = ["Setting", "check_keys", "describe", "sentence", "settings_in", "structs_in"]
+__all__ = ["Setting", "check_keys", "describe", "explain_error", "settings_in", "structs_in"]
 
 
 LONGEST_KEY = 300
-"""Characters of a key that a refusal quotes."""
+"""Characters of a key in an error message."""
 
 
 def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
-    """Refuse the first key or strategy that the schema does not know, offering the nearest.
+    """Refuse the first unknown key, unknown name of a choice, or infinite number.
+
+    Args:
+        raw: the tree.
+        kind: type of the tree in the schema.
+        where: dotted key of the tree; "" for the whole file.
+        name: beginning of an error message.
 
     Raises:
-        MivolError: with the dotted key.
+        MivolError: with the dotted key, and the nearest valid name.
     """
     struct = struct_of(kind, raw)
     if isinstance(raw, list):
@@ -36,29 +44,37 @@ def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
         return
     tag = struct.__struct_config__.tag_field
     _check_tag(raw, tag, {s.__struct_config__.tag: s for s in structs_in(kind)}, where, name)
-    known = list(struct.__struct_fields__)
-    unknown = next((key for key in raw if key not in known and key != tag), None)
+    fields = {field.name: field for field in msgspec.structs.fields(struct)}
+    unknown = next((key for key in raw if key not in fields and key != tag), None)
     if unknown is not None:
         dotted = textwrap.shorten(f"{where}.{unknown}".lstrip("."), LONGEST_KEY, placeholder="...")
-        raise MivolError(f'{name}: unknown key "{dotted}": {suggest_name(unknown, [*known, *([tag] if tag else [])])}')
+        raise MivolError(f'{name}: unknown key "{dotted}": {suggest_name(unknown, [*fields, *([tag] if tag else [])])}')
     hints = get_type_hints(struct)
     for key, value in raw.items():
         if key in hints:
             dotted, words = f"{where}.{key}".lstrip("."), words_in(hints[key])
             if isinstance(value, str) and words and value not in words:
                 raise MivolError(f'{name}: {dotted} = "{value}" is unknown: {suggest_name(value, list(words))}')
+            if _is_infinite(value) and not _is_infinite(fields[key].default):
+                raise MivolError(f"{name}: {dotted} = {value}: expected a finite number.")
             check_keys(value, hints[key], dotted, name)
+
+
+def _is_infinite(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return any(map(_is_infinite, value))
+    return isinstance(value, float) and math.isinf(value)
 
 
 def _check_tag(raw: dict[str, Any], tag: str | None, choices: dict[str, type], where: str, name: str) -> None:
     if tag and raw.get(tag) not in choices:
-        found = raw.get(tag)
-        what = f'"{where}.{tag}" is missing' if found is None else f'{where}.{tag} = "{found}" is unknown'
-        raise MivolError(f"{name}: {what}: {suggest_name(str(found), list(choices))}")
+        word = raw.get(tag)
+        fault = f'"{where}.{tag}" is missing' if word is None else f'{where}.{tag} = "{word}" is unknown'
+        raise MivolError(f"{name}: {fault}: {suggest_name(str(word), list(choices))}")
 
 
 def structs_in(kind: Any) -> list[type]:
-    """The structs that a value of this type may be."""
+    """Return the structs that a value of this type may be."""
     if get_origin(kind) is tuple or isinstance(kind, str):
         return []
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
@@ -67,12 +83,12 @@ def structs_in(kind: Any) -> list[type]:
 
 
 def words_in(kind: Any) -> tuple[str, ...]:
-    """The words that a value of this type is chosen from; none where it is no choice of words."""
+    """Return the words among which a value of this type is chosen; empty for other types."""
     return tuple(str(word) for part in (kind, *get_args(kind)) if get_origin(part) is Literal for word in get_args(part))
 
 
 def struct_of(kind: Any, raw: Any) -> type | None:
-    """The struct that ``raw`` asks for by its tag; the first possible one where the tag is missing or unknown."""
+    """Return the struct with the tag of ``raw``; the first possible struct if the tag is missing or unknown."""
     structs = structs_in(kind)
     if not structs or not isinstance(raw, dict):
         return None
@@ -81,42 +97,42 @@ def struct_of(kind: Any, raw: Any) -> type | None:
 
 
 def entry_kind(kind: Any) -> Any:
-    """The type of the entries of a list type."""
+    """Return the type of the entries of a list type."""
     if get_origin(kind) is tuple:
         return get_args(kind)[0]
     return next((entry_kind(part) for part in get_args(kind) if get_args(part)), Any)
 
 
-def sentence(raw: Any, message: str) -> str:
-    """msgspec's message as: where = found: expected."""
+def explain_error(raw: Any, message: str) -> str:
+    """Rewrite a message of msgspec as: key = value: expected."""
     what, _, place = message.partition(" - at `$")
     steps = re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", place.rstrip("`"))
     dotted = ".".join(word or number for word, number in steps)
-    found = raw
+    value = raw
     for word, number in steps:
         try:
-            found = found[word] if word else found[int(number)]
+            value = value[word] if word else value[int(number)]
         except (KeyError, IndexError, TypeError, ValueError):
-            found = None
+            value = None
             break
     if what.startswith("Object missing required field"):
         missing = f"{dotted}.{what.split('`')[1]}".lstrip(".")
         return f'the key "{missing}" is missing: give it.'
     what = f"{what[0].lower()}{what[1:]}".rstrip(".") + "." * (what[-1] != "?")
-    plain = found is not None and not isinstance(found, dict)
-    return f"{dotted or 'the file'}{f' = {found!r}' if plain else ''}: {what}"
+    plain = value is not None and not isinstance(value, dict)
+    return f"{dotted or 'the file'}{f' = {value!r}' if plain else ''}: {what}"
 
 
 class Setting(NamedTuple):
     """A setting of a file.
 
     Attributes:
-        key: dotted; an entry of a list has the number 0, and a key of one choice only has its name in brackets.
-        default: as Python writes it; "" where it must be given, and where the setting is a table.
-        unit: "1" for none.
-        meaning: in a line.
-        choices: words that it is chosen from, or names of tables; none where it is no choice.
-        table: its own settings follow.
+        key: dotted key; an entry of a list has the number 0; a key of one choice has the choice's name in brackets.
+        default: default as Python writes it; "" for required settings and tables.
+        unit: unit; "1" for none.
+        meaning: meaning in a line.
+        choices: words or names of tables to choose from; empty without a choice.
+        table: whether the setting is a table with settings of its own.
     """
 
     key: str
@@ -128,28 +144,29 @@ class Setting(NamedTuple):
 
 
 def settings_in(kind: type, prefix: str = "") -> list[Setting]:
-    """Every setting of a struct, with those of the tables in it and of the entries of its lists."""
-    found = []
+    """Return every setting of a struct, of the tables in it and of the entries of its lists."""
+    settings = []
     hints = get_type_hints(kind, include_extras=True)
     for field in msgspec.structs.fields(kind):
         hint, key = hints[field.name], f"{prefix}{field.name}"
-        meta = getattr(hint, "__metadata__", (setting("1", "one of " + ", ".join(map(str, get_args(hint)))),))[0]
-        inner = getattr(hint, "__origin__", hint)
+        described = next((part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__")), None)
+        meta = described.__metadata__[0] if described else setting("1", "one of " + ", ".join(map(str, get_args(hint))))
+        inner = getattr(hint, "__origin__", hint) if described is hint else hint
         many = get_origin(inner) is tuple and bool(structs_in(get_args(inner)[0]))
         structs = structs_in(get_args(inner)[0] if many else inner)
         default = "" if field.default is msgspec.NODEFAULT or structs else repr(field.default)
         tags = tuple(str(s.__struct_config__.tag) for s in structs if s.__struct_config__.tag is not None)
         choices = tags or tuple(filter(None, words_in(inner)))
-        found.append(Setting(key, default, meta.extra["unit"], meta.description, choices, bool(structs)))
+        settings.append(Setting(key, default, meta.extra["unit"], meta.description, choices, bool(structs)))
         key += ".0" * many
         for struct in structs:
             label = struct.__struct_config__.tag
-            found += settings_in(struct, f"{key}[{label}]." if label else f"{key}.")
-    return found
+            settings += settings_in(struct, f"{key}[{label}]." if label else f"{key}.")
+    return settings
 
 
 def describe(kind: type) -> list[str]:
-    """One line per setting: key, default, unit, meaning; for ``mivol optimize --help``."""
+    """Return one line per setting with key, default, unit and meaning, for ``mivol optimize --help``."""
     lines = []
     for key, default, unit, meaning, choices, table in settings_in(kind):
         if not table or choices:

@@ -149,9 +149,9 @@ def optimize_flags(sub: argparse.ArgumentParser) -> None:
     from mivol.schema import describe
 
     lines: list[str] = []
-    for title, kind in config.TITLES.items():
-        lines += [*([""] if lines else []), f"{title}:", *describe(kind)]
-    sub.epilog = "settings of the file for " + "\n  ".join(line.replace("%", "%%") for line in lines)
+    for kind in config.KINDS.values():
+        lines += ["", kind.__doc__.replace("``", "").rstrip(".") + ":", *describe(kind)]
+    sub.epilog = "Settings of the TOML file, by kind of experiment.\n" + "\n  ".join(line.replace("%", "%%") for line in lines)
     sub.add_argument("experiment", type=Path, help="TOML file, or posed photographs: a folder or its file of cameras")
     sub.add_argument("--preset", help="of photographs without a TOML file: capture for a place around the cameras, or cpu, ...")
     sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of the file")

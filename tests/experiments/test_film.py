@@ -65,7 +65,7 @@ def test_what_nobody_asked_for_is_left_out_with_a_note() -> None:
     with pytest.raises(MivolError, match="without a common upward direction"):
         plan_film(ShowSettings(way="keyframes", keyframes=keys), photos(upset))
     down = ((0.0, 0.0, 3.0, 0.0, 0.0, 0.0), (0.0, 0.0, 4.0, 0.0, 0.0, 1.0))
-    with pytest.raises(MivolError, match="its own upward direction"):
+    with pytest.raises(MivolError, match="a view along the upward direction"):
         plan_film(ShowSettings(way="keyframes", keyframes=down), photos(ring(4)))
 
 

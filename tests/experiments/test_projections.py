@@ -172,7 +172,7 @@ def test_quanta_are_those_of_the_readings(measured: ScanReadings, monkeypatch: p
         with pytest.raises(MivolError, match="ml-tr needs counts of quanta"):
             projections.quanta_of(chosen, found)
     problems = {"pcg": SimpleNamespace(problem=LeastSquares), "ml-tr": SimpleNamespace(problem=PoissonCounts)}
-    monkeypatch.setattr(projections, "METHODS", problems)
+    monkeypatch.setattr(projections, "ALL_SOLVERS", problems)
     chosen = scan()
     chosen.solve = config.SolveSettings("ml-tr")
     assert projections.read_measured(chosen, Path()).quanta is made
