@@ -53,7 +53,7 @@ def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | S
         o = np.broadcast_to(o, d.shape)
         sent = RayBundle(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
         seen = render_rays(cells, source, model, sent)
-        behind = background.seen(sent.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
+        behind = background.eval(sent.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
         colour = seen.colour + seen.T * behind
         dr.eval(colour, seen.T, seen.distance)
         found[order[start : start + PASS]] = np.stack([*np.array(colour), np.array(seen.T), np.array(seen.distance)], axis=1)
