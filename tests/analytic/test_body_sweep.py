@@ -31,20 +31,20 @@ class Opacity:
 
     rows, points = 1, (0.25, 0.75)
 
-    def cell(self, site: object, sigma: list) -> list[CellIntegral]:
+    def integrate_cell(self, piece: object, sigma: list) -> list[CellIntegral]:
         (row,) = sigma
-        tau = site.dt * 0.5 * (row[0] + row[1])
-        half, T = 0.5 * site.dt, dr.exp(-tau)
+        tau = piece.dt * 0.5 * (row[0] + row[1])
+        half, T = 0.5 * piece.dt, dr.exp(-tau)
         return [CellIntegral(tau, T, 1 - T, [half, half], [T * half, T * half])]
 
-    def constant(self, site: object, sigma: list) -> list[CellIntegral]:
-        T = dr.exp(-sigma[0] * site.dt)
-        return [CellIntegral(sigma[0] * site.dt, T, 1 - T, [site.dt], [T * site.dt])]
+    def integrate_constant(self, piece: object, sigma: list) -> list[CellIntegral]:
+        T = dr.exp(-sigma[0] * piece.dt)
+        return [CellIntegral(sigma[0] * piece.dt, T, 1 - T, [piece.dt], [T * piece.dt])]
 
-    def vjp(self, site: object, sigma: list, weight: list) -> None:
+    def vjp(self, piece: object, sigma: list, weight: list) -> None:
         """No other parameters."""
 
-    def jvp(self, site: object, sigma: list) -> list[mi.Float]:
+    def jvp(self, piece: object, sigma: list) -> list[mi.Float]:
         return [mi.Float(0)]
 
 

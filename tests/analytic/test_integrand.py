@@ -18,7 +18,7 @@ from mivol.transport.traversal.lattice import Lattice
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-ASKING = SimpleNamespace(asked="somebody asks", way_out="do without")
+ASKING = SimpleNamespace(request="somebody asks", alternative="do without")
 
 
 def grid(*res: int, edge: float = 1.0) -> GridExtinction:

@@ -1,12 +1,28 @@
-r"""Arbitrary output variables (AOVs) of a camera ray: optical depth, opacity, and expected depth.
+r"""Arbitrary output variables (AOVs) of a camera ray: optical depth, opacity and expected depth.
 
 .. math:: \tau = \int \sigma\,dt, \qquad \alpha = 1 - e^{-\tau}, \qquad
           \bar t = \frac{1}{\alpha} \Big( \int t\,\sigma T\,dt + t_s T_s \Big)
 
-Conventions. AOVs belong to the first segment of a ray: from the camera to the first opaque surface (at t_s; alpha is 1 there),
-or out of the scene. Optical depth is returned as it was integrated, and not as -log T, which is infinite where T underflows.
-``tau`` and ``alpha`` are means over the channels of the extinction, and so are numerator and denominator of ``depth``, which is
-0 where nothing stops the ray; ``tau.R`` is ``tau`` where the extinction is grey. Rays and surfaces carry no derivatives.
+Conventions. AOVs belong to the first segment of a ray: from the camera to the first opaque surface (at t_s; alpha is 1), or out
+of the scene. Optical depth is the integral itself, not -log T, which is infinite after underflow of T. ``tau`` and ``alpha``
+are means over the channels of the extinction, as are numerator and denominator of ``depth``. ``depth`` is 0 for a ray without
+matter or surface. ``tau.R`` equals ``tau`` for a grey extinction. Rays and surfaces carry no derivatives.
+
+Expected depth. The numerator N is the integral of t sigma T. In a cell [a, a + D] three Gauss points give the optical depth and
+the first and second Legendre moments (slope B and bend G) of the extinction. The transmittance T = exp(-tau u) exp(B (u - u^2)
+- G (2 u^3 - 3 u^2 + u)) is expanded, to second order in B and first order in G, about a cell of constant extinction with the
+same optical depth:
+
+.. math:: N_{cell} = a\,\alpha + \Delta \Big(\int_0^1 e^{-\tau(u)} du - e^{-\tau}\Big)
+          = a\,\alpha + \Delta \Big(\tau E_1 + B (E_1 - E_2) + \frac{B^2}{2} (E_2 - 2 E_3 + E_4)
+          - G (E_1 - 3 E_2 + 2 E_3)\Big)
+
+with E_n(tau) from :mod:`mivol.numerics`. The formula is exact for a thin cell of any (cubic) extinction, and for a constant
+extinction at any optical depth, so a region of constant extinction is one cell of any length. Otherwise the error falls as D^6.
+Nothing is divided by a transmittance or an extinction, so derivatives are finite everywhere. Distances count from ``origin``:
+with the expected depth as origin N is 0, so the derivative of the quotient N / alpha is the derivative of N over alpha.
+
+References: Max 1995 (the integral, with distance as the source); Abramowitz & Stegun 25.4.30 (Gauss points).
 """
 
 from __future__ import annotations
@@ -40,7 +56,7 @@ __all__ = [
 
 
 AOVS = ("tau", "tau.R", "tau.G", "tau.B", "alpha", "depth")
-"""Names: optical depth [1] (mean, and of a channel), opacity [1], and expected depth [length]."""
+"""Names: optical depth [1] (mean, and single channels), opacity [1], and expected depth [length]."""
 
 
 @dataclass
@@ -48,7 +64,7 @@ class _FirstSegment:
     """The first segment of camera rays.
 
     Attributes:
-        ray_segment, end: the ray, and where it ends.
+        ray_segment, end: ray and its end.
         tau, T, alpha: optical depth, transmittance (0 behind a surface) and opacity [1], of each channel.
     """
 
@@ -63,18 +79,18 @@ def integrate_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: 
     """Integrate AOVs along camera rays.
 
     Args:
-        media: of the scene.
+        media: media of the scene.
         ray: world space, unit direction.
-        names: of :data:`AOVS`.
+        names: names in :data:`AOVS`.
         active: lanes to integrate.
 
     Returns:
-        One number a ray for each name, in their order.
+        One number a ray for each name, in the same order.
 
     Raises:
-        MivolError: ``depth`` of a medium that sums grids of two resolutions or places.
+        MivolError: ``depth`` of a medium with grids of two resolutions or places.
 
-    Cost: a walk of the first segment, and another one for ``depth``.
+    Cost: a walk of the first segment, and a second walk for ``depth``.
     """
     if not names:
         return []
@@ -85,7 +101,7 @@ def integrate_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: 
 
 
 def jvp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
-    """Tangents of AOVs, from the parameters' tangents that :meth:`SceneMedia.start_tangent` took.
+    """Tangents of AOVs, from the parameter tangents taken by :meth:`SceneMedia.start_tangent`.
 
     Args:
         media, ray, names, active: as :func:`integrate_aovs`.
@@ -139,10 +155,10 @@ def _find_first_segment(media: SceneMedia, ray: Ray, active: mi.Bool) -> _FirstS
 
 
 def _integrate_depth(media: SceneMedia, first: _FirstSegment, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """The expected depth, and the opacity that it is divided by."""
+    """The expected depth, and the opacity in its denominator."""
     N, opacity = integrate_expected_depth(media, first.ray_segment, first.end, mi.Bool(active))
-    some = opacity > 0
-    return dr.select(some, N / dr.select(some, opacity, 1), 0), opacity
+    stopped = opacity > 0
+    return dr.select(stopped, N / dr.select(stopped, opacity, 1), 0), opacity
 
 
 def _row_name(name: str) -> str:
@@ -150,7 +166,7 @@ def _row_name(name: str) -> str:
 
 
 def _channel_weights(name: str, channels: int) -> list[float]:
-    """The weight of each channel in an AOV: that of a mean, or of one channel alone."""
+    """The weight of each channel in an AOV: equal weights, or 1 for a single channel."""
     channel = name.partition(".")[2]
     if not channel:
         return [1 / channels] * channels
@@ -162,28 +178,30 @@ def _weigh(weights: list[float], rows: list[mi.Float]) -> mi.Float:
 
 
 def _safe_inverse(alpha: mi.Float) -> mi.Float:
-    """1 / alpha; 0 where nothing stops the ray, whose depth is 0 by definition. 1 / 1e-37 is still finite in float32."""
-    some = alpha > 1e-37
-    return dr.select(some, dr.rcp(dr.select(some, alpha, 1)), 0)
+    """1 / alpha; 0 for a ray of opacity 0, whose depth is 0 by definition. 1 / 1e-37 is still finite in float32."""
+    stopped = alpha > 1e-37
+    return dr.select(stopped, dr.rcp(dr.select(stopped, alpha, 1)), 0)
 
 
 GAUSS_OFFSET = math.sqrt(15) / 10
-"""Distance of the outer Gauss points from the middle of [0, 1]; with the weights 5/18, 8/18, 5/18 exact to degree 5."""
+"""Distance of the outer Gauss points from the middle of [0, 1]. With the weights 5/18, 8/18, 5/18 the rule is exact to degree
+5."""
 
 OPAQUE_DEPTH = 1000.0
-"""Stands for an infinite optical depth: exp(-1000) is 0, and in float64 1000 + x - 1000 is x again, to 1e-13."""
+"""Replaces an infinite optical depth: exp(-1000) is 0, and in float64 1000 + x - 1000 equals x to 1e-13."""
 
 
 def integrate_distance_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle: mi.Float, far: mi.Float) -> CellIntegral:
     """Integrate t sigma T over a cell.
 
     Args:
-        a: distance of its near end [length].
-        dt: its length [length], finite.
-        near, middle, far: extinction [1/length] at its three Gauss points.
+        a: distance of the near end [length].
+        dt: length of the cell [length], finite.
+        near, middle, far: extinction [1/length] at the three Gauss points.
 
-    Bias: none for a thin cell or a constant extinction; O(dt^7) for a smooth one; at most about the length of the cell where
-        the extinction changes strongly within a cell of large optical depth.
+    Bias: none for a thin cell or a constant extinction; O(dt^7) for a smooth extinction; at most about the length of the cell,
+    for
+        an extinction that changes strongly within a cell of large optical depth.
     """
     sides = near + far
     tau = dt * dr.fma(sides, 5 / 18, middle * (8 / 18))
@@ -192,26 +210,26 @@ def integrate_distance_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle
     T = dr.exp(-tau)
     e0, e1, e2, e3, e4, e5 = exp_moments(tau)
     by_slope, by_bend = e1 - e2, -(e1 - 3 * e2 + 2 * e3)
-    twice = e2 - 2 * e3 + e4
-    mean = tau * e1 + slope * (by_slope + 0.5 * slope * twice) + bend * by_bend
+    by_slope_squared = e2 - 2 * e3 + e4
+    mean = tau * e1 + slope * (by_slope + 0.5 * slope * by_slope_squared) + bend * by_bend
     by_tau = T - e1 - slope * (e2 - e3 + 0.5 * slope * (e3 - 2 * e4 + e5)) + bend * (e2 - 3 * e3 + 2 * e4)
-    by_slope += slope * twice
+    by_slope += slope * by_slope_squared
 
-    straight = dt * dr.fma(a, T, dt * by_tau)
-    lean, bow = dt * dt * (math.sqrt(15) / 6) * by_slope, dt * dt * (5 / 9) * by_bend
-    dN = [straight * (5 / 18) - lean + bow, straight * (8 / 18) - 2 * bow, straight * (5 / 18) + lean + bow]
+    level = dt * dr.fma(a, T, dt * by_tau)
+    tilt, curvature = dt * dt * (math.sqrt(15) / 6) * by_slope, dt * dt * (5 / 9) * by_bend
+    dN = [level * (5 / 18) - tilt + curvature, level * (8 / 18) - 2 * curvature, level * (5 / 18) + tilt + curvature]
     return CellIntegral(tau, T, dr.fma(a, tau * e0, dt * mean), [dt * (5 / 18), dt * (8 / 18), dt * (5 / 18)], dN)
 
 
-def _integrate_in_constant(site: RayPiece, origin: mi.Float, sigma: mi.Float) -> CellIntegral:
+def _integrate_in_constant(piece: RayPiece, origin: mi.Float, sigma: mi.Float) -> CellIntegral:
     """Integrate over constant extinction of any length.
 
-    For an infinite length N = a + 1/sigma. There is no expected depth for extinction 0; N and its derivative are then 0.
+    For an infinite length N = a + 1/sigma. For extinction 0 the expected depth is undefined; N and its derivative are then 0.
     """
-    begin = dr.select(site.on, site.a - origin, 0)
-    finite = dr.isfinite(site.dt)
-    integral = integrate_distance_in_cell(begin, dr.select(finite, site.dt, 0), sigma, sigma, sigma)
-    endless = site.on & ~finite & (sigma > 0)
+    begin = dr.select(piece.on, piece.a - origin, 0)
+    finite = dr.isfinite(piece.dt)
+    integral = integrate_distance_in_cell(begin, dr.select(finite, piece.dt, 0), sigma, sigma, sigma)
+    endless = piece.on & ~finite & (sigma > 0)
     mean = dr.rcp(dr.select(endless, sigma, 1))
     return CellIntegral(
         dr.select(endless, OPAQUE_DEPTH, integral.tau),
@@ -229,48 +247,48 @@ class _ExpectedDepthIntegrand:
     rows: int
     origin: mi.Float
     points: ClassVar[tuple[float, ...]] = (0.5 - GAUSS_OFFSET, 0.5, 0.5 + GAUSS_OFFSET)
-    asked: ClassVar[str] = "the AOV depth was asked for"
-    way_out: ClassVar[str] = "leave depth out of aovs"
+    request: ClassVar[str] = "the AOV depth was asked for"
+    alternative: ClassVar[str] = "leave depth out of aovs"
 
-    def cell(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
-        return [integrate_distance_in_cell(site.a - self.origin, site.dt, *row) for row in sigma]
+    def integrate_cell(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
+        return [integrate_distance_in_cell(piece.a - self.origin, piece.dt, *row) for row in sigma]
 
-    def constant(self, site: RayPiece, sigma: list[mi.Float]) -> list[CellIntegral]:
-        return [_integrate_in_constant(site, self.origin, s) for s in sigma]
+    def integrate_constant(self, piece: RayPiece, sigma: list[mi.Float]) -> list[CellIntegral]:
+        return [_integrate_in_constant(piece, self.origin, s) for s in sigma]
 
-    def vjp(self, site: RayPiece, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
-        """Do nothing: N depends on the extinction only."""
+    def vjp(self, piece: RayPiece, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
+        """Do nothing: N depends only on the extinction."""
 
-    def jvp(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[mi.Float]:
+    def jvp(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> list[mi.Float]:
         return [mi.Float(0) for _ in range(self.rows)]
 
-    def least(self, t1: mi.Float) -> mi.Float:
+    def lower_bound(self, t1: mi.Float) -> mi.Float:
         return dr.minimum(t1 - self.origin, 0)
 
     def end(self, end: SegmentEnd) -> list[mi.Float]:
-        """What the opaque surface at the end of a ray adds, by itself."""
+        """Contribution of the opaque surface at the end of a ray, not attenuated."""
         return [dr.select(end.si.is_valid(), end.t - self.origin, 0)] * self.rows
 
 
 def integrate_expected_depth(
     media: SceneMedia, ray_segment: RaySegment, end: SegmentEnd, active: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:
-    """Integrate the distance at which a ray is stopped, mean over channels.
+    """Integrate the distance at which rays stop, mean over channels.
 
     Args:
-        media: of the scene.
-        ray_segment: the ray, the medium around its origin, and how far it goes; world space, unit direction.
-        end: where it ends, possibly at an opaque surface.
+        media: media of the scene.
+        ray_segment: ray, medium around its origin, and length; world space, unit direction.
+        end: end of the ray, possibly at an opaque surface.
         active: lanes to integrate.
 
     Returns:
-        N [length], the expected depth times the opacity, and that opacity [1]. The opacity is that of the optical depth in N:
-        with a radiance field it differs a little from ``alpha``, since an activated extinction depends on the points of a cell.
+        N [length], the expected depth times the opacity; and this opacity [1], from the optical depth of the same quadrature.
+        For a radiance field it differs slightly from ``alpha``, since an activated extinction depends on the points of a cell.
 
     Raises:
-        MivolError: a medium that sums grids of two resolutions or places.
+        MivolError: a medium with grids of two resolutions or places.
 
-    Bias: that of :func:`integrate_distance_in_cell`. Cost: a walk of each body.
+    Bias: as :func:`integrate_distance_in_cell`. Cost: a walk of each body.
     """
     integrand = _ExpectedDepthIntegrand(media.channels, mi.Float(0))
     composite = composite_ray(LineIntegral(media, integrand, ray_segment, active), integrand.end(end), skip=True)
@@ -300,7 +318,7 @@ def vjp_expected_depth(
     Args:
         media, ray_segment, end, active: as :func:`integrate_expected_depth`.
         origin: the expected depth, as in :func:`jvp_expected_depth`.
-        weight: of each lane.
+        weight: weight of each lane.
 
     Cost: two walks of each body, and one packed write of 8 a cell and channel.
     """

@@ -1,11 +1,10 @@
-r"""Emission-absorption compositing in one medium: a sweep over its cells from the far end of a ray's interval to the near end.
+r"""Emission-absorption compositing in one medium: a sweep over the cells of a ray's interval, from the far end to the near end.
 
 .. math:: N \leftarrow N_i + T_i N
 
-Conventions. The sweep runs back to front, so what lies behind a cell is known when the cell is passed, and no sum has to be
-undone. The reverse pass repeats the very walk that integrated the medium: the optical depths that it subtracts from a float64
-sum are, bit for bit, those that were added to it. Rows are channels or colours; where tangents are asked for, their rows
-follow.
+Conventions. The sweep runs back to front, so the light behind a cell is known at the cell, and no sum is undone. The reverse
+pass repeats the walk of the forward pass: it subtracts from a float64 sum exactly the optical depths that the forward pass
+added, bit for bit. Rows are channels or colours, followed by the rows of tangents if tangents are followed.
 
 References: Max 1995 (the discrete emission-absorption integral); Porter & Duff 1984 (``over``, from back to front).
 """
@@ -31,9 +30,9 @@ __all__ = ["BodySweep"]
 
 @dataclass
 class _IntervalLayout:
-    """Where the interval of a medium has cells: before ``enter`` and from ``leave`` on there are only constants.
+    """The cells of an interval in a medium: cells lie between ``enter`` and ``leave``, only constants outside.
 
-    ``segment`` runs from ``leave`` back to ``enter``; it and ``lattice`` are None where no grid defines cells.
+    ``segment`` runs from ``leave`` back to ``enter``; ``segment`` and ``lattice`` are None for a medium without a grid.
     """
 
     t0: mi.Float64
@@ -48,9 +47,9 @@ class BodySweep:
     """The sweep over one medium.
 
     Args:
-        line: what is summed along which ray.
-        interval: of the ray in the medium.
-        tangent: follow tangents too, from those that the media took from the parameters.
+        line: line integral.
+        interval: interval of the ray in the medium.
+        tangent: whether to follow tangents, which the media took from the parameters.
     """
 
     def __init__(self, line: LineIntegral, interval: MediumInterval, tangent: bool = False) -> None:
@@ -58,33 +57,36 @@ class BodySweep:
         self.body, self.active = interval.body, interval.active
         self.layout = _find_layout(interval, self.ray)
         self.extinction = self.body.extinction(self.ray)
-        self.change = None
+        self.tangent = None
         if tangent:
-            self.change = SummedExtinction(self.body.view.parts, self.body.tangents, mi.Float(1), linear=True)
+            self.tangent = SummedExtinction(self.body.view.parts, self.body.tangents, mi.Float(1), linear=True)
 
     # -- The sum and its tangent ---------------------------------------------------------------------------------------
 
     def integrate(self, skip: bool) -> BodyIntegral:
-        """Sum the rows of the medium; with ``skip`` empty blocks may be skipped, which changes the order of sums.
+        """Sum the rows of the medium.
+
+        Args:
+            skip: whether the walk may skip empty blocks, which changes the order of sums.
 
         Cost: a walk of the medium.
         """
-        layout, tangent = self.layout, self.change is not None
+        layout, tangent = self.layout, self.tangent is not None
         rows = self.integrand.rows * (2 if tangent else 1)
         integral = BodyIntegral(zeros(mi.Float64, rows), zeros(mi.Float, rows))
 
         def add_constant(integral: BodyIntegral, a: mi.Float64, b: mi.Float64) -> BodyIntegral:
-            site, sigma, integrals = self._constant(a, b)
+            piece, sigma, integrals = self._constant(a, b)
             if not tangent:
                 return composite_over(integral, integrals, [], [])
-            changes = [[d] for d in self._rows(self.change.constant)]
-            return composite_over(integral, integrals, changes, self.integrand.jvp(site, sigma))
+            changes = [[d] for d in self._rows(self.tangent.constant)]
+            return composite_over(integral, integrals, changes, self.integrand.jvp(piece, sigma))
 
         def visit(integral: BodyIntegral, cell: Cell, on: mi.Bool) -> BodyIntegral:
-            site, sigma, integrals = self._cell(cell, on)
+            piece, sigma, integrals = self._cell(cell, on)
             if not tangent:
                 return composite_over(integral, integrals, [], [])
-            return composite_over(integral, integrals, self._changes(cell), self.integrand.jvp(site, sigma))
+            return composite_over(integral, integrals, self._tangents(cell), self.integrand.jvp(piece, sigma))
 
         if self._has_constants and layout.lattice is not None:
             integral = add_constant(integral, layout.leave, layout.t1)
@@ -104,7 +106,7 @@ class BodySweep:
         Args:
             weight: d loss / d N of each row.
             ahead: optical depth from the camera to the far end of the interval.
-            behind: weight times N of what lies behind the interval, as the camera sees it.
+            behind: weight times N of the light behind the interval, attenuated to the camera.
 
         Cost: a walk of the medium, and one packed write of 8 a cell and channel.
         """
@@ -114,15 +116,15 @@ class BodySweep:
         outside: list[tuple] = []
 
         def add_constant(sweep: ReverseState, a: mi.Float64, b: mi.Float64) -> ReverseState:
-            site, sigma, integrals = self._constant(a, b)
+            piece, sigma, integrals = self._constant(a, b)
             sweep, _, weights = pass_cell(sweep, integrals, weight, behind)
-            outside.append((site, sigma, weights))
+            outside.append((piece, sigma, weights))
             return sweep
 
         def visit(sweep: ReverseState, cell: Cell, on: mi.Bool) -> ReverseState:
-            site, sigma, integrals = self._cell(cell, on)
+            piece, sigma, integrals = self._cell(cell, on)
             sweep, slopes, weights = pass_cell(sweep, integrals, weight, behind)
-            integrand.vjp(site, sigma, weights)
+            integrand.vjp(piece, sigma, weights)
             points = self._points(cell)
             corners = [node_weights(p, cell, layout.lattice.res) for p in points]
             activations = self.extinction.slopes(cell.corners, points)
@@ -141,39 +143,38 @@ class BodySweep:
         if self._has_constants:
             sweep = add_constant(sweep, layout.t0, layout.enter)
             body.add_to_constants(self.media.sum_channels(sweep.constant), self.active)
-        # Only after the walk: Dr.Jit loses what is differentiated inside a loop by an array that was differentiated by before
-        # it.
-        for site, sigma, weights in outside:
-            integrand.vjp(site, sigma, weights)
+        # After the walk: Dr.Jit loses derivatives taken inside a loop by an array that already has derivatives before it.
+        for piece, sigma, weights in outside:
+            integrand.vjp(piece, sigma, weights)
 
     # -- Pieces of the ray ---------------------------------------------------------------------------------------------
 
     @property
     def _has_constants(self) -> bool:
-        """Whether the medium has something outside its grid too, so that no block may be skipped."""
+        """Whether the medium has matter outside its grid too, which forbids skipping blocks."""
         return self.body.view.emission_density is not None or any(p.is_constant for p in self.body.view.parts)
 
     @property
     def _reads(self) -> list:
-        """The node arrays that the walk reads."""
-        return self.extinction.reads + (self.change.reads if self.change else [])
+        """Node arrays read by the walk."""
+        return self.extinction.reads + (self.tangent.reads if self.tangent else [])
 
     def _cell(self, cell: Cell, on: mi.Bool) -> tuple[RayPiece, list[list[mi.Float]], list[CellIntegral]]:
-        """A cell, its extinction [row][point], and its integrals; the walk runs towards the camera."""
+        """A cell as a piece of the ray, its extinction [row][point], and its integrals; the walk runs towards the camera."""
         a = mi.Float(self.layout.leave - mi.Float64(cell.s + cell.dt))
-        site = RayPiece(self.body, self.ray, a, dr.select(on, cell.dt, 0), on)
+        piece = RayPiece(self.body, self.ray, a, dr.select(on, cell.dt, 0), on)
         sigma = self._along(self.extinction, cell.corners[: len(self.extinction.reads)], cell)
-        return site, sigma, self.integrand.cell(site, sigma)
+        return piece, sigma, self.integrand.integrate_cell(piece, sigma)
 
     def _constant(self, a: mi.Float64, b: mi.Float64) -> tuple[RayPiece, list[list[mi.Float]], list[CellIntegral]]:
-        """As :meth:`_cell`, for the interval [a, b] that only constants fill."""
+        """The same for the interval [a, b] of constant extinction."""
         on = self.active & (b > a)
-        site = RayPiece(self.body, self.ray, mi.Float(dr.select(on, a, 0)), mi.Float(dr.select(on, b - a, 0)), on)
+        piece = RayPiece(self.body, self.ray, mi.Float(dr.select(on, a, 0)), mi.Float(dr.select(on, b - a, 0)), on)
         sigma = self._rows(self.extinction.constant)
-        return site, [[s] * len(self.integrand.points) for s in sigma], self.integrand.constant(site, sigma)
+        return piece, [[s] * len(self.integrand.points) for s in sigma], self.integrand.integrate_constant(piece, sigma)
 
     def _points(self, cell: Cell) -> list[mi.Vector3f]:
-        """The points of a cell, as fractions from its near planes; that nearest to the camera comes first."""
+        """The points of a cell, as fractions from its near planes; the point nearest to the camera comes first."""
         return [dr.fma(cell.step, 1 - p, cell.frac) for p in self.integrand.points]
 
     def _along(self, extinction: SummedExtinction, corners: list, cell: Cell) -> list[list[mi.Float]]:
@@ -182,14 +183,14 @@ class BodySweep:
         points = [self._rows([row[p] for row in values]) for p in range(len(self.integrand.points))]
         return [list(row) for row in zip(*points, strict=True)]
 
-    def _changes(self, cell: Cell) -> list[list[mi.Float]]:
+    def _tangents(self, cell: Cell) -> list[list[mi.Float]]:
         """[row][point] tangents of the extinction."""
-        values = self._along(self.change, cell.corners[len(self.extinction.reads) :], cell)
+        values = self._along(self.tangent, cell.corners[len(self.extinction.reads) :], cell)
         slopes = self.extinction.slopes(cell.corners, self._points(cell))
         return values if slopes is None else [[v * slope for v, slope in zip(row, slopes, strict=True)] for row in values]
 
     def _rows(self, channels: list[mi.Float]) -> list[mi.Float]:
-        """One number for each row of the integrand, from one for each channel of the medium."""
+        """One number for each row of the integrand, from one number for each channel of the medium."""
         channels = self.media.to_channels(channels)
         return [channels[r % len(channels)] for r in range(self.integrand.rows)]
 

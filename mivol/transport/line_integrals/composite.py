@@ -2,12 +2,12 @@ r"""Emission-absorption compositing of all media along a ray, with the tangent a
 
 .. math:: N = \sum_i T_1 \cdots T_{i-1} N_i
 
-Each medium is integrated by itself: :mod:`mivol.transport.line_integrals.body_sweep`, or one of Gaussians by
-:mod:`mivol.transport.media.gaussian_sweep`. Media are disjoint, so the middles of their intervals put them in their order along
-the ray, and the optical depth of those in front dims each of them.
+A sweep integrates each medium alone: :mod:`mivol.transport.line_integrals.body_sweep`, or for Gaussians
+:mod:`mivol.transport.media.gaussian_sweep`. Media are disjoint, so the middles of their intervals give their order along the
+ray, and the optical depth of the media in front attenuates each medium.
 
-Conventions. Media in boxes are integrated once and kept in a list; intervals that are found by tracing come in the order of the
-ray, in a loop, and only their sums are kept. Rows are channels or colours; where tangents are asked for, their rows follow.
+Conventions. Media in boxes are integrated once and kept in a list. Traced intervals come in the order of the ray, in a loop
+that keeps only sums. Rows are channels or colours, followed by the rows of tangents if tangents are followed.
 
 References: Max 1995 (the discrete emission-absorption integral).
 """
@@ -31,53 +31,53 @@ __all__ = ["Composite", "composite_ray", "vjp_composite"]
 
 @dataclass
 class _BoxedMedium:
-    """A medium in a box, as a ray crosses it.
+    """A medium in a box along a ray.
 
     Attributes:
-        interval: of the ray.
-        middle: of the interval, which orders the media.
-        own: the medium by itself.
-        front: optical depth in front of it.
-        seen: its N as the camera sees it.
-        behind: N of all that lies behind it as the camera sees it.
+        interval: interval of the ray in the medium.
+        middle: middle of the interval, which orders the media.
+        own: integral of the medium alone.
+        front: optical depth in front of the medium.
+        attenuated: N of the medium, attenuated to the camera.
+        behind: N behind the medium, attenuated to the camera.
     """
 
     interval: MediumInterval
     middle: mi.Float64
     own: BodyIntegral
     front: list[mi.Float64]
-    seen: list[mi.Float]
+    attenuated: list[mi.Float]
     behind: list[mi.Float]
 
 
 @dataclass
 class _TracedSums:
-    """Sums over the intervals that were found by tracing.
+    """Sums over the traced intervals.
 
     Attributes:
-        tau: their optical depth.
-        N: their sum as the camera sees it.
-        fronts: for each medium in a box, the optical depth of those in front of it.
-        behinds: for each medium in a box, N of those behind it as the camera sees it.
-        reach: the largest N that one of them would have if it were opaque.
+        tau: optical depth.
+        N: sum, attenuated to the camera.
+        fronts: for each boxed medium, the optical depth of the traced intervals in front.
+        behinds: for each boxed medium, N of the traced intervals behind, attenuated to the camera.
+        max_opaque: largest N of an interval if the interval were opaque.
     """
 
     tau: list[mi.Float64]
     N: list[mi.Float]
     fronts: list[list[mi.Float64]]
     behinds: list[list[mi.Float]]
-    reach: mi.Float
+    max_opaque: mi.Float
 
 
 @dataclass
 class Composite:
-    """The sum along a ray, and what its transpose needs of it.
+    """The sum along a ray, with the parts that the transpose needs.
 
     Attributes:
-        boxes, traced: media in boxes, and intervals found by tracing.
+        boxes, traced: media in boxes, and sums over traced intervals.
         tau: optical depth [1] of the whole ray, each row (then its tangent).
-        last: what the end of the ray adds, as the camera sees it.
-        N: the sum, each row (then its tangent).
+        last: contribution of the end of the ray, attenuated to the camera.
+        N: sum, each row (then its tangent).
     """
 
     boxes: list[_BoxedMedium]
@@ -88,16 +88,16 @@ class Composite:
 
 
 def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False, skip: bool = False) -> Composite:
-    """Integrate each medium by itself and composite them in the order of the ray.
+    """Integrate each medium alone, and composite the media in the order of the ray.
 
     Args:
-        line: what is summed along which ray.
-        end: what the end of the ray adds, each row, by itself.
-        tangent: follow tangents too, from those that the media took from the parameters.
-        skip: skip empty blocks, which changes the order of sums.
+        line: line integral.
+        end: contribution of the end of the ray, each row, not attenuated.
+        tangent: whether to follow tangents, which the media took from the parameters.
+        skip: whether to skip empty blocks, which changes the order of sums.
 
     Raises:
-        MivolError: a medium that sums grids of two resolutions or places, or whose extinction depends on the direction.
+        MivolError: a medium with grids of two resolutions or places, or with an extinction that depends on the direction.
 
     Cost: a walk of each medium.
     """
@@ -111,17 +111,17 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
         own = make_sweep(line, interval, tangent).integrate(skip)
         boxes.append(_BoxedMedium(interval, middle, own, zeros(mi.Float64, rows), [], zeros(mi.Float, rows)))
 
-    def visit_traced(t: _TracedSums, interval: MediumInterval) -> _TracedSums:
+    def add_interval(t: _TracedSums, interval: MediumInterval) -> _TracedSums:
         own, middle = make_sweep(line, interval, tangent).integrate(skip), interval.middle()
-        seen = _multiply_transmittance(_add_rows(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
-        opaque = [one_minus_exp(mi.Float(x)) for x in own.tau[: integrand.rows]]
-        means = [dr.select(a > 0, n / dr.select(a > 0, a, 1), 0) for n, a in zip(own.N, opaque, strict=False)]
+        attenuated = _multiply_transmittance(_add_rows(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
+        opacity = [one_minus_exp(mi.Float(x)) for x in own.tau[: integrand.rows]]
+        means = [dr.select(a > 0, n / dr.select(a > 0, a, 1), 0) for n, a in zip(own.N, opacity, strict=False)]
         return _TracedSums(
             _add_rows(t.tau, own.tau),
-            _add_rows(t.N, seen),
+            _add_rows(t.N, attenuated),
             [_add_rows(f, _mask_rows(middle < b.middle, own.tau)) for f, b in zip(t.fronts, boxes, strict=True)],
-            [_add_rows(g, _mask_rows(middle > b.middle, seen)) for g, b in zip(t.behinds, boxes, strict=True)],
-            dr.maximum(t.reach, largest_of(means)),
+            [_add_rows(g, _mask_rows(middle > b.middle, attenuated)) for g, b in zip(t.behinds, boxes, strict=True)],
+            dr.maximum(t.max_opaque, largest_of(means)),
         )
 
     traced = _TracedSums(
@@ -133,7 +133,7 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
     )
     if media.traced:
         ray, medium, passes_null = ray_segment.ray, ray_segment.medium, ray_segment.passes_null
-        _, traced = trace_boundaries(media, ray, medium, visit_traced, traced, line.active, passes_null)
+        _, traced = trace_boundaries(media, ray, medium, add_interval, traced, line.active, passes_null)
     return _composite_media(boxes, traced, end, integrand.rows, rows)
 
 
@@ -147,17 +147,17 @@ def make_sweep(line: LineIntegral, interval: MediumInterval, tangent: bool = Fal
 def _composite_media(
     boxes: list[_BoxedMedium], traced: _TracedSums, end: list[mi.Float], channels: int, rows: int
 ) -> Composite:
-    """Find what is in front of and behind each medium in a box, and N of the whole ray."""
+    """Find the light in front of and behind each boxed medium, and N of the whole ray."""
     for box, front in zip(boxes, traced.fronts, strict=True):
         box.front = _add_rows(front, _tau_in_front(boxes, box.middle, rows))
-        box.seen = _multiply_transmittance(box.front, box.own.N, channels)
+        box.attenuated = _multiply_transmittance(box.front, box.own.N, channels)
     total = traced.tau
     for box in boxes:
         total = _add_rows(total, box.own.tau)
     last = _multiply_transmittance(total, end + zeros(mi.Float, rows - channels), channels)
     N = _add_rows(traced.N, last)
     for box, behind in zip(boxes, traced.behinds, strict=True):
-        N = _add_rows(N, box.seen)
+        N = _add_rows(N, box.attenuated)
         box.behind = _add_rows(behind, _add_rows(last, _visible_behind(boxes, box.middle, rows)))
     return Composite(boxes, traced, total, last, N)
 
@@ -165,17 +165,17 @@ def _composite_media(
 def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Float], rest: list[mi.Float]) -> None:
     """Add ``weight`` times the derivatives of N to the gradients of the media: the transpose of the tangent.
 
-    What lies behind a cell is summed, and not found as a difference, so a voxel behind an optical depth of 50 gets its
-    derivative of the size e^-50. Only what lies behind an interval that was found by tracing is a difference of two sums; it is
-    clamped to what the known transmittance in front of it can let through.
+    The light behind a cell is a sum, not a difference, so a voxel behind an optical depth of 50 gets its derivative of the size
+    e^-50. Only the light behind a traced interval is a difference of two sums; it is clamped to the largest value that the
+    transmittance in front of the interval allows.
 
     Args:
-        line: as :func:`composite_ray`, which made ``composite``.
-        composite: the sum.
+        line: line integral of :func:`composite_ray`.
+        composite: result of :func:`composite_ray`.
         weight: d loss / d N of each row.
         rest: d loss / d log T of each row, with T the transmittance of the whole ray, for light from behind its end.
 
-    Cost: a walk of each medium, and one packed write of 8 a cell and channel; intervals found by tracing are walked twice.
+    Cost: a walk of each medium, and one packed write of 8 a cell and channel; traced intervals are walked twice.
     """
     media, integrand, ray_segment = line.media, line.integrand, line.ray_segment
     for box in composite.boxes:
@@ -183,30 +183,30 @@ def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Floa
         behind = [dr.fma(w, b, r) for w, b, r in zip(weight, box.behind, rest, strict=True)]
         make_sweep(line, box.interval).vjp(weight, ahead, behind)
 
-    def visit(passed: BodyIntegral, interval: MediumInterval) -> BodyIntegral:
+    def add_gradients(passed: BodyIntegral, interval: MediumInterval) -> BodyIntegral:
         sweep, middle = make_sweep(line, interval), interval.middle()
         own = sweep.integrate(False)
         front = _add_rows(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
         ahead, N = _add_rows(front, own.tau), _add_rows(passed.N, _multiply_transmittance(front, own.N, integrand.rows))
         P = [transmittance_of(a) for a in ahead]
-        near, far = integrand.least(interval.t1), composite.traced.reach
-        left = [dr.clip(n - m, p * near, p * far) for n, m, p in zip(composite.traced.N, N, P, strict=True)]
-        seen = _add_rows(left, _add_rows(composite.last, _visible_behind(composite.boxes, middle, integrand.rows)))
-        behind = [dr.fma(w, b, r) for w, b, r in zip(weight, seen, rest, strict=True)]
+        near, far = integrand.lower_bound(interval.t1), composite.traced.max_opaque
+        remaining = [dr.clip(n - m, p * near, p * far) for n, m, p in zip(composite.traced.N, N, P, strict=True)]
+        visible = _add_rows(remaining, _add_rows(composite.last, _visible_behind(composite.boxes, middle, integrand.rows)))
+        behind = [dr.fma(w, b, r) for w, b, r in zip(weight, visible, rest, strict=True)]
         sweep.vjp(weight, ahead, behind)
         return BodyIntegral(_add_rows(passed.tau, own.tau), N)
 
     if media.traced:
-        nothing = BodyIntegral(zeros(mi.Float64, integrand.rows), zeros(mi.Float, integrand.rows))
+        empty = BodyIntegral(zeros(mi.Float64, integrand.rows), zeros(mi.Float, integrand.rows))
         ray, medium, passes_null = ray_segment.ray, ray_segment.medium, ray_segment.passes_null
-        trace_boundaries(media, ray, medium, visit, nothing, line.active, passes_null)
+        trace_boundaries(media, ray, medium, add_gradients, empty, line.active, passes_null)
 
 
 # -- Rows of media in the order of the ray -----------------------------------------------------------------------------
 
 
 def _tau_in_front(boxes: list[_BoxedMedium], middle: mi.Float64, rows: int) -> list[mi.Float64]:
-    """Optical depth of the media in boxes in front of a distance."""
+    """Optical depth of the boxed media in front of a distance."""
     total = zeros(mi.Float64, rows)
     for box in boxes:
         total = _add_rows(total, _mask_rows(box.middle < middle, box.own.tau))
@@ -214,19 +214,19 @@ def _tau_in_front(boxes: list[_BoxedMedium], middle: mi.Float64, rows: int) -> l
 
 
 def _visible_behind(boxes: list[_BoxedMedium], middle: mi.Float64, rows: int) -> list[mi.Float]:
-    """N, as the camera sees it, of the media in boxes behind a distance."""
+    """N of the boxed media behind a distance, attenuated to the camera."""
     total = zeros(mi.Float, rows)
     for box in boxes:
-        total = _add_rows(total, _mask_rows(box.middle > middle, box.seen))
+        total = _add_rows(total, _mask_rows(box.middle > middle, box.attenuated))
     return total
 
 
 def _multiply_transmittance(front: list[mi.Float64], N: list[mi.Float], channels: int) -> list[mi.Float]:
-    """Rows of N, and of its tangent, as seen through rows of optical depth."""
+    """Rows of N and of its tangent, attenuated by rows of optical depth."""
     P = [transmittance_of(f) for f in front[:channels]]
-    seen = [p * n for p, n in zip(P, N, strict=False)]
+    attenuated = [p * n for p, n in zip(P, N, strict=False)]
     changes = zip(P, N, N[channels:], front[channels:], strict=False)
-    return seen + [p * (dn - mi.Float(df) * n) for p, n, dn, df in changes]
+    return attenuated + [p * (dn - mi.Float(df) * n) for p, n, dn, df in changes]
 
 
 def _add_rows(a: list, b: list) -> list:

@@ -1,15 +1,15 @@
-r"""Emission of media along a ray (the emission-absorption integral), with its tangent and its transpose.
+r"""Emission of media along a ray (the emission-absorption integral), with tangent and transpose, and its segment estimator.
 
 .. math:: L = \int_0^D T(t) \Big( \sigma_t (1 - \alpha)\, L_e(x_t, \omega) + j(x_t, \omega) \Big) dt
 
-The source function (1 - albedo) Le is multiplied by the extinction, so an infinitely thick medium that does not scatter has the
-radiance Le; with ``sigma_a`` and ``sigma_s`` the emitted power is sigma_a Le. The emission density j (``emission_density``)
-does not depend on the extinction.
+The extinction multiplies the source function (1 - albedo) Le, so an infinitely thick medium without scattering has the radiance
+Le. With ``sigma_a`` and ``sigma_s`` the emitted power is sigma_a Le. The emission density j (``emission_density``) does not
+depend on the extinction.
 
-Conventions. A ray is composited cell by cell (:mod:`mivol.transport.line_integrals.composite`). In a cell both are evaluated at
-the two points of the cell quadrature (:mod:`mivol.transport.traversal.cell_quadrature`). Cells are those of the extinction's
-grid, or of the emission's where the extinction has none; an interval outside any grid is one cell. ``omega`` is the direction
-from the point to the camera (``wi``).
+Conventions. :mod:`mivol.transport.line_integrals.composite` composites a ray cell by cell. Source function and emission density
+are evaluated at the two points of the cell quadrature (:mod:`mivol.transport.traversal.cell_quadrature`). Cells belong to the
+grid of the extinction, or to the grid of the emission if the extinction has no grid; an interval outside all grids is one cell.
+``omega`` is the direction from the point to the camera (``wi``).
 
 References: Max 1995 (the emission-absorption integral).
 """
@@ -40,26 +40,27 @@ __all__ = ["integrate_emission", "vjp_emission", "Emission"]
 
 
 OPAQUE_DEPTH = 1000.0
-"""Stands for an infinite optical depth: exp(-1000) is 0."""
+"""Redistances an infinite optical depth: exp(-1000) is 0."""
 
 
 def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool, tangent: bool = False) -> Composite:
-    """Integrate the light that media emit along a ray.
+    """Integrate the emitted light of media along a ray.
 
     Args:
-        media: of the scene.
-        ray_segment: the ray, and how far it goes; world space, unit direction.
+        media: media of the scene.
+        ray_segment: ray and length; world space, unit direction.
         active: lanes to follow.
-        tangent: follow tangents too, from those that the media took from the parameters.
+        tangent: whether to follow tangents, which the media took from the parameters.
 
     Returns:
-        The composite: its ``N`` is the light of each colour [radiance], its ``tau`` the optical depth; their tangents follow.
+        The composite: ``N`` is the light of each colour [radiance], ``tau`` the optical depth; tangents follow.
 
     Raises:
         MivolError: a medium whose grids of extinction do not share their cells.
 
-    Bias: of the order dt^4 of a cell; none for a constant source function. Cost: a walk of each medium and two look-ups of
-        its emission a cell.
+    Bias: of order dt^4 in the length of a cell; none for a constant source function. Cost: a walk of each medium, and two
+    look-ups
+        of the emission a cell.
     """
     line = LineIntegral(media, _EmissionIntegrand.of(media), ray_segment, active)
     return composite_ray(line, [mi.Float(0)] * line.integrand.rows, tangent, skip=not tangent)
@@ -77,8 +78,9 @@ def vjp_emission(
 
     Args:
         media, ray_segment, active: as :func:`integrate_emission`, which returned ``composite``.
+        composite: result of the forward pass.
         weight: d loss / d light of each colour, at the origin of the ray.
-        behind: d loss / d log T of each colour: the derivative times the light from behind the ray, as the camera sees it.
+        behind: d loss / d log T of each colour: the derivative times the light behind the ray, attenuated to the camera.
     """
     line = LineIntegral(media, _EmissionIntegrand.of(media), ray_segment, active)
     rows, rest = ([v[c] for c in range(line.integrand.rows)] for v in (weight, behind))
@@ -92,17 +94,17 @@ class _EmissionIntegrand:
     rows: int
     channels: int
     points: ClassVar[tuple[float, ...]] = (GAUSS_POINT, 1 - GAUSS_POINT)
-    asked: ClassVar[str] = "a medium emits"
-    way_out: ClassVar[str] = "take its emission out"
+    request: ClassVar[str] = "a medium emits"
+    alternative: ClassVar[str] = "take its emission out"
 
     @classmethod
     def of(cls, media: SceneMedia) -> _EmissionIntegrand:
         return cls(dr.size_v(mi.Spectrum), media.channels)
 
-    def cell(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
-        source, emission_density = self._detached(site)
-        shares = [share_opacity(site.dt, *row) for row in sigma[: self.channels]]
-        density_weights = [weigh_emission_density(site.dt, *row) for row in sigma[: self.channels]] if emission_density else []
+    def integrate_cell(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
+        source, emission_density = self._detached(piece)
+        shares = [share_opacity(piece.dt, *row) for row in sigma[: self.channels]]
+        density_weights = [weigh_emission_density(piece.dt, *row) for row in sigma[: self.channels]] if emission_density else []
         integrals = []
         for r in range(self.rows):
             share = shares[r % self.channels]
@@ -117,15 +119,15 @@ class _EmissionIntegrand:
             integrals.append(CellIntegral(share.tau, share.T, N, [share.half, share.half], dN))
         return integrals
 
-    def constant(self, site: RayPiece, sigma: list[mi.Float]) -> list[CellIntegral]:
-        finite = dr.isfinite(site.dt)
-        near = RayPiece(site.body, site.ray, site.a, dr.select(finite, site.dt, 0), site.on)
-        integrals = self.cell(near, [[s, s] for s in sigma])
+    def integrate_constant(self, piece: RayPiece, sigma: list[mi.Float]) -> list[CellIntegral]:
+        finite = dr.isfinite(piece.dt)
+        near = RayPiece(piece.body, piece.ray, piece.a, dr.select(finite, piece.dt, 0), piece.on)
+        integrals = self.integrate_cell(near, [[s, s] for s in sigma])
         source, emission_density = self._detached(near)
         return [
             _extend_to_infinity(
                 integral,
-                site.on & ~finite & (s > 0),
+                piece.on & ~finite & (s > 0),
                 s,
                 source[0][r] if source else 0,
                 emission_density[0][r] if emission_density else 0,
@@ -133,108 +135,114 @@ class _EmissionIntegrand:
             for r, (integral, s) in enumerate(zip(integrals, sigma, strict=True))
         ]
 
-    def vjp(self, site: RayPiece, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
-        body, factor = site.body, mi.Spectrum(*weight)
+    def vjp(self, piece: RayPiece, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
+        body, factor = piece.body, mi.Spectrum(*weight)
         if not body.view.emits:
             return
-        by_source, by_density, per_sigma = self._weights(site, sigma)
+        by_source, by_density, per_sigma = self._weights(piece, sigma)
         with dr.resume_grad():
-            sent = self._sent(site, by_source, by_density)
-            if dr.grad_enabled(sent):
-                dr.backward_from(dr.select(site.on, factor * sent, 0))
+            light = self._cell_light(piece, by_source, by_density)
+            if dr.grad_enabled(light):
+                dr.backward_from(dr.select(piece.on, factor * light, 0))
         if body.view.emission is None or body.view.albedo is not None:
             return
-        for t, per in zip(self._places(site), per_sigma, strict=True):
-            Le, fraction = self._absorbed(site, t)
+        for t, per in zip(self._point_distances(piece), per_sigma, strict=True):
+            Le, fraction = self._emitted(piece, t)
             for name, by in (("sigma_a", 1 - fraction), ("sigma_s", -fraction)):
                 rows = factor * per * Le * by
-                body.vjp_extinction_at(site.ray, t, colours_to_channels(rows, self.channels), site.on, name)
+                body.vjp_extinction_at(piece.ray, t, colours_to_channels(rows, self.channels), piece.on, name)
 
-    def jvp(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[mi.Float]:
-        body = site.body
+    def jvp(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> list[mi.Float]:
+        body = piece.body
         if not body.view.emits:
             return [mi.Float(0)] * self.rows
-        by_source, by_density, per_sigma = self._weights(site, sigma)
+        by_source, by_density, per_sigma = self._weights(piece, sigma)
         with dr.resume_grad():
-            sent = self._sent(site, by_source, by_density)
-            change = take_tangent(sent)
+            light = self._cell_light(piece, by_source, by_density)
+            change = take_tangent(light)
         if body.view.emission is not None and body.view.albedo is None:
-            for t, per in zip(self._places(site), per_sigma, strict=True):
-                Le, fraction = self._absorbed(site, t)
+            for t, per in zip(self._point_distances(piece), per_sigma, strict=True):
+                Le, fraction = self._emitted(piece, t)
                 by_a, by_s = (
-                    to_spectrum(body.jvp_extinction_at(site.ray, t, self.channels, site.on, name))
+                    to_spectrum(body.jvp_extinction_at(piece.ray, t, self.channels, piece.on, name))
                     for name in ("sigma_a", "sigma_s")
                 )
                 change += per * Le * ((1 - fraction) * by_a - fraction * by_s)
         return [change[r] for r in range(self.rows)]
 
-    def least(self, t1: mi.Float) -> float:
+    def lower_bound(self, t1: mi.Float) -> float:
         return 0.0
 
-    def _places(self, site: RayPiece) -> list[mi.Float]:
+    def _point_distances(self, piece: RayPiece) -> list[mi.Float]:
         """Distances of the points of a cell."""
-        dt = dr.select(dr.isfinite(site.dt), site.dt, 0)
-        return [dr.fma(dt, p, site.a) for p in self.points]
+        dt = dr.select(dr.isfinite(piece.dt), piece.dt, 0)
+        return [dr.fma(dt, p, piece.a) for p in self.points]
 
-    def _detached(self, site: RayPiece) -> tuple[list[mi.Spectrum], list[mi.Spectrum]]:
-        """Source function and emission density at the points; empty lists where the medium has none."""
-        view, places = site.body.view, self._places(site)
+    def _detached(self, piece: RayPiece) -> tuple[list[mi.Spectrum], list[mi.Spectrum]]:
+        """Source function and emission density at the points; an empty list if the medium has none."""
+        view, distances = piece.body.view, self._point_distances(piece)
         source, emission_density = [], []
         if view.emission is not None:
-            source = [dr.detach(self._source(site, t) * self._absorbed_fraction(site, t)) for t in places]
+            source = [dr.detach(self._source(piece, t) * self._absorbed_fraction(piece, t)) for t in distances]
         if view.emission_density is not None:
-            emission_density = [dr.detach(_eval_field(view.emission_density, site, t)) for t in places]
+            emission_density = [dr.detach(_eval_field(view.emission_density, piece, t)) for t in distances]
         return source, emission_density
 
-    def _source(self, site: RayPiece, t: mi.Float) -> mi.Spectrum:
-        """The source function (1 - albedo) Le, with its derivative, where the medium has an albedo; else Le."""
-        view = site.body.view
-        Le = _eval_field(view.emission, site, t)
-        return Le if view.albedo is None else (1 - _eval_albedo(site, t)) * Le
+    def _source(self, piece: RayPiece, t: mi.Float) -> mi.Spectrum:
+        """The source function (1 - albedo) Le for a medium with an albedo, otherwise Le; attached."""
+        view = piece.body.view
+        Le = _eval_field(view.emission, piece, t)
+        return Le if view.albedo is None else (1 - _eval_albedo(piece, t)) * Le
 
-    def _absorbed_fraction(self, site: RayPiece, t: mi.Float) -> mi.Spectrum:
-        """sigma_a / sigma_t where the medium has both coefficients (1 in a vacuum); else 1."""
-        body = site.body
+    def _absorbed_fraction(self, piece: RayPiece, t: mi.Float) -> mi.Spectrum:
+        """sigma_a / sigma_t for a medium with both coefficients (1 in a vacuum), otherwise 1."""
+        body = piece.body
         if body.view.albedo is not None:
             return mi.Spectrum(1)
         sigma_a, sigma_t = (
-            to_spectrum(body.extinction_at(site.ray, t, self.channels, site.on, name)) for name in ("sigma_a", "sigma_")
+            to_spectrum(body.extinction_at(piece.ray, t, self.channels, piece.on, name)) for name in ("sigma_a", "sigma_")
         )
         return dr.detach(dr.select(sigma_t > 0, sigma_a / dr.select(sigma_t > 0, sigma_t, 1), 1))
 
-    def _absorbed(self, site: RayPiece, t: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
-        return dr.detach(_eval_field(site.body.view.emission, site, t)), self._absorbed_fraction(site, t)
+    def _emitted(self, piece: RayPiece, t: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
+        return dr.detach(_eval_field(piece.body.view.emission, piece, t)), self._absorbed_fraction(piece, t)
 
-    def _weights(self, site: RayPiece, sigma: list[list[mi.Float]]) -> tuple[list, list, list]:
+    def _weights(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> tuple[list, list, list]:
         """Weights at each point: of the source function, of the emission density, of source function times extinction."""
-        finite = dr.isfinite(site.dt)
-        dt = dr.select(finite, site.dt, 0)
+        finite = dr.isfinite(piece.dt)
+        dt = dr.select(finite, piece.dt, 0)
         rows = sigma[: self.channels]
         shares = [share_opacity(dt, *row) for row in rows]
         by_source = _group_by_point([s.weights for s in shares])
         per_sigma = _group_by_point([s.per_sigma for s in shares])
         by_density = (
             _group_by_point([weigh_emission_density(dt, *row).weights for row in rows])
-            if site.body.view.emission_density is not None
+            if piece.body.view.emission_density is not None
             else []
         )
-        endless = site.on & ~finite
+        endless = piece.on & ~finite
         if by_density:
             lengths = [dr.rcp(dr.maximum(row[0], 1e-30)) for row in rows]
             by_density[0] = dr.select(endless & (to_spectrum([r[0] for r in rows]) > 0), to_spectrum(lengths), by_density[0])
         by_source[0] = dr.select(endless & (to_spectrum([r[0] for r in rows]) > 0), 1, by_source[0])
         return by_source, by_density, per_sigma
 
-    def _sent(self, site: RayPiece, by_source: list, by_density: list) -> mi.Spectrum:
-        """The light of a cell, with derivatives with respect to emission and albedo."""
-        total, places = mi.Spectrum(0), self._places(site)
-        if site.body.view.emission is not None:
+    def _cell_light(self, piece: RayPiece, by_source: list, by_density: list) -> mi.Spectrum:
+        """The light of a cell, attached to emission and albedo."""
+        total, distances = mi.Spectrum(0), self._point_distances(piece)
+        if piece.body.view.emission is not None:
             total += sum(
-                (w * self._absorbed_fraction(site, t) * self._source(site, t) for w, t in zip(by_source, places, strict=True))
+                (
+                    w * self._absorbed_fraction(piece, t) * self._source(piece, t)
+                    for w, t in zip(by_source, distances, strict=True)
+                )
             )
-        if site.body.view.emission_density is not None:
+        if piece.body.view.emission_density is not None:
             total += sum(
-                (w * _eval_field(site.body.view.emission_density, site, t) for w, t in zip(by_density, places, strict=True))
+                (
+                    w * _eval_field(piece.body.view.emission_density, piece, t)
+                    for w, t in zip(by_density, distances, strict=True)
+                )
             )
         return total
 
@@ -242,7 +250,7 @@ class _EmissionIntegrand:
 def _extend_to_infinity(
     integral: CellIntegral, endless: mi.Bool, sigma: mi.Float, source: mi.Float, emission_density: mi.Float
 ) -> CellIntegral:
-    """The integral over constants; where they have no end, the ray is opaque and has the radiance source + density / sigma."""
+    """The integral over constants. On an endless piece the ray is opaque, with radiance source + density / sigma."""
     mean = dr.rcp(dr.select(endless, sigma, 1))
     return CellIntegral(
         dr.select(endless, OPAQUE_DEPTH, integral.tau),
@@ -253,18 +261,18 @@ def _extend_to_infinity(
     )
 
 
-def _eval_albedo(site: RayPiece, t: mi.Float) -> mi.Spectrum:
-    """The albedo at a point of a ray, with its derivative. A stock grid repeats its border outside its box."""
-    albedo = site.body.view.albedo
-    return albedo.eval(medium_interaction(site.ray, t), site.on) if isinstance(albedo, mi.Volume) else mi.Spectrum(albedo)
+def _eval_albedo(piece: RayPiece, t: mi.Float) -> mi.Spectrum:
+    """The albedo at a point of a ray, attached. A stock grid repeats its border outside its box."""
+    albedo = piece.body.view.albedo
+    return albedo.eval(medium_interaction(piece.ray, t), piece.on) if isinstance(albedo, mi.Volume) else mi.Spectrum(albedo)
 
 
-def _eval_field(field: mi.Volume | mi.Float | mi.Color3f, site: RayPiece, t: mi.Float) -> mi.Spectrum:
-    """A volume or a constant at a point of a ray, with its derivative; 0 outside the box of a grid."""
+def _eval_field(field: mi.Volume | mi.Float | mi.Color3f, piece: RayPiece, t: mi.Float) -> mi.Spectrum:
+    """A volume or a constant at a point of a ray, attached; 0 outside the box of a grid."""
     if not isinstance(field, mi.Volume):
         return mi.Spectrum(field)
-    there = medium_interaction(site.ray, t)
-    on = site.on & site.body.view.holds(field, there.p)
+    there = medium_interaction(piece.ray, t)
+    on = piece.on & piece.body.view.holds(field, there.p)
     return dr.select(on, field.eval(there, on), 0)
 
 
@@ -276,7 +284,7 @@ def _group_by_point(pairs: list[tuple[mi.Float, mi.Float]]) -> list[mi.Spectrum]
 class Emission:
     """The segment estimator for media that emit and absorb, without scattering.
 
-    Bias and cost: as :func:`mivol.transport.line_integrals.emission.integrate_emission`. Variance: none.
+    Bias and cost: as :func:`integrate_emission`. Variance: none.
     """
 
     directions = "none"
@@ -289,10 +297,10 @@ class Emission:
         """Draw nothing: the estimate is deterministic."""
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
-        """Nothing is needed."""
+        """Prepare nothing."""
 
     def replayed(self) -> Emission:
-        """The light of emission is met again by a replay."""
+        """Itself: a replay meets the emitted light again."""
         return self
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
@@ -302,16 +310,16 @@ class Emission:
         passed = RaySegment(segment.ray, segment.medium, end.t)
         composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD)
         shared = _EmittingSegment(media, segment, passed, composite, active)
-        light = SegmentLight(shared, dr.select(active, shared.seen * shared.rows(0), 0), is_replayed=True)
+        light = SegmentLight(shared, dr.select(active, shared.weight * shared.rows(0), 0), is_replayed=True)
         T = transmittance([mi.Float(t) for t in composite.tau[: media.channels]])
         return SegmentEstimate(end, T, light, SegmentTransmittance(shared))
 
 
 @dataclass
 class _EmittingSegment:
-    """A segment with its composite: the derivatives of its light and of its transmittance (a ``SharedSegment``).
+    """A segment with its composite, and the derivatives of its light and transmittance (a ``SharedSegment``).
 
-    The rows of the composite are the light of each colour; those of its tangent follow, where it is asked for.
+    Rows of the composite hold the light of each colour, then the tangents if tangents are followed.
     """
 
     media: SceneMedia
@@ -322,24 +330,24 @@ class _EmittingSegment:
     dL: mi.Spectrum | None = None
 
     @property
-    def seen(self) -> mi.Spectrum:
-        """What multiplies the light of the media."""
-        weight = self.segment.emission_weight
-        return self.segment.beta if weight is None else self.segment.beta * weight
+    def weight(self) -> mi.Spectrum:
+        """Factor on the light of the media: throughput times the weight of emission."""
+        w_mis = self.segment.emission_weight
+        return self.segment.beta if w_mis is None else self.segment.beta * w_mis
 
     def rows(self, block: int) -> mi.Spectrum:
-        """The light (block 0), or its tangent (block 1)."""
+        """The light (block 0) or its tangent (block 1)."""
         k = dr.size_v(mi.Spectrum)
         return mi.Spectrum(*self.composite.N[block * k : (block + 1) * k])
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
-        """Do nothing yet: the sweep in :meth:`vjp` finds the derivatives of light and transmittance together."""
+        """Do nothing: the sweep in :meth:`vjp` finds the derivatives of light and transmittance together."""
 
     def vjp(self, dlog: mi.Spectrum) -> None:
-        vjp_emission(self.media, self.passed, self.composite, self.dL * self.seen, dlog, self.active)
+        vjp_emission(self.media, self.passed, self.composite, self.dL * self.weight, dlog, self.active)
 
     def jvp_light(self) -> mi.Spectrum:
-        return dr.select(self.active, self.seen * self.rows(1), 0)
+        return dr.select(self.active, self.weight * self.rows(1), 0)
 
     def jvp_transmittance(self) -> mi.Spectrum:
         k = dr.size_v(mi.Spectrum)

@@ -1,11 +1,11 @@
-"""How density and colour of a radiance field are read at the corners of its cells, and where their derivatives are added.
+"""Sources of a radiance field's values: they read density and colour at the corners of cells, and collect derivatives.
 
-A :class:`Source` reads the corners of a cell: :class:`Baked` for rays from pinholes, where the harmonics of each node are
-summed once per pinhole, in the direction from there; :class:`Exact` for any rays, which sum them at each corner, and so carry
-what they found at the corners of a face on to the next cell (:mod:`mivol.transport.line_integrals.carried_face`).
+:class:`Baked` serves rays from pinholes: it sums the harmonics of each node once per pinhole, in the direction from the
+pinhole. :class:`Exact` serves any rays: it sums harmonics at each corner, and carries the values of a face to the next cell
+(:mod:`mivol.transport.line_integrals.carried_face`).
 
-Conventions. Values come before the activation (density) and before the clamp at 0 (colour). Corners have the numbers that the
-points of their cell are given for.
+Conventions. Values are raw: before the activation (density) and before the clamp at 0 (colour). The points of a cell are given
+for the same numbering of corners.
 
 References: Sloan 2008, 2013 (the basis of ``dr.sh_eval``); Fridovich-Keil, Yu et al. 2022 (the model).
 """
@@ -34,13 +34,13 @@ Colours = list
 
 @dataclass
 class CellValues:
-    """What a source gives of a cell.
+    """The values of a cell.
 
     Attributes:
         raw: densities at the 8 corners.
-        colours: a call for the colours of the corners, where a mask says that they are needed.
-        points: the Gauss points, as fractions along the axes that bits 0, 1, 2 of the number of a corner stand for.
-        corners: where a source carries faces, what it needs to go on from here.
+        colours: function of a mask that returns the colours of the corners in lanes that need colours.
+        points: Gauss points, as fractions along the axes of bits 0, 1, 2 of the corner numbers.
+        corners: corners with their exit face, for a source that carries faces.
     """
 
     raw: list[mi.Float]
@@ -50,52 +50,52 @@ class CellValues:
 
 
 class Source(Protocol):
-    """Reads density and colour at the corners of cells, and takes their derivatives.
+    """Reads density and colour at the corners of cells, and collects derivatives.
 
-    What a ray carries from cell to cell is any PyTree, and belongs to the source: a ray starts with that of :meth:`start`.
+    A ray carries a PyTree of the source from cell to cell; :meth:`start` gives its first value.
 
     Attributes:
-        gains_by_sorting: whether reads take so long that rays are worth sorting.
+        gains_by_sorting: whether reads are slow enough to pay for sorting rays.
     """
 
     gains_by_sorting: ClassVar[bool]
 
     def gather_lanes(self, which: mi.UInt32) -> Source:
-        """The source for these of its lanes, with the same derivative."""
+        """The source for a selection of its lanes, with the same derivative."""
 
     def start(self, slope: bool = False) -> Any:
-        """What rays carry that have met no cell; ``slope``: for :meth:`add`."""
+        """Carried state before the first cell; with ``slope`` the state for :meth:`add`."""
 
-    def read(self, cells: OccupiedCells, here: OccupiedCell, carried: Any, on: mi.Bool) -> CellValues:
-        """The values of a listed cell."""
+    def read(self, cells: OccupiedCells, visited: OccupiedCell, carried: Any, on: mi.Bool) -> CellValues:
+        """The values of an occupied cell."""
 
     def carried_from(self, at: CellValues) -> Any:
-        """What rays carry on from a cell that they have read."""
+        """Carried state after a cell was read."""
 
     def add(
         self,
         cells: OccupiedCells,
-        here: OccupiedCell,
+        visited: OccupiedCell,
         at: CellValues,
         carried: Any,
         raw: list[mi.Float],
         colours: Colours,
         on: mi.Bool,
     ) -> Any:
-        """Add derivatives by what :meth:`read` gave to those of the field; what rays carry on then."""
+        """Add derivatives by the values of :meth:`read` to the derivatives of the field; returns the carried state."""
 
     def finish(self, carried: Any) -> None:
-        """Add what rays have carried to their ends."""
+        """Add the derivatives still carried at the ends of rays."""
 
 
 @dataclass
 class Baked:
-    """Density, and colour as seen from each pinhole, at the nodes of occupied cells: 4 numbers, which are read as one packet.
+    """Density, and colour as seen from each pinhole, at the nodes of occupied cells: 4 numbers, read as one packet.
 
     Attributes:
-        table: Float: raw density and rgb (its offset included) of a node; a block of all nodes for each pinhole.
-        first: where the block of each lane's pinhole begins.
-        slope: the derivative, laid out as ``table``; None where none is computed.
+        table: Float, raw density and rgb (offset included) of each node; one block of all nodes for each pinhole.
+        first: start of the block of each lane's pinhole.
+        slope: derivative in the layout of ``table``; None without derivatives.
     """
 
     gains_by_sorting: ClassVar[bool] = False
@@ -110,10 +110,10 @@ class Baked:
     def start(self, slope: bool = False) -> list:
         return []
 
-    def read(self, cells: OccupiedCells, here: OccupiedCell, carried: list, on: mi.Bool) -> CellValues:
-        nodes = self._nodes(cells, here.number, on)
+    def read(self, cells: OccupiedCells, visited: OccupiedCell, carried: list, on: mi.Bool) -> CellValues:
+        nodes = self._nodes(cells, visited.number, on)
         packets = [dr.gather(mi.ArrayXf, self.table, node, on, shape=(4, 1)) for node in nodes]
-        return CellValues([p[0] for p in packets], lambda on: [[p[k] for p in packets] for k in (1, 2, 3)], here.points)
+        return CellValues([p[0] for p in packets], lambda on: [[p[k] for p in packets] for k in (1, 2, 3)], visited.points)
 
     def carried_from(self, at: CellValues) -> list:
         return []
@@ -121,14 +121,14 @@ class Baked:
     def add(
         self,
         cells: OccupiedCells,
-        here: OccupiedCell,
+        visited: OccupiedCell,
         at: CellValues,
         carried: list,
         raw: list[mi.Float],
         colours: Colours,
         on: mi.Bool,
     ) -> list:
-        for node, values in zip(self._nodes(cells, here.number, on), zip(raw, *colours, strict=True), strict=True):
+        for node, values in zip(self._nodes(cells, visited.number, on), zip(raw, *colours, strict=True), strict=True):
             _add_packet(self.slope, values, node, on)
         return carried
 
@@ -141,13 +141,13 @@ class Baked:
 
 @dataclass
 class Exact:
-    """Harmonics and density side by side, the harmonics of a node summed in the direction of the ray.
+    """Harmonics and density side by side; the harmonics of a node are summed in the direction of the ray.
 
     Attributes:
-        field: the radiance field.
-        table: Float: harmonics and raw density of each row, ``packed_width`` numbers.
-        basis: the harmonics of each lane's direction.
-        slope: the derivative, laid out as ``table``; None where none is computed.
+        field: radiance field.
+        table: Float, harmonics and raw density of each row, ``packed_width`` numbers.
+        basis: harmonics of each lane's direction.
+        slope: derivative in the layout of ``table``; None without derivatives.
     """
 
     gains_by_sorting: ClassVar[bool] = True
@@ -164,9 +164,9 @@ class Exact:
     def start(self, slope: bool = False) -> Face | PendingGradients:
         return PendingGradients() if slope else Face()
 
-    def read(self, cells: OccupiedCells, here: OccupiedCell, carried: Face | PendingGradients, on: mi.Bool) -> CellValues:
+    def read(self, cells: OccupiedCells, visited: OccupiedCell, carried: Face | PendingGradients, on: mi.Bool) -> CellValues:
         face = carried.face if isinstance(carried, PendingGradients) else carried
-        corners = read_corners(cells.res, self.field.look_up_rows, self._value, face, here, on)
+        corners = read_corners(cells.res, self.field.look_up_rows, self._value, face, visited, on)
         raw, *colours = (list(channel) for channel in zip(*corners.values, strict=True))
         return CellValues(raw, lambda on: colours, corners.points, corners)
 
@@ -176,7 +176,7 @@ class Exact:
     def add(
         self,
         cells: OccupiedCells,
-        here: OccupiedCell,
+        visited: OccupiedCell,
         at: CellValues,
         carried: PendingGradients,
         raw: list[mi.Float],
@@ -184,13 +184,13 @@ class Exact:
         on: mi.Bool,
     ) -> PendingGradients:
         slopes = [list(values) for values in zip(raw, *colours, strict=True)]
-        return carried.add(at.corners, here, slopes, self._write, on)
+        return carried.add(at.corners, visited, slopes, self._write, on)
 
     def finish(self, carried: PendingGradients) -> None:
         carried.finish(self._write)
 
     def slopes(self) -> tuple[mi.Float, mi.Float]:
-        """The derivatives with respect to the rows of the field: those of ``density`` and of ``harmonics``."""
+        """Derivatives with respect to ``density`` and ``harmonics`` of the field."""
         field = self.field
         every, many = dr.arange(mi.UInt32, field.rows), 3 * field.basis
         density, harmonics = (dr.empty(mi.Float, dr.width(v)) for v in (field.density, field.harmonics))
@@ -205,24 +205,24 @@ class Exact:
         return [values[3 * self.field.basis], *_sum_harmonics(values, self.basis, self.field.offset)]
 
     def _write(self, row: mi.UInt32, slopes: list[mi.Float], on: mi.Bool) -> None:
-        """Add the derivatives by what :meth:`_value` gave."""
+        """Add the derivatives by the values of :meth:`_value`."""
         raw, *colour = slopes
         values = [*(c * y for y in self.basis for c in colour), raw]
         _add_packet(self.slope, _pad_row(values, packed_width(self.field.basis)), row, on)
 
 
 def packed_width(basis: int) -> int:
-    """Numbers of a row of harmonics and density, filled up to packets of 4 or of 8, the largest that Dr.Jit moves."""
+    """Size of a row of harmonics and density, padded to packets of 4 or of 8 numbers, the largest packet of Dr.Jit."""
     return 4 if basis == 1 else -(-(3 * basis + 1) // 8) * 8
 
 
 def _pad_row(values: list[mi.Float], width: int) -> mi.ArrayXf:
-    """A row of so many numbers, filled up with 0."""
+    """A row padded with 0."""
     return mi.ArrayXf([*values, *(mi.Float(0) for _ in range(width - len(values)))])
 
 
 def _sum_harmonics(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> list[mi.Float]:
-    """The colour of a row of harmonics, before it is clamped."""
+    """The colour of a row of harmonics, before the clamp."""
     colour = [mi.Float(offset)] * 3
     for b, y in enumerate(basis):
         colour = [dr.fma(row[3 * b + k], y, c) for k, c in enumerate(colour)]
@@ -230,7 +230,7 @@ def _sum_harmonics(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> lis
 
 
 def _add_packet(target: mi.Float, values: Sequence[mi.Float], row: mi.UInt32, on: mi.Bool) -> None:
-    """Add numbers that lie side by side in memory; on the CPU each thread adds to a copy of its own, without atomics."""
+    """Add numbers that lie side by side in memory. On the CPU each thread adds to its own copy, without atomics."""
     mode = dr.ReduceMode.Expand if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else dr.ReduceMode.Auto
     dr.scatter_add(target, mi.ArrayXf(list(values)), row, on, mode=mode)
 
@@ -239,14 +239,14 @@ def bake(field: SphericalGrid, cells: OccupiedCells, points: np.ndarray, view: m
     """Sum the harmonics of each node in the directions from pinholes.
 
     Args:
-        field: the radiance field.
-        cells: its occupied cells; other nodes are left out.
+        field: radiance field.
+        cells: occupied cells; other nodes are left out.
         points: (V, 3) world, the pinholes.
-        view: the index of each ray's pinhole.
+        view: number of each ray's pinhole.
         slope: whether derivatives will be computed.
 
-    Bias: O(h^2 / r^2) of the colour for a cell of size h at distance r from a pinhole: the directions to the nodes, averaged
-        with their trilinear weights, are that of the ray to first order.
+    Bias: O(h^2 / r^2) of the colour for a cell of size h at distance r from a pinhole. The mean of the directions to the nodes,
+        with trilinear weights, equals the direction of the ray to first order.
     Cost: the field is read once, and 4 numbers a node and pinhole are written.
     """
     table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
@@ -257,52 +257,49 @@ def bake(field: SphericalGrid, cells: OccupiedCells, points: np.ndarray, view: m
 
 @dr.syntax
 def _fill_table(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
-    """Fill the blocks of a table, in a loop, so that the field is read once and one kernel serves any number of pinholes."""
-    number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _look_up_node(field, rows), field.make_view_basis(points)
+    """Fill the blocks of a table in a loop, which reads the field once; a single kernel serves any number of pinholes."""
+    number, node, view_basis = dr.arange(mi.UInt32, dr.width(rows)), _look_up_node(field, rows), field.make_view_basis(points)
     pinholes, count = dr.opaque(mi.UInt32, len(points)), _opaque_count(rows)
     raw = dr.gather(mi.Float, field.density, rows)
     values = dr.gather(mi.ArrayXf, field.harmonics, rows, shape=(field.width, 1))
     v = mi.UInt32(0)
     while dr.hint(v < pinholes, exclude=[table]):
-        dr.scatter(table, mi.ArrayXf([raw, *_sum_harmonics(values, seen_from(node, v), field.offset)]), number + v * count)
+        dr.scatter(table, mi.ArrayXf([raw, *_sum_harmonics(values, view_basis(node, v), field.offset)]), number + v * count)
         v += 1
 
 
 def _round_up_size(size: int) -> int:
-    """Round a size up to one of few.
+    """Round a size up to one of few sizes.
 
-    A kernel that adds to an array with a copy for each thread contains its length, and is compiled anew for another.
+    A kernel that adds to a private copy per thread contains the length of the array, and would be compiled for each length.
     """
     step = 1 << max(size.bit_length() - 4, 2)
     return -(-size // step) * step
 
 
 def _opaque_count(rows: mi.UInt32) -> mi.UInt32:
-    """The number of rows as an opaque number: it changes during a fit, and the kernels need not be compiled anew."""
+    """The number of rows as an opaque number: it changes during a fit, and kernels should not be compiled again."""
     return dr.opaque(mi.UInt32, dr.width(rows))
 
 
 def _look_up_node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
-    """The node of a row; any node for the row of the vacuum, whose values are not used."""
+    """The node of a row; the row of the vacuum gives an arbitrary node, whose values are unused."""
     return row if field.nodes is None else dr.gather(mi.UInt32, field.nodes, row, row < field.rows - 1)
 
 
 def vjp_bake(field: SphericalGrid, cells: OccupiedCells, baked: Baked, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
-    """Derivatives with respect to the rows of a field, from those with respect to its baked table: the transpose of
-    :func:`bake`.
-
-    Returns:
-        Those of ``density`` and of ``harmonics``.
+    """Derivatives by the rows of a field, density and harmonics, from the derivatives by its baked table: the transpose of
+    bake.
     """
     return _sum_over_pinholes(field, cells.rows, baked.slope, points)
 
 
 @dr.syntax
 def _sum_over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
-    """Sum the derivatives of all pinholes, in a loop, so that one kernel serves any number of them."""
+    """Sum the derivatives of all pinholes in a loop; a single kernel serves any number of pinholes."""
     number = dr.arange(mi.UInt32, dr.width(rows))
     node = _look_up_node(field, rows)
-    seen_from = field.make_view_basis(points)
+    view_basis = field.make_view_basis(points)
     pinholes, count, width = dr.opaque(mi.UInt32, len(points)), _opaque_count(rows), field.width
     packet = mi.ArrayXf([mi.Float(0)] * 4)
     raw = dr.zeros(mi.Float, dr.width(rows))
@@ -311,7 +308,7 @@ def _sum_over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, p
     while v < pinholes:
         packet = dr.gather(mi.ArrayXf, nodes, number + v * count, shape=(4, 1))
         raw += packet[0]
-        harmonics = _add_outer_product(harmonics, packet, seen_from(node, v))
+        harmonics = _add_outer_product(harmonics, packet, view_basis(node, v))
         v += 1
     density, total = dr.zeros(mi.Float, field.rows), dr.zeros(mi.Float, field.rows * width)
     dr.scatter(density, raw, rows)
@@ -320,25 +317,25 @@ def _sum_over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, p
 
 
 def _add_outer_product(harmonics: list[mi.Float], packet: mi.ArrayXf, basis: list[mi.Float]) -> list[mi.Float]:
-    """Add a colour's derivative times each harmonic."""
-    more = [dr.fma(packet[1 + k], y, harmonics[3 * b + k]) for b, y in enumerate(basis) for k in range(3)]
-    return more + harmonics[len(more) :]
+    """Add the derivative of a colour times each harmonic."""
+    sums = [dr.fma(packet[1 + k], y, harmonics[3 * b + k]) for b, y in enumerate(basis) for k in range(3)]
+    return sums + harmonics[len(sums) :]
 
 
 def make_exact(field: SphericalGrid, d: mi.Vector3f, slope: bool = False) -> Exact:
-    """The field for rays of any directions.
+    """The source for rays of any directions.
 
     Args:
-        field: the radiance field.
-        d: unit directions of the rays, in the world.
+        field: radiance field.
+        d: unit directions of the rays, world.
         slope: whether derivatives will be computed.
 
-    Cost: all rows are copied once, since a row of harmonics and density is read in a fifth of the time of numbers that lie
-        apart; twice as much memory with derivatives.
+    Cost: all rows are copied once, since a packed row of harmonics and density is read five times faster than separate numbers.
+        Derivatives double the memory.
     """
     width, every = packed_width(field.basis), dr.arange(mi.UInt32, field.rows)
     if field.nodes is not None:
-        field.sparse_index()  # a walk is no place to make it
+        field.sparse_index()  # the index cannot be made inside a traced walk
     table = dr.empty(mi.Float, width * field.rows)
     row = dr.gather(mi.ArrayXf, field.harmonics, every, shape=(field.width, 1))
     values = [*(row[k] for k in range(3 * field.basis)), dr.gather(mi.Float, field.density, every)]
