@@ -1,14 +1,14 @@
 """Points and Gaussians in tiles of pixels, composited front to back, with derivatives.
 
     splatter = Splatter(width, height, degree)
-    picture, kept = splatter.forward(to_tensors(gaussians), camera)
-    gradient, statistics = splatter.backward(kept, d_picture)
+    image, cache = splatter.forward(to_tensors(gaussians), camera)
+    gradient, statistics = splatter.backward(cache, d_image)
 
-One picture passes through three modules: ``projection`` makes an ellipse in the image of each Gaussian (EWA splatting),
-``tile_lists`` lists for each tile of 8 x 8 pixels the ellipses that reach it, nearest first, and ``compositing`` adds them up,
-forward and backward. ``splatter`` records the kernels of all three once, and launches them for any cloud and any camera.
+An image passes through three modules. ``projection`` projects each Gaussian to an ellipse in the image (EWA splatting).
+``tile_lists`` lists the ellipses in each tile of 8 x 8 pixels, nearest first. ``compositing`` adds up the ellipses, forward and
+backward. ``splatter`` records the kernels of these modules once, and launches them for every cloud and camera.
 """
 
-from mivol.splatting.splatter import Splatter, SplatterCache, Statistics, to_tensors
+from mivol.splatting.splatter import ScreenStatistics, Splatter, SplatterCache, to_tensors
 
-__all__ = ["SplatterCache", "Splatter", "Statistics", "to_tensors"]
+__all__ = ["SplatterCache", "Splatter", "ScreenStatistics", "to_tensors"]

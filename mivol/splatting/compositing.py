@@ -5,17 +5,17 @@ Each tile of 8 x 8 pixels is 16 lanes of 2 x 2 pixels; all lanes of a tile walk 
 .. math:: L = \sum_i T_i \alpha_i c_i, \qquad T_i = \prod_{j<i} u_j, \qquad
    \frac{dL}{d\alpha_i} = T_i (c_i - \rho_i), \qquad \rho_{i-1} = \alpha_i c_i + u_i \rho_i
 
-T runs from the front and rho from the back, so one of the two has to be remembered: the forward pass writes T down once in
-``CHUNK`` entries, and the backward pass, which takes the chunks from the last to the first, recomputes T within a chunk. The
-usual way, T_i = T_{i+1} / u_i, loses its digits where alpha is near 1, and has none at 1.
+T runs from the front and rho from the back, so either T or rho has to be stored. The forward pass writes down T once in
+``CHUNK`` entries. The backward pass takes the chunks from the last to the first, and recomputes T within a chunk. The usual
+way, T_i = T_{i+1} / u_i, loses its digits for alpha near 1, and has no digits at 1.
 
-**Where a lane stops.** Not where T is below ``STOP``: behind one splat of alpha = 1 nothing is seen, but dL/dalpha of this
-splat is c minus the colour of what stands behind. A lane stops where M, the product of all u but the smallest, is below
-``STOP``. Every derivative leaves out every u but its own at most once, so what is left out of L is below STOP times the
-largest colour, and so is what is left out of each c_i - rho_i, times T_i.
+**The end of a lane.** A lane does not stop at T below ``STOP``. Behind a splat of alpha = 1 everything is hidden, but
+dL/dalpha of this splat is c minus the colour behind the splat. A lane stops where M, the product of all u but the smallest, is
+below ``STOP``. Every derivative leaves out at most its own u, so the neglected part of L is below STOP times the largest
+colour, and so is the neglected part of each c_i - rho_i, times T_i.
 
-Conventions. Lanes count tiles in the order that is given; the numbers of a tile's lanes follow its blocks of 2 x 2 pixels row
-by row, those of a block its pixels. Colours are channels: rgb, and the depth where it is asked for. A splat is skipped in a
+Conventions. Lanes count tiles in the given order. The numbers of the lanes of a tile follow its blocks of 2 x 2 pixels row by
+row; the numbers of a block follow its pixels. Colours are channels: rgb, and the depth on request. A splat is skipped in a
 pixel where its alpha is below ``grid.least``.
 
 References: Kerbl et al. 2023.
@@ -34,10 +34,10 @@ from mivol.splatting.tile_lists import TILE, Grid
 __all__ = ["CHUNK", "LANES", "PIXELS", "STOP", "Adjoint", "Frame", "Lists", "composite", "composite_adjoint"]
 
 CHUNK = 4
-"""Entries between two places where T is written down."""
+"""Entries between two stored values of T."""
 
 BLOCK = 2
-"""Pixels along the edge of what one lane draws."""
+"""Pixels along the edge of the block of a lane."""
 
 PIXELS = BLOCK * BLOCK
 LANES = (TILE // BLOCK) ** 2
@@ -45,7 +45,7 @@ LANES = (TILE // BLOCK) ** 2
 STOP = 1e-4
 
 HALF = 0.5
-"""T that the median depth crosses."""
+"""T crossed by the median depth."""
 
 
 @dataclass
@@ -54,9 +54,9 @@ class Lists:
 
     Attributes:
         entries: indices of splats.
-        starts: where a tile's list begins, one more than there are tiles.
-        chunks: where a tile's chunks begin, one more than there are tiles.
-        tiles: the order in which tiles are drawn.
+        starts: beginning of the list of a tile, one number more than tiles.
+        chunks: beginning of the chunks of a tile, one number more than tiles.
+        tiles: the order for drawing tiles.
     """
 
     entries: mi.UInt32
@@ -71,10 +71,10 @@ class Frame:
 
     Attributes:
         width, height: [pixel].
-        image: takes rgb, depth where asked for, and alpha of each pixel.
-        transmittance: takes T of each lane's pixels at the beginning of each chunk.
+        image: receives rgb, depth on request, and alpha of each pixel.
+        transmittance: receives T of the pixels of each lane at the beginning of each chunk.
         depth: whether the depth is a channel.
-        median: whether that channel is the depth of the splat at which T falls below a half, instead of the mean times alpha.
+        median: whether this channel is the depth of the splat at which T falls below a half, instead of the mean times alpha.
         remembers: whether T is written down.
         discs: whether a splat is the inside of its ellipse of one standard deviation, instead of a Gaussian.
     """
@@ -94,8 +94,8 @@ class Adjoint:
     """Derivatives by the image, and by the splats.
 
     Attributes:
-        image: of each number of the image.
-        chunks: how many chunks each lane has drawn.
+        image: derivative by each number of the image.
+        chunks: number of chunks drawn by each lane.
         shape: eight numbers a splat: the sums of :func:`_moments`, red, green.
         rest: two numbers a splat: blue, depth.
     """
@@ -108,7 +108,7 @@ class Adjoint:
 
 @dataclass
 class _Lane:
-    """What a lane draws: its list, and where its pixels are."""
+    """The list and the pixels of a lane."""
 
     start: mi.UInt32
     count: mi.UInt32
@@ -129,23 +129,23 @@ class _Lane:
         return cls(start, count, dr.gather(mi.UInt32, lists.chunks, tile), number, x, y)
 
     def pixels(self, width: mi.UInt32, height: mi.UInt32) -> list[tuple[mi.UInt32, mi.Bool]]:
-        """Index in the image of each pixel, and whether it is inside."""
+        """Index in the image of each pixel, and whether the pixel is inside."""
         at = [(self.x + p % BLOCK, self.y + p // BLOCK) for p in range(PIXELS)]
         return [(y * width + x, (x < width) & (y < height)) for x, y in at]
 
     def transmittance(self, chunk: mi.UInt32) -> mi.UInt32:
-        """Where T of this lane's pixels is written down."""
+        """Position of the stored T of the pixels of this lane."""
         return (self.chunk + chunk) * LANES + self.number
 
     def splat(self, lists: Lists, at: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
-        """The splat of an entry of the list, and whether there is one."""
+        """The splat of an entry of the list, and whether the entry exists."""
         there = at < self.count
         return dr.gather(mi.UInt32, lists.entries, self.start + at, there), there
 
 
 @dataclass
 class _Footprint:
-    """A splat as the pixels of a lane see it."""
+    """A splat on the pixels of a lane."""
 
     dx: list[mi.Float]
     dy: list[mi.Float]
@@ -176,10 +176,11 @@ class _Footprint:
 
 
 def _covered(q: mi.Float, q_x: mi.Float, q_y: mi.Float) -> mi.Float:
-    """Share of a pixel that the ellipse of one standard deviation covers, to first order in its distance from the border.
+    """Share of a pixel covered by the ellipse of one standard deviation, to first order in its distance from the border.
 
-    m = sqrt(q / EXP2) is 1 on the border, and (1 - m) / |grad m| the distance from it [pixel]: the share falls from 1 to 0
-    between half a pixel inside and half a pixel outside, as that of a pixel that a straight border cuts along its edges.
+    m = sqrt(q / EXP2) is 1 on the border, and (1 - m) / |grad m| is the distance from the border [pixel]. The share falls from
+    1 to 0 between half a pixel inside and half a pixel outside, like the share of a pixel cut by a straight border parallel to
+    its edges.
     """
     m = dr.sqrt(q * (1 / EXP2))
     slope = dr.sqrt(q_x * q_x + q_y * q_y) * dr.rcp(-2 * EXP2 * dr.maximum(m, 1e-6))
@@ -187,7 +188,7 @@ def _covered(q: mi.Float, q_x: mi.Float, q_y: mi.Float) -> mi.Float:
 
 
 def _rest(rest: mi.Float, index: mi.UInt32, there: mi.Bool, depth: bool) -> list[mi.Float]:
-    """Blue, and the depth where it is asked for."""
+    """Blue, and the depth on request."""
     if depth:
         return list(dr.gather(mi.ArrayXf, rest, index, there, shape=(2, dr.width(index))))
     return [dr.gather(mi.Float, rest, index * 2, there)]
@@ -200,12 +201,13 @@ def composite(
 
     Args:
         splats: eight and two numbers a splat (:class:`mivol.splatting.projection.Splats`).
-        lists: what is seen in which tile.
+        lists: the splats of each tile.
         grid: the tiles.
-        frame: the image, and where T is written down.
+        frame: the image, and the store of T.
 
     Returns:
-        The image, flat (rgb, depth where asked for, alpha); how many chunks each lane has drawn; T at their beginnings.
+        The image, flat (rgb, depth on request, alpha); the number of chunks drawn by each lane; T at the beginnings of the
+        chunks.
     """
     shape, rest = splats
     lane = _Lane.of(lists, grid)
@@ -216,16 +218,16 @@ def composite(
             dr.scatter(frame.transmittance, mi.ArrayXf(_product(clear, most)), lane.transmittance(chunk))
         for k in range(CHUNK):
             index, there = lane.splat(lists, chunk * CHUNK + k)
-            print_ = _Footprint.of(shape, index, there, lane, grid, frame.discs)
-            tint = print_.colour + _rest(rest, index, there, frame.depth)
+            footprint = _Footprint.of(shape, index, there, lane, grid, frame.discs)
+            splat_colour = footprint.colour + _rest(rest, index, there, frame.depth)
             for p in range(PIXELS):
-                a, u = print_.alpha[p], 1 - print_.alpha[p]
+                a, u = footprint.alpha[p], 1 - footprint.alpha[p]
                 weight = a * clear[p] * most[p]
                 for c in range(3 if frame.median else channels):
-                    colour[p][c] = dr.fma(weight, tint[c], colour[p][c])
+                    colour[p][c] = dr.fma(weight, splat_colour[c], colour[p][c])
                 if frame.median:
                     through = clear[p] * most[p]
-                    colour[p][3] = dr.select((through >= HALF) & (through * u < HALF), tint[3], colour[p][3])
+                    colour[p][3] = dr.select((through >= HALF) & (through * u < HALF), splat_colour[3], colour[p][3])
                 clear[p], most[p] = clear[p] * dr.maximum(most[p], u), dr.minimum(most[p], u)
         return chunk + 1, clear, most, colour
 
@@ -247,13 +249,13 @@ def composite_adjoint(splats: tuple[mi.Float, mi.Float], lists: Lists, grid: Gri
     """Take the derivative by an image back to the numbers of every splat.
 
     Args:
-        splats, lists, grid, frame: as :func:`composite` was called with, where it remembered T.
-        adjoint: the derivative by the image, what :func:`composite` returned, and where the derivatives are added.
+        splats, lists, grid, frame: arguments of :func:`composite`, in a call that stored T.
+        adjoint: the derivative by the image, the results of :func:`composite`, and the arrays for the derivatives.
     """
     shape, rest = splats
     lane = _Lane.of(lists, grid)
     channels = 5 if frame.depth else 4
-    towards = [
+    d_pixels = [
         [dr.gather(mi.Float, adjoint.image, pixel * channels + c, inside) for c in range(channels)]
         for pixel, inside in lane.pixels(frame.width, frame.height)
     ]
@@ -263,26 +265,26 @@ def composite_adjoint(splats: tuple[mi.Float, mi.Float], lists: Lists, grid: Gri
     def step(left: mi.UInt32, behind: list) -> tuple:
         chunk = left - 1
         t = list(dr.gather(mi.ArrayXf, frame.transmittance, lane.transmittance(chunk), shape=(PIXELS, dr.width(chunk))))
-        seen = []
+        chunk_splats = []
         for k in range(CHUNK):
             index, there = lane.splat(lists, chunk * CHUNK + k)
-            print_ = _Footprint.of(shape, index, there, lane, grid, frame.discs)
-            seen.append((index, there, print_, list(t)))
-            t = [t[p] * (1 - print_.alpha[p]) for p in range(PIXELS)]
-        for index, there, print_, t in reversed(seen):
-            tint = [*print_.colour, *_rest(rest, index, there, frame.depth)]
-            d_alpha, d_tint = [], [mi.Float(0) for _ in tint]
+            footprint = _Footprint.of(shape, index, there, lane, grid, frame.discs)
+            chunk_splats.append((index, there, footprint, list(t)))
+            t = [t[p] * (1 - footprint.alpha[p]) for p in range(PIXELS)]
+        for index, there, footprint, t in reversed(chunk_splats):
+            splat_colour = [*footprint.colour, *_rest(rest, index, there, frame.depth)]
+            d_alpha, d_colour = [], [mi.Float(0) for _ in splat_colour]
             for p in range(PIXELS):
-                value = towards[p][-1]
-                for c, colour in enumerate(tint):
-                    value = dr.fma(towards[p][c], colour, value)
-                d_alpha.append(dr.select(print_.drawn[p], t[p] * (value - behind[p]), 0))
-                weight = t[p] * print_.alpha[p]
-                d_tint = [dr.fma(weight, towards[p][c], d) for c, d in enumerate(d_tint)]
-                behind[p] = dr.fma(print_.alpha[p], value - behind[p], behind[p])
-            sums = _moments(print_, d_alpha)
-            dr.scatter_add(adjoint.shape, mi.ArrayXf([*sums, *d_tint[:2]]), index, there, mode=dr.ReduceMode.Expand)
-            dr.scatter_add(adjoint.rest, mi.ArrayXf([*d_tint[2:], mi.Float(0)][:2]), index, there, mode=dr.ReduceMode.Expand)
+                value = d_pixels[p][-1]
+                for c, colour in enumerate(splat_colour):
+                    value = dr.fma(d_pixels[p][c], colour, value)
+                d_alpha.append(dr.select(footprint.drawn[p], t[p] * (value - behind[p]), 0))
+                weight = t[p] * footprint.alpha[p]
+                d_colour = [dr.fma(weight, d_pixels[p][c], d) for c, d in enumerate(d_colour)]
+                behind[p] = dr.fma(footprint.alpha[p], value - behind[p], behind[p])
+            sums = _moments(footprint, d_alpha)
+            dr.scatter_add(adjoint.shape, mi.ArrayXf([*sums, *d_colour[:2]]), index, there, mode=dr.ReduceMode.Expand)
+            dr.scatter_add(adjoint.rest, mi.ArrayXf([*d_colour[2:], mi.Float(0)][:2]), index, there, mode=dr.ReduceMode.Expand)
         return chunk, behind
 
     state = (first, [mi.Float(0) for _ in range(PIXELS)])
@@ -294,12 +296,12 @@ def _product(a: list[mi.Float], b: list[mi.Float]) -> list[mi.Float]:
     return [x * y for x, y in zip(a, b, strict=True)]
 
 
-def _moments(print_: _Footprint, d_alpha: list[mi.Float]) -> list[mi.Float]:
+def _moments(footprint: _Footprint, d_alpha: list[mi.Float]) -> list[mi.Float]:
     """Sums over the pixels of d L / d exponent times dx, dy, dx^2, dx dy, dy^2, and the derivative by the opacity."""
-    e = [d * a for d, a in zip(d_alpha, print_.alpha, strict=True)]
-    (x0, x1), (y0, y1) = print_.dx, print_.dy
+    e = [d * a for d, a in zip(d_alpha, footprint.alpha, strict=True)]
+    (x0, x1), (y0, y1) = footprint.dx, footprint.dy
     left, right, top, bottom = e[0] + e[2], e[1] + e[3], e[0] + e[1], e[2] + e[3]
     ax, bx, ay, by = left * x0, right * x1, top * y0, bottom * y1
     xy = dr.fma(y0, dr.fma(e[0], x0, e[1] * x1), y1 * dr.fma(e[2], x0, e[3] * x1))
-    opacity = sum(d * f for d, f in zip(d_alpha, print_.falloff, strict=True))
+    opacity = sum(d * f for d, f in zip(d_alpha, footprint.falloff, strict=True))
     return [ax + bx, ay + by, ax * x0 + bx * x1, xy, ay * y0 + by * y1, opacity]

@@ -1,17 +1,18 @@
-r"""Gaussians of space as ellipses of the image (EWA splatting), with the derivatives of Dr.Jit.
+r"""Gaussians of space as ellipses in the image of a camera (EWA splatting), with the derivatives of Dr.Jit.
 
-A Gaussian of mean p and covariance R S S R^T is projected with the perspective linearised at p: with J the (2, 3) derivative of
-the image by space, its image is a Gaussian of covariance
+A Gaussian of mean p and covariance R S S R^T is projected with the perspective linearised at p. With J the (2, 3) derivative
+of the image by space, its image is a Gaussian of covariance
 
 .. math:: C = A A^T + s\,I, \qquad A = J R S, \qquad \alpha(x) = o\,e^{-\frac12 (x-\mu)^T C^{-1} (x-\mu)}
 
-and s [pixel^2] a low-pass filter. det C is computed as |a_1 x a_2|^2 + s (|a_1|^2 + |a_2|^2) + s^2, a sum of positive terms:
+and s [pixel^2] is a low-pass filter. det C is computed as |a_1 x a_2|^2 + s (|a_1|^2 + |a_2|^2) + s^2, a sum of positive terms:
 C is never singular, however thin the Gaussian.
 
-Conventions. Arrays of the cloud are flat, one Gaussian after the other; those of splats are one array a component. Colours are
-max(0, 1/2 + sum Y_b k_b), with the basis of ``dr.sh_eval`` and the direction from the camera to the mean. Where the sum is
-below -1/2, a channel is black and its derivative by harmonics and direction is 0, as the function's is: a channel that is black
-in all photographs stays so in a fit. Opacity, place and shape keep theirs there.
+Conventions. Arrays of the cloud are flat, Gaussian after Gaussian; splats have an array for each component. Colours are
+max(0, 1/2 + sum Y_b k_b), with the basis of ``dr.sh_eval`` and the direction from the camera to the mean. If the sum is below
+-1/2, the channel is black and its derivative by harmonics and direction is 0, as the derivative of the function is: a channel
+black in all photographs stays black in a fit. Opacity, place and shape keep their derivatives. The numbers of a camera are on
+the device, so kernels do not depend on its pose.
 
 References: Zwicker et al. 2001 (EWA); Kerbl et al. 2023 (the model); Yu et al. 2024 (mip-splatting: compensated opacity).
 """
@@ -33,7 +34,7 @@ from mivol.photos.camera import FLIP, Camera
 __all__ = ["Cloud", "Filter", "Splats", "project", "View", "pack_view"]
 
 LEAST_COMPENSATION = 1e-12
-"""Squared factor below which the compensated opacity is not derived: with 1e-6 of its opacity no Gaussian is drawn."""
+"""Squared factor below which the compensated opacity has no derivative: with 1e-6 of its opacity no Gaussian is drawn."""
 
 LEAST_QUATERNION = 2.0**-100
 """Largest component below which a quaternion has lost its direction: components of 2^-26 of it are still normal numbers."""
@@ -59,7 +60,7 @@ class Cloud:
         return Cloud(**{name: _columns(flat[name], size, count) for name, size in _sizes(degree).items()})
 
     def write(self, parts: Cloud) -> None:
-        """Take the numbers of a cloud that is split, or of its derivatives."""
+        """Write the components of a split cloud, or of its derivatives, into these flat arrays."""
         for field in dataclasses.fields(self):
             flat, components = getattr(self, field.name), getattr(parts, field.name)
             index, side = dr.arange(mi.UInt32, dr.width(components[0])), _packet(len(components))
@@ -71,27 +72,27 @@ class Cloud:
 def _columns(flat: mi.Float, size: int, count: int) -> list[mi.Float]:
     """The components of a table of ``count`` rows of ``size`` numbers, each an array."""
     index, side = dr.arange(mi.UInt32, count), _packet(size)
-    found = [dr.gather(mi.ArrayXf, flat, index * (size // side) + c, shape=(side, count)) for c in range(size // side)]
-    return [value for packet in found for value in packet]
+    packets = [dr.gather(mi.ArrayXf, flat, index * (size // side) + c, shape=(side, count)) for c in range(size // side)]
+    return [value for packet in packets for value in packet]
 
 
 def _packet(size: int) -> int:
-    """How many neighbours of a row are read and written at once: the largest power of two that divides it, up to 16."""
+    """Neighbours of a row to read or write at once: the largest power of two dividing its length, up to 16."""
     return math.gcd(size, 16)
 
 
 def _sizes(degree: int) -> dict[str, int]:
-    """Numbers of a Gaussian."""
+    """Numbers of a Gaussian, by tensor."""
     return {"means": 3, "log_scales": 3, "quaternions": 4, "opacity_logits": 1, "harmonics": 3 * (degree + 1) ** 2}
 
 
 @dataclass
 class Filter:
-    """What is taken of a cloud into a picture.
+    """Filters between a cloud and an image.
 
     Attributes:
-        low_pass: s [pixel^2] of this picture.
-        near: least depth of a mean that is drawn [length].
+        low_pass: s [pixel^2] of this image.
+        near: least depth of the mean of a drawn Gaussian [length].
         sheen: factor on all harmonics but the constant one.
     """
 
@@ -106,12 +107,12 @@ class Splats:
 
     Attributes:
         x, y: centre [pixel].
-        xx, xy, yy: of the exponent, alpha = opacity 2^(xx dx^2 + xy dx dy + yy dy^2).
-        opacity: at the centre, in [0, 1].
+        xx, xy, yy: coefficients of the exponent, alpha = opacity 2^(xx dx^2 + xy dx dy + yy dy^2).
+        opacity: opacity at the centre, in [0, 1].
         colour: rgb code values, >= 0.
-        depth: along the view [length].
-        drawn: whether it stands in front of the camera, and all its numbers are finite.
-        faulty: NaN among its numbers, or a quaternion of no direction: 0 (below 2^-100), or infinite.
+        depth: distance along the view [length].
+        drawn: whether the splat is in front of the camera, and all its numbers are finite.
+        faulty: NaN among its numbers, or a quaternion without direction: 0 (below 2^-100), or infinite.
     """
 
     x: mi.Float
@@ -130,7 +131,7 @@ class Splats:
         return [self.x, self.y, self.xx, self.xy, self.yy, self.opacity, self.colour[0], self.colour[1]]
 
     def rest(self) -> list[mi.Float]:
-        """The two numbers that it reads beside them: blue, depth."""
+        """The two other numbers for compositing: blue, depth."""
         return [self.colour[2], self.depth]
 
 
@@ -139,9 +140,9 @@ def project(cloud: Cloud, view: View, filtering: Filter, degree: int, compensate
 
     Args:
         cloud: N Gaussians, split.
-        view: who looks.
+        view: the camera.
         filtering: the low-pass filter and the near plane.
-        degree: of the harmonics.
+        degree: degree of the harmonics.
         compensated: whether the low-pass filter keeps the integral of alpha (the mip filter), instead of its peak.
     """
     mean, log_scale = mi.Point3f(*cloud.means), mi.Vector3f(*cloud.log_scales)
@@ -180,16 +181,16 @@ def project(cloud: Cloud, view: View, filtering: Filter, degree: int, compensate
     )
     total = dr.detach(splats.x + splats.y + splats.xx + splats.xy + splats.yy + z)
     splats.drawn &= dr.isfinite(total) & dr.isfinite(det) & (det > 0)
-    given = dr.detach(mean.x + mean.y + mean.z + log_scale.x + log_scale.y + log_scale.z + opacity + sum(splats.colour))
-    splats.faulty |= dr.isnan(given)
+    total = dr.detach(mean.x + mean.y + mean.z + log_scale.x + log_scale.y + log_scale.z + opacity + sum(splats.colour))
+    splats.faulty |= dr.isnan(total)
     return splats
 
 
 def _bounded(quaternion: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Bool]:
-    """A quaternion whose largest component is 1 or -1, and whether it has a direction at all (else it is the identity).
+    """Scale a quaternion to a largest component of 1 or -1; also returns whether it has a direction (else it is the identity).
 
-    The squared length of one of 1e-20 is 0 in float32 and that of one of 1e20 is infinite; both have a direction. The factor is
-    a constant for derivatives: a rotation does not depend on the length of its quaternion.
+    The squared length of a quaternion of 1e-20 is 0 in float32 and the squared length of a quaternion of 1e20 is infinite;
+    both have a direction. The factor is a constant for derivatives: a rotation does not depend on the length of its quaternion.
     """
     largest = dr.detach(dr.maximum(*[dr.maximum(dr.abs(a), dr.abs(b)) for a, b in (quaternion[:2], quaternion[2:])]))
     has_direction = (largest >= LEAST_QUATERNION) & dr.isfinite(largest) & ~dr.isnan(dr.detach(sum(quaternion)))
@@ -223,8 +224,9 @@ def _colour(harmonics: list[mi.Float], d: mi.Vector3f, degree: int, sheen: mi.Fl
 
 
 REACH = 0.3
-"""How far beyond the border of the image, in units of the tangent of half its angle, the perspective is linearised where a
-Gaussian stands; beyond that, where it would be at that limit (Kerbl et al. 2023: 1.3 times the tangent)."""
+"""Reach of the linearised perspective beyond the border of the image, in units of the tangent of half its angle. A Gaussian
+further out is linearised at this limit (Kerbl et al. 2023: 1.3 times the tangent).
+"""
 
 
 @dataclass
@@ -232,12 +234,12 @@ class View:
     """A pinhole camera on the device.
 
     Attributes:
-        origin: where it stands.
-        right, down, forward: its axes in the world.
+        origin: place of the camera.
+        right, down, forward: axes of the camera in the world.
         focal, centre: [pixel].
-        low, high: between which x / z and y / z the perspective is linearised.
-        turn, shift: a small motion of the camera, 0, by which the picture can be derived: a rotation vector about the
-            camera's place, in the world's axes [rad], and a translation in the world [length].
+        low, high: bounds of x / z and y / z for the linearised perspective.
+        turn, shift: a small motion of the camera, 0, for derivatives of the image: a rotation vector about the place of the
+            camera, in the axes of the world [rad], and a translation in the world [length].
     """
 
     origin: mi.Point3f
@@ -261,14 +263,14 @@ class View:
 
 
 def pack_view(camera: Camera, size: tuple[int, int]) -> mi.Float:
-    """A camera as one array on the device: the numbers of a :class:`View`, in the order of its attributes.
+    """Pack a camera into an array on the device: the numbers of a :class:`View`, in the order of its attributes.
 
     Args:
         camera: without a distorting lens.
-        size: (width, height) of the picture [pixel].
+        size: (width, height) of the image [pixel].
 
     Raises:
-        MivolError: the camera's image is of another size, or its lens distorts.
+        MivolError: the image of the camera has another size, or the lens distorts.
     """
     if camera.size != size:
         raise MivolError(

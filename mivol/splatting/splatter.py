@@ -1,11 +1,11 @@
-"""Pictures of Gaussians, and derivatives by everything that a picture depends on: the renderer that fits use.
+"""The renderer of fits of Gaussians: images, and derivatives by every input of an image.
 
-Conventions. The cloud is given as Dr.Jit tensors by name, as :mod:`mivol.points.gaussians` describes them: "means" (N, 3)
-[length], "log_scales" (N, 3), "quaternions" (N, 4), (w, x, y, z) of any length, "opacity_logits" (N,), "harmonics" (N, K, 3).
-Pictures are (height, width, 4): rgb multiplied by alpha, and alpha; black where nothing is. What stands behind the cloud is
-added as ``rgb + (1 - alpha) background``.
+Conventions. A cloud is a dictionary of Dr.Jit tensors, as in :mod:`mivol.points.gaussians`: "means" (N, 3) [length],
+"log_scales" (N, 3), "quaternions" (N, 4), (w, x, y, z) of any length, "opacity_logits" (N,), "harmonics" (N, K, 3). Images are
+(height, width, 4): rgb multiplied by alpha, and alpha; black without Gaussians. A background behind the cloud is added as
+``rgb + (1 - alpha) background``.
 
-Kernels are recorded once (``dr.freeze``) and launched for any number of Gaussians, any pose and any lists without tracing.
+Kernels are recorded once (``dr.freeze``) and launched without tracing for any number of Gaussians, any pose and any lists.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, View, pack_v
 from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, nearest_first, write_tiles
 from mivol.threads import check_one_thread
 
-__all__ = ["NAMES", "SplatterCache", "Splatter", "Statistics", "to_tensors"]
+__all__ = ["NAMES", "SplatterCache", "Splatter", "ScreenStatistics", "to_tensors"]
 
 NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
 """The tensors of a cloud."""
 
 ENTRY_BYTES = 4 * (4 + LANES * PIXELS // CHUNK)
-"""Of an entry of a list: itself, what sorting takes, and T of the tile once in ``CHUNK`` entries."""
+"""Memory of an entry of a list: the entry, its sorting, and T of the tile once in ``CHUNK`` entries."""
 
 
 @dataclass(frozen=True, eq=False)
 class SplatterCache:
-    """What a picture keeps for its derivatives; valid until the splatter draws the next one."""
+    """Intermediate results of an image for its derivatives; valid until the splatter draws the next image."""
 
     cloud: Cloud
     view: mi.Float
@@ -48,57 +48,57 @@ class SplatterCache:
     lists: Lists
     frame: Frame
     chunks: mi.UInt32
-    seen: np.ndarray
+    visible: np.ndarray
     radius: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Statistics:
-    """What density control asks of a picture.
+class ScreenStatistics:
+    """Statistics of an image for density control.
 
     Attributes:
-        seen: (N,) bool, listed in at least one tile.
+        visible: (N,) bool, listed in at least one tile.
         d_mean2d: (N,) norm of the derivative by the projected mean [1/pixel].
-        radius: (N,) three standard deviations along the longer axis of the ellipse [pixel]; 0 where it is not seen.
+        radius: (N,) three standard deviations along the longer axis of the ellipse [pixel]; 0 for an invisible Gaussian.
     """
 
-    seen: np.ndarray
+    visible: np.ndarray
     d_mean2d: np.ndarray
     radius: np.ndarray
 
 
 def to_tensors(gaussians: Gaussians) -> dict[str, mi.TensorXf]:
-    """The tensors of a cloud by name, as :meth:`Splatter.forward` takes them."""
+    """The tensors of a cloud by name, for :meth:`Splatter.forward`."""
     return {name: mi.TensorXf(getattr(gaussians, name)) for name in NAMES}
 
 
 class Splatter:
-    """Draws clouds of Gaussians by tile-based EWA splatting, and takes derivatives back.
+    """Draws clouds of Gaussians by tile-based EWA splatting, with derivatives.
 
     Args:
-        width, height: of the picture [pixel].
-        degree: of the harmonics, 0 to 9.
-        low_pass: variance that is added to every ellipse [pixel^2 of the judged picture].
-        judged_width: width at which pictures are judged [pixel]; the low-pass filter is that of this resolution, so that a
-            fit at a lower one learns no blur. The picture's own by default.
+        width, height: size of the image [pixel].
+        degree: degree of the harmonics, 0 to 9.
+        low_pass: variance added to every ellipse [pixel^2 of the judged image].
+        judged_width: width at which images are judged [pixel], by default the width of the image. The low-pass filter belongs
+            to this resolution, so a fit at a lower resolution learns no blur.
         compensated: keep the integral of alpha under the low-pass filter (mip-splatting), instead of its peak.
-        depth: give the expected depth, multiplied by alpha, as a channel between rgb and alpha.
-        median: give in its place the depth of the splat at which less than half of the light is left; 0 where more gets
-            through. Such pictures have no derivatives.
-        discs: draw a splat as the inside of its ellipse of one standard deviation, each pixel by the share that it covers of
-            it: a point of a given radius. Such pictures have no derivatives.
-        near: least depth of a mean that is drawn [length]. A Gaussian that reaches across the camera is drawn if its mean is in
-            front of this plane.
-        sheen: factor on all harmonics but the constant one. A fit that keeps those divided by it gives them a learning rate
-            that is smaller by as much.
-        least_alpha: a splat is skipped in pixels where its alpha is below.
+        depth: add the expected depth, multiplied by alpha, as a channel between rgb and alpha.
+        median: replace the expected depth by the depth of the splat at which the transmittance falls below a half; 0 if more
+            light passes all splats. Such images have no derivatives.
+        discs: draw a splat as the inside of its ellipse of one standard deviation, a point of a given radius; each pixel gets
+            the covered share of its area. Such images have no derivatives.
+        near: least depth of the mean of a drawn Gaussian [length]. A Gaussian reaching across the camera is drawn if its mean
+            is in front of this plane.
+        sheen: factor on all harmonics but the constant one. A fit that stores harmonics divided by the factor gives them a
+            learning rate smaller by the factor.
+        least_alpha: a splat is skipped in pixels where its alpha is below this number.
 
     Raises:
-        MivolError: a size, degree or filter that makes no sense, or a Mitsuba variant that does not compile.
+        MivolError: an impossible size, degree or filter, or a Mitsuba variant that does not compile.
 
     Example:
         >>> gaussians = mivol.read_gaussians("biker.ply")
-        >>> picture, _ = Splatter(800, 800, gaussians.degree).forward(to_tensors(gaussians), camera)
+        >>> image, _ = Splatter(800, 800, gaussians.degree).forward(to_tensors(gaussians), camera)
     """
 
     def __init__(
@@ -142,15 +142,15 @@ class Splatter:
 
         Args:
             reals: the tensors of the cloud by name; no derivatives are tracked through them.
-            camera: a pinhole of the splatter's size.
-            derivatives: whether :meth:`vjp_rays` will be asked; without, less memory is taken.
+            camera: a pinhole of the size of the splatter.
+            derivatives: whether :meth:`backward` will be called; False saves memory.
 
         Returns:
-            The picture (height, width, 4 or 5), and what its derivatives need.
+            The image (height, width, 4 or 5), and the cache for its derivatives.
 
         Raises:
-            MivolError: tensors of the wrong shape, NaN or a quaternion of no direction in them, a camera of another size or
-                with a lens that distorts, or lists that do not fit into memory.
+            MivolError: tensors of the wrong shape, NaN or a quaternion without direction in them, a camera of another size or
+                with a distorting lens, or lists that do not fit into memory.
         """
         check_one_thread()
         shapes = _checked_shapes(reals, self.degree)
@@ -167,48 +167,50 @@ class Splatter:
         lists = self._list(shape, np.array(depth), counts)
         frame = self._frame(lists, derivatives)
         image, chunks, frame.transmittance = self._composite((shape, rest), lists, self._grid, frame)
-        seen = counts > 0
-        kept = SplatterCache(cloud, view, shapes, shape, rest, lists, frame, chunks, seen, np.where(seen, np.array(radius), 0))
-        return self._tensor(image), kept
+        visible = counts > 0
+        cache = SplatterCache(
+            cloud, view, shapes, shape, rest, lists, frame, chunks, visible, np.where(visible, np.array(radius), 0)
+        )
+        return self._tensor(image), cache
 
-    def backward(self, kept: SplatterCache, d_picture: mi.TensorXf) -> tuple[dict[str, mi.TensorXf], Statistics]:
-        """The derivatives of a number L by everything that a picture was made of.
+    def backward(self, cache: SplatterCache, d_image: mi.TensorXf) -> tuple[dict[str, mi.TensorXf], ScreenStatistics]:
+        """The derivatives of a number L by every input of an image.
 
         Args:
-            kept: of :meth:`forward`.
-            d_picture: the derivative of L by each number of the picture, of its shape.
+            cache: from :meth:`forward`.
+            d_image: derivative of L by each number of the image, of the shape of the image.
 
         Returns:
-            The derivatives by name, of the shapes of the cloud's tensors, and under "pose" (6,) those by a small motion of the
-            camera: a rotation vector about its place, in the world's axes [1/rad], and a translation in the world [1/length].
-            And the statistics of the screen.
+            The derivatives by name, of the shapes of the tensors of the cloud, with "pose" (6,): derivatives by a small motion
+            of the camera, a rotation vector about its place in the axes of the world [1/rad] and a translation in the world
+            [1/length]. The second result is the statistics of the screen.
 
         Raises:
-            MivolError: a derivative of another shape, or a picture drawn without derivatives, with a median depth or of discs.
+            MivolError: a derivative of another shape, or an image drawn without derivatives, with a median depth or of discs.
         """
-        if tuple(d_picture.shape) != (self.size[1], self.size[0], self.channels):
+        if tuple(d_image.shape) != (self.size[1], self.size[0], self.channels):
             raise MivolError(
-                f"Found a derivative of shape {tuple(d_picture.shape)}, expected the picture's "
+                f"Found a derivative of shape {tuple(d_image.shape)}, expected the image's "
                 f"{(self.size[1], self.size[0], self.channels)}."
             )
         if self.median or self.discs:
-            found = "of discs, which have" if self.discs else "with the median depth, which has"
-            raise MivolError(f"Found a picture {found} no derivatives: make a Splatter of Gaussians with depth=True instead.")
-        if not kept.frame.remembers:
-            raise MivolError("Found a picture that was drawn with derivatives=False: draw it again with derivatives=True.")
-        n = kept.shapes["means"][0]
+            kind = "of discs, which have" if self.discs else "with the median depth, which has"
+            raise MivolError(f"Found an image {kind} no derivatives: make a Splatter of Gaussians with depth=True instead.")
+        if not cache.frame.remembers:
+            raise MivolError("Found an image drawn with derivatives=False: draw it again with derivatives=True.")
+        n = cache.shapes["means"][0]
         if n == 0:
-            gradient = {name: dr.zeros(mi.TensorXf, shape) for name, shape in kept.shapes.items()}
+            gradient = {name: dr.zeros(mi.TensorXf, shape) for name, shape in cache.shapes.items()}
             nothing = np.zeros(0, np.float32)
-            return gradient | {"pose": dr.zeros(mi.TensorXf, (6,))}, Statistics(np.zeros(0, bool), nothing, nothing)
-        adjoint = Adjoint(dr.detach(d_picture.array), kept.chunks, _blank(8 * _capacity(n)), _blank(2 * _capacity(n)))
+            return gradient | {"pose": dr.zeros(mi.TensorXf, (6,))}, ScreenStatistics(np.zeros(0, bool), nothing, nothing)
+        adjoint = Adjoint(dr.detach(d_image.array), cache.chunks, _blank(8 * _capacity(n)), _blank(2 * _capacity(n)))
         # Not recorded: the copies of the target that each thread adds to are of a size that a recording would hold fast.
-        adjoint = composite_adjoint((kept.shape, kept.rest), kept.lists, self._grid, kept.frame, adjoint)
-        target = Cloud(*[_blank(int(np.prod(kept.shapes[name]))) for name in NAMES])
-        d_cloud, pose, d_mean2d = self._project_adjoint(kept.cloud, kept.view, self._filter, adjoint, target)
-        gradient = {name: mi.TensorXf(getattr(d_cloud, name), kept.shapes[name]) for name in NAMES}
+        adjoint = composite_adjoint((cache.shape, cache.rest), cache.lists, self._grid, cache.frame, adjoint)
+        target = Cloud(*[_blank(int(np.prod(cache.shapes[name]))) for name in NAMES])
+        d_cloud, pose, d_mean2d = self._project_adjoint(cache.cloud, cache.view, self._filter, adjoint, target)
+        gradient = {name: mi.TensorXf(getattr(d_cloud, name), cache.shapes[name]) for name in NAMES}
         gradient["pose"] = mi.TensorXf(np.array([np.array(d).sum(dtype=np.float64) for d in pose], np.float32))
-        return gradient, Statistics(kept.seen, np.array(d_mean2d), kept.radius)
+        return gradient, ScreenStatistics(cache.visible, np.array(d_mean2d), cache.radius)
 
     # -- What is recorded --------------------------------------------------------------------------------------------------
 
@@ -242,7 +244,7 @@ class Splatter:
     # -- Lists ---------------------------------------------------------------------------------------------------------------
 
     def _list(self, shape: mi.Float, depth: np.ndarray, counts: np.ndarray) -> Lists:
-        """Lists of all tiles, and the order in which tiles are drawn: the longest first, so that no core ends late."""
+        """Lists of tiles, and the order for drawing tiles: the longest list first, so that no core ends late."""
         self._check_room(counts)
         order = nearest_first(depth, np.flatnonzero(counts))
         offsets = np.zeros(len(order) + 1, np.int32)
@@ -263,7 +265,7 @@ class Splatter:
 
     def _check_room(self, counts: np.ndarray) -> None:
         total = int(counts.sum(dtype=np.int64))
-        check_memory(total * ENTRY_BYTES, available_memory(), total, f"{int((counts > 0).sum()):,} Gaussians are seen")
+        check_memory(total * ENTRY_BYTES, available_memory(), total, f"{int((counts > 0).sum()):,} Gaussians are visible")
 
     def _frame(self, lists: Lists, derivatives: bool) -> Frame:
         width, height = self.size
@@ -275,29 +277,29 @@ class Splatter:
     def _nothing(
         self, cloud: Cloud, view: mi.Float, shapes: Mapping[str, tuple[int, ...]]
     ) -> tuple[mi.TensorXf, SplatterCache]:
-        """The picture of a cloud without Gaussians."""
+        """The image of a cloud without Gaussians."""
         nothing, empty = mi.Float(), np.zeros(0, np.float32)
         lists = Lists(mi.UInt32(), mi.UInt32(), mi.UInt32(), mi.UInt32())
         frame = Frame(self._width, self._height, nothing, nothing, self.depth, self.median, True, self.discs)
-        kept = SplatterCache(cloud, view, shapes, nothing, nothing, lists, frame, mi.UInt32(), np.zeros(0, bool), empty)
-        return dr.zeros(mi.TensorXf, (self.size[1], self.size[0], self.channels)), kept
+        cache = SplatterCache(cloud, view, shapes, nothing, nothing, lists, frame, mi.UInt32(), np.zeros(0, bool), empty)
+        return dr.zeros(mi.TensorXf, (self.size[1], self.size[0], self.channels)), cache
 
     def _tensor(self, image: mi.Float) -> mi.TensorXf:
         return mi.TensorXf(image, (self.size[1], self.size[0], self.channels))
 
 
 def _blank(size: int) -> mi.Float:
-    """Zeros in memory, whose number no kernel knows."""
+    """Zeros in memory, a number unknown to kernels."""
     return dr.opaque(mi.Float, 0, size)
 
 
 def _capacity(n: int) -> int:
-    """Gaussians that there is room for where derivatives are added up: the size of this array is part of the kernel."""
+    """Room for derivatives of Gaussians: the size of this array is part of the kernel."""
     return max(4096, 1 << (n - 1).bit_length())
 
 
 def _derivatives(splats: Splats, d_shape: mi.Float, d_rest: mi.Float) -> list[mi.Float]:
-    """Derivatives by the ten numbers of each splat, of the sums that compositing has made."""
+    """Derivatives by the ten numbers of each splat, from the sums of compositing."""
     index = dr.arange(mi.UInt32, dr.width(splats.x))
     x, y, xx, xy, yy, opacity, red, green = dr.gather(mi.ArrayXf, d_shape, index, shape=(8, dr.width(index)))
     blue, depth = dr.gather(mi.ArrayXf, d_rest, index, shape=(2, dr.width(index)))
@@ -327,7 +329,7 @@ def _check_settings(
     width: int, height: int, degree: int, low_pass: float, near: float, sheen: float, least_alpha: float
 ) -> None:
     if min(width, height) < 1 or max(width, height) > 1 << 15:
-        raise MivolError(f"Found a picture of {width} x {height} pixels, expected 1 to {1 << 15} along each edge.")
+        raise MivolError(f"Found an image of {width} x {height} pixels, expected 1 to {1 << 15} along each edge.")
     if not 0 <= degree <= 9:
         raise MivolError(f"Found harmonics of degree {degree}, expected 0 to 9.")
     if not 0 < low_pass < np.inf:
@@ -335,7 +337,7 @@ def _check_settings(
     if not 0 < near < np.inf:
         raise MivolError(f"Found near = {near:g}, expected a depth above 0.")
     if not 0 < sheen < np.inf:
-        raise MivolError(f"Found sheen = {sheen:g}, expected a factor above 0 (1 takes harmonics as they are).")
+        raise MivolError(f"Found sheen = {sheen:g}, expected a factor above 0 (1 leaves harmonics unchanged).")
     if not 0 < least_alpha < 1:
         raise MivolError(f"Found least_alpha = {least_alpha:g}, expected a number between 0 and 1 (1/255 is usual).")
 

@@ -1,9 +1,9 @@
-"""Which splats reach which tile of the image, nearest first.
+"""The splats in each tile of an image, nearest first.
 
-A splat is listed in a tile if its alpha is at least ``least_alpha`` somewhere in the rectangle that the centres of the tile's
-pixels span. That is decided exactly: an ellipse cuts an interval out of each row of tiles, and both its ends are closed forms.
-Lists are sorted by (tile, depth, index of the Gaussian): entries are made in the order of depth, and a transposition of a
-sparse matrix, which is a stable counting sort, brings them to their tiles.
+A tile lists a splat if its alpha is at least ``least_alpha`` somewhere in the rectangle spanned by the centres of the pixels
+of the tile. The decision is exact: an ellipse cuts an interval out of each row of tiles, and both ends of the interval are
+closed forms. Lists are sorted by (tile, depth, index of the Gaussian). Entries are made in the order of depth, and the
+transposition of a sparse matrix, a stable counting sort, brings them to their tiles.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ TILE = 8
 """Pixels along the edge of a tile. 4 and 16 are slower."""
 
 MOST_ENTRIES = 1 << 28
-"""Of all lists: T of 64 pixels once in 4 entries is 16 numbers an entry, and places in memory are counted in 32 bits."""
+"""Largest number of entries, all lists together: T of 64 pixels once in 4 entries is 16 numbers an entry, and addresses are 32
+bits.
+"""
 
 SLACK = 1e-3
-"""By how much an ellipse is widened before it is listed [pixel]: far more than its centre and its radii are rounded by."""
+"""Widening of an ellipse before it is listed [pixel]: far more than the rounding of its centre and its radii."""
 
 
 @dataclass
@@ -34,8 +36,8 @@ class Grid:
     """The tiles of an image, opaque to kernels.
 
     Attributes:
-        columns, rows: how many tiles.
-        least: alpha from which on a splat is drawn.
+        columns, rows: number of tiles.
+        least: least alpha of a drawn splat.
     """
 
     columns: mi.Int32
@@ -45,11 +47,11 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """Entries of all tiles, one tile after the other.
+    """Entries of the tiles, tile after tile.
 
     Attributes:
         entries: (E,) uint32 index of a splat.
-        starts: (tiles + 1,) where each tile's list begins in ``entries``.
+        starts: (tiles + 1,) beginning of the list of each tile in ``entries``.
     """
 
     entries: np.ndarray
@@ -58,7 +60,7 @@ class TileLists:
 
 @dataclass
 class _Ellipse:
-    """alpha >= least: centre, and what its intervals are made of."""
+    """alpha >= least: centre, and the numbers for its intervals."""
 
     x: mi.Float
     y: mi.Float
@@ -84,11 +86,11 @@ class _Ellipse:
         return cls(x, y, reach_x, reach_y, top_at, slope, level * dr.rcp(xx), drawn)
 
     def rows(self, grid: Grid) -> tuple[mi.Int32, mi.Int32]:
-        """First row of tiles, and the one behind the last."""
+        """First row of tiles, and the row behind the last."""
         return _tiles(self.y - self.reach_y, self.y + self.reach_y, grid.rows, self.drawn)
 
     def columns(self, row: mi.Int32, grid: Grid) -> tuple[mi.Int32, mi.Int32]:
-        """First column of tiles that it reaches in a row of tiles, and the one behind the last."""
+        """First column of tiles in a row of tiles, and the column behind the last."""
         low = mi.Float(row * TILE) + 0.5 - self.y
         high = low + (TILE - 1)
         low, high = dr.maximum(low, -self.reach_y), dr.minimum(high, self.reach_y)
@@ -97,13 +99,13 @@ class _Ellipse:
         return _tiles(self.x + left, self.x + right, grid.columns, self.drawn)
 
     def _end(self, dy: mi.Float, side: int) -> mi.Float:
-        """Where the horizontal line at ``dy`` leaves the ellipse."""
+        """Offset at which the horizontal line at ``dy`` leaves the ellipse."""
         within = dr.sqrt(dr.maximum(1 - dr.square(dy * dr.rcp(dr.maximum(self.reach_y, 1e-30))), 0))
         return self.slope * dy + side * within * dr.sqrt(self.inner)
 
 
 def _tiles(low: mi.Float, high: mi.Float, count: mi.Int32, drawn: mi.Bool) -> tuple[mi.Int32, mi.Int32]:
-    """Tiles with a pixel's centre in [low, high]: the first, and the one behind the last."""
+    """Tiles with the centre of a pixel in [low, high]: the first tile, and the tile behind the last."""
     end = mi.Float(count)
     first = dr.clip(dr.ceil((low - SLACK - (TILE - 0.5)) / TILE), 0, end)
     behind = dr.clip(dr.floor((high + SLACK - 0.5) / TILE) + 1, first, end)
@@ -111,11 +113,11 @@ def _tiles(low: mi.Float, high: mi.Float, count: mi.Int32, drawn: mi.Bool) -> tu
 
 
 def count_tiles(shape: mi.Float, drawn: mi.Bool, grid: Grid) -> mi.UInt32:
-    """In how many tiles each splat is listed.
+    """Count the tiles of each splat.
 
     Args:
         shape: eight numbers a splat, as :meth:`mivol.splatting.projection.Splats.shape`.
-        drawn: whether a splat is drawn at all.
+        drawn: whether a splat is drawn.
         grid: the tiles.
     """
     ellipse = _Ellipse.of(shape, grid, dr.arange(mi.UInt32, dr.width(drawn)), mi.Bool(drawn))
@@ -130,13 +132,13 @@ def count_tiles(shape: mi.Float, drawn: mi.Bool, grid: Grid) -> mi.UInt32:
 
 
 def write_tiles(shape: mi.Float, order: mi.UInt32, offsets: mi.UInt32, target: mi.Int32, grid: Grid) -> mi.Int32:
-    """The tiles of some splats.
+    """Write the tiles of some splats.
 
     Args:
-        shape: of all splats.
-        order: indices of those that are listed.
-        offsets: where the tiles of each begin in ``target``.
-        target: takes the tiles, row by row.
+        shape: eight numbers for every splat.
+        order: indices of the listed splats.
+        offsets: beginning of the tiles of each splat in ``target``.
+        target: receives the tiles, row by row.
         grid: the tiles.
     """
     ellipse = _Ellipse.of(shape, grid, order, mi.Bool(True))
@@ -160,8 +162,8 @@ def write_tiles(shape: mi.Float, order: mi.UInt32, offsets: mi.UInt32, target: m
 def nearest_first(depth: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """(n,) uint32 rows in ascending order of depth, the smaller row first at a tie.
 
-    Depth and row are sorted as one number of 64 bits, since bits of float32 numbers above 0 ascend as these do: a seventh of
-    the time of a stable sort of indices.
+    Depth and row are sorted as a single number of 64 bits, since bits of positive float32 numbers ascend as the numbers do: a
+    seventh of the time of a stable sort of indices.
 
     Args:
         depth: (N,) float32, above 0 in the rows.
@@ -173,13 +175,13 @@ def nearest_first(depth: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def list_tiles(tiles: np.ndarray, order: np.ndarray, offsets: np.ndarray, n_tiles: int) -> TileLists:
-    """Lists of all tiles.
+    """Make the lists of the tiles.
 
     Args:
-        tiles: (E,) int32 the tiles of the splats in ``order``, one splat after the other.
+        tiles: (E,) int32 tiles of the splats in ``order``, splat after splat.
         order: (n,) uint32 indices of splats, nearest first.
-        offsets: (n + 1,) int32 where the tiles of each begin.
-        n_tiles: how many tiles there are.
+        offsets: (n + 1,) int32 beginning of the tiles of each splat.
+        n_tiles: number of tiles.
     """
     if len(order) == 0:
         return TileLists(np.zeros(0, np.uint32), np.zeros(n_tiles + 1, np.uint32))
@@ -191,7 +193,7 @@ def check_memory(needed: int, available: int | None, entries: int, longest: str)
     """Refuse lists that do not fit.
 
     Raises:
-        MivolError: ``needed`` is more than half of what is ``available`` [bytes], or there are more than MOST_ENTRIES.
+        MivolError: ``needed`` is more than half of ``available`` [bytes], or ``entries`` exceeds MOST_ENTRIES.
     """
     if entries > MOST_ENTRIES:
         raise MivolError(

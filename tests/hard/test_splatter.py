@@ -151,8 +151,8 @@ def test_opacities_of_zero_and_one_by_infinite_logits(splatter: Splatter) -> Non
     np.testing.assert_array_equal(np.array(picture), np.array(alone))
     gradient, statistics = splatter.backward(kept, picture)
     assert all(np.isfinite(np.array(g)).all() for g in gradient.values())
-    assert not statistics.seen[0]
-    assert statistics.seen[1:].all()
+    assert not statistics.visible[0]
+    assert statistics.visible[1:].all()
     assert not np.array(gradient["means"])[0].any()
 
 
@@ -190,7 +190,7 @@ def test_nothing_behind_the_camera_is_drawn(splatter: Splatter, camera: Camera) 
     np.testing.assert_array_equal(np.array(picture), np.array(last))
     assert np.array(picture)[..., 3].max() > 0
     gradient, statistics = splatter.backward(kept, picture)
-    assert statistics.seen.tolist() == [False, False, True]
+    assert statistics.visible.tolist() == [False, False, True]
     assert all(np.isfinite(np.array(g)).all() for g in gradient.values())
 
 
@@ -286,8 +286,8 @@ def test_no_gaussian_is_seen(splatter: Splatter, camera: Camera, n: int) -> None
     gradient, statistics = splatter.backward(kept, picture)
     assert {name: g.shape for name, g in gradient.items()} == {name: v.shape for name, v in arrays.items()} | {"pose": (6,)}
     assert not any(np.array(g).any() for g in gradient.values())
-    assert statistics.seen.shape == (n,)
-    assert not statistics.seen.any()
+    assert statistics.visible.shape == (n,)
+    assert not statistics.visible.any()
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "quaternions", "opacity_logits", "harmonics"])
@@ -392,7 +392,7 @@ def test_cameras_and_derivatives_that_do_not_fit(splatter: Splatter, camera: Cam
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"width": 0}, "a picture of 0 x 8 pixels"),
+        ({"width": 0}, "an image of 0 x 8 pixels"),
         ({"degree": 10}, "degree 10, expected 0 to 9"),
         ({"low_pass": 0.0}, "low_pass = 0"),
         ({"near": -1.0}, "near = -1"),

@@ -37,7 +37,7 @@ from mivol.optim.problem import Reals, Refinement
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera
 from mivol.splatting import Splatter
-from mivol.splatting.splatter import Statistics
+from mivol.splatting.splatter import ScreenStatistics
 
 __all__ = ["GaussianProblem"]
 
@@ -150,7 +150,9 @@ class GaussianProblem:
             loss, gradient = self._sparse(reals, loss, gradient)
         return loss, gradient
 
-    def loss_of_view(self, reals: Reals, view: int, background: np.ndarray | None = None) -> tuple[mi.Float, Reals, Statistics]:
+    def loss_of_view(
+        self, reals: Reals, view: int, background: np.ndarray | None = None
+    ) -> tuple[mi.Float, Reals, ScreenStatistics]:
         """The loss of a view in the size of the stage, its gradient by the reals, and what the screen says of each Gaussian.
 
         Args:
@@ -319,9 +321,9 @@ class GaussianProblem:
         more = min(max(room, 0), max(1, len(self.cloud["means"]) // 20))
         return moved.then(grow(moved.cloud, more, self.plan.least_opacity, rng)) if more else moved
 
-    def _add_up(self, seen: Statistics) -> None:
-        self._slopes += np.where(seen.seen, seen.d_mean2d, 0)
-        self._times += seen.seen
+    def _add_up(self, seen: ScreenStatistics) -> None:
+        self._slopes += np.where(seen.visible, seen.d_mean2d, 0)
+        self._times += seen.visible
 
     def _forget_sums(self) -> None:
         """Begin to add up anew: the slope of each Gaussian's place on the screen, and how often it was seen."""
