@@ -1,11 +1,12 @@
-"""Measurements beside what else could be used: how fast and how exact mivol is, one module for each question.
+"""Benchmarks: the speed and accuracy of mivol beside other methods, one study for each subject.
 
-Conventions. A bench is a module whose docstring says what is asked and how it is measured; :func:`main` of that module
-reads the command line, prints JSON and writes it beside a figure. The scripts ``scripts/bench_*.py`` only call it. A
-``Size`` holds how much work is done: FULL is what the README quotes, QUICK is small and its times mean nothing. Contestants
-of one question run in turns on the same work (:mod:`mivol.bench.harness.timing`). Progress goes to standard error. No other
-room of mivol imports this one.
+Conventions. ``mivol bench NAME`` runs the study in ``studies/NAME``. A study asks questions; each question is a function from
+an amount of work (:class:`~mivol.bench.harness.study.Size`) to numbers for a JSON file. The full size gives the published
+figures. The quick size is for CI, and its times mean nothing. Standard output holds the JSON; progress goes to standard error.
+No other room of mivol imports this room, except ``cli/``.
 
-Shared: timing (clocks and turns), agreement (are two noisy means the same?), bars (a figure beside the value that the
-project promises), questions (the command line and the JSON), extinctions and scenes (the work), figures (panels).
+A new study is one file in ``studies/`` with a module docstring, whose first line is a question, and a constant ``STUDY``.
+
+Shared: ``harness`` (timing, contests, bars, command line, figures), ``extinctions`` and ``scenes`` (volumes and lights),
+``reference_walk`` (rays through a volume; the rate of this walk measures the speed of a machine).
 """

@@ -23,7 +23,7 @@ __all__ = [
     "glass_under_a_sky",
     "milk_in_a_glass",
     "milky_glass",
-    "of_depth",
+    "make_integrator",
     "perspective",
     "point_light",
     "sun_and_sky",
@@ -176,7 +176,7 @@ def milk_in_a_glass() -> dict:
     return milky_glass() | {"bsdf": {"type": "dielectric", "int_ior": water, "ext_ior": glass}, "glass": outside}
 
 
-def of_depth(name: str, depth: int, hide_emitters: bool = False) -> mi.Integrator:
+def make_integrator(name: str, depth: int, hide_emitters: bool = False) -> mi.Integrator:
     """That integrator with this ``max_depth``, made anew for each scene: ``prbvolpath`` keeps flags of the first scene it sees.
 
     Roulette begins at depth 64 for all, beyond which a path of an unlimited one hardly counts in scenes that absorb.

@@ -423,7 +423,7 @@ def test_the_tutorials_questions(variant_rgb: str, monkeypatch: pytest.MonkeyPat
     heard, rendered, loops = [], [], []
     monkeypatch.setattr(tutorial, "smoke", lambda: found)
     monkeypatch.setattr(tutorial, "half_circle", lambda side: [f"camera {k}, {side}" for k in range(2)])
-    monkeypatch.setattr(tutorial, "of_depth", lambda name, depth: f"{name} {depth}")
+    monkeypatch.setattr(tutorial, "make_integrator", lambda name, depth: f"{name} {depth}")
     monkeypatch.setattr(tutorial, "tutorial_scene", lambda tensor: np.array(tensor))
     monkeypatch.setattr(tutorial.mi, "load_dict", lambda scene: scene)
 

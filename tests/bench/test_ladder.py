@@ -94,7 +94,7 @@ def test_a_rung_is_rendered_and_differentiated(variant_rgb: str, monkeypatch: py
     heard, asked = [], []
     rung = replace(RUNGS["multiple scattering"], depth=7)
     monkeypatch.setattr(ladder.Rung, "scene", lambda self, values, side: ("scene", side))
-    monkeypatch.setattr(ladder, "of_depth", lambda name, depth: (name, depth))
+    monkeypatch.setattr(ladder, "make_integrator", lambda name, depth: (name, depth))
     monkeypatch.setattr(ladder, "Subject", lambda scene, integrator: SimpleNamespace(of_mean=("step", scene, integrator)))
     monkeypatch.setattr(ladder.mi, "render", lambda scene, **named: asked.append((scene, named)))
     monkeypatch.setattr(ladder, "_race", lambda steps, size: steps)

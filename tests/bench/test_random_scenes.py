@@ -235,7 +235,7 @@ def test_hard_scenes_are_followed_without_a_limit(monkeypatch: pytest.MonkeyPatc
         return np.full((2, 3, 3), [5.0, 2.0, 3.0][seed])
 
     monkeypatch.setattr(hard, "HARD", {"made up": lambda: "parts"})
-    monkeypatch.setattr(hard, "of_depth", lambda name, depth: (name, depth))
+    monkeypatch.setattr(hard, "make_integrator", lambda name, depth: (name, depth))
     monkeypatch.setattr(hard.mi, "load_dict", lambda parts: parts)
     monkeypatch.setattr(hard.mi, "render", render)
     found = hard.try_hard_scenes(replace(TINY, hard_pictures=3))

@@ -8,7 +8,7 @@ import pytest
 from scene_numbers import add_up
 
 from mivol.bench.extinctions import Extinction
-from mivol.bench.scenes import box_scene, of_depth, point_light, sun_and_sky
+from mivol.bench.scenes import box_scene, make_integrator, point_light, sun_and_sky
 from mivol.bench.studies import multiple_scattering, single_scattering
 from mivol.bench.studies.gradients.size import CONTESTS, TABLES
 from mivol.bench.studies.ladder import RUNGS
@@ -47,8 +47,8 @@ def test_the_sun_gives_a_third_of_the_light(variant_rgb: str) -> None:
 
 
 def test_integrators_scatter_once_and_are_made_anew(variant_rgb: str) -> None:
-    assert of_depth("volpath", 2) is not of_depth("volpath", 2)
-    assert "max_depth = 2" in str(of_depth("volpath", 2))
+    assert make_integrator("volpath", 2) is not make_integrator("volpath", 2)
+    assert "max_depth = 2" in str(make_integrator("volpath", 2))
 
 
 def test_scenes_of_the_benches_are_those_of_the_published_figures(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:

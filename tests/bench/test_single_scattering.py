@@ -17,7 +17,7 @@ from false_alarms import ALPHA, fresh, note
 from mivol.bench.harness import agreement
 from mivol.bench.harness.agreement import compare_means
 from mivol.bench.harness.timing import Budget, Timing
-from mivol.bench.scenes import box_scene, milk_in_a_glass, of_depth
+from mivol.bench.scenes import box_scene, milk_in_a_glass, make_integrator
 from mivol.bench.studies import single_scattering as bench
 from mivol.validate.statistics import Estimate
 
@@ -63,7 +63,7 @@ def test_renderers_agree_in_a_sky(variant_rgb: str, tmp_path, monkeypatch: pytes
 @pytest.mark.parametrize("name", bench.LIGHTS)
 def test_every_light_lights_the_medium(variant_rgb: str, name: str) -> None:
     scene = mi.load_dict(box_scene(fog(), 8, bench.ALBEDO, **bench.LIGHTS[name].parts()))
-    image = np.array(mi.render(scene, integrator=of_depth(bench.OURS, 2), spp=4, seed=0))
+    image = np.array(mi.render(scene, integrator=make_integrator(bench.OURS, 2), spp=4, seed=0))
     assert image[bench.optical_depths(scene) > bench.SEEN].mean() > 0.01
 
 
@@ -110,7 +110,7 @@ def test_pixels_at_the_emitter_do_not_count(variant_rgb: str) -> None:
     """The brightest pixel of a thin fog is at the emitter; it and its neighbours are left out, no others."""
     light = bench.LIGHTS["point light inside"]
     scene = mi.load_dict(box_scene(np.full((4, 4, 4), 0.1, np.float32), 24, 0.75, **light.parts()))
-    image = np.array(mi.render(scene, integrator=of_depth("mivol", 2), spp=64)).mean(axis=-1)
+    image = np.array(mi.render(scene, integrator=make_integrator("mivol", 2), spp=64)).mean(axis=-1)
     left_out = bench.pixels_from_emitter(scene, light, 24) <= bench.AT_EMITTER
     assert left_out[np.unravel_index(image.argmax(), image.shape)]
     # a disc of 1.5 pixels' radius holds the centres of 4 to 9 pixels
@@ -179,7 +179,7 @@ def test_a_difference_without_noise_is_beyond_every_bound() -> None:
 def test_renders_in_turns_have_seeds_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """12 samples: 12, 3 and 1 (not 0) by level; seeds tell the size, the place of the integrator, the level and the round."""
     asked, raced = [], []
-    monkeypatch.setattr(bench, "of_depth", lambda name, depth: (name, depth))
+    monkeypatch.setattr(bench, "make_integrator", lambda name, depth: (name, depth))
     monkeypatch.setattr(bench.mi, "render", lambda scene, integrator, spp, seed: asked.append((scene, integrator, spp, seed)))
     monkeypatch.setattr(bench, "race", lambda calls, rounds, keep: raced.append((rounds, keep)) or calls)
     light = bench.LIGHTS["constant light"]

@@ -1,1 +1,1 @@
-"""What all studies share: contestants in rounds, budgets, bars, the command line, JSON and figures."""
+"""The parts that all studies share: contests in rounds, agreement of means, bars, command line, JSON and figures."""

@@ -1,8 +1,8 @@
-"""Do two noisy measurements have the same mean? z, its bound by Student's t, and how small a bias could have been seen.
+"""Agreement of two noisy means: z, its bound by Student's t, and the smallest bias that the comparison would see.
 
-Conventions. Values are float64, one for each round (a round has its own seed); an error is a variance of a mean together
-with the degrees of freedom that it was estimated with (:class:`mivol.validate.statistics.Estimate`). A ratio of times between
-methods whose means differ says nothing, so every bench of unbiased methods judges their means first.
+Conventions. Values are float64, one for each round; a round has its own seed. An error is the variance of a mean with the
+degrees of freedom of its estimate (:class:`mivol.validate.statistics.Estimate`). A time ratio of two methods is meaningless
+if their means differ, so every study of unbiased methods compares the means first.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ import numpy as np
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate, Significance, effective_dof, z_bound, z_image
 
-__all__ = ["FALSE_ALARM", "compare_means", "finite", "mean_of_pixels", "mean_of_rounds", "number"]
+__all__ = ["FALSE_ALARM", "compare_means", "finite_or_none", "mean_of_pixels", "mean_of_rounds"]
 
 FALSE_ALARM = 1e-3
-"""Chance that a run of a bench in which all means agree is said not to."""
+"""Probability that a run reports a difference although all means agree."""
 
 
 def mean_of_rounds(values: np.ndarray) -> Estimate:
-    """The mean of independent values (rounds,), two at least."""
+    """Estimate the mean of at least two independent values (rounds,)."""
     m = Moments.of(values)
     return Estimate(float(m.mean), float(m.variance_of_mean), m.n - 1)
 
 
 def mean_of_pixels(rounds: np.ndarray) -> Estimate:
-    """The mean over rounds and pixels (rounds, pixels).
+    """Estimate the mean over rounds and pixels (rounds, pixels).
 
-    Pixels with samples of their own tell its variance well: it is the sum of theirs, with the degrees of freedom that
-    :func:`effective_dof` gives: few where one pixel has most of the noise. Rounds tell it whatever pixels
-    share (random numbers, in a tile). The larger of the two variances counts.
+    Two variances are known, and the larger one counts. The sum of the variances of the pixels has many degrees of freedom
+    (:func:`effective_dof`; few if one pixel has most of the noise), but misses noise shared by pixels, for instance random
+    numbers of a tile. The variance of the means of rounds has this shared noise.
     """
     shared = mean_of_rounds(rounds.mean(axis=1))
     v = Moments.of(rounds).variance_of_mean
@@ -45,28 +45,25 @@ def compare_means(a: Estimate, b: Estimate, comparisons: int) -> dict[str, float
     """Compare two means by Student's t with Welch's degrees of freedom.
 
     Args:
-        a, b: the second one is what percents are of.
-        comparisons: how many of them share FALSE_ALARM.
+        a: mean under test.
+        b: reference mean; percentages are relative to this mean.
+        comparisons: number of comparisons that share ``FALSE_ALARM``.
 
     Returns:
-        z of a - b, its bound, the difference and its standard error in percent of b; None where b, or both variances, are 0.
+        z of a - b, the bound of z, the difference and its standard error in percent of b. An infinite value is None: z for
+        means without variance, the percentages for b = 0.
     """
     variance = a.var + b.var
     dof = effective_dof(np.array([a.var, b.var]), np.array([a.dof, b.dof]))
     scale = 100 / abs(b.mean) if b.mean else math.inf
     return {
-        "z": finite(z_image(a, b)),
+        "z": finite_or_none(z_image(a, b)),
         "z_bound": float(z_bound(Significance(FALSE_ALARM, comparisons), dof)),
-        "percent": finite(scale * math.copysign(1, b.mean) * (a.mean - b.mean)),
-        "standard_error_percent": finite(scale * math.sqrt(variance)),
+        "percent": finite_or_none(scale * math.copysign(1, b.mean) * (a.mean - b.mean)),
+        "standard_error_percent": finite_or_none(scale * math.sqrt(variance)),
     }
 
 
-def finite(x: float) -> float | None:
-    """The number, or None: JSON has no infinity."""
+def finite_or_none(x: float) -> float | None:
+    """Replace infinity and NaN, which JSON lacks, by None."""
     return float(x) if np.isfinite(x) else None
-
-
-def number(x: float | None) -> float:
-    """The number, or NaN where there is none: to be printed."""
-    return math.nan if x is None else x

@@ -1,19 +1,19 @@
-"""A figure beside its bar, the value that the project promises of it."""
+"""Measured figures beside their bars. A bar is the bound that the project promises for a figure."""
 
 from __future__ import annotations
 
 import sys
 from typing import TypedDict
 
-__all__ = ["AT_LEAST", "AT_MOST", "Bar", "judge", "judge_agreement", "means_that_differ", "say"]
+__all__ = ["AT_LEAST", "AT_MOST", "Bar", "find_disagreements", "judge", "judge_agreement", "say", "say_row"]
 
 AT_LEAST, AT_MOST = "at least", "at most"
 AGREEMENT = "|z|: "
-"""With what the figures of :func:`judge_agreement` begin."""
+"""Prefix of the figures that :func:`judge_agreement` returns."""
 
 
 class Bar(TypedDict):
-    """A figure, its value, in which sense it is bounded, the bound, and whether it is met."""
+    """A figure: its label, its value, the sense and value of its bound, and whether the value meets the bound."""
 
     figure: str
     value: float
@@ -23,34 +23,40 @@ class Bar(TypedDict):
 
 
 def say(text: str) -> None:
-    """To standard error: standard output is for the JSON."""
+    """Print progress to standard error; standard output is for the JSON."""
     print(text, file=sys.stderr, flush=True)
 
 
-def judge(figure: str, value: float, sense: str, bar: float, aloud: bool = True) -> Bar:
-    """Put a figure beside its bar, and say it.
+def say_row(place: str, **numbers: float | None) -> None:
+    """Print a line of progress: a place and its numbers, with three digits."""
+    shown = (f"{name.replace('_', ' ')} {'none' if value is None else f'{value:.3g}'}" for name, value in numbers.items())
+    say(f"  {place}: {', '.join(shown)}")
+
+
+def judge(figure: str, value: float, sense: str, bar: float, quiet: bool = False) -> Bar:
+    """Compare a figure with its bar, and print both.
 
     Args:
-        figure: what was measured.
-        value: of it.
+        figure: label of the figure.
+        value: measured value.
         sense: AT_LEAST or AT_MOST.
-        bar: the bound.
-        aloud: say it in any case; else only where it misses.
+        bar: bound.
+        quiet: print only figures that miss their bar.
     """
     met = value >= bar if sense == AT_LEAST else value <= bar
-    if aloud or not met:
+    if not (quiet and met):
         say(f"  {figure}: {value:.3g}, bar {sense} {bar:g}{'' if met else ': MISSED'}")
     return {"figure": figure, "value": value, "sense": sense, "bar": bar, "met": bool(met)}
 
 
-def judge_agreement(what: str, z: float | None, bound: float) -> Bar:
-    """Put the difference of two means, in standard errors, beside its bound; said only where it is beyond.
+def judge_agreement(label: str, z: float | None, bound: float) -> Bar:
+    """Compare the difference of two means, in standard errors, with its bound; print only a difference above the bound.
 
-    Means that differ without any noise have no z (None); they count as beyond every bound.
+    Two different means without noise have no z (None) and miss every bound.
     """
-    return judge(AGREEMENT + what, sys.float_info.max if z is None else abs(z), AT_MOST, bound, aloud=False)
+    return judge(AGREEMENT + label, sys.float_info.max if z is None else abs(z), AT_MOST, bound, quiet=True)
 
 
-def means_that_differ(bars: list[Bar]) -> list[str]:
-    """Figures of :func:`judge_agreement` that are beyond their bound: ratios of such methods mean nothing."""
+def find_disagreements(bars: list[Bar]) -> list[str]:
+    """Labels of the means that differ. Time ratios of methods with different means are meaningless."""
     return [bar["figure"] for bar in bars if bar["figure"].startswith(AGREEMENT) and not bar["met"]]

@@ -1,4 +1,4 @@
-"""A bench as a command: its questions, its sizes, the machine it ran on, one JSON."""
+"""A study: its questions, the amount of work, its command line, and one JSON file with the machine and the versions."""
 
 from __future__ import annotations
 
@@ -8,142 +8,208 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import drjit as dr
 import mitsuba as mi
 import msgspec
 import numpy as np
 
-from mivol.bench.harness.bars import Bar, means_that_differ, say
+from mivol.bench.harness.bars import Bar, find_disagreements, say
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report.record import describe_machine, package_versions
 
-__all__ = ["Bench", "Expected", "Question", "called"]
-
-Question = Callable[[object], dict]
-"""Takes a size, returns an answer for the JSON; the first line of its docstring is what is asked. NumPy arrays in an answer
-are for its figure: the JSON leaves them out."""
+__all__ = ["Question", "ResultKind", "Size", "Study", "amount", "ask"]
 
 
-class Expected(NamedTuple):
-    """What a JSON of the same kind holds: the same values under some keys, and an answer to one of the questions at least."""
+def amount(full: Any, quick: Any = None, doc: str = "", kind: type | None = None) -> Any:
+    """Declare a field of a :class:`Size`.
+
+    Args:
+        full: value for published figures.
+        quick: value for CI; None: the same as ``full``.
+        doc: description with the unit, for ``--help``.
+        kind: type of the value on the command line; None: the type of ``full``.
+    """
+    kind = kind or (type(full[0]) if isinstance(full, tuple) else type(full))
+    return field(default=full, metadata={"quick": full if quick is None else quick, "doc": doc, "kind": kind})
+
+
+@dataclass(frozen=True)
+class Size:
+    """Amount of work of a study. Each field declared by :func:`amount` is also an option of the command line.
+
+    Attributes:
+        name: "full" or "quick", and the changed fields.
+    """
+
+    name: str = "full"
+
+    @classmethod
+    def quick(cls) -> Self:
+        """The amount of work for CI."""
+        return cls("quick", **{f.name: f.metadata["quick"] for f in fields(cls) if f.metadata})
+
+    def changed(self, **values: Any) -> Self:
+        """A size with other values, which its name lists."""
+        return replace(self, name=", ".join([self.name, *(f"{key}={value}" for key, value in values.items())]), **values)
+
+
+Question = Callable[[Any], dict]
+"""Size -> answer for the JSON; the first line of the docstring is the question. An answer may hold NumPy arrays for the figure;
+the JSON leaves them out."""
+
+
+def ask(text: str, measure: Callable[..., dict], *arguments: object) -> Question:
+    """Make a question from its text and a function of some arguments and the size."""
+    question = partial(measure, *arguments)
+    question.__doc__ = text
+    return question
+
+
+class ResultKind(NamedTuple):
+    """Kind of a result: required values by key, and questions of which the result answers one at least."""
 
     same: dict[str, object]
     questions: tuple[str, ...]
 
 
-def called(script: str) -> str:
-    """How a bench is called: by its script, where that is what runs, else by the verb."""
-    return f"{script}.py" if Path(sys.argv[0]).stem == script else f"mivol bench {script.removeprefix('bench_')}"
-
-
 @dataclass(frozen=True)
-class Bench:
-    """A bench: its questions, and what is made of the answers.
+class Study:
+    """A study.
 
     Attributes:
-        name: of the script, and of the files it writes.
-        doc: what ``--help`` prints.
+        module: ``__name__`` of its module.
+        doc: text of ``--help``: the docstring of the module, which begins with a question.
+        size: class of its sizes.
         questions: by name.
-        full, quick: sizes, with an attribute ``name``.
-        compare: name of a question, its answer -> figures beside their bars.
-        draw: answers and folder -> pictures.
-        unasked: questions that are asked by name only.
+        bars: name of a question, its answer -> figures beside their bars.
+        draw: answers by question, path of the figure -> writes the figure.
+        table: name of a question, its answer -> lines of a Markdown table; printed as progress.
+        on_request: questions that only ``--only`` asks.
     """
 
-    name: str
-    doc: str
+    module: str
+    doc: str | None
+    size: type[Size]
     questions: dict[str, Question]
-    full: object
-    quick: object
-    compare: Callable[[str, dict], list[Bar]]
-    draw: Callable[[dict, Path], None]
-    unasked: tuple[str, ...] = ()
+    bars: Callable[[str, dict], list[Bar]] = lambda question, answer: []
+    draw: Callable[[dict, Path], None] = lambda answers, path: None
+    table: Callable[[str, dict], list[str]] = lambda question, answer: []
+    on_request: tuple[str, ...] = ()
 
-    def ask(self, names: Sequence[str], size: object) -> dict:
-        """Ask questions in turn: the answers by name, and under ``bars`` the figures that have one."""
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return self.module.rpartition(".")[2]
+
+    @property
+    def stem(self) -> str:
+        """Stem of the names of the JSON file and the figure, and default name of their folder."""
+        return f"bench_{self.name}"
+
+    def answer(self, names: Sequence[str], size: Size) -> dict:
+        """Ask questions in turn; the answers by name, and the figures with a bar under ``bars``."""
         answers, bars = {}, []
         for name in names:
             say(f"{name}: {(self.questions[name].__doc__ or '').splitlines()[0]}")
             answers[name] = self.questions[name](size)
-            bars += self.compare(name, answers[name])
+            if lines := self.table(name, answers[name]):
+                say("\n".join(lines))
+            bars += self.bars(name, answers[name])
         return {"bars": bars, **answers}
 
-    def run(self, argv: Sequence[str] | None = None) -> int:
-        """Read the command line, ask the questions, print the answers and write them beside their pictures.
+    def run(self, argv: Sequence[str]) -> int:
+        """Read the command line, ask the questions, print the answers, and write JSON and figure.
 
         Returns:
-            Exit code: 0, or 1 where means differ that have to agree, or where something is refused in a sentence.
+            Exit code: 0, or 1 after a refusal or if means differ that must agree.
         """
         args = self.parse(argv)
         try:
-            found = self.measure(args)
+            result = self.measure(args)
         except MivolError as error:
-            say(f"{called(self.name)}: {error}")
+            say(f"mivol bench {self.name}: {error}")
             return 1
-        if beyond := means_that_differ(found["bars"]):
-            say(f"the means differ ({'; '.join(beyond)}): the ratios mean nothing")
-        return 1 if beyond else 0
+        if differing := find_disagreements(result["bars"]):
+            say(f"the means differ ({'; '.join(differing)}): the ratios are meaningless")
+        return 1 if differing else 0
 
     def measure(self, args: argparse.Namespace) -> dict:
-        """What :meth:`run` does with a command line that was read; the JSON."""
+        """Ask the questions of a parsed command line, and write the result, which is returned."""
         mi.set_variant(args.variant)
-        size = self.quick if args.quick else self.full
-        start, load = time.perf_counter(), load_of_machine()
-        answers = self.ask(args.only.split(","), size)
-        figures = header(size.name, args.variant, load, start) | answers
+        start, load = time.perf_counter(), mean_load()
+        answers = self.answer(args.only.split(","), args.size)
+        result = header(args.size.name, args.variant, load, start) | answers
         args.out.mkdir(parents=True, exist_ok=True)
-        self.draw({name: answer for name, answer in answers.items() if name != "bars"}, args.out)
-        text = json.dumps(without_arrays(figures), indent=2, allow_nan=False) + "\n"
-        write_whole_text(args.out / f"{self.name}.json", text)
+        self.draw({name: answer for name, answer in answers.items() if name != "bars"}, args.out / f"{self.stem}.png")
+        text = json.dumps(without_arrays(result), indent=2, allow_nan=False) + "\n"
+        write_whole_text(args.out / f"{self.stem}.json", text)
         sys.stdout.write(text)
-        return figures
+        return result
 
-    def expected(self, argv: Sequence[str]) -> Expected:
-        """What the JSON of these arguments will hold; the process ends where they are wrong."""
+    def result_kind(self, argv: Sequence[str]) -> ResultKind:
+        """Kind of the result of these arguments; the process ends if they are wrong."""
         args = self.parse(argv)
-        return Expected({"size": (self.quick if args.quick else self.full).name}, tuple(args.only.split(",")))
+        return ResultKind({"size": args.size.name}, tuple(args.only.split(",")))
 
-    def parse(self, argv: Sequence[str] | None = None) -> argparse.Namespace:
-        """The command line; the process ends where it asks what is no question."""
-        default = [q for q in self.questions if q not in self.unasked]
+    def result_path(self, argv: Sequence[str]) -> Path:
+        """Path of the JSON file."""
+        return self.parse(argv).out / f"{self.stem}.json"
+
+    def parse(self, argv: Sequence[str]) -> argparse.Namespace:
+        """Parse the command line; the process ends with a usage message if an argument is wrong."""
+        default = [name for name in self.questions if name not in self.on_request]
         parser = argparse.ArgumentParser(
-            prog=called(self.name), description=self.doc, formatter_class=argparse.RawDescriptionHelpFormatter
+            prog=f"mivol bench {self.name}", description=self.doc, formatter_class=argparse.RawDescriptionHelpFormatter
         )
-        parser.add_argument("--quick", action="store_true", help="small sizes, for CI: its times mean nothing")
+        parser.add_argument("--quick", action="store_true", help="small sizes, for CI: the times mean nothing")
         parser.add_argument("--only", default=",".join(default), help=f"questions to ask, of {','.join(self.questions)}")
-        parser.add_argument("--out", type=Path, default=Path("runs") / self.name)
-        parser.add_argument("--variant", default="llvm_ad_rgb")
+        parser.add_argument("--out", type=Path, default=Path("runs") / self.stem, help="folder of the JSON file and the figure")
+        parser.add_argument("--variant", default="llvm_ad_rgb", help="variant of Mitsuba (llvm_ad_rgb)")
+        self._add_amounts(parser.add_argument_group("amount of work"))
         args = parser.parse_args(argv)
         if unknown := set(args.only.split(",")) - set(self.questions):
-            parser.error(f"--only: {', '.join(sorted(unknown))} is not a question; known are {', '.join(self.questions)}")
+            parser.error(f"--only: {', '.join(sorted(unknown))} is not a question; choose from {', '.join(self.questions)}")
+        changes = {f.name: getattr(args, f.name) for f in fields(self.size) if getattr(args, f.name, None) is not None}
+        changes = {key: tuple(value) if isinstance(value, list) else value for key, value in changes.items() if key != "name"}
+        size = self.size.quick() if args.quick else self.size()
+        args.size = size.changed(**changes) if changes else size
         return args
+
+    def _add_amounts(self, group: argparse._ArgumentGroup) -> None:
+        for f in fields(self.size):
+            kind = f.metadata.get("kind")
+            if kind not in (int, float, str, Path):
+                continue
+            flag, text = f"--{f.name.replace('_', '-')}", f"{f.metadata['doc']} ({f.default})".replace("%", "%%")
+            group.add_argument(flag, type=kind, help=text, nargs="+" if type(f.default) is tuple else None)
 
 
 def header(size: str, variant: str, load: float | None, start: float) -> dict:
-    """With what every JSON begins: size, machine, versions, load of the machine, seconds since the start."""
+    """First values of every JSON file: size, machine, versions, load of the machine, seconds since ``start``."""
     return {
         "size": size,
         "machine": msgspec.to_builtins(describe_machine()),
         "versions": package_versions(),
         "variant": variant,
         "threads": dr.thread_count(),
-        "load_before_and_after": [load, load_of_machine()],
+        "load_before_and_after": [load, mean_load()],
         "seconds": round(time.perf_counter() - start, 1),
     }
 
 
-def load_of_machine() -> float | None:
-    """Processes that want to run, on the mean over a minute; None on Windows, which does not count them."""
+def mean_load() -> float | None:
+    """Mean number of runnable processes in the last minute; None on Windows, which does not count them."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
 def without_arrays(answer: object) -> object:
-    """An answer without the NumPy arrays in it."""
+    """Copy an answer without its NumPy arrays."""
     if not isinstance(answer, dict):
         return answer
     return {name: without_arrays(value) for name, value in answer.items() if not isinstance(value, np.ndarray)}

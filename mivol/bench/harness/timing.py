@@ -1,9 +1,9 @@
-"""Seconds of calls on the device: contestants in turns, warm calls apart from first ones, samples for a budget.
+"""Seconds of calls on the device: contestants in rounds, warm calls apart from first calls.
 
-Conventions. A contestant takes the number of a round, from which it makes its seed, and returns Dr.Jit arrays that are
-still to be evaluated. Contestants of one question run in turns within rounds, each round in another order, so that what
-else the machine does falls on all of them alike. "Processor" seconds are summed over all threads of the process: other
-work on the machine moves them less than the clock on the wall.
+Conventions. A contestant takes the number of a round, makes its seed from the number, and returns Dr.Jit arrays that are not
+evaluated yet. The contestants of a question take turns within each round, in an order that changes from round to round, so
+that other work on the machine slows all of them alike. Processor seconds are summed over all threads of the process; other
+work on the machine changes them less than it changes the wall clock.
 """
 
 from __future__ import annotations
@@ -11,29 +11,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-__all__ = ["Budget", "Contestant", "Stopwatch", "Timing", "clock", "fastest", "race", "ratio_of"]
-
-LEAST_SAMPLES, MOST_SAMPLES = 4, 4096
-"""Per pixel, of one render."""
+__all__ = ["Contestant", "Stopwatch", "Timing", "fastest", "peak_bytes", "race", "ratio_of", "time_call"]
 
 Contestant = Callable[[int], object]
-"""Takes the number of the round (a seed), returns Dr.Jit arrays that are still to be evaluated."""
+"""Number of the round (a seed) -> Dr.Jit arrays that are not evaluated yet."""
 
 
 @dataclass
 class Timing:
-    """Seconds of the warm calls of one contestant, what its first call was, and what the calls returned.
+    """Times of one contestant.
 
     Attributes:
-        first: of the first call, see :func:`first_call`.
-        seconds: on the wall, one for each round.
-        processor: of all threads, one for each round.
-        results: NumPy arrays, where :func:`race` was asked to keep them.
+        first: cost of the first call, see :func:`time_first_call`.
+        seconds: wall clock of the warm calls [s], one for each round.
+        processor: processor time of the same calls [s].
+        results: returned values as NumPy arrays, if :func:`race` was to keep them.
     """
 
     first: dict[str, float]
@@ -47,7 +44,7 @@ class Timing:
         return float(np.median(self.seconds))
 
     def report(self, units: float, name: str) -> dict[str, float]:
-        """Median and fastest time, the rates at which ``units`` of that name were done, and the first call."""
+        """Median and fastest time, the rates for ``units`` of work called ``name``, and the first call."""
         fastest = min(self.seconds)
         return {
             "seconds_median": self.median,
@@ -64,15 +61,15 @@ def race(contestants: dict[str, Contestant], rounds: int, keep: bool = False) ->
 
     Args:
         contestants: by name.
-        rounds: calls of each, after a first one that is not counted; they are numbered from 1.
-        keep: keep what each call returned, as NumPy arrays.
+        rounds: timed calls of each contestant, numbered from 1; a first call with the number 0 is reported apart.
+        keep: keep the returned values as NumPy arrays.
     """
-    timings = {name: Timing(first_call(call)) for name, call in contestants.items()}
+    timings = {name: Timing(time_first_call(call)) for name, call in contestants.items()}
     names = list(contestants)
     for number in range(1, rounds + 1):
         for name in names[number % len(names) :] + names[: number % len(names)]:
             before = time.process_time()
-            result, seconds = clock(contestants[name], number)
+            result, seconds = time_call(contestants[name], number)
             timings[name].processor.append(time.process_time() - before)
             timings[name].seconds.append(seconds)
             if keep:
@@ -81,18 +78,18 @@ def race(contestants: dict[str, Contestant], rounds: int, keep: bool = False) ->
     return timings
 
 
-def fastest(call: Callable[[], object], now: Callable[[], float], times: int = 3) -> float:
-    """Seconds of the fastest of a few calls, the first of which may compile, by the clock ``now``."""
+def fastest(call: Callable[[], object], clock: Callable[[], float], calls: int = 3) -> float:
+    """Shortest duration of a few calls by a clock [s]; the first call may compile."""
     seconds = []
-    for _ in range(times):
-        start = now()
+    for _ in range(calls):
+        start = clock()
         call()
-        seconds.append(now() - start)
+        seconds.append(clock() - start)
     return min(seconds)
 
 
-def clock(call: Contestant, number: int = 0) -> tuple[object, float]:
-    """Make a call and evaluate what it returns; the result and its seconds on the wall."""
+def time_call(call: Contestant, number: int = 0) -> tuple[object, float]:
+    """Call a contestant and evaluate its result; the result and the wall-clock time [s]."""
     start = time.perf_counter()
     result = call(number)
     dr.eval(result)
@@ -100,11 +97,11 @@ def clock(call: Contestant, number: int = 0) -> tuple[object, float]:
     return result, time.perf_counter() - start
 
 
-def first_call(call: Contestant) -> dict[str, float]:
-    """Make the first call: seconds in all and in the compiler, kernels compiled, kernels found on disk."""
+def time_first_call(call: Contestant) -> dict[str, float]:
+    """Make the first call: total and compiler seconds, number of compiled kernels and of kernels found on disk."""
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        _, seconds = clock(call)
+        _, seconds = time_call(call)
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     return {
         "seconds": seconds,
@@ -115,52 +112,26 @@ def first_call(call: Contestant) -> dict[str, float]:
 
 
 def ratio_of(slow: Timing, fast: Timing, clock: str = "seconds") -> float:
-    """How many times longer one takes than the other: median over the rounds, by ``seconds`` or by ``processor``."""
+    """Time of one contestant over the time of another: median over the rounds, by ``seconds`` or by ``processor``."""
     return float(np.median(np.array(getattr(slow, clock)) / np.array(getattr(fast, clock))))
 
 
-class Budget(NamedTuple):
-    """How many samples a contestant gets: a fixed number, or as many as take a time.
-
-    Attributes:
-        seconds: of processor time that one call may take.
-        spp: samples per pixel; where it is given, no clock is asked.
-    """
-
-    seconds: float = 1.0
-    spp: int | None = None
-
-    def samples(self, render: Callable[[int, int], object]) -> int:
-        """Samples per pixel of a call: ``spp``, or the largest power of two that takes ``seconds`` or less.
-
-        Args:
-            render: seed, samples per pixel -> Dr.Jit arrays.
-        """
-        return self.spp or _samples_for(render, self.seconds)
-
-
-def _samples_for(render: Callable[[int, int], object], seconds: float) -> int:
-    def taken(spp: int) -> float:
-        before = time.process_time()
-        clock(lambda seed: render(seed, spp), spp)
-        return time.process_time() - before
-
-    spp = LEAST_SAMPLES
-    taken(spp)
-    while True:
-        # The smaller of two: the other may have compiled a kernel, or made what is kept for a scene. A part of
-        # what they take does not grow with the samples, so the last step is a small one.
-        least = min(taken(spp), taken(spp))
-        if least > seconds / 2 or spp >= MOST_SAMPLES:
-            return spp
-        spp = min(spp * (8 if least < seconds / 32 else 2), MOST_SAMPLES)
+def peak_bytes(call: Callable[[], object]) -> int:
+    """Largest memory that Dr.Jit holds at once during a call, with everything allocated before [bytes]."""
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    call()
+    return dr.detail.malloc_watermark(dr.backend_v(mi.Float))
 
 
 @dataclass
 class Stopwatch:
-    """Sums the seconds inside its ``with`` blocks, on the wall and of all threads, once the device is done.
+    """Sum of the durations of its ``with`` blocks; each block ends when the device is done.
 
-    What stands between the blocks (judging a fit, writing a line) costs nothing.
+    Attributes:
+        seconds: wall clock [s].
+        processor: processor time of all threads [s].
     """
 
     seconds: float = 0.0

@@ -1,1 +1,2 @@
-"""The studies: each module here is one, found by its name and run by ``mivol bench NAME``."""
+"""The studies. Each module or package in this folder is one study; :mod:`mivol.bench.harness.catalogue` finds it by its
+name."""

@@ -1,22 +1,21 @@
 """One scene, four models of light: how do the errors of images and gradients fall with time, for mivol and for Mitsuba?
 
-    scripts/bench_ladder.py              # 3 minutes on 2 idle cores
-    scripts/bench_ladder.py --quick      # small sizes, for CI
+    mivol bench ladder              # 3 minutes on 2 idle cores
+    mivol bench ladder --quick      # small sizes, for CI
 
-The smoke of the Mitsuba tutorial (or a made-up one, and the JSON says so) under a sky: it absorbs; it absorbs and emits; it
-scatters once below a sun (albedo 0.75, HG 0.8, ``max_depth`` 2); it scatters up to five times (6). The grid is the same, and so
-is what is differentiated: the density. Images by ``volpath``, gradients of an image's mean by ``prbvolpath``; Mitsuba 3.9 has
-no media that emit. Every method gets 1/16, 1/4 and all of the samples that take 0.8 s of processor time, in turns, 8 rounds.
-Drawn is the error of a pixel over the mean radiance, and of a voxel of sigma_t >= 1 over the root mean square of the gradient.
-
-Prints JSON; writes bench_ladder.json and bench_ladder.png.
+The smoke of the Mitsuba tutorial (or a made-up smoke, and the JSON says so) under a sky, in four models: absorption; absorption
+and emission; single scattering below a sun (albedo 0.75, HG 0.8, ``max_depth`` 2); multiple scattering (``max_depth`` 6). The
+grid is the same in all models, and gradients are with respect to its density. Mitsuba renders images by ``volpath`` and
+gradients of the mean of an image by ``prbvolpath``; Mitsuba 3.9 has no media that emit. Each method gets 1/16, 1/4 and all of
+the samples that take 0.8 s of processor time, in turns, in 8 rounds. The figure shows the error of a pixel over the mean
+radiance, and the error of a voxel with sigma_t >= 1 over the root mean square of the gradient.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -25,29 +24,37 @@ from matplotlib.axes import Axes
 
 from mivol.bench.extinctions import smoke
 from mivol.bench.harness.agreement import compare_means, mean_of_rounds
-from mivol.bench.harness.bars import Bar, judge_agreement, say
-from mivol.bench.harness.figures import drawn, plain_ticks
-from mivol.bench.harness.study import Bench
-from mivol.bench.harness.timing import Budget, Timing, race
-from mivol.bench.scenes import box_scene, constant_light, of_depth, sun_and_sky
-from mivol.bench.studies.gradients.subject import Subject
-from mivol.report.figures import MARKERS, SERIES
+from mivol.bench.harness.bars import Bar, judge_agreement, say_row
+from mivol.bench.harness.contests import Contest, Method, compete
+from mivol.bench.harness.figures import new_figure, plot_errors, use_plain_ticks
+from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.scenes import box_scene, constant_light, make_integrator, sun_and_sky
+from mivol.bench.studies.gradients.density_gradient import DensityGradient
 from mivol.validate.moments import Moments
 
-__all__ = ["BENCH", "RUNGS", "Rung", "Size", "climb", "main"]
-
-OURS = "mivol"
+__all__ = ["MODELS", "STUDY", "LadderSize", "Model", "measure"]
 
 
 @dataclass(frozen=True)
-class Rung:
+class LadderSize(Size):
+    """Amount of work."""
+
+    rounds: int = amount(8, 4, "images and gradients of each method")
+    side: int = amount(64, 12, "edge of the image [pixels]")
+    budget: float = amount(0.8, 0.05, "processor time of one render [s]")
+    spp: int = amount(0, doc="samples per pixel of one render; 0: decided by the budget")
+    levels: tuple[int, ...] = amount((1, 4, 16), (1, 4), "divisors of the samples")
+
+
+@dataclass(frozen=True)
+class Model:
     """A model of light.
 
     Attributes:
-        parts: of the scene.
-        albedo: of the medium.
+        parts: makes the parts of the scene.
+        albedo: albedo of the medium.
         depth: ``max_depth``.
-        emits: the medium has a source function of 1, which Mitsuba's own media have not.
+        emits: the medium has a source function of 1; Mitsuba has no such medium.
     """
 
     parts: Callable[[], dict]
@@ -56,169 +63,127 @@ class Rung:
     emits: bool = False
 
     def scene(self, values: np.ndarray, side: int) -> mi.Scene:
-        """The box around extinctions (Z, Y, X)."""
+        """The box around an extinction (Z, Y, X)."""
         parts = box_scene(values, side, self.albedo, **self.parts())
         if self.emits:
             medium = parts["box"]["interior"]
             medium |= {"type": "mivol_medium", "emission": {"type": "constvolume", "value": 1.0}}
         return mi.load_dict(parts)
 
-    def rivals(self, stock: str) -> tuple[str, ...]:
-        """Who renders it."""
-        return (OURS,) if self.emits else (OURS, stock)
+    def integrators(self, peer: str) -> dict[str, mi.Integrator]:
+        """Integrators of the model: mivol, and the peer if Mitsuba has such media."""
+        return {name: make_integrator(name, self.depth) for name in (("mivol",) if self.emits else ("mivol", peer))}
 
 
-RUNGS = {
-    "absorption": Rung(constant_light, 0.0, 2),
-    "emission": Rung(lambda: {"emitter": {"type": "constant", "radiance": 0.2}}, 0.0, 2, True),
-    "single scattering": Rung(sun_and_sky, 0.75, 2),
-    "multiple scattering": Rung(sun_and_sky, 0.75, 6),
+MODELS = {
+    "absorption": Model(constant_light, 0.0, 2),
+    "emission": Model(lambda: {"emitter": {"type": "constant", "radiance": 0.2}}, 0.0, 2, True),
+    "single scattering": Model(sun_and_sky, 0.75, 2),
+    "multiple scattering": Model(sun_and_sky, 0.75, 6),
 }
-"""Models, each of which knows all that the one before knows but for the emission."""
+"""Models; each contains the effects of the one before, except for the emission."""
 
 
-@dataclass(frozen=True)
-class Size:
-    """How much work is done.
-
-    Attributes:
-        name: for the JSON.
-        rounds: images and gradients of each method.
-        side: of the picture [pixels].
-        budget: samples of one render.
-        levels: the samples are divided by these.
-    """
-
-    name: str = "full"
-    rounds: int = 8
-    side: int = 64
-    budget: Budget = field(default=Budget(seconds=0.8))
-    levels: tuple[int, ...] = (1, 4, 16)
-
-
-FULL = Size()
-QUICK = Size(name="quick", side=12, rounds=4, budget=Budget(seconds=0.05), levels=(1, 4))
-
-
-def climb(size: Size) -> dict:
+def measure(size: LadderSize) -> dict:
     """How do the errors of images and gradients fall with time, in four models of one scene?"""
-    found = smoke()
-    answer: dict = {"grid": str(found)}
-    for name, rung in RUNGS.items():
-        answer[name] = {"image": _image(rung, found.values, size), "gradient": _gradient(rung, found.values, size)}
-        say(f"  {name}: {said(answer[name])}")
+    grid, measures = smoke(), {"image": measure_image, "gradient": measure_gradient}
+    answer: dict = {"grid": str(grid)}
+    for name, model in MODELS.items():
+        answer[name] = {kind: run(model, grid.values, size) for kind, run in measures.items()}
+        say_row(name, **{kind: figures["variance_x_time"] for kind, figures in answer[name].items() if not model.emits})
     return answer
 
 
-Step = Callable[[int, int], object]
-"""Seed and samples per pixel to an image or a gradient."""
+def measure_image(model: Model, values: np.ndarray, size: LadderSize) -> dict:
+    """Errors of pixels against time, and the image."""
+    scene = model.scene(values, size.side)
+
+    def rendering(integrator: mi.Integrator) -> Method:
+        return lambda seed, spp: mi.render(scene, integrator=integrator, spp=spp, seed=seed)
+
+    methods = {name: rendering(integrator) for name, integrator in model.integrators("volpath").items()}
+    contest = compete(methods, size.rounds, size.budget, size.spp, levels=size.levels)
+    figures, mean = error_figures(contest, np.ones(size.side**2 * 3, bool), np.mean)
+    return figures | {"picture": mean.reshape(size.side, size.side, 3)}  # for the figure only
 
 
-def _image(rung: Rung, values: np.ndarray, size: Size) -> dict:
-    """Errors of pixels against time, and the picture."""
-    scene = rung.scene(values, size.side)
-    steps: dict[str, Step] = {}
-    for name in rung.rivals("volpath"):
-        integrator = of_depth(name, rung.depth)
-        steps[name] = lambda seed, spp, integrator=integrator: mi.render(scene, integrator=integrator, spp=spp, seed=seed)
-    timings = _race(steps, size)
-    figures, level = _figures(timings, size, np.ones(size.side**2 * 3, bool), np.mean)
-    # A picture to be looked at, for the figure only.
-    return figures | {"picture": level.reshape(size.side, size.side, 3)}
-
-
-def _gradient(rung: Rung, values: np.ndarray, size: Size) -> dict:
+def measure_gradient(model: Model, values: np.ndarray, size: LadderSize) -> dict:
     """Errors of voxels against time."""
-    steps: dict[str, Step] = {}
-    for name in rung.rivals("prbvolpath"):
-        steps[name] = Subject(rung.scene(values, size.side), of_depth(name, rung.depth)).of_mean
-    return _figures(_race(steps, size), size, (values >= 1).ravel(), _root_mean_square)[0]
+    methods: dict[str, Method] = {
+        name: DensityGradient(model.scene(values, size.side), integrator).of_mean
+        for name, integrator in model.integrators("prbvolpath").items()
+    }
+    contest = compete(methods, size.rounds, size.budget, size.spp, levels=size.levels)
+    return error_figures(contest, (values >= 1).ravel(), root_mean_square)[0]
 
 
-def _root_mean_square(values: np.ndarray) -> float:
+def root_mean_square(values: np.ndarray) -> float:
+    """Root mean square."""
     return math.sqrt(np.square(values).mean())
 
 
-def _race(steps: dict[str, Step], size: Size) -> dict[tuple[str, int], Timing]:
-    """Every method at every level, in turns."""
-    calls = {}
-    for place, (name, step) in enumerate(steps.items()):
-        most = size.budget.samples(step)
-        for level in size.levels:
-            first, spp = 100_000 * (place + 1) + 1000 * level, max(most // level, 1)
-            calls[name, level] = lambda number, step=step, first=first, spp=spp: step(first + number, spp)
-    return race(calls, size.rounds, keep=True)
+def error_figures(contest: Contest, counts: np.ndarray, scale: Callable[[np.ndarray], float]) -> tuple[dict, np.ndarray]:
+    """Errors relative to the scale of mivol's mean, the gain of mivol, and this mean.
 
+    Args:
+        contest: results of mivol and perhaps of a peer.
+        counts: mask of the numbers that count (n,).
+        scale: mean values that count -> scale of the errors.
 
-def _figures(
-    timings: dict[tuple[str, int], Timing], size: Size, counts: np.ndarray, scale: Callable[[np.ndarray], float]
-) -> tuple[dict, np.ndarray]:
-    """Errors over the scale of mivol's mean, the agreement of the means, and that mean."""
-    moments = {key: Moments.of(np.array(t.results).reshape(size.rounds, -1)) for key, t in timings.items()}
-    mean = moments[OURS, 1].mean
+    Returns:
+        Rows of each method, ``agreement`` and ``variance_x_time`` of a contest with a peer; and the mean of mivol (n,).
+    """
+    results = {key: contest.results(*key).reshape(len(t.results), -1) for key, t in contest.timings.items()}
+    mean = results["mivol", 1].mean(axis=0)
     unit = scale(mean[counts])
     figures: dict = {}
-    for (name, level), timing in timings.items():
-        error = math.sqrt(moments[name, level].variance[counts].mean()) / unit
+    for (name, level), timing in contest.timings.items():
+        error = math.sqrt(Moments.of(results[name, level]).variance[counts].mean()) / unit
         figures.setdefault(name, []).append({"level": level, "seconds_median": timing.median, "relative_error": error})
-    whole = {name: np.array(timings[name, 1].results).reshape(size.rounds, -1)[:, counts].sum(axis=1) for name in figures}
-    for name in whole.keys() - {OURS}:
-        figures["agreement"] = compare_means(mean_of_rounds(whole[OURS]), mean_of_rounds(whole[name]), 6)
-        slow, fast = (figures[n][0] for n in (name, OURS))
+    for peer in list(figures)[1:]:
+        sums = (mean_of_rounds(results[name, 1][:, counts].sum(axis=1)) for name in ("mivol", peer))
+        figures["agreement"] = compare_means(*sums, 6)
+        slow, fast = (figures[name][0] for name in (peer, "mivol"))
         error = slow["relative_error"] / fast["relative_error"]
         figures["variance_x_time"] = error**2 * slow["seconds_median"] / fast["seconds_median"]
     return figures, mean
 
 
-def said(figures: dict) -> str:
-    """One line on a rung."""
-    return "; ".join(
-        f"{what} {figures[what]['variance_x_time']:.0f}x" if "variance_x_time" in figures[what] else f"{what} alone"
-        for what in ("image", "gradient")
-    )
-
-
 def compare(question: str, answer: dict) -> list[Bar]:
-    """The means of both methods."""
-    rows = []
-    for name in RUNGS:
-        for what in ("image", "gradient"):
-            if (z := answer[name][what].get("agreement")) is not None:
-                rows.append(judge_agreement(f"{what}, {name}", z["z"], z["z_bound"]))
-    return rows
+    """Judge the agreement of the means."""
+    pairs = [(f"{kind}, {name}", answer[name][kind].get("agreement")) for name in MODELS for kind in ("image", "gradient")]
+    return [judge_agreement(label, found["z"], found["z_bound"]) for label, found in pairs if found is not None]
 
 
-def draw(answers: dict, folder: Path) -> None:
-    """A column for each model: its picture, and the errors of images and gradients. Low, as the README has room for it."""
+def draw(answers: dict, path: Path) -> None:
+    """A column for each model: its image, the errors of images and of gradients. The figure is low, to fit into the README."""
     (answer,) = answers.values()
-    with drawn(folder / "bench_ladder.png", 2.2 * len(RUNGS), 4.2) as figure:
-        rows = figure.subplots(3, len(RUNGS), height_ratios=(1, 1.1, 1.1))
-        for k, name in enumerate(RUNGS):
-            picture, image, gradient = (row[k] for row in rows)
+    with new_figure(path, 2.2 * len(MODELS), 4.2) as figure:
+        rows = figure.subplots(3, len(MODELS), height_ratios=(1, 1.1, 1.1))
+        for k, name in enumerate(MODELS):
+            panel, image, gradient = (row[k] for row in rows)
             pixels = answer[name]["image"]["picture"]
-            picture.imshow(np.clip(pixels / np.quantile(pixels, 0.99), 0, 1) ** (1 / 2.2), interpolation="nearest")
-            picture.set_axis_off()
-            picture.set_title(name, loc="center")
-            _draw_errors(image, answer[name]["image"], "volpath")
-            _draw_errors(gradient, answer[name]["gradient"], "prbvolpath")
+            panel.imshow(np.clip(pixels / np.quantile(pixels, 0.99), 0, 1) ** (1 / 2.2), interpolation="nearest")
+            panel.set_axis_off()
+            panel.set_title(name, loc="center")
+            plot_model(image, answer[name]["image"], "volpath")
+            plot_model(gradient, answer[name]["gradient"], "prbvolpath")
             gradient.set_xlabel("time [s], warm")
-        for axes, what in zip(rows[1:, 0], ("image", "gradient"), strict=True):
-            axes.set_ylabel(f"error of {what} [1]")
+        for axes, kind in zip(rows[1:, 0], ("image", "gradient"), strict=True):
+            axes.set_ylabel(f"error of {kind} [1]")
             axes.legend()
 
 
-def _draw_errors(axes: Axes, figures: dict, stock: str) -> None:
-    for i, name in enumerate((OURS, stock)):
-        if name in figures:
-            seconds, error = ([row[key] for row in figures[name]] for key in ("seconds_median", "relative_error"))
-            axes.loglog(seconds, error, marker=MARKERS[i], color=SERIES[i], label=name)
-    plain_ticks(axes.xaxis, "")
-    plain_ticks(axes.yaxis, "")
+def plot_model(axes: Axes, figures: dict, peer: str) -> None:
+    """Plot error against time of mivol and of the peer, if the peer took part."""
+    curves = {
+        name: tuple([row[key] for row in figures[name]] for key in ("seconds_median", "relative_error"))
+        for name in ("mivol", peer)
+        if name in figures
+    }
+    plot_errors(axes, curves)
+    use_plain_ticks(axes.xaxis)
+    use_plain_ticks(axes.yaxis)
 
 
-BENCH = Bench("bench_ladder", __doc__, {"ladder": climb}, FULL, QUICK, compare, draw)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the bench with these arguments (by default the process's own); its exit code."""
-    return BENCH.run(argv)
+STUDY = Study(__name__, __doc__, LadderSize, {"ladder": measure}, compare, draw)

@@ -1,49 +1,48 @@
 """Light that scatters once: how much sooner does mivol reach an error than Mitsuba's ``volpath`` and ``prbvolpath``?
 
-    scripts/bench_single_scattering.py                    # 5 minutes on 2 idle cores
-    scripts/bench_single_scattering.py --quick            # half a minute, small sizes: are the means the same?
-    scripts/bench_single_scattering.py --only smoke       # one of the volumes
+    mivol bench single_scattering                    # 5 minutes on 2 idle cores
+    mivol bench single_scattering --quick            # half a minute, small sizes: are the means the same?
+    mivol bench single_scattering --only smoke       # one of the volumes
 
-Four kinds of light in five volumes, albedo 0.75, all integrators with ``max_depth`` 2, through ``mi.render``, pictures of
-64 x 64 pixels (point lights: 24 x 24) with a box filter and independent samples. The volumes fill [-1, 1]^3: the smoke of the
-Mitsuba tutorial at its density (x 40); the same upsampled to 256^3, where an exact walk has five times the cells to cross and
-delta tracking nothing more to do; a CT of 256^3, and threads in 512^3 that leave 99 % of it empty, both with the largest
-extinction of the smoke, so that delta tracking has as many steps to take (and with empty outermost voxels: Mitsuba loses a skin
-at a boundary); a cloud of a large-eddy simulation.
+Four lights in five volumes, albedo 0.75, ``max_depth`` 2 for all integrators, ``mi.render``, 64 x 64 pixels (point lights:
+24 x 24), box filter, independent samples. The volumes fill [-1, 1]^3:
 
-Equal error. The error of an unbiased estimate falls with the root of the time, so variance x time is a number of the method
-alone. Each integrator gets the samples per pixel (a power of two) that take 0.8 s of processor time; then all render in turns,
-warm, in 8 rounds, every render with another seed. Of the 8 images each pixel has its variance (mean over the channels); time is
-the ratio of two renders of one round by processor time, which a busy machine moves less than the clock, median over the rounds.
-Printed are
+- smoke: the Mitsuba tutorial's smoke at its density (x 40).
+- fine smoke: the same smoke upsampled to 256^3. An exact walk crosses five times the cells; delta tracking takes as many steps.
+- CT: a CT scan of 256^3. threads: 512^3 voxels, 99 % of them empty. Both have the largest extinction of the smoke, so delta
+  tracking takes as many steps. Their outermost voxels are empty, because Mitsuba loses a skin at a boundary.
+- cloud: a cloud of a large-eddy simulation.
 
-    variance x time, mean over pixels      ratio of the means of the variances, times the ratio of times
-    variance x time, median over pixels    median of the ratios of the variances, times the ratio of times
+Variance x time. The error of an unbiased estimate falls with the square root of the time, so variance x time depends on the
+method alone. Each integrator gets the samples per pixel (a power of two) that take 0.8 s of processor time. All render in
+turns, warm, in 8 rounds with their own seeds. The 8 images give the variance of each pixel (mean over the channels). The time
+ratio is the median over the rounds of the ratio of processor times. The study reports
 
-The bar is on the first, but for point lights, near which the mean does not exist: there it is on the second, and the picture is
-small, so that each pixel has samples enough to show the long tail of its variance (from 32 samples ``volpath`` seems to have
-half the variance that it shows in 500). Only pixels that see the medium count (a mean optical depth above 0.01), and none
-within a pixel and a half of an emitter inside it. A pixel in which the other integrator found no light in 8 images counts as a
-ratio of 0. Beside each ratio stands what it is by the clock, as a share.
+    variance x time, mean over pixels      ratio of the mean variances, times the ratio of times
+    variance x time, median over pixels    median of the ratios of variances, times the ratio of times
 
-Equality. Beside every ratio stands z: the difference of the means over those pixels in standard errors, with the relative
-standard error, which says how small a bias it could have seen. Where an emitter stands inside, most of the mean comes from
-samples that are rare (through dense matter) or without bound (near the emitter), and no number of rounds makes it normal.
-There the means of the same volume are compared after it was thinned to an optical depth of 1 at most, and truncated to pixels
-beyond a quarter of the picture from the emitter. If any z of a run is beyond its bound by Student's t with effective degrees
-of freedom (a false alarm in one run in 1000), the script ends with status 1: then the ratios mean nothing. Samples are camera
-paths, per second of a warm render.
+The bar is on the first figure. Near a point light the mean variance does not exist, so for point lights the bar is on the
+median. Their image is small, so that each pixel has enough samples to show the long tail of its variance (``volpath`` seems to
+have half its variance at 32 samples compared with 500). Only pixels with a mean optical depth above 0.01 count, and no pixel
+within 1.5 pixels of an emitter inside the medium. If the other integrator returns 0 in all 8 images of a pixel, the ratio of
+this pixel counts as 0. Beside each ratio stands the ratio by wall clock, as a share of the ratio by processor time.
 
-Prints JSON; writes bench_single_scattering.json and bench_single_scattering.png (error against time in the smoke, and the
-ratios of all volumes). Data is read from MIVOL_DATA (default ../shared/data); where it is missing made-up fields take its
-place, and the JSON says so.
+Agreement. Beside every ratio stands z: the difference of the means over these pixels in standard errors, with the relative
+standard error, which is the smallest bias that z would show. With an emitter inside, most of the mean comes from rare or
+unbounded samples, and no number of rounds makes the mean normal. Then the means are compared in the same volume thinned to an
+optical depth of 1 at most, over pixels farther than a quarter of the image from the emitter. If a z exceeds its bound by
+Student's t with effective degrees of freedom (false alarm in one run in 1000), the study ends with status 1: the ratios are
+meaningless. Sample rates are camera paths per second of a warm render.
+
+The figure shows error against time in the smoke and the ratios of all volumes. Data comes from MIVOL_DATA (default
+../shared/data). Without the data, made-up fields take its place, and the JSON says so.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,93 +50,60 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.extinctions import (
-    Extinction,
-    as_dense_as_smoke,
-    ct_scan,
-    fine_smoke,
-    les_cloud,
-    smoke,
-    threads_in_space,
-)
-from mivol.bench.harness.agreement import compare_means, mean_of_pixels, number
-from mivol.bench.harness.bars import AT_LEAST, Bar, judge, judge_agreement, say
-from mivol.bench.harness.figures import drawn, plain_ticks
-from mivol.bench.harness.study import Bench
-from mivol.bench.harness.timing import Budget, Timing, race, ratio_of
-from mivol.bench.scenes import box_scene, constant_light, of_depth, point_light, sun_and_sky
-from mivol.report.figures import MARKERS, SERIES
+from mivol.bench.extinctions import Extinction, as_dense_as_smoke, ct_scan, fine_smoke, les_cloud, smoke, threads_in_space
+from mivol.bench.harness.agreement import compare_means, mean_of_pixels
+from mivol.bench.harness.bars import AT_LEAST, Bar, judge, judge_agreement, say_row
+from mivol.bench.harness.contests import Contest, Method, compete
+from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios, use_plain_ticks
+from mivol.bench.harness.study import Size, Study, amount, ask
+from mivol.bench.scenes import box_scene, constant_light, make_integrator, point_light, sun_and_sky
 from mivol.validate.moments import Moments
 
 __all__ = [
-    "BENCH",
-    "FULL",
-    "LIGHTS",
-    "QUICK",
-    "STOCK",
-    "VOLUMES",
-    "Light",
-    "Size",
-    "contend",
-    "draw_errors",
-    "main",
-    "said",
-]
+    "LIGHTS", "LONGER", "PEERS", "STUDY", "VOLUMES", "ContestSize", "Light", "contend", "contest_bars", "contest_images",
+    "contest_volume", "gain_figures", "plot_contest",
+]  # fmt: skip
 
 ALBEDO = 0.75
-OURS = "mivol"
-STOCK = ("volpath", "prbvolpath")
-SEEN = 0.01
-"""Mean optical depth of a pixel from which on it counts."""
+PEERS = ("volpath", "prbvolpath")
+MIN_TAU = 0.01
+"""Smallest mean optical depth of a pixel that counts."""
 
-AT_EMITTER, TRUNCATED = 1.5, 0.25
-"""Pixels so near to an emitter inside do not count [pixels], and are left out of the means compared [share of a side]."""
+LONGER = 16.0
+"""Factor on the processor time of a render if the errors have heavy tails."""
+
+EMITTER_PIXELS, EMITTER_SHARE = 1.5, 0.25
+"""Pixels closer than this to an emitter inside do not count [pixels], and are left out of the means [share of a side]."""
 
 
 @dataclass(frozen=True)
-class Size:
-    """How much work is done.
+class ContestSize(Size):
+    """Amount of work of the contests of images."""
 
-    Attributes:
-        name: for the JSON.
-        rounds: images of each integrator.
-        most_pixels: along the side of a picture, at most.
-        budget: samples of one render.
-        levels: the samples are divided by these, for curves of error against time.
-        fine_res, sparse_res: voxels along an edge of the fine volumes, and of the threads.
-        seed: of all renders; another one gives independent images.
-    """
-
-    name: str = "full"
-    rounds: int = 8
-    most_pixels: int = 64
-    budget: Budget = field(default=Budget(seconds=0.8))
-    levels: tuple[int, ...] = (1, 4, 16)
-    fine_res: int = 256
-    sparse_res: int = 512
-    seed: int = 0
-
-
-FULL = Size()
-QUICK = Size(name="quick", most_pixels=16, budget=Budget(seconds=0.02), levels=(1, 4), fine_res=48, sparse_res=64)
-
-
-# -- Emitters and volumes -----------------------------------------------------------------------------------------------------
+    rounds: int = amount(8, doc="images of each integrator")
+    max_pixels: int = amount(64, 16, "largest edge of an image [pixels]")
+    budget: float = amount(0.8, 0.02, "processor time of one render [s]")
+    spp: int = amount(0, doc="samples per pixel of one render; 0: decided by the budget")
+    levels: tuple[int, ...] = amount((1, 4, 16), (1, 4), "divisors of the samples, for error against time")
+    fine_res: int = amount(256, 48, "voxels along an edge of the fine volumes")
+    sparse_res: int = amount(512, 64, "voxels along an edge of the threads")
+    seed: int = amount(0, doc="seed of all renders")
 
 
 class Light(NamedTuple):
-    """An emitter and a phase function.
+    """An emitter, a phase function, and the terms of its contest.
 
     Attributes:
-        parts: of the scene.
-        bar: how many times sooner mivol has to be.
-        by_pixel: judge the median over pixels, where the mean of their variances does not exist.
-        side: of the picture [pixels].
-        inside: where an emitter stands in the medium.
-        albedo: of the medium.
-        depth: ``max_depth`` of all integrators; -1 for no limit.
-        peers: Mitsuba's integrators that take part.
-        has_tails: where the means of no number of rounds are normal, so that they are compared in the thinned volume.
+        parts: makes the parts of the scene.
+        bar: smallest ratio of variance x time.
+        by_pixel: judge the median over pixels, because the mean variance does not exist.
+        side: edge of the image [pixels].
+        inside: position of an emitter in the medium.
+        albedo: albedo of the medium.
+        depth: ``max_depth`` of all integrators; -1: unlimited.
+        peers: integrators of Mitsuba.
+        has_tails: errors have heavy tails: renders take longer, and means, which no number of rounds makes normal, are compared
+            in the thinned volume.
     """
 
     parts: Callable[[], dict]
@@ -147,13 +113,18 @@ class Light(NamedTuple):
     inside: tuple[float, float, float] | None = None
     albedo: float | tuple[float, ...] = ALBEDO
     depth: int = 2
-    peers: tuple[str, ...] = STOCK
+    peers: tuple[str, ...] = PEERS
     has_tails: bool = False
 
     @property
     def average(self) -> str:
-        """What the bar is on, over pixels."""
+        """Average over pixels that the bar is on."""
         return "median" if self.by_pixel else "mean"
+
+    @property
+    def ratio_key(self) -> str:
+        """Key of the figure that the bar is on."""
+        return f"variance_x_time_{self.average}_over_pixels"
 
 
 INSIDE, NEAR = (0.3, -0.5, 0.2), (0.9, -1.3, 1.2)
@@ -165,7 +136,7 @@ LIGHTS = {
     "point light near": Light(lambda: point_light(NEAR), 100, True, 24),
 }
 
-VOLUMES: dict[str, Callable[[Size], Extinction]] = {
+VOLUMES: dict[str, Callable[[ContestSize], Extinction]] = {
     "smoke": lambda _: smoke(),
     "fine smoke": lambda size: fine_smoke(size.fine_res),
     "CT": lambda size: as_dense_as_smoke(ct_scan(size.fine_res)),
@@ -174,206 +145,168 @@ VOLUMES: dict[str, Callable[[Size], Extinction]] = {
 }
 
 
-# -- Contests --------------------------------------------------------------------------------------------------------------
+# -- Contests ---------------------------------------------------------------------------------------------------------------
 
 
-def contend(values: np.ndarray, light: Light, size: Size, levels: tuple[int, ...] = (1,)) -> dict:
-    """Variance and time of each integrator, and what they mean for mivol.
+def contest_volume(name: str, make: Callable[[ContestSize], Extinction], lights: dict[str, Light], size: ContestSize) -> dict:
+    """Let all integrators contend in a volume, in each of its lights; the smoke has curves of error against time."""
+    volume = make(size)
+    answer: dict = {"grid": str(volume)}
+    for light_name, light in lights.items():
+        answer[light_name] = contend(volume.values, light, size, size.levels if name == "smoke" else (1,))
+    return answer
+
+
+def contend(values: np.ndarray, light: Light, size: ContestSize, levels: tuple[int, ...] = (1,)) -> dict:
+    """Measure variance, time and mean of each integrator, and the gain of mivol.
 
     Args:
-        values: (Z, Y, X) extinction of the box, or (3,) of a homogeneous medium in rgb.
+        values: extinction of the box: (Z, Y, X), or (3,) for a homogeneous rgb medium [1/length].
         light: emitter and phase function.
         size: pixels, samples and rounds.
-        levels: see ``Size.levels``; the first one, 1, is what ratios are of.
+        levels: divisors of the samples; ratios are of the first one, 1.
     """
-    side = min(light.side, size.most_pixels)
+    if light.has_tails:
+        size = replace(size, budget=LONGER * size.budget)
+    side = min(light.side, size.max_pixels)
     scene = mi.load_dict(box_scene(values, side, light.albedo, **light.parts()))
-    timings, spp = render_in_turns(scene, size, levels, light)
-    tau, away = optical_depths(without_surfaces(values, light, side)), pixels_from_emitter(scene, light, side)
-    counts = (tau > SEEN) & (away > AT_EMITTER)
-    figures = {"pixels_that_count": int(counts.sum())}
-    for name in (OURS, *light.peers):
-        figures[name] = [{"spp": spp[name, k]} | errors(timings[name, k], counts, spp[name, k]) for k in levels]
-    compared, fair = timings, counts
+    integrators = {name: make_integrator(name, light.depth) for name in ("mivol", *light.peers)}
+    contest = contest_images(scene, integrators, size, levels)
+    tau, distance = pixel_depths(values, light, side), emitter_distances(scene, light, side)
+    counts = (tau > MIN_TAU) & (distance > EMITTER_PIXELS)
+    answer: dict = {"pixels_that_count": int(counts.sum())}
+    for name in integrators:
+        answer[name] = [image_errors(contest, name, level, counts) for level in levels]
+    compared, fair = contest, counts
     if light.inside is not None or light.has_tails:
         thinned = mi.load_dict(box_scene(values * np.float32(min(1, 1 / tau.max())), side, light.albedo, **light.parts()))
-        compared, _ = render_in_turns(thinned, size, (1,), light)
-        fair = (tau > SEEN) & (away > TRUNCATED * side)
+        compared = contest_images(thinned, integrators, size)
+        fair = (tau > MIN_TAU) & (distance > EMITTER_SHARE * side)
     for name in light.peers:
-        ratios = gain(timings[name, 1], timings[OURS, 1], counts)
-        figures[f"mivol over {name}"] = ratios | difference(compared[name, 1], compared[OURS, 1], fair)
-    return figures
+        gain = gain_figures(contest, name, "mivol", counts) | agreement_figures(compared, name, "mivol", fair)
+        answer[f"mivol over {name}"] = gain
+        say_row(f"mivol over {name}", **{key: gain[key] for key in (light.ratio_key, "z", "relative_standard_error")})
+    return answer
 
 
-def without_surfaces(values: np.ndarray, light: Light, side: int) -> mi.Scene:
-    """The volume alone, in a boundary that neither bends nor reflects: rays see how much of it lies behind each pixel."""
-    return mi.load_dict(box_scene(values, side, light.albedo))
+def contest_images(
+    scene: mi.Scene, integrators: dict[str, mi.Integrator], size: ContestSize, levels: tuple[int, ...] = (1,)
+) -> Contest:
+    """Render images by all integrators in turns."""
+
+    def rendering(integrator: mi.Integrator) -> Method:
+        return lambda seed, spp: mi.render(scene, integrator=integrator, spp=spp, seed=seed)
+
+    methods = {name: rendering(integrator) for name, integrator in integrators.items()}
+    return compete(methods, size.rounds, size.budget, size.spp, levels=levels, seed=size.seed)
 
 
-def render_in_turns(scene: mi.Scene, size: Size, levels: tuple[int, ...], light: Light) -> tuple[dict, dict]:
-    """Images of all integrators at all levels; timings and samples per pixel by (name, level)."""
-    calls, spp = {}, {}
-    for place, name in enumerate((OURS, *light.peers)):
-        integrator = of_depth(name, light.depth)
-
-        def render(seed: int, n: int, integrator: mi.Integrator = integrator, place: int = place) -> mi.TensorXf:
-            return mi.render(scene, integrator=integrator, spp=n, seed=10_000 * size.seed + 1000 * place + seed)
-
-        most = size.budget.samples(render)
-        for level in levels:
-            spp[name, level] = n = max(most // level, 1)
-            calls[name, level] = lambda seed, render=render, n=n, level=level: render(seed + 100 * level, n)
-    return race(calls, size.rounds, keep=True), spp
+def pixel_depths(values: np.ndarray, light: Light, side: int) -> np.ndarray:
+    """Mean optical depth of each pixel (H, W), seen without surfaces that bend or reflect rays."""
+    scene = mi.load_dict(box_scene(values, side, light.albedo))
+    image = mi.render(scene, integrator=mi.load_dict({"type": "mivol", "max_depth": 1, "aovs": "tau"}), spp=64, seed=1)
+    return np.array(image)[..., 3]
 
 
-def optical_depths(scene: mi.Scene) -> np.ndarray:
-    """Mean optical depth of each pixel (H, W)."""
-    tau = mi.render(scene, integrator=mi.load_dict({"type": OURS, "max_depth": 1, "aovs": "tau"}), spp=64, seed=1)
-    return np.array(tau)[..., 3]
-
-
-def pixels_from_emitter(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
-    """How far each pixel (H, W) is from an emitter in the medium [pixels]; infinite where none stands in it."""
+def emitter_distances(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
+    """Distance of each pixel (H, W) to the emitter in the medium [pixels]; infinite without such an emitter."""
     if light.inside is None:
         return np.full((side, side), np.inf)
-    seen = np.array(mi.Transform4f(scene.sensors()[0].world_transform()).inverse() @ mi.Point3f(light.inside)).ravel()
-    # 45 degrees across the picture; the camera looks along z, x to the left.
-    at = 0.5 - seen[:2] / seen[2] / (2 * math.tan(math.radians(22.5)))
+    position = np.array(mi.Transform4f(scene.sensors()[0].world_transform()).inverse() @ mi.Point3f(light.inside)).ravel()
+    # The image is 45 degrees wide; the sensor looks along z, with x to the left.
+    at = 0.5 - position[:2] / position[2] / (2 * math.tan(math.radians(22.5)))
     j, i = np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5, indexing="ij")
     return np.hypot(i - side * at[0], j - side * at[1])
 
 
-def errors(timing: Timing, counts: np.ndarray, spp: int) -> dict:
-    """Mean, variance and time of one integrator's images."""
-    m = Moments.of(np.array(timing.results))
+def image_errors(contest: Contest, name: str, level: int, counts: np.ndarray) -> dict:
+    """Mean, variance, relative error and time of the images of one integrator, over the pixels that count."""
+    m, spp = Moments.of(contest.results(name, level)), contest.spp[name, level]
     variance, mean = m.variance.mean(axis=-1)[counts], m.mean.mean(axis=-1)[counts]
     return {
+        "spp": spp,
         "mean": float(mean.mean()),
         "variance_mean_over_pixels": float(variance.mean()),
         "variance_median_over_pixels": float(np.median(variance)),
         "relative_error_mean_over_pixels": math.sqrt(variance.mean()) / float(mean.mean()),
         "relative_error_median_over_pixels": float(np.median(np.sqrt(variance)[mean > 0] / mean[mean > 0])),
-        **timing.report(counts.size * spp, "samples"),
+        **contest.timings[name, level].report(counts.size * spp, "samples"),
     }
 
 
-def gain(slow: Timing, fast: Timing, counts: np.ndarray) -> dict:
-    """How much more variance x time one needs."""
-    a, b = (Moments.of(np.array(t.results)).variance.mean(axis=-1)[counts] for t in (slow, fast))
-    time = ratio_of(slow, fast, "processor")
+def gain_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray) -> dict:
+    """Ratios of times and of variance x time, over the pixels that count."""
+    a, b = (contest.variances(name).mean(axis=-1)[counts] for name in (slow, fast))
+    times = contest.time_ratios(slow, fast)
     with np.errstate(divide="ignore", invalid="ignore"):
         by_pixel = np.median((a / b)[(a > 0) | (b > 0)])
-    return {
-        "time": ratio_of(slow, fast),
-        "processor_time": time,
-        "variance_x_time_mean_over_pixels": float(a.mean() / b.mean() * time),
-        "variance_x_time_median_over_pixels": float(by_pixel * time),
+    return times | {
+        "variance_x_time_mean_over_pixels": float(a.mean() / b.mean() * times["processor_time"]),
+        "variance_x_time_median_over_pixels": float(by_pixel * times["processor_time"]),
     }
 
 
-def difference(slow: Timing, fast: Timing, counts: np.ndarray) -> dict:
-    """z of the means over those pixels, its bound, and the standard error relative to the mean of the slow one."""
-    ours, theirs = (mean_of_pixels(np.array(t.results).mean(axis=-1)[:, counts]) for t in (fast, slow))
-    found = compare_means(ours, theirs, len(VOLUMES) * len(LIGHTS) * len(STOCK))
-    error = found["standard_error_percent"]
+def agreement_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray) -> dict:
+    """z of the means over the pixels that count, its bound, and the standard error relative to the mean of ``slow``."""
+    means = (mean_of_pixels(contest.results(name).mean(axis=-1)[:, counts]) for name in (fast, slow))
+    agreement = compare_means(*means, len(VOLUMES) * len(LIGHTS) * len(PEERS))
+    error = agreement["standard_error_percent"]
     return {
-        "z": found["z"],
-        "z_bound": found["z_bound"],
+        "z": agreement["z"],
+        "z_bound": agreement["z_bound"],
         "relative_standard_error": None if error is None else error / 100,
     }
 
 
-def ask(volume: str) -> Callable[[Size], dict]:
-    """The question about one volume."""
-
-    def measure(size: Size) -> dict:
-        found = VOLUMES[volume](size)
-        answer = {"grid": str(found)}
-        levels = size.levels if volume == "smoke" else (1,)
-        for name, light in LIGHTS.items():
-            answer[name] = contend(found.values, light, size, levels)
-            say(f"  {name}: {said(answer[name])}")
-        return answer
-
-    measure.__doc__ = f"How much sooner has mivol the same error in the {volume}?"
-    return measure
+# -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 
-def said(figures: dict) -> str:
-    """One line on a contest."""
-    peers = [name.removeprefix("mivol over ") for name in figures if name.startswith("mivol over ")]
-    rates = ", ".join(f"{name} {figures[name][0]['samples_per_second_median'] / 1e6:.3g}" for name in (OURS, *peers))
-    gains = []
-    for name in peers:
-        g = figures[f"mivol over {name}"]
-        gains.append(
-            f"{name} {g['variance_x_time_mean_over_pixels']:.0f}x mean, {g['variance_x_time_median_over_pixels']:.0f}x median, "
-            f"by the clock {g['time'] / g['processor_time']:.2f} of that "
-            f"(z {number(g['z']):+.2f}, {number(g['relative_standard_error']):.1e})"
-        )
-    return f"{'; '.join(gains)}; M samples/s: {rates}"
-
-
-QUESTIONS = {volume: ask(volume) for volume in VOLUMES}
-
-
-# -- Saying it -------------------------------------------------------------------------------------------------------------
-
-
-def compare(volume: str, answer: dict) -> list[Bar]:
-    """Every ratio beside its bar, and every z beside its bound."""
+def contest_bars(volume: str, lights: dict[str, Light], answer: dict, judged: tuple[str, ...]) -> list[Bar]:
+    """Judge the ratios to the ``judged`` integrators, and the agreement of all means."""
     rows = []
-    for name, light in LIGHTS.items():
-        for stock in STOCK:
-            g = answer[name][f"mivol over {stock}"]
-            what, ratio = f"{volume}, {name}, {stock}", g[f"variance_x_time_{light.average}_over_pixels"]
-            rows.append(judge(f"variance x time, {light.average}: {what}", ratio, AT_LEAST, light.bar))
-            rows.append(judge_agreement(what, g["z"], g["z_bound"]))
+    for name, light in lights.items():
+        for peer in light.peers:
+            figures, label = answer[name][f"mivol over {peer}"], f"{volume}, {name}, {peer}"
+            if peer in judged:
+                rows.append(judge(f"variance x time, {light.average}: {label}", figures[light.ratio_key], AT_LEAST, light.bar))
+            rows.append(judge_agreement(label, figures["z"], figures["z_bound"]))
     return rows
 
 
-def draw(answers: dict, folder: Path) -> None:
-    """Error against time in the first volume asked about; below, the ratios of all."""
-    with drawn(folder / "bench_single_scattering.png", 13, 7.2) as figure:
+def draw(answers: dict, path: Path) -> None:
+    """Plot error against time in the first volume; below, the ratios of all volumes."""
+    with new_figure(path, 13, 7.2) as figure:
         above, below = figure.subfigures(2, 1, height_ratios=(1, 0.9))
         volume = next(iter(answers))
         for axes, (name, light) in zip(above.subplots(1, len(LIGHTS)), LIGHTS.items(), strict=True):
-            draw_errors(axes, answers[volume][name], light)
+            plot_contest(axes, answers[volume][name], light)
             axes.set_title(name)
         axes.legend()
         above.suptitle(f"{volume}, one scattering: error against time", x=0.01, ha="left", weight="bold")
         for axes, (name, light) in zip(below.subplots(1, len(LIGHTS), sharey=True), LIGHTS.items(), strict=True):
-            draw_gains(axes, answers, name, light)
+            ratios = {peer: [answers[v][name][f"mivol over {peer}"][light.ratio_key] for v in answers] for peer in PEERS}
+            plot_ratios(axes, list(answers), ratios, [light.bar], first=1)
+            axes.set(xlabel=f"variance x time ({light.average} over pixels)", ylim=(-0.6, len(answers) - 0.4))
         below.suptitle("how much sooner mivol has the same error (line: the bar)", x=0.01, ha="left", weight="bold")
 
 
-def draw_errors(axes: Axes, figures: dict, light: Light) -> None:
-    """Error of a pixel against seconds."""
-    for i, name in enumerate((OURS, *light.peers)):
-        rows = figures[name]
-        seconds = [row["seconds_median"] for row in rows]
-        error = [row[f"relative_error_{light.average}_over_pixels"] for row in rows]
-        axes.loglog(seconds, error, marker=MARKERS[i], color=SERIES[i], label=name)
+def plot_contest(axes: Axes, figures: dict, light: Light) -> None:
+    """Plot the relative error of a pixel against time."""
+    key = f"relative_error_{light.average}_over_pixels"
+    curves = {
+        name: ([row["seconds_median"] for row in figures[name]], [row[key] for row in figures[name]])
+        for name in ("mivol", *light.peers)
+    }
+    plot_errors(axes, curves)
     axes.set(xlabel="time [s], warm", ylabel=f"relative error of a pixel ({light.average})")
-    plain_ticks(axes.xaxis, "")
-    plain_ticks(axes.yaxis, "")
+    use_plain_ticks(axes.xaxis)
+    use_plain_ticks(axes.yaxis)
 
 
-def draw_gains(axes: Axes, answers: dict, name: str, light: Light) -> None:
-    """A row of points for each volume."""
-    rows = np.arange(len(answers))[::-1]
-    for i, stock in enumerate(STOCK, 1):
-        gains = [answers[v][name][f"mivol over {stock}"][f"variance_x_time_{light.average}_over_pixels"] for v in answers]
-        axes.semilogx(gains, rows, MARKERS[i], color=SERIES[i], label=stock)
-    axes.axvline(light.bar, color=SERIES[0], linestyle="--", linewidth=1.2)
-    axes.set(yticks=rows, yticklabels=list(answers), ylim=(-0.6, len(rows) - 0.4))
-    axes.set_xlabel(f"variance x time ({light.average} over pixels)")
-    plain_ticks(axes.xaxis, "×")
-
-
-BENCH = Bench("bench_single_scattering", __doc__, QUESTIONS, FULL, QUICK, compare, draw)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the bench with these arguments (by default the process's own); its exit code."""
-    return BENCH.run(argv)
+QUESTIONS = {
+    name: ask(f"How much sooner has mivol the same error in the {name}?", contest_volume, name, make, LIGHTS)
+    for name, make in VOLUMES.items()
+}
+STUDY = Study(
+    __name__, __doc__, ContestSize, QUESTIONS, lambda volume, answer: contest_bars(volume, LIGHTS, answer, PEERS), draw
+)

@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.studies.gradients.size import Light
+from mivol.bench.studies.gradients.density_gradient import Light
 
 __all__ = ["Twin"]
 
@@ -93,7 +93,7 @@ class Twin:
         values: (Z, Y, X) extinction of the box [-1, 1]^3 [1/length].
         direction: (Z, Y, X) in which it changes.
         side: of the picture [pixels].
-        light: what lights the box, how often light scatters; ``drawn`` emitters are sampled at collisions.
+        light: what lights the box, how often light scatters; emitters are sampled at collisions.
     """
 
     def __init__(self, values: np.ndarray, direction: np.ndarray, side: int, light: Light) -> None:
@@ -141,7 +141,7 @@ class Twin:
         collides, meets = hit & may, p.on & ~hit & si.is_valid()
         mei = dr.zeros(mi.MediumInteraction3f, dr.width(p.ray))
         mei.p, mei.wi, mei.sh_frame, mei.t = p.ray.o + t * p.ray.d, -p.ray.d, mi.Frame3f(-p.ray.d), t
-        if self.light.drawn:
+        if self.light.samples_emitters:
             p = self._add_drawn(p, mei, collides)
         p, turned, lives = self._scatter(p, mei, collides)
         p, passed = self._cross(p, si, meets, may)
@@ -182,7 +182,7 @@ class Twin:
         if self.light.hidden:
             shown = shown & (p.depth > 0)
         emitter, mis = si.emitter(self.scene, shown), mi.Float(1)
-        if self.light.drawn:
+        if self.light.samples_emitters:
             direct = mi.DirectionSample3f(self.scene, si, p.last)
             other = self.scene.pdf_emitter_direction(p.last, direct, shown & ~p.delta & (emitter != None))
             mis = dr.select(p.delta, 1, _heuristic(p.pdf, other))

@@ -1,34 +1,384 @@
-"""What does an exact optical depth cost, and how exact is it, beside what else could be used?
+"""What does an exact optical depth cost, and how exact is it, beside other methods?
 
-    scripts/bench_optical_depth.py                        # under 10 minutes on 2 cores
-    scripts/bench_optical_depth.py --quick                # under a minute, small sizes: are the errors within their bars?
-    scripts/bench_optical_depth.py --only walk,grids      # parts of it
+    mivol bench optical_depth                        # under 10 minutes on 2 cores
+    mivol bench optical_depth --quick                # under a minute, small sizes: do the errors meet their bars?
+    mivol bench optical_depth --only walk,grids      # some of the questions
 
-Contestants trace the same rays through the same grid in the same run, in turns: rounds go through all of them, each round
-in another order. A time is the median over the rounds, the fastest one beside it; a ratio of times is the median of the
-ratios within a round. What the first call pays is reported apart: seconds in the compiler, or kernels that were found on
-disk (HOME=$(mktemp -d) hides those). Errors are against a twin in float64 NumPy. Prints JSON; writes
-bench_optical_depth.json and bench_optical_depth.png. Each figure that has a bar is printed beside it.
+All contestants trace the same rays through the same grid, in turns within each round. A time is the median over the rounds,
+with the fastest time beside it. A ratio of times is the median of the ratios within a round. The cost of the first call is
+reported apart: seconds in the compiler, or kernels found on disk (HOME=$(mktemp -d) hides those). Errors are differences to a
+slow twin in float64 NumPy.
 
-The smoke of the Mitsuba tutorial and a CT scan are read from MIVOL_DATA (default ../shared/data); where they are missing,
-made-up fields of the same sizes take their place, and the JSON says so.
+The smoke of the Mitsuba tutorial and a CT scan come from MIVOL_DATA (default ../shared/data). Without the data, made-up fields
+of the same sizes take their place, and the JSON says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import gc
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.bench.extinctions import TO_WORLD, Extinction, ct_scan, made_up, smoke, threads_in_space
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge
-from mivol.bench.harness.study import Bench
-from mivol.bench.studies.optical_depth.accuracy import measure_accuracy, measure_image
-from mivol.bench.studies.optical_depth.cost import measure_grids, measure_memory, measure_reverse, measure_walk
-from mivol.bench.studies.optical_depth.peers import measure_peers
-from mivol.bench.studies.optical_depth.size import FULL, QUICK, Size
+from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.timing import peak_bytes, race, ratio_of, time_call
+from mivol.bench.reference_walk import GridRays, camera_rays
+from mivol.bench.scenes import box_scene
+from mivol.bench.studies.optical_depth.peers import (
+    delta_survival,
+    integrate_by_drjit,
+    intersect_box,
+    marching,
+    pad_for_drjit,
+    ratio_survival,
+    tracking,
+    volpath,
+)
+from mivol.bench.studies.optical_depth.twin import exact_tau
 from mivol.report.figures import Series, plot_error_against_time
+from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_tau
+from mivol.transport.traversal.empty_blocks import block_bounds
+from mivol.transport.traversal.grid_walk import walk
+from mivol.transport.traversal.lattice import Lattice, clip
 
-__all__ = ["BENCH", "FULL", "QUICK", "Size", "main"]
+__all__ = ["STUDY", "OpticalDepthSize"]
+
+
+@dataclass(frozen=True)
+class OpticalDepthSize(Size):
+    """Amount of work."""
+
+    rounds: int = amount(7, 3, "warm calls of each contestant")
+    walk_side: int = amount(1024, 256, "edge of the image whose rays are walked [pixels]")
+    image_side: int = amount(256, 64, "edge of rendered images [pixels]")
+    image_spp: int = amount(16, 4, "samples per pixel of rendered images")
+    exact_pixels: int = amount(192, 32, "pixels compared with float64")
+    exact_rays: int = amount(4096, 1024, "rays compared with float64")
+    accuracy_res: tuple[int, ...] = amount((64, 256), (64,), "voxels along an edge of the grids for errors")
+    memory_res: tuple[int, ...] = amount((16, 64), doc="voxels along an edge of the grids for memory")
+    memory_sides: tuple[int, ...] = amount((256, 512, 1024), (64, 128, 256), "edges of the images for memory [pixels]")
+    grid_side: int = amount(512, 128, "edge of the image whose rays cross large grids [pixels]")
+    ct_res: int = amount(256, 64, "voxels along an edge of the CT scan")
+    sparse_res: int = amount(512, 128, "voxels along an edge of the threads")
+    peer_rounds: int = amount(3, doc="warm calls of each peer")
+    peer_side: int = amount(512, 64, "edge of the image for peers [pixels]")
+    peer_spp: tuple[int, ...] = amount((1, 4, 16, 64), (1, 4), "samples per ray of tracking")
+    volpath_spp: tuple[int, ...] = amount((1, 4, 16), (1, 4), "samples per ray of volpath")
+    march_steps: tuple[int, ...] = amount((16, 32, 64, 128, 256, 512, 1024), (16, 64, 256), "steps of ray marching")
+
+
+# -- Speed ------------------------------------------------------------------------------------------------------------------
+
+
+def measure_walk(size: OpticalDepthSize) -> dict:
+    """How many rays per second does the walk take through the smoke of the tutorial?"""
+    grid = smoke()
+    orders = order_rays(grid, size.walk_side)
+    timings = race({name: rays.optical_depths() for name, rays in orders.items()}, size.rounds)
+    rays = orders["camera order"]
+    hits = float(dr.mean(mi.Float(intersect_box(rays.o, rays.d)[0])).array[0])
+    reports = {name: t.report(rays.n, "rays") for name, t in timings.items()}
+    return {"grid": str(grid), "rays": rays.n, "share_of_rays_in_the_box": hits, **reports}
+
+
+def order_rays(grid: Extinction, side: int) -> dict[str, GridRays]:
+    """Camera rays through a grid, in the order of the image and in random order."""
+    o, d = camera_rays(side)
+    return {"camera order": GridRays(grid.values, o, d), "random order": GridRays(grid.values, *shuffle(o, d))}
+
+
+def shuffle(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Put rays into random order, by the seed 0."""
+    order = mi.UInt32(np.random.default_rng(0).permutation(dr.width(d)).astype(np.uint32))
+    o, d = dr.gather(mi.Point3f, o, order), dr.gather(mi.Vector3f, d, order)
+    dr.eval(o, d)
+    return o, d
+
+
+def measure_grids(size: OpticalDepthSize) -> dict:
+    """Does the cost of a walk follow the crossed cells or the size of the grid?"""
+    grids = {"smoke": smoke(), "CT": ct_scan(size.ct_res), "threads": threads_in_space(size.sparse_res)}
+    answer = {}
+    for name, grid in grids.items():
+        answer[name] = measure_grid(grid, size)
+        gc.collect()
+    return answer
+
+
+def measure_grid(grid: Extinction, size: OpticalDepthSize) -> dict:
+    """Times and steps of walks with and without empty blocks, in both orders of the rays."""
+    orders = order_rays(grid, size.grid_side)
+    contestants = {
+        f"{order}, {'empty blocks skipped' if skip else 'every cell'}": rays.optical_depths(skip)
+        for order, rays in orders.items()
+        for skip in (False, True)
+    }
+    timings = race(contestants, size.rounds)
+    rays = orders["camera order"]
+    counts = {skip: count_cells(rays.lattice(skip), rays) for skip in (False, True)}
+    occupied = np.array(block_bounds(rays.tensor)) > 0
+    answer: dict = {"grid": str(grid), "rays": rays.n, "occupied_blocks": float(occupied.mean())}
+    for name, timing in timings.items():
+        visited, steps = counts["skipped" in name]
+        answer[name] = timing.report(rays.n, "rays") | {
+            "cells_visited_per_ray": visited,
+            "steps_per_ray": steps,
+            "nanoseconds_per_step": 1e9 * timing.median / (rays.n * steps),
+        }
+    return answer
+
+
+def count_cells(lattice: Lattice, rays: GridRays) -> tuple[float, float]:
+    """Mean number of visited cells and of steps per ray, rays that miss the box included; a leap over a block is a step."""
+
+    def visit(state: tuple[mi.UInt32, mi.UInt32], cell: object, on: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        return state[0] + dr.select(on, mi.UInt32(1), 0), state[1] + 1
+
+    zero = dr.zeros(mi.UInt32, rays.n)
+    visited, steps = walk(lattice, clip(lattice, rays.o, rays.d, 0, math.inf), visit, (zero, mi.UInt32(zero)))
+    return tuple(float(np.array(c, np.float64).mean()) for c in (visited, steps))
+
+
+# -- Derivatives ------------------------------------------------------------------------------------------------------------
+
+
+def measure_reverse(size: OpticalDepthSize) -> dict:
+    """What does the transpose cost, relative to the optical depth itself?"""
+    answer = {}
+    for name, grid, side in (("smoke", smoke(), size.walk_side), ("CT", ct_scan(size.ct_res), size.grid_side)):
+        rays = GridRays(grid.values, *camera_rays(side))
+        answer[name] = {"grid": str(grid), "rays": rays.n} | race_reverse(rays, size.rounds)
+    return answer | {"render": race_gradient_of_render(size)}
+
+
+def race_reverse(rays: GridRays, rounds: int) -> dict:
+    """Times of the walk, of its transpose, and of gradient steps through the AD graph."""
+    lattice, padded, ones = rays.lattice(), pad_for_drjit(rays.values), dr.full(mi.Float, 1, rays.n)
+    dr.make_opaque(ones)
+
+    def reverse(_: int) -> mi.Float:
+        gradient = Gradient.zeros(lattice)
+        backproject_segment(lattice, gradient, [ones], clip(lattice, rays.o, rays.d, 0, math.inf))
+        return gradient.fold()
+
+    contestants = {
+        "forward": rays.optical_depths(),
+        "reverse": reverse,
+        "gradient step": lambda _: grid_gradient_step(rays),
+        "gradient step of drjit.dda.integrate": lambda _: gradient_step(padded, lambda v: integrate_by_drjit(rays, v)),
+    }
+    timings = race(contestants, rounds)
+    ratios = {f"{name} over forward": ratio_of(t, timings["forward"]) for name, t in timings.items() if name != "forward"}
+    return ratios | {name: t.report(rays.n, "rays") for name, t in timings.items()}
+
+
+def grid_gradient_step(rays: GridRays) -> mi.Float:
+    """A gradient step of mivol's optical depth."""
+    return gradient_step(rays.tensor, lambda v: integrate_tau(Lattice(v, TO_WORLD), rays.o, rays.d))
+
+
+def gradient_step(values: mi.TensorXf, integrate: Callable[[mi.TensorXf], mi.Float]) -> mi.Float:
+    """Derivative of the sum of tau^2 over all rays with respect to the grid."""
+    values = mi.TensorXf(values)
+    dr.enable_grad(values)
+    tau = integrate(values)
+    dr.backward(dr.sum(tau * tau))
+    return dr.grad(values).array
+
+
+def race_gradient_of_render(size: OpticalDepthSize) -> dict:
+    """Times of a render and of a gradient step through ``mi.render``."""
+    scene, integrator = mi.load_dict(box_scene(smoke().values, size.image_side)), mi.load_dict({"type": "mivol"})
+    params, key = mi.traverse(scene), "box.interior_medium.sigma_t.data"
+
+    def render(seed: int) -> mi.TensorXf:
+        return mi.render(scene, params, integrator=integrator, spp=size.image_spp, seed=seed)
+
+    def step(seed: int) -> mi.Float:
+        dr.enable_grad(params[key])
+        dr.backward(dr.mean(render(seed)))
+        gradient = dr.grad(params[key])
+        dr.disable_grad(params[key])
+        return gradient
+
+    timings = race({"render": render, "gradient step": step}, size.rounds)
+    reports = {name: t.report(size.image_side**2 * size.image_spp, "paths") for name, t in timings.items()}
+    return {"gradient step over render": ratio_of(timings["gradient step"], timings["render"])} | reports
+
+
+def measure_memory(size: OpticalDepthSize) -> dict:
+    """How does the memory of a gradient step grow with the number of rays, and with the number of crossed cells?"""
+    answer = {}
+    for res in size.memory_res:
+        values, counts, peaks = made_up((res,) * 3, 2.0, "any").values, [], []
+        for side in size.memory_sides:
+            rays = GridRays(values, *camera_rays(side))
+            gc.collect()
+            counts.append(rays.n)
+            peaks.append(peak_bytes(lambda rays=rays: time_call(lambda _: grid_gradient_step(rays))))
+        slope, start = np.polyfit(np.array(counts, float), np.array(peaks, float), 1)
+        answer[f"{res}^3"] = {
+            "rays": counts,
+            "peak_bytes": peaks,
+            "bytes_per_ray": float(slope),
+            "bytes_without_rays": float(start),
+        }
+    return answer
+
+
+# -- Errors -----------------------------------------------------------------------------------------------------------------
+
+
+def measure_accuracy(size: OpticalDepthSize) -> dict:
+    """How far is tau from the float64 twin, relative to the integral of sigma + h |grad sigma|?"""
+    answer = {}
+    for res in size.accuracy_res:
+        rng = np.random.default_rng(res)
+        fields = {"noise": rng.uniform(0, 4, (res,) * 3).astype(np.float32), "threads": threads_in_space(res).values}
+        for name, values in fields.items():
+            o, d = rays_across(rng, size.exact_rays)
+            exact = exact_tau(values, *(x.T.astype(np.float64) for x in (o, d)))
+            rays = GridRays(values, mi.Point3f(o), mi.Vector3f(d))
+            answer |= {
+                f"{res}^3 {name}": tau_errors(rays.optical_depths()(0), *exact),
+                f"{res}^3 {name}, empty blocks skipped": tau_errors(rays.optical_depths(skip_empty=True)(0), *exact),
+                f"drjit.dda.integrate, {res}^3 {name}": tau_errors(integrate_by_drjit(rays, pad_for_drjit(values)), *exact),
+            }
+    return answer
+
+
+def rays_across(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays (3, n) float32 through random points of the box in all directions; an eighth is parallel to an axis."""
+    d = rng.normal(size=(3, n))
+    d[:, : n // 8] = np.repeat(np.eye(3), -(-n // 24), axis=1)[:, : n // 8]
+    d /= np.linalg.norm(d, axis=0)
+    return np.float32(rng.uniform(-1, 1, (3, n)) - rng.uniform(2, 8, n) * d), np.float32(d)
+
+
+def tau_errors(tau: mi.Float, exact: np.ndarray, measure: np.ndarray) -> dict[str, float]:
+    """Errors of optical depths relative to their measure; a ray with measure 0 must have an optical depth of 0."""
+    error, hit = np.abs(np.array(tau) - exact), measure > 0
+    relative = error[hit] / measure[hit]
+    return {
+        "rays": int(hit.sum()),
+        "largest_error": float(relative.max()),
+        "rms_error": float(np.sqrt(np.mean(relative**2))),
+        "error_of_99.9_percent": float(np.quantile(relative, 0.999)),
+        "error_where_exactly_empty": float(error[~hit].max(initial=0)),
+    }
+
+
+def measure_image(size: OpticalDepthSize) -> dict:
+    """How much sooner than ``volpath`` does ``mi.render`` finish, with the same samples per pixel and with the same error?"""
+    grid = smoke()
+    scene = mi.load_dict(box_scene(grid.values, size.image_side))
+    settings = {"mivol": ("mivol", 1), "volpath, max_depth 1": ("volpath", 1), "volpath, max_depth 6": ("volpath", 6)}
+    contestants = {}
+    for name, (kind, depth) in settings.items():
+        integrator = mi.load_dict({"type": kind, "max_depth": depth})
+        contestants[name] = lambda seed, i=integrator: mi.render(scene, integrator=i, spp=size.image_spp, seed=seed)
+    timings = race(contestants, size.rounds, keep=True)
+    pixels = np.random.default_rng(0).choice(size.image_side**2, size.exact_pixels, replace=False)
+    exact, doubt = pixel_means(grid.values, size.image_side, pixels)
+    answer: dict = {
+        "grid": str(grid),
+        "pixels": size.image_side**2,
+        "spp": size.image_spp,
+        "exact_pixels": len(pixels),
+        "rms_error_of_exact": doubt,
+    }
+    for name, timing in timings.items():
+        errors = [image[..., 0].ravel()[pixels] - exact for image in timing.results]
+        answer[name] = timing.report(size.image_side**2 * size.image_spp, "paths") | {"rms_error": rms(errors)}
+        if name != "mivol":
+            faster = ratio_of(timing, timings["mivol"])
+            variance = (answer[name]["rms_error"] / answer["mivol"]["rms_error"]) ** 2
+            answer[name] |= {"mivol_is_faster": faster, "mivol_is_faster_at_equal_error": faster * variance}
+    return answer
+
+
+def pixel_means(values: np.ndarray, side: int, pixels: np.ndarray, k: int = 12) -> tuple[np.ndarray, float]:
+    """Mean transmittance of pixels from k x k rays of the twin each, and the RMS difference to k/2 x k/2 rays."""
+    means = []
+    for parts in (k, k // 2):
+        o, d = (np.array(x).T.astype(np.float64) for x in camera_rays(side, pixels, parts))
+        means.append(np.exp(-exact_tau(values, o, d)[0]).reshape(len(pixels), -1).mean(axis=1))
+    return means[0], rms(means[0] - means[1])
+
+
+def rms(errors: object) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def measure_peers(size: OpticalDepthSize) -> dict:
+    """How does the error of the transmittance of a ray fall with time, for all methods?"""
+    grid = smoke()
+    rays = GridRays(grid.values, *camera_rays(size.peer_side))
+    tau, padded = rays.optical_depths(), pad_for_drjit(grid.values)
+    methods = {
+        ("mivol", ""): lambda _: dr.exp(-tau(0)),
+        **{("volpath", f"{n} spp"): volpath(rays, n) for n in size.volpath_spp},
+        **{("ratio tracking", f"{n} spp"): tracking(rays, n, ratio_survival) for n in size.peer_spp},
+        **{("delta tracking", f"{n} spp"): tracking(rays, n, delta_survival) for n in size.peer_spp},
+        **{("marching", f"{n} steps"): marching(rays, n) for n in size.march_steps},
+        ("drjit.dda.integrate", ""): lambda _: dr.exp(-integrate_by_drjit(rays, padded)),
+    }
+    timings = race(methods, size.peer_rounds, keep=True)
+    index, o, d = rays.select(size.exact_rays)
+    exact = np.exp(-exact_tau(grid.values, o, d)[0])
+    answer: dict = {"grid": str(grid), "rays": rays.n, "exact_rays": len(index)}
+    for (method, setting), timing in timings.items():
+        error = np.array([T[index] - exact for T in timing.results])
+        errors = {"setting": setting, "rms_error": rms(error), "mean_error": float(np.mean(error))}
+        answer.setdefault(method, []).append(errors | timing.report(rays.n, "rays"))
+    return answer
+
+
+# -- Bars and figure --------------------------------------------------------------------------------------------------------
+
+
+def compare(question: str, answer: dict) -> list[Bar]:
+    """Judge the figures of an answer."""
+    if question == "walk":
+        return [judge("walk [M rays/s]", answer["camera order"]["rays_per_second_median"] / 1e6, AT_LEAST, 15)]
+    if question == "image":
+        return [judge("mi.render, rate over volpath's", answer["volpath, max_depth 1"]["mivol_is_faster"], AT_LEAST, 20)]
+    if question == "reverse":
+        return [judge("reverse pass over forward pass", answer["smoke"]["reverse over forward"], AT_MOST, 4)]
+    if question == "memory":
+        # The state of a ray: o and d, its optical depth, and the derivative of the optical depth: 8 float32.
+        return [judge("gradient step [bytes/ray]", max(f["bytes_per_ray"] for f in answer.values()), AT_MOST, 32)]
+    if question == "accuracy":
+        largest: dict[str, float] = {}
+        for name, figures in answer.items():
+            if not name.startswith("drjit"):
+                res = name.split()[0]
+                largest[res] = max(largest.get(res, 0.0), figures["largest_error"])
+        label = "error of tau over int (sigma + h |grad sigma|)"
+        return [judge(f"{label}, {res}", error, AT_MOST, 2e-6) for res, error in largest.items()]
+    return []
+
+
+def draw(answers: dict, path: Path) -> None:
+    """Plot error against time for all methods."""
+    if (peers := answers.get("peers")) is None:
+        return
+    series = [
+        Series(name, [p["seconds_median"] for p in points], [p["rms_error"] for p in points])
+        for name, points in peers.items()
+        if isinstance(points, list)
+    ]
+    title = f"Transmittance of {peers['rays']:,} rays through the smoke {peers['grid'].split(',')[0]}: error against time"
+    plot_error_against_time(series, path, error="RMS error of T against float64", title=title)
+
 
 QUESTIONS = {
     "walk": measure_walk,
@@ -39,55 +389,4 @@ QUESTIONS = {
     "grids": measure_grids,
     "peers": measure_peers,
 }
-
-
-class Promise(NamedTuple):
-    """What the project promises of an answer: a figure, and where it has to lie. ``find`` gives None where it is not there."""
-
-    question: str
-    figure: str
-    sense: str
-    bar: float
-    find: Callable[[dict], float | None]
-
-
-def _largest_error(res: int) -> Callable[[dict], float | None]:
-    return lambda a: max((f["largest_error"] for name, f in a.items() if name.startswith(f"{res}^3")), default=None)
-
-
-ERROR = "error of tau over int (sigma + h |grad sigma|)"
-PROMISES = (
-    Promise("walk", "walk [M rays/s]", AT_LEAST, 15, lambda a: a["camera order"]["rays_per_second_median"] / 1e6),
-    Promise("image", "mi.render, rate over volpath's", AT_LEAST, 20, lambda a: a["volpath, max_depth 1"]["mivol_is_faster"]),
-    Promise("accuracy", f"{ERROR}, 64^3", AT_MOST, 2e-6, _largest_error(64)),
-    Promise("accuracy", f"{ERROR}, 256^3", AT_MOST, 2e-6, _largest_error(256)),
-    Promise("reverse", "reverse pass over forward pass", AT_MOST, 4, lambda a: a["smoke"]["reverse over forward"]),
-    # A ray's own state: o and d, its optical depth, and the derivative of that: 8 float32.
-    Promise("memory", "gradient step [bytes/ray]", AT_MOST, 32, lambda a: max(f["bytes_per_ray"] for f in a.values())),
-)
-
-
-def compare(question: str, answer: dict) -> list[Bar]:
-    """The figures of an answer that have a bar, beside it, and said."""
-    found = [(b, b.find(answer)) for b in PROMISES if b.question == question]
-    return [judge(b.figure, value, b.sense, b.bar) for b, value in found if value is not None]
-
-
-def draw(answers: dict, folder: Path) -> None:
-    """Error against time."""
-    if (peers := answers.get("peers")) is None:
-        return
-    rows = {name: points for name, points in peers.items() if isinstance(points, list)}
-    series = [
-        Series(name, [p["seconds_median"] for p in points], [p["rms_error"] for p in points]) for name, points in rows.items()
-    ]
-    title = f"Transmittance of {peers['rays']:,} rays through the smoke {peers['grid'].split(',')[0]}: error against time"
-    plot_error_against_time(series, folder / "bench_optical_depth.png", error="RMS error of T against float64", title=title)
-
-
-BENCH = Bench("bench_optical_depth", __doc__, QUESTIONS, FULL, QUICK, compare, draw)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the bench with these arguments (by default the process's own); its exit code."""
-    return BENCH.run(argv)
+STUDY = Study(__name__, __doc__, OpticalDepthSize, QUESTIONS, compare, draw)

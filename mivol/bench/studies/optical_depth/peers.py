@@ -1,6 +1,6 @@
-"""Error of the transmittance of rays against time, for all that could be used in the place of an exact optical depth.
+"""Other methods for the transmittance of rays: ray marching, ratio and delta tracking, ``volpath``, ``drjit.dda.integrate``.
 
-Conventions. Every method gets the same rays through the same grid over [-1, 1]^3 and returns one transmittance a ray.
+Conventions. Every method gets the same rays through the same grid over [-1, 1]^3 and returns one transmittance for each ray.
 Marching and tracking read a ``Texture3f``, as a user of Mitsuba would write them.
 """
 
@@ -13,31 +13,31 @@ import drjit.dda
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.extinctions import smoke
-from mivol.bench.harness.timing import Contestant, race
+from mivol.bench.harness.timing import Contestant
+from mivol.bench.reference_walk import GridRays
 from mivol.bench.scenes import box_scene
-from mivol.bench.studies.optical_depth.size import Size
-from mivol.bench.studies.optical_depth.twin import exact_tau
-from mivol.bench.studies.optical_depth.work import Work, camera_rays
 
-__all__ = ["by_drjit_dda", "inside_box", "measure_peers", "padded"]
+__all__ = [
+    "delta_survival", "integrate_by_drjit", "intersect_box", "marching", "pad_for_drjit", "ratio_survival", "tracking",
+    "volpath",
+]  # fmt: skip
 
 
-def inside_box(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-    """Where rays are in the box, as a user of Mitsuba finds it."""
+def intersect_box(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    """Hit, entry and exit distance of rays and the box, by Mitsuba's bounding box."""
     hit, t0, t1 = mi.BoundingBox3f(mi.Point3f(-1), mi.Point3f(1)).ray_intersect(mi.Ray3f(o, d))
     return hit & (t1 > 0), dr.maximum(t0, 0), t1
 
 
 def look_up(texture: mi.Texture3f, o: mi.Point3f, d: mi.Vector3f, t: mi.Float, active: mi.Bool) -> mi.Float:
-    """The extinction at a distance along a ray."""
+    """Extinction at a distance along a ray."""
     return texture.eval(dr.fma(dr.fma(d, t, o), 0.5, 0.5), active)[0]
 
 
 @dr.syntax
 def march(texture: mi.Texture3f, o: mi.Point3f, d: mi.Vector3f, steps: mi.UInt32) -> mi.Float:
-    """Transmittance by the midpoint rule with equal steps through the box."""
-    active, t0, t1 = inside_box(o, d)
+    """Transmittance by the midpoint rule, with equal steps through the box."""
+    active, t0, t1 = intersect_box(o, d)
     dt = (t1 - t0) / mi.Float(steps)
     tau, i = mi.Float(0), mi.UInt32(0)
     while active & (i < steps):
@@ -47,16 +47,16 @@ def march(texture: mi.Texture3f, o: mi.Point3f, d: mi.Vector3f, steps: mi.UInt32
 
 
 Survival = Callable[["mi.Float", "mi.Sampler", "mi.Bool"], "mi.Float"]
-"""Takes the probability that a tentative collision is a real one; returns the factor that the transmittance gets."""
+"""Probability of a real collision -> factor of the transmittance."""
 
 
-def ratio(p_real: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-    """Ratio tracking: the expected share that survives."""
+def ratio_survival(p_real: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
+    """Ratio tracking: the expected surviving share."""
     return 1 - p_real
 
 
-def delta(p_real: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-    """Delta tracking: all or nothing, drawn."""
+def delta_survival(p_real: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
+    """Delta tracking: 0 or 1 at random."""
     return dr.select(sampler.next_1d(active) < p_real, 0, mi.Float(1))
 
 
@@ -64,8 +64,8 @@ def delta(p_real: mi.Float, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
 def track(
     texture: mi.Texture3f, o: mi.Point3f, d: mi.Vector3f, majorant: mi.Float, sampler: mi.Sampler, survive: Survival
 ) -> mi.Float:
-    """Transmittance by tracking with one majorant, unbiased with either way to survive a tentative collision."""
-    active, t, t1 = inside_box(o, d)
+    """Unbiased transmittance by tracking with one majorant."""
+    active, t, t1 = intersect_box(o, d)
     T = mi.Float(1)
     while active:
         t -= dr.log(1 - sampler.next_1d(active)) / majorant
@@ -76,73 +76,48 @@ def track(
     return T
 
 
-def each_sample(work: Work, spp: int, seed: int, estimate: Callable) -> mi.Float:
-    """Mean of ``spp`` estimates a ray, those of one ray side by side, as a renderer lays them out."""
+def mean_of_samples(rays: GridRays, spp: int, seed: int, estimate: Callable) -> mi.Float:
+    """Mean of ``spp`` estimates for each ray; the samples of a ray are adjacent, as in a renderer."""
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, work.n * spp)
-    ray = dr.arange(mi.UInt32, work.n * spp) // dr.opaque(mi.UInt32, spp)
-    o, d = dr.gather(mi.Point3f, work.o, ray), dr.gather(mi.Vector3f, work.d, ray)
+    sampler.seed(seed, rays.n * spp)
+    ray = dr.arange(mi.UInt32, rays.n * spp) // dr.opaque(mi.UInt32, spp)
+    o, d = dr.gather(mi.Point3f, rays.o, ray), dr.gather(mi.Vector3f, rays.d, ray)
     return dr.block_sum(estimate(o, d, sampler), spp) / spp
 
 
-def by_marching(work: Work, steps: int) -> Contestant:
-    """A transmittance for each ray in ``steps`` equal steps over a Texture3f."""
-    texture = mi.Texture3f(work.tensor, wrap_mode=dr.WrapMode.Clamp)
-    return lambda _: march(texture, work.o, work.d, dr.opaque(mi.UInt32, steps))
+def marching(rays: GridRays, steps: int) -> Contestant:
+    """Contestant: ray marching in equal steps over a Texture3f."""
+    texture = mi.Texture3f(rays.tensor, wrap_mode=dr.WrapMode.Clamp)
+    return lambda _: march(texture, rays.o, rays.d, dr.opaque(mi.UInt32, steps))
 
 
-def by_tracking(work: Work, spp: int, survive: Survival) -> Contestant:
-    """A transmittance for each ray from ``spp`` random walks over a Texture3f."""
-    texture = mi.Texture3f(work.tensor, wrap_mode=dr.WrapMode.Clamp)
-    majorant = dr.opaque(mi.Float, float(work.values.max()))
-    return lambda seed: each_sample(work, spp, seed, lambda o, d, s: track(texture, o, d, majorant, s, survive))
+def tracking(rays: GridRays, spp: int, survive: Survival) -> Contestant:
+    """Contestant: ``spp`` random walks for each ray over a Texture3f."""
+    texture = mi.Texture3f(rays.tensor, wrap_mode=dr.WrapMode.Clamp)
+    majorant = dr.opaque(mi.Float, float(rays.values.max()))
+    return lambda seed: mean_of_samples(rays, spp, seed, lambda o, d, s: track(texture, o, d, majorant, s, survive))
 
 
-def by_volpath(work: Work, spp: int) -> Contestant:
-    """A transmittance for each ray from ``spp`` paths of stock ``volpath`` under a sky of radiance 1."""
-    scene = mi.load_dict(box_scene(work.values, 8))
-    volpath = mi.load_dict({"type": "volpath", "max_depth": 1})
+def volpath(rays: GridRays, spp: int) -> Contestant:
+    """Contestant: ``spp`` paths of Mitsuba's ``volpath`` for each ray, under a sky of radiance 1."""
+    scene = mi.load_dict(box_scene(rays.values, 8))
+    integrator = mi.load_dict({"type": "volpath", "max_depth": 1})
 
     def paths(o: mi.Point3f, d: mi.Vector3f, sampler: mi.Sampler) -> mi.Float:
-        return volpath.sample(scene, sampler, mi.RayDifferential3f(o, d))[0].x
+        return integrator.sample(scene, sampler, mi.RayDifferential3f(o, d))[0].x
 
-    return lambda seed: each_sample(work, spp, seed, paths)
+    return lambda seed: mean_of_samples(rays, spp, seed, paths)
 
 
-def padded(values: np.ndarray) -> mi.TensorXf:
-    """A grid for ``drjit.dda.integrate``, whose nodes lie at the corners of its box: one voxel of edge on each side."""
+def pad_for_drjit(values: np.ndarray) -> mi.TensorXf:
+    """Pad a grid by one voxel on each side for ``drjit.dda.integrate``, whose nodes lie at the corners of its box."""
     return mi.TensorXf(np.pad(values, 1, mode="edge"))
 
 
-def by_drjit_dda(work: Work, grid: mi.TensorXf) -> mi.Float:
-    """The optical depth of each ray by ``drjit.dda.integrate`` over a padded grid: rays are cut to the true box."""
-    size = np.array(work.values.shape[::-1])
+def integrate_by_drjit(rays: GridRays, padded: mi.TensorXf) -> mi.Float:
+    """Optical depth of each ray by ``drjit.dda.integrate`` over a padded grid; rays are clipped to the true box."""
+    size = np.array(rays.values.shape[::-1])
     low, high = mi.Vector3f((-1 - 1 / size).tolist()), mi.Vector3f((1 + 1 / size).tolist())
-    hit, t0, t1 = inside_box(work.o, work.d)
-    start = mi.Vector3f(dr.fma(work.d, t0, work.o))
-    return drjit.dda.integrate(start, work.d, t1 - t0, low, high, grid, active=hit)
-
-
-def measure_peers(size: Size) -> dict:
-    """Error of the transmittance of a ray against time, for all that could be used."""
-    found = smoke()
-    work = Work(found.values, *camera_rays(size.peer_side))
-    tau, grid = work.tau(), padded(found.values)
-    methods = {
-        "mivol": {"": lambda _: dr.exp(-tau(0))},
-        "volpath": {f"{s} spp": by_volpath(work, s) for s in size.volpath_spp},
-        "ratio tracking": {f"{s} spp": by_tracking(work, s, ratio) for s in size.peer_spp},
-        "delta tracking": {f"{s} spp": by_tracking(work, s, delta) for s in size.peer_spp},
-        "marching": {f"{n} steps": by_marching(work, n) for n in size.march_steps},
-        "drjit.dda.integrate": {"": lambda _: dr.exp(-by_drjit_dda(work, grid))},
-    }
-    flat = {(method, setting): call for method, settings in methods.items() for setting, call in settings.items()}
-    timings = race(flat, size.peer_rounds, keep=True)
-    index, o, d = work.spread(size.exact_rays)
-    exact = np.exp(-exact_tau(found.values, o, d)[0])
-    figures = {"grid": str(found), "rays": work.n, "exact_rays": len(index)}
-    for (method, setting), t in timings.items():
-        error = np.array([T[index] - exact for T in t.results])
-        errors = {"rms_error": float(np.sqrt(np.mean(error**2))), "mean_error": float(np.mean(error))}
-        figures.setdefault(method, []).append({"setting": setting} | errors | t.report(work.n, "rays"))
-    return figures
+    hit, t0, t1 = intersect_box(rays.o, rays.d)
+    start = mi.Vector3f(dr.fma(rays.d, t0, rays.o))
+    return drjit.dda.integrate(start, rays.d, t1 - t0, low, high, padded, active=hit)

@@ -1,4 +1,4 @@
-"""The slow twin of the walk: optical depths of rays in float64 NumPy, with the measure of what float32 may err by."""
+"""Slow twin of the walk: optical depths of rays in float64 NumPy, with the scale of the rounding error of float32."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ __all__ = ["exact_tau"]
 def exact_tau(values: np.ndarray, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Optical depth of rays in float64 NumPy, and the measure of its error.
 
-    All planes through voxel centres that a ray crosses are sorted, and two Gauss points between each pair integrate the
-    cubic that a trilinear field is there.
+    A ray crosses planes through voxel centres. Between two adjacent planes a trilinear field is a cubic along the ray, and two
+    Gauss points integrate this cubic exactly.
 
     Args:
-        values: (Z, Y, X), over ``TO_WORLD``.
-        o, d: (n, 3).
+        values: (Z, Y, X) extinction in the box ``TO_WORLD``.
+        o, d: origins and directions (n, 3).
 
     Returns:
-        int sigma and int (sigma + |grad sigma|), the gradient over one voxel: (n,) each.
+        Integrals of sigma and of |sigma| + |grad sigma|, with the gradient per voxel: (n,) each.
     """
     size = np.array(values.shape[::-1])
     chunk = max(1, (1 << 20) // int(size.sum()))
@@ -52,7 +52,7 @@ def _exact_tau(values: np.ndarray, size: np.ndarray, o: np.ndarray, d: np.ndarra
 
 
 def _trilinear(values: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A field and the length of its gradient at lattice points (..., 3), the borders clamped."""
+    """Value and length of the gradient of a field at lattice points (..., 3), with clamped borders."""
     low = np.floor(q).astype(int)
     f = q - low
     sigma, slope = np.zeros(q.shape[:-1]), np.zeros(q.shape)

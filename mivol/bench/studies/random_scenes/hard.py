@@ -10,7 +10,7 @@ import numpy as np
 
 from mivol.bench.extinctions import as_dense_as_smoke, smoke, threads_in_space
 from mivol.bench.harness.bars import say
-from mivol.bench.scenes import box_scene, constant_light, emitter_inside, milky_glass, of_depth, sun_and_sky
+from mivol.bench.scenes import box_scene, constant_light, emitter_inside, make_integrator, milky_glass, sun_and_sky
 from mivol.bench.studies.random_scenes.trials import Size
 
 __all__ = ["HARD", "try_hard_scenes"]
@@ -56,7 +56,7 @@ def try_hard_scenes(size: Size) -> dict:
     """Are all paths of hard scenes of a finite radiance that is not negative?"""
     answer = {}
     for name, parts in HARD.items():
-        scene, integrator = mi.load_dict(parts()), of_depth("mivol", -1)
+        scene, integrator = mi.load_dict(parts()), make_integrator("mivol", -1)
         answer[name] = found = {"paths": 0, "not_finite": 0, "negative": 0, "brightest": 0.0}
         for k in range(size.hard_pictures):
             picture = np.array(mi.render(scene, integrator=integrator, spp=1, seed=k))
