@@ -187,7 +187,7 @@ def smoke_bench(folder: Path) -> None:
     """The studies are listed, and the quickest is run."""
     check("optical_depth" in mivol("bench"), "bench lists no study")
     mivol("bench", "tomography", "--size", "16", "--views", "8", "--iterations", "2", "--out", "tomography")
-    check((folder / "tomography" / "tomography.json").is_file(), "bench tomography writes no figures")
+    check((folder / "tomography" / "bench_tomography.json").is_file(), "bench tomography writes no figures")
 
 
 def smoke_render(folder: Path) -> None:

@@ -24,7 +24,7 @@ def kept(module: ModuleType, found: list[Figure], monkeypatch: pytest.MonkeyPatc
             found.append(Figure(figsize=(width, height)))
             yield found[-1]
 
-    monkeypatch.setattr(module, "drawn", keep)
+    monkeypatch.setattr(module, "new_figure", keep)
     yield
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.bench.studies.radiance_field.room import cameras_of, image_of
+from mivol.bench.studies.radiance_field.room import make_cameras, trace_image
 from mivol.files import write_png
 from mivol.photos import Camera, Photo
 from mivol.photos.photo_file import decode_srgb
@@ -17,7 +17,7 @@ SIZE = (32, 24)
 
 def cameras(count: int) -> list[Camera]:
     """All around the ball, at several heights, looking at it."""
-    return cameras_of(count, SIZE)
+    return make_cameras(count, SIZE)
 
 
 def capture(count: int, uneven: float = 0.0) -> list[Photo]:
@@ -25,7 +25,7 @@ def capture(count: int, uneven: float = 0.0) -> list[Photo]:
     gains = np.exp(uneven * np.random.default_rng(7).normal(size=count))
     black = np.zeros(3, np.float32)
     return [
-        Photo(camera.name, np.float32(np.clip(gain * image_of(camera), 0, 1)), None, None, camera, black)
+        Photo(camera.name, np.float32(np.clip(gain * trace_image(camera), 0, 1)), None, None, camera, black)
         for camera, gain in zip(cameras(count), gains, strict=True)
     ]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import re
 import shlex
@@ -14,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from mivol.bench.harness.catalogue import STUDIES
+from mivol.bench.harness.catalogue import load_study, study_names
 from mivol.cli import VERBS
 from mivol.cli import parser as mivol_parser
 from mivol.experiments.examples import EXAMPLES
@@ -61,10 +60,8 @@ def find_faults(command: str) -> list[str]:
         named = [name for word in rest for group in re.findall(r"^(?:mivol|\.)\[(.*)\]$", word) for name in group.split(",")]
         return [name for name in named if name not in extras]
     if program.endswith(".py") and (ROOT / program).is_file():
-        text = _text_of_flags(ROOT / program)
-        only = [name for word, value in pairwise(rest) if word == "--only" for name in value.split(",")]
-        questions = only if "mivol.bench" in (ROOT / program).read_text() else []
-        return [word for word in (*_flags(rest), *questions) if not re.search(rf"(?<![\w-]){re.escape(word)}(?![\w-])", text)]
+        text = (ROOT / program).read_text()
+        return [flag for flag in _flags(rest) if not re.search(rf"(?<![\w-]){re.escape(flag)}(?![\w-])", text)]
     return []
 
 
@@ -76,20 +73,15 @@ def _faults_of_verb(verb: str, *rest: str) -> list[str]:
     """Flags that a verb does not take, and unknown names of examples, benches and data sets; capitals stand for any name."""
     if verb not in VERBS:
         return [] if verb.isupper() else [verb]
-    known = {"demo": EXAMPLES, "bench": STUDIES, "fetch": DATA}.get(verb, rest)
+    known = {"demo": EXAMPLES, "bench": study_names(), "fetch": DATA}.get(verb, rest)
     unknown = [name for name in rest[:1] if not name.startswith("-") and name not in known and not name.isupper()]
-    if verb == "bench" and rest[:1] and rest[0] in STUDIES:
-        help_text = _help_of(lambda: importlib.import_module(f"mivol.bench.studies.{rest[0]}").main(["--help"]))
-    else:
-        help_text = _help_of(lambda: mivol_parser().parse_args([verb, "--help"]))
+    help_text = _help_of(lambda: mivol_parser().parse_args([verb, "--help"]))
+    if verb == "bench" and rest and not unknown:
+        study = load_study(rest[0])
+        help_text += _help_of(lambda: study.parse(["--help"]))
+        only = [name for word, value in pairwise(rest) if word == "--only" for name in value.split(",")]
+        unknown = [name for name in only if name not in study.questions]
     return unknown + [flag for flag in _flags(rest) if not re.search(rf"(?<![\w-]){flag}(?![\w-])", help_text)]
-
-
-def _text_of_flags(script: Path) -> str:
-    """The help of the bench that a script calls; else the script itself."""
-    text = script.read_text()
-    bench = re.search(r"^from (mivol\.bench[.\w]*) import main$", text, re.MULTILINE)
-    return _help_of(lambda: importlib.import_module(bench[1]).main(["--help"])) if bench else text
 
 
 def _help_of(call: Callable) -> str:
@@ -112,9 +104,8 @@ def test_commands_of_a_page_can_be_typed(page: Path) -> None:
         ("python -m mivol demo smok", "smok"),
         ("mivol bench optical_depths", "optical_depths"),
         ("mivol fetch toot", "toot"),
-        ("scripts/bench_pints.py", "scripts/bench_pints.py"),
-        ("scripts/bench_points.py --onl chair", "--onl"),
-        ("scripts/bench_points.py --only chairs", "chairs"),
+        ("mivol bench points --onl chair", "--onl"),
+        ("mivol bench points --only chairs", "chairs"),
         ("python scenes/bonsai/scan.py --slices", "--slices"),
         ("pip install '.[llvn]'", "llvn"),
     ],

@@ -17,7 +17,7 @@ from mivol.bench.extinctions import TO_WORLD, smoke
 from mivol.bench.harness.timing import Contestant, race
 from mivol.bench.scenes import perspective
 from mivol.transport.media.grid_integral import integrate_tau
-from mivol.transport.traversal.empty_blocks import find_empty_distances
+from mivol.transport.traversal.grid_blocks import find_empty_distances
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = ["REFERENCE_RATE", "GridRays", "camera_rays", "measure_walk_rate", "reference_seconds", "reference_walk"]

@@ -16,7 +16,7 @@ for in thin matter twice-scattered light goes with the depth from the first coll
 :math:`\tau = 0.8966\,\sigma_t a`. The largest extinction times the diagonal would not do: it is twice that for a
 cube, and 7 times tau for the smoke of Mitsuba's tutorial.
 
-Source: the tables are printed by ``scripts/bench_depth.py`` (Mitsuba's ``volpath``, a cube); standard errors are
+Source: the tables are printed by ``mivol bench depth`` (Mitsuba's ``volpath``, a cube); standard errors are
 below 0.008.
 """
 

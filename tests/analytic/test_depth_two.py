@@ -31,7 +31,7 @@ CUBE_DEPTH = 0.8966336
 
 
 def test_no_number_of_the_table_was_changed() -> None:
-    """Sums of what scripts/bench_depth.py has printed, which takes an hour: one wrong digit changes one of them."""
+    """Sums of what mivol bench depth has printed, which takes an hour: one wrong digit changes one of them."""
     sums = {key: table.sum() for key, table in TABLES.items()}
     expected = {("constant", "isotropic"): 10.824, ("constant", "forward"): 13.608}
     assert sums == pytest.approx({**expected, ("collimated", "isotropic"): 11.414, ("collimated", "forward"): 14.94})

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mivol.bench.harness.agreement import FALSE_ALARM, compare_means, finite, mean_of_pixels, mean_of_rounds, number
+from mivol.bench.harness.agreement import FALSE_ALARM, compare_means, finite_or_none, mean_of_pixels, mean_of_rounds
 from mivol.validate.statistics import Estimate
 
 
@@ -51,5 +51,6 @@ def test_means_of_rounds() -> None:
 def test_what_json_cannot_say_is_none() -> None:
     found = compare_means(Estimate(1.0, 0.0, 3), Estimate(0.0, 0.0, 3), 1)
     assert (found["z"], found["percent"], found["standard_error_percent"]) == (None, None, None)
-    assert finite(math.inf) is None and finite(2) == 2.0
-    assert math.isnan(number(None)) and number(0.0) == 0.0
+    assert finite_or_none(math.inf) is None and finite_or_none(2) == 2.0
+    without_noise = compare_means(Estimate(1.0, 0.0, 5.0), Estimate(2.0, 0.0, 5.0), 1)
+    assert without_noise["z"] is None and without_noise["percent"] == pytest.approx(-50)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,8 +22,9 @@ from mivol.bench.studies import (
     still_life,
     tomography,
 )
-from mivol.bench.studies.depth import TABLED, Cell
-from mivol.bench.studies.gradients.size import CONTESTS, OURS, STOCK
+from mivol.bench.studies.depth import TABLES, Cell
+from mivol.bench.studies.gradients import CONTESTS
+from mivol.bench.studies.gradients.density_gradient import INTEGRATORS
 
 
 def contest(names: dict, stocks: tuple[str, ...]) -> dict:
@@ -35,20 +35,20 @@ def contest(names: dict, stocks: tuple[str, ...]) -> dict:
         ratios = {
             f"mivol over {s}": {f"variance_x_time_{light.average}_over_pixels": 10.0 * k + i} for i, s in enumerate(stocks)
         }
-        answer[name] = dict.fromkeys((single_scattering.OURS, *stocks), rows) | ratios
+        answer[name] = dict.fromkeys(("mivol", *stocks), rows) | ratios
     return answer
 
 
 @pytest.mark.slow
 def test_single_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
-    answer = contest(single_scattering.LIGHTS, single_scattering.STOCK)
+    answer = contest(single_scattering.LIGHTS, single_scattering.PEERS)
     figure = drawn(single_scattering, monkeypatch, {"smoke": answer, "cloud": answer}, Path())
     assert_readable(figure)
 
 
 def test_multiple_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
     lights = multiple_scattering.CONTESTS["smoke"]
-    figure = drawn(multiple_scattering, monkeypatch, {"smoke": contest(lights, multiple_scattering.STOCK)}, Path())
+    figure = drawn(multiple_scattering, monkeypatch, {"smoke": contest(lights, single_scattering.PEERS)}, Path())
     assert_readable(figure)
 
 
@@ -57,9 +57,9 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
         light: {what: {"sigma_t >= 1": {"variance_x_time": 10.0 * k + i}} for i, what in enumerate(("mean", "L2"))}
         for k, light in enumerate(CONTESTS["smoke"][1], 4)
     }
-    one = {name: {"bias_percent": 2.0 + k, "known_to_percent": 0.1 + k} for k, name in enumerate((OURS, STOCK))}
+    one = {name: {"bias_percent": 2.0 + k, "known_to_percent": 0.1 + k} for k, name in enumerate(INTEGRATORS)}
     estimators = {light: {"dense": one, "density 0": one} for light in CONTESTS["smoke"][1]}
-    runs = {name: {"seconds": [1.0, 2.0 + k], "loss": [0.5, 0.0]} for k, name in enumerate((OURS, STOCK))}
+    runs = {name: {"seconds": [1.0, 2.0 + k], "loss": [0.5, 0.0]} for k, name in enumerate(INTEGRATORS)}
     answers = {"smoke": smoke, "estimators": estimators, "tutorial": {"runs": runs}}
     assert_readable(drawn(gradients, monkeypatch, answers, Path()))
 
@@ -67,11 +67,11 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     cells = [
         Cell("cube", light, phase, albedo, tau, 1.0, 2.0, albedo * tau / (4 + tau), 0.01 * k, 1.0)
-        for k, (light, phase) in enumerate(TABLED, 1)
+        for k, (light, phase) in enumerate(TABLES, 1)
         for albedo in depth.ALBEDOS
         for tau in (0.1, 1.0, 10.0)
     ]
-    beside = [Cell(*place, "isotropic", 0.5, 2.0, 1.0, 2.0, 0.2 + 0.1 * k, 0.01, 1.0) for k, place in enumerate(depth.MARKS)]
+    beside = [Cell(*place, "isotropic", 0.5, 2.0, 1.0, 2.0, 0.2 + 0.1 * k, 0.01, 1.0) for k, place in enumerate(depth.MARKERS)]
     answers = {"table": {"cells": [asdict(c) for c in cells]}, "beside": {"cells": [asdict(c) for c in beside]}}
     assert_readable(drawn(depth, monkeypatch, answers, Path()))
 
@@ -94,9 +94,8 @@ def test_tomography(monkeypatch: pytest.MonkeyPatch) -> None:
     """The slice is three eighths up, and white is 0.6 of the truth's brightest thousandth."""
     truth = np.arange(8.0 * 3 * 4).reshape(8, 3, 4)
     curves = {"SIRT": {"nrmse": [0.5, 0.25], "seconds": [3.0, 6.0]}}
-    figure = drawn(
-        tomography, monkeypatch, SimpleNamespace(name="head", truth=truth), curves, {"SIRT": truth / 2}, Path("a.png")
-    )
+    answer = {"object": "head", "truth": truth, "curves": curves, "volumes": {"SIRT": truth / 2}}
+    figure = drawn(tomography, monkeypatch, {"solvers": answer}, Path("a.png"))
     assert_readable(figure)
 
 
@@ -124,13 +123,13 @@ def test_optical_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(optical_depth, "plot_error_against_time", lambda *place, **words: given.append((place, words)))
     points_of = [{"seconds_median": 2.0, "rms_error": 0.5}, {"seconds_median": 4.0, "rms_error": 0.25}]
     peers = {"rays": 12345, "grid": "128^3, of floats", "mivol": points_of, "volpath": points_of[:1]}
-    optical_depth.draw({"peers": peers}, Path("a"))
+    optical_depth.draw({"peers": peers}, Path("a.png"))
     (((series, path), words),) = given
     assert [(s.name, list(s.seconds), list(s.error)) for s in series] == [
         ("mivol", [2.0, 4.0], [0.5, 0.25]),
         ("volpath", [2.0], [0.5]),
     ]
-    assert path == Path("a/bench_optical_depth.png")
+    assert path == Path("a.png")
     assert words == {
         "error": "RMS error of T against float64",
         "title": "Transmittance of 12,345 rays through the smoke 128^3: error against time",

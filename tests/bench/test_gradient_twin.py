@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean, fresh, over_pixels
 
-from mivol.bench.studies.gradients import twin
-from mivol.bench.studies.gradients.bias import deep_cases
-from mivol.bench.studies.gradients.size import CONSTANT, SHONE, TABLES, Light
+from mivol.bench.studies.gradients import CONSTANT, DEEP_LIGHTS, TABLES, make_deep_cases, twin
+from mivol.bench.studies.gradients.density_gradient import Light
 from mivol.bench.studies.gradients.twin import Twin
 from mivol.validate.moments import Moments
 
 SIDE = 6
 NOISE = np.random.default_rng(2).uniform(0.5, 1.5, (3, 4, 5))
-UNLIMITED = {name: replace(light, depth=-1) for name, light in SHONE.items()}
+UNLIMITED = {name: replace(light, depth=-1) for name, light in DEEP_LIGHTS.items()}
 
 
 def means(values: np.ndarray, light: Light, seed: int, spp: int) -> tuple[float, float]:
@@ -27,14 +26,14 @@ def means(values: np.ndarray, light: Light, seed: int, spp: int) -> tuple[float,
     return float(found.mean()), float(derivative.mean())
 
 
-@pytest.mark.parametrize("name", SHONE)
+@pytest.mark.parametrize("name", DEEP_LIGHTS)
 def test_the_derivative_is_that_of_the_same_paths(variant_rgb: str, name: str) -> None:
     """Up to a quarter of the majorant collisions are as likely whatever the extinction is: equal seeds give the same paths, and
     light is a smooth function of the extinction. With n <= 5 scatterings and about as many points looked at in between, it is
     a polynomial of degree 10 or so in a factor of it; a difference over 2 % errs by less than 10^3 / 6 0.02^2 = 7 %, one of
     fourth order by 10^5 / 30 0.02^4 = 0.1 %. Sums of float32 are divided by 0.12: 6e-8 of a mean that is at most 20 times as
     large as its derivative."""
-    values, h, light = 0.08 * NOISE, 0.02, replace(SHONE[name], depth=6)
+    values, h, light = 0.08 * NOISE, 0.02, replace(DEEP_LIGHTS[name], depth=6)
     at = {s: means((1 + s * h) * values, light, 3, 256)[0] for s in (-2, -1, 1, 2)}
     found = means(values, light, 3, 256)[1]
     assert found == pytest.approx((8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h), rel=2e-3)
@@ -60,7 +59,7 @@ def test_its_light_is_that_of_volpath(variant_rgb: str, name: str) -> None:
 def test_white_smoke_in_a_furnace(variant_rgb: str, depth: int) -> None:
     """Paths of unlimited depth leave with the weight 1, each of them, where collisions are as likely as the extinction says;
     those of depth 6 do or end inside."""
-    light = replace(SHONE[CONSTANT], depth=depth, albedo=1.0)
+    light = replace(DEEP_LIGHTS[CONSTANT], depth=depth, albedo=1.0)
     made = Twin(3 * NOISE, NOISE, SIDE, light)
     found = made.paths(1, 64)[0]
     # The weight is a product of quotients that are 1 but for a few roundings each.
@@ -71,7 +70,7 @@ def test_white_smoke_in_a_furnace(variant_rgb: str, depth: int) -> None:
 def test_levels_take_noise_and_no_light(variant_rgb: str) -> None:
     """In a furnace the light of a path is its weight, so that nothing is left; without levels the mean of 9216 derivatives
     whose deviation is about 1 would be some 0.01."""
-    light = replace(SHONE[CONSTANT], depth=-1, albedo=1.0)
+    light = replace(DEEP_LIGHTS[CONSTANT], depth=-1, albedo=1.0)
     made = Twin(3 * NOISE, NOISE, SIDE, light)
     raw = made.paths(5, 256)[1]
     found = [made.derivative(10 + k, 256) for k in range(3)]
@@ -103,7 +102,7 @@ def test_levels_of_each_number_of_scatterings_take_more_noise(variant_rgb: str) 
 
 def test_the_camera_does_not_see_a_hidden_emitter(variant_rgb: str) -> None:
     """Nothing scatters, so that nothing else could bring its light."""
-    light = SHONE["emitter inside"]
+    light = DEEP_LIGHTS["emitter inside"]
     assert light.hidden
     assert Twin(0 * NOISE, NOISE, SIDE, light).paths(1, 256)[0].max() == 0
     assert Twin(0 * NOISE, NOISE, SIDE, replace(light, hidden=False)).paths(1, 256)[0].max() > 0
@@ -116,20 +115,20 @@ def test_nothing_of_the_twin_is_walked_by_mivol(variant_rgb: str) -> None:
 
 def test_light_that_is_caught_for_ever_meets_no_emptiness() -> None:
     """A thin half in the place of the empty one, a quarter of the other's mean; not where paths end after six segments."""
-    caught = Light(dict, depth=-1, catches=True)
-    found = deep_cases(8, caught)
+    caught = Light(dict, depth=-1, traps_light=True)
+    found = make_deep_cases(8, caught)
     assert list(found) == ["half thin", "dense"]
     assert (found["half thin"].values[..., :4] == 0.25).all()
     assert found["half thin"].values[..., 4:].mean() == pytest.approx(1, abs=0.05)
-    for other in (replace(caught, depth=6), replace(caught, catches=False)):
-        assert list(deep_cases(8, other)) == ["half empty", "dense"]
+    for other in (replace(caught, depth=6), replace(caught, traps_light=False)):
+        assert list(make_deep_cases(8, other)) == ["half empty", "dense"]
     deep = TABLES["deep estimators"]
-    assert [name for name in deep if deep[name].catches] == ["glass, depth 6", "glass, unlimited"]
+    assert [name for name in deep if deep[name].traps_light] == ["glass, depth 6", "glass, unlimited"]
 
 
 def test_deep_cases_change_where_they_say() -> None:
     """The empty half alone, and the density itself."""
-    found = deep_cases(8, Light(dict))
+    found = make_deep_cases(8, Light(dict))
     half, dense = found["half empty"], found["dense"]
     left = np.arange(8) < 4
     assert (half.values[..., left] == 0).all() and (half.direction[..., left] == 1).all()

@@ -13,28 +13,50 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.bench.studies.radiance_field import BENCH, QUICK, fields, fits, photographs
-from mivol.bench.studies.radiance_field.fields import FIELDS, centred
-from mivol.bench.studies.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
+from mivol.bench import photo_fits
+from mivol.bench.studies import radiance_field as study
+from mivol.bench.studies.radiance_field import (
+    STUDY,
+    PhotoFit,
+    RadianceSize,
+    fields,
+    fits,
+    make_tasks,
+    measure_memory,
+    mivol_step,
+    peer_step,
+    to_peer,
+)
+from mivol.bench.studies.radiance_field.fields import (
+    BOX,
+    FIELDS,
+    centre,
+    middle_cameras,
+    photograph,
+    ring_cameras,
+    tiled_pixels,
+    to_bundle,
+    trace,
+)
+from mivol.bench.studies.radiance_field.fits import EVERY, fit_mivol, fit_peer, follow, held_out_psnr
 from mivol.bench.studies.radiance_field.peer import Peer
-from mivol.bench.studies.radiance_field.size import PhotoFit
-from mivol.bench.studies.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
-from mivol.bench.studies.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, Photo, intrinsics
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
 
-TINY = replace(QUICK, resolution=8, side=16, steps=EVERY, fit_resolution=8, fit_side=16, chair_steps=8, fields=("fog",))
+TINY = replace(
+    RadianceSize.quick(), resolution=8, side=16, steps=EVERY, fit_resolution=8, fit_side=16, chair_steps=8, fields=("fog",)
+)
 
 
 @pytest.mark.slow
 def test_the_peer_sees_the_same_and_derives_the_same(variant_rgb: str) -> None:
-    field, _ = FIELDS["fog"](QUICK)
+    field, _ = FIELDS["fog"](RadianceSize.quick())
     density, sh = field.to_dense()
     field = type(field).from_dense(density, sh * np.float32(0.3), field.to_world)
-    task = tasks(QUICK)["camera"]
-    cells, peer = find_occupied_cells(field), peer_of(field)
+    task = make_tasks(RadianceSize.quick())["camera"]
+    cells, peer = find_occupied_cells(field), to_peer(field)
     seen = render_rays(cells, bake(field, cells, task.pinholes, mi.UInt32(0)), make_model(field), task.rays)
     ours = np.array(seen.colour)
     theirs = np.array(peer.render(mi.Point3f((task.rays.o + 1) * 0.5), task.rays.d))
@@ -42,7 +64,7 @@ def test_the_peer_sees_the_same_and_derives_the_same(variant_rgb: str) -> None:
     assert np.abs(ours - theirs).max() < 1.5 * 2 / 32
     assert np.abs(ours - theirs).mean() < 0.02 * ours.max()
     assert ours.max() > 0.2
-    slopes = [[np.array(a) for a in step(0)] for step in (our_step(field, task), peer_step(peer, task))]
+    slopes = [[np.array(a) for a in step(0)] for step in (mivol_step(field, task), peer_step(peer, task))]
     # The longer way again, twice over: the derivative is of a square.
     density = slopes[0][0], slopes[1][0] * 2  # the peer's lengths are half of ours
     sh = slopes[0][1].reshape(-1, field.width)[:, :27], slopes[1][1].reshape(-1, 27)
@@ -66,8 +88,8 @@ def test_rays_without_pinholes_have_the_same_derivatives(variant_rgb: str) -> No
     """Where nothing depends on the direction, harmonics of a direction and those that are baked for a pinhole are the same."""
     density = np.random.default_rng(1).random((5, 6, 4)).astype(np.float32)
     field = SphericalGrid.from_dense(density, np.zeros((5, 6, 4, 1, 3), np.float32), FIELDS["fog"](TINY)[0].to_world)
-    task = tasks(TINY)["camera"]
-    steps = [our_step(field, each)(0) for each in (task, replace(task, pinholes=None, view=None))]
+    task = make_tasks(TINY)["camera"]
+    steps = [mivol_step(field, each)(0) for each in (task, replace(task, pinholes=None, view=None))]
     for of_one_point, of_any in zip(*([np.array(slope) for slope in step] for step in steps), strict=True):
         assert np.abs(of_any).max() > 0
         # 256 rays in float32, which are added up in any order.
@@ -78,9 +100,9 @@ def test_rays_without_pinholes_have_the_same_derivatives(variant_rgb: str) -> No
 def test_both_fits_learn_the_views(variant_rgb: str) -> None:
     """Seven steps a stage make views of a fog better than black ones, which is what both are compared by."""
     field, _ = FIELDS["fog"](TINY)
-    photos, held_out = photographed(field, ring(16)), photographed(field, between(16))
+    photos, held_out = photograph(field, ring_cameras(16)), photograph(field, middle_cameras(16))
     black = held_out_psnr(held_out, lambda camera: np.zeros((16, 16, 3)))
-    for fit, stages in ((our_fit, 4), (peer_fit, 4)):
+    for fit, stages in ((fit_mivol, 4), (fit_peer, 4)):
         curve = fit(photos, held_out, TINY)
         assert len(curve) == stages
         assert curve[-1][1] > black + 1
@@ -101,20 +123,20 @@ def asked_plans(monkeypatch: pytest.MonkeyPatch, fit: Callable[[], object]) -> l
     return asked
 
 
-def test_our_fit_has_three_stages(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
+def test_fit_mivol_has_three_stages(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
     """An eighth, a quarter and all of the nodes, from views shrunk by 4, by 2 and not at all; each is compiled first."""
-    size = replace(QUICK, fit_resolution=32, fit_side=64, steps=10)
-    plans = asked_plans(monkeypatch, lambda: our_fit([], [], size))
+    size = replace(RadianceSize.quick(), fit_resolution=32, fit_side=64, steps=10)
+    plans = asked_plans(monkeypatch, lambda: fit_mivol([], [], size))
     assert plans[-1] == [(4, 10, 4, 7, 9), (8, 10, 2, 7, 9), (32, 20, 1, 7, 36)]
     assert plans[:-1] == [[(n, 2, shrink, 7, tiles)] for n, _, shrink, _, tiles in plans[-1]]
-    small = asked_plans(monkeypatch, lambda: our_fit([], [], replace(size, fit_side=8)))[-1]
+    small = asked_plans(monkeypatch, lambda: fit_mivol([], [], replace(size, fit_side=8)))[-1]
     assert [stage[-1] for stage in small] == [1, 1, 4]
 
 
 @pytest.mark.parametrize("kind", ["camera", "pixels", "any"])
 def test_rays_of_a_step(variant_rgb: str, kind: str) -> None:
     """Of one camera, of pixels of eight, sorted by view, or from a sphere of radius 3 towards points of the field."""
-    task, n = tasks(TINY)[kind], TINY.side**2
+    task, n = make_tasks(TINY)[kind], TINY.side**2
     o, d = np.array(task.rays.o).T, np.array(task.rays.d).T
     assert len(o) == len(d) == n
     # Of float32 numbers of size 3.
@@ -141,17 +163,17 @@ def test_views_that_are_hit_exactly_count_100_decibels() -> None:
 
 def test_views_show_the_field(variant_rgb: str) -> None:
     """Those of a ring look at the middle of the box from 3.1 away; those between are half a step further on."""
-    cameras, others = ring(16, 4), between(16, 4)
+    cameras, others = ring_cameras(16, 4), middle_cameras(16, 4)
     for camera in (*cameras, *others):
         assert np.linalg.norm(camera.origin) == pytest.approx(np.hypot(3, 0.9))
     turned = [np.arctan2(*camera.origin[1::-1]) for camera in (cameras[1], others[0])]
     assert turned == pytest.approx([np.pi / 2, np.pi / 4])
-    (photo,) = photographed(FIELDS["shell"](TINY)[0], cameras[:1])
+    (photo,) = photograph(FIELDS["shell"](TINY)[0], cameras[:1])
     assert photo.image[8, 8].max() > 0.2 > photo.image[0, 0].max()
-    o, d = rays_through(cameras[0], tiled(16))
+    o, d = trace(cameras[0], tiled_pixels(16))
     assert np.allclose(o, cameras[0].origin) and np.allclose(np.linalg.norm(d, axis=1), 1)
-    assert np.array_equal(np.sort(tiled(16) @ [16, 1]), np.arange(256))
-    assert np.array_equal(tiled(16)[:5], [[0, 0], [0, 1], [0, 2], [0, 3], [1, 0]])
+    assert np.array_equal(np.sort(tiled_pixels(16) @ [16, 1]), np.arange(256))
+    assert np.array_equal(tiled_pixels(16)[:5], [[0, 0], [0, 1], [0, 2], [0, 3], [1, 0]])
 
 
 def test_only_steps_are_counted() -> None:
@@ -165,8 +187,10 @@ def test_only_steps_are_counted() -> None:
 
 def test_pixels_are_drawn_anywhere(variant_rgb: str) -> None:
     """As many rays as tiles would have; four neighbours of a tile are rarely neighbours here."""
-    photos = photographed(FIELDS["fog"](TINY)[0], ring(16, 3))
-    batches = [kind.of(photos).draw(1, np.arange(3), 4, np.random.default_rng(0)) for kind in (fits.Pixels, fits.RayBatches)]
+    photos = photograph(FIELDS["fog"](TINY)[0], ring_cameras(16, 3))
+    batches = [
+        kind.of(photos).draw(1, np.arange(3), 4, np.random.default_rng(0)) for kind in (fits.PixelBatches, fits.RayBatches)
+    ]
     widths = [dr.width(batch.rays.d) for batch in batches]
     assert widths == [3 * 4 * 16] * 2
     steps = [np.linalg.norm(np.diff(np.array(batch.rays.d), axis=1), axis=0) for batch in batches]
@@ -175,7 +199,7 @@ def test_pixels_are_drawn_anywhere(variant_rgb: str) -> None:
 
 @pytest.mark.slow
 def test_memory_a_ray(variant_rgb: str) -> None:
-    (bar,) = BENCH.compare("memory", ask_memory(replace(TINY, fields=("shell",), side=64)))
+    (bar,) = STUDY.bars("memory", measure_memory(replace(TINY, fields=("shell",), side=64)))
     assert bar["met"], bar
 
 
@@ -193,55 +217,29 @@ def test_the_fitted_field_is_the_chair_where_there_is_one(monkeypatch: pytest.Mo
         (tmp_path / "multiview" / "chair").mkdir(parents=True)
     monkeypatch.setattr(fields, "DATA", tmp_path)
     monkeypatch.setattr(fields, "load_photos", ask)
-    monkeypatch.setattr(fields, "shell", lambda size: ask("shell"))
+    monkeypatch.setattr(fields, "make_shell", lambda size: ask("shell"))
     with pytest.raises(Asked) as asked:
-        fields.fitted(TINY)
+        fields.fit_field(TINY)
     chair = (tmp_path / "multiview" / "chair", {"split": "train", "background": "white", "scale": 0.5})
     assert asked.value.args == (chair if there else ("shell", {}))
 
 
 def test_a_smaller_array_stands_in_the_middle() -> None:
-    found = centred(np.ones((2, 3, 4, 2), np.float32), 6)
+    found = centre(np.ones((2, 3, 4, 2), np.float32), 6)
     assert found.shape == (6, 6, 6, 2)
     assert np.all(found[2:4, 1:4, 1:5] == 1) and found.sum() == 2 * 24
 
 
 def test_rays_are_float32(variant_rgb: str) -> None:
-    made = rays_of(BOX.repeat(2, axis=0), np.ones((4, 3)))
+    made = to_bundle(BOX.repeat(2, axis=0), np.ones((4, 3)))
     assert np.array_equal(np.array(made.o).T, BOX.repeat(2, axis=0).astype(np.float32))
-
-
-def test_photographs_that_are_not_here_are_left_out(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.setattr(photographs, "DATA", tmp_path)
-    assert photographs.ask_photographs(replace(TINY, photo_fits=(PhotoFit("chair", 16, 0.03),))) == {}
-    assert "chair: left out, its data is not here (MIVOL_DATA" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("asked", "longest", "steps"), [
-    (PhotoFit("shell", 64, 0.1), [32, 64], [13, 70]),
-    (PhotoFit("shell", effort=0.1, preset="tiny"), [24, 48], [10, 20]),
-])  # fmt: skip
-def test_a_fit_has_the_nodes_that_it_asks_for(
-    monkeypatch: pytest.MonkeyPatch, asked: PhotoFit, longest: list[int], steps: list[int]
-) -> None:
-    """Of the preset's effort, up to as many nodes; or those of the preset."""
-    asked_of = []
-    monkeypatch.setattr(photographs, "read_photos", lambda chosen, folder: ("shown", "judged"))
-    monkeypatch.setattr(photographs, "boxed", lambda chosen, shown: shown)
-    monkeypatch.setattr(photographs, "suited", lambda plan, shown: asked_of.append(plan) or 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        photographs.fitted(Path("shell"), asked, TINY)
-    (plan,) = asked_of
-    assert ([stage.longest for stage in plan.stages], [stage.steps for stage in plan.stages]) == (longest, steps)
 
 
 @pytest.mark.slow
 def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     asked = (PhotoFit("wires", 16, 0.03), PhotoFit("wires", effort=0.01, preset="tiny"))
-    size = replace(TINY, photo_fits=asked, photo_folder=tmp_path / "photographs")
-    answers = BENCH.ask(tuple(BENCH.questions), size)
+    size = replace(TINY, photo_fits=asked, photo_folder=str(tmp_path / "photographs"))
+    answers = STUDY.answer(tuple(STUDY.questions), size)
     assert all(answers["step"]["fog"][kind]["ratio_of_processor_time"] > 0 for kind in ("camera", "pixels", "any"))
     assert set(answers["locality"]) == {"tiles", "pixels"}
     assert answers["fit"]["fog"]["peer_psnr"] > 5
@@ -252,46 +250,26 @@ def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     threads, rate = dr.thread_count(), found["walk_rays_per_second"]
     assert found["seconds"] == pytest.approx(found["processor_seconds"] / threads * rate / 25e6)
     assert len(answers.pop("bars")) == 3 + 1 + 1
-    BENCH.draw(answers, tmp_path)
-    assert (tmp_path / "bench_radiance_field.png").read_bytes().startswith(b"\x89PNG")
+    STUDY.draw(answers, tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_pixels_of_the_peer_are_those_of_the_camera(variant_rgb: str) -> None:
     """What the peer fits, and what it shows, lies where a view has it: rays in the unit cube, colours by row and column."""
-    camera = ring(16, 3)[1]
+    camera = ring_cameras(16, 3)[1]
     image = np.random.default_rng(0).random((16, 16, 3), dtype=np.float32)
-    o, d, colours = fits.rays_and_colours(Photo("a", image, None, None, camera, np.zeros(3)))
-    origins, directions = rays_through(camera, tiled(16))
+    o, d, colours = fits.peer_view(Photo("a", image, None, None, camera, np.zeros(3)))
+    origins, directions = trace(camera, tiled_pixels(16))
     np.testing.assert_allclose(np.array(o).T, (origins + 1) / 2, atol=1e-6)
     np.testing.assert_allclose(np.array(d).T, directions, atol=1e-6)
-    np.testing.assert_array_equal(np.array(colours).T, image[tuple(tiled(16).T)])
+    np.testing.assert_array_equal(np.array(colours).T, image[tuple(tiled_pixels(16).T)])
 
     class Mirror:
         def render(self, at: mi.Point3f, along: mi.Vector3f) -> mi.Color3f:
             assert np.abs(np.array(at) - np.array(o)).max() <= 1e-6 and np.abs(np.array(along) - np.array(d)).max() <= 1e-6
             return colours
 
-    np.testing.assert_array_equal(fits.view_of_peer(Mirror(), camera), image)
-
-
-def test_the_peer_has_four_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each is refined from the one before, and takes all steps; the newest is the last of those made."""
-    monkeypatch.setattr(fits.dr, "eval", lambda *arrays: None)
-
-    class Stage:
-        density = harmonics = None
-
-        def __init__(self, resolution: int) -> None:
-            self.resolution = resolution
-
-        def refined(self) -> Stage:
-            return Stage(2 * self.resolution)
-
-        def fit(self, views: object, steps: int) -> range:
-            return range(steps)
-
-    made = [Stage(4)]
-    assert [made[-1].resolution for _ in fits.peer_steps(made, [], 3)] == [4] * 3 + [8] * 3 + [16] * 3 + [32] * 3
+    np.testing.assert_array_equal(fits.render_peer(Mirror(), camera), image)
 
 
 def test_a_stage_of_the_peer_has_twice_the_resolution(variant_rgb: str) -> None:
@@ -313,11 +291,11 @@ def test_a_step_of_the_peer_goes_to_its_target(variant_rgb: str, target: float) 
 @pytest.mark.parametrize(("ours", "ratio"), [([(1.0, 20.0), (2.0, 25.0), (4.0, 30.0)], 10.0), ([(1.0, 20.0)], 0.0)])
 def test_a_fit_is_as_good_as_the_peers_best(monkeypatch: pytest.MonkeyPatch, ours: list, ratio: float) -> None:
     """24 dB, which the peer had after 20 s and lost again; ours is there after 2 s, or never."""
-    monkeypatch.setattr(fits, "field_of", lambda name, size: (None, "made"))
-    monkeypatch.setattr(fits, "photographed", lambda field, cameras: [])
-    monkeypatch.setattr(fits, "our_fit", lambda *asked: ours)
-    monkeypatch.setattr(fits, "peer_fit", lambda *asked: [(10.0, 18.0), (20.0, 24.0), (30.0, 23.0)])
-    found = fits.ask_fit(TINY)["fog"]
+    monkeypatch.setattr(fits, "load_field", lambda name, size: (None, "made"))
+    monkeypatch.setattr(fits, "photograph", lambda field, cameras: [])
+    monkeypatch.setattr(fits, "fit_mivol", lambda *asked: ours)
+    monkeypatch.setattr(fits, "fit_peer", lambda *asked: [(10.0, 18.0), (20.0, 24.0), (30.0, 23.0)])
+    found = fits.measure_fit(TINY)["fog"]
     assert (found["peer_psnr"], found["ratio"], found["field"]) == (24.0, ratio, "made")
 
 
@@ -334,3 +312,40 @@ def test_the_peer_takes_one_view_after_the_other(variant_rgb: str, monkeypatch: 
     views = [(mi.Point3f(x, 0.5, -1.0), mi.Vector3f(0, 0, 1), mi.Color3f(0.5)) for x in (0.25, 0.5, 0.75)]
     assert len(list(Watched(start.density, start.harmonics).fit(views, 5))) == 5
     assert seen == [0.25, 0.5, 0.75, 0.25, 0.5]
+
+
+def test_missing_photographs_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(photo_fits, "DATA", tmp_path)
+    assert study.measure_photographs(replace(TINY, photo_fits=(PhotoFit("chair", 16, 0.03),))) == {}
+    assert "chair: left out, its data is missing (MIVOL_DATA" in capsys.readouterr().err
+
+
+BARS = {
+    "memory": ({"bytes_per_ray": 512.0}, [(512, "at most", 512, True)]),
+    "locality": ({}, []),
+    "photographs": (
+        {
+            "chair at 256": {"psnr": 31.0, "seconds": 300.0, "held_gib": 1.6},
+            "chair, fine": {"psnr": 32.0, "seconds": 1201.0, "held_gib": 3.0},
+            "wires at 128": {"psnr": 20.0},
+        },
+        [
+            (31, "at least", 31.3, False), (300, "at most", 300, True), (1.6, "at most", 1.5, False),
+            (32, "at least", 32, True), (1201, "at most", 1200, False), (3, "at most", 16, True),
+        ],
+    ),
+    "priors": ({}, []),
+    "fit": ({"fog": {"ratio": 9.0}, "shell": {"ratio": 10.0}}, [(9, "at least", 10, False), (10, "at least", 10, True)]),
+    "step": (
+        {"fog": {kind: {"ratio_of_processor_time": r} for kind, r in (("camera", 7.0), ("pixels", 5.0), ("any", 3.0))}},
+        [(7, "at least", 8, False), (5, "at least", 4, True), (3, "at least", 4, False)],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("question", BARS)
+def test_the_right_figure_is_judged(question: str) -> None:
+    answer, expected = BARS[question]
+    assert [(bar["value"], bar["sense"], bar["bar"], bar["met"]) for bar in STUDY.bars(question, answer)] == expected

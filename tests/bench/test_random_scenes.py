@@ -15,12 +15,11 @@ from scene_numbers import add_up
 from mivol.bench.harness import agreement
 from mivol.bench.harness.agreement import mean_of_rounds
 from mivol.bench.studies import random_scenes
-from mivol.bench.studies.random_scenes import BENCH, QUICK, hard, trials
+from mivol.bench.studies.random_scenes import STUDY, RandomSize, measure_hard, measure_trials, quarter_means, try_scene
 from mivol.bench.studies.random_scenes.generate import EMITTERS, RandomScene, draw_scene
-from mivol.bench.studies.random_scenes.trials import try_scene, try_scenes
 from mivol.errors import MivolError
 
-TINY = replace(QUICK, scenes=2, rounds=2, spp=1, stock_spp=1, hard_pictures=1)
+TINY = replace(RandomSize.quick(), scenes=2, rounds=2, spp=1, stock_spp=1, hard_pictures=1)
 
 
 def volumes_of(parts: dict) -> list[dict]:
@@ -70,8 +69,8 @@ def test_a_channel_is_that_of_the_rgb_extinction(variant_rgb: str) -> None:
 def test_places_are_quarters_and_colours() -> None:
     """One picture whose quarters are 1, 2, 3 and 4, times 1, 10 and 100 by colour."""
     quarter = np.repeat(np.repeat([[1.0, 2.0], [3.0, 4.0]], 3, axis=0), 3, axis=1)
-    found = trials._places((quarter[..., None] * [1.0, 10.0, 100.0])[None])
-    assert found.shape == (trials.PLACES, 1)
+    found = quarter_means((quarter[..., None] * [1.0, 10.0, 100.0])[None])
+    assert found.shape == (random_scenes.MEANS, 1)
     assert sorted(found[:, 0]) == [v * s for s in (1, 10, 100) for v in (1, 2, 3, 4)]
 
 
@@ -81,10 +80,10 @@ def test_refusals_are_counted_by_their_sentence(variant_rgb: str, monkeypatch: p
     def refuse(drawn: object, name: str, *_: object) -> None:
         raise MivolError(f"an albedo of {len(drawn.features)} was found.")
 
-    monkeypatch.setattr(trials, "_pictures", refuse)
-    found = try_scenes(TINY)
+    monkeypatch.setattr(random_scenes, "render_rounds", refuse)
+    found = measure_trials(TINY)
     assert found["refusals"] == {"an albedo of # was found#": 2}
-    bars = BENCH.compare("trials", found)
+    bars = STUDY.bars("trials", found)
     assert [(row["figure"], row["met"]) for row in bars] == [("refused scenes", False), ("pixels that are no radiance", True)]
 
 
@@ -98,13 +97,13 @@ def test_samples_that_are_no_radiance_are_counted(variant_rgb: str, monkeypatch:
             made[0, 0, 0] = np.nan, np.inf, -1e-9
         return made
 
-    monkeypatch.setattr(trials, "_pictures", picture)
+    monkeypatch.setattr(random_scenes, "render_rounds", picture)
     with np.errstate(invalid="ignore"):
         found = try_scene(0, TINY)
     assert found["not_a_radiance"] == 3
     assert found["z"] is None
     answer = {"refusals": {}, "trials": {0: found}}
-    assert [row["met"] for row in BENCH.compare("trials", answer)] == [True, False, False]
+    assert [row["met"] for row in STUDY.bars("trials", answer)] == [True, False, False]
 
 
 @pytest.mark.slow
@@ -113,19 +112,19 @@ def test_a_sample_of_scenes_agrees_with_volpath(variant_rgb: str, monkeypatch: p
     """Ten that the quoted run does not have."""
     monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
     note(ALPHA, "random scenes")
-    found = try_scenes(replace(QUICK, scenes=10, first=10_000))
+    found = measure_trials(replace(RandomSize.quick(), scenes=10, first=10_000))
     assert not found["refusals"]
-    assert all(row["met"] for row in BENCH.compare("trials", found))
-    BENCH.draw({"trials": found}, tmp_path)
+    assert all(row["met"] for row in STUDY.bars("trials", found))
+    STUDY.draw({"trials": found}, tmp_path / "a.png")
 
 
 @pytest.mark.slow
 def test_every_path_of_hard_scenes_is_a_radiance(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """65,536 paths of each."""
-    monkeypatch.setattr(hard, "SIDE", 256)
-    found = hard.try_hard_scenes(TINY)
+    monkeypatch.setattr(random_scenes, "HARD_SIDE", 256)
+    found = measure_hard(TINY)
     assert {f["paths"] for f in found.values()} == {1 << 16}
-    assert all(row["met"] for row in BENCH.compare("hard", found))
+    assert all(row["met"] for row in STUDY.bars("hard", found))
     assert all(f["brightest"] > 0.1 for f in found.values())
 
 
@@ -133,29 +132,11 @@ def test_a_fault_of_a_hard_scene_is_counted(variant_rgb: str, monkeypatch: pytes
     """One NaN and two negative numbers in a picture of 12."""
     bad = np.ones((2, 2, 3))
     bad[0, 0] = np.nan, -1.0, -2.0
-    monkeypatch.setattr(hard, "HARD", {"made up": lambda: {"type": "scene"}})
+    monkeypatch.setattr(random_scenes, "HARD", {"made up": lambda: {"type": "scene"}})
     monkeypatch.setattr(mi, "render", lambda *_, **__: bad)
-    found = hard.try_hard_scenes(TINY)
+    found = measure_hard(TINY)
     assert found == {"made up": {"paths": 4, "not_finite": 1, "negative": 2, "brightest": 1.0}}
-    assert [row["met"] for row in BENCH.compare("hard", found)] == [False]
-
-
-def test_pictures_have_seeds_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of mivol begin at 1000, those of volpath at 5000; they are kept in float64."""
-    asked = []
-
-    def render(scene: object, integrator: dict, spp: int, seed: int) -> np.ndarray:
-        asked.append((scene, integrator, spp, seed))
-        return np.full((2, 3, 3), seed, np.float32)
-
-    monkeypatch.setattr(trials.mi, "load_dict", lambda parts: parts)
-    monkeypatch.setattr(trials.mi, "render", render)
-    drawn = RandomScene({"type": "scene"}, {"max_depth": 3, "rr_depth": 5})
-    for name, first in (("mivol", 1000), ("volpath", 5000)):
-        found = trials._pictures(drawn, name, 2, 7)
-        assert (found.shape, found.dtype, found[:, 1, 2, 0].tolist()) == ((2, 2, 3, 3), np.float64, [first, first + 1])
-        integrator = {"type": name, "max_depth": 3, "rr_depth": 5}
-        assert asked[-2:] == [(drawn.parts, integrator, 7, first + k) for k in range(2)]
+    assert [row["met"] for row in STUDY.bars("hard", found)] == [False]
 
 
 @pytest.mark.parametrize("is_rgb", [False, True])
@@ -169,8 +150,8 @@ def test_a_scene_is_judged_by_what_differs_most(monkeypatch: pytest.MonkeyPatch,
         heard.append((drawn.parts["channel"], name, rounds, spp))
         return ours if name == "mivol" else noise
 
-    monkeypatch.setattr(trials, "draw_scene", lambda seed, c=None: RandomScene({"channel": c}, {}, ["f"], is_rgb))
-    monkeypatch.setattr(trials, "_pictures", pictures)
+    monkeypatch.setattr(random_scenes, "draw_scene", lambda seed, c=None: RandomScene({"channel": c}, {}, ["f"], is_rgb))
+    monkeypatch.setattr(random_scenes, "render_rounds", pictures)
     size = replace(TINY, scenes=5, rounds=4, spp=2, stock_spp=3)
     found = try_scene(9, size)
     channels = (0, 1, 2) if is_rgb else (None,)
@@ -180,25 +161,6 @@ def test_a_scene_is_judged_by_what_differs_most(monkeypatch: pytest.MonkeyPatch,
     assert found == {"features": ["f"], "not_a_radiance": 0, "mean": pytest.approx(noise.mean()), **wanted}
     ours[0, 0, 0, 0], ours[0, 0, 0, 1] = 0.0, -1e-30
     assert try_scene(9, size)["not_a_radiance"] == 1
-
-
-def test_scenes_are_tried_from_the_first_seed_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = []
-    monkeypatch.setattr(trials, "try_scene", lambda seed, size: {"seed": seed} | ({"refused": ["no"]} if seed == 8 else {}))
-    monkeypatch.setattr(trials, "said", lambda found: f"{found['seed']}")
-    monkeypatch.setattr(trials, "say", said.append)
-    found = try_scenes(replace(TINY, scenes=3, first=7))
-    assert found == {
-        "scenes": 3, "refusals": {"no": 1}, "trials": {7: {"seed": 7}, 8: {"seed": 8, "refused": ["no"]}, 9: {"seed": 9}},
-    }  # fmt: skip
-    assert said == ["  scene 7: 7", "  scene 8: 8", "  scene 9: 9"]
-
-
-def test_what_is_said_of_a_scene() -> None:
-    found = {"features": ["fog", "sun"], "z": -1.26, "z_bound": 4.02, "not_a_radiance": 0}
-    assert trials.said(found) == "z -1.3 of 4.0: fog, sun"
-    assert trials.said(found | {"z": None, "not_a_radiance": 2}) == "z none, 2 pixels are no radiance: fog, sun"
-    assert trials.said({"features": ["fog"], "refused": ["a", "b"]}) == "refused (a): fog"
 
 
 def test_a_figure_of_the_largest_differences(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,27 +179,10 @@ def test_a_figure_of_the_largest_differences(monkeypatch: pytest.MonkeyPatch) ->
 def test_bars_of_scenes_and_of_paths() -> None:
     """No refusal, no sample that is no radiance, and z within its bound."""
     found = {1: {"z": 3.0, "z_bound": 4.0, "not_a_radiance": 0}, 2: {"z": -5.0, "z_bound": 4.0, "not_a_radiance": 2}}
-    rows = BENCH.compare("trials", {"refusals": {"a": 1, "b": 2}, "trials": found | {3: {"refused": ["a"]}}})
+    rows = STUDY.bars("trials", {"refusals": {"a": 1, "b": 2}, "trials": found | {3: {"refused": ["a"]}}})
     assert [(row["value"], row["met"]) for row in rows] == [(3, False), (2, False), (3.0, True), (5.0, False)]
     almost = {"refusals": {"a": 1}, "trials": {1: found[1] | {"not_a_radiance": 1}}}
-    assert [row["met"] for row in BENCH.compare("trials", almost)] == [False, False, True]
-    assert not BENCH.compare("hard", {"a": {"not_finite": 0, "negative": 1}})[0]["met"]
+    assert [row["met"] for row in STUDY.bars("trials", almost)] == [False, False, True]
+    assert not STUDY.bars("hard", {"a": {"not_finite": 0, "negative": 1}})[0]["met"]
     faults = {"a": {"not_finite": 1, "negative": 2}, "b": {"not_finite": 0, "negative": 0}}
-    assert [(row["value"], row["met"]) for row in BENCH.compare("hard", faults)] == [(3, False), (0, True)]
-
-
-def test_hard_scenes_are_followed_without_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One path a pixel, pictures numbered from 0; the brightest number of all of them."""
-    asked = []
-
-    def render(scene: object, integrator: object, spp: int, seed: int) -> np.ndarray:
-        asked.append((scene, integrator, spp, seed))
-        return np.full((2, 3, 3), [5.0, 2.0, 3.0][seed])
-
-    monkeypatch.setattr(hard, "HARD", {"made up": lambda: "parts"})
-    monkeypatch.setattr(hard, "make_integrator", lambda name, depth: (name, depth))
-    monkeypatch.setattr(hard.mi, "load_dict", lambda parts: parts)
-    monkeypatch.setattr(hard.mi, "render", render)
-    found = hard.try_hard_scenes(replace(TINY, hard_pictures=3))
-    assert found == {"made up": {"paths": 18, "not_finite": 0, "negative": 0, "brightest": 5.0}}
-    assert asked == [("parts", ("mivol", -1), 1, k) for k in range(3)]
+    assert [(row["value"], row["met"]) for row in STUDY.bars("hard", faults)] == [(3, False), (0, True)]

@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from bench_figures import drawn
 
+from mivol.bench import photo_fits
 from mivol.bench.studies import representations
-from mivol.bench.studies.radiance_field import photographs
-from mivol.bench.studies.representations import BENCH, QUICK
+from mivol.bench.studies.representations import STUDY, RepresentationSize
 
 
 def test_the_chair_is_left_out_where_it_is_not(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(photographs, "DATA", tmp_path)
-    assert representations.measure_chair(QUICK) == {}
-    assert "chair: left out, its data is not here (MIVOL_DATA" in capsys.readouterr().err
+    monkeypatch.setattr(photo_fits, "DATA", tmp_path)
+    assert STUDY.questions["chair"](RepresentationSize.quick()) == {}
+    assert "chair: left out, its data is missing (MIVOL_DATA" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_all_fits_see_the_same_photographs(variant_rgb: str, tmp_path: Path) -> None:
-    small = replace(QUICK.photographs, photo_folder=tmp_path / "photographs", photo_side=32, photo_views=9)
-    answer = BENCH.ask(("still_life",), replace(QUICK, photographs=small, edge=16))["still_life"]
+    small = {"photo_folder": str(tmp_path / "photographs"), "photo_side": 32, "photo_views": 9, "edge": 16}
+    answer = STUDY.answer(("still_life",), replace(RepresentationSize.quick(), **small))["still_life"]
     assert set(answer) == {"grid, 16 nodes", "Gaussians, minute"}
     assert len({found["photograph"].tobytes() for found in answer.values()}) == 1
     for found in answer.values():
@@ -40,12 +40,12 @@ def test_all_fits_see_the_same_photographs(variant_rgb: str, tmp_path: Path) -> 
     gaussians = answer["Gaussians, minute"]
     headers = [gaussians["file_mib"] * 2**20 - 4 * gaussians["count"] * (14 + 3 * (d + 1) ** 2) for d in range(4)]
     assert any(0 < header < 4096 for header in headers)
-    BENCH.draw({"still_life": answer}, tmp_path)
-    assert (tmp_path / "bench_representations.png").read_bytes().startswith(b"\x89PNG")
+    STUDY.draw({"still_life": answer}, tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_nothing_is_drawn_of_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    BENCH.draw({"chair": {}}, tmp_path)
+    STUDY.draw({"chair": {}}, tmp_path / "a.png")
     assert not list(tmp_path.iterdir())
 
 

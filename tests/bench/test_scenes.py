@@ -9,10 +9,9 @@ from scene_numbers import add_up
 
 from mivol.bench.extinctions import Extinction
 from mivol.bench.scenes import box_scene, make_integrator, point_light, sun_and_sky
-from mivol.bench.studies import multiple_scattering, single_scattering
-from mivol.bench.studies.gradients.size import CONTESTS, TABLES
-from mivol.bench.studies.ladder import RUNGS
-from mivol.bench.studies.random_scenes import hard
+from mivol.bench.studies import multiple_scattering, random_scenes, single_scattering
+from mivol.bench.studies.gradients import CONTESTS, TABLES
+from mivol.bench.studies.ladder import MODELS
 
 
 def test_the_box_holds_its_grid(variant_rgb: str) -> None:
@@ -54,15 +53,15 @@ def test_integrators_scatter_once_and_are_made_anew(variant_rgb: str) -> None:
 def test_scenes_of_the_benches_are_those_of_the_published_figures(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sum of all numbers of hard scenes and of the lights of every bench, each times a weight of its place."""
     grids = lambda res: Extinction(np.full((res // 32,) * 3, res / 7, np.float32), "")  # noqa: E731
-    monkeypatch.setattr(hard, "smoke", lambda: grids(64))
-    monkeypatch.setattr(hard, "threads_in_space", grids)
-    monkeypatch.setattr(hard, "as_dense_as_smoke", lambda found: found)
-    scenes = {f"hard: {name}": parts() for name, parts in hard.HARD.items()}
+    monkeypatch.setattr(random_scenes, "smoke", lambda: grids(64))
+    monkeypatch.setattr(random_scenes, "threads_in_space", grids)
+    monkeypatch.setattr(random_scenes, "as_dense_as_smoke", lambda found: found)
+    scenes = {f"hard: {name}": parts() for name, parts in random_scenes.HARD.items()}
     scenes |= {f"single scattering: {name}": light.parts() for name, light in single_scattering.LIGHTS.items()}
     for tables in (TABLES, {name: lights for name, (_, lights) in CONTESTS.items()}, multiple_scattering.CONTESTS):
         for question, lights in tables.items():
             scenes |= {f"{question}: {name}": light.parts() for name, light in lights.items()}
-    scenes |= {f"rung: {name}": rung.parts() for name, rung in RUNGS.items()}
+    scenes |= {f"rung: {name}": rung.parts() for name, rung in MODELS.items()}
     sums: dict[str, float] = {}
     for parts in scenes.values():
         add_up(parts, sums)

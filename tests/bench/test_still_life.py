@@ -11,13 +11,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.bench.studies import still_life as bench
+from mivol.bench import photo_fits
+from mivol.bench.studies.still_life import STUDY, StillLifeSize, fit_views, load_still_life
 from mivol.files.mesh import write_mesh
 from mivol.photos import load_photos, project
 from scenes import refused
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scenes" / "still_life" / "photographs.py"
-TINY = replace(bench.QUICK, views=10, side=24, longest=8, steps=24, tiles=16, spp=16)
+TINY = replace(StillLifeSize.quick(), views=10, side=24, longest=8, steps=24, tiles=16, spp=16)
 
 
 @pytest.fixture(scope="module")
@@ -81,47 +82,37 @@ def test_what_is_there_is_not_rendered_again(still_life, variant_rgb, tmp_path, 
     assert (tmp_path / names[0]).read_bytes() == first
 
 
-def test_every_fit_of_the_bench(monkeypatch):
-    """What is fitted, to how many views and with which priors; a fit itself is the next test's."""
-    asked = []
-    monkeypatch.setattr(bench, "still_life", lambda size: (range(12), range(3), None))
-    monkeypatch.setattr(bench, "fit", lambda photos, *rest, **priors: asked.append((len(photos), rest[-1], priors)))
-    degree, few = bench.ask_degree(TINY), bench.ask_few(TINY)
-    assert {"degree": set(degree), "few": set(few)} == {"degree": {"SH 0", "SH 0, no TV", "SH 2"}, "few": {"no TV", "TV"}}
-    assert asked == [(12, 0, {}), (12, 0, bench.NO_TV), (12, 2, {}), (6, 2, bench.NO_TV), (6, 2, {})]
-
-
 @pytest.mark.slow
 def test_a_fit_is_judged_by_held_out_views(variant_rgb, tmp_path):
     """A few steps see that something stands in front of white; its figure is drawn."""
-    size = replace(TINY, folder=tmp_path / "photographs")
-    train, held_out, box = bench.still_life(size)
+    size = replace(TINY, folder=str(tmp_path / "photographs"))
+    train, held_out, box = load_still_life(size)
     assert (len(train), len(held_out)) == (8, 2)
-    found = bench.fit(train, held_out, box, size, 2)
+    found = fit_views(train, held_out, box, size, 2)
     assert found["psnr"] == pytest.approx(np.mean(found["each"]))
     white = np.mean([-10 * np.log10(np.mean((1 - photo.image) ** 2)) for photo in held_out])
     assert found["psnr"] > white + 1
     assert (found["degree"], found["views"], len(found["each"])) == (2, 8, 2)
     assert found["photograph"] is held_out[1].image and found["view"].shape == held_out[1].image.shape
     figures = {"few": {"TV": found, "no TV": found | {"psnr": found["psnr"] - 1}}}
-    (bar,) = bench.compare("few", figures["few"])
+    (bar,) = STUDY.bars("few", figures["few"])
     assert bar["value"] == pytest.approx(1)
-    bench.draw(figures, tmp_path)
-    assert (tmp_path / "bench_still_life.png").stat().st_size > 10_000
+    STUDY.draw(figures, tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_a_checkout_without_the_scene(monkeypatch, tmp_path):
-    monkeypatch.setattr(bench, "SCENE", tmp_path / "photographs.py")
-    with refused("run this bench from a checkout"):
-        bench.still_life(TINY)
+    monkeypatch.setattr(photo_fits, "SCRIPT", tmp_path / "photographs.py")
+    with refused("run this study in a checkout"):
+        load_still_life(TINY)
 
 
 @pytest.mark.slow
 def test_a_field_sees_directions_and_total_variation_helps(variant_rgb, tmp_path):
     """Two degrees more are worth 1.5 dB on views between the others, and total variation something where views are few: at
     three quarters of the bench's size and half of its steps, where they were worth 2.7 and 0.2 dB."""
-    size = replace(bench.FULL, folder=tmp_path, side=96, longest=48, steps=300, tiles=128)
-    answers = bench.BENCH.ask(("degree", "few"), size)
+    size = StillLifeSize(folder=str(tmp_path), side=96, longest=48, steps=300, tiles=128)
+    answers = STUDY.answer(("degree", "few"), size)
     assert len(answers["bars"]) == 2
     assert all(bar["met"] for bar in answers["bars"]), answers["bars"]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -63,71 +62,59 @@ def test_the_index_is_what_the_walk_reads(variant_rgb, share: float) -> None:
 
 def test_the_lecture_counts_4_gigabytes() -> None:
     """1024^3 cells of 4 bytes; degree 2 is 27 numbers a cell in rows of 28, and the density; sparse falls as 1/N."""
-    found = {kind.name: kind for kind in storage.kinds(0.1)}
+    found = {kind.name: kind for kind in storage.make_layouts(0.1)}
     assert found["dense rgba, 8 bits (the lecture's)"].scenes[1024] == (4 * 2**30, 4 * 2**30)
     assert found["dense SH 2"].per_cell == (4 * 29, 2 * 28)
     assert found["sparse SH 2"].per_cell == (4 * 29 + 4, 2 * 28 + 4)
     ratio = found["sparse SH 2"].scenes[1024][0] / found["dense SH 2"].scenes[1024][0]
     assert ratio == pytest.approx(0.1 / 8 * 30 / 29, rel=1e-6)
     # Hundreds of nodes of 64^3 lie at one distance: a share is met to a thousandth or two.
-    assert storage.shell(0.2).mean() == pytest.approx(0.2, abs=2e-3)
+    assert storage.ball_shell(0.2).mean() == pytest.approx(0.2, abs=2e-3)
 
 
 def test_the_index_grows_with_the_surface() -> None:
     """A quarter of a byte a node, 4 a brick of the grid and 12 a brick with a listed cell, 32 a listed cell and 4 a row, of
     which a surface has as at 64^3."""
-    shell = storage.shell(0.1 * 128 / 64)
+    shell = storage.ball_shell(0.1 * 128 / 64)
     listed, rows, bricks = (count / shell.sum() for count in storage.count_cells(shell))
-    found = storage.kinds(0.1)[-1]
+    found = storage.make_layouts(0.1)[-1]
     for n in (128, 1024):
         near = 0.1 * 128 / n * n**3
         expected = n**3 // 4 + 4 * (n // 4 + 1) ** 3 + 12 * round(bricks * near)
         expected += 32 * round(listed * near) + 4 * round(rows * near)
         assert found.scenes[n] == (expected, 0)
     assert found.per_cell == (found.scenes[128][0] / 128**3, 0)
-    assert [kind.sparse for kind in storage.kinds(0.1)] == [False] * 6 + [True] * 4 + [False]
-
-
-def test_what_is_printed(variant_rgb, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """A table, the run's quality in the row of its kind, and JSON with the bytes of its real file."""
-    run = tmp_path / "a_run"
-    run.mkdir()
-    write_field(run / "field.npz", field(2, np.ones(RES, bool)))
-    (run / "run.json").write_text(json.dumps({"title": "A fit", "results": {"held_out_psnr": 29.54}}))
-    assert storage.main(["--runs", str(run)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert all(line.count("|") == 8 for line in lines if line.startswith("|"))
-    judged = {line.split("|")[1].strip(): line.split("|")[7].strip() for line in lines if line.startswith("|")}
-    assert judged["sparse SH 2"] == "29.5 dB at 7^3 (A fit)"
-    assert judged["dense SH 2"] == "not fitted"
-    fitted = json.loads(lines[-1])["fitted"][0]
-    assert (fitted["kept"], fitted["share"], fitted["file"]) == (210, 1.0, (run / "field.npz").stat().st_size)
-
-
-def test_a_folder_that_holds_no_fit(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    (tmp_path / "run.json").write_text("{}")
-    assert storage.main(["--runs", str(tmp_path)]) == 1
-    assert "has no field.npz; give folders of fits to photographs" in capsys.readouterr().err
-
-
-def test_a_fit_in_a_line():
-    """Whether it was judged, and whether it is sparse."""
-    dense = storage.Fitted("A fit", 64, 2, False, 262144, 1.0, 29 * 2**20, 14 * 2**20, None)
-    assert dense.text == "A fit: 64^3, dense SH 2, no held-out view; 262144 nodes (1e+02 %), 29 MiB, 14 MiB on disk, compressed"
-    sparse = replace(dense, sparse=True, kept=2621, share=0.01, psnr=31.426)
-    assert sparse.text == "A fit: 64^3, sparse SH 2, 31.43 dB; 2621 nodes (1 %), 29 MiB, 14 MiB on disk, compressed"
+    assert [kind.sparse for kind in storage.make_layouts(0.1)] == [False] * 6 + [True] * 4 + [False]
 
 
 @pytest.mark.parametrize(
     ("count", "text"), [(0, "0 B"), (1000, "1e+03 B"), (1023, "1.02e+03 B"), (1024, "1 KiB"), (2**50, "1.02e+03 TiB")]
 )
 def test_bytes_in_units(count: int, text: str) -> None:
-    assert storage.size(count) == text
+    assert storage.format_bytes(count) == text
 
 
-def test_shares_are_numbers_up_to_1(capsys: pytest.CaptureFixture) -> None:
-    assert storage.arguments([]).kept == 0.1 and storage.arguments(["--kept", "1"]).kept == 1
-    for wrong in ("0", "1.01"):
-        with pytest.raises(SystemExit):
-            storage.arguments(["--kept", wrong])
-        assert f"--kept {wrong} is no share" in capsys.readouterr().err
+def test_a_table_with_the_quality_of_runs(variant_rgb, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The PSNR of a run stands in the row of its layout; a run without held-out views and a wrong option are named."""
+    run = tmp_path / "a_run"
+    run.mkdir()
+    write_field(run / "field.npz", field(2, np.ones(RES, bool)))
+    (run / "run.json").write_text(json.dumps({"title": "A fit", "results": {"held_out_psnr": 29.54}}))
+    options = ["--out", str(tmp_path / "out"), "--variant", variant_rgb]
+    assert storage.STUDY.run(["--runs", str(run), *options]) == 0
+    printed = capsys.readouterr()
+    rows = [line.split("|") for line in printed.err.splitlines() if line.startswith("|")]
+    assert all(len(row) == 9 for row in rows)
+    quality = {row[1].strip(): row[7].strip() for row in rows}
+    assert quality["sparse SH 2"] == "29.5 dB at 7^3 (A fit)"
+    assert quality["dense SH 2"] == "not fitted"
+    assert "A fit: 7^3, sparse SH 2, 29.54 dB; 210 nodes (1e+02 %)" in printed.err
+    (fit,) = json.loads(printed.out)["storage"]["fitted"]
+    assert (fit["kept"], fit["share"], fit["file"]) == (210, 1.0, (run / "field.npz").stat().st_size)
+    assert storage.describe_fit(fit | {"psnr": None, "sparse": False}).startswith("A fit: 7^3, dense SH 2, no held-out view;")
+    for wrong, message in (
+        (["--runs", str(tmp_path)], "has no run.json and no field.npz"),
+        (["--kept", "1.01"], "is no share"),
+    ):
+        assert storage.STUDY.run([*wrong, *options]) == 1
+        assert message in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Contestants run in turns and are counted apart from their first call; budgets in samples ask no clock."""
+"""Contestants run in turns, and first calls are reported apart."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mivol.bench.harness import timing
-from mivol.bench.harness.timing import Budget, Stopwatch, Timing, race, ratio_of
+from mivol.bench.harness.timing import Stopwatch, Timing, race, ratio_of
 
 
 def test_contestants_take_turns(variant_rgb: str) -> None:
@@ -29,10 +29,10 @@ def test_first_calls_count_their_kernels(variant_rgb: str) -> None:
     new = int.from_bytes(os.urandom(3), "big") / 2**24
     x = dr.arange(mi.Float, 1000)
     dr.eval(x)
-    first = timing.first_call(lambda _: dr.sin(x) * new + dr.cos(x))
+    first = timing.time_first_call(lambda _: dr.sin(x) * new + dr.cos(x))
     assert set(first) == {"seconds", "compile_seconds", "kernels_compiled", "kernels_from_disk"}
     assert first["kernels_compiled"] == 1
-    assert timing.first_call(lambda _: dr.sin(x) * new + dr.cos(x))["kernels_compiled"] == 0
+    assert timing.time_first_call(lambda _: dr.sin(x) * new + dr.cos(x))["kernels_compiled"] == 0
 
 
 def test_first_calls_add_up_what_the_compiler_took(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
@@ -41,7 +41,7 @@ def test_first_calls_add_up_what_the_compiler_took(monkeypatch: pytest.MonkeyPat
     kernel = {"type": jit, "codegen_time": 200.0, "backend_time": 300.0, "cache_hit": False, "cache_disk": False}
     found = [kernel, {**kernel, "cache_hit": True, "cache_disk": True}, {**kernel, "type": other}]
     monkeypatch.setattr(dr, "kernel_history", lambda: found)
-    first = timing.first_call(lambda _: mi.Float(1))
+    first = timing.time_first_call(lambda _: mi.Float(1))
     assert (first["compile_seconds"], first["kernels_compiled"], first["kernels_from_disk"]) == (1.0, 1, 1)
 
 
@@ -56,22 +56,6 @@ def test_ratios_are_medians_of_rounds() -> None:
     assert report["rays_per_second_best"] == 40
 
 
-@pytest.mark.parametrize(("a_sample", "a_call", "expected"), [(0.01, 0, 64), (1.0, 0, 4), (1e-9, 0, 4096), (0.012, 0.1, 64)])
-def test_samples_for_a_time(
-    monkeypatch: pytest.MonkeyPatch, variant_rgb: str, a_sample: float, a_call: float, expected: int
-) -> None:
-    """The largest power of two that takes 1 s by a clock of ours, between 4 and 4096, what every call costs anyway included."""
-    now = [0.0]
-    monkeypatch.setattr(timing.time, "process_time", lambda: now[0])
-
-    def render(seed: int, spp: int) -> mi.Float:
-        now[0] += a_call + a_sample * spp
-        return mi.Float(0)
-
-    assert Budget(seconds=1.0).samples(render) == expected
-    assert Budget(seconds=1.0, spp=7).samples(None) == 7
-
-
 def test_a_stopwatch_adds_up_its_blocks(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
     """What stands between two blocks is not counted."""
     now = [0.0]
@@ -83,3 +67,16 @@ def test_a_stopwatch_adds_up_its_blocks(monkeypatch: pytest.MonkeyPatch, variant
             now[0] += inside
         now[0] += outside
     assert (watch.seconds, watch.processor) == (3.0, 6.0)
+
+
+def test_the_fastest_call_counts() -> None:
+    """Three calls, of 5, 2 and 4 seconds."""
+    clock = iter([0.0, 5.0, 10.0, 12.0, 20.0, 24.0])
+    calls = []
+    assert timing.fastest(lambda: calls.append(0), lambda: next(clock)) == 2
+    assert len(calls) == 3
+
+
+def test_peak_memory_of_a_call(variant_rgb: str) -> None:
+    """An array of 4 MB, which is freed when the call ends."""
+    assert timing.peak_bytes(lambda: dr.eval(dr.arange(mi.Float, 1 << 20) + 1)) >= 4 << 20

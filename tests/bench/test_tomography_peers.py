@@ -5,56 +5,64 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import sys
-from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mivol.bench.studies import tomography_peers as peers
+from mivol.bench.studies.tomography import peers, slices
+from mivol.bench.studies.tomography.slices import Slice, make_slice
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import random_ellipsoids, shepp_logan
+from mivol.tomography.projector import Projector
+
+
+def curve(errors: list[float], seconds: list[float]) -> peers.Curve:
+    """A curve of a method."""
+    return {"errors": errors, "seconds": seconds}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("who", ["mivol", *peers.PEERS])
 def test_everyone_finds_the_object(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, who: str) -> None:
     """Each method's least error is below 0.75, where an empty slice has 1 and one that is upside down, or mirrored, more."""
-    module, run = peers.PEERS.get(who, ("numpy", peers.ours))
+    module, run = peers.PEERS.get(who, ("numpy", peers.run_solvers))
     if importlib.util.find_spec(module) is None:
         pytest.skip(f"{who} is not installed")
     monkeypatch.setattr(peers, "STEPS", dict.fromkeys(peers.STEPS, 12))
     # Ellipsoids that lie anywhere: a head is nearly its own mirror image.
-    monkeypatch.setattr(peers, "shepp_logan", lambda table, half: random_ellipsoids(5, seed=8).scaled(0.8 * half))
-    scan = peers.make_slice(33, 40, 0.0)
+    monkeypatch.setattr(slices, "shepp_logan", lambda table, half: random_ellipsoids(5, seed=8).scaled(0.8 * half))
+    scan = make_slice(33, 40, 0.0)
     for turned in (scan.truth[:, ::-1], scan.truth[:, :, ::-1], scan.truth.transpose(0, 2, 1)):
         assert scan.error(turned) > 0.75
     assert scan.error(0 * scan.truth) == pytest.approx(1)
     found = run(scan)
     for curve in found.values():
-        assert min(curve.errors) < 0.75
-        assert np.all(np.diff(curve.seconds) >= 0)
+        assert min(curve["errors"]) < 0.75
+        assert np.all(np.diff(curve["seconds"]) >= 0)
 
 
 def test_the_table_has_the_least_error_of_each() -> None:
-    found = {"few": {"a": peers.Curve([0.5, 0.25, 0.3], [1.0, 2.0, 3.0])}, "many": {"a": peers.Curve([0.1], [0.5])}}
-    assert peers.rows(found)[2] == "| a | 0.2500 (2, 2.00 s) | 0.1000 (1, 0.50 s) |"
-    found["many"]["b"] = peers.Curve([0.2], [3.0])
-    assert peers.rows(found)[3] == "| b |  | 0.2000 (1, 3.00 s) |"
+    found = {"few": {"a": curve([0.5, 0.25, 0.3], [1.0, 2.0, 3.0])}, "many": {"a": curve([0.1], [0.5])}}
+    assert peers.error_rows(found)[2] == "| a | 0.2500 (2, 2.00 s) | 0.1000 (1, 0.50 s) |"
+    found["many"]["b"] = curve([0.2], [3.0])
+    assert peers.error_rows(found)[3] == "| b |  | 0.2000 (1, 3.00 s) |"
 
 
 def test_times_are_compared_at_the_error_that_both_reach(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ours has 0.2 after 2 s, theirs in the end after 4; and ours ends at 0.4, which theirs has after 1 s."""
     monkeypatch.setattr(peers, "PAIRS", (("a", "b"), ("a", "who is missing")))
-    ours = {"few": peers.Curve([0.5, 0.2, 0.1], [1.0, 2.0, 3.0]), "many": peers.Curve([0.5, 0.4], [1.0, 2.0])}
-    theirs = {"few": peers.Curve([0.3, 0.2], [1.0, 4.0]), "many": peers.Curve([0.4, 0.3], [1.0, 4.0])}
+    ours = {"few": curve([0.5, 0.2, 0.1], [1.0, 2.0, 3.0]), "many": curve([0.5, 0.4], [1.0, 2.0])}
+    theirs = {"few": curve([0.3, 0.2], [1.0, 4.0]), "many": curve([0.4, 0.3], [1.0, 4.0])}
     found = {kind: {"a": ours[kind], "b": theirs[kind]} for kind in ours}
-    assert peers.ratios(found)[2:] == ["| a / b | 0.50 (0.2000) | 2.00 (0.4000) |"]
+    assert peers.ratio_rows(found)[2:] == ["| a / b | 0.50 (0.2000) | 2.00 (0.4000) |"]
 
 
 def test_times_are_medians_of_runs() -> None:
-    runs = [{"a": peers.Curve([0.5, 0.2], seconds)} for seconds in ([1.0, 9.0], [3.0, 5.0], [2.0, 7.0])]
-    assert peers.median(runs) == {"a": peers.Curve([0.5, 0.2], [2.0, 7.0])}
+    runs = [{"a": curve([0.5, 0.2], seconds)} for seconds in ([1.0, 9.0], [3.0, 5.0], [2.0, 7.0])]
+    assert peers.median_times(runs) == {"a": curve([0.5, 0.2], [2.0, 7.0])}
 
 
 @pytest.mark.slow
@@ -62,30 +70,21 @@ def test_times_are_medians_of_runs() -> None:
 def test_the_default_of_a_slice_is_that_of_a_file(variant_rgb: str, photons: float) -> None:
     """Twelve iterations of it have a lower error than as many of pcg from nothing, with noise and without, and keep the voxels;
     counts have a likelihood besides."""
-    scan = peers.make_slice(33, 40, photons)
-    last = dict(zip(range(12), peers.default(scan), strict=False))[11]
+    scan = make_slice(33, 40, photons)
+    last = dict(zip(range(12), peers.default_states(scan), strict=False))[11]
     assert last.shape == scan.truth.shape
-    problem = peers.LeastSquares(peers.Projector(scan.beam, scan.grid), scan.y, scan.weights, nonnegative=True)
-    plain = dict(zip(range(12), peers.ALL_SOLVERS["pcg"].run(problem), strict=False))[11]
+    problem = LeastSquares(Projector(scan.beam, scan.grid), scan.y, scan.weights, nonnegative=True)
+    plain = dict(zip(range(12), ALL_SOLVERS["pcg"].run(problem), strict=False))[11]
     assert scan.error(last) < scan.error(plain.x)
     if photons:
-        assert scan.error(next(peers.likelihood(scan))) < 1
-
-
-def test_who_counts_quanta_has_a_likelihood(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peers, "default", lambda scan: iter([1, 2]))
-    monkeypatch.setattr(peers, "likelihood", lambda scan: iter([3, 4]))
-    monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (next(states), steps))
-    slices = [peers.Slice(None, None, None, None, None, photons) for photons in (0.0, 5.0)]
-    assert peers.ours_of_noise(slices[0]) == {"mivol default": (1, 20)}
-    assert peers.ours_of_noise(slices[1]) == {"mivol default": (1, 20), "mivol ml-tr from fbp": (3, 20)}
+        assert scan.error(next(peers.likelihood_states(scan))) < 1
 
 
 @pytest.mark.parametrize("photons", [0.0, 50.0])
 def test_a_slice_and_its_projections(variant_rgb: str, photons: float) -> None:
     """Chords of the head at 4 / n, so that 1 across the grid has an optical depth of 4; quanta from the seed 0 where the kind
     of data has noise, their numbers for weights."""
-    scan = peers.make_slice(9, 5, photons)
+    scan = make_slice(9, 5, photons)
     assert (scan.beam.shape, scan.grid.shape, scan.truth.shape) == ((5, 1, 13), (1, 9, 9), (1, 9, 9))
     assert scan.beam.angles == pytest.approx(np.arange(5) * np.pi / 5)
     head = shepp_logan("toft-schabel", 4.5)
@@ -102,7 +101,7 @@ def test_a_slice_and_its_projections(variant_rgb: str, photons: float) -> None:
 def test_errors_count_inside_the_disc(variant_rgb: str) -> None:
     """Corners, and what touches the rim, do not count: the disc reaches from the middle to the last column, without it."""
     truth = np.ones((1, 5, 5))
-    scan = peers.Slice(None, VoxelGrid((1, 5, 5)), None, None, truth)
+    scan = Slice(None, VoxelGrid((1, 5, 5)), None, None, truth)
     inside = np.array([[0, 0, 0, 0, 0], [0, 1, 1, 1, 0], [0, 1, 1, 1, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 0]], bool)
     assert scan.error(np.where(inside, 1.0, 7.0)) == 0
     assert scan.error(np.where(inside, 0.0, 1.0).ravel()) == 1
@@ -119,76 +118,14 @@ def test_steps_are_timed_and_judging_is_not(monkeypatch: pytest.MonkeyPatch) -> 
 
     scan = type("Scan", (), {"error": lambda self, x: passes(100.0, x / 2)})()
     states = (passes(2.0**k, float(k)) for k in range(3))
-    assert peers.timed(scan, states, 2) == peers.Curve([0.0, 0.5], [1.0, 3.0])
-    assert peers.timed(scan, iter([]), 2) == peers.Curve([], [])
+    assert peers.time_states(scan, states, 2) == curve([0.0, 0.5], [1.0, 3.0])
+    assert peers.time_states(scan, iter([]), 2) == curve([], [])
 
 
-def test_every_method_of_ours_runs_once_before_it_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The warm run of each takes a step; ours begin at nothing but for the one that begins at the filtered back-projection,
-    of which what is below 0 is cut off; those that know a bound have it, and rows are stored for whom the choice says so."""
-    asked = []
-
-    class Method:
-        def __init__(self, name: str) -> None:
-            self.name = name
-
-        def run(self, problem: tuple) -> Iterator[SimpleNamespace]:
-            asked.append((self.name, problem))
-            return iter([SimpleNamespace(x=np.array([-1.0, 2.0]))] * 99)
-
-    monkeypatch.setattr(peers, "Projector", lambda beam, grid: (beam, grid))
-    monkeypatch.setattr(peers, "store", lambda walk: ("stored", *walk))
-    monkeypatch.setattr(
-        peers,
-        "choose_storage",
-        lambda wanted, walk: SimpleNamespace(is_stored=(wanted.name, wanted.iterations) in (("sart", 6), ("os-sart", 12))),
-    )
-    monkeypatch.setattr(peers, "LeastSquares", lambda a, y, w, x0, nonnegative: (a, y, w, x0, nonnegative))
-    monkeypatch.setattr(
-        peers, "ALL_SOLVERS", {name: Method(name) for name in ("fbp", "cgls", "pcg", "sirt", "sart", "os-sart")}
-    )
-    monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (next(states).tolist(), steps))
-    found = peers.ours(peers.Slice("beam", "grid", "y", "w", None))
-    steps = {"fbp": 1, "cgls": 20, "pcg": 20, "pcg from fbp": 10, "sirt": 60, "sart": 6, "os-sart": 12}
-    assert found == {f"mivol {name}": ([-1.0, 2.0], n) for name, n in steps.items()}
-    twice = [name for name in ("fbp", "cgls", "pcg", "pcg", "sirt", "sart", "os-sart") for _ in range(2)]
-    assert [name for name, _ in asked] == twice
-    for place, (name, (*rest, start, bounded)) in enumerate(asked):
-        a = ("stored", "beam", "grid") if "sart" in name else ("beam", "grid")
-        assert (rest, bounded) == ([a, "y", "w"], name not in ("fbp", "cgls"))
-        assert (start is None) == (place not in (6, 7)) and (start is None or start.tolist() == [0, 2])
-
-
-def test_who_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kinds of data in turns, peers that are installed beside ours."""
-    said = []
-    monkeypatch.setattr(peers, "make_slice", lambda n, views, photons: (n, views, photons))
-    ticks = iter(range(99))
-    curve = lambda scan: peers.Curve([scan], [float(next(ticks))])  # noqa: E731
-    monkeypatch.setattr(peers, "ours", lambda scan: {"ours": curve(scan)})
-    monkeypatch.setattr(peers, "ours_of_noise", lambda scan: {})
-    monkeypatch.setattr(peers, "say", said.append)
-    run = lambda scan: {"theirs": curve(scan)}  # noqa: E731
-    monkeypatch.setattr(peers, "PEERS", {"there": ("json", run), "not there": ("no_such_module", run)})
-    found = peers.compare(peers.slices_of_the_head(7))
-    data = {"few views": (7, 30, 0.0), "noisy": (7, 90, 1e4), "many": (7, 360, 1e4)}
-    # Three runs of two clocks that tick in turns: the second run of each kind is the middle one.
-    assert found == {
-        kind: {"ours": peers.Curve([scan], [6.0 * k + 2]), "theirs": peers.Curve([scan], [6.0 * k + 3])}
-        for k, (kind, scan) in enumerate(data.items())
-    }
-    assert said == ["not there is not installed: left out"]
-
-
-def test_the_table_in_markdown() -> None:
-    found = {"few": {"a": peers.Curve([0.5], [1.0])}, "many": {"a": peers.Curve([0.1], [0.5])}}
-    assert peers.rows(found) == ["| method | few | many |", "|---|---|---|", "| a | 0.5000 (1, 1.00 s) | 0.1000 (1, 0.50 s) |"]
-
-
-def sliced(views: int = 3) -> peers.Slice:
+def sliced(views: int = 3) -> Slice:
     """A slice of 5 x 5 voxels seen by 9 pixels, its projections numbered."""
     beam = ParallelBeam(np.arange(views) * np.pi / views, (1, 9))
-    return peers.Slice(beam, VoxelGrid((1, 5, 5)), np.arange(9.0 * views).reshape(views, 1, 9), None, np.ones((1, 5, 5)))
+    return Slice(beam, VoxelGrid((1, 5, 5)), np.arange(9.0 * views).reshape(views, 1, 9), None, np.ones((1, 5, 5)))
 
 
 def test_scikit_image_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,8 +145,10 @@ def test_scikit_image_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None
     transform = SimpleNamespace(iradon=iradon, iradon_sart=iradon_sart)
     monkeypatch.setitem(sys.modules, "skimage", SimpleNamespace(transform=transform))
     monkeypatch.setitem(sys.modules, "skimage.transform", transform)
-    monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (list(itertools.islice(states, min(steps, 2))), steps))
-    found = peers.scikit_image(scan)
+    monkeypatch.setattr(
+        peers, "time_states", lambda scan, states, steps: (list(itertools.islice(states, min(steps, 2))), steps)
+    )
+    found = peers.run_scikit_image(scan)
     (filtered, one), (swept, six) = found["scikit-image iradon"], found["scikit-image iradon_sart"]
     assert (one, six, len(filtered), len(swept)) == (1, 6, 1, 2)
     assert np.array_equal(filtered[0], np.arange(25.0).reshape(5, 5)[::-1])
@@ -239,8 +178,8 @@ def test_astra_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
     )
     monkeypatch.setitem(sys.modules, "astra", astra)
-    monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (next(states).tolist(), steps))
-    found = peers.astra_toolbox(scan)
+    monkeypatch.setattr(peers, "time_states", lambda scan, states, steps: (next(states).tolist(), steps))
+    found = peers.run_astra(scan)
     steps = {"FBP": 1, "CGLS": 20, "SIRT": 60, "SART": 6}
     assert found == {f"astra {name}": (image[::-1].tolist(), n) for name, n in steps.items()}
     volume = ("volume", 5, 5)
@@ -252,3 +191,33 @@ def test_astra_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     bounded = {"option": {"MinConstraint": 0.0}}
     assert made == [{"type": name} | common | (bounded if name in ("SIRT", "SART") else {}) for name in steps]
     assert ran == [(1, 1), (2, 1), (3, 1), (4, 3)]
+
+
+@pytest.mark.slow
+def test_rows_of_parts_differ(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a slice of 33^2 with noise: no row equals another, and the last but one is the default."""
+    monkeypatch.setattr(peers, "PART_KINDS", {"noisy": (20, 1e3)})
+    answer = peers.measure_parts(None, 33)
+    assert list(answer["noisy"]) == list(peers.PARTS) and len(set(answer["noisy"].values())) == len(peers.PARTS)
+    scan = make_slice(33, 20, 1e3)
+    *_, last = itertools.islice(peers.default_states(scan), 20)
+    # Float32 sums in another order.
+    assert answer["noisy"]["from fbp, twice as fine, tv = 1"] == pytest.approx(scan.error(last), rel=1e-3)
+    assert peers.part_rows({"few": {"a": 0.25, "b": 0.5}, "many": {"a": 0.125, "b": 1.0}})[2:] == [
+        "| a | 0.250 | 0.125 |", "| b | 0.500 | 1.000 |",
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_packages_that_are_missing_are_named(
+    variant_rgb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A tiny slice by all methods of mivol, and by those packages that are installed."""
+    monkeypatch.setattr(peers, "KINDS", {"noisy": (20, 1e3)})
+    monkeypatch.setattr(peers, "STEPS", dict.fromkeys(peers.STEPS, 1))
+    monkeypatch.setattr(
+        peers, "PEERS", {"there": ("json", lambda scan: {"theirs": curve([0.5], [1.0])}), "gone": ("no_module", None)}
+    )
+    (curves,) = peers.measure_peers(None, 9).values()
+    assert {"mivol fbp", "mivol pcg from fbp", "mivol default", "mivol ml-tr from fbp", "theirs"} <= set(curves)
+    assert "gone is not installed: left out" in capsys.readouterr().err

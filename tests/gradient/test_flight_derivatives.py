@@ -17,8 +17,7 @@ from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rou
 
 import scenes
 from mivol.bench.scenes import box_scene, constant_light
-from mivol.bench.studies.gradients.size import Light
-from mivol.bench.studies.gradients.subject import Subject
+from mivol.bench.studies.gradients.density_gradient import DensityGradient, Light
 from mivol.bench.studies.gradients.twin import Twin
 from mivol.scene import plan
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes
@@ -226,7 +225,8 @@ def test_what_no_camera_ray_meets():
     left = np.broadcast_to(np.arange(8) < 4, (8, 8, 8))
     values, direction = np.where(left, 2.0, 0), np.where(left, 0.0, 1.0)
     light = _Aside(constant_light, depth=4)
-    subject, twin = Subject(light.scene(np.float32(values), 8), light.integrator("mivol")), Twin(values, direction, 8, light)
+    subject = DensityGradient(light.scene(np.float32(values), 8), light.integrator("mivol"))
+    twin = Twin(values, direction, 8, light)
     found = [float(np.array(subject.of_mean(fresh(k), 512), np.float64) @ direction.ravel()) for k in range(BATCHES)]
     truth = [twin.derivative(fresh(100 + k), 256) for k in range(BATCHES)]
     found, truth = (Estimate.of(Moments.of(np.array(x)[:, None])) for x in (found, truth))

@@ -13,7 +13,7 @@ from mivol.bench import studies
 from mivol.bench.harness.bars import say
 from mivol.bench.harness.study import ResultKind, Study
 from mivol.errors import MivolError
-from mivol.optim.strategy import nearest
+from mivol.optim.strategy import suggest_name
 
 __all__ = ["find_changes", "list_studies", "load_study", "run_study", "study_names"]
 
@@ -33,7 +33,7 @@ def load_study(name: str) -> Study:
         MivolError: unknown name.
     """
     if name not in study_names():
-        raise MivolError(f'there is no study "{name}": {nearest(name, study_names())}')
+        raise MivolError(f'there is no study "{name}": {suggest_name(name, study_names())}')
     return importlib.import_module(f"{studies.__name__}.{name}").STUDY
 
 

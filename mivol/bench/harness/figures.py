@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from mivol.report.figures import MARKERS, SERIES, STYLE, save
+from mivol.report.figures import MARKERS, SERIES, STYLE, save_figure
 
 __all__ = ["new_figure", "plot_errors", "plot_ratios", "show_images", "use_plain_ticks"]
 
@@ -26,7 +26,7 @@ def new_figure(path: Path, width: float, height: float) -> Iterator[Figure]:
         figure = Figure(figsize=(width, height))
         FigureCanvasAgg(figure)
         yield figure
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def use_plain_ticks(axis: Axis, unit: str = "") -> None:
@@ -36,10 +36,13 @@ def use_plain_ticks(axis: Axis, unit: str = "") -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def plot_errors(axes: Axes, curves: dict[str, tuple[Sequence[float], Sequence[float]]], **style: float) -> None:
-    """Plot error against time, one line for each method (seconds, errors), on logarithmic axes."""
+def plot_errors(
+    axes: Axes, curves: dict[str, tuple[Sequence[float], Sequence[float]]], log: bool = True, **style: float | str
+) -> None:
+    """Plot one line for each method (seconds, errors); ``log``: on logarithmic axes."""
+    plot = axes.loglog if log else axes.plot
     for i, (name, (seconds, errors)) in enumerate(curves.items()):
-        axes.loglog(seconds, errors, marker=MARKERS[i], color=SERIES[i], label=name, **style)
+        plot(seconds, errors, marker=MARKERS[i], color=SERIES[i], label=name, **style)
 
 
 def plot_ratios(

@@ -209,7 +209,8 @@ def mean_load() -> float | None:
 
 
 def without_arrays(answer: object) -> object:
-    """Copy an answer without its NumPy arrays."""
+    """Copy an answer without its NumPy arrays, and without tables of nothing but arrays."""
     if not isinstance(answer, dict):
         return answer
-    return {name: without_arrays(value) for name, value in answer.items() if not isinstance(value, np.ndarray)}
+    kept = {name: without_arrays(value) for name, value in answer.items() if not isinstance(value, np.ndarray)}
+    return {name: value for name, value in kept.items() if value != {} or answer[name] == {}}

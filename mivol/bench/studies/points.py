@@ -1,27 +1,34 @@
-"""How many pixels a second are splatted from clouds of Gaussians, or traced through them, beside what Mitsuba draws of them?
+"""How many pixels per second are splatted from clouds of Gaussians, or traced through them, beside Mitsuba's ellipsoids?
 
-    scripts/bench_points.py                 # 3 minutes on 2 cores
-    scripts/bench_points.py --quick         # under a minute, small clouds
-    scripts/bench_points.py --only clouds
-    scripts/bench_points.py --only chair    # fits: 3 minutes; chair_minutes 15, chair_large 5, chair_finest 20
-    scripts/bench_points.py --only mip,exposure    # what two choices of a fit bring: 3 minutes
+    mivol bench points                 # 3 minutes on 2 cores
+    mivol bench points --quick         # under a minute, small clouds
+    mivol bench points --only clouds
+    mivol bench points --only chair    # fits: 3 minutes; chair_minutes 15, chair_large 5, chair_finest 20
+    mivol bench points --only mip,exposure    # gains by two options of a fit: 3 minutes
 
-Clouds are random: means even in a unit cube, scales about a quarter of the mean distance, opacities the logistic of a normal
-number, harmonics of degree 2; the camera sees the whole cube. The walk of ``bench_optical_depth`` through the tutorial's smoke
-runs in turns with them: "scaled" rates are those of a machine that walks 25 M rays a second. The peer is Mitsuba's
-``ellipsoids`` with ``volprim_rf_basic``, one ray a pixel, which sorts by where a ray enters an ellipsoid and stops at 64 of
-them; its picture and ours differ by the order, by the ends of the ellipsoids (three standard deviations), by the low-pass
-filter and by places within the pixel. "rays" traces one a pixel through the same cloud, as a medium that shows its colours in
-the order of their peaks (``mivol_gaussians`` as the emission), in turns with the peer, and as the extinction of a medium before
-a white sky, which nothing is sorted for. The biker (152,746 Gaussians) is read from MIVOL_DATA (default
-../shared/data); where it is missing a cloud of as many takes its place, and the JSON says so. Prints JSON; writes
-bench_points.json and bench_points.png.
+Clouds are random: means uniform in a unit cube, scales about a quarter of the mean distance, opacities by the logistic function
+of a normal variable, harmonics of degree 2. The camera sees the whole cube. The reference walk through the tutorial's smoke
+runs in turns with the clouds; "scaled" rates are those of a machine that walks 25 M rays per second.
+
+The peer is Mitsuba's ``ellipsoids`` with ``volprim_rf_basic``, one ray per pixel. It sorts ellipsoids by the entry points of
+the ray and stops after 64 of them. The two images differ by the order, the ends of the ellipsoids (three standard deviations),
+the low-pass filter, and the positions within the pixel.
+
+Question ``rays`` traces one ray per pixel through the same cloud, in turns with the peer: as emission of a medium
+(``mivol_gaussians``), composited in the order of the peaks, and as extinction of a medium before a white sky, without any
+sorting. The biker (152,746 Gaussians) comes from MIVOL_DATA (default ../shared/data). Without the data, a random cloud of the
+same size takes its place, and the JSON says so.
+
+The fits of the chair of NeRF-synthetic are those of ``mivol optimize``. Minutes are those of the reference machine. Training
+and judged views are averaged over squares of pixels of the files; PSNR is the mean over views, over white. ``mip`` and
+``exposure`` compare pairs of fits with the same photographs, steps, rates and seed. At each size the image has the low-pass
+filter of its own pixels, compensated if the fit was compensated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,92 +36,87 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.extinctions import DATA, smoke
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge
-from mivol.bench.harness.figures import drawn
-from mivol.bench.harness.study import Bench
+from mivol.bench.extinctions import DATA
+from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, say_row
+from mivol.bench.harness.figures import new_figure, show_images
+from mivol.bench.harness.study import Size, Study, amount, ask
 from mivol.bench.harness.timing import Contestant, Timing, race, ratio_of
-from mivol.bench.studies.gaussian_choices import exposure_gain, mip_gain
-from mivol.bench.studies.gaussian_fits import Fitted, fit_and_judge
-from mivol.bench.studies.optical_depth.work import Work, camera_rays
+from mivol.bench.photo_fits import find_data, fit_photographs, prepare_fit
+from mivol.bench.reference_walk import REFERENCE_RATE, reference_walk
+from mivol.experiments.judged_views import judge_colour_fitted
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
+from mivol.photos import load_photos, rectify
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import Gaussians, read_gaussians
 from mivol.splatting import Splatter, to_tensors
 
-__all__ = ["BENCH", "FULL", "QUICK", "Size", "compare", "dense_cloud", "main"]
-
-WALK = 25e6
-"""Rays a second of the machine that rates are scaled to."""
+__all__ = ["STUDY", "ChairFit", "PointsSize", "random_cloud"]
 
 DEGREE, FOCAL, DISTANCE = 2, 1.6, 1.8
-"""Of the harmonics; of the camera, in widths of the image, and from the centre of the cube in its edges."""
+"""Degree of the harmonics; focal length in image widths, distance of the camera from the centre of the cube in edges."""
 
 SPACING = 0.25
-"""Scales of a cloud in mean distances: it hides nine tenths of what is behind it."""
+"""Mean scale of the Gaussians in mean distances: the cloud hides nine tenths of the background."""
 
 RATES = {"10,000 at 200^2": 1.7, "50,000 at 400^2": 1.3}
-"""What the project promises, forward and backward, in millions of pixels a second, scaled."""
+"""Bars of splatting, forward and backward [M pixels/s, scaled]."""
 
-RATIO, BIKER_SECONDS = 40.0, 2.0
-"""At least so many times as fast as the peer; at most so many seconds for a picture of the biker."""
-
-TRACED = 0.14
-"""What the project promises of rays through Gaussians, in millions of pixels a second, scaled."""
+RATIO, BIKER_SECONDS, TRACED_RATE = 40.0, 2.0, 0.14
+"""Bars: ratio to the rate of the peer; time of an image of the biker [s]; rate of traced rays [M pixels/s, scaled]."""
 
 
+class ChairFit(NamedTuple):
+    """A fit of the chair.
+
+    Attributes:
+        preset, effort: settings of the table ``gaussians``.
+        scale: size of training and judged views relative to the files.
+        seeds: one fit for each.
+        decibels: bar on the PSNR of each seed [dB].
+        text: the question.
+    """
+
+    preset: str
+    effort: float
+    scale: float
+    seeds: tuple[int, ...]
+    decibels: float
+    text: str
+
+
+PSNR_TEXT = "What is the PSNR of the chair's test views"
 CHAIR = {
-    "chair": Fitted("minute", 1.2, 0.25, (0, 1, 2)),
-    "chair_minutes": Fitted("minutes", 1.0, 0.25, (0, 1, 2)),
-    "chair_large": Fitted("fine", 0.85, 1.0, (0,)),
-    "chair_finest": Fitted("finest", 1.0, 1.0, (0,)),
+    "chair": ChairFit("minute", 1.2, 0.25, (0, 1, 2), 34.0, f"{PSNR_TEXT} at 200 pixels after a minute, for three seeds?"),
+    "chair_minutes": ChairFit("minutes", 1.0, 0.25, (0, 1, 2), 37.0, f"{PSNR_TEXT} at 200 pixels after five minutes?"),
+    "chair_large": ChairFit("fine", 0.85, 1.0, (0,), 31.0, f"{PSNR_TEXT} at 800 pixels after five minutes?"),
+    "chair_finest": ChairFit("finest", 1.0, 1.0, (0,), 32.5, f"{PSNR_TEXT} at 800 pixels after twenty minutes?"),
 }
-"""Fits of about 1, 5, 5 and 20 minutes, judged at 200, 200, 800 and 800 pixels."""
 
-MIP, JUDGED_AT = Fitted("minute", 0.5, 0.25, (0,)), (0.125, 0.25, 1.0)
-"""A fit at 200 pixels, judged at 100, 200 and 800."""
+MIP_SCALES = (0.125, 0.25, 1.0)
+"""Sizes of judged views of fits at scale 0.25: 100, 200 and 800 pixels."""
 
-EXPOSURE, EVERY = Fitted("minute", 0.5, 0.125, (0,)), 8
-"""A fit of photographs of 135 x 240 pixels, all but every eighth."""
-
-DECIBELS = {"chair": 34.0, "chair_minutes": 37.0, "chair_large": 31.0, "chair_finest": 32.5}
-"""What the project promises of each seed [dB]."""
+HELD_OUT = 8
+"""Every eighth photograph of the fox is judged; photographs have 135 x 240 pixels."""
 
 
 @dataclass(frozen=True)
-class Size:
-    """How much is measured.
+class PointsSize(Size):
+    """Amount of work."""
 
-    Attributes:
-        name: for the JSON.
-        rounds: warm calls of each contestant.
-        clouds: Gaussians, and pixels along the edge of the picture.
-        peer: the cloud that the peer draws too.
-        biker_side: pixels along the edge of its picture.
-        substitute: Gaussians of the cloud in the place of the biker.
-        walk_side: rays of the walk are its square.
-        effort: factor on the steps of fits.
-    """
-
-    name: str = "full"
-    rounds: int = 9
-    clouds: tuple[tuple[int, int], ...] = ((10_000, 200), (50_000, 400))
-    peer: tuple[int, int] = (10_000, 200)
-    biker_side: int = 800
-    substitute: int = 152_746
-    walk_side: int = 1024
-    effort: float = 1.0
+    rounds: int = amount(9, 2, "warm calls of each contestant")
+    clouds: tuple[tuple[int, int], ...] = amount(((10_000, 200), (50_000, 400)), ((1000, 64),), "Gaussians and edges", tuple)
+    peer: tuple[int, int] = amount((10_000, 200), (500, 32), "Gaussians and edge of the image [pixels], for the peer")
+    biker_side: int = amount(800, 64, "edge of the image of the biker [pixels]")
+    substitute: int = amount(152_746, 2000, "Gaussians of the cloud in place of the biker")
+    walk_side: int = amount(1024, 128, "the reference walk has the square of this number of rays")
+    effort: float = amount(1.0, 0.02, "factor on the steps of fits")
 
 
-FULL = Size()
-QUICK = Size("quick", 2, ((1000, 64),), (500, 32), 64, 2000, 128, 0.02)
+# -- Clouds and cameras -----------------------------------------------------------------------------------------------------
 
 
-# -- Clouds and cameras ------------------------------------------------------------------------------------------------------
-
-
-def dense_cloud(n: int, seed: int = 0) -> Gaussians:
-    """n Gaussians of random places, directions, opacities and colours in the unit cube around the origin."""
+def random_cloud(n: int, seed: int = 0) -> Gaussians:
+    """n Gaussians with random positions, rotations, opacities and colours in the unit cube around the origin."""
     rng = np.random.default_rng(seed)
     return Gaussians(
         means=rng.uniform(-0.5, 0.5, (n, 3)).astype(np.float32),
@@ -126,148 +128,47 @@ def dense_cloud(n: int, seed: int = 0) -> Gaussians:
 
 
 def camera_before(centre: np.ndarray, edge: float, side: int, up: float = 1.0) -> Camera:
-    """A square camera that sees a cube of that centre and edge; ``up`` is -1 where the cloud's y points down."""
+    """Square camera that sees a cube; ``up`` is -1 for a cloud whose y axis points down.
+
+    Args:
+        centre, edge: centre (3,) and edge of the cube [length].
+        side: edge of the image [pixels].
+        up: sign of the vertical axis.
+    """
     pose = np.diag([up, up, 1.0, 1.0])
     pose[:3, 3] = centre + np.array([0, 0, DISTANCE * edge])
     return Camera(intrinsics(FOCAL * side, FOCAL * side, side / 2, side / 2), (side, side), pose)
 
 
 class Drawing(NamedTuple):
-    """A cloud, the camera before it, and the splatter of its picture."""
+    """A cloud, a camera, and the splatter of the image."""
 
-    reals: dict[str, mi.TensorXf]
+    tensors: dict[str, mi.TensorXf]
     camera: Camera
     splatter: Splatter
 
     @classmethod
-    def of(cls, gaussians: Gaussians, camera: Camera) -> Drawing:
-        return cls(to_tensors(gaussians), camera, Splatter(*camera.size, gaussians.degree))
+    def of(cls, cloud: Gaussians, camera: Camera) -> Drawing:
+        return cls(to_tensors(cloud), camera, Splatter(*camera.size, cloud.degree))
 
     def forward(self) -> Contestant:
-        """The picture alone."""
-        return lambda _: self.splatter.forward(self.reals, self.camera, derivatives=False)[0]
+        """Contestant: the image."""
+        return lambda _: self.splatter.forward(self.tensors, self.camera, derivatives=False)[0]
 
     def both(self) -> Contestant:
-        """The picture, and the derivatives of the sum of its numbers."""
+        """Contestant: the image, and the derivatives of the sum of its numbers."""
         ones = dr.full(mi.TensorXf, 1, (self.camera.size[1], self.camera.size[0], self.splatter.channels))
         dr.make_opaque(ones)
 
         def step(_: int) -> list:
-            _, kept = self.splatter.forward(self.reals, self.camera)
+            _, kept = self.splatter.forward(self.tensors, self.camera)
             return list(self.splatter.backward(kept, ones)[0].values())
 
         return step
 
 
-# -- Questions -----------------------------------------------------------------------------------------------------------------
-
-
-def measure_clouds(size: Size) -> dict:
-    """How many pixels a second are splatted, forward, and forward and backward?"""
-    works = {f"{n:,} at {side}^2": (n, side) for n, side in size.clouds}
-    contestants, pixels = {"walk": Work(smoke().values, *camera_rays(size.walk_side)).tau()}, {}
-    for name, (n, side) in works.items():
-        drawing = Drawing.of(dense_cloud(n), camera_before(np.zeros(3), 1.0, side))
-        contestants[f"{name}, forward"] = drawing.forward()
-        contestants[f"{name}, forward and backward"] = drawing.both()
-        pixels |= {f"{name}, forward": side**2, f"{name}, forward and backward": side**2}
-    timings = race(contestants, size.rounds)
-    walk = timings.pop("walk")
-    found = {name: t.report(pixels[name], "pixels") | scaled(t, pixels[name], walk, size) for name, t in timings.items()}
-    return {"walk": walk.report(size.walk_side**2, "rays"), **found}
-
-
-def scaled(timing: Timing, pixels: int, walk: Timing, size: Size) -> dict[str, float]:
-    """Pixels a second of a machine that walks WALK rays a second, by the clock and by processor time."""
-    one = pixels * WALK / size.walk_side**2
-    return {
-        "pixels_per_second_scaled": one / ratio_of(timing, walk),
-        "pixels_per_second_scaled_by_processor": one / ratio_of(timing, walk, "processor"),
-    }
-
-
-def measure_peer(size: Size) -> dict:
-    """How much faster than Mitsuba's ellipsoids, forward and backward, and by what do the pictures differ?"""
-    n, side = size.peer
-    cloud, camera = dense_cloud(n), camera_before(np.zeros(3), 1.0, side)
-    drawing, scene = Drawing.of(cloud, camera), ellipsoids(cloud, camera)
-    params = mi.traverse(scene)
-    keys = [key for key in params.properties if key.endswith((".data", ".opacities", ".sh_coeffs"))]
-
-    def peers_step(seed: int) -> list:
-        for key in keys:
-            dr.enable_grad(params[key])
-            dr.set_grad(params[key], 0)
-        dr.backward(dr.sum(mi.render(scene, params, spp=1, seed=seed), axis=None))
-        return [dr.grad(params[key]) for key in keys]
-
-    timings = race({"mivol": drawing.both(), "volprim_rf_basic": peers_step}, max(3, size.rounds // 2))
-    forward = race(
-        {"mivol": drawing.forward(), "volprim_rf_basic": lambda seed: mi.render(scene, spp=1, seed=seed)}, 3, keep=True
-    )
-    ours, peers = forward["mivol"].results[0][..., :3], forward["volprim_rf_basic"].results[0][..., :3]
-    return {
-        "cloud": f"{n:,} at {side}^2",
-        "forward and backward": {name: t.report(side**2, "pixels") for name, t in timings.items()},
-        "forward": {name: t.report(side**2, "pixels") for name, t in forward.items()},
-        "mivol_is_faster": ratio_of(timings["volprim_rf_basic"], timings["mivol"]),
-        "mivol_is_faster_by_processor": ratio_of(timings["volprim_rf_basic"], timings["mivol"], "processor"),
-        "mivol_is_faster_forward": ratio_of(forward["volprim_rf_basic"], forward["mivol"]),
-        "rms_difference": float(np.sqrt(np.mean((ours - peers) ** 2))),
-        "mean_difference": float(np.mean(ours - peers)),
-        "mean": float(ours.mean()),
-        "pictures": np.stack([ours, peers]),
-    }
-
-
-def measure_rays(size: Size) -> dict:
-    """How many pixels a second are traced through a cloud that shows its colours, and how many by Mitsuba's ellipsoids?"""
-    n, side = size.peer
-    cloud, camera = dense_cloud(n), camera_before(np.zeros(3), 1.0, side)
-    shown, peers = traced_scene(cloud, camera), ellipsoids(cloud, camera)
-    hidden = traced_scene(cloud, camera, as_extinction=True, sky={"type": "constant"})
-    timings = race(
-        {
-            "walk": Work(smoke().values, *camera_rays(size.walk_side)).tau(),
-            "mivol": lambda seed: mi.render(shown, spp=1, seed=seed),
-            "extinction": lambda seed: mi.render(hidden, spp=1, seed=seed),
-            "volprim_rf_basic": lambda seed: mi.render(peers, spp=1, seed=seed),
-        },
-        size.rounds,
-        keep=True,
-    )
-    walk, peer, ours = timings["walk"], timings["volprim_rf_basic"], ("mivol", "extinction")
-    pictures = [timings["mivol"].results[0][..., :3], peer.results[0][..., :3]]
-    return {
-        "cloud": f"{n:,} at {side}^2",
-        **{name: timings[name].report(side**2, "pixels") | scaled(timings[name], side**2, walk, size) for name in ours},
-        "volprim_rf_basic": peer.report(side**2, "pixels"),
-        "mivol_is_faster": ratio_of(peer, timings["mivol"]),
-        "mivol_is_faster_by_processor": ratio_of(peer, timings["mivol"], "processor"),
-        "rms_difference": float(np.sqrt(np.mean((pictures[0] - pictures[1]) ** 2))),
-        "mean": float(pictures[0].mean()),
-    }
-
-
-def traced_scene(cloud: Gaussians, camera: Camera, as_extinction: bool = False, **more: dict) -> mi.Scene:
-    """The cloud as a medium that holds all of it: with its colours as they are, or as an extinction."""
-    names = EXTINCTION_PARAMETERS if as_extinction else (*EXTINCTION_PARAMETERS, HARMONICS)
-    rays = {"type": "mivol_gaussians", "space": "linear", **{name: mi.TensorXf(getattr(cloud, name)) for name in names}}
-    medium = {"type": "mivol_medium", "sigma_t" if as_extinction else "emission": rays}
-    place = mi.ScalarTransform4f().scale(2 * float(np.abs(cloud.means).max() + 4 * np.exp(cloud.log_scales.max())))
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "mivol", "max_depth": 1},
-            "sensor": sensor_of(camera),
-            "cloud": {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium},
-            **more,
-        }
-    )
-
-
-def sensor_of(camera: Camera) -> dict:
-    """A camera as Mitsuba has it: along +z with x to the left, where ours looks along -z with x to the right."""
+def to_sensor(camera: Camera) -> dict:
+    """Mitsuba's sensor of a camera: along +z with x to the left, where the camera looks along -z with x to the right."""
     w, h = camera.size
     return {
         "type": "perspective",
@@ -277,136 +178,244 @@ def sensor_of(camera: Camera) -> dict:
     }
 
 
-def ellipsoids(cloud: Gaussians, camera: Camera) -> mi.Scene:
-    """The cloud as Mitsuba draws it; colours are kept as they are, for with ``srgb_primitives`` its derivatives are wrong."""
+def ellipsoid_scene(cloud: Gaussians, camera: Camera) -> mi.Scene:
+    """The cloud as Mitsuba's ellipsoids. ``srgb_primitives`` is off, because its derivatives are wrong."""
+    quaternions = cloud.quaternions / np.linalg.norm(cloud.quaternions, axis=1, keepdims=True)
     shape = {
         "type": "ellipsoids",
         "centers": mi.TensorXf(cloud.means),
         "scales": mi.TensorXf(np.exp(cloud.log_scales)),
-        "quaternions": mi.TensorXf(np.ascontiguousarray(_unit(cloud.quaternions)[:, [1, 2, 3, 0]])),
+        "quaternions": mi.TensorXf(np.ascontiguousarray(quaternions[:, [1, 2, 3, 0]])),
         "opacities": mi.TensorXf(1 / (1 + np.exp(-cloud.opacity_logits[:, None]))),
         "sh_coeffs": mi.TensorXf(cloud.harmonics.reshape(cloud.count, -1)),
     }
     integrator = {"type": "volprim_rf_basic", "srgb_primitives": False}
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor_of(camera), "cloud": shape})
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": to_sensor(camera), "cloud": shape})
 
 
-def _unit(quaternions: np.ndarray) -> np.ndarray:
-    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+def medium_scene(cloud: Gaussians, camera: Camera, as_extinction: bool = False, **more: dict) -> mi.Scene:
+    """The cloud as a medium: with its colours as emission, or as an extinction."""
+    names = EXTINCTION_PARAMETERS if as_extinction else (*EXTINCTION_PARAMETERS, HARMONICS)
+    volume = {"type": "mivol_gaussians", "space": "linear", **{name: mi.TensorXf(getattr(cloud, name)) for name in names}}
+    medium = {"type": "mivol_medium", "sigma_t" if as_extinction else "emission": volume}
+    to_world = mi.ScalarTransform4f().scale(2 * float(np.abs(cloud.means).max() + 4 * np.exp(cloud.log_scales.max())))
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "mivol", "max_depth": 1},
+            "sensor": to_sensor(camera),
+            "cloud": {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}, "interior": medium},
+            **more,
+        }
+    )
 
 
-def measure_biker(size: Size) -> dict:
-    """How long does one picture of the biker take?"""
+# -- Speed ------------------------------------------------------------------------------------------------------------------
+
+
+def measure_clouds(size: PointsSize) -> dict:
+    """How many pixels per second are splatted, forward, and forward and backward?"""
+    contestants, pixels = {"walk": reference_walk(size.walk_side)}, {}
+    for n, side in size.clouds:
+        drawing = Drawing.of(random_cloud(n), camera_before(np.zeros(3), 1.0, side))
+        for kind, call in (("forward", drawing.forward()), ("forward and backward", drawing.both())):
+            contestants[f"{n:,} at {side}^2, {kind}"] = call
+            pixels[f"{n:,} at {side}^2, {kind}"] = side**2
+    timings = race(contestants, size.rounds)
+    walk = timings.pop("walk")
+    rates = {name: report_scaled(t, pixels[name], walk, size) for name, t in timings.items()}
+    return {"walk": walk.report(size.walk_side**2, "rays"), **rates}
+
+
+def report_scaled(timing: Timing, pixels: int, walk: Timing, size: PointsSize) -> dict[str, float]:
+    """Times and rates, with the rates of the reference machine by wall clock and by processor time."""
+    scale = pixels * REFERENCE_RATE / size.walk_side**2
+    return timing.report(pixels, "pixels") | {
+        "pixels_per_second_scaled": scale / ratio_of(timing, walk),
+        "pixels_per_second_scaled_by_processor": scale / ratio_of(timing, walk, "processor"),
+    }
+
+
+def measure_peer(size: PointsSize) -> dict:
+    """How much faster than Mitsuba's ellipsoids is splatting, forward and backward, and how do the images differ?"""
+    n, side = size.peer
+    cloud, camera = random_cloud(n), camera_before(np.zeros(3), 1.0, side)
+    drawing, scene = Drawing.of(cloud, camera), ellipsoid_scene(cloud, camera)
+    params = mi.traverse(scene)
+    keys = [key for key in params.properties if key.endswith((".data", ".opacities", ".sh_coeffs"))]
+
+    def peer_step(seed: int) -> list:
+        for key in keys:
+            dr.enable_grad(params[key])
+            dr.set_grad(params[key], 0)
+        dr.backward(dr.sum(mi.render(scene, params, spp=1, seed=seed), axis=None))
+        return [dr.grad(params[key]) for key in keys]
+
+    both = race({"mivol": drawing.both(), "volprim_rf_basic": peer_step}, max(3, size.rounds // 2))
+    forward = race(
+        {"mivol": drawing.forward(), "volprim_rf_basic": lambda seed: mi.render(scene, spp=1, seed=seed)}, 3, keep=True
+    )
+    images = [forward[name].results[0][..., :3] for name in ("mivol", "volprim_rf_basic")]
+    return {
+        "cloud": f"{n:,} at {side}^2",
+        "forward and backward": {name: t.report(side**2, "pixels") for name, t in both.items()},
+        "forward": {name: t.report(side**2, "pixels") for name, t in forward.items()},
+        "mivol_is_faster": ratio_of(both["volprim_rf_basic"], both["mivol"]),
+        "mivol_is_faster_by_processor": ratio_of(both["volprim_rf_basic"], both["mivol"], "processor"),
+        "mivol_is_faster_forward": ratio_of(forward["volprim_rf_basic"], forward["mivol"]),
+        "rms_difference": float(np.sqrt(np.mean((images[0] - images[1]) ** 2))),
+        "mean_difference": float(np.mean(images[0] - images[1])),
+        "mean": float(images[0].mean()),
+        "pictures": np.stack(images),
+    }
+
+
+def measure_rays(size: PointsSize) -> dict:
+    """How many pixels per second are traced through a cloud, and how many through Mitsuba's ellipsoids?"""
+    n, side = size.peer
+    cloud, camera = random_cloud(n), camera_before(np.zeros(3), 1.0, side)
+    scenes = {
+        "mivol": medium_scene(cloud, camera),
+        "extinction": medium_scene(cloud, camera, as_extinction=True, sky={"type": "constant"}),
+        "volprim_rf_basic": ellipsoid_scene(cloud, camera),
+    }
+    renders = {name: lambda seed, scene=scene: mi.render(scene, spp=1, seed=seed) for name, scene in scenes.items()}
+    timings = race({"walk": reference_walk(size.walk_side), **renders}, size.rounds, keep=True)
+    walk, peer = timings["walk"], timings["volprim_rf_basic"]
+    images = [timings["mivol"].results[0][..., :3], peer.results[0][..., :3]]
+    return {
+        "cloud": f"{n:,} at {side}^2",
+        **{name: report_scaled(timings[name], side**2, walk, size) for name in ("mivol", "extinction")},
+        "volprim_rf_basic": peer.report(side**2, "pixels"),
+        "mivol_is_faster": ratio_of(peer, timings["mivol"]),
+        "mivol_is_faster_by_processor": ratio_of(peer, timings["mivol"], "processor"),
+        "rms_difference": float(np.sqrt(np.mean((images[0] - images[1]) ** 2))),
+        "mean": float(images[0].mean()),
+    }
+
+
+def measure_biker(size: PointsSize) -> dict:
+    """How long does one image of the biker take?"""
     path = DATA / "splats" / "biker.compressed.ply"
-    here = path.is_file() and size.name == FULL.name
-    cloud = read_gaussians(path) if here else dense_cloud(size.substitute)
+    is_biker = path.is_file() and not size.name.startswith("quick")
+    cloud = read_gaussians(path) if is_biker else random_cloud(size.substitute)
     low, high = np.percentile(cloud.means, [2, 98], axis=0)
     camera = camera_before((low + high) / 2, float((high - low).max()), size.biker_side, up=-1.0)
-    drawing = Drawing.of(cloud, camera)
-    timing = race({"forward": drawing.forward()}, size.rounds, keep=True)["forward"]
+    timing = race({"forward": Drawing.of(cloud, camera).forward()}, size.rounds, keep=True)["forward"]
     return {
-        "cloud": path.name if here else "made up",
+        "cloud": path.name if is_biker else "made up",
         "gaussians": cloud.count,
         **timing.report(size.biker_side**2, "pixels"),
         "pictures": timing.results[0][None, ..., :3],
     }
 
 
-def measure_chair(size: Size) -> dict:
-    """How many dB have test views of the chair at 200 pixels after a minute, with three seeds?"""
-    return _fit("chair", size)
+# -- Fits -------------------------------------------------------------------------------------------------------------------
+
+CHAIR_PHOTOS = {"background": "white", "judged": "test", "held_out": 0, "box": "silhouettes"}
 
 
-def measure_chair_minutes(size: Size) -> dict:
-    """How many dB have test views of the chair at 200 pixels after five minutes, with three seeds?"""
-    return _fit("chair_minutes", size)
+def fit_chair(wanted: ChairFit, size: PointsSize) -> dict:
+    """Fit the chair once for each seed, and judge by the test views."""
+    photos = CHAIR_PHOTOS | {"scale": wanted.scale}
+    settings = {"gaussians": {"preset": wanted.preset, "effort": wanted.effort * size.effort}}
+    answer: dict = {}
+    seeds = {}
+    for seed in wanted.seeds:
+        prepared = prepare_fit(find_data("chair"), photos, settings, seed)
+        done = fit_photographs(prepared.problem, size.walk_side)
+        psnr = prepared.score(prepared.judged.views)["psnr"]
+        seeds[str(seed)] = {"psnr": psnr, "minutes": done.seconds / 60, "gaussians": len(prepared.problem.cloud["means"])}
+        say_row(f"{wanted.preset}, seed {seed}", psnr=psnr, minutes=done.seconds / 60)
+        views = prepared.judged.views
+        answer = {"pixels": list(views[0].camera.size), "views": len(views), "steps": prepared.steps}
+    return answer | {"seeds": seeds}
 
 
-def measure_chair_large(size: Size) -> dict:
-    """How many dB have test views of the chair at 800 pixels after five minutes?"""
-    return _fit("chair_large", size)
-
-
-def measure_chair_finest(size: Size) -> dict:
-    """How many dB have test views of the chair at 800 pixels after twenty minutes?"""
-    return _fit("chair_finest", size)
-
-
-def measure_mip(size: Size) -> dict:
+def measure_mip(size: PointsSize) -> dict:
     """How many dB do test views of the chair gain by the mip filter, at the size of the fit and at others?"""
-    return mip_gain(DATA / "multiview" / "chair", replace(MIP, effort=MIP.effort * size.effort), JUDGED_AT)
+    folder, answer = find_data("chair"), {}
+    views_by_width = {}
+    for scale in MIP_SCALES:
+        views = load_photos(folder, split="test", scale=scale, background="white", space="srgb").views
+        views_by_width[str(views[0].camera.size[0])] = views
+    for name, mip in (("without", False), ("with", True)):
+        settings = {"preset": "minute", "effort": 0.5 * size.effort, "mip": mip}
+        prepared = prepare_fit(folder, CHAIR_PHOTOS | {"scale": 0.25}, {"gaussians": settings})
+        fit_photographs(prepared.problem, size.walk_side)
+        answer[name] = {width: prepared.score(views)["psnr"] for width, views in views_by_width.items()}
+        say_row(f"{name} mip", **answer[name])
+    fitted_at = prepared.train.views[0].camera.size[0]
+    return {"steps": prepared.steps, "fitted_at": fitted_at, "views": len(views), **answer}
 
 
-def measure_exposure(size: Size) -> dict:
-    """How many dB do held-out photographs of the fox gain by a gain for each?"""
-    return exposure_gain(DATA / "multiview" / "fox", replace(EXPOSURE, effort=EXPOSURE.effort * size.effort), EVERY)
+def measure_exposure(size: PointsSize) -> dict:
+    """How many dB do held-out photographs of the fox gain by a gain for each photograph?"""
+    photos, answer = {"scale": 0.125, "held_out": HELD_OUT}, {}
+    for name, exposure in (("without", False), ("with", True)):
+        settings = {"preset": "minute", "effort": 0.5 * size.effort, "exposure": exposure}
+        prepared = prepare_fit(find_data("fox"), photos, {"gaussians": settings})
+        fit_photographs(prepared.problem, size.walk_side)
+        views = [rectify(view) for view in prepared.judged.views]
+        # Nobody knows the exposure of a held-out photograph: its colours may be fitted before the comparison.
+        adjusted = [judge_colour_fitted(prepared.show(view), view, prepared.judged.space) for view in views]
+        gains = prepared.problem.exposure.table() if prepared.problem.exposure is not None else np.ones(1)
+        answer[name] = {
+            "psnr": prepared.score(views)["psnr"],
+            "psnr_colour_fitted": float(np.mean(adjusted)),
+            "gains": [float(gains.min()), float(gains.max())],
+        }
+        say_row(f"{name} gains", psnr=answer[name]["psnr"], with_fitted_colours=answer[name]["psnr_colour_fitted"])
+    counts = {"fitted": len(prepared.train.views), "judged": len(views), "steps": prepared.steps}
+    return answer | {"pixels": list(views[0].camera.size)} | counts
 
 
-def _fit(name: str, size: Size) -> dict:
-    walk = race({"walk": Work(smoke().values, *camera_rays(size.walk_side)).tau()}, max(size.rounds, 3))["walk"]
-    asked = replace(CHAIR[name], effort=CHAIR[name].effort * size.effort)
-    seconds = float(np.median(walk.processor))
-    return fit_and_judge(DATA / "multiview" / "chair", asked, seconds, size.walk_side**2 / WALK)
-
-
-# -- Bars and figure ----------------------------------------------------------------------------------------------------------
+# -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 
 def compare(question: str, answer: dict) -> list[Bar]:
-    """The figures of an answer that have a bar."""
+    """Judge the figures of an answer."""
     if question == "clouds":
-        rates = {name: answer.get(f"{name}, forward and backward") for name in RATES}
-        what = "forward and backward [M pixels/s, scaled]"
+        label = "forward and backward"
+        rates = {name: answer[f"{name}, {label}"] for name in RATES if f"{name}, {label}" in answer}
         return [
-            judge(f"{name}, {what}", rate["pixels_per_second_scaled"] / 1e6, AT_LEAST, RATES[name])
+            judge(f"{name}, {label} [M pixels/s, scaled]", rate["pixels_per_second_scaled"] / 1e6, AT_LEAST, RATES[name])
             for name, rate in rates.items()
-            if rate is not None
         ]
     if question == "peer":
         return [judge("rate over volprim_rf_basic's, forward and backward", answer["mivol_is_faster"], AT_LEAST, RATIO)]
     if question == "rays":
-        what = f"{answer['cloud']}, traced, forward [M pixels/s, scaled]"
-        return [judge(what, answer["mivol"]["pixels_per_second_scaled"] / 1e6, AT_LEAST, TRACED)]
-    if question in DECIBELS:
-        seeds, what = answer["seeds"], f"{question}, {answer['pixels'][0]} pixels [dB]"
-        return [judge(f"{what}, seed {seed}", one["psnr"], AT_LEAST, DECIBELS[question]) for seed, one in seeds.items()]
+        rate = answer["mivol"]["pixels_per_second_scaled"] / 1e6
+        return [judge(f"{answer['cloud']}, traced, forward [M pixels/s, scaled]", rate, AT_LEAST, TRACED_RATE)]
     if question == "biker":
-        return [judge("a picture of the biker [s]", answer["seconds_median"], AT_MOST, BIKER_SECONDS)]
+        return [judge("an image of the biker [s]", answer["seconds_median"], AT_MOST, BIKER_SECONDS)]
+    if question in CHAIR:
+        label, bar = f"{question}, {answer['pixels'][0]} pixels [dB]", CHAIR[question].decibels
+        return [judge(f"{label}, seed {seed}", one["psnr"], AT_LEAST, bar) for seed, one in answer["seeds"].items()]
     return []
 
 
-def draw(answers: dict, folder: Path) -> None:
-    """The pictures of the peer's cloud, their difference, and the biker."""
-    shown = {}
+def draw(answers: dict, path: Path) -> None:
+    """Show the images of the peer's cloud, their difference, and the biker."""
+    images = {}
     if "peer" in answers:
-        ours, peers = answers["peer"]["pictures"]
-        shown = {"mivol": ours, "volprim_rf_basic": peers, "difference, + 1/2": ours - peers + 0.5}
+        mivol, peer = answers["peer"]["pictures"]
+        images = {"mivol": mivol, "volprim_rf_basic": peer, "difference, + 1/2": mivol - peer + 0.5}
     if "biker" in answers:
-        shown[f"{answers['biker']['cloud']}, {answers['biker']['seconds_median']:.2f} s"] = answers["biker"]["pictures"][0]
-    if not shown:
+        images[f"{answers['biker']['cloud']}, {answers['biker']['seconds_median']:.2f} s"] = answers["biker"]["pictures"][0]
+    if not images:
         return
-    with drawn(folder / "bench_points.png", 4 * len(shown), 4.4) as figure:
-        for ax, (title, picture) in zip(np.ravel(figure.subplots(1, len(shown), squeeze=False)), shown.items(), strict=True):
-            ax.imshow(np.clip(picture, 0, 1))
-            ax.set_title(title)
-            ax.axis("off")
+    with new_figure(path, 4 * len(images), 4.4) as figure:
+        show_images(np.ravel(figure.subplots(1, len(images), squeeze=False)), images)
 
 
-QUESTIONS = {
+QUESTIONS: dict[str, Callable[[PointsSize], dict]] = {
     "clouds": measure_clouds,
     "peer": measure_peer,
     "rays": measure_rays,
     "biker": measure_biker,
-    "chair": measure_chair,
-    "chair_minutes": measure_chair_minutes,
-    "chair_large": measure_chair_large,
-    "chair_finest": measure_chair_finest,
+    **{name: ask(wanted.text, fit_chair, wanted) for name, wanted in CHAIR.items()},
     "mip": measure_mip,
     "exposure": measure_exposure,
 }
-BENCH = Bench("bench_points", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=(*CHAIR, "mip", "exposure"))
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the bench with these arguments (by default the process's own); its exit code."""
-    return BENCH.run(argv)
+STUDY = Study(__name__, __doc__, PointsSize, QUESTIONS, compare, draw, on_request=(*CHAIR, "mip", "exposure"))

@@ -232,7 +232,7 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 
 STEP, EACH_GAUSSIAN, EACH_PIXEL = 5e-3, 0.75e-6, 0.23e-6
 """Seconds of a step, and of each Gaussian and each pixel in it, on two cores that walk 25 million rays a second in
-``scripts/bench_optical_depth.py``. Measured with 10,000 and 25,000 Gaussians of degree 2 at 100, 200 and 400 pixels squared,
+``mivol bench optical_depth``. Measured with 10,000 and 25,000 Gaussians of degree 2 at 100, 200 and 400 pixels squared,
 which it meets to 10 %."""
 
 NUMBER, PIXEL = 4 * 6, 4 * 40

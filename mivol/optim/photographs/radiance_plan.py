@@ -269,7 +269,7 @@ minutes too and is for photographs of a place without bounds; ``gpu`` has the re
 measured).
 
 Rates and priors were chosen on views held out of the chair's training split (32^3 and 64^3), on the still life from 12 and
-60 views and on seven views of the three fields of scripts/bench_radiance_field. The delay is what few views need most: from
+60 views and on seven views of the three fields of mivol bench radiance_field. The delay is what few views need most: from
 the first step at the full rate a field is opaque before it has a shape (seven views of a thin shell: 14 dB, with it 28).
 
 With the rates of ``cpu`` a voxel's optical depth moves alike in all stages, and colours move twice as far as by default: half

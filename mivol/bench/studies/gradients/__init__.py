@@ -181,6 +181,8 @@ def contest_figures(contest: Contest, values: np.ndarray, side: int, comparisons
     figures |= times
     regions = {"sigma_t >= 1": values >= 1, "0 < sigma_t < 1": (values > 0) & (values < 1), "sigma_t = 0": values == 0}
     for region, chosen in regions.items():
+        if not chosen.any():
+            continue
         a, b = (contest.variances(name)[chosen.ravel()].sum() for name in (peer, mivol))
         direction = np.where(chosen, values if values[chosen].any() else 1.0, 0.0)
         means = (mean_of_rounds(directional_derivatives(contest, name, direction)) for name in INTEGRATORS)

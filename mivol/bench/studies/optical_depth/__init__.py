@@ -43,10 +43,10 @@ from mivol.bench.studies.optical_depth.peers import (
 )
 from mivol.bench.studies.optical_depth.twin import exact_tau
 from mivol.report.figures import Series, plot_error_against_time
-from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_tau
-from mivol.transport.traversal.empty_blocks import block_bounds
-from mivol.transport.traversal.grid_walk import walk
-from mivol.transport.traversal.lattice import Lattice, clip
+from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_tau
+from mivol.transport.traversal.grid_blocks import bound_blocks
+from mivol.transport.traversal.grid_walk import walk_cells
+from mivol.transport.traversal.lattice import Lattice, clip_to_grid
 
 __all__ = ["STUDY", "OpticalDepthSize"]
 
@@ -123,7 +123,7 @@ def measure_grid(grid: Extinction, size: OpticalDepthSize) -> dict:
     timings = race(contestants, size.rounds)
     rays = orders["camera order"]
     counts = {skip: count_cells(rays.lattice(skip), rays) for skip in (False, True)}
-    occupied = np.array(block_bounds(rays.tensor)) > 0
+    occupied = np.array(bound_blocks(rays.tensor)) > 0
     answer: dict = {"grid": str(grid), "rays": rays.n, "occupied_blocks": float(occupied.mean())}
     for name, timing in timings.items():
         visited, steps = counts["skipped" in name]
@@ -142,7 +142,7 @@ def count_cells(lattice: Lattice, rays: GridRays) -> tuple[float, float]:
         return state[0] + dr.select(on, mi.UInt32(1), 0), state[1] + 1
 
     zero = dr.zeros(mi.UInt32, rays.n)
-    visited, steps = walk(lattice, clip(lattice, rays.o, rays.d, 0, math.inf), visit, (zero, mi.UInt32(zero)))
+    visited, steps = walk_cells(lattice, clip_to_grid(lattice, rays.o, rays.d, 0, math.inf), visit, (zero, mi.UInt32(zero)))
     return tuple(float(np.array(c, np.float64).mean()) for c in (visited, steps))
 
 
@@ -164,8 +164,8 @@ def race_reverse(rays: GridRays, rounds: int) -> dict:
     dr.make_opaque(ones)
 
     def reverse(_: int) -> mi.Float:
-        gradient = Gradient.zeros(lattice)
-        backproject_segment(lattice, gradient, [ones], clip(lattice, rays.o, rays.d, 0, math.inf))
+        gradient = NodeGradient.zeros(lattice)
+        backproject_segment(lattice, gradient, [ones], clip_to_grid(lattice, rays.o, rays.d, 0, math.inf))
         return gradient.fold()
 
     contestants = {

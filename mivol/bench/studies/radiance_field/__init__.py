@@ -1,139 +1,382 @@
 """How fast are a radiance field's rays and their derivatives, and how much sooner is a fit done, beside Mitsuba's tutorial?
 
-    scripts/bench_radiance_field.py                     # an hour on 2 idle cores, most of it in photographs and the peer
-    scripts/bench_radiance_field.py --only step,memory  # 6 minutes
-    scripts/bench_radiance_field.py --only photographs  # 40 minutes, a third of them for one fit
-    scripts/bench_radiance_field.py --quick             # under two minutes, small sizes: its times mean nothing
+    mivol bench radiance_field                     # an hour on 2 idle cores, most of it in photographs and the peer
+    mivol bench radiance_field --only step,memory  # 6 minutes
+    mivol bench radiance_field --only photographs  # 40 minutes, a third of them for one fit
+    mivol bench radiance_field --quick             # under two minutes, small sizes: the times mean nothing
 
-The peer is :mod:`mivol.bench.studies.radiance_field.peer`: uniform steps over textures. Fields: a thin shell, a fog that fills
-the box, and a fitted scene (the chair of NeRF's synthetic scenes from MIVOL_DATA, fitted here for a minute; without data, views
-of a made-up object, and the JSON says so). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
+The peer (:mod:`mivol.bench.studies.radiance_field.peer`) takes uniform steps through textures. Fields: a thin shell, a fog that
+fills the box, and a fitted scene (the chair of NeRF's synthetic scenes from MIVOL_DATA, fitted here for a minute; without the
+data, views of the shell, and the JSON says so). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
 
-step: forward and backward, the same 65,536 rays for both, in turns; ratios of processor time (which other work on the machine
-moves least), with the clock's beside them. camera: the pixels of one view; pixels: drawn at random from 8 views, as the
-tutorial's loader draws them; any: random origins and directions. The first two share pinholes, so their harmonics are summed
-once a node and pinhole, and that is counted. Rays of the third share nothing: each reads 28 numbers at every corner, from
-anywhere in memory, and carries those of a face on to the next cell; they are sorted first, which is counted.
+step: forward and backward, the same 65,536 rays for both, in turns; ratios of processor time, with those of the wall clock.
+Three kinds of rays: ``camera``, the pixels of one view; ``pixels``, random pixels of 8 views, as the loader of the tutorial
+draws them; ``any``, random origins and directions. The first two share pinholes, so their harmonics are summed once for each
+node and pinhole, and this time counts. Rays of the third kind share nothing: each reads 28 numbers at every corner and carries
+the corners of a face on to the next cell. They are sorted first, and this time counts.
 
-memory: the most that Dr.Jit held during a gradient step, for N and 4 N rays: what a ray costs is its own state.
+memory: the most that Dr.Jit holds during a gradient step, for N and 4 N rays; the difference is the state of the rays.
 
-locality: fits of 64^3 nodes from 24 views of the fitted scene, with rays of tiles of 4 x 4 pixels (what a fit does) and with as
-many rays of single pixels drawn at random from the same views: time a step, and held-out PSNR after as many steps.
+locality: fits of 64^3 nodes from 24 views of the fitted scene, with rays of tiles of 4 x 4 pixels (as every fit) and with as
+many rays of random single pixels of the same views: time of a step, and held-out PSNR after the same number of steps.
 
-fit: 7 views of 256 x 256 pixels rendered of each field over black. The peer does as the tutorial does: 4 stages of doubling
-resolution up to 128^3, 105 steps each, one view a step. Ours has 3 stages to the same resolution, in the last as many rays a
-step as a view has pixels, from all views, and otherwise what every fit has. The mean PSNR of 4 views between them is followed,
-every 7 steps of either, the clock stopped while it is measured; kernels are compiled before. Printed is the peer's time over
-ours to the best PSNR that the peer reaches.
+fit: 7 views of 256 x 256 pixels, rendered of each field over black. The peer fits as the tutorial does: 4 stages of doubling
+resolution up to 128^3, 105 steps each, one view in each step. mivol has 3 stages up to the same resolution. Its last stage has
+as many rays in a step as a view has pixels, from all views; all else is as in every fit. The mean PSNR of 4 views in between is
+measured every 7 steps of either, with stopped clock, after all kernels were compiled. The study reports the time of the peer
+over mivol's time to the best PSNR of the peer.
 
-priors: the preset for captures at a small size, as it is and without each of its priors, on a procedural room and on the fox of
-MIVOL_DATA: mean PSNR of the photographs of each fold, of fits to the others, and what a prior gains over the folds.
+photographs: fits of data sets with the settings of ``mivol optimize``: quality of test views, time, memory.
+
+priors: the preset for captures at a small size, with and without each of its priors, on a procedural room and on the fox of
+MIVOL_DATA: mean PSNR of the photographs of each fold, from fits to the other photographs; the gain of a prior over the folds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge
-from mivol.bench.harness.figures import drawn, plain_ticks
-from mivol.bench.harness.study import Bench
-from mivol.bench.studies.radiance_field.fits import ask_fit, ask_locality
-from mivol.bench.studies.radiance_field.photographs import ask_photographs, bars_of
-from mivol.bench.studies.radiance_field.priors import ask_priors
-from mivol.bench.studies.radiance_field.size import FULL, QUICK, Size
-from mivol.bench.studies.radiance_field.steps import ask_memory, ask_step
-from mivol.report.figures import MARKERS, SERIES
+from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, say_row
+from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
+from mivol.bench.harness.study import Study, amount
+from mivol.bench.harness.timing import Stopwatch, peak_bytes, race, ratio_of
+from mivol.bench.photo_fits import find_photographs, fit_photographs, prepare_fit
+from mivol.bench.studies.radiance_field.fields import (
+    STOP,
+    load_field,
+    make_camera,
+    ring_cameras,
+    tiled_pixels,
+    to_bundle,
+    trace,
+)
+from mivol.bench.studies.radiance_field.fits import measure_fit, measure_locality
+from mivol.bench.studies.radiance_field.peer import Peer
+from mivol.bench.studies.radiance_field.priors import PriorSize, measure_priors
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.optim.loop import Fit
+from mivol.optim.photographs.radiance_plan import estimate_bytes
+from mivol.report.figures import SERIES
+from mivol.transport.line_integrals.radiance_field import (
+    RayBundle,
+    RayGradient,
+    find_occupied_cells,
+    make_model,
+    render_rays,
+    vjp_rays,
+)
+from mivol.transport.line_integrals.radiance_source import bake, make_exact, vjp_bake
 
-__all__ = ["BENCH", "FULL", "QUICK", "Size", "main"]
+__all__ = ["STUDY", "PhotoFit", "RadianceSize", "RayTask"]
 
-QUESTIONS = {
-    "step": ask_step,
-    "memory": ask_memory,
-    "locality": ask_locality,
-    "fit": ask_fit,
-    "photographs": ask_photographs,
-    "priors": ask_priors,
+
+class PhotoFit(NamedTuple):
+    """A fit of a data set of photographs.
+
+    Attributes:
+        name: data set.
+        longest: nodes along an edge of a cube with as many nodes; None: as the preset.
+        effort: factor on the steps of the preset.
+        preset: name of the preset.
+    """
+
+    name: str
+    longest: int | None = None
+    effort: float = 1.0
+    preset: str = "cpu"
+
+    def __str__(self) -> str:
+        return f"{self.name} at {self.longest}" if self.longest else f"{self.name}, {self.preset}"
+
+
+ALL_FITS = (
+    PhotoFit("chair", 128),
+    PhotoFit("chair", 256, 1.9),
+    PhotoFit("chair", preset="fine"),
+    *(PhotoFit(name, 128) for name in ("still_life", "wires", "glossy")),
+    *(PhotoFit(name, preset="fine") for name in ("still_life", "wires", "glossy")),
+)
+
+
+@dataclass(frozen=True)
+class RadianceSize(PriorSize):
+    """Amount of work."""
+
+    side: int = amount(256, 64, "edge of images whose rays are timed [pixels]")
+    rounds: int = amount(3, 1, "warm steps of each contestant")
+    photo_fits: tuple[PhotoFit, ...] = amount(
+        ALL_FITS, (PhotoFit("chair", 32, 0.03), PhotoFit("wires", 32, 0.03)), "fits", tuple
+    )
+    photo_folder: str = amount("runs/photographs", "runs/quick_photographs", "folder of rendered photographs")
+    photo_views: int = amount(75, 15, "number of rendered photographs")
+    photo_side: int = amount(200, 48, "edge of rendered photographs [pixels]")
+    photo_spp: int = amount(32, 2, "samples per pixel of rendered photographs")
+    walk_side: int = amount(1024, 64, "the reference walk has the square of this number of rays")
+
+
+# -- Steps ------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class RayTask:
+    """Rays of one kind.
+
+    Attributes:
+        rays: the rays.
+        pinholes: shared origins (P, 3).
+        view: index of the pinhole of each ray; None: the rays share no pinholes.
+    """
+
+    rays: RayBundle
+    pinholes: np.ndarray | None = None
+    view: np.ndarray | None = None
+
+
+def make_tasks(size: RadianceSize) -> dict[str, RayTask]:
+    """The three kinds of rays."""
+    n = size.side**2
+    rng = np.random.default_rng(0)
+    one = make_camera(0.3, 7, size.side)
+    camera = RayTask(to_bundle(*trace(one, tiled_pixels(size.side))), one.origin[None], np.zeros(n, int))
+    cameras = ring_cameras(size.side, 8)
+    view = np.sort(rng.integers(8, size=n))
+    chosen = rng.integers(size.side, size=(n, 2))
+    pairs = [trace(c, chosen[view == k]) for k, c in enumerate(cameras)]
+    o, d = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    pixels = RayTask(to_bundle(o, d), np.array([c.origin for c in cameras]), view)
+    o = rng.normal(size=(n, 3))
+    o *= 3 / np.linalg.norm(o, axis=1, keepdims=True)
+    d = rng.uniform(-0.7, 0.7, (n, 3)) - o
+    return {"camera": camera, "pixels": pixels, "any": RayTask(to_bundle(o, d / np.linalg.norm(d, axis=1, keepdims=True)))}
+
+
+def mivol_step(field: SphericalGrid, task: RayTask) -> Callable[[int], list[mi.Float]]:
+    """Contestant: forward and backward of the squared radiance by mivol."""
+    cells, model = find_occupied_cells(field), make_model(field, STOP)
+    view = None if task.view is None else mi.UInt32(task.view.astype(np.uint32))
+
+    def step(number: int) -> list[mi.Float]:
+        baked = view is not None
+        source = bake(field, cells, task.pinholes, view, True) if baked else make_exact(field, task.rays.d, True)
+        radiance = render_rays(cells, source, model, task.rays)
+        dr.eval(radiance)
+        vjp_rays(cells, source, model, radiance, RayGradient(2 * radiance.colour))
+        return list(vjp_bake(field, cells, source, task.pinholes)) if baked else list(source.slopes())
+
+    return step
+
+
+def to_peer(field: SphericalGrid) -> Peer:
+    """The same field in textures over the unit cube, in which lengths are half as large."""
+    density, sh = field.to_dense()
+    sh[..., 0, :] += field.offset / 0.28209479  # the peer has no offset: the constant harmonic takes it
+    density, sh = density[..., None] * np.float32(2), sh.reshape(*sh.shape[:3], 27)
+    return Peer(*(mi.TensorXf(np.ascontiguousarray(a)) for a in (density, sh)))
+
+
+def peer_step(peer: Peer, task: RayTask) -> Callable[[int], list[mi.Float]]:
+    """Contestant: forward and backward of the squared radiance by the peer."""
+    o, d = mi.Point3f((task.rays.o + 1) * 0.5), task.rays.d
+    dr.eval(o)
+
+    def step(number: int) -> list[mi.Float]:
+        L = peer.render(o, d)
+        dr.eval(L)
+        return list(peer.backward(o, d, L, 2 * L))
+
+    return step
+
+
+def measure_step(size: RadianceSize) -> dict:
+    """How many rays per second are followed forward and backward, beside the peer?"""
+    answer = {}
+    for name in size.fields:
+        field, origin = load_field(name, size)
+        peer = to_peer(field)
+        answer[name] = {"field": origin, "rows": field.rows}
+        for kind, task in make_tasks(size).items():
+            times = race({"mivol": mivol_step(field, task), "peer": peer_step(peer, task)}, size.rounds)
+            answer[name][kind] = {
+                "ratio_of_processor_time": ratio_of(times["peer"], times["mivol"], "processor"),
+                "ratio_of_time": ratio_of(times["peer"], times["mivol"]),
+                **{who: t.report(size.side**2, "rays") for who, t in times.items()},
+            }
+    return answer
+
+
+def measure_memory(size: RadianceSize) -> dict:
+    """How much memory does a gradient step hold, and how much of it grows with the rays?"""
+    field, _ = load_field("shell", size)
+    peaks = []
+    for side in (size.side, 2 * size.side):
+        step = mivol_step(field, make_tasks(replace(size, side=side))["camera"])
+        # The first calls compile, and allocate what later calls use again.
+        peaks.append([peak_bytes(lambda step=step: dr.eval(step(0))) for _ in range(3)][-1])
+    return {
+        "field_bytes": field.bytes,
+        "peak_bytes": peaks,
+        "bytes_per_ray": (peaks[1] - peaks[0]) / (3 * size.side**2),
+        "resident_bytes": resident_bytes(),
+    }
+
+
+def resident_bytes() -> int | None:
+    """Largest memory of this process so far; None on Windows, whose Python does not report it."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+# -- Photographs ------------------------------------------------------------------------------------------------------------
+
+PHOTO_BARS = {
+    "chair at 128": [("psnr", AT_LEAST, 30.2), ("seconds", AT_MOST, 60), ("step_milliseconds", AT_MOST, 70)],
+    "chair at 256": [("psnr", AT_LEAST, 31.3), ("seconds", AT_MOST, 300), ("held_gib", AT_MOST, 1.5)],
+    "chair, fine": [("psnr", AT_LEAST, 32.0), ("seconds", AT_MOST, 1200), ("held_gib", AT_MOST, 16)],
 }
+"""Bars of fits of photographs, by fit."""
+
+STEPS_TIMED = 8
+
+
+def measure_photographs(size: RadianceSize) -> dict:
+    """How good are held-out views, after how long, and how much memory does a fit hold?"""
+    answer = {}
+    for wanted in size.photo_fits:
+        folder = find_photographs(wanted.name, Path(size.photo_folder), size.photo_views, size.photo_side, size.photo_spp)
+        if folder is not None:
+            answer[str(wanted)] = figures = fit_and_judge(folder, wanted, size)
+            say_row(str(wanted), **{key: figures[key] for key in ("psnr", "seconds", "held_gib")})
+    return answer
+
+
+def fit_and_judge(folder: Path, wanted: PhotoFit, size: RadianceSize) -> dict:
+    """Fit a data set as ``mivol optimize`` does, and measure.
+
+    Returns:
+        ``psnr`` [dB] and ``ssim`` of the test views, ``train_psnr`` of some fitted views; ``seconds`` of the reference machine,
+        ``processor_seconds``, ``walk_rays_per_second``; processor time ``step_milliseconds`` of a step of the last stage, and
+        its ``step_rays``; memory ``counted_gib`` by the plan for the stored rows, and ``held_gib`` by Dr.Jit, both without the
+        photographs.
+    """
+    photos = {"background": "white", "judged": "test", "held_out": 0}
+    adapt = (lambda plan: plan) if wanted.longest is None else (lambda plan: plan.with_longest(wanted.longest))
+    prepared = prepare_fit(folder, photos, {"field": {"preset": wanted.preset, "effort": wanted.effort}}, adapt=adapt)
+    problem, train = prepared.problem, prepared.train.views
+    done, last = fit_photographs(problem, size.walk_side), problem.plan.stages[-1]
+    return {
+        **prepared.score(prepared.judged.views, ("psnr", "ssim")),
+        "train_psnr": prepared.score(train[:: max(1, len(train) // 8)])["psnr"],
+        "seconds": done.seconds,
+        "processor_seconds": done.processor,
+        "walk_rays_per_second": done.rate,
+        "step_milliseconds": 1e3 * time_step(done.fit),
+        "step_rays": 16 * min(last.views, len(train)) * last.tiles,
+        "rows": problem.field.rows,
+        "counted_gib": estimate_bytes(problem.plan, last, prepared.train.box, problem.field.rows) / 2**30,
+        "held_gib": done.held / 2**30,
+    }
+
+
+def time_step(fit: Fit) -> float:
+    """Processor time of one more step of a finished fit, median of a few [s]."""
+    times = []
+    for number in range(STEPS_TIMED):
+        with Stopwatch() as watch:
+            fit.run.step(fit.next_iteration + number, 1.0)
+        times.append(watch.processor)
+    return float(np.median(times))
+
+
+# -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 STEP_BARS = {"camera": 8, "pixels": 4, "any": 4}
-"""How many times the peer's rays a second there must be, for each order of the rays."""
+"""Smallest ratio to the peer's rays per second, by kind of rays."""
 
 
 def compare(question: str, answer: dict) -> list[Bar]:
-    """The figures that have a bar."""
+    """Judge the figures of an answer."""
     if question == "memory":
         return [judge("bytes a ray beyond the grid's", answer["bytes_per_ray"], AT_MOST, 512)]
-    if question in ("locality", "priors"):
-        return []
     if question == "photographs":
-        return bars_of(answer)
+        bars = [(fit, *bar) for fit in PHOTO_BARS if fit in answer for bar in PHOTO_BARS[fit]]
+        return [judge(f"{fit}: {figure}", answer[fit][figure], sense, bar) for fit, figure, sense, bar in bars]
     if question == "fit":
         return [judge(f"{name}: time to the same PSNR", a["ratio"], AT_LEAST, 10) for name, a in answer.items()]
-    return [
-        judge(f"{name}: {kind} rays, forward and backward", a[kind]["ratio_of_processor_time"], AT_LEAST, bar)
-        for name, a in answer.items()
-        for kind, bar in STEP_BARS.items()
-    ]
+    if question == "step":
+        return [
+            judge(f"{name}: {kind} rays, forward and backward", a[kind]["ratio_of_processor_time"], AT_LEAST, bar)
+            for name, a in answer.items()
+            for kind, bar in STEP_BARS.items()
+        ]
+    return []
 
 
-def draw(answers: dict, folder: Path) -> None:
-    """A panel for each question that has a picture, and one for each field of the fits."""
+def draw(answers: dict, path: Path) -> None:
+    """A panel for each question with a picture, and a panel for each field of the fits."""
     panels = [(PANELS[question], answer) for question, answer in answers.items() if question in PANELS]
-    panels += [(draw_fit, {name: answer}) for name, answer in answers.get("fit", {}).items()]
-    with drawn(folder / "bench_radiance_field.png", 4.2 * max(len(panels), 1), 3.6) as figure:
-        for number, (panel, answer) in enumerate(panels, 1):
-            panel(figure.add_subplot(1, len(panels), number), answer)
+    panels += [(plot_fit, {name: answer}) for name, answer in answers.get("fit", {}).items()]
+    with new_figure(path, 4.2 * max(len(panels), 1), 3.6) as figure:
+        for number, (plot, answer) in enumerate(panels, 1):
+            plot(figure.add_subplot(1, len(panels), number), answer)
 
 
-def draw_step(axes: Axes, answer: dict) -> None:
-    """How many times the peer's rays a second, for each order of the rays."""
-    rows = np.arange(len(answer))[::-1]
-    for i, (kind, bar) in enumerate(STEP_BARS.items()):
-        ratios = [a[kind]["ratio_of_processor_time"] for a in answer.values()]
-        axes.semilogx(ratios, rows, MARKERS[i], color=SERIES[i], label=f"{kind} rays" if kind != "pixels" else "random pixels")
-        axes.axvline(bar, color=SERIES[i], linestyle="--", linewidth=1.2)
-    axes.set(yticks=rows, yticklabels=list(answer), ylim=(-0.6, len(rows) + 0.5))
+def plot_step(axes: Axes, answer: dict) -> None:
+    """Plot ratios to the peer's rays per second."""
+    labels = {"camera": "camera rays", "pixels": "random pixels", "any": "any rays"}
+    series = {labels[kind]: [a[kind]["ratio_of_processor_time"] for a in answer.values()] for kind in STEP_BARS}
+    plot_ratios(axes, list(answer), series, STEP_BARS.values())
+    axes.set(ylim=(-0.6, len(answer) - 0.5 + 1))
     axes.set(title="Rays a second over the peer's", xlabel="forward and backward (lines: the bars)")
-    plain_ticks(axes.xaxis, "×")
     axes.legend(loc="upper left")
 
 
-def draw_memory(axes: Axes, answer: dict) -> None:
-    """Peak of a step for two numbers of rays."""
+def plot_memory(axes: Axes, answer: dict) -> None:
+    """Plot the peak of a step for two numbers of rays."""
     axes.bar(("rays", "4 x rays"), np.array(answer["peak_bytes"]) / 2**20, 0.5, color=SERIES[0])
     axes.axhline(answer["field_bytes"] / 2**20, color=SERIES[1], linestyle="--", linewidth=1.2, label="the field")
     axes.set(title=f"{answer['bytes_per_ray']:.0f} bytes a ray", ylabel="peak of a step [MiB]")
     axes.legend()
 
 
-def draw_locality(axes: Axes, answer: dict) -> None:
-    """What a step takes, and where as many steps end."""
-    for i, (name, a) in enumerate(answer.items()):
-        axes.plot(1e3 * a["processor_seconds"] / a["steps"], a["psnr"], MARKERS[i], color=SERIES[i], label=name)
+def plot_locality(axes: Axes, answer: dict) -> None:
+    """Plot the time of a step, and the PSNR after the same number of steps."""
+    points = {name: ([1e3 * a["processor_seconds"] / a["steps"]], [a["psnr"]]) for name, a in answer.items()}
+    plot_errors(axes, points, log=False, linestyle="none")
     axes.set(title="Tiles and single pixels", xlabel="processor time of a step [ms]", ylabel="held-out PSNR [dB]")
     axes.margins(0.4)
     axes.legend()
 
 
-def draw_fit(axes: Axes, answer: dict) -> None:
-    """Held-out views against time."""
+def plot_fit(axes: Axes, answer: dict) -> None:
+    """Plot the PSNR of held-out views against time."""
     ((name, curves),) = answer.items()
-    for i, (who, label) in enumerate((("ours", "mivol"), ("peer", "tutorial's method"))):
-        axes.semilogx(*zip(*curves[who], strict=True), marker=MARKERS[i], markersize=3, color=SERIES[i], label=label)
+    series = {label: tuple(zip(*curves[who], strict=True)) for who, label in (("ours", "mivol"), ("peer", "tutorial's method"))}
+    plot_errors(axes, series, log=False, markersize=3)
+    axes.set_xscale("log")
     axes.axhline(curves["peer_psnr"], color=SERIES[1], linestyle="--", linewidth=1.2, label="its best")
     axes.set(title=f"{name}, 7 views", xlabel="time [s]", ylabel="held-out PSNR [dB]")
     axes.legend()
 
 
-PANELS = {"step": draw_step, "memory": draw_memory, "locality": draw_locality}
-
-BENCH = Bench("bench_radiance_field", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=("photographs",))
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the bench with these arguments (by default the process's own); its exit code."""
-    return BENCH.run(argv)
+PANELS = {"step": plot_step, "memory": plot_memory, "locality": plot_locality}
+QUESTIONS = {
+    "step": measure_step,
+    "memory": measure_memory,
+    "locality": measure_locality,
+    "fit": measure_fit,
+    "photographs": measure_photographs,
+    "priors": measure_priors,
+}
+STUDY = Study(__name__, __doc__, RadianceSize, QUESTIONS, compare, draw, on_request=("photographs",))

@@ -1,34 +1,111 @@
-"""Radiance fields to measure: a thin shell, a fog, and a fitted scene, all of harmonics of degree 2 in [-1, 1]^3."""
+"""Radiance fields of a study, and views of them: a thin shell, a fog, a fitted scene; cameras on a ring around the box."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mivol.bench.extinctions import DATA, TO_WORLD
-from mivol.bench.studies.radiance_field.size import Size
-from mivol.bench.studies.radiance_field.views import BOX, photographed, ring
+from mivol.bench.harness.study import Size, amount
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import reconstruct
+from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
-from mivol.photos import load_photos
+from mivol.photos import Camera, Photo, intrinsics, load_photos, pixel_centres, rays
+from mivol.photos.camera_path import aim_camera
+from mivol.transport.line_integrals.radiance_field import RayBundle
 
-__all__ = ["FIELDS", "field_of"]
+__all__ = [
+    "BLACK", "BOX", "FIELDS", "STOP", "FieldSize", "load_field", "make_camera", "middle_cameras", "photograph", "ring_cameras",
+    "tiled_pixels", "to_bundle", "trace",
+]  # fmt: skip
+
+STOP = 1e-4
+"""Transmittance at which mivol's rays end; rays of the peer end at 0."""
+
+BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
+BLACK = np.zeros(3, np.float32)
 
 
-def places(n: int) -> list[np.ndarray]:
+@dataclass(frozen=True)
+class FieldSize(Size):
+    """Amount of work of fields and fits."""
+
+    resolution: int = amount(128, 32, "nodes along an edge of the fields")
+    fields: tuple[str, ...] = amount(("shell", "fog", "fitted"), doc="fields")
+    steps: int = amount(105, 7, "steps of the first stage of a fit")
+    chair_steps: int = amount(800, 30, "steps of the fit that makes the fitted field")
+    fit_resolution: int = amount(128, 32, "nodes along an edge in fits")
+    fit_side: int = amount(256, 32, "edge of the views of fits [pixels]")
+    side: int = amount(256, 64, "edge of images [pixels]")
+
+
+# -- Views ------------------------------------------------------------------------------------------------------------------
+
+
+def make_camera(k: float, count: int, side: int) -> Camera:
+    """Camera k of a ring of ``count``, at distance 3 from the axis and 0.9 above the centre of the box, its target."""
+    angle = 2 * np.pi * k / count
+    like = Camera(intrinsics(1.2 * side, 1.2 * side, side / 2, side / 2), (side, side), np.eye(4))
+    origin = np.array([3 * np.cos(angle), 3 * np.sin(angle), 0.9])
+    return aim_camera(like, origin, np.zeros(3), np.array([0.0, 0, 1]), f"camera {k}")
+
+
+def ring_cameras(side: int, count: int = 7) -> list[Camera]:
+    """Cameras of a ring."""
+    return [make_camera(k, count, side) for k in range(count)]
+
+
+def middle_cameras(side: int, count: int = 7) -> list[Camera]:
+    """Cameras in the middle between every second pair of a ring."""
+    return [make_camera(k + 0.5, count, side) for k in range(0, count, 2)]
+
+
+def photograph(field: SphericalGrid, cameras: Sequence[Camera]) -> list[Photo]:
+    """Render views of a field over black."""
+    images = [np.clip(render_view(field, camera, BLACK).image, 0, 1) for camera in cameras]
+    return [Photo(camera.name, image, None, None, camera, BLACK) for camera, image in zip(cameras, images, strict=True)]
+
+
+def tiled_pixels(side: int) -> np.ndarray:
+    """Pixels of a view (row, column), in the order of tiles of 4 x 4."""
+    i = np.arange(side * side)
+    tile, within = i // 16, i % 16
+    return np.stack([tile // (side // 4) * 4 + within // 4, tile % (side // 4) * 4 + within % 4], axis=1)
+
+
+def trace(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions (N, 3) of rays through the centres of pixels (row, column)."""
+    o, d = rays(camera, pixel_centres(camera.size)[pixels[:, 0], pixels[:, 1]])
+    return np.broadcast_to(o, d.shape), d
+
+
+def to_bundle(o: np.ndarray, d: np.ndarray) -> RayBundle:
+    """Rays on the device, from origins and directions (N, 3)."""
+    bundle = RayBundle(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
+    dr.eval(bundle.o, bundle.d)
+    return bundle
+
+
+# -- Fields -----------------------------------------------------------------------------------------------------------------
+
+
+def node_positions(n: int) -> list[np.ndarray]:
     """z, y and x of n^3 nodes in [-1, 1]^3, (n, n, n) each."""
     g = (np.arange(n) + 0.5) / n * 2 - 1
     return np.meshgrid(g, g, g, indexing="ij")
 
 
-def colours(n: int, seed: int = 0) -> np.ndarray:
-    """Smooth harmonics (n, n, n, 9, 3): colours about 0.5, a fifth of them with the direction."""
-    z, y, x = (a.astype(np.float32) for a in places(n))
+def make_colours(n: int, seed: int = 0) -> np.ndarray:
+    """Smooth harmonics (n, n, n, 9, 3): colours around 0.5, a fifth of them view-dependent."""
+    z, y, x = (a.astype(np.float32) for a in node_positions(n))
     rng = np.random.default_rng(seed)
     sh = np.empty((n, n, n, 9, 3), np.float32)
     for b in range(9):
@@ -38,26 +115,24 @@ def colours(n: int, seed: int = 0) -> np.ndarray:
     return sh
 
 
-def shell(size: Size) -> tuple[SphericalGrid, str]:
-    """A sphere of 0.7 whose skin of two voxels is nearly opaque."""
+def make_shell(size: FieldSize) -> tuple[SphericalGrid, str]:
+    """A sphere of radius 0.7 with a nearly opaque skin of two voxels."""
     n = size.resolution
-    z, y, x = places(n)
+    z, y, x = node_positions(n)
     density = np.clip(2.5 * n * (1 - np.abs(np.sqrt(x * x + y * y + z * z) - 0.7) * n / 2.5), -10, None)
-    keep = density > -10
-    return SphericalGrid.from_dense(density, colours(n), TO_WORLD, keep), "a shell of radius 0.7"
+    return SphericalGrid.from_dense(density, make_colours(n), TO_WORLD, density > -10), "a shell of radius 0.7"
 
 
-def fog(size: Size) -> tuple[SphericalGrid, str]:
+def make_fog(size: FieldSize) -> tuple[SphericalGrid, str]:
     """A fog that fills the box."""
     n = size.resolution
-    z, y, x = places(n)
-    return SphericalGrid.from_dense(
-        1 + 0.5 * np.sin(5 * x) * np.sin(4 * y + z), colours(n, 1), TO_WORLD
-    ), "a fog of extinction 1"
+    z, y, x = node_positions(n)
+    density = 1 + 0.5 * np.sin(5 * x) * np.sin(4 * y + z)
+    return SphericalGrid.from_dense(density, make_colours(n, 1), TO_WORLD), "a fog of extinction 1"
 
 
-def fitted(size: Size) -> tuple[SphericalGrid, str]:
-    """The chair of NeRF's synthetic scenes, fitted for a minute; without data, views of the shell."""
+def fit_field(size: FieldSize) -> tuple[SphericalGrid, str]:
+    """The chair of NeRF's synthetic scenes, fitted for a minute; without the data, views of the shell."""
     quarter = size.chair_steps // 4
     stages = tuple(RadianceStage(size.resolution // k, quarter * s, k, 8, 128) for k, s in ((4, 1), (2, 1), (1, 2)))
     path = DATA / "multiview" / "chair"
@@ -65,31 +140,35 @@ def fitted(size: Size) -> tuple[SphericalGrid, str]:
         photos = load_photos(path, split="train", background="white", scale=0.5)
         views, box, origin = RayBatches.of(photos.views, (1, 2, 4)), photos.silhouette_box(), "NeRF's chair"
     else:
-        photos = photographed(shell(size)[0], ring(size.side, 24))
+        photos = photograph(make_shell(size)[0], ring_cameras(size.side, 24))
         views, box, origin = RayBatches.of(photos, (1, 2, 4)), BOX, "views of the shell (no data folder)"
     plan = RadiancePlan(stages)
     problem = RadianceProblem(views, box, plan)
     reconstruct(problem, plan.optimizer, plan.course())
-    # Into the box of the others, dense: the peer has nothing else.
+    # Put the field into the box of the other fields, as a dense grid: the peer has no other kind.
     density, sh = problem.field.to_dense()
-    density, sh = (centred(a, size.resolution) for a in (density * problem.unit, sh))
+    density, sh = (centre(a, size.resolution) for a in (density * problem.unit, sh))
     keep = density > 0
     keep |= np.roll(keep, 1, 0) | np.roll(keep, -1, 0) | np.roll(keep, 1, 1) | np.roll(keep, -1, 1)
     return SphericalGrid.from_dense(density, sh, TO_WORLD, keep), f"{origin}, fitted in {size.chair_steps} steps"
 
 
-def centred(values: np.ndarray, n: int) -> np.ndarray:
-    """Put an array in the middle of n^3 nodes."""
+def centre(values: np.ndarray, n: int) -> np.ndarray:
+    """Put an array into the centre of n^3 nodes."""
     out = np.zeros((n, n, n, *values.shape[3:]), np.float32)
     low = [(n - s) // 2 for s in values.shape[:3]]
     out[tuple(slice(a, a + s) for a, s in zip(low, values.shape[:3], strict=True))] = values[:n, :n, :n]
     return out
 
 
-FIELDS: dict[str, Callable[[Size], tuple[SphericalGrid, str]]] = {"shell": shell, "fog": fog, "fitted": fitted}
+FIELDS: dict[str, Callable[[FieldSize], tuple[SphericalGrid, str]]] = {
+    "shell": make_shell,
+    "fog": make_fog,
+    "fitted": fit_field,
+}
 
 
 @cache
-def field_of(name: str, size: Size) -> tuple[SphericalGrid, str]:
-    """A field and where it is from, made once."""
+def load_field(name: str, size: FieldSize) -> tuple[SphericalGrid, str]:
+    """A field and its origin, made once."""
     return FIELDS[name](size)

@@ -1,58 +1,196 @@
-"""Are pictures of random scenes those of Mitsuba, and is every path of hard ones a radiance?
+"""Do images of random scenes agree with Mitsuba's, and is the radiance of every path of hard scenes finite and not negative?
 
-    scripts/bench_random_scenes.py                    # 15 minutes on 2 idle cores
-    scripts/bench_random_scenes.py --quick            # a minute: a dozen scenes
-    scripts/bench_random_scenes.py --only hard
+    mivol bench random_scenes                    # 15 minutes on 2 idle cores
+    mivol bench random_scenes --quick            # a minute: a dozen scenes
+    mivol bench random_scenes --only hard
 
-trials: scenes drawn by a seed (:mod:`mivol.bench.studies.random_scenes.generate`): homogeneous media and grids, grey and rgb,
-in boxes and balls, one, two, or one inside the other, behind boundaries that let light pass, bend it or blur it; phase
-functions, emitters, surfaces; ``max_depth`` from 2 to unlimited. Each is rendered 16 times by mivol and by volpath (an rgb
-extinction one channel at a time), 12 x 12 pixels, 64 samples; the means of each quarter and colour are compared by Student's
-t, with a chance of 1 in 1000 that any of all comparisons fails where the means are equal. Refusals are counted by sentence.
+trials: random scenes (:mod:`mivol.bench.studies.random_scenes.generate`) with homogeneous media and grids, grey and rgb, in
+boxes and balls, one, two side by side, or one inside the other, behind boundaries that transmit, refract or blur light; with
+phase functions, emitters and surfaces; ``max_depth`` from 2 to unlimited. Each is rendered 16 times by mivol and by volpath (an
+rgb extinction one channel at a time), 12 x 12 pixels, 64 samples per pixel. The means of each quarter of the image and each
+colour are compared by Student's t. If all means are equal, any of all comparisons fails with a probability of 1 in 1000.
+Refusals are counted by their message.
 
-hard: a box of an optical depth of 64, voxels of 2000, vacuum, colours at ratios of 10,000, nearly straight phase functions,
-glass, an emitter inside: 1e8 paths and more of unlimited depth, one a pixel, none of which may be negative, infinite or NaN.
-
-Prints JSON; writes bench_random_scenes.json and bench_random_scenes.png.
+hard: an optical depth of 64, voxels of 2000, vacuum, extinctions of three colours at ratios of 10,000, nearly straight phase
+functions, glass, an emitter inside: more than 1e8 paths of unlimited depth, one in each pixel. No radiance may be negative,
+infinite or NaN.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import gc
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from mivol.bench.harness.bars import AT_MOST, Bar, judge, judge_agreement
-from mivol.bench.harness.figures import drawn
-from mivol.bench.harness.study import Bench
-from mivol.bench.studies.random_scenes.hard import try_hard_scenes
-from mivol.bench.studies.random_scenes.trials import Size, try_scenes
+from mivol.bench.extinctions import as_dense_as_smoke, smoke, threads_in_space
+from mivol.bench.harness.agreement import compare_means, mean_of_rounds
+from mivol.bench.harness.bars import AT_MOST, Bar, judge, judge_agreement, say, say_row
+from mivol.bench.harness.figures import new_figure
+from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.scenes import box_scene, constant_light, emitter_inside, make_integrator, milky_glass, sun_and_sky
+from mivol.bench.studies.random_scenes.generate import RandomScene, draw_scene
+from mivol.errors import MivolError
 from mivol.report.figures import SERIES
 
-__all__ = ["BENCH", "FULL", "QUICK", "Size", "main"]
+__all__ = ["HARD", "STUDY", "RandomSize", "measure_hard", "measure_trials", "try_scene"]
 
-FULL = Size()
-QUICK = Size(name="quick", scenes=12, hard_pictures=1)
+MEANS = 12
+"""Compared means of a scene: of each quarter of the image, in each colour."""
+
+HARD_SIDE = 1024
+"""Edge of an image of a hard scene [pixels], with one path in each pixel."""
+
+
+@dataclass(frozen=True)
+class RandomSize(Size):
+    """Amount of work."""
+
+    scenes: int = amount(300, 12, "number of random scenes")
+    first: int = amount(0, doc="seed of the first scene")
+    rounds: int = amount(16, doc="images of each scene")
+    spp: int = amount(64, doc="samples per pixel of an image by mivol")
+    stock_spp: int = amount(64, doc="samples per pixel of an image by volpath")
+    hard_pictures: int = amount(16, 1, "images of 1024 x 1024 paths of each hard scene")
+
+
+# -- Random scenes ----------------------------------------------------------------------------------------------------------
+
+
+def measure_trials(size: RandomSize) -> dict:
+    """Do the means of random scenes agree with volpath's, and is every pixel finite and not negative?"""
+    trials, refused = {}, Counter()
+    for seed in range(size.first, size.first + size.scenes):
+        trials[seed] = trial = try_scene(seed, size)
+        refused.update(trial.get("refused", []))
+        outcome = trial.get("refused", [f"z {trial.get('z')} of {trial.get('z_bound')}"])[0]
+        say(f"  scene {seed}: {outcome}: {', '.join(trial['features'])}")
+        gc.collect()
+        dr.flush_malloc_cache()
+    return {"scenes": size.scenes, "refusals": dict(refused), "trials": trials}
+
+
+def try_scene(seed: int, size: RandomSize) -> dict:
+    """Compare one scene: its largest z over the bound and its pixels that are no radiance, or the reason of a refusal."""
+    scene = draw_scene(seed)
+    answer: dict = {"features": scene.features}
+    try:
+        images = render_rounds(scene, "mivol", size.rounds, size.spp)
+    except MivolError as error:
+        return answer | {"refused": [re.sub(r"[\d.]+", "#", str(error))]}
+    answer["not_a_radiance"] = int(np.sum(~(np.isfinite(images) & (images >= 0))))
+    if scene.is_rgb:
+        channels = [render_rounds(draw_scene(seed, c), "volpath", size.rounds, size.stock_spp)[..., c] for c in range(3)]
+        expected = np.stack(channels, axis=-1)
+    else:
+        expected = render_rounds(scene, "volpath", size.rounds, size.stock_spp)
+    agreements = [
+        compare_means(mean_of_rounds(a), mean_of_rounds(b), MEANS * size.scenes)
+        for a, b in zip(quarter_means(images), quarter_means(expected), strict=True)
+    ]
+    worst = max(agreements, key=lambda f: np.inf if f["z"] is None else abs(f["z"]) / f["z_bound"])
+    return answer | {"mean": float(expected.mean()), **worst}
+
+
+def quarter_means(images: np.ndarray) -> np.ndarray:
+    """Means (12, rounds) of the quarters of images (rounds, height, width, 3), by quarter and colour."""
+    h, w = (n // 2 for n in images.shape[1:3])
+    quarters = [images[:, y : y + h, x : x + w].mean(axis=(1, 2)) for y in (0, h) for x in (0, w)]
+    return np.concatenate([q.T for q in quarters])
+
+
+def render_rounds(drawn: RandomScene, name: str, rounds: int, spp: int) -> np.ndarray:
+    """Images (rounds, height, width, 3) by one integrator, each with its own seed."""
+    scene = mi.load_dict(drawn.parts)
+    integrator = mi.load_dict({"type": name, **drawn.settings})
+    first = 1000 if name == "mivol" else 5000
+    images = (mi.render(scene, integrator=integrator, spp=spp, seed=first + k) for k in range(rounds))
+    return np.array([np.array(image, np.float64) for image in images])
+
+
+# -- Hard scenes ------------------------------------------------------------------------------------------------------------
+
+
+def _constant_box(sigma_t: float, albedo: float, light: dict, res: int = 4) -> dict:
+    return box_scene(np.full((res,) * 3, sigma_t, np.float32), HARD_SIDE, albedo, **light)
+
+
+def _rgb_box() -> dict:
+    """Extinctions of three colours at ratios of 10,000; one of them is 0 in half of the box."""
+    values = np.random.default_rng(1).uniform(0, 1, (8, 8, 8, 3)) * np.array([4.0, 4e-4, 40.0])
+    values[:4, ..., 0] = 0
+    scene = box_scene(np.zeros((2, 2, 2), np.float32), HARD_SIDE, 0.99, **emitter_inside())
+    scene["box"]["interior"]["sigma_t"]["grid"] = mi.VolumeGrid(values.astype(np.float32))
+    return scene
+
+
+def _smoke_box(albedo: float, light: dict) -> dict:
+    return box_scene(smoke().values, HARD_SIDE, albedo, **light)
+
+
+def _peaked(g: float) -> dict:
+    """A sun in a sky, with a phase function that nearly follows a line."""
+    return sun_and_sky() | {"phase": {"type": "hg", "g": g}}
+
+
+HARD: dict[str, Callable[[], dict]] = {
+    "white box of optical depth 64": lambda: _constant_box(32, 0.999, constant_light()),
+    "one voxel of optical depth 2000": lambda: _constant_box(1e3, 0.9, sun_and_sky(), 1),
+    "empty box": lambda: _constant_box(0, 0.9, sun_and_sky()),
+    "thin as 1e-12": lambda: _constant_box(1e-12, 0.9, sun_and_sky()),
+    "colours at ratios of 10,000": _rgb_box,
+    "HG 0.99": lambda: _smoke_box(0.99, _peaked(0.99)),
+    "HG -0.99": lambda: _smoke_box(0.99, _peaked(-0.99)),
+    "emitter inside": lambda: _smoke_box(1.0, emitter_inside()),
+    "glass": lambda: _smoke_box(1.0, milky_glass()),
+    "threads": lambda: box_scene(as_dense_as_smoke(threads_in_space(128)).values, HARD_SIDE, 0.75, **sun_and_sky()),
+}
+"""Hard scenes, rendered with unlimited depth."""
+
+
+def measure_hard(size: RandomSize) -> dict:
+    """Is the radiance of every path of hard scenes finite and not negative?"""
+    answer = {}
+    for name, parts in HARD.items():
+        scene, integrator = mi.load_dict(parts()), make_integrator("mivol", -1)
+        answer[name] = counts = {"paths": 0, "not_finite": 0, "negative": 0, "brightest": 0.0}
+        for k in range(size.hard_pictures):
+            image = np.array(mi.render(scene, integrator=integrator, spp=1, seed=k))
+            counts["paths"] += image.shape[0] * image.shape[1]
+            counts["not_finite"] += int(np.sum(~np.isfinite(image)))
+            counts["negative"] += int(np.sum(image < 0))
+            counts["brightest"] = max(counts["brightest"], float(np.nanmax(image)))
+        dr.flush_malloc_cache()
+        say_row(name, **counts)
+    return answer
+
+
+# -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 
 def compare(question: str, answer: dict) -> list[Bar]:
-    """Every z beside its bound; no refusal, and no pixel that is no radiance."""
+    """Judge refusals, pixels that are no radiance, and every z."""
     if question == "hard":
         faults = {f"samples that are no radiance: {name}": f["not_finite"] + f["negative"] for name, f in answer.items()}
-        return [judge(what, count, AT_MOST, 0, aloud=False) for what, count in faults.items()]
-    tried = {seed: found for seed, found in answer["trials"].items() if "refused" not in found}
+        return [judge(label, count, AT_MOST, 0, quiet=True) for label, count in faults.items()]
+    rendered = {seed: trial for seed, trial in answer["trials"].items() if "refused" not in trial}
     rows = [judge("refused scenes", sum(answer["refusals"].values()), AT_MOST, 0)]
-    rows.append(judge("pixels that are no radiance", sum(f["not_a_radiance"] for f in tried.values()), AT_MOST, 0))
-    return rows + [judge_agreement(f"scene {seed}", found["z"], found["z_bound"]) for seed, found in tried.items()]
+    rows.append(judge("pixels that are no radiance", sum(t["not_a_radiance"] for t in rendered.values()), AT_MOST, 0))
+    return rows + [judge_agreement(f"scene {seed}", trial["z"], trial["z_bound"]) for seed, trial in rendered.items()]
 
 
-def draw(answers: dict, folder: Path) -> None:
-    """The largest z of each scene over its bound."""
+def draw(answers: dict, path: Path) -> None:
+    """Draw a histogram of the largest z of each scene over its bound."""
     trials = answers.get("trials", {}).get("trials", {})
     shares = [abs(f["z"]) / f["z_bound"] for f in trials.values() if f.get("z") is not None]
-    with drawn(folder / "bench_random_scenes.png", 5, 4) as figure:
+    with new_figure(path, 5, 4) as figure:
         axes = figure.subplots()
         axes.hist(shares, bins=np.linspace(0, 1.5, 31), color=SERIES[0])
         axes.axvline(1, color=SERIES[1], linestyle="--", label="the bound")
@@ -61,9 +199,4 @@ def draw(answers: dict, folder: Path) -> None:
         axes.legend()
 
 
-BENCH = Bench("bench_random_scenes", __doc__, {"trials": try_scenes, "hard": try_hard_scenes}, FULL, QUICK, compare, draw)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the bench with these arguments (by default the process's own); its exit code."""
-    return BENCH.run(argv)
+STUDY = Study(__name__, __doc__, RandomSize, {"trials": measure_trials, "hard": measure_hard}, compare, draw)

@@ -1,4 +1,4 @@
-"""A measured slice beside other programs: all get it about its axis, and are judged by views that they were not given."""
+"""A measured slice: the rotation axis is in the middle, and predictions of held-out views judge it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mivol.bench.studies.tomography_tooth import MeasuredSlice, centred, slice_of_the_tooth
+from mivol.bench.studies.tomography.slices import MeasuredSlice, centre_axis, load_tooth
 from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
@@ -18,11 +18,11 @@ def test_readings_are_moved_to_the_middle() -> None:
     the readings, whose mirrors it takes for their continuation."""
     column = 3.3
     values = np.tile((np.arange(41.0) - 15 - column) ** 2, (2, 3, 1))
-    found = centred(values, 15 + column, 3)
+    found = centre_axis(values, 15 + column, 3)
     assert found.shape == (2, 3, 2 * 18 + 1)
     # What the ends do falls by the root of 3 less 2, 0.27, a column: 400 units of slope are 1e-8 after 20 columns.
     np.testing.assert_allclose(found[0, 0, 16:21], (np.arange(5.0) - 2) ** 2, atol=1e-5)
-    weights = centred(np.arange(41.0)[None, None], 15 + column, 0)
+    weights = centre_axis(np.arange(41.0)[None, None], 15 + column, 0)
     assert np.array_equal(weights[0, 0], np.arange(37.0))
 
 
@@ -35,16 +35,16 @@ def test_the_error_is_what_a_prediction_misses_over_the_noise(variant_rgb: str) 
     certain[1, 0, 3] = 0
     seen = held_out @ x + 2 / 4
     seen[1, 0, 3] = 1e3
-    scan = MeasuredSlice(None, grid, None, None, None, held_out=held_out, seen=seen, certain=certain)
+    scan = MeasuredSlice(None, grid, None, None, None, held_out=held_out, measured=seen, certainty=certain)
     assert scan.error(x.ravel()) == pytest.approx(2, rel=1e-5)
 
 
 @pytest.mark.slow
-def test_the_slice_of_the_tooth(variant_rgb: str, data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_load_tooth(variant_rgb: str, data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every tenth view is kept back; none sees the object it was given mirrored, turned or moved."""
     monkeypatch.setenv("MIVOL_DATA", str(data_dir))
-    scan = slice_of_the_tooth()
-    assert scan.y.shape[0] + scan.seen.shape[0] == 181 and scan.seen.shape[0] == 18
+    scan = load_tooth()
+    assert scan.y.shape[0] + scan.measured.shape[0] == 181 and scan.measured.shape[0] == 18
     assert scan.y.shape[2] % 2 == 1 and scan.grid.shape == (1, 381, 381)
     assert not set(scan.beam.angles) & set(scan.held_out.geometry.angles)
     found = filtered_backprojection(Projector(scan.beam, scan.grid), scan.y)

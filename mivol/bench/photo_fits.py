@@ -1,0 +1,181 @@
+"""Fits of photographs as ``mivol optimize`` makes them: quality of held-out views, time on the reference machine, memory.
+
+Conventions. Times are processor time, converted to seconds of the machine of :mod:`mivol.bench.reference_walk`. The walk is
+timed before and after each fit. Memory is what Dr.Jit holds at most, without the photographs. Views are judged over white.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol import config
+from mivol.bench.extinctions import CHECKOUT, DATA
+from mivol.bench.harness.bars import say
+from mivol.bench.harness.timing import Stopwatch
+from mivol.bench.reference_walk import measure_walk_rate, reference_seconds
+from mivol.errors import MivolError
+from mivol.experiments import gaussian_fit
+from mivol.experiments.field_plan import batches_of, make_plan, suited
+from mivol.experiments.gaussian_fit import begin, make_gaussian_plan
+from mivol.experiments.photo_data import boxed, read_photos
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import RadiancePlan
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.photos import Photo, Photos, rectify
+from mivol.validate import images
+
+__all__ = ["PhotoFit", "PhotoProblem", "find_data", "find_photographs", "fit_photographs", "load_photographer", "prepare_fit"]
+
+SCRIPT = CHECKOUT / "scenes" / "still_life" / "photographs.py"
+
+
+def load_photographer() -> ModuleType:
+    """Load the script that renders the photographs of the still life.
+
+    Raises:
+        MivolError: the script is missing, because mivol was installed without its checkout.
+    """
+    if not SCRIPT.is_file():
+        raise MivolError(f"{SCRIPT} is missing; run this study in a checkout of mivol, which has the scene.")
+    spec = importlib.util.spec_from_file_location("still_life", SCRIPT)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return script
+
+
+def find_data(name: str) -> Path:
+    """Folder of a data set of photographs in MIVOL_DATA.
+
+    Raises:
+        MivolError: the folder is missing.
+    """
+    folder = DATA / "multiview" / name
+    if not folder.is_dir():
+        raise MivolError(f"{folder} is missing: set MIVOL_DATA to the folder that holds multiview/{name}.")
+    return folder
+
+
+def find_photographs(name: str, folder: Path, views: int, side: int, spp: int) -> Path | None:
+    """Folder of a data set: the chair from MIVOL_DATA, or rendered photographs of another scene.
+
+    Args:
+        name: "chair", or a scene of the still life's script.
+        folder: folder of rendered data sets; missing photographs are rendered.
+        views, side, spp: number of rendered photographs, their edge [pixels], samples per pixel.
+
+    Returns:
+        The folder; None if the chair is missing, which is printed.
+    """
+    if name == "chair":
+        if (DATA / "multiview" / name).is_dir():
+            return DATA / "multiview" / name
+        say(f"  {name}: left out, its data is missing (MIVOL_DATA names the folder)")
+        return None
+    load_photographer().make(folder / name, views, side, spp, name)
+    return folder / name
+
+
+@dataclass(frozen=True)
+class PhotoProblem:
+    """A fit before its first step.
+
+    Attributes:
+        problem: the fitted grid or Gaussians.
+        train, judged: photographs to fit and to judge by.
+        steps: number of steps.
+    """
+
+    problem: RadianceProblem | GaussianProblem
+    train: Photos
+    judged: Photos
+    steps: int
+
+    def show(self, photo: Photo) -> np.ndarray:
+        """Render the view of a pinhole photograph (H, W, 3) over its background."""
+        if isinstance(self.problem, RadianceProblem):
+            return render_view(self.problem.field, photo.camera, photo.background).image
+        return gaussian_fit.picture_of(self.problem, photo.camera, photo.background, self.problem.plan.low_pass)
+
+    def score(self, views: Iterable[Photo], metrics: tuple[str, ...] = ("psnr",)) -> dict[str, float]:
+        """Mean metrics of views."""
+        return images.score([self.judge(self.show(view), view, metrics) for view in map(rectify, views)]).values
+
+    def judge(self, image: np.ndarray, view: Photo, metrics: tuple[str, ...] = ("psnr",)) -> images.Quality:
+        """Compare an image with the photograph of the same view."""
+        return images.judge(image, view.image, space=self.judged.space, mask=view.mask, metrics=metrics)
+
+
+def prepare_fit(
+    folder: Path, photos: dict, settings: dict, seed: int = 0, adapt: Callable[[RadiancePlan], RadiancePlan] = lambda plan: plan
+) -> PhotoProblem:
+    """Read photographs and prepare their fit.
+
+    Args:
+        folder: folder of the photographs.
+        photos: settings of the table ``photos``, besides the path.
+        settings: the table ``field`` or ``gaussians``.
+        seed: seed of the fit.
+        adapt: changes the plan of a grid.
+    """
+    tables = {"title": folder.name, "seed": seed, "photos": {"path": str(folder), **photos}, **settings}
+    chosen = config.from_dict(tables)
+    train, judged = read_photos(chosen, Path())
+    train = boxed(chosen, train)
+    if isinstance(chosen, config.FieldExperiment):
+        plan = suited(adapt(make_plan(chosen)), train)
+        problem = RadianceProblem(batches_of(plan, train), train.box, plan)
+        return PhotoProblem(problem, train, judged, sum(stage.steps for stage in plan.stages))
+    begun = begin(chosen, train, make_gaussian_plan(chosen))
+    return PhotoProblem(begun.problem(seed), train, judged, begun.plan.steps)
+
+
+@dataclass(frozen=True)
+class PhotoFit:
+    """A finished fit and its cost.
+
+    Attributes:
+        fit: the fit.
+        processor: processor time of all threads [s].
+        rate: rays per second that this machine walks.
+        seconds: time on the reference machine [s].
+        held: largest memory of Dr.Jit, without the photographs [bytes].
+    """
+
+    fit: Fit
+    processor: float
+    rate: float
+    held: int
+
+    @property
+    def seconds(self) -> float:
+        """Time on the reference machine [s]."""
+        return reference_seconds(self.processor, self.rate)
+
+
+def fit_photographs(problem: RadianceProblem | GaussianProblem, walk_side: int) -> PhotoFit:
+    """Take all steps of a fit, and measure them.
+
+    Args:
+        problem: fit before its first step.
+        walk_side: the reference walk has ``walk_side`` squared rays.
+    """
+    watch, rates = Stopwatch(), [measure_walk_rate(walk_side)]
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    before = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+    fit = begin_fit(problem, problem.plan.optimizer, problem.plan.course())
+    with watch:
+        fit.complete()
+    held = dr.detail.malloc_watermark(dr.backend_v(mi.Float)) - before
+    rates.append(measure_walk_rate(walk_side))
+    return PhotoFit(fit, watch.processor, float(np.mean(rates)), held)
