@@ -47,7 +47,7 @@ def test_a_fold_is_judged_by_what_it_holds_out(monkeypatch: pytest.MonkeyPatch) 
     fitted, judged = [], []
     fit = SimpleNamespace(course=SimpleNamespace(iterations=2), advance=lambda: None, problem=SimpleNamespace(sky=None))
     monkeypatch.setattr(priors, "begin_radiance_fit", lambda views, box, plan, seed: fitted.append((views, plan, seed)) or fit)
-    monkeypatch.setattr(priors, "newest_field", lambda fit: "field")
+    monkeypatch.setattr(priors, "current_field", lambda fit: "field")
     monkeypatch.setattr(priors, "rectify", lambda photo: photo)
     monkeypatch.setattr(priors, "RayBatches", SimpleNamespace(of=lambda photos, shrinks: list(photos)))
     monkeypatch.setattr(priors, "held_out_psnr", lambda photos, render: judged.append(list(photos)) or 20.0)
