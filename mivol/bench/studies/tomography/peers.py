@@ -30,9 +30,9 @@ from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.filtered import filtered_backprojection
+from mivol.tomography.geometry import subdivide, voxel_means
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import store
-from mivol.tomography.supersampling import subdivide, voxel_means
 
 __all__ = ["error_rows", "measure_parts", "measure_peers", "measure_tooth", "part_rows", "ratio_rows"]
 
