@@ -72,7 +72,7 @@ def test_the_peers_needles_point_where_ours_do(variant_rgb: str) -> None:
     cloud = points.random_cloud(12, seed=3)
     cloud = replace(cloud, log_scales=np.log(np.full((12, 3), [0.2, 0.03, 0.03], np.float32)))
     camera = points.camera_before(np.zeros(3), 1.0, 64)
-    ours = np.array(points.Drawing.of(cloud, camera).forward()(0))[..., :3]
+    ours = np.array(points.Drawing.make(cloud, camera).forward()(0))[..., :3]
     peers = np.array(mi.render(points.ellipsoid_scene(cloud, camera), spp=4))
     assert np.sqrt(np.mean((ours - peers) ** 2)) < 0.03
 

@@ -148,7 +148,8 @@ class Drawing(NamedTuple):
     splatter: Splatter
 
     @classmethod
-    def of(cls, cloud: Gaussians, camera: Camera) -> Drawing:
+    def make(cls, cloud: Gaussians, camera: Camera) -> Drawing:
+        """Tensors of a cloud, and a splatter of the size of the image."""
         return cls(to_tensors(cloud), camera, Splatter(*camera.size, cloud.degree))
 
     def forward(self) -> Contestant:
@@ -217,7 +218,7 @@ def measure_clouds(size: PointsSize) -> dict:
     """How many pixels per second are splatted, forward, and forward and backward?"""
     contestants, pixels = {"walk": reference_walk(size.walk_side)}, {}
     for n, side in size.clouds:
-        drawing = Drawing.of(random_cloud(n), camera_before(np.zeros(3), 1.0, side))
+        drawing = Drawing.make(random_cloud(n), camera_before(np.zeros(3), 1.0, side))
         for kind, call in (("forward", drawing.forward()), ("forward and backward", drawing.both())):
             contestants[f"{n:,} at {side}^2, {kind}"] = call
             pixels[f"{n:,} at {side}^2, {kind}"] = side**2
@@ -240,7 +241,7 @@ def measure_peer(size: PointsSize) -> dict:
     """How much faster than Mitsuba's ellipsoids is splatting, forward and backward, and how do the images differ?"""
     n, side = size.peer
     cloud, camera = random_cloud(n), camera_before(np.zeros(3), 1.0, side)
-    drawing, scene = Drawing.of(cloud, camera), ellipsoid_scene(cloud, camera)
+    drawing, scene = Drawing.make(cloud, camera), ellipsoid_scene(cloud, camera)
     params = mi.traverse(scene)
     keys = [key for key in params.properties if key.endswith((".data", ".opacities", ".sh_coeffs"))]
 
@@ -301,7 +302,7 @@ def measure_biker(size: PointsSize) -> dict:
     cloud = read_gaussians(path) if is_biker else random_cloud(size.substitute)
     low, high = np.percentile(cloud.means, [2, 98], axis=0)
     camera = camera_before((low + high) / 2, float((high - low).max()), size.biker_side, up=-1.0)
-    timing = race({"forward": Drawing.of(cloud, camera).forward()}, size.rounds, keep=True)["forward"]
+    timing = race({"forward": Drawing.make(cloud, camera).forward()}, size.rounds, keep=True)["forward"]
     return {
         "cloud": path.name if is_biker else "made up",
         "gaussians": cloud.count,
