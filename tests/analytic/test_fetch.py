@@ -82,8 +82,8 @@ def data(server: Server) -> DataSet:
     return DataSet("body", "bytes", url, "kind/a.vol", len(BODY), hashlib.sha256(BODY).hexdigest(), "CC0")
 
 
-def test_a_client_that_breaks_off_is_quiet(server: Server, capfd: pytest.CaptureFixture) -> None:
-    """As `fetch` does, where a server sends more than was said: socketserver would print a traceback amid other tests."""
+def test_the_test_server_is_quiet_about_closed_connections(server: Server, capfd: pytest.CaptureFixture) -> None:
+    """``fetch_data`` closes the connection to a server with too many bytes; socketserver would print a traceback."""
     server.body = bytes(1 << 26)  # more than a socket holds: the server is still writing when the client leaves
     server.server.daemon_threads = False  # so that closing waits for the thread that answers
     linger = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)  # 0 s: the connection ends by a reset
@@ -96,7 +96,7 @@ def test_a_client_that_breaks_off_is_quiet(server: Server, capfd: pytest.Capture
     assert capfd.readouterr().err == ""
 
 
-def test_a_set_is_fetched_once(server: Server, data: DataSet, tmp_path: Path) -> None:
+def test_a_data_set_is_downloaded_once(server: Server, data: DataSet, tmp_path: Path) -> None:
     seen: list[int] = []
     path = fetch_data(data, tmp_path, seen.append)
     assert path == tmp_path / "kind/a.vol"
@@ -109,8 +109,8 @@ def test_a_set_is_fetched_once(server: Server, data: DataSet, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("knows_ranges", [True, False])
-def test_what_broke_off_goes_on(server: Server, data: DataSet, tmp_path: Path, knows_ranges: bool) -> None:
-    """The second call asks for what is missing; a server that knows no ranges sends all of it, and it is whole all the same."""
+def test_an_interrupted_download_resumes(server: Server, data: DataSet, tmp_path: Path, knows_ranges: bool) -> None:
+    """The second call requests the missing bytes; a server without ranges sends the whole file again."""
     server.breaks_after, server.knows_ranges = 100000, knows_ranges
     with pytest.raises(MivolError, match="100000 of 262144 bytes; call again to resume the download"):
         fetch_data(data, tmp_path)
@@ -121,7 +121,7 @@ def test_what_broke_off_goes_on(server: Server, data: DataSet, tmp_path: Path, k
     assert [path.name for path in (tmp_path / "kind").iterdir()] == ["a.vol"]
 
 
-def test_other_bytes_are_refused_and_not_kept(server: Server, data: DataSet, tmp_path: Path) -> None:
+def test_a_wrong_hash_is_refused_and_deleted(server: Server, data: DataSet, tmp_path: Path) -> None:
     with pytest.raises(MivolError, match="the download was deleted"):
         fetch_data(replace(data, sha256="0" * 64), tmp_path)
     server.body = BODY * 50
@@ -130,8 +130,8 @@ def test_other_bytes_are_refused_and_not_kept(server: Server, data: DataSet, tmp
     assert list((tmp_path / "kind").iterdir()) == []
 
 
-def test_a_file_that_has_grown_does_not_fill_the_disk(server: Server, data: DataSet, tmp_path: Path) -> None:
-    """Reading ends with the chunk that passes the expected size."""
+def test_a_larger_file_does_not_fill_the_disk(server: Server, data: DataSet, tmp_path: Path) -> None:
+    """Reading ends with the chunk that exceeds the expected size."""
     seen: list[int] = []
     server.body = BODY * 50
     with pytest.raises(MivolError):
@@ -139,7 +139,7 @@ def test_a_file_that_has_grown_does_not_fill_the_disk(server: Server, data: Data
     assert seen[-1] <= len(BODY) + fetch.CHUNK
 
 
-def test_a_server_that_is_not_there_is_one_sentence(server: Server, data: DataSet, tmp_path: Path) -> None:
+def test_an_unreachable_server_is_reported(server: Server, data: DataSet, tmp_path: Path) -> None:
     server.status = 404
     with pytest.raises(MivolError, match=r"could not be fetched \(Not Found\) after 0 of"):
         fetch_data(data, tmp_path)
@@ -147,7 +147,7 @@ def test_a_server_that_is_not_there_is_one_sentence(server: Server, data: DataSe
         fetch_data(replace(data, url="http://127.0.0.1:9/a.vol"), tmp_path)
 
 
-def test_a_path_may_name_a_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_may_name_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MIVOL_DATA", raising=False)
     monkeypatch.setenv("MIVOL_CACHE", str(tmp_path / "cache"))
     assert resolve_path(tmp_path, "a.vol") == tmp_path / "a.vol"
@@ -164,7 +164,7 @@ def test_a_path_may_name_a_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert resolve_path(tmp_path, "data:smoke") == there
 
 
-def test_the_cache_is_where_the_system_keeps_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_is_in_the_folder_of_the_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MIVOL_CACHE", raising=False)
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
@@ -178,7 +178,7 @@ def test_the_cache_is_where_the_system_keeps_caches(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("name", DATA)
-def test_a_set_is_one_file_at_one_commit(name: str) -> None:
+def test_a_data_set_is_a_file_at_a_fixed_commit(name: str) -> None:
     one = DATA[name]
     assert one.url.startswith("https://raw.githubusercontent.com/")
     assert any(len(part) == 40 and set(part) <= set("0123456789abcdef") for part in one.url.split("/"))
@@ -186,6 +186,6 @@ def test_a_set_is_one_file_at_one_commit(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DATA)
-def test_a_set_has_the_bytes_of_the_table(name: str, data_dir: Path) -> None:
+def test_a_data_set_has_the_size_and_hash_of_the_table(name: str, data_dir: Path) -> None:
     found = (data_dir / DATA[name].path).read_bytes()
     assert (len(found), hashlib.sha256(found).hexdigest()) == (DATA[name].size, DATA[name].sha256)

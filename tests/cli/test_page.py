@@ -1,7 +1,7 @@
-"""The record of a run and its page: complete, self-contained, right way up, and nothing in them that tells on the user.
+"""The record of a run and its page: complete, self-contained, upright, and free of user names and folders.
 
-Rationale: the page is what colleagues see; a picture upside down, a difference of the wrong sign or a number from another
-formula would mislead them all. So pictures are decoded again and compared with values known on paper.
+Rationale: colleagues judge a run by its page. An image upside down, a difference of the wrong sign or a number of another
+formula would mislead them, so the tests decode the images and compare them with values computed by hand.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ VOID = {"meta", "link", "img", "br", "hr", "input", "path", "use"}
 
 
 class Page(HTMLParser):
-    """Tags, attributes and text of a page; a tag that is closed in the wrong place is an error."""
+    """Tags, attributes and text of a page; a wrongly nested tag is an error."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ def page(run_folder) -> Page:
 
 
 def one_view(folder: Path, reference: np.ndarray, render: np.ndarray, **fields) -> Page:
-    """The page of a run with one held-out view."""
+    """Return the page of a run with one held-out view."""
     images = []
     for role, values in (("reference", reference), ("render", render)):
         write_exr(folder / f"{role}.exr", {"Y" if values.ndim == 2 else "": values})
@@ -107,7 +107,7 @@ def one_view(folder: Path, reference: np.ndarray, render: np.ndarray, **fields) 
 
 
 def test_page_loads_nothing(run_folder, page):
-    """No outside address anywhere but in links that a reader may follow; the script of the slider stands in the page."""
+    """Outside addresses appear only in links; the script of the slider is inline."""
     assert [attributes for tag, attributes in page.tags if tag == "script"] == [{}]
     assert not {"iframe", "object", "embed", "link", "base"} & {tag for tag, _ in page.tags}
     for tag, attributes in page.tags:
@@ -119,8 +119,8 @@ def test_page_loads_nothing(run_folder, page):
     assert all(target.startswith("#") for target in re.findall(r"url\(\s*['\"]?([^)'\"]*)", text))
 
 
-def test_judged_views_are_scrolled_through(tmp_path):
-    """Those that are small, in one frame below the others, each with what is said of it; and how many at which size."""
+def test_small_held_out_views_are_scrollable(tmp_path):
+    """The small views share a frame below the others, each with its caption; the page states their number and size."""
     images = []
     for view in ("large", "one", "two"):
         for role in ("reference", "render"):
@@ -139,7 +139,7 @@ def test_judged_views_are_scrolled_through(tmp_path):
 
 
 def test_views_beyond_four_are_folded(tmp_path):
-    """The first four are seen at once; all others are one click away."""
+    """The first four views are visible, the others are folded."""
     write_png(tmp_path / "a.png", np.full((2, 2, 3), 0.5))
     images = [Image(path="a.png", role="reference", view=f"view {k}", held_out=True) for k in range(6)]
     write_record(RunRecord.new("V", images=images), tmp_path)
@@ -160,8 +160,8 @@ def test_the_page_defines_psnr(tmp_path, quantity, definition):
     assert definition in text and text.count("PSNR compares") + text.count("peak of PSNR") == 1
 
 
-def test_layers_have_a_slider_that_begins_in_the_middle(page):
-    """It is shown by its script; without one the frame is scrolled, and begins at the same layer."""
+def test_the_slider_of_layers_starts_in_the_middle(page):
+    """A script shows the slider; without the script the frame scrolls and starts at the same layer."""
     frame = next(index for index, (_, a) in enumerate(page.tags) if a.get("aria-label", "").startswith("slices along z"))
     ranges = [attributes for tag, attributes in page.tags if attributes.get("type") == "range"]
     layers = [a["class"] for tag, a in page.tags[frame:] if tag == "figure" and a.get("class", "").startswith("view")]
@@ -172,7 +172,7 @@ def test_layers_have_a_slider_that_begins_in_the_middle(page):
     assert any(tag == "label" and a["class"] == "slide" and "hidden" in a for tag, a in page.tags)
 
 
-def test_page_shows_all_that_the_record_names(run_folder, page):
+def test_page_shows_all_entries_of_the_record(run_folder, page):
     names = [name for name, _ in page.pictures()]
     assert names.count("Reference") == names.count("Render") == names.count("z-image") == 2
     assert names.count("Truth") == names.count("Reconstruction") == names.count("Difference") == 3
@@ -187,8 +187,8 @@ def test_page_shows_all_that_the_record_names(run_folder, page):
     assert [tag for tag, _ in page.tags].count("svg") == 2
 
 
-def test_a_configuration_is_shown_as_toml():
-    """Tables within tables by their full names, plain values first, and nothing that is not set."""
+def test_settings_are_shown_as_toml():
+    """Nested tables have full names, plain values come first, and unset values are missing."""
     config = {"a": {"b": {"c": 1, "d": None}, "e": "x"}, "f": [{"g": 2.5, "h": None}, {"g": True}], "i": None}
     text = page_module._toml(config)
     assert text == 'f = [{ g = 2.5 }, { g = true }]\n\n[a]\ne = "x"\n\n[a.b]\nc = 1'
@@ -209,7 +209,7 @@ def test_page_is_the_same_for_the_same_folder(run_folder):
     assert write_page(run_folder).read_bytes() == first
 
 
-def test_numbers_of_a_view_on_paper(tmp_path):
+def test_errors_of_a_view_by_hand(tmp_path):
     """Reference 1, render 0.9: PSNR 10 log10(1/0.01) = 20 dB, nRMSE 0.1; float32 errs by 1e-7, the text has 3 digits."""
     found = one_view(tmp_path, np.ones((4, 6)), np.full((4, 6), 0.9), status="finished")
     assert "PSNR 20.0 dB" in found.text and "nRMSE 0.1" in found.text
@@ -234,7 +234,7 @@ COUNTS = {
 
 
 @pytest.mark.parametrize("number", COUNTS)
-def test_counts_have_prefixes_from_their_powers_on(number):
+def test_counts_have_si_prefixes(number):
     assert page_module._count(number) == COUNTS[number]
 
 
@@ -252,7 +252,7 @@ DURATIONS = {
 
 
 @pytest.mark.parametrize("seconds", DURATIONS)
-def test_durations_are_said_in_the_unit_that_suits(seconds):
+def test_durations_have_a_suitable_unit(seconds):
     assert page_module._duration(seconds) == DURATIONS[seconds]
 
 
@@ -271,11 +271,11 @@ def test_difference_is_render_minus_reference(tmp_path):
     assert picture.shape == (5, 7, 3)
     assert picture[1, 2, 0] > picture[1, 2, 2] + 50
     assert picture[3, 6, 2] > picture[3, 6, 0] + 50
-    # The middle of 256 entries lies between two of them, so white is grey to one step of the map.
+    # The middle of 256 entries is between two entries, so white is grey up to one step of the map.
     assert np.ptp(picture[0, 0]) <= 4
 
 
-def test_images_are_the_right_way_up_and_share_their_scale(tmp_path):
+def test_images_are_upright_on_one_scale(tmp_path):
     reference = np.linspace(0, 2, 12).reshape(3, 4)
     pictures = dict(one_view(tmp_path, reference, reference / 2).pictures())
     # White is the 99.8th percentile of 12 values, 1.996: half a grey level below 2.
@@ -283,19 +283,19 @@ def test_images_are_the_right_way_up_and_share_their_scale(tmp_path):
     np.testing.assert_allclose(pictures["Render"][..., 1], 255 * reference / 3.992, atol=0.51)
 
 
-def test_radiance_in_colour_is_coded_as_srgb(tmp_path):
+def test_rgb_radiance_is_shown_in_srgb(tmp_path):
     """Linear 0.5 of white is 187.5 in sRGB; channels keep their order."""
     reference = np.zeros((2, 2, 3))
     reference[0, 0], reference[0, 1], reference[1, 0] = 1.0, (0.5, 0, 0), (0, 0, 1.0)
     picture = dict(one_view(tmp_path, reference, reference * 0.99).pictures())["Reference"]
-    # The percentile of 12 values of which 4 are 1 is 1.
+    # The 99.8th percentile of 12 values, 4 of them 1, is 1.
     assert picture[0, 0].tolist() == [255, 255, 255]
     assert picture[0, 1].tolist() == [188, 0, 0]
     assert picture[1, 0].tolist() == [0, 0, 255]
 
 
-def test_slices_point_up_and_right():
-    """Voxel (x 3, y 1, z 2) of (4, 3, 5) voxels lies in each middle slice where its coordinates say."""
+def test_axes_of_slices_point_right_and_up():
+    """Voxel (x 3, y 1, z 2) of (4, 3, 5) voxels appears at its coordinates in each middle slice."""
     grid = np.zeros((5, 3, 4))
     grid[2, 1, 3] = 1
     cut = pixel_scale.middle_slices(grid)
@@ -308,7 +308,7 @@ def test_slices_point_up_and_right():
     assert pixel_scale.middle_slices(grid, (2.0, 1.0, 4.0)).aspect == {"xy": 2.0, "xz": 0.5, "yz": 0.25}
 
 
-def test_pixels_that_are_not_finite_are_seen():
+def test_pixels_that_are_not_finite_are_magenta():
     image = np.array([[0.0, np.nan], [1.0, np.inf]])
     rgb = pixel_scale.to_pixels(image, pixel_scale.shared_scale(image))
     assert rgb[0, 1].tolist() == rgb[1, 1].tolist() == [255, 0, 255]
@@ -320,7 +320,7 @@ def test_pixels_that_are_not_finite_are_seen():
 
 
 def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):
-    """Reference and standard error are layers of one OpenEXR; z = 0.3 / 0.1 = 3, and three quarters of the blue-red map."""
+    """Reference and standard error are layers of one OpenEXR; z = 0.3 / 0.1 = 3, three quarters of the blue-red map."""
     layers = {"": np.full((2, 3, 3), 0.5), "error": np.full((2, 3, 3), 0.1)}
     write_exr(tmp_path / "reference.exr", layers)
     write_exr(tmp_path / "render.exr", {"": np.full((2, 3, 3), 0.8)})
@@ -342,7 +342,7 @@ def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):
 
 
 def test_projections_are_measured_and_modelled(tmp_path):
-    """The sinogram stands first, in a section of its own; pictures have the names of a scan, and the volume has profiles."""
+    """The sinogram has the first section, images have the names of a scan, and the volume has profiles."""
     layers = {"Y": np.full((2, 3), 0.8), "reference.Y": np.full((2, 3), 0.5), "noise.Y": np.full((2, 3), np.inf)}
     write_exr(tmp_path / "lines.exr", {name: values.astype(np.float32) for name, values in layers.items()})
     roles = {"render": "Y", "reference": "reference.Y", "standard error": "noise.Y"}
@@ -362,10 +362,10 @@ def test_projections_are_measured_and_modelled(tmp_path):
     names = [name for name, _ in found.pictures()]
     assert names[:8] == 2 * ["Measured", "Modelled", "Modelled − measured", "Difference / noise"]
     assert names.count("Measured") == 2
-    # The film is listed first, and says nothing of the views.
+    # The film is the first image and does not determine the labels of the views.
     assert found.text.count("Line integral") == 2 and "Radiance" not in found.text
     assert "Projections left out of the fit" in found.text and "rendered from viewpoints" not in found.text
-    # A pixel that is not used has noise without bound, and no difference beside it: the middle of the blue-red map.
+    # An unused pixel has infinite noise, so its ratio is 0: the middle of the blue-red map.
     np.testing.assert_array_equal(dict(found.pictures())["Difference / noise"][0, 0], pixel_scale.to_pixels(
         np.zeros((1, 1)), pixel_scale.Scale("signed", -4.0, 4.0))[0, 0])  # fmt: skip
     labels = [attributes["aria-label"] for tag, attributes in found.tags if tag == "svg"]
@@ -373,7 +373,7 @@ def test_projections_are_measured_and_modelled(tmp_path):
 
 
 def test_each_volume_is_shown_beside_its_own_truth(tmp_path):
-    """Two grids were found and the truth of the first is known: it is no truth of the second, and neither hides the other."""
+    """Two reconstructed grids, only the first with a truth: the truth does not appear beside the second grid."""
     for name, values in {"found": 1.0, "true": 2.0, "albedo": 0.5}.items():
         write_volume(tmp_path / f"{name}.npz", np.full((2, 2, 2, 1), values, np.float32))
     volumes = [
@@ -386,12 +386,12 @@ def test_each_volume_is_shown_beside_its_own_truth(tmp_path):
     assert "a.sigma_t.data" in found.text and "a.albedo.data" in found.text
     shown = [attributes["alt"] for tag, attributes in found.tags if tag == "img"]
     assert [shown.count(role) for role in ("Truth", "Reconstruction")] == [3, 3] and sum("xy" in alt for alt in shown) == 1
-    # Two layers of three volumes to be scrolled through, and the lowest once more, which is not seen and gives them room.
+    # Two scrollable layers of three volumes; the lowest layer appears again as an invisible placeholder.
     for role, count in (("Truth", 1), ("Reconstruction", 2)):
         assert [shown.count(f"{role}, z = {k} of 2") for k in (1, 2)] == [2 * count, count]
 
 
-def test_text_of_a_run_cannot_become_markup(tmp_path):
+def test_text_of_a_record_is_escaped(tmp_path):
     plan = [PlanLine(choice="<img src=x onerror=alert(1)>", reason="a < b & c")]
     write_record(RunRecord.new("<script>alert(1)</script>", plan=plan, config={"a": "</pre><b>"}), tmp_path)
     found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
@@ -402,14 +402,14 @@ def test_text_of_a_run_cannot_become_markup(tmp_path):
 
 
 @pytest.mark.parametrize("status", ["running", "stopped"])
-def test_page_of_a_run_that_has_nothing_yet(tmp_path, status):
+def test_page_of_an_empty_run(tmp_path, status):
     write_record(RunRecord.new("Nothing yet", status=status), tmp_path)
     found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
     assert "Nothing yet" in found.text and found.pictures() == []
     assert {"running": "Still running", "stopped": "Stopped"}[status] in found.text
 
 
-def test_a_killed_runs_last_line_is_left_out_and_a_resumed_one_says_nothing_twice(tmp_path):
+def test_metrics_of_killed_and_resumed_runs(tmp_path):
     for iteration in range(1, 5):
         append_metrics(tmp_path, iteration, 0.1 * iteration, loss=1 / iteration, nrmse=np.nan)
     with (tmp_path / "metrics.jsonl").open("a") as file:
@@ -421,7 +421,7 @@ def test_a_killed_runs_last_line_is_left_out_and_a_resumed_one_says_nothing_twic
     assert [row["loss"] for row in read_metrics(tmp_path)] == [1.0, 0.5, 0.25]
 
 
-def test_record_comes_back_and_tells_nothing_of_the_machine(tmp_path):
+def test_a_record_is_read_back_without_folders_or_users(tmp_path):
     record = RunRecord.new(
         "A run",
         command="mivol optimize /home/ada/work/fit.toml --out=/scratch/ada/run",
@@ -442,7 +442,7 @@ def test_record_comes_back_and_tells_nothing_of_the_machine(tmp_path):
     assert back.machine == record.machine and back.started.endswith("Z")
 
 
-def test_headline_says_what_is_known():
+def test_headline_states_the_known_results():
     record = RunRecord.new("A run", status="finished", timings={"a": 30.0, "b": 11.0}, results={"nrmse": 0.0341})
     cores = f"{record.machine.cores} core" + "s" * (record.machine.cores > 1)
     said = f"Reconstructed in 41 s on {cores}: 40.0 dB PSNR on held-out views, a volume nRMSE of 0.0341."
@@ -469,8 +469,8 @@ def test_headline_says_what_is_known():
         (lambda folder: write_exr(folder / "images/view_9_render.exr", dict.fromkeys("AB", np.ones((16, 16)))), "layers"),
     ],
 )
-def test_refusals(tmp_path, spoil, says):
-    """One sentence each, and no half-written page."""
+def test_damaged_run_folders_are_refused(tmp_path, spoil, says):
+    """In one sentence, without a half-written page."""
     folder = write_run(tmp_path, n=6, size=16, fitted=8, held_out=1, steps=2)
     spoil(folder)
     with pytest.raises(MivolError, match=re.escape(says)) as refused:
@@ -484,7 +484,7 @@ def edit(folder: Path, **fields) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
 
-def test_citations_are_complete_and_come_once_each():
+def test_citations_are_complete_and_unique():
     for key, source in CITATIONS.items():
         assert source.authors and source.title and source.where and 1700 < source.year < 2100, key
         assert source.link == "" or source.link.startswith("https://"), key
@@ -493,13 +493,13 @@ def test_citations_are_complete_and_come_once_each():
         citations(["kingma_2014"])
 
 
-def test_a_citation_ends_with_its_link_where_it_has_one():
+def test_a_citation_ends_with_its_link():
     with_link = Citation("A", 2001, "T", "W", "https://x")
     assert str(with_link) == "A (2001). T. W. https://x" and str(with_link._replace(link="")) == "A (2001). T. W."
 
 
-def test_ratio_at_equal_error_on_paper():
-    """Error 1/t against 1/sqrt(t): at the slow one's last error 0.1 (t = 100) the fast one needs t = 10, ten times less."""
+def test_ratio_at_equal_error_by_hand():
+    """Error 1/t against 1/sqrt(t): the slow method reaches 0.1 at t = 100, the fast method at t = 10."""
     t = np.array([1.0, 4.0, 25.0, 100.0])
     slow, fast = figures.Series("slow", t, t**-0.5), figures.Series("fast", t, 1 / t)
     # A power law is a straight line in log-log, so the interpolation is exact but for rounding.
@@ -509,7 +509,7 @@ def test_ratio_at_equal_error_on_paper():
     assert figures.ratio_at_equal_error(exact, slow) == (0.1, 2.0, 100.0)
 
 
-def test_figures_are_written_whole_or_refused(tmp_path, artefacts):
+def test_error_figures_are_written_or_refused(tmp_path, artefacts):
     t = np.array([1.0, 4.0, 16.0])
     series = [figures.Series("exact", [0.5], [1e-6]), figures.Series("sampled", t, t**-0.5)]
     for suffix in ("png", "svg"):
@@ -524,7 +524,7 @@ def test_figures_are_written_whole_or_refused(tmp_path, artefacts):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_slices_and_rows_as_figures(artefacts):
+def test_figures_of_slices_and_rows(artefacts):
     rng = np.random.default_rng(5)
     truth = rng.random((6, 8, 10))
     figures.save_figure(figures.plot_slices(truth + 0.1, truth, size=(1, 0.8, 0.6)), artefacts / "slices.png")
@@ -537,8 +537,10 @@ def test_slices_and_rows_as_figures(artefacts):
 
 
 def write_run_by_hand(folder: Path) -> Path:
-    """A run of round numbers with all that a page can show: three views (a reference that is known, one held out whose errors
-    are known, one that is a PNG), a slice, a film, two volumes, one with its truth."""
+    """Write a run of round numbers with every part of a page.
+
+    Three views (fitted, held out with standard errors, and a PNG), a slice, a film, and two volumes, one with its truth.
+    """
     ramp = np.linspace(0, 2, 24, dtype=np.float32).reshape(4, 6)
     bump = np.where(np.arange(24).reshape(4, 6) % 5 == 0, np.float32(0.25), np.float32(0))
     images = []
@@ -592,7 +594,7 @@ def write_run_by_hand(folder: Path) -> Path:
 
 
 def test_every_part_of_a_record_is_on_the_page(tmp_path: Path) -> None:
-    """Results, scales, errors of views, slices, tables, notes and times: round numbers, by hand."""
+    """Results, scales, errors of views, slices, tables, notes and times, from round numbers."""
     page = Page(write_page(write_run_by_hand(tmp_path)).read_text(encoding="utf-8"))
     words = [" ".join(word.split()) for word in page.words]
     said = " | ".join(word for word in words if word)

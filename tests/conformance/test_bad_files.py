@@ -1,4 +1,4 @@
-"""Every bad file gets one sentence: what was found, what was expected, the way out; and never another exception.
+"""Every bad file is refused in one sentence (found, expected, way out), never with another exception.
 
 BAD is the table: name -> (file name, what makes its bytes, words that the sentence must hold).
 """
@@ -220,7 +220,7 @@ def test_bad_file(tmp_path: Path, name: str) -> None:
     assert_sentence(str(caught.value), str(tmp_path), *words)
 
 
-def test_missing_file_offers_the_nearest(tmp_path: Path) -> None:
+def test_a_missing_file_suggests_a_similar_name(tmp_path: Path) -> None:
     (tmp_path / "smoke.vol").write_bytes(made.vol(ONE))
     with pytest.raises(MivolError) as caught:
         files.read_volume(tmp_path / "smoek.vol")
@@ -230,7 +230,7 @@ def test_missing_file_offers_the_nearest(tmp_path: Path) -> None:
     assert_sentence(str(caught.value), "nowhere does not exist")
 
 
-def test_folder_for_a_file(tmp_path: Path) -> None:
+def test_a_folder_instead_of_a_file_is_refused(tmp_path: Path) -> None:
     for read in (files.read_volume, files.read_exr, files.read_projections):
         with pytest.raises(MivolError) as caught:
             read(tmp_path)
@@ -240,7 +240,7 @@ def test_folder_for_a_file(tmp_path: Path) -> None:
     assert_sentence(str(caught.value), "a folder", f"{tmp_path.name}/*.tif")
 
 
-def test_dataset_that_is_not_there(tmp_path: Path) -> None:
+def test_an_unknown_dataset_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_bytes(npz(density=ONE, albedo=RGB))
     with pytest.raises(MivolError) as caught:
         files.read_volume(tmp_path / "a.npz", "densty")
@@ -251,7 +251,7 @@ def test_dataset_that_is_not_there(tmp_path: Path) -> None:
     assert_sentence(str(caught.value), "one unnamed array")
 
 
-def test_frame_of_no_such_name(tmp_path: Path) -> None:
+def test_an_unknown_frame_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.vol").write_bytes(made.vol(ONE))
     with pytest.raises(MivolError) as caught:
         files.read_volume(tmp_path / "a.vol", frame="world")
@@ -298,7 +298,7 @@ def read_or_refuse(path: Path) -> bool:
 
 @pytest.mark.parametrize("name", SOUND)
 def test_every_truncation_is_refused(tmp_path: Path, name: str) -> None:
-    """Cut at 60 places spread over the file: nothing is read from a file that lost voxels."""
+    """Cut at 60 places spread over the file: a file without all voxels is never read."""
     file_name, data = SOUND[name]
     path = tmp_path / file_name
     path.write_bytes(data)
@@ -309,8 +309,8 @@ def test_every_truncation_is_refused(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SOUND)
-def test_damaged_bytes_raise_nothing_else(tmp_path: Path, name: str, seed: int) -> None:
-    """One to four bytes replaced at random, 80 times: read or refused with a sentence, never another exception."""
+def test_damaged_files_are_read_or_refused(tmp_path: Path, name: str, seed: int) -> None:
+    """One to four random bytes, 80 times: read or refused with a sentence, never another exception."""
     file_name, data = SOUND[name]
     path = tmp_path / file_name
     rng = np.random.default_rng(seed)
@@ -346,14 +346,14 @@ VALUES: dict[str, tuple[np.ndarray, dict, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", VALUES)
-def test_bad_values_are_named(case: str, tmp_path: Path) -> None:
+def test_bad_values_are_refused_with_their_voxel(case: str, tmp_path: Path) -> None:
     values, options, words = VALUES[case]
     with pytest.raises(MivolError) as caught:
         files.check_volume(values, name="sigma_t", **options)
     assert_sentence(str(caught.value), "sigma_t: ", *words)
 
 
-def test_good_values_pass() -> None:
+def test_valid_values_are_accepted() -> None:
     files.check_volume(np.zeros((1, 1, 1, 1)), name="sigma_t")
     files.check_volume(with_voxel(-3.0), name="hounsfield", minimum=None)
     files.check_volume(np.ones((2, 2, 2, 6), np.uint8), name="directions", channels=(6,))
@@ -413,7 +413,7 @@ def test_angles_of_unknown_unit(tmp_path: Path) -> None:
     assert_sentence(str(caught.value), "'gon'", "degrees or radians")
 
 
-def test_pages_of_a_tiff_are_grey_and_of_one_size(tmp_path: Path) -> None:
+def test_pages_of_a_tiff_must_be_grey_and_equal(tmp_path: Path) -> None:
     """A page more, wider than the first; two colour pages of one size."""
     path = tmp_path / "a.tif"
     first = Image.fromarray(np.zeros((3, 4), np.float32))
@@ -428,7 +428,7 @@ def test_pages_of_a_tiff_are_grey_and_of_one_size(tmp_path: Path) -> None:
     assert_sentence(str(caught.value), "images of shapes [(3, 4, 3)]", "crop or convert them")
 
 
-def test_hdf5_that_is_none(tmp_path: Path) -> None:
+def test_a_foreign_hdf5_is_refused(tmp_path: Path) -> None:
     path = make_exchange(tmp_path / "a.h5")
     data = path.read_bytes()
     for broken in (data[: len(data) // 2], b"not HDF5 at all"):
@@ -461,7 +461,7 @@ def test_bad_exr(tmp_path: Path) -> None:
         assert_sentence(str(caught.value), *words)
 
 
-def test_exr_of_several_parts(tmp_path: Path) -> None:
+def test_an_exr_of_several_parts_is_refused(tmp_path: Path) -> None:
     import OpenEXR
 
     plane = np.zeros((2, 3), np.float32)

@@ -17,8 +17,8 @@ from mivol.photos.region import MIDDLE, count_levels, middle_box, nested_boxes, 
 from mivol.validate.images import colour_fitted, judge
 
 
-def test_the_middle_box_is_a_cube_about_what_cameras_look_at() -> None:
-    """Cameras at one distance from the origin, which they look at: half an edge is a share of it."""
+def test_the_middle_box_is_a_cube_around_the_focus() -> None:
+    """Cameras at one distance from the origin, their focus: half the edge is a share of the distance."""
     box = middle_box(cameras(9))
     np.testing.assert_allclose(box, MIDDLE * DISTANCE * np.array([[-1.0] * 3, [1.0] * 3]), atol=1e-9)
     far = [*cameras(9), *(Camera(c.K, c.size, _moved(c, 30.0)) for c in cameras(2))]
@@ -26,8 +26,8 @@ def test_the_middle_box_is_a_cube_about_what_cameras_look_at() -> None:
     np.testing.assert_allclose(middle_box(far), box, atol=1e-9)
 
 
-def test_nested_boxes_are_as_many_as_hold_nearly_all_points() -> None:
-    """Of 200 points one in a hundred may lie anywhere: here two do. The others lie in a box that is one way half as long."""
+def test_nested_boxes_hold_nearly_all_points() -> None:
+    """One of 100 points may be an outlier: here 2 of 200. The other points fill a box of half the length along one axis."""
     box = np.array([[-1.0, -1, -0.5], [1, 1, 0.5]]) + 3
     assert [b.tolist() for b in nested_boxes(box, 3)] == [box.tolist(), (2 * box - 3).tolist(), (4 * box - 9).tolist()]
     wild = np.array([[500.0, 0, 0], [0, 0, 999]])
@@ -45,13 +45,13 @@ def _moved(camera: Camera, distance: float) -> np.ndarray:
     return pose
 
 
-def test_cameras_that_stand_where_they_look_have_no_middle_box() -> None:
+def test_cameras_at_their_focus_have_no_middle_box() -> None:
     turned = [Camera(intrinsics(9, 9, 4, 4), (8, 8), _moved(camera, 0.0)) for camera in cameras(4)]
     with pytest.raises(MivolError, match="cameras that all stand in one place"):
         middle_box(turned)
 
 
-def test_photographs_are_held_at_the_size_that_is_asked_for(tmp_path: Path) -> None:
+def test_largest_limits_the_size_of_photographs(tmp_path: Path) -> None:
     folder = write_capture(tmp_path / "photos", 3)
     small = load_photos(folder, split="all", largest=16, box="middle")
     assert [view.image.shape for view in small.views] == [(12, 16, 3)] * 3
@@ -63,7 +63,7 @@ def test_photographs_are_held_at_the_size_that_is_asked_for(tmp_path: Path) -> N
     assert load_photos(folder, split="all", largest=900, scale=0.5).views[0].image.shape[1] == SIZE[0] // 2
 
 
-def test_photographs_that_do_not_fit_are_refused_before_one_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_photographs_are_refused_before_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_capture(tmp_path / "photos", 4)
     pixels = SIZE[0] * SIZE[1]
     # 64 bytes a pixel of the one that is read, 24 of each that is kept: at scale 0.5 a quarter of these.
@@ -76,7 +76,7 @@ def test_photographs_that_do_not_fit_are_refused_before_one_is_read(tmp_path: Pa
         load_photos(folder, split="all", scale=0.1, limit=60 * pixels)  # what is kept would fit
 
 
-def test_only_one_word_finds_a_box(tmp_path: Path) -> None:
+def test_an_unknown_word_for_a_box_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MivolError, match='"edge"'):
         survey_photos(write_capture(tmp_path / "photos", 3), box="edge")
 

@@ -63,7 +63,7 @@ def blank() -> np.ndarray:
 
 
 @pytest.mark.parametrize(("tilt", "roll"), [(0.0, 0.0), (3.0, 0.0), (0.0, 5.0)])
-def test_a_bead_is_where_the_laboratory_sees_it(tmp_path: Path, tilt: float, roll: float) -> None:
+def test_a_bead_is_projected_as_in_the_laboratory(tmp_path: Path, tilt: float, roll: float) -> None:
     """A bead on a stage that turns clockwise, imaged through the source on to a panel that is read from its top right corner.
 
     Written from the laboratory's side: the light runs along +y from the origin, z is up, the axis at -ObjectOffsetX. The ray
@@ -91,8 +91,8 @@ def test_a_bead_is_where_the_laboratory_sees_it(tmp_path: Path, tilt: float, rol
         assert np.abs(towards).max() < 1e-12 * 50 * 20
 
 
-def test_images_are_turned_round(tmp_path: Path) -> None:
-    """A reading of its own in each pixel: the file's first row and column are the detector's last ones."""
+def test_images_are_flipped(tmp_path: Path) -> None:
+    """A unique reading in each pixel: the first row and column of the file are the last of the detector."""
     counts = 1000.0 + np.arange(VIEWS * ROWS * COLUMNS).reshape(VIEWS, ROWS, COLUMNS)
     found = read_nikon_transmission(read_nikon(write_scan(tmp_path, counts)))
     for row in range(ROWS):
@@ -102,10 +102,11 @@ def test_images_are_turned_round(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_scan_is_reconstructed_as_the_equal_cone(variant_rgb, tmp_path: Path) -> None:
-    """The same readings as a stack, turned round by hand, in a cone beam whose settings are in TOML: the same volume. And
-    the line integrals are those of the volume that was scanned, as far as 16 bits show: half a count of at least 0.4
-    of the white level is 0.5 / 24000."""
+def test_a_scan_equals_the_same_cone_beam(variant_rgb, tmp_path: Path) -> None:
+    """The same readings as a stack, flipped by hand, in a cone beam with settings in TOML give the same volume.
+
+    Its line integrals equal the scanned volume's to 16 bits: half a count of at least 0.4 of the white level is 0.5 / 24000.
+    """
     beam = ConeBeam(np.arange(VIEWS) * 2 * np.pi / VIEWS, (ROWS, COLUMNS), 20.0, 50.0, (0.6, 0.5), axis_offset=-0.1)
     grid = VoxelGrid((7, 8, 9), (0.21, 0.22, 0.23))
     exact = Projector(beam, grid) @ np.random.default_rng(0).uniform(0, 0.4, grid.shape).astype("f")
@@ -127,7 +128,7 @@ def test_a_scan_is_reconstructed_as_the_equal_cone(variant_rgb, tmp_path: Path) 
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
-def test_older_files_have_the_axis_on_the_detector(tmp_path: Path) -> None:
+def test_older_files_give_the_axis_on_the_detector(tmp_path: Path) -> None:
     scan = read_nikon(write_scan(tmp_path, blank(), CentreOfRotationTop=0.5, CentreOfRotationBottom=0.5))
     assert scan.axis_offset == -0.5 * 20 / 50
     assert scan.roll == 0
@@ -142,7 +143,7 @@ LISTS = {
 
 
 @pytest.mark.parametrize("name", LISTS)
-def test_listed_angles_are_taken_where_they_are_named(variant_rgb, tmp_path: Path, name: str) -> None:
+def test_angles_are_read_from_a_list(variant_rgb, tmp_path: Path, name: str) -> None:
     angles = 180 + 22.5 * np.arange(VIEWS) + np.linspace(0, 5, VIEWS)
     separator = ":\t" if name.endswith(".ang") else "\t"
     rows = [f"{number}{separator}{angle}\t0.5" for number, angle in enumerate(angles, 1)]
@@ -166,13 +167,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_settings_that_are_refused(tmp_path: Path, case: str) -> None:
+def test_invalid_settings_are_refused(tmp_path: Path, case: str) -> None:
     changes, sentence = REFUSED[case]
     with pytest.raises(MivolError, match=sentence):
         read_nikon(write_scan(tmp_path, blank(), **changes))
 
 
-def test_files_that_are_no_scan(variant_rgb, tmp_path: Path) -> None:
+def test_foreign_files_are_refused(variant_rgb, tmp_path: Path) -> None:
     path = write_scan(tmp_path, blank()[:, :-1], VoxelsX=0)
     (tmp_path / "fit.toml").write_text(TOML)
     chosen = config.load(tmp_path / "fit.toml")
@@ -192,7 +193,7 @@ def test_files_that_are_no_scan(variant_rgb, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ['scan={beam="parallel"}', 'data={source="shepp_logan"}'])
-def test_geometry_and_data_come_together(tmp_path: Path, change: str) -> None:
+def test_geometry_and_data_belong_together(tmp_path: Path, change: str) -> None:
     (tmp_path / "fit.toml").write_text(TOML)
     with pytest.raises(MivolError, match="go together"):
         config.load(tmp_path / "fit.toml", [change])

@@ -1,4 +1,4 @@
-"""Fisheyes and panoramas: directions against formulas written here, files that name them, and the rays of a fit."""
+"""Fisheyes and panoramas: directions against independent formulas, files of cameras, and rays of a fit."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def panorama(size: tuple[int, int] = (64, 32), pose: np.ndarray = PLACE) -> Came
 # -- Lenses -------------------------------------------------------------------------------------------------------
 
 
-def test_a_fisheye_against_its_polynomial() -> None:
-    """Directions by angles from the axis and about it: the radius is the polynomial, on the same side."""
+def test_fisheye_against_its_polynomial() -> None:
+    """Directions by angles from and about the axis: the image radius is the polynomial, on the same side."""
     rng = np.random.default_rng(1)
     theta, phi = rng.uniform(0, 3, 200), rng.uniform(-np.pi, np.pi, 200)
     d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
@@ -59,16 +59,16 @@ def test_a_fisheye_against_its_polynomial() -> None:
 
 
 @pytest.mark.parametrize("lens", [Fisheye(), LENS, Fisheye(k1=-0.1)])
-def test_directions_of_a_fisheye_are_found_again(lens: Fisheye) -> None:
-    """The polynomial's root to 1e-14; near the rim of the third lens its slope is 1/100, which loses two digits."""
+def test_fisheye_directions_invert_points(lens: Fisheye) -> None:
+    """The root of the polynomial to 1e-14; near the rim of the third lens a slope of 1/100 loses two digits."""
     angles = np.linspace(-1, 1, 41) * 0.99 * lens.widest
     d = np.stack([np.sin(angles) * 0.6, np.sin(angles) * 0.8, np.cos(angles)], axis=-1)
     np.testing.assert_allclose(lens.direction(lens.point(d)), d, atol=2e-12)
     np.testing.assert_array_equal(lens.direction(np.zeros(2)), [0, 0, 1])
 
 
-def test_a_fisheye_sees_up_to_where_its_image_folds() -> None:
-    """t - t^3 / 12 grows up to t = 2, where it is 4/3; beyond that nothing is seen, and a ray goes along the rim."""
+def test_a_fisheye_ends_at_the_fold_of_its_image() -> None:
+    """t - t^3 / 12 grows up to t = 2, to 4/3; points beyond get the direction at the rim."""
     lens = Fisheye(k1=-1 / 12)
     assert lens.widest == pytest.approx(2)
     assert Fisheye().widest == np.pi
@@ -79,8 +79,8 @@ def test_a_fisheye_sees_up_to_where_its_image_folds() -> None:
     assert np.isfinite(lens.point(np.array([np.sin(1.99), 0, np.cos(1.99)]))).all()
 
 
-def test_the_pixels_of_a_panorama() -> None:
-    """The middle looks along -z, a quarter to the right along +x, the top up; the pose turns all of it."""
+def test_pixels_of_a_panorama() -> None:
+    """The centre looks along -z, a quarter to the right along +x, the top up; the pose rotates all directions."""
     camera = panorama(pose=np.eye(4))
     at = np.array([[32.0, 16], [48, 16], [16, 16], [32, 0], [32, 32], [0, 16]])
     wanted = [[0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]]
@@ -92,7 +92,7 @@ def test_the_pixels_of_a_panorama() -> None:
 
 
 @pytest.mark.parametrize("camera", [fisheye(), panorama()], ids=["fisheye", "panorama"])
-def test_points_are_seen_where_their_rays_come_from(camera: Camera) -> None:
+def test_project_inverts_rays_of_wide_lenses(camera: Camera) -> None:
     pixel = pixel_centres(camera.size)[is_seen(camera, pixel_centres(camera.size))]
     o, d = rays(camera, pixel)
     back, distance = project(camera, o + 2.5 * d)
@@ -115,20 +115,20 @@ def test_fields_of_view() -> None:
     assert field_of_view(fisheye(lens=Fisheye(k1=-1 / 12))) == pytest.approx(np.degrees(4), abs=np.degrees(4e-7))
 
 
-def test_what_fisheyes_look_at_is_what_pinholes_would() -> None:
+def test_fisheyes_and_pinholes_have_the_same_focus() -> None:
     pinholes = [Camera(intrinsics(50, 50, 24, 24), (48, 48), pose) for pose in ring(5)]
     np.testing.assert_allclose(find_focus([replace(c, distortion=LENS) for c in pinholes]), find_focus(pinholes), atol=1e-14)
     around = [panorama(pose=pose) for pose in ring(5)]
     np.testing.assert_allclose(find_focus(around), np.mean([c.origin for c in around], axis=0), atol=1e-14)
 
 
-def test_films_of_wide_lenses_are_of_pinholes() -> None:
+def test_films_of_wide_lenses_use_pinholes() -> None:
     film = turntable([fisheye(pose=pose) for pose in ring(6)], np.array([[-1.0] * 3, [1.0] * 3]), 4)
     assert all(camera.distortion == Lens() and field_of_view(camera) == pytest.approx(WIDE) for camera in film)
 
 
-def test_a_wide_camera_is_drawn_with_a_right_angle() -> None:
-    """Opposite edges of the four from the camera: (1, 1, -1) and (-1, 1, -1) times the length are 2 apart."""
+def test_a_wide_camera_is_drawn_with_90_degrees() -> None:
+    """Opposite edges: (1, 1, -1) and (-1, 1, -1) times the length are 2 apart."""
     ends = outline(type("Frame", (), {"camera": panorama(pose=np.eye(4))}), 0.5)[:4, 1]
     np.testing.assert_allclose(np.abs(ends), 0.5)
     assert len({tuple(np.sign(end)) for end in ends}) == 4
@@ -178,13 +178,13 @@ def test_cameras_of_nerfstudio_and_instant_ngp(tmp_path: Path) -> None:
         ({"equirectangular": True, "fl_x": 9}, "found equirectangular = True, expected one of"),
     ],
 )
-def test_cameras_that_are_refused(tmp_path: Path, settings: dict, said: str) -> None:
+def test_invalid_wide_cameras_are_refused(tmp_path: Path, settings: dict, said: str) -> None:
     with pytest.raises(MivolError, match=said):
         survey_photos(write_transforms(tmp_path / "set", settings))
 
 
 @pytest.mark.parametrize("camera", [fisheye(), panorama()], ids=["fisheye", "panorama"])
-def test_cameras_are_written_and_read_again(tmp_path: Path, camera: Camera) -> None:
+def test_written_wide_cameras_are_read_unchanged(tmp_path: Path, camera: Camera) -> None:
     folder = write_transforms(tmp_path / "set", {"fl_x": 1}, camera.size, 2)
     made = {f"images/{k:04d}.png": replace(camera, to_world=pose) for k, pose in enumerate(ring(2))}
     write_cameras(folder / "transforms.json", made)
@@ -196,8 +196,8 @@ def test_cameras_are_written_and_read_again(tmp_path: Path, camera: Camera) -> N
         write_cameras(folder / "transforms.json", {"a": fisheye(), "b": replace(fisheye(), distortion=Lens())})
 
 
-def test_what_lies_outside_of_the_image_circle_does_not_count(tmp_path: Path) -> None:
-    """At 8 pixels a radian the circle of an equidistant fisheye ends 8 pi pixels from the middle: inside of the corners."""
+def test_pixels_outside_the_image_circle_are_masked(tmp_path: Path) -> None:
+    """At 8 pixels per radian the circle of an equidistant fisheye has a radius of 8 pi pixels, inside the corners."""
     lens = {"camera_model": "OPENCV_FISHEYE", "fl_x": 8.0, "fl_y": 8.0}
     (view, *_) = load_photos(write_transforms(tmp_path / "set", lens, (48, 40))).views
     x, y = np.moveaxis(pixel_centres((48, 40)) - (24, 20), -1, 0)
@@ -217,8 +217,8 @@ def photo(camera: Camera) -> Photo:
     return Photo(camera.name, np.float32(capture_photos.image_of(camera)), None, mask, camera, np.zeros(3, np.float32))
 
 
-def test_rays_of_batches_are_those_of_the_lens(variant_rgb: str) -> None:
-    """Of a fisheye, a pinhole, another fisheye and a panorama in one set, in two sizes."""
+def test_batches_have_the_rays_of_each_lens(variant_rgb: str) -> None:
+    """A fisheye, a pinhole, another fisheye and a panorama in one data set, in two sizes."""
     poses = [camera.to_world for camera in capture_photos.cameras(4)]
     pinhole = Camera(intrinsics(40, 40, 24, 24), (48, 48), poses[1])
     other = fisheye(lens=Fisheye(k1=0.01), pose=poses[2])
@@ -248,7 +248,7 @@ def by_tiles(camera: Camera, shrink: int) -> np.ndarray:
     return centres.swapaxes(1, 2).reshape(-1, 2)
 
 
-def test_what_needs_an_image_plane_refuses_by_name(variant_rgb: str) -> None:
+def test_functions_of_an_image_plane_refuse_wide_lenses(variant_rgb: str) -> None:
     camera = fisheye()
     with pytest.raises(MivolError, match="fish: found a fisheye, expected a lens with an image plane"):
         to_pinhole(camera)
@@ -262,7 +262,7 @@ def test_what_needs_an_image_plane_refuses_by_name(variant_rgb: str) -> None:
         silhouette_box([camera], [np.ones((48, 48), np.float32)], np.zeros((2, 3)))
 
 
-def test_a_plan_says_that_rays_are_traced() -> None:
+def test_the_plan_names_wide_photographs() -> None:
     (line,) = wide_lenses(type("Photos", (), {"views": [photo(fisheye()), photo(fisheye())]}))
     assert line.choice == "rays of 2 fisheye photographs"
     assert not wide_lenses(type("Photos", (), {"views": [photo(Camera(intrinsics(40, 40, 4, 4), (8, 8), PLACE))]}))
@@ -270,9 +270,11 @@ def test_a_plan_says_that_rays_are_traced() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [fisheye, panorama])
-def test_a_place_is_found_from_wide_photographs(variant_rgb: str, kind: object) -> None:
-    """Seen from places that were not fitted, by the same lens. The best single colour has the variance of the pictures as its
-    error, about 0.07 here; a field is to have a tenth of it (0.002 to 0.03 measured; 0.9 with the rays of a pinhole)."""
+def test_a_place_is_reconstructed_from_wide_photographs(variant_rgb: str, kind: object) -> None:
+    """Held-out views of the same lens: the best single colour has the variance of the images as its error, about 0.07.
+
+    The field must have a tenth of this error (0.002 to 0.03 measured; 0.9 with the rays of a pinhole).
+    """
     views = [photo(kind(pose=camera.to_world)) for camera in capture_photos.cameras(28)]
     plan = replace(PRESETS["capture"], stages=(RadianceStage(16, 40, 1, 8, 32), RadianceStage(32, 40, 1, 8, 32)))
     problem = RadianceProblem(RayBatches.of(views[:24]), np.array([[-0.9] * 3, [0.9] * 3]), plan)
