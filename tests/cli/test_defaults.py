@@ -140,7 +140,7 @@ DEFAULTS = {
     "optim.schedules.Cosine": {"final": 0.0},
     "optim.schedules.Exponential": {"final": 0.1, "delay": 0},
     "optim.schedules.Step": {"at": (0.75, 0.85, 0.95), "ratio": 0.5},
-    "scene.cameras.Hemisphere": {
+    "scene.camera_rigs.Hemisphere": {
         "count": 16,
         "distance": 4.0,
         "lowest": 0.0,
@@ -153,7 +153,7 @@ DEFAULTS = {
         "near": 0.01,
         "far": 10000.0,
     },
-    "scene.cameras.LookAts": {
+    "scene.camera_rigs.LookAts": {
         "ups": ((0.0, 1.0, 0.0),),
         "fov": 0.0,
         "width": 64,
@@ -162,8 +162,8 @@ DEFAULTS = {
         "near": 0.01,
         "far": 10000.0,
     },
-    "scene.cameras.PlacedRig": {"fov": 0.0, "width": 64, "height": 64, "rfilter": "box", "near": 0.01, "far": 10000.0},
-    "scene.cameras.Ring": {
+    "scene.camera_rigs.PlacedRig": {"fov": 0.0, "width": 64, "height": 64, "rfilter": "box", "near": 0.01, "far": 10000.0},
+    "scene.camera_rigs.Ring": {
         "count": 8,
         "distance": 4.0,
         "elevation": 0.0,
@@ -177,7 +177,7 @@ DEFAULTS = {
         "near": 0.01,
         "far": 10000.0,
     },
-    "scene.cameras.SceneSensors": {"indices": ()},
+    "scene.camera_rigs.SceneSensors": {"indices": ()},
 }
 
 
