@@ -1,9 +1,9 @@
-"""Differentiable and inverse volume rendering on Mitsuba 3. Importing this needs no variant.
+"""Differentiable and inverse volume rendering on Mitsuba 3. The import needs no active variant.
 
-``mivol.<tab>`` shows what a script needs: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
+``mivol.<tab>`` lists the functions for scripts: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
 ``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
 (``load_photos``, ``fit_photographs``, ``fit_gaussians``, ``read_field``), Gaussians and points (``read_gaussians``,
-``read_points``, ``Splatter``) and tomography (``Projector`` and its geometries). Each is imported when it is first used.
+``read_points``, ``Splatter``) and tomography (``Projector`` and its geometries). Each name is imported at its first use.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from . import cuda, llvm
 
-llvm.ensure()
+llvm.choose_library()
 
 try:
     import mitsuba as mi  # Dr.Jit loads LLVM as soon as it is imported
@@ -57,9 +57,9 @@ PUBLIC = {
     "write_points": "points",
     "write_volume": "files",
 }
-"""What ``mivol.<name>`` is, and the module below mivol that it comes from; type checkers see the list below."""
+"""Public names and their modules below ``mivol``. Type checkers read the list below instead."""
 
-if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it is first used
+if TYPE_CHECKING:  # for type checkers; at run time __getattr__ imports each name at its first use
     from .experiments.script import Problem as Problem
     from .experiments.script import explain as explain
     from .experiments.script import fit_gaussians as fit_gaussians

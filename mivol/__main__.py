@@ -1,4 +1,4 @@
-"""``python -m mivol`` is the command ``mivol``."""
+"""Run the command ``mivol`` as ``python -m mivol``."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Where the methods come from: one table from a key to the full reference.
+"""References of the methods: one table from a key to the full citation.
 
-Conventions. A key is ``author_year`` or the name of a program. Every entry was compared with the publisher's page, the
-project's own citation file or several independent bibliographies; a DOI stands only where it was seen there.
+Conventions. A key is ``author_year`` or the name of a program. Every entry was compared with the page of the publisher, the
+citation file of the project or several independent bibliographies. A DOI is given only if confirmed there.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from mivol.errors import MivolError
 
-__all__ = ["CITATIONS", "Citation", "citations"]
+__all__ = ["CITATIONS", "Citation", "list_citations"]
 
 
 class Citation(NamedTuple):
@@ -323,7 +323,7 @@ CITATIONS: dict[str, Citation] = {
 }
 
 
-def citations(keys: Iterable[str]) -> list[Citation]:
+def list_citations(keys: Iterable[str]) -> list[Citation]:
     """References for ``keys``, in the order of their first mention, each once.
 
     Raises:

@@ -1,8 +1,8 @@
-"""The CUDA back end: what Dr.Jit has to be told before it compiles a kernel.
+"""The CUDA back end: a switch of Dr.Jit before kernels are compiled.
 
-Dr.Jit 1.5 asks for registers to be spilled to shared memory where the driver can (PTX 8.7 and newer). ptxas refuses that of a
-kernel that calls functions, as one does that calls plugins ("(C7800) Smem spilling should not be enabled when functions use
-abi"), and the process is aborted. Seen with CUDA 13.0.
+Dr.Jit 1.5 spills registers to shared memory if the driver can (PTX 8.7 and newer). For a kernel with function calls, and so for
+every kernel calling a plugin, ptxas refuses ("(C7800) Smem spilling should not be enabled when functions use abi") and aborts
+the process. Seen with CUDA 13.0.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ __all__ = ["spill_to_local_memory"]
 
 
 def spill_to_local_memory(variant: str | None = None) -> None:
-    """Switch spills to shared memory off, for this thread, where kernels are compiled for a GPU of NVIDIA's.
+    """Switch off spills to shared memory in this thread, for CUDA variants.
 
     Args:
-        variant: the variant that becomes active; by default the one that is.
+        variant: variant about to become active; None: the active variant.
     """
-    import drjit as dr  # loads LLVM, which mivol.llvm has to choose before
+    import drjit as dr  # loads LLVM, so mivol.llvm chooses the library first
     import mitsuba as mi
 
     variant = variant or mi.variant()

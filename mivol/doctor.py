@@ -1,7 +1,7 @@
-"""Will a render work on this machine, and if not, what to do: each variant is tried in a process of its own.
+"""Check this machine: try each variant in its own process, and give advice for each fault.
 
-A trial compiles a kernel with ``minimum`` and a scattered gradient (what LLVM 15 dies of), checks the gradient, and
-renders four pixels of an absorbing cube; nothing short of that tells, since a bad LLVM aborts the process.
+A trial compiles a kernel with ``minimum`` and a scattered gradient (fatal with LLVM 15), checks the gradient, and renders four
+pixels of an absorbing cube. A cheaper check is not enough, because a bad LLVM aborts the process.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from . import llvm, machine
 from .threads import run_child
 
-__all__ = ["Finding", "main", "render_works", "report"]
+__all__ = ["Finding", "main", "render_works", "diagnose"]
 
 OK, NOTE, FAULT = "ok", "-", "FAULT"
 
@@ -39,17 +39,17 @@ try:
     # Entries 0 to 31 are each read twice, and 15.5 cuts off the upper half: 16 entries have the gradient 2.
     dr.backward(dr.sum(dr.minimum(dr.gather(mi.Float, x, dr.arange(mi.UInt32, 64) // 2), 15.5)))
     if dr.sum(dr.grad(x))[0] != 32:
-        raise RuntimeError(f"the gradient of a gather is wrong: {dr.sum(dr.grad(x))[0]} where 32 is right")
+        raise RuntimeError(f"the gradient of a gather is {dr.sum(dr.grad(x))[0]}, expected 32")
     cube = {"type": "cube", "bsdf": {"type": "null"},
             "interior": {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.0}}
     sensor = {"type": "orthographic", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
               @ mi.ScalarTransform4f().scale(0.5), "film": {"type": "hdrfilm", "width": 2, "height": 2}}
     scene = mi.load_dict({"type": "scene", "cube": cube, "sensor": sensor, "light": {"type": "constant"},
                           "integrator": {"type": "volpath", "max_depth": 2}})
-    seen = float(dr.mean(mi.render(scene, spp=1024).array)[0])
+    transmittance = float(dr.mean(mi.render(scene, spp=1024).array)[0])
     # Delta tracking gives 0 or 1 for each of 4096 samples: 6 standard errors of a Bernoulli mean at exp(-2).
-    if abs(seen - math.exp(-2)) > 6 * math.sqrt(math.exp(-2) * (1 - math.exp(-2)) / 4096):
-        raise RuntimeError(f"a cube of optical depth 2 lets {seen:.4f} of the light through, not {math.exp(-2):.4f}")
+    if abs(transmittance - math.exp(-2)) > 6 * math.sqrt(math.exp(-2) * (1 - math.exp(-2)) / 4096):
+        raise RuntimeError(f"the transmittance at optical depth 2 is {transmittance:.4f}, expected {math.exp(-2):.4f}")
 except Exception as error:
     sys.exit(f"MARKER{error}")
 """.replace("MARKER", _MARKER)
@@ -57,7 +57,7 @@ except Exception as error:
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report: what was looked at, how it stands (``ok``, ``-`` or ``FAULT``), and what to do."""
+    """One line of the report: subject, state (``ok``, ``-`` or ``FAULT``), value and advice."""
 
     subject: str
     state: str
@@ -90,24 +90,24 @@ def _mivol() -> Finding:
 
 
 def _llvm() -> list[Finding]:
-    version, path = llvm.version(), llvm.loaded_path()
+    version, path = llvm.loaded_version(), llvm.loaded_path()
     if version is None or version[0] < llvm.OLDEST:
-        what = "none usable" if version is None else f"{'.'.join(map(str, version))}  {path} ({llvm.origin()})"
-        needed = f"LLVM {llvm.OLDEST} to {llvm.NEWEST_TESTED} is needed on the CPU; any one of:"
-        findings = [Finding("LLVM", FAULT, what, (needed, *llvm.fixes()))]
+        what = "none usable" if version is None else f"{'.'.join(map(str, version))}  {path} ({llvm.library_origin()})"
+        needed = f"LLVM {llvm.OLDEST} to {llvm.NEWEST_TESTED} is needed on the CPU; use one of:"
+        findings = [Finding("LLVM", FAULT, what, (needed, *llvm.list_fixes()))]
     else:
         untested = version[0] > llvm.NEWEST_TESTED
-        advice = (f"newer than LLVM {llvm.NEWEST_TESTED}, the newest that was tested",) if untested else ()
-        findings = [Finding("LLVM", OK, f"{'.'.join(map(str, version))}  {path} ({llvm.origin()})", advice)]
+        advice = (f"newer than LLVM {llvm.NEWEST_TESTED}, the newest tested version",) if untested else ()
+        findings = [Finding("LLVM", OK, f"{'.'.join(map(str, version))}  {path} ({llvm.library_origin()})", advice)]
     for library in llvm.find_libraries():
         if path is None or Path(os.path.realpath(path)) != library.path:
-            findings.append(Finding("", NOTE, f"{_other(library)}  {library.path}"))
+            findings.append(Finding("", NOTE, f"{_describe_unused(library)}  {library.path}"))
     return findings
 
 
-def _other(library: llvm.Library) -> str:
-    if library.path in llvm.unloadable():
-        return f"also here: LLVM {library.major}, does not load ({llvm.unloadable()[library.path]})"
+def _describe_unused(library: llvm.Library) -> str:
+    if library.path in llvm.unloadable_libraries():
+        return f"also here: LLVM {library.major}, does not load ({llvm.unloadable_libraries()[library.path]})"
     return f"also here: LLVM {library.major}" + (", too old" if library.major < llvm.OLDEST else "")
 
 
@@ -126,8 +126,8 @@ def _cuda() -> list[Finding]:
     return [*findings, Finding("OptiX", FAULT, "libnvoptix.so.1 does not load", (advice,))]
 
 
-def _candidates() -> list[str]:
-    """The variants to try: rgb and mono with derivatives, those for a GPU only where Dr.Jit sees one."""
+def _variants_to_try() -> list[str]:
+    """Variants to try: rgb and mono variants with derivatives; CUDA variants only with a usable GPU."""
     import drjit as dr
     import mitsuba as mi
 
@@ -135,24 +135,24 @@ def _candidates() -> list[str]:
     return [name for name in names if dr.has_backend(dr.JitBackend.CUDA) or not name.startswith("cuda")]
 
 
-def _try(variant: str) -> Finding:
+def _try_variant(variant: str) -> Finding:
     start = time.perf_counter()
     try:
         child = run_child(_TRIAL, variant, timeout=300.0)
     except subprocess.TimeoutExpired:
-        return Finding(variant, FAULT, "no answer within 300 s", ("look for a process that takes all cores",))
+        return Finding(variant, FAULT, "no answer within 300 s", ("look for another process using all cores",))
     if child.returncode == 0:
         return Finding(variant, OK, f"renders and differentiates ({time.perf_counter() - start:.1f} s with start-up)")
     if child.returncode < 0:
         value = f"a kernel kills the process ({signal.Signals(-child.returncode).name})"
-        cure = ("this LLVM cannot be used; any one of:", *llvm.fixes()) if variant.startswith("llvm") else ()
+        cure = ("this LLVM is unusable; use one of:", *llvm.list_fixes()) if variant.startswith("llvm") else ()
         return Finding(variant, FAULT, value, cure)
-    reason = child.stderr.rpartition(_MARKER)[2].strip().splitlines() or [f"it ended with code {child.returncode}"]
-    return Finding(variant, FAULT, reason[0])
+    error = child.stderr.rpartition(_MARKER)[2].strip().splitlines() or [f"the process ended with code {child.returncode}"]
+    return Finding(variant, FAULT, error[0])
 
 
 def _resources() -> list[Finding]:
-    count, threads = machine.cores(), os.cpu_count() or 1
+    count, threads = machine.count_cores(), os.cpu_count() or 1
     mask = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else threads
     advice = ()
     if count < mask:
@@ -161,7 +161,7 @@ def _resources() -> list[Finding]:
     memory = machine.available_memory()
     if memory is not None:
         small = memory < 2 * 2**30
-        advice = ("2 GiB are needed for the examples",) if small else ()
+        advice = ("the examples need 2 GiB",) if small else ()
         findings.append(Finding("memory", NOTE if small else OK, f"{memory / 2**30:.1f} GiB available", advice))
     return findings
 
@@ -169,33 +169,35 @@ def _resources() -> list[Finding]:
 def _kernel_cache() -> Finding:
     named, home = os.environ.get("DRJIT_CACHE_DIR"), os.environ.get("HOME")
     if not named and not home:
-        advice = ("set HOME or DRJIT_CACHE_DIR, or every kernel is compiled anew in each process",)
+        advice = ("set HOME or DRJIT_CACHE_DIR; without it each process compiles every kernel again",)
         return Finding("kernel cache", NOTE, "none: HOME is not set", advice)
     folder = Path(named) if named else Path(home or "") / ".drjit"
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     if not os.access(existing, os.W_OK):
-        return Finding("kernel cache", NOTE, f"{folder} cannot be written", ("set DRJIT_CACHE_DIR to one that can",))
+        return Finding("kernel cache", NOTE, f"{folder} is not writable", ("set DRJIT_CACHE_DIR to a writable folder",))
     return Finding("kernel cache", OK, f"{folder}")
 
 
-def report() -> list[Finding]:
-    """Look at everything a render needs, and try each rgb and mono variant with derivatives in a child process.
+def diagnose() -> list[Finding]:
+    """Check everything needed for a render, and try each rgb and mono variant with derivatives in a child process.
 
     Returns:
-        The findings in reading order. Cost: two to five seconds, and up to a minute where nothing is cached.
+        The findings in reading order.
+
+    Cost: 2 to 5 s; up to a minute without cached kernels.
     """
-    trials = [_try(variant) for variant in _candidates()]
+    trials = [_try_variant(variant) for variant in _variants_to_try()]
     return [_mivol(), *_versions(), *_llvm(), *_cuda(), *trials, *_resources(), _kernel_cache()]
 
 
 def render_works(findings: Sequence[Finding]) -> bool:
-    """Whether at least one variant rendered and differentiated, and no version is outside what mivol supports."""
+    """Whether at least one variant rendered and differentiated, and all versions are supported."""
     variants = [f for f in findings if f.subject.endswith(("_ad_rgb", "_ad_mono"))]
     versions = [f for f in findings if f.subject in ("Python", "Mitsuba")]
     return any(f.state == OK for f in variants) and all(f.state == OK for f in versions)
 
 
-def _lines(findings: Sequence[Finding]) -> list[str]:
+def _format_findings(findings: Sequence[Finding]) -> list[str]:
     lines = []
     for finding in findings:
         lines.append(f"{finding.state:<6}{finding.subject:<14}{finding.value}")
@@ -207,18 +209,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Print the report.
 
     Args:
-        argv: command line without the program's name; there are no options but ``--help``.
+        argv: command line without the program's name; the only option is ``--help``.
 
     Returns:
-        0 where a render works, 1 where none does.
+        0 if a render works, else 1.
     """
     parser = argparse.ArgumentParser(prog="mivol doctor", description="Check whether a render works on this machine.")
     parser.parse_args(argv)
-    findings = report()
-    print("\n".join(_lines(findings)))
+    findings = diagnose()
+    print("\n".join(_format_findings(findings)))
     works = [f.subject for f in findings if f.state == OK and f.subject.endswith(("_ad_rgb", "_ad_mono"))]
     if render_works(findings):
-        print(f"\nA render works here, with {' and '.join(works)}.")
+        print(f"\nRenders work here, with {' and '.join(works)}.")
         return 0
-    print("\nA render does not work here: see each FAULT above.")
+    print("\nRenders do not work here: see each FAULT above.")
     return 1

@@ -1,4 +1,4 @@
-"""What mivol refuses, it refuses with one sentence: what was found, what was expected, the way out."""
+"""Refusals: one sentence each, with the found input, the expected input and a way out."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ __all__ = ["MivolError", "reveal_refusals"]
 
 
 class MivolError(ValueError):
-    """An input that mivol cannot use; the message is one sentence for the person who gave it.
+    """An unusable input; the message is one sentence for the user.
 
-    What it quotes may be no text, such as half of a pair of UTF-16 in a name of JSON; that is shown by its number, so that the
-    sentence can be printed.
+    The message may quote invalid text, such as half of a UTF-16 pair from a name in JSON. Such characters are shown by number,
+    to keep the message printable.
     """
 
     def __str__(self) -> str:
@@ -21,14 +21,13 @@ class MivolError(ValueError):
 
 
 def reveal_refusals(render: Callable[..., Any]) -> Callable[..., Any]:
-    """Let a function that raises a RuntimeError because of a MivolError raise the MivolError.
+    """Make a render function raise the MivolError behind a RuntimeError.
 
-    ``mi.render`` runs an integrator inside ``dr.custom``, which replaces whatever is raised there by a RuntimeError that says
-    no more than "see above": ``except MivolError`` around ``mi.render`` would never catch a refusal. Other errors pass as they
-    are.
+    ``mi.render`` runs an integrator inside ``dr.custom``, and ``dr.custom`` replaces every exception by a RuntimeError with the
+    text "see above". So ``except MivolError`` around ``mi.render`` would never catch a refusal. Other errors pass unchanged.
 
     Args:
-        render: the function; one that reveals refusals already is returned as it is.
+        render: the function; returned unchanged if already wrapped.
     """
     if hasattr(render, "reveals_refusals"):
         return render
@@ -41,8 +40,8 @@ def reveal_refusals(render: Callable[..., Any]) -> Callable[..., Any]:
             refusal = error.__cause__
             if not isinstance(refusal, MivolError):
                 raise
-        # Out here the refusal does not get the RuntimeError as its context: each would be the reason of the other, and who
-        # follows reasons (as loggers do) would never come to an end.
+        # Raised outside of the except block, the refusal does not get the RuntimeError as its context. Otherwise each would be
+        # the cause of the other, and a logger following causes would never end.
         raise refusal
 
     revealing.reveals_refusals = True

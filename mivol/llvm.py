@@ -1,9 +1,9 @@
-"""The CPU backend's compiler: finds an LLVM library that Dr.Jit can use, and stops a render that has none.
+"""The compiler of the CPU back end: find an LLVM library for Dr.Jit, and refuse to render without a usable library.
 
-Conventions. Dr.Jit loads LLVM as soon as it is imported, from ``DRJIT_LIBLLVM_PATH`` if that is set, so :func:`ensure`
-runs before; it never overrides a choice of the user's and never raises (CUDA needs no LLVM). :func:`check_backend`
-raises. Dr.Jit 1.5 refuses LLVM 14 and accepts 15 and 16, which abort the process on x86-64 at the first ``minimum``:
-their code generator cannot select ``llvm.minimum`` there.
+Conventions. Dr.Jit loads LLVM during its import, from ``DRJIT_LIBLLVM_PATH`` if set, so :func:`choose_library` runs first. It
+never overrides a choice of the user and never raises, because CUDA needs no LLVM. :func:`check_backend` raises. Dr.Jit 1.5
+refuses LLVM 14 and accepts LLVM 15 and 16; on x86-64 both abort the process at the first ``minimum``, because their code
+generator cannot select ``llvm.minimum``.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ __all__ = [
     "Library",
     "LlvmError",
     "check_backend",
-    "ensure",
+    "choose_library",
     "find_libraries",
-    "fixes",
+    "list_fixes",
     "loaded_path",
     "missing_system_library",
-    "origin",
-    "probe",
-    "rank",
-    "unloadable",
-    "version",
+    "library_origin",
+    "probe_version",
+    "rank_libraries",
+    "unloadable_libraries",
+    "loaded_version",
 ]
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -48,8 +48,8 @@ BY_MIVOL = "chosen by mivol"
 BY_DRJIT = "chosen by Dr.Jit's own search"
 LOADED_FIRST = "chosen by Dr.Jit, which was imported before mivol"
 
-_origin = BY_DRJIT
-_unloadable: dict[Path, str] = {}
+_library_origin = BY_DRJIT
+_load_failures: dict[Path, str] = {}
 
 
 _INSTALL = (
@@ -64,32 +64,32 @@ _INSTALL = (
 
 
 NAMES = ("libLLVM[-.]*so*", "libLLVM*.dylib", "LLVM-C.dll")
-"""Files of the library on Linux, macOS and Windows."""
+"""File names of the library on Linux, macOS and Windows."""
 
 
 class LlvmError(MivolError, ImportError):
-    """An llvm variant was asked for where no LLVM library works."""
+    """An llvm variant is requested and no LLVM library works."""
 
 
 class Library(NamedTuple):
-    """An LLVM library on disk; ``major`` is its version."""
+    """An LLVM library on disk, with its major version."""
 
     path: Path
     major: int
 
 
-def folders_of(system: str, machine: str, root: Path, prefix: Path, environment: Mapping[str, str]) -> list[Path]:
-    """Where LLVM libraries usually lie.
+def library_folders(system: str, machine: str, root: Path, prefix: Path, environment: Mapping[str, str]) -> list[Path]:
+    """List the usual folders of LLVM libraries.
 
     Args:
-        system: as ``sys.platform`` names it.
-        machine: as ``platform.machine()`` names it.
-        root: of the file system.
-        prefix: of this Python's environment.
-        environment: variables; ``CONDA_PREFIX`` and, on Windows, ``ProgramFiles`` and ``LOCALAPPDATA`` count.
+        system: ``sys.platform``.
+        machine: ``platform.machine()``.
+        root: root of the file system.
+        prefix: folder of the Python environment.
+        environment: environment variables; ``CONDA_PREFIX`` and, on Windows, ``ProgramFiles`` and ``LOCALAPPDATA`` are used.
 
     Returns:
-        Folders in the order of the search, whether they are there or not.
+        Folders in search order; folders may not exist.
     """
     bases = [prefix, *([Path(conda)] if (conda := environment.get("CONDA_PREFIX")) else [])]
     if system == "win32":
@@ -103,8 +103,8 @@ def folders_of(system: str, machine: str, root: Path, prefix: Path, environment:
     return [*own, *fixed, *sorted([*root.glob("usr/lib/llvm-*/lib"), *root.glob("usr/lib64/llvm*/lib*")])]
 
 
-def _folders() -> list[Path]:
-    return folders_of(sys.platform, platform.machine(), Path("/"), Path(sys.prefix), os.environ)
+def _usual_folders() -> list[Path]:
+    return library_folders(sys.platform, platform.machine(), Path("/"), Path(sys.prefix), os.environ)
 
 
 def _stated_major(path: Path) -> int | None:
@@ -112,11 +112,11 @@ def _stated_major(path: Path) -> int | None:
     return int(found[1]) if found else None
 
 
-def probe(path: Path | str) -> tuple[int | None, str]:
-    """Load a library in a child process (which survives one that crashes) and ask its version.
+def probe_version(path: Path | str) -> tuple[int | None, str]:
+    """Load a library in a child process, safe from crashes, and read its version.
 
     Returns:
-        The major version and an empty string, or None and what went wrong.
+        The major version and an empty string, or None and the error.
     """
     code = (
         "import ctypes, sys\n"
@@ -132,36 +132,36 @@ def probe(path: Path | str) -> tuple[int | None, str]:
     if child.returncode == 0:
         return int(child.stdout), ""
     if "LLVMGetVersion" in child.stderr:
-        return None, "it is older than LLVM 16, or no LLVM library at all"
+        return None, "the file is older than LLVM 16, or not an LLVM library"
     last = child.stderr.strip().splitlines()[-1:] or [f"loading it ends the process with code {child.returncode}"]
     return None, last[0].removeprefix("OSError: ")
 
 
 def find_libraries(folders: Iterable[Path] | None = None) -> list[Library]:
-    """Every LLVM library in the usual places: this environment, conda, the system's folders, Homebrew.
+    """Find all LLVM libraries in the usual folders: this environment, conda, system, Homebrew.
 
-    The version is the one that the file's name states, else the one that the library states to a child process.
+    The version comes from the file name, or else from the library, loaded in a child process.
 
     Args:
-        folders: where to look instead.
+        folders: folders to search; None: the usual folders.
 
     Returns:
-        One entry for each real file, in the order of the search.
+        One entry for each real file, in search order.
     """
     found: dict[Path, Library] = {}
-    for folder in _folders() if folders is None else folders:
+    for folder in _usual_folders() if folders is None else folders:
         for path in sorted(path for name in NAMES for path in folder.glob(name)):
             real = Path(os.path.realpath(path))
             if real in found or not real.is_file():
                 continue
-            major = _stated_major(real) or probe(real)[0]
+            major = _stated_major(real) or probe_version(real)[0]
             if major is not None:
                 found[real] = Library(real, major)
     return list(found.values())
 
 
-def rank(libraries: Sequence[Library]) -> list[Library]:
-    """The libraries that Dr.Jit can use, best first: the newest that was tested, then the least new of the untested."""
+def rank_libraries(libraries: Sequence[Library]) -> list[Library]:
+    """Sort the usable libraries, best first: tested versions from the newest, then untested versions from the oldest."""
     tested = [lib for lib in libraries if OLDEST <= lib.major <= NEWEST_TESTED]
     newer = [lib for lib in libraries if lib.major > NEWEST_TESTED]
     return sorted(tested, key=lambda lib: -lib.major) + sorted(newer, key=lambda lib: lib.major)
@@ -169,37 +169,37 @@ def rank(libraries: Sequence[Library]) -> list[Library]:
 
 def _loads(path: Path) -> bool:
     try:
-        # In this process: Dr.Jit is about to load the same file here. Local symbols, so that it cannot shadow anything.
+        # Loaded in this process, where Dr.Jit is about to load the same file. Local symbols cannot shadow other libraries.
         ctypes.CDLL(str(path), mode=ctypes.RTLD_LOCAL)
     except OSError as error:
-        _unloadable[path] = str(error)
+        _load_failures[path] = str(error)
         return False
     return True
 
 
-def ensure() -> None:
-    """Choose the LLVM library before Dr.Jit does, and watch over the import of llvm variants.
+def choose_library() -> None:
+    """Choose the LLVM library for Dr.Jit, and check LLVM at each import of an llvm variant.
 
-    Sets ``DRJIT_LIBLLVM_PATH`` (child processes inherit it) to the best library that loads. Leaves everything alone
-    where the variable is set, where Dr.Jit is loaded already, and where no library serves. Never raises.
+    Sets ``DRJIT_LIBLLVM_PATH``, also for child processes, to the best loadable library. Changes nothing if the variable is set,
+    if Dr.Jit is already loaded, or if no library is usable. Never raises.
     """
-    global _origin
+    global _library_origin
     if not any(isinstance(finder, _VariantGuard) for finder in sys.meta_path):
         sys.meta_path.insert(0, _VariantGuard())
     if os.environ.get(VARIABLE):
-        _origin = BY_USER
+        _library_origin = BY_USER
     elif "drjit" in sys.modules:
-        _origin = LOADED_FIRST
+        _library_origin = LOADED_FIRST
     else:
-        for library in rank(find_libraries()):
+        for library in rank_libraries(find_libraries()):
             if _loads(library.path):
                 os.environ[VARIABLE] = str(library.path)
-                _origin = BY_MIVOL
+                _library_origin = BY_MIVOL
                 return
 
 
 class _VariantGuard(importlib.abc.MetaPathFinder):
-    """Refuses to import ``mitsuba.llvm_*`` without a usable LLVM: Mitsuba's own error would not say what to do."""
+    """Refuses to import ``mitsuba.llvm_*`` without a usable LLVM; the error of Mitsuba gives no advice."""
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> None:
         if name.startswith("mitsuba.llvm_"):
@@ -207,7 +207,7 @@ class _VariantGuard(importlib.abc.MetaPathFinder):
 
 
 def missing_system_library() -> str | None:
-    """What to do where the system lacks the one library that Dr.Jit's wheel needs and slim images leave out."""
+    """Advice if the system lacks libatomic, needed by the wheel of Dr.Jit and missing in slim images; else None."""
     if sys.platform != "linux":
         return None
     try:
@@ -221,26 +221,26 @@ def missing_system_library() -> str | None:
     return None
 
 
-def version() -> tuple[int, int, int] | None:
-    """The version of the LLVM library that Dr.Jit has loaded, None where it has none."""
+def loaded_version() -> tuple[int, int, int] | None:
+    """Version of the LLVM library loaded by Dr.Jit; None without a library."""
     import drjit as dr
 
     found = tuple(dr.detail.llvm_version())
     return None if found[0] < 0 else found
 
 
-def origin() -> str:
-    """Who chose the library, in words."""
-    return _origin
+def library_origin() -> str:
+    """Who chose the library, in words: the user, mivol or Dr.Jit."""
+    return _library_origin
 
 
-def unloadable() -> dict[Path, str]:
-    """Libraries of a usable version that the system's loader refused when mivol chose, and why."""
-    return dict(_unloadable)
+def unloadable_libraries() -> dict[Path, str]:
+    """Libraries of a usable version refused by the loader of the system, with the error."""
+    return dict(_load_failures)
 
 
 def loaded_path() -> Path | None:
-    """The LLVM library of this process, as far as the system (or the variable) tells."""
+    """Path of the LLVM library of this process, from the memory map or from the variable; None if unknown."""
     maps = Path("/proc/self/maps")
     if maps.exists():
         for line in maps.read_text().splitlines():
@@ -252,57 +252,57 @@ def loaded_path() -> Path | None:
 
 
 def check_backend(variant: str | None = None) -> None:
-    """Stop before a kernel is compiled by an LLVM library that cannot do it.
+    """Refuse a variant before an unusable LLVM library compiles a kernel.
 
     Args:
-        variant: the variant to judge; by default the active one. Variants that are not of the llvm kind always pass.
+        variant: variant to check; None: the active variant. Only llvm variants are checked.
 
     Raises:
-        LlvmError: the variant needs LLVM and Dr.Jit has none, or one that would abort the process. The message says
-            what was found, what is needed and how to get it.
+        LlvmError: the variant needs LLVM, and Dr.Jit has no library or a library known to abort the process. The message lists
+            the found library, the needed versions and the commands to install one.
     """
     import mitsuba as mi
 
     variant = variant or mi.variant()
     if variant is None or not variant.startswith("llvm"):
         return
-    found = version()
+    found = loaded_version()
     if found is None or found[0] < OLDEST:
-        raise LlvmError(_sentence(variant, found))
+        raise LlvmError(_describe_failure(variant, found))
 
 
-def _sentence(variant: str, found: tuple[int, int, int] | None) -> str:
+def _describe_failure(variant: str, found: tuple[int, int, int] | None) -> str:
     what = "has no LLVM library" if found is None else "cannot use LLVM " + ".".join(map(str, found))
     aborts = "; 15 and 16 load, but abort Python at the first kernel on x86-64" if OLDEST > 15 else ""
     return "\n".join(
         [
             f"the CPU backend ({variant}) {what}",
-            f"  found   : {_found()}",
+            f"  found   : {_describe_library()}",
             f"  needed  : LLVM {OLDEST} to {NEWEST_TESTED}{aborts}",
-            "  fix, any one of these, then start Python again:",
-            *(f"    {fix}" for fix in fixes()),
-            "  to see what is there: mivol doctor",
+            "  fix with one of these, then start Python again:",
+            *(f"    {fix}" for fix in list_fixes()),
+            "  to list all libraries: mivol doctor",
         ]
     )
 
 
-def _found() -> str:
-    if _origin == BY_USER:
+def _describe_library() -> str:
+    if _library_origin == BY_USER:
         path = Path(os.environ[VARIABLE])
         major = _stated_major(path) if path.is_file() else None
-        return f"{path} ({_origin}): {f'LLVM {major}' if major else probe(path)[1]}"
-    if _unloadable:
-        return "; ".join(f"{path} does not load ({why})" for path, why in _unloadable.items())
+        return f"{path} ({_library_origin}): {f'LLVM {major}' if major else probe_version(path)[1]}"
+    if _load_failures:
+        return "; ".join(f"{path} does not load ({why})" for path, why in _load_failures.items())
     path = loaded_path()
-    return f"{path} ({_origin})" if path else "nothing in the usual places"
+    return f"{path} ({_library_origin})" if path else "nothing in the usual places"
 
 
-def fixes() -> list[str]:
-    """What can be done where no LLVM library works, the surest first: commands, each with its conditions."""
-    better = [lib for lib in rank(find_libraries()) if lib.path not in _unloadable]
+def list_fixes() -> list[str]:
+    """Commands to get a working LLVM library, the surest first, each with its conditions."""
+    better = [lib for lib in rank_libraries(find_libraries()) if lib.path not in _load_failures]
     lines = []
-    if better and _origin == LOADED_FIRST:
+    if better and _library_origin == LOADED_FIRST:
         lines.append(f"import mivol before mitsuba and drjit: it then chooses {better[0].path}")
-    if better and _origin == BY_USER:
+    if better and _library_origin == BY_USER:
         lines.append(f"unset {VARIABLE}: mivol then chooses {better[0].path}")
     return lines + [f"{command:<52}{note}" for command, note in _INSTALL]

@@ -1,7 +1,7 @@
-"""What this process may use of the machine: cores and memory, with the limits that containers and schedulers set.
+"""Cores and memory available to this process, within the limits of containers and schedulers.
 
-Conventions. Memory is in bytes. Limits come from the affinity mask, from the control group (versions 1 and 2) and from
-the system; the smallest one holds.
+Conventions. Memory is in bytes. Limits come from the affinity mask, the control group (versions 1 and 2) and the system; the
+smallest limit holds.
 """
 
 from __future__ import annotations
@@ -12,70 +12,71 @@ from pathlib import Path
 
 from mivol.errors import MivolError
 
-__all__ = ["available_memory", "check_fits", "cores"]
+__all__ = ["available_memory", "check_memory", "count_cores"]
 
 _CGROUP = Path("/sys/fs/cgroup")
 
 
-def _number(path: Path) -> float:
-    """The number in a file of the system; infinity where there is none, or no limit."""
+def _read_number(path: Path) -> float:
+    """Read a number from a system file; infinity without a file or without a limit."""
     try:
         return float(path.read_text().split()[0])
     except (OSError, ValueError, IndexError):
         return math.inf
 
 
-def _quota() -> float:
-    """How many cores the control group grants."""
+def _group_cores() -> float:
+    """Number of cores granted by the control group."""
     try:
         quota, period = (_CGROUP / "cpu.max").read_text().split()
         return math.inf if quota == "max" else float(quota) / float(period)
     except (OSError, ValueError):
-        quota = _number(_CGROUP / "cpu/cpu.cfs_quota_us")
-        return math.inf if quota < 0 else quota / _number(_CGROUP / "cpu/cpu.cfs_period_us")
+        quota = _read_number(_CGROUP / "cpu/cpu.cfs_quota_us")
+        return math.inf if quota < 0 else quota / _read_number(_CGROUP / "cpu/cpu.cfs_period_us")
 
 
-def cores() -> int:
-    """Cores that this process may use; Dr.Jit by itself knows the affinity mask, but not the control group's quota."""
+def count_cores() -> int:
+    """Count the cores of this process. Dr.Jit itself respects the affinity mask but not the quota of the control group."""
     mask = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quota = _quota()
+    quota = _group_cores()
     return max(1, min(mask, math.ceil(quota) if math.isfinite(quota) else mask))
 
 
 def available_memory() -> int | None:
-    """Bytes that this process can still take without swapping, None where the system does not tell.
+    """Memory left to this process without swapping [bytes]; None if the system does not report memory.
 
-    The smaller of the system's ``MemAvailable`` and what the control group leaves. Page cache that the group counts as
-    its own, and would give back, is not deducted.
+    The smaller of ``MemAvailable`` of the system and the rest of the control group. Reclaimable page cache of the group counts
+    as free.
     """
     meminfo = Path("/proc/meminfo")
     if not meminfo.exists():
         return None
     fields = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
     system = float(fields["MemAvailable"].split()[0]) * 1024
-    second = _left_in_group("memory.max", "memory.current", "memory.stat")
-    first = _left_in_group("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat")
+    second = _group_memory("memory.max", "memory.current", "memory.stat")
+    first = _group_memory("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat")
     return int(min(system, second, first))
 
 
-def check_fits(needed: float, what: str, way_out: str) -> None:
-    """Refuse what takes more memory than is left, before any of it is taken.
+def check_memory(needed: float, what: str, way_out: str) -> None:
+    """Refuse a task with more memory than available, before its start.
 
     Args:
-        needed: bytes.
-        what: subject of the sentence: what takes them.
-        way_out: what to do instead.
+        needed: memory of the task [bytes].
+        what: subject of the sentence, for instance "a fit of 256^3 voxels".
+        way_out: advice in the imperative.
 
     Raises:
-        MivolError: with what is needed, what is free and the way out.
+        MivolError: the task needs more than the free memory.
     """
     free = available_memory()
     if free is not None and needed > free:
-        raise MivolError(f"{what} takes {needed / 2**30:,.1f} GiB and {free / 2**30:,.1f} GiB are free: {way_out}.")
+        raise MivolError(f"{what} needs {needed / 2**30:,.1f} GiB of memory and {free / 2**30:,.1f} GiB are free: {way_out}.")
 
 
-def _left_in_group(limit: str, usage: str, stat: str) -> float:
-    ceiling = _number(_CGROUP / limit)
+def _group_memory(limit: str, usage: str, stat: str) -> float:
+    """Memory left in the control group [bytes], from the names of its files."""
+    ceiling = _read_number(_CGROUP / limit)
     if math.isinf(ceiling):
         return math.inf
     try:
@@ -83,4 +84,4 @@ def _left_in_group(limit: str, usage: str, stat: str) -> float:
     except OSError:
         pairs = {}
     cache = float(pairs.get("total_inactive_file", pairs.get("inactive_file", 0)))
-    return max(0.0, ceiling - (_number(_CGROUP / usage) - cache))
+    return max(0.0, ceiling - (_read_number(_CGROUP / usage) - cache))

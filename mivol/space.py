@@ -1,4 +1,4 @@
-"""Where a grid lies: unit cube, voxel centres and world, said once.
+"""Placement of a grid: unit cube, voxel centres and world.
 
 Conventions. A grid of resolution (Z, Y, X) fills the unit cube [0, 1]^3, x fastest; ``to_world`` (4x4, float64) maps the
 cube to the world. Voxel (i, j, k) has its centre at ((i + 1/2)/X, (j + 1/2)/Y, (k + 1/2)/Z): lattice coordinates
@@ -15,24 +15,25 @@ __all__ = ["check_affine", "lattice_from_world"]
 
 
 def check_affine(matrix: np.ndarray, name: str = "to_world") -> np.ndarray:
-    """Return ``matrix`` as float64 (4, 4), refusing what cannot place a box in space.
+    """Return ``matrix`` as float64 (4, 4); refuse a matrix unable to place a box in space.
 
     Args:
         matrix: (4, 4) affine map, last row (0, 0, 0, 1).
-        name: what the matrix is called in the sentence that refuses it.
+        name: name of the matrix in the message.
 
     Raises:
-        MivolError: wrong shape, a value that is not finite, a projective last row, or a volume of zero.
+        MivolError: wrong shape, a non-finite value, a projective last row, or a volume of zero.
     """
     m = np.asarray(matrix, dtype=np.float64)
     if m.shape != (4, 4):
         raise MivolError(f"{name} has shape {m.shape}; a 4x4 affine matrix is expected.")
     if not np.isfinite(m).all():
-        raise MivolError(f"{name} holds a value that is not finite; give a matrix of finite numbers.")
+        raise MivolError(f"{name} holds a non-finite value; give a matrix of finite numbers.")
     if not np.array_equal(m[3], (0.0, 0.0, 0.0, 1.0)):
         raise MivolError(f"{name} has the last row {m[3].tolist()}; only affine maps (0, 0, 0, 1) can place a grid.")
-    # det / (product of column lengths) is the volume of the box relative to a right-angled one of the same edges: free of
-    # scale, so that a box of size 1e-6 passes and a flat one does not. 1e-7: an edge that float32 cannot tell from flat.
+    # det / (product of column lengths) is the volume of the box over the volume of a right-angled box with equal edges. This
+    # ratio has no scale: a box of size 1e-6 passes, a flat box fails. Below 1e-7 float32 cannot distinguish an edge from a flat
+    # one.
     edges = np.linalg.norm(m[:3, :3], axis=0)
     if not (edges > 0).all() or abs(np.linalg.det(m[:3, :3] / edges)) < 1e-7:
         raise MivolError(f"{name} is degenerate (determinant 0): the box has no volume; scale every axis by more than 0.")

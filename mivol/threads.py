@@ -1,10 +1,10 @@
-"""One thread of a process uses Dr.Jit, and helpers are fresh processes: two threads silently lose gradients.
+"""One thread of a process uses Dr.Jit, and other work runs in fresh processes: two threads lose gradients silently.
 
-Why. Dr.Jit 1.5 keeps one copy of a small scatter target for each pool thread (its reduction mode ``Expand``) and takes
-every Python thread for the same one, so two of them add into one copy without atomics: up to a third of a gradient was
-seen to go missing, with no error raised. A forked child has no pool threads at all. So code that renders, walks or
-differentiates calls :func:`check_one_thread` first, and code that needs another process starts it with
-:func:`run_child`; nothing else in mivol starts threads or processes.
+Reason. Dr.Jit 1.5 keeps one copy of a small scatter target for each pool thread (reduction mode ``Expand``), and counts all
+Python threads as the same pool thread. Two Python threads then add to one copy without atomics. Up to a third of a gradient was
+missing in a test, without an error. A forked child has no pool threads at all. Therefore every function that renders or
+differentiates calls :func:`check_one_thread` first, and child processes are started by :func:`run_child`. No other module of
+mivol starts threads or processes.
 """
 
 from __future__ import annotations
@@ -18,42 +18,44 @@ from contextlib import contextmanager
 
 from .errors import MivolError
 
-__all__ = ["check_one_thread", "owner_waits", "run_child", "set_thread_count"]
+__all__ = ["check_one_thread", "lend_ownership", "run_child", "set_thread_count"]
 
 _owner: threading.Thread | None = None
 _pid = os.getpid()
 
 
 def check_one_thread() -> None:
-    """Make the calling thread the one that uses Dr.Jit, or refuse.
+    """Make the calling thread the owner of Dr.Jit, or refuse.
 
-    The first caller becomes the owner; once its thread has ended, the next caller does.
+    The first caller becomes the owner. After the end of its thread the next caller becomes the owner.
 
     Raises:
-        MivolError: another live thread of this process owns Dr.Jit, or this process is a fork of one in which mivol
-            was imported.
+        MivolError: another live thread of this process owns Dr.Jit, or this process was forked after the import of mivol.
     """
     global _owner
     if os.getpid() != _pid:
         raise MivolError(
-            f"process {os.getpid()} was forked from process {_pid}, which had loaded mivol: Dr.Jit's worker threads do "
-            "not survive a fork; start workers with multiprocessing.get_context('spawn')."
+            f"process {os.getpid()} was forked from process {_pid} after the import of mivol, and Dr.Jit's worker threads do "
+            "not survive a fork: start workers with multiprocessing.get_context('spawn')."
         )
     caller = threading.current_thread()
     if _owner is None or not _owner.is_alive():
         _owner = caller
     if _owner is not caller:
         raise MivolError(
-            f"thread {caller.name!r} wants to use Dr.Jit, but thread {_owner.name!r} of this process does already, and "
-            f"two of them lose gradients silently: hand the work to {_owner.name!r} (a queue of NumPy arrays), or to a "
-            "process of its own."
+            f"thread {caller.name!r} wants to use Dr.Jit, but thread {_owner.name!r} of this process already uses it, and two "
+            f"threads lose gradients silently: hand the work to {_owner.name!r} (by a queue of NumPy arrays), or to a process "
+            "of its own."
         )
 
 
 @contextmanager
-def owner_waits() -> Iterator[None]:
-    """The thread that uses Dr.Jit waits for the calling one, as it does for PyTorch's, which differentiate on a GPU: for a
-    while the caller is the one. What the owner launched has to be done (``dr.sync_thread``)."""
+def lend_ownership() -> Iterator[None]:
+    """Make the calling thread the owner of Dr.Jit while the former owner waits for the caller.
+
+    PyTorch differentiates on threads of its own, and its calling thread waits for them. Kernels launched by the former owner
+    must have finished (``dr.sync_thread``).
+    """
     global _owner
     before, _owner = _owner, threading.current_thread()
     try:
@@ -63,11 +65,11 @@ def owner_waits() -> Iterator[None]:
 
 
 def set_thread_count(count: int) -> None:
-    """Give Dr.Jit so many threads, once the kernels that still run have ended.
+    """Set the number of Dr.Jit threads after all running kernels have ended.
 
-    A pool whose size changes under running kernels has crashed a process (seen once, in a run of the tests).
+    Changing the size of the pool under running kernels crashed a process once, in a run of the tests.
     """
-    import drjit as dr  # loads LLVM, which mivol.llvm has to choose before
+    import drjit as dr  # loads LLVM, so mivol.llvm chooses the library first
 
     dr.sync_thread()
     dr.set_thread_count(count)
@@ -76,19 +78,19 @@ def set_thread_count(count: int) -> None:
 def run_child(
     code: str, *args: str, timeout: float = 120.0, env: Mapping[str, str] | None = None, isolated: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    """Run Python code in a fresh interpreter (started anew, never forked) and wait for it.
+    """Run Python code in a fresh interpreter (never forked) and wait for its end.
 
-    The working directory is not on the child's path: a file of the user's that is called like a module does not matter.
+    The working directory is not on the path of the child, so a user's file with the name of a module does no harm.
 
     Args:
-        code: what ``python -c`` is given.
-        args: become ``sys.argv[1:]`` there.
-        timeout: seconds after which the child is killed.
-        env: its whole environment; by default this process's own.
-        isolated: leave out site-packages and the user's settings (25 ms instead of 100).
+        code: code for ``python -c``.
+        args: ``sys.argv[1:]`` of the child.
+        timeout: time limit [s]; afterwards the child is killed.
+        env: whole environment of the child; None: the environment of this process.
+        isolated: leave out site-packages and user settings (25 ms instead of 100 ms).
 
     Returns:
-        The finished process; ``returncode`` is minus the signal's number where a signal killed it.
+        The finished process; ``returncode`` is minus the number of the signal if a signal killed the child.
 
     Raises:
         subprocess.TimeoutExpired: the child did not end within ``timeout``.

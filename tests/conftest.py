@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(false_alarms.Count())
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
     if workers > 1:
-        drjit.set_thread_count(max(2, machine.cores() // workers))
+        drjit.set_thread_count(max(2, machine.count_cores() // workers))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

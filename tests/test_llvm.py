@@ -48,13 +48,13 @@ def library(path: Path, major: int) -> Path:
 def test_import_chooses_the_best_library_before_drjit() -> None:
     code, out, err = child("import mivol, drjit; print(drjit.detail.llvm_version()[0])\n" + SWITCH)
     assert code == 0, err
-    best = llvm.rank(llvm.find_libraries())[0]
+    best = llvm.rank_libraries(llvm.find_libraries())[0]
     assert int(out) == best.major
 
 
 def test_import_after_mitsuba_chooses_nothing() -> None:
     """Mitsuba first: what Dr.Jit found is left alone."""
-    code, out, err = child("import mitsuba, mivol; print(mivol.llvm.origin())")
+    code, out, err = child("import mitsuba, mivol; print(mivol.llvm.library_origin())")
     assert code == 0, err
     assert out == llvm.LOADED_FIRST
 
@@ -65,8 +65,9 @@ def test_import_needs_no_library_and_never_fails() -> None:
 
 
 def test_users_choice_is_not_overridden() -> None:
-    chosen = llvm.rank(llvm.find_libraries())[0].path
-    code, out, err = child("import mivol, os; print(os.environ['DRJIT_LIBLLVM_PATH'], mivol.llvm.origin())", str(chosen))
+    chosen = llvm.rank_libraries(llvm.find_libraries())[0].path
+    script = "import mivol, os; print(os.environ['DRJIT_LIBLLVM_PATH'], mivol.llvm.library_origin())"
+    code, out, err = child(script, str(chosen))
     assert code == 0, err
     assert out == f"{chosen} {llvm.BY_USER}"
 
@@ -136,16 +137,16 @@ def test_variant_set_before_mivol_is_imported() -> None:
 
 
 def test_loaded_first_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(llvm, "version", lambda: (15, 0, 6))
-    monkeypatch.setattr(llvm, "_origin", llvm.LOADED_FIRST)
+    monkeypatch.setattr(llvm, "loaded_version", lambda: (15, 0, 6))
+    monkeypatch.setattr(llvm, "_library_origin", llvm.LOADED_FIRST)
     with pytest.raises(llvm.LlvmError, match="import mivol before mitsuba and drjit"):
         llvm.check_backend("llvm_ad_mono")
 
 
 def test_library_that_does_not_load_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(llvm, "version", lambda: None)
-    monkeypatch.setattr(llvm, "_origin", llvm.BY_DRJIT)
-    monkeypatch.setattr(llvm, "_unloadable", {Path("/venv/lib/libLLVM.so.23.1"): "invalid ELF header"})
+    monkeypatch.setattr(llvm, "loaded_version", lambda: None)
+    monkeypatch.setattr(llvm, "_library_origin", llvm.BY_DRJIT)
+    monkeypatch.setattr(llvm, "_load_failures", {Path("/venv/lib/libLLVM.so.23.1"): "invalid ELF header"})
     with pytest.raises(llvm.LlvmError, match=r"/venv/lib/libLLVM\.so\.23\.1 does not load \(invalid ELF header\)"):
         llvm.check_backend("llvm_ad_rgb")
 
@@ -162,7 +163,7 @@ def test_lack_of_libatomic_is_said(tmp_path: Path) -> None:
 
 
 def test_variants_without_llvm_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(llvm, "version", lambda: None)
+    monkeypatch.setattr(llvm, "loaded_version", lambda: None)
     llvm.check_backend("scalar_rgb")
     llvm.check_backend("cuda_ad_rgb")
 
@@ -176,11 +177,11 @@ def test_search_reads_versions_from_names_and_ranks_them(tmp_path: Path) -> None
     found = llvm.find_libraries([tmp_path / "lib", tmp_path / "absent"])
     assert sorted(lib.major for lib in found) == [14, 16, 19, 23, 24, 25]
     usable = [23, 19] if llvm.OLDEST == 17 else [23, 19, 16]
-    assert [lib.major for lib in llvm.rank(found)] == [*usable, 24, 25]
+    assert [lib.major for lib in llvm.rank_libraries(found)] == [*usable, 24, 25]
 
 
 def test_search_asks_a_library_without_a_version_in_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = llvm.rank(llvm.find_libraries())[0]
+    real = llvm.rank_libraries(llvm.find_libraries())[0]
     (tmp_path / "libLLVM.so").symlink_to(real.path)
     (tmp_path / "libLLVM-git.so").write_text("not a library")
     monkeypatch.setattr(llvm, "_stated_major", lambda path: None)
@@ -188,17 +189,17 @@ def test_search_asks_a_library_without_a_version_in_its_name(tmp_path: Path, mon
 
 
 def test_ensure_passes_over_a_library_that_does_not_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = llvm.rank(llvm.find_libraries())[0]
+    real = llvm.rank_libraries(llvm.find_libraries())[0]
     broken = library(tmp_path, 23)
     monkeypatch.setattr(llvm, "find_libraries", lambda: [llvm.Library(broken, 23), real])
-    monkeypatch.setattr(llvm, "_unloadable", {})
-    monkeypatch.setattr(llvm, "_origin", llvm.BY_DRJIT)
+    monkeypatch.setattr(llvm, "_load_failures", {})
+    monkeypatch.setattr(llvm, "_library_origin", llvm.BY_DRJIT)
     monkeypatch.setenv(llvm.VARIABLE, "")
     monkeypatch.delitem(sys.modules, "drjit")
-    llvm.ensure()
+    llvm.choose_library()
     assert os.environ[llvm.VARIABLE] == str(real.path)
-    assert llvm.origin() == llvm.BY_MIVOL
-    assert list(llvm.unloadable()) == [broken]
+    assert llvm.library_origin() == llvm.BY_MIVOL
+    assert list(llvm.unloadable_libraries()) == [broken]
 
 
 def test_one_thread_owns_drjit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,7 +229,7 @@ def test_an_owner_that_waits_lends_drjit(monkeypatch: pytest.MonkeyPatch) -> Non
     owners: list[threading.Thread | None] = []
 
     def differentiate() -> None:
-        with threads.owner_waits():
+        with threads.lend_ownership():
             threads.check_one_thread()
             owners.append(threads._owner)
         owners.append(threads._owner)
@@ -266,7 +267,7 @@ def test_machine_limits_of_a_control_group(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "memory.max").write_text("1000000\n")
     (tmp_path / "memory.current").write_text("600000\n")
     (tmp_path / "memory.stat").write_text("anon 500000\ninactive_file 100000\n")
-    assert machine.cores() == 1
+    assert machine.count_cores() == 1
     assert free is None or machine.available_memory() == 500000
 
 
@@ -284,10 +285,10 @@ def test_search_knows_where_each_system_keeps_libraries(tmp_path: Path, monkeypa
         for name in names:
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).touch()
-    monkeypatch.setattr(llvm, "probe", lambda path: (19, ""))
+    monkeypatch.setattr(llvm, "probe_version", lambda path: (19, ""))
     variables = {"ProgramFiles": tmp_path / "programs", "LOCALAPPDATA": tmp_path / "local", "CONDA_PREFIX": tmp_path / "conda"}
     environment = {name: str(path) for name, path in variables.items()}
-    folders = llvm.folders_of(system, "x86_64", tmp_path, tmp_path / "env", environment)
+    folders = llvm.library_folders(system, "x86_64", tmp_path, tmp_path / "env", environment)
     found = {lib.path.relative_to(tmp_path).as_posix() for lib in llvm.find_libraries(folders)}
     assert set(FAKED[system]) <= found
     own = {"env/lib/libLLVM.so.20.1", "env/lib/libLLVM.dylib"}

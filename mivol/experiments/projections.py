@@ -10,15 +10,15 @@ import numpy as np
 
 from mivol import config
 from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, Measured, Nikon, OfData, Parallel, Stack, Table
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.experiments.readings import ScanReadings, nikon_grid, note_order, read_scan
 from mivol.experiments.row_order import note_rows
 from mivol.files import read_columns, read_volume
 from mivol.files.fetch import resolve_path
-from mivol.machine import check_fits
+from mivol.machine import check_memory
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
-from mivol.shown import briefly
 from mivol.tomography.fan_axis import axis_from_fans, offset_of_cone
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_of_matrices
@@ -37,7 +37,7 @@ RAY_BYTES = 3 * 8
 """Of a ray of a computed scan: what is exact, what is seen of it and its weight, in float64."""
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class Projections:
     """Line integrals and what they were taken with.
@@ -140,7 +140,7 @@ def check_rays(chosen: config.ScanExperiment) -> None:
     rows, columns = chosen.scan.detector
     views = getattr(chosen.scan, "views", 1)
     what = f"a scan of {views} x {rows} x {columns} rays"
-    check_fits(RAY_BYTES * views * rows * columns, what, "give scan.detector or scan.views fewer of them")
+    check_memory(RAY_BYTES * views * rows * columns, what, "give scan.detector or scan.views fewer of them")
 
 
 def check_hits(projector: Projector) -> None:

@@ -9,18 +9,18 @@ import numpy as np
 
 from mivol import config
 from mivol.config import Matrices, Measured, Nikon, Stack, Table
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files import read_columns, read_projections, read_stack
 from mivol.files.fetch import resolve_path
 from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.files.source import refusal
-from mivol.shown import briefly
 from mivol.tomography.geometry import ConeBeam, FlatDetector, VoxelGrid
 from mivol.tomography.panel_views import PanelViews, nikon_geometry
 from mivol.tomography.preprocess import Transmission, correct_transmission, of_unknown_noise
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True, eq=False)
 class ScanReadings:
     """What the files of a scan hold.

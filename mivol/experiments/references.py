@@ -19,7 +19,7 @@ from mivol.experiments.fit_kind import RunContext
 from mivol.fields.procedural import make_procedural
 from mivol.files import read_exr, read_volume, stack_layers
 from mivol.files.fetch import PREFIX, resolve_path
-from mivol.machine import check_fits
+from mivol.machine import check_memory
 from mivol.optim.parameters import find, like
 from mivol.optim.scenes.views import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
@@ -212,7 +212,7 @@ def make_truth(chosen: SceneExperiment, base: Path, scene: mi.Scene) -> np.ndarr
         return read_volume(resolve_path(base, chosen.truth.file)).values
     wanted = chosen.truth
     said = " x ".join(str(n) for n in wanted.shape)
-    check_fits(VOXEL_BYTES * math.prod(wanted.shape), f"a truth of {said} voxels", "give truth.shape fewer voxels")
+    check_memory(VOXEL_BYTES * math.prod(wanted.shape), f"a truth of {said} voxels", "give truth.shape fewer voxels")
     return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
 
 

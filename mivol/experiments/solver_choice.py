@@ -18,7 +18,7 @@ from mivol import config
 from mivol.config import AUTO
 from mivol.errors import MivolError
 from mivol.experiments.projections import Projections
-from mivol.machine import check_fits
+from mivol.machine import check_memory
 from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
 from mivol.optim.projections.linear_problems import SolverState, expected_residual_norm
@@ -95,7 +95,7 @@ def check_grid(chosen: config.ScanExperiment, grid: VoxelGrid) -> None:
     """
     fields = FIELDS_OF_ONE_STEP if chosen.solve.solver in DIRECT else FIELDS
     what = f"a reconstruction of {' x '.join(str(n) for n in grid.shape)} unknowns"
-    check_fits(4 * fields * math.prod(grid.shape), what, "give grid.shape fewer voxels, or set solve.supersampling = 1")
+    check_memory(4 * fields * math.prod(grid.shape), what, "give grid.shape fewer voxels, or set solve.supersampling = 1")
 
 
 BY_SUBSETS = ("sart", "os-sart")

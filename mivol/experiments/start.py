@@ -18,7 +18,7 @@ from mivol.config import SceneExperiment, Sought
 from mivol.errors import MivolError
 from mivol.files import read_volume
 from mivol.files.fetch import resolve_path as place_in
-from mivol.machine import check_fits
+from mivol.machine import check_memory
 from mivol.optim.events import Upsample, check_for_grids
 from mivol.optim.parameters import GRID, Parameter, as_tensor, find
 from mivol.transport.media.medium_view import find_grid_place
@@ -66,7 +66,7 @@ def check_grid(key: str, shape: Sequence[int], way_out: str) -> None:
         MivolError: with its shape and what it takes.
     """
     said = " x ".join(str(n) for n in shape)
-    check_fits(NUMBER_BYTES * math.prod(shape), f"{key} of {said} numbers, with its derivative and the optimiser,", way_out)
+    check_memory(NUMBER_BYTES * math.prod(shape), f"{key} of {said} numbers, with its derivative and the optimiser,", way_out)
 
 
 def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:

@@ -38,6 +38,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, select_activation
 from mivol.fields.harmonics import (
@@ -52,7 +53,6 @@ from mivol.fields.harmonics import (
 from mivol.fields.sparse_index import SparseIndex
 from mivol.files.notebook import slices_html
 from mivol.kernel_recording import copy_aligned
-from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
 __all__ = ["SphericalGrid", "is_covered_by_inner"]
@@ -78,7 +78,7 @@ def is_covered_by_inner(node: mi.UInt32, res: tuple[int, int, int]) -> mi.Bool:
     return covered
 
 
-@briefly
+@with_short_repr
 @dataclass
 class SphericalGrid:
     """A grid of density and directional colour.

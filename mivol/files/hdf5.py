@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files.source import check_file, refusal, select_dataset
 from mivol.files.volume import VolumeData, to_values
-from mivol.shown import briefly
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 
@@ -37,7 +37,7 @@ ANGLES: dict[str, float] = {
 }
 
 
-@briefly
+@with_short_repr
 @dataclasses.dataclass(frozen=True)
 class ProjectionData:
     """The counts of a tomographic scan.

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
+from mivol.display import text_html
 from mivol.files.image_files import encode_srgb
-from mivol.shown import text_html
 
 __all__ = ["pairs_html", "slices_html"]
 

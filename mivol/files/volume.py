@@ -13,9 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mivol.display import summarize, with_short_repr
 from mivol.files.notebook import slices_html
 from mivol.files.source import refusal
-from mivol.shown import brief, briefly
 
 #: Smallest side of a box: the reciprocal of a denormal float32 number overflows.
 SMALLEST_SIDE = float(np.finfo(np.float32).tiny)
@@ -27,7 +27,7 @@ FLATTEST = 16 * float(np.finfo(np.float32).eps)
 SPACES: dict[str, tuple[int, int, int]] = {"RAS": (1, 1, 1), "LPS": (-1, -1, 1), "LAS": (-1, 1, 1)}
 
 
-@briefly
+@with_short_repr
 @dataclasses.dataclass(frozen=True)
 class VolumeData:
     """A volume with its placement and the facts of its file.
@@ -44,7 +44,7 @@ class VolumeData:
 
     def _repr_html_(self) -> str:
         """Return three middle slices for notebooks."""
-        return slices_html(self.values, f"{brief(self.values)}, from {self.values.min():.4g} to {self.values.max():.4g}")
+        return slices_html(self.values, f"{summarize(self.values)}, from {self.values.min():.4g} to {self.values.max():.4g}")
 
     @property
     def size(self) -> np.ndarray:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import mitsuba as mi
 
+from mivol.display import curve_html
 from mivol.errors import MivolError
 from mivol.files.notebook import pairs_html
 from mivol.optim.checkpoint import CheckpointFile
@@ -22,7 +23,6 @@ from mivol.optim.interrupt import InterruptGuard
 from mivol.optim.optimizer import Optimizer, OptimizerRun
 from mivol.optim.problem import Problem
 from mivol.optim.schedules import Constant, Schedule
-from mivol.shown import curve_html
 from mivol.threads import check_one_thread
 
 SAVED_FIELDS = ("next_iteration", "events_done", "history", "evaluations", "log", "has_warned", "seconds")

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.machine import available_memory
@@ -23,7 +24,6 @@ from mivol.photos.lens import Lens, distort
 from mivol.photos.photo_file import find_colour_space, read_mask, read_photo, read_photo_header, shrink
 from mivol.photos.region import silhouette_box
 from mivol.photos.survey import PhotoFrame, PhotoSurvey, survey_photos
-from mivol.shown import briefly
 
 __all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos", "rectify", "to_pinhole"]
 
@@ -38,7 +38,7 @@ BACKGROUNDS: dict[str, Callable[[int, int], np.ndarray]] = {
 }
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class Photo:
     """A photograph with its camera.
@@ -72,7 +72,7 @@ class Photo:
         return self.image + (1 - self.alpha[..., None]) * (np.asarray(colour, np.float32) - self.background)
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class Photos:
     """Photographs for a fit.

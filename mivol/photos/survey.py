@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos import region
@@ -24,7 +25,6 @@ from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import UNLISTED, Entry, Listing
 from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
-from mivol.shown import briefly
 
 __all__ = ["FORMATS", "SPLITS", "Format", "PhotoFrame", "PhotoSurvey", "find_format", "survey_photos"]
 
@@ -66,7 +66,7 @@ class PhotoFrame:
     points: np.ndarray | None = None
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class PhotoSurvey:
     """The content of a data set, from its cameras and the headers of its images.

@@ -18,12 +18,12 @@ from typing import BinaryIO
 
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.files import ply
 from mivol.files.atomic import write_whole
 from mivol.files.npy import DAMAGE, check_memory
 from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.photos.colmap import read_points3d
-from mivol.shown import briefly
 
 __all__ = ["CLOUD_READERS", "CLOUD_WRITERS", "PointCloud", "read_points", "write_points"]
 
@@ -34,7 +34,7 @@ LAS_1_0_HEADER_SIZE, LAS_HEADER_SIZE = 227, 375
 """Bytes of the header of LAS up to version 1.2, and of version 1.4 (section 2.4)."""
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class PointCloud:
     """N points.

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.files.source import refusal
-from mivol.shown import briefly
 
 __all__ = [
     "CONSTANT_HARMONIC",
@@ -42,7 +42,7 @@ ROW_SHAPES = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_l
 """What each Gaussian has of each array, but for the harmonics."""
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class Gaussians:
     """N Gaussians; float32, C-contiguous, whatever real arrays are given.

@@ -17,7 +17,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from mivol.cite import citations
+from mivol.cite import list_citations
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report import figures
@@ -70,7 +70,7 @@ def write_page(folder: str | Path) -> Path:
         "films": [encode_film(folder, image) for image in record.images if image.role == "film"],
         "others": [encode_image(folder, image) for image in record.images if image.role in ("slice", "picture")],
         "config": _toml(record.config),
-        "citations": citations(record.citations),
+        "citations": list_citations(record.citations),
         "theme": figures.CSS,
     }
     template = _environment().get_template("page.html.jinja")

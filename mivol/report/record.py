@@ -26,7 +26,7 @@ import msgspec
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.files.atomic import disk_faults
-from mivol.machine import cores
+from mivol.machine import count_cores
 
 __all__ = [
     "QUANTITIES",
@@ -234,7 +234,7 @@ def package_versions() -> dict[str, str]:
 
 def describe_machine(device: str = "") -> Machine:
     """Return the usable cores, the main memory and ``device``, by default the model of the processor."""
-    return Machine(cores=cores(), memory=_memory(), device=device or _processor())
+    return Machine(cores=count_cores(), memory=_memory(), device=device or _processor())
 
 
 def _memory() -> float | None:

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.cite import citations
+from mivol.cite import list_citations
 from mivol.errors import MivolError
 from mivol.scene.choices import is_lit, shares_cells
 from mivol.scene.depth_two import depth_two_error, mean_albedo, scattering_depth
@@ -171,7 +171,7 @@ def _plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Settings, noi
         answer = measure_depths(scene, eye, settings, noise)
         depth = "without a limit (-1)" if answer.depth < 0 else answer.depth
         lines += [f"  depth     {depth} is enough\n              because {answer.reason}"]
-    return [*lines, "references", *(f"  {source}" for source in citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
+    return [*lines, "references", *(f"  {source}" for source in list_citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
 
 
 def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:

@@ -16,6 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.display import text_html, with_short_repr
 from mivol.errors import MivolError
 from mivol.scene.description import (
     NO_TEXT,
@@ -30,14 +31,13 @@ from mivol.scene.description import (
     resolving_beside,
 )
 from mivol.scene.explain import examine
-from mivol.shown import briefly, text_html
 from mivol.threads import set_thread_count
 
 __all__ = ["LoadedScene", "SceneSource", "load_scene"]
 
 SceneSource = str | os.PathLike | Mapping
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class LoadedScene:
     """A scene, and where it came from.

@@ -9,7 +9,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.files.source import refusal
-from mivol.machine import check_fits
+from mivol.machine import check_memory
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera import PIXELS_LOST
 
@@ -51,7 +51,7 @@ def check_film(sensor: mi.Sensor, kept: int = 0) -> None:
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     what, way_out = f"a film of {width} x {height} pixels", "give it fewer pixels, or render it in crops"
-    check_fits((PIXEL_BYTES + kept) * width * height, what, way_out)
+    check_memory((PIXEL_BYTES + kept) * width * height, what, way_out)
     if FILM_NUMBERS * width * height >= MOST_ENTRIES:
         raise MivolError(f"{what} has more numbers than Dr.Jit can count in one array (2^32): {way_out}.")
 

@@ -19,8 +19,8 @@ from typing import Protocol
 
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
-from mivol.shown import briefly
 
 _Z = np.array([0.0, 0.0, 1.0])
 
@@ -120,7 +120,7 @@ class VoxelGrid:
         return self.centre[i] + (np.arange(n) - (n - 1) / 2) * self.voxel_size[i]
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True, eq=False)
 class PencilRays:
     """A free list of half lines, each ray a view of its own.
@@ -158,7 +158,7 @@ class PencilRays:
         return self.o[index][:, None, None], self.d[index][:, None, None]
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True, eq=False)
 class ParallelBeam:
     """Parallel light and a flat detector that turn together about the z axis.
@@ -213,7 +213,7 @@ class ParallelBeam:
         return Panels(w, self.u[0] * u + self.v[0] * _Z, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True, eq=False)
 class ConeBeam:
     """A point source and a flat detector on circles about the z axis.

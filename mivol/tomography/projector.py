@@ -22,7 +22,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.kernel_recording import copy_aligned
-from mivol.threads import check_one_thread, owner_waits
+from mivol.threads import check_one_thread, lend_ownership
 from mivol.tomography.geometry import Geometry, VoxelGrid, view_index
 from mivol.tomography.recorded_kernels import RecordedKernels
 from mivol.transport.traversal.grid_blocks import find_empty_distances
@@ -362,7 +362,7 @@ class _ProjectionOfTorch(_Projection):
         return y
 
     def backward(self) -> None:
-        with owner_waits():
+        with lend_ownership():
             super().backward()
 
 

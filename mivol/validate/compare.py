@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
-from mivol.shown import briefly
 from mivol.validate.metrics import nrmse, psnr
 from mivol.validate.reference_file import ReferenceResult
 from mivol.validate.statistics import Bias, Estimate, Significance, bias, smallest_detectable_bias, z_bound, z_image
@@ -20,7 +20,7 @@ from mivol.validate.statistics import Bias, Estimate, Significance, bias, smalle
 __all__ = ["Comparison", "compare"]
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class Comparison:
     """What can be said of an image and its reference.

@@ -18,11 +18,11 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 import mivol
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files.atomic import write_whole
 from mivol.files.image_files import read_exr, write_exr
 from mivol.files.npy import read_archive
-from mivol.shown import briefly
 from mivol.validate.moments import Moments
 from mivol.validate.trust import Doubt
 
@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class ReferenceResult:
     """A reference image.

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import mivol
 from mivol.files import write_exr, write_png
-from smoke import make_plume
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 XML = Path(__file__).parent / "scene.xml"
 RUNS = Path("runs")
@@ -33,6 +33,10 @@ def main() -> None:
     """Render the image and its derivative, and write both."""
     args = parse_arguments()
     mi.set_variant("llvm_ad_rgb")
+    commands = {args.field: "mivol optimize scenes/still_life/fit.toml", args.needles: "python scenes/knot/render.py"}
+    for path, command in commands.items():
+        if not path.exists():
+            raise SystemExit(f"{path} is missing: run {command} first (all commands: the first lines of this script).")
     args.output.mkdir(parents=True, exist_ok=True)
     smoke = args.output / "smoke.vol"
     mivol.write_volume(smoke, PEAK * make_plume()[..., None])
@@ -64,6 +68,46 @@ def colour_by_sign(tangent: np.ndarray, image: np.ndarray) -> np.ndarray:
     change = np.clip(change / np.quantile(np.abs(change), 0.99), -1, 1)[..., None]
     grey = 0.12 * np.clip(image.mean(axis=2, keepdims=True), 0, 1)
     return grey + np.maximum(change, 0) * [1.0, 0.25, 0.05] + np.maximum(-change, 0) * [0.05, 0.3, 1.0]
+
+
+def make_plume(shape: tuple[int, int, int] = (160, 96, 96), seed: int = 3) -> np.ndarray:
+    """A widening, swirling column of smoke, torn by turbulence, without a simulation.
+
+    Three fields of turbulence displace the points, which makes the curls. A fourth field eats holes into the column's edge.
+
+    Args:
+        shape: voxels (Z, Y, X).
+        seed: of the turbulence.
+
+    Returns:
+        Density (Z, Y, X), float32, in [0, 1], 0 on the outermost voxels.
+    """
+    rng = np.random.default_rng(seed)
+    here = np.indices(shape, dtype=np.float64)
+    height = here[0] / shape[0]
+    push = np.stack([turbulence(shape, rng) for _ in range(3)])
+    moved = here + push * (2 + 13 * height)
+    z, y, x = (moved[k] / shape[2] for k in range(3))
+    top = shape[0] / shape[2]
+    angle, lean = 5.0 * z / top, 0.10 * np.clip(z / top, 0, 1.2)
+    radius = 0.05 + 0.27 * np.clip(z / top, 0, 1) ** 0.9
+    away = np.hypot(y - 0.5 - lean * np.sin(angle), x - 0.5 - lean * np.cos(angle) * np.clip(2 * z, 0, 1)) / radius
+    column = np.clip(1.35 - away, 0, 1)
+    torn = map_coordinates(turbulence(shape, rng), moved, order=1, mode="grid-wrap")
+    density = np.clip(1.6 * column * (0.75 + 0.55 * torn) - 0.35 * height, 0, 1)
+    fade = np.clip((1 - height) / 0.22, 0, 1) ** 1.5 / (1 + 4 * height)
+    edge = np.minimum.reduce([np.minimum(here[k], shape[k] - 1 - here[k]) for k in range(3)])
+    return (density * fade * np.clip(edge / 4, 0, 1)).astype(np.float32)
+
+
+def turbulence(shape: tuple[int, int, int], rng: np.random.Generator, largest: float = 30) -> np.ndarray:
+    """Gaussian noise with the power spectrum |k|^-13/3 below a largest wavelength [voxel]; mean 0, variance 1."""
+    waves = np.meshgrid(np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1]), np.fft.rfftfreq(shape[2]), indexing="ij")
+    square = sum(k**2 for k in waves)
+    spectrum = np.fft.rfftn(rng.normal(size=shape)) * (square + largest**-2) ** (-13 / 12)
+    spectrum[0, 0, 0] = 0
+    field = np.fft.irfftn(spectrum, shape)
+    return field / field.std()
 
 
 def parse_arguments() -> argparse.Namespace:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import hyp1f1
 
-from mivol.numerics import exp_moments, greater, largest_of, least_of, lesser, one_minus_exp, phi1
+from mivol.numerics import exp_moments, fast_max, fast_min, maximum, minimum, one_minus_exp, phi1
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -78,7 +78,7 @@ def test_a_negative_argument_is_no_special_case():
 def test_extremes_of_numbers_in_each_lane():
     values = np.random.default_rng(3).normal(size=(3, 50)).astype(np.float32)
     rows = [mi.Float(row) for row in values]
-    np.testing.assert_array_equal(np.array(least_of(rows)), values.min(axis=0))
-    np.testing.assert_array_equal(np.array(largest_of(rows)), values.max(axis=0))
-    np.testing.assert_array_equal(np.array(lesser(*rows[:2])), values[:2].min(axis=0))
-    np.testing.assert_array_equal(np.array(greater(*rows[:2])), values[:2].max(axis=0))
+    np.testing.assert_array_equal(np.array(minimum(rows)), values.min(axis=0))
+    np.testing.assert_array_equal(np.array(maximum(rows)), values.max(axis=0))
+    np.testing.assert_array_equal(np.array(fast_min(*rows[:2])), values[:2].min(axis=0))
+    np.testing.assert_array_equal(np.array(fast_max(*rows[:2])), values[:2].max(axis=0))

@@ -32,7 +32,7 @@ def test_centres_and_faces():
     [
         (box((1, 0, 0), (0, 1, 0), (1, 1, 0)), "degenerate"),  # flat: the third edge lies in the plane of the others
         (box((1, 0, 0), (0, 0, 0), (0, 0, 1)), "degenerate"),
-        (box((1, 0, 0), (0, np.nan, 0), (0, 0, 1)), "not finite"),
+        (box((1, 0, 0), (0, np.nan, 0), (0, 0, 1)), "non-finite"),
         (np.eye(3), "shape"),
         (np.diag([1, 1, 1, 2.0]), "affine"),
     ],

@@ -20,7 +20,7 @@ import pytest
 from cli.run_folder import write_run
 from matplotlib.image import imread
 
-from mivol.cite import CITATIONS, Citation, citations
+from mivol.cite import CITATIONS, Citation, list_citations
 from mivol.errors import MivolError
 from mivol.files import write_exr, write_png, write_volume
 from mivol.report import figures, pixel_scale
@@ -181,7 +181,7 @@ def test_page_shows_all_entries_of_the_record(run_folder, page):
         assert line.choice in page.text and line.reason in page.text
     for name in (*record.timings, *record.versions, *record.seeds, *record.notes):
         assert name in page.text
-    for source in citations(record.citations):
+    for source in list_citations(record.citations):
         assert source.title in page.text
     assert "[views]" in page.text and "held_out = 2" in page.text
     assert [tag for tag, _ in page.tags].count("svg") == 2
@@ -488,9 +488,9 @@ def test_citations_are_complete_and_unique():
     for key, source in CITATIONS.items():
         assert source.authors and source.title and source.where and 1700 < source.year < 2100, key
         assert source.link == "" or source.link.startswith("https://"), key
-    assert [source.year for source in citations(["novak_2018", "kak_1988", "novak_2018"])] == [2018, 1988]
+    assert [source.year for source in list_citations(["novak_2018", "kak_1988", "novak_2018"])] == [2018, 1988]
     with pytest.raises(MivolError, match="use kingma_2015"):
-        citations(["kingma_2014"])
+        list_citations(["kingma_2014"])
 
 
 def test_a_citation_ends_with_its_link():

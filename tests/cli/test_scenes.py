@@ -18,8 +18,10 @@ import pytest
 from PIL import Image
 
 from mivol.cli import main
+from mivol.fields.field_files import write_field
 from mivol.fields.procedural import make_procedural
-from mivol.files import read_volume, write_volume
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.files import read_exr, read_volume, write_volume
 from mivol.points import write_gaussians
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -67,6 +69,7 @@ SCRIPTS = {
     "fog": "render.py",
     "knot": "render.py",
     "relit_smoke": "relight.py",
+    "showcase": "render.py",
     "scan_view": "tables.py",
     "still_life": "photographs.py",
     "tank": "fit.py",
@@ -348,6 +351,25 @@ def test_a_knot_of_gaussians_is_lit_and_casts_a_shadow(tmp_path: Path, variant_r
     assert np.median(ratio[26:, 15:18]) < 0.75
     assert np.median(ratio[6:10, 14:18]) > 1.05
     assert 0.95 < np.median(ratio[:5]) < 1.05
+
+
+@pytest.mark.slow
+def test_the_showcase_shows_four_things_and_how_the_smoke_changes_the_image(tmp_path: Path, variant_rgb: str) -> None:
+    """A denser smoke changes the image most within the smoke's own pixels (upper left), and hardly at the Gaussians (right).
+
+    The seed is fixed and absolute means are compared.
+    """
+    write_gaussians(tmp_path / "needles.ply", runpy.run_path(str(SCENES / "knot" / "render.py"))["knot"](300))
+    rng = np.random.default_rng(0)
+    box = np.diag([2.0, 2, 0.8, 1]) + np.array([[0, 0, 0, -0.9], [0, 0, 0, -0.75], [0, 0, 0, -0.2], [0, 0, 0, 0]])
+    field = SphericalGrid.from_dense(rng.uniform(0, 9, (4, 6, 6)), rng.normal(0.5, 0.2, (4, 6, 6, 1, 3)), box)
+    write_field(tmp_path / "field.npz", field)
+    files = ("--field", tmp_path / "field.npz", "--needles", tmp_path / "needles.ply")
+    script("showcase", *files, "--size", 32, "--spp", 4, "--tangent-spp", 16, "-o", tmp_path)
+    assert (tmp_path / "image.png").stat().st_size > 200 and (tmp_path / "tangent.png").stat().st_size > 200
+    channels, _ = read_exr(tmp_path / "tangent.exr")
+    change = np.abs(np.mean([channels[c] for c in "RGB"], axis=0))
+    assert np.isfinite(change).all() and change[2:12, 5:18].mean() > 4 * change[2:12, 55:70].mean()
 
 
 @pytest.mark.slow

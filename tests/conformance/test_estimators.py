@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.cite import citations
+from mivol.cite import list_citations
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
@@ -37,7 +37,7 @@ def test_a_question_has_one_answer_at_most(asked: SegmentNeeds) -> None:
 def test_an_entry_says_what_it_needs_and_promises(name: str) -> None:
     entry = SEGMENT_ESTIMATORS[name]
     assert entry.needs and entry.promises
-    assert len(citations(entry.cites)) == len(entry.cites) >= 1
+    assert len(list_citations(entry.cites)) == len(entry.cites) >= 1
     answered = [asked for asked in QUESTIONS if entry.applies(asked)]
     assert answered and all(asked.scatters == (entry.scatterings > 0) for asked in answered)
 

@@ -505,10 +505,10 @@ REFUSED = {
     "prior beside a direct method": (["solve.name=fdk", "solve.tv=1"], "prior"),
     "subsets beyond the views": (["solve.name=os-sart", "solve.subsets=99"], "99 subsets"),
     "circles of a parallel beam": (['scan={beam="parallel", views=18}', "solve.name=fdk"], "expected a ConeBeam on a circle"),
-    "a grid beyond the memory": (["grid.shape=[20000,20000,20000]"], "of 20000 x 20000 x 20000 unknowns takes"),
-    "unknowns beyond the memory": (["solve.supersampling=1000"], "a reconstruction of 12000 x 12000 x 12000 unknowns takes"),
-    "a panel beyond the memory": (["scan.detector=[100000,100000]"], "a scan of 18 x 100000 x 100000 rays takes"),
-    "views beyond the memory": (["scan.views=2000000000"], "a scan of 2000000000 x 14 x 14 rays takes"),
+    "a grid beyond the memory": (["grid.shape=[20000,20000,20000]"], "of 20000 x 20000 x 20000 unknowns needs"),
+    "unknowns beyond the memory": (["solve.supersampling=1000"], "a reconstruction of 12000 x 12000 x 12000 unknowns needs"),
+    "a panel beyond the memory": (["scan.detector=[100000,100000]"], "a scan of 18 x 100000 x 100000 rays needs"),
+    "views beyond the memory": (["scan.views=2000000000"], "a scan of 2000000000 x 14 x 14 rays needs"),
     "a grid without voxels": (["grid.shape=[12,0,12]"], "grid.shape.1 = 0"),
 }
 

@@ -118,8 +118,8 @@ OPTIMIZE_REFUSED = {
         ["fit.iterations=9", 'event=[{name="upsample", at=[0,3,6,8,9], factor=8}]'],
         "of 12288 x 12288 x 12288 x 1 numbers",
     ),
-    "a truth beyond the memory": (["truth.shape=[20000,20000,20000]"], "a truth of 20000 x 20000 x 20000 voxels takes"),
-    "views beyond the memory": (["views.width=60000", "views.height=60000"], "a film of 60000 x 60000 pixels takes"),
+    "a truth beyond the memory": (["truth.shape=[20000,20000,20000]"], "a truth of 20000 x 20000 x 20000 voxels needs"),
+    "views beyond the memory": (["views.width=60000", "views.height=60000"], "a film of 60000 x 60000 pixels needs"),
 }
 
 

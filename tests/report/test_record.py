@@ -13,7 +13,7 @@ from mivol.report import record
 
 def test_a_machine_is_described_by_proc_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Memory in GiB to a tenth, and the model of the processor. Without the files: no memory, and the architecture."""
-    monkeypatch.setattr(record, "cores", lambda: 3)
+    monkeypatch.setattr(record, "count_cores", lambda: 3)
     monkeypatch.setattr(record, "Path", lambda name: tmp_path / Path(name).name)
     assert record.describe_machine() == record.Machine(3, None, platform.machine())
     (tmp_path / "meminfo").write_text("MemTotal:       24576000 kB\nMemFree: 1 kB\n")

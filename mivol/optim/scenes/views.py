@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from mivol.display import with_short_repr
 from mivol.errors import MivolError
-from mivol.shown import briefly
 
 PRIMAL, ADJOINT, HELD_OUT, FINAL = range(4)
 """Purposes: an image of a fit, its derivative, an evaluation, an image that is kept."""
@@ -26,7 +26,7 @@ def derive_seed(*key: int) -> int:
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class View:
     """A sensor and what it saw.
@@ -42,7 +42,7 @@ class View:
     reference: mi.TensorXf
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class RenderBatch:
     """One render.

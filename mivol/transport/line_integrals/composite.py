@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import largest_of, one_minus_exp
+from mivol.numerics import maximum, one_minus_exp
 from mivol.transport.line_integrals.body_sweep import BodySweep
 from mivol.transport.line_integrals.integrand import LineIntegral, check_cells_shared
 from mivol.transport.media.compositing import BodyIntegral, transmittance_of, zeros
@@ -121,7 +121,7 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
             _add_rows(t.N, attenuated),
             [_add_rows(f, _mask_rows(middle < b.middle, own.tau)) for f, b in zip(t.fronts, boxes, strict=True)],
             [_add_rows(g, _mask_rows(middle > b.middle, attenuated)) for g, b in zip(t.behinds, boxes, strict=True)],
-            dr.maximum(t.max_opaque, largest_of(means)),
+            dr.maximum(t.max_opaque, maximum(means)),
         )
 
     traced = _TracedSums(

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import lesser
+from mivol.numerics import fast_min
 from mivol.transport.traversal.interpolation import GAUSS_POINT
 
 __all__ = [
@@ -308,7 +308,7 @@ def walk_columns(grid: ColumnGrid, line: Line, hooks: Hooks, state: Any) -> Any:
     start, going = mi.Float64(0), length > 0
 
     while dr.hint(going, label="pieces of a ray"):
-        end = dr.maximum(lesser(lesser(ends, start + piece), length), start)
+        end = dr.maximum(fast_min(fast_min(ends, start + piece), length), start)
         left = mi.Float(end - start)
         frac_a, base_a = _place_between(dr.fma(start, v_a, q_a), up_a, n[a] - 1, stride[a])
         frac_b, base_b = _place_between(dr.fma(start, v_b, q_b), up_b, n[b] - 1, stride[b])
@@ -320,7 +320,7 @@ def walk_columns(grid: ColumnGrid, line: Line, hooks: Hooks, state: Any) -> Any:
 
         while dr.hint(on, label="walk between columns"):
             reach_a, reach_b = dr.fma(-frac_a, pace_a, pace_a), dr.fma(-frac_b, pace_b, pace_b)
-            dt = lesser(lesser(reach_a, reach_b), left)
+            dt = fast_min(fast_min(reach_a, reach_b), left)
             step_a, step_b, step_c = speed_a * dt, speed_b * dt, speed_c * dt
             cell = ColumnCell((frac_a, frac_b, frac_c), (step_a, step_b, step_c), dt)
             state, columns = visit(state, columns, cell)

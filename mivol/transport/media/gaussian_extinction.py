@@ -12,7 +12,7 @@ import mitsuba as mi
 from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.gaussian_line import ROW_SIZE, SCALE_COLUMN, LineSlopes, WhitenedLine, read_row, row_tangent
 from mivol.fields.harmonics import blocks_per_gaussian
-from mivol.numerics import greater, lesser
+from mivol.numerics import fast_max, fast_min
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.traversal.grid_walk import Cell, walk_cells
 from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
@@ -155,7 +155,7 @@ class GaussianExtinction:
         def visit(state: Any, cell: Cell, on: mi.Bool) -> Any:
             def meet(state: Any, line: WhitenedLine, index: mi.UInt32) -> Any:
                 start, end = line.chord
-                ends = greater(start, 0), lesser(end, length)
+                ends = fast_max(start, 0), fast_min(end, length)
                 # Cells follow each other without a gap, so the place of entry lies in one of them.
                 here = line.hits & (ends[1] > ends[0]) & (ends[0] >= cell.s) & (ends[0] < cell.s + cell.dt)
                 # Most are not met: a branch costs two thirds of what adding 0 for them did.

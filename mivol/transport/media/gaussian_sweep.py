@@ -34,7 +34,7 @@ import mitsuba as mi
 
 from mivol.fields.gaussian_line import ROW_SIZE, WhitenedLine, intersect_gaussian, read_row
 from mivol.fields.harmonics import eval_colour, eval_colour_slopes, read_harmonics, sum_harmonics
-from mivol.numerics import greater, lesser, one_minus_exp
+from mivol.numerics import fast_max, fast_min, one_minus_exp
 from mivol.transport.media.channels import LUMINANCE
 from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, composite_over, pass_cell, zeros
 from mivol.transport.media.extinction import RayInterval
@@ -199,13 +199,13 @@ def visit_far_to_near(part: GaussianExtinction, interval: RayInterval, state: An
 
     def ends_of(line: WhitenedLine) -> tuple[mi.Float, mi.Float]:
         near, far = line.chord
-        return greater(near, 0), lesser(far, length)
+        return fast_max(near, 0), fast_min(far, length)
 
     def visit(state: Any, cell: Cell, on: mi.Bool) -> Any:
         def fill(more: mi.Bool, last: tuple, state: Any) -> tuple:
             def meet(slots: list, line: WhitenedLine, index: mi.UInt32) -> list:
                 ends = ends_of(line)
-                place = lesser(greater(segment.length - line.peak, 0), segment.length * LAST_PLACE)
+                place = fast_min(fast_max(segment.length - line.peak, 0), segment.length * LAST_PLACE)
                 here = line.hits & (ends[1] > ends[0]) & (place >= cell.s) & (place < cell.s + cell.dt)
                 here &= _is_farther(last, (line.peak, index))
                 return dr.if_stmt((slots,), here, lambda slots: _insert(slots, (line.peak, index)), lambda slots: slots)

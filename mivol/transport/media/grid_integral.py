@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.numerics import least_of
+from mivol.numerics import minimum
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, walk_cells
 from mivol.transport.traversal.interpolation import gauss_points, interpolate, node_weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
@@ -99,7 +99,7 @@ def integrate_segment(
 
     zero = [mi.Float(0) for _ in range(lattice.channels)]
 
-    until = None if enough is None else lambda tau: least_of(tau) > enough
+    until = None if enough is None else lambda tau: minimum(tau) > enough
     return walk_cells(lattice, segment, visit, zero, [NodeArray(values, lattice.channels)], active, until)
 
 

@@ -38,7 +38,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import exp_moments, lesser, one_minus_exp, phi1, reciprocal
+from mivol.numerics import exp_moments, fast_min, one_minus_exp, phi1, reciprocal
 from mivol.transport.traversal.interpolation import GAUSS_POINT
 
 __all__ = ["DensityWeights", "OpacityShares", "share_opacity", "weigh_emission_density"]
@@ -104,7 +104,7 @@ def share_opacity(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> OpacitySh
     some = both > 0
     inverse = reciprocal(dr.select(some, both, 1))
     # A GPU's reciprocals err by an ulp or two: a weight 1 - f must not become negative.
-    f = dr.select(some, lesser(first * inverse, 1), 0.5)
+    f = dr.select(some, fast_min(first * inverse, 1), 0.5)
     scale = phi1(tau) * dr.select(some, total * inverse, 1)
     growth = half * (1 / math.sqrt(3)) * (1 + x + (2 / 3) * dr.square(r) * (3 + x))  # dq / d sigma, for either point
     lean = (scale * dr.fma(sigma1, growth, q) * (1 - f), -scale * f * (1 - sigma2 * growth / q))

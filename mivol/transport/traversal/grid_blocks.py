@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.numerics import largest_of
+from mivol.numerics import maximum
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = [
@@ -230,7 +230,7 @@ def find_block_ranges(values: mi.TensorXf, shift: int | None = None) -> BlockRan
         ranges.append((high - low) * (1 + 1e-6))
     n = res[0] * res[1] * res[2]
     table = dr.zeros(mi.Float, n * (c + 1))
-    for k, row in enumerate([*rows, largest_of(ranges)]):
+    for k, row in enumerate([*rows, maximum(ranges)]):
         dr.scatter(table, row, dr.arange(mi.UInt32, n) * (c + 1) + k)
     dr.eval(table)
     return BlockRanges(table, res, c, shift)

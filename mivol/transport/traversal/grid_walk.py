@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import greater, lesser
+from mivol.numerics import fast_max, fast_min
 from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks
 from mivol.transport.traversal.lattice import Lattice, Mask3, Segment
@@ -132,9 +132,9 @@ def walk_cells(
 
         # -- Distance to the planes ahead, and visit ----------------------------------------------------------------------
         reach = (mi.Vector3f(span) + (1 - frac)) * pace
-        plane = lesser(lesser(reach.x, reach.y), reach.z)
+        plane = fast_min(fast_min(reach.x, reach.y), reach.z)
         left = (length - s) - s_rest
-        dt = lesser(plane, left)
+        dt = fast_min(plane, left)
         visited = Cell(corners, cell, ahead, frac, speed * dt, s, dt)
         if halts:
             state, dt = visit(state, visited, active & full)
@@ -170,7 +170,7 @@ def walk_cells(
         # in every step, and would carry a ray 1e-5 of a cell off its course in 256. speed * s and the number of planes passed
         # are nearly equal; the fused multiply-add subtracts them before it rounds, so that only the remainder is rounded.
         course = dr.fma(speed, s_rest, dr.fma(speed_rest, s, entry))
-        frac = lesser(greater(dr.fma(speed, s, -passed) + course, 0), 1)
+        frac = fast_min(fast_max(dr.fma(speed, s, -passed) + course, 0), 1)
     return state
 
 

@@ -21,7 +21,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import greater, lesser
+from mivol.numerics import fast_max, fast_min
 from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.interpolation import GAUSS_POINT
 from mivol.transport.traversal.lattice import Segment, clip_to_grid, segment_between
@@ -115,7 +115,7 @@ def walk_occupied_cells(
             searching &= free.x > 0
             ends = n + free
             reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
-            exit = lesser(lesser(reach.x, reach.y), reach.z)
+            exit = fast_min(fast_min(reach.x, reach.y), reach.z)
             arrival = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
             arrival = dr.select(reach <= exit, ends, arrival)
             t = dr.select(searching, exit, t)
@@ -127,8 +127,8 @@ def walk_occupied_cells(
 
         # -- Visit it, and leave it ----------------------------------------------------------------------------------------
         reach = dr.fma(mi.Vector3f(n + 1) - entry, pace, never)
-        exit = lesser(lesser(reach.x, reach.y), reach.z)
-        dt = greater(lesser(exit, length) - t, 0)
+        exit = fast_min(fast_min(reach.x, reach.y), reach.z)
+        dt = fast_max(fast_min(exit, length) - t, 0)
         offset = entry - mi.Vector3f(n)
         along = tuple(dr.clip(dr.fma(speed, dr.fma(dt, g, t), offset), 0, 1) for g in (GAUSS_POINT, 1 - GAUSS_POINT))
         points = tuple(dr.select(ahead, p, 1 - p) for p in along)

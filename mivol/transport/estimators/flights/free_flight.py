@@ -25,7 +25,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import least_of
+from mivol.numerics import minimum
 from mivol.transport.estimators.flights.flight_derivatives import Baseline, FlightSegment
 from mivol.transport.estimators.flights.gaussian_light import GaussianLight
 from mivol.transport.estimators.flights.regular_tracking import regular_tracking, sample_gaussian_flight
@@ -141,7 +141,7 @@ class FreeFlight:
             return mi.Spectrum(1)
         tau = segment_optical_depth(self.media, passed, active)
         # Only ratios of transmittances count, and the largest of them is made 1.
-        least = least_of(tau)
+        least = minimum(tau)
         value = to_spectrum([dr.exp(least - row) for row in tau])
         hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
         for body, here in hits:

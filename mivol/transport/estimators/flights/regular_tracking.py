@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.fields.gaussian_line import WhitenedLine
-from mivol.numerics import greater, lesser
+from mivol.numerics import fast_max, fast_min
 from mivol.transport.media.channels import to_scene_channels
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
@@ -140,7 +140,7 @@ def sample_gaussian_flight(
         hits = goal < before + line.share(*ends)
         own = line.peak + math.sqrt(2) * dr.erfinv(dr.select(hits, 2 * goal - 1, 0)) / line.speed
         # Between its ends: in the tails a share of 1e-7 is a long way.
-        own = lesser(greater(own, ends[0]), ends[1])
+        own = fast_min(fast_max(own, ends[0]), ends[1])
         return dr.select(hits & (own < nearest), own, nearest), reached, rng
 
     def leave(state: tuple, cell: Cell) -> tuple:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import largest_of
+from mivol.numerics import maximum
 from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction, clip_interval
 from mivol.transport.traversal.grid_walk import Cell, walk_cells
@@ -123,14 +123,14 @@ def residual_ratio_tracking(
         fresh = -dr.log(u[3])
         left = dr.select(meets, fresh, dr.maximum(state.ahead - dr.select(on, density * dt, 0), 0))
         # -- Roulette ---------------------------------------------------------------------------------------------------
-        seen = largest_of([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
+        seen = maximum([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
         lives = u[4] * ROULETTE_BELOW < seen
         lift = dr.select(lives, dr.maximum(1, ROULETTE_BELOW / seen), 0)
         weight = [dr.select(on, w * lift, w) for w in weight]
         return _TrackedRay(tau, weight, left, rng), dt
 
     def is_dark(state: _TrackedRay) -> mi.Bool:
-        return largest_of(state.weight) == 0
+        return maximum(state.weight) == 0
 
     width = dr.width(segment.t0)
     rng, u = draw_pcg32(rng, 1)
@@ -182,7 +182,7 @@ def ratio_tracking(
         values = part.eval_at(scale, ray, t, on)
         T = [dr.select(on, a * (1 - value / rate), a) for a, value in zip(T, values, strict=True)]
         # -- Roulette ---------------------------------------------------------------------------------------------------
-        seen = largest_of(T)
+        seen = maximum(T)
         lift = dr.select(chance * ROULETTE_BELOW < seen, dr.maximum(1, ROULETTE_BELOW / seen), 0)
         T = [dr.select(on, a * lift, a) for a in T]
         return t, T, rng, on & (lift > 0)

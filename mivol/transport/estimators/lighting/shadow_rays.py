@@ -12,7 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import least_of
+from mivol.numerics import minimum
 from mivol.transport.estimators.flights.tracking import ratio_tracking, residual_ratio_tracking
 from mivol.transport.media.channels import to_scene_channels, to_spectrum
 from mivol.transport.media.grid_extinction import clip_interval
@@ -65,7 +65,7 @@ def find_transmittance(
     if rng is None:
         return end, tau, transmittance(tau) * end.null_transmission
     # Every channel is divided by the probability of the clearest one, so that weights stay below 1.
-    clearest = least_of(tau)
+    clearest = minimum(tau)
     thicker = [t - dr.maximum(clearest - ROULETTE_TAU, 0) for t in tau]
     return end, tau, dr.select(clearest <= enough, transmittance(thicker), 0) * end.null_transmission
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import least_of, one_minus_exp
+from mivol.numerics import minimum, one_minus_exp
 from mivol.transport.estimators.lighting.emitters import ChosenEmitter
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU
 from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
@@ -354,7 +354,7 @@ class _Filling:
             reservoir = add_constant(reservoir, t0, dr.select(hit, segment.start, t1))
         # Light from beyond the optical depth DARK is negligible in an image. Derivatives need the whole optical depth, since
         # they are swept from the far end.
-        until = None if self.proposal.probe_depth else lambda p: least_of(p.tau) > NEGLIGIBLE_TAU
+        until = None if self.proposal.probe_depth else lambda p: minimum(p.tau) > NEGLIGIBLE_TAU
         reservoir = walk_cells(lattice, segment, visit, reservoir, extinction.reads, on, until)
         if extinction.has_constants:
             reservoir = add_constant(reservoir, dr.select(hit, segment.end, t1), t1)

@@ -29,7 +29,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import largest_of, least_of, phi1
+from mivol.numerics import maximum, minimum, phi1
 from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, make_ball_sampler
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
 from mivol.transport.estimators.scores import IMAGE, TrackedTerm
@@ -235,7 +235,7 @@ def _add_span(state: _LightSum, span: _Span, least: mi.Float) -> _LightSum:
     """Cut a span into pieces, ``least`` of them or more, and add them in their order."""
     dt, sigma, equiangular = span.length, span.sigma, span.equiangular
     near, far = sigma(mi.Float(GAUSS_POINT)), sigma(mi.Float(1 - GAUSS_POINT))
-    thick = largest_of([0.5 * dt * (a + b) for a, b in zip(near, far, strict=True)])
+    thick = maximum([0.5 * dt * (a + b) for a, b in zip(near, far, strict=True)])
     count = dr.maximum(least, dr.ceil(thick / MAX_PIECE_TAU))
     if equiangular is not None:
         count = dr.maximum(
@@ -243,7 +243,7 @@ def _add_span(state: _LightSum, span: _Span, least: mi.Float) -> _LightSum:
         )
     is_deep = span.on & (thick > MAX_PIECES * MAX_PIECE_TAU)
     edges = _sort_rows(_dark_fractions(state.tau, dt, sigma, is_deep))
-    lit = dr.select(least_of(state.tau) < NEGLIGIBLE_TAU, DEEP_PIECES * len(edges), 1)
+    lit = dr.select(minimum(state.tau) < NEGLIGIBLE_TAU, DEEP_PIECES * len(edges), 1)
     count = dr.select(is_deep, mi.UInt32(lit), mi.UInt32(dr.clip(count, 1, MAX_PIECES)))
     return _add_pieces(state, span, is_deep, edges, count)
 

@@ -1,6 +1,6 @@
-"""How objects show themselves: in a line without the numbers of their arrays, and in notebooks as a small picture.
+"""Short representations of objects: one line without array contents, and small images for notebooks.
 
-Conventions. HTML is self-contained and has no script; text in it is escaped.
+Conventions. HTML is self-contained, has no script, and escapes its text.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-__all__ = ["brief", "briefly", "curve_html", "text_html"]
+__all__ = ["summarize", "with_short_repr", "curve_html", "text_html"]
 
 T = TypeVar("T")
 
 FEW = 4
-"""So many entries of a sequence are shown."""
+"""Largest number of sequence entries in a summary."""
 
 WIDTH, HEIGHT = 320, 100
-"""Of a curve [pixel]."""
+"""Size of a curve [pixel]."""
 
 
-def brief(value: object) -> str:
-    """A value in a few words: arrays by type and shape, long sequences by their length, other objects by their type."""
+def summarize(value: object) -> str:
+    """Describe a value in a few words: arrays by type and shape, long sequences by length, other objects by type."""
     shape = getattr(value, "shape", None)
     if isinstance(shape, tuple) and shape:
         kind = getattr(value, "dtype", None) or type(value).__name__
@@ -38,34 +38,34 @@ def brief(value: object) -> str:
     if isinstance(value, Sequence):
         if len(value) > FEW:
             return f"[{len(value)} x {type(value[0]).__name__}]"
-        return f"[{', '.join(map(brief, value))}]"
+        return f"[{', '.join(map(summarize, value))}]"
     return type(value).__name__
 
 
-def briefly(cls: type[T]) -> type[T]:
-    """A dataclass whose ``repr`` is one line: its public fields by :func:`brief`."""
+def with_short_repr(cls: type[T]) -> type[T]:
+    """Give a dataclass a ``repr`` of one line: its public fields by :func:`summarize`."""
 
     def show(self: object) -> str:
-        names = [one.name for one in dataclasses.fields(self) if one.repr and not one.name.startswith("_")]
-        return f"{type(self).__name__}({', '.join(f'{name}={brief(getattr(self, name))}' for name in names)})"
+        names = [field.name for field in dataclasses.fields(self) if field.repr and not field.name.startswith("_")]
+        return f"{type(self).__name__}({', '.join(f'{name}={summarize(getattr(self, name))}' for name in names)})"
 
     cls.__repr__ = show
     return cls
 
 
 def text_html(text: str) -> str:
-    """Lines of text as they are."""
+    """Show lines of text unchanged."""
     return f"<pre>{html.escape(text)}</pre>"
 
 
-def curve_html(values: Sequence[float], says: str) -> str:
-    """A curve against its number, on a logarithmic axis where all values are above 0, with a line of text.
+def curve_html(values: Sequence[float], caption: str) -> str:
+    """Draw values against their index above a line of text; the axis is logarithmic if all values are positive.
 
-    Values that are not finite are left out.
+    Non-finite values are left out.
     """
     finite = [(number, float(value)) for number, value in enumerate(values) if math.isfinite(value)]
     if len(finite) < 2:
-        return text_html(says)
+        return text_html(caption)
     is_log = all(value > 0 for _, value in finite)
     heights = [math.log(value) if is_log else value for _, value in finite]
     low, high, last = min(heights), max(heights), finite[-1][0] or 1
@@ -77,4 +77,4 @@ def curve_html(values: Sequence[float], says: str) -> str:
         f'<svg width="{WIDTH}" height="{HEIGHT}" viewBox="0 -2 {WIDTH} {HEIGHT + 4}" role="img">'
         f'<polyline points="{points}" fill="none" stroke="currentColor" stroke-width="1.5"/></svg>'
     )
-    return f"{picture}{text_html(says)}"
+    return f"{picture}{text_html(caption)}"

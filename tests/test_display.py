@@ -17,16 +17,16 @@ from PIL import Image
 from tiny_experiment import write_experiment
 
 import mivol
+from mivol.display import curve_html, summarize, with_short_repr
 from mivol.experiments.script import Problem, optimize
 from mivol.files import VolumeData
 from mivol.files.notebook import EDGE, GAP, pairs_html
-from mivol.shown import brief, briefly, curve_html
 
 SHORT = 400
 """Letters of a line that a person reads."""
 
 
-@briefly
+@with_short_repr
 @dataclass(frozen=True)
 class Thing:
     values: np.ndarray
@@ -40,8 +40,8 @@ class Thing:
 def test_values_in_a_few_words() -> None:
     thing = Thing(np.zeros((3, 4), np.float32), Path("a/b.vol"), ("x",) * 9, {str(n): n for n in range(6)})
     assert repr(thing) == "Thing(values=float32 (3, 4), path='b.vol', names=[9 x str], about={6 of 0, 1, 2, 3, ...})"
-    assert brief((1, 2.5, None, "a")) == "[1, 2.5, None, 'a']"
-    assert brief(SimpleNamespace()) == "SimpleNamespace"
+    assert summarize((1, 2.5, None, "a")) == "[1, 2.5, None, 'a']"
+    assert summarize(SimpleNamespace()) == "SimpleNamespace"
 
 
 def objects(folder: Path) -> dict[str, object]:
