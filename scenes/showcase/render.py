@@ -106,7 +106,7 @@ def turbulence(shape: tuple[int, int, int], rng: np.random.Generator, largest: f
     square = sum(k**2 for k in waves)
     spectrum = np.fft.rfftn(rng.normal(size=shape)) * (square + largest**-2) ** (-13 / 12)
     spectrum[0, 0, 0] = 0
-    field = np.fft.irfftn(spectrum, shape)
+    field = np.fft.irfftn(spectrum, shape, axes=(0, 1, 2))
     return field / field.std()
 
 

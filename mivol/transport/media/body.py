@@ -60,6 +60,7 @@ class Body:
         self.flight_parts = flight_parts(view.parts)
         self.gradients: list[Any] = []
         self.tangents: list[Any] = []
+        self.has_tangent: list[bool] = []
         self.microflakes_gradient: mi.Float | None = None
         self.microflakes_tangent: list[mi.Float] | None = None
 
@@ -134,11 +135,11 @@ class Body:
 
     def jvp_optical_depth(self, interval: RayInterval, channels: int) -> list[mi.Float]:
         """Tangent of the optical depth of the exact parts, from the tangents of :meth:`SceneMedia.start_tangent`."""
-        pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.exact_line]
         area = self.area(interval.ray.d)
         total = [mi.Float(0) for _ in range(channels)]
-        for part, change in pairs:
-            total = _add(total, to_scene_channels(part.jvp(change, interval), channels))
+        for part, change in self._parts_with_tangents():
+            if part.exact_line:
+                total = _add(total, to_scene_channels(part.jvp(change, interval), channels))
         rows = [area * row for row in total]
         if self.microflakes_tangent is None:
             return rows
@@ -157,8 +158,15 @@ class Body:
 
     def jvp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Tangent of the coefficient [1/length] of a part at a point of a ray."""
-        change = next(v for p, v in zip(self.view.parts, self.tangents, strict=True) if p is part)
-        return to_scene_channels(part.jvp_at(change, ray, t, active), channels)
+        for other, change in self._parts_with_tangents():
+            if other is part:
+                return to_scene_channels(part.jvp_at(change, ray, t, active), channels)
+        return [mi.Float(0) for _ in range(channels)]
+
+    def _parts_with_tangents(self) -> list[tuple[Extinction, Any]]:
+        """The parts with a tangent, and their tangents. Other parts are not walked: their derivative is 0."""
+        rows = zip(self.view.parts, self.tangents, self.has_tangent, strict=True)
+        return [(part, change) for part, change, has_tangent in rows if has_tangent]
 
     def vjp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d coefficient of each channel) at a point: the transpose of :meth:`jvp_part_at`."""
@@ -178,7 +186,7 @@ class Body:
     def jvp_extinction_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """Tangent of :meth:`extinction_at`, from the tangents of :meth:`SceneMedia.start_tangent`."""
         total = [mi.Float(0) for _ in range(channels)]
-        for part, change in zip(self.view.parts, self.tangents, strict=True):
+        for part, change in self._parts_with_tangents():
             if part.name.startswith(name):
                 total = _add(total, to_scene_channels(part.jvp_at(change, ray, t, active), channels))
         rows = [self.area(ray.d) * row for row in total]

@@ -146,6 +146,7 @@ class SceneMedia:
             if asked:
                 # The tangents of the parameters are kept: what else was made of them, such as an albedo, is followed later.
                 dr.forward_to(*asked, flags=dr.ADFlag.ClearEdges)
+            body.has_tangent = [dr.grad_enabled(p) for p in products]
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
             if is_followed(body.view.microflakes):
                 dr.forward_to(body.view.microflakes, flags=dr.ADFlag.ClearEdges)
