@@ -67,6 +67,27 @@ def forward(scene: mi.Scene, v: dict[str, np.ndarray], spp: int, seed: int, inte
     return found
 
 
+def test_gaussians_without_a_tangent_stand_beside_a_medium_with_one() -> None:
+    """The tangent by the fog's scale is the same whether the Gaussians have no tangent or a tangent of 0, with one seed.
+
+    With no tangent the Gaussians are not walked; with a tangent of 0 each adds an exact 0.
+    """
+    fog = {"type": "mivol_medium", "sigma_t": {"type": "constvolume", "value": 0.8}, "albedo": 0.7, "scale": 1.0}
+    place = mi.ScalarTransform4f().translate([0, 0, 2.4]).scale([1.8, 1.8, 0.5])
+    slab = {"slab": {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": fog}}
+    scene = close_up(parts(0.8, sky=scenes.sky(0.3)) | slab, res=6)
+    integrator, tangents = mi.load_dict(mivol(max_depth=4)), []
+    for keys in (["slab.interior_medium.scale"], ["slab.interior_medium.scale", PARAMETERS["opacity_logits"]]):
+        variables = {key: watched(scene, key)[1] for key in keys}
+        dr.set_grad(variables[keys[0]], 1.0)
+        tangents.append(np.array(integrator.render_forward(scene, mi.traverse(scene), seed=3, spp=8)))
+        for key, variable in variables.items():
+            release(scene, key, variable)
+    assert np.abs(tangents[0]).max() > 0
+    # Float32 sums of the same terms: 8 samples and at most 4 segments, each rounded to 6e-8 of the largest term.
+    np.testing.assert_allclose(*tangents, rtol=0, atol=32 * 6e-8 * 30 * np.abs(tangents[0]).max())
+
+
 @pytest.mark.slow
 def test_forward_is_the_transpose_of_reverse(whole_paths: None) -> None:
     """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""

@@ -151,7 +151,8 @@ class SceneMedia:
             if is_followed(body.view.microflakes):
                 dr.forward_to(body.view.microflakes, flags=dr.ADFlag.ClearEdges)
                 body.microflakes_tangent = dr.detach(dr.grad(body.view.microflakes))
-            dr.eval(body.tangents, body.microflakes_tangent)
+            # A tangent of 0 would stay a literal, and the loop over the Gaussians of a cell would take its own sum for a constant.
+            dr.make_opaque(body.tangents, body.microflakes_tangent)
 
 
 @dr.syntax
