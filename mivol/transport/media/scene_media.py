@@ -151,7 +151,7 @@ class SceneMedia:
             if is_followed(body.view.microflakes):
                 dr.forward_to(body.view.microflakes, flags=dr.ADFlag.ClearEdges)
                 body.microflakes_tangent = dr.detach(dr.grad(body.view.microflakes))
-            # A tangent of 0 would stay a literal, and the loop over the Gaussians of a cell would take its own sum for a constant.
+            # A literal 0 would make the loop over the Gaussians of a cell take its sum for a constant.
             dr.make_opaque(body.tangents, body.microflakes_tangent)
 
 
