@@ -1,11 +1,22 @@
-r"""The Henyey-Greenstein phase function, with its mean cosine g as the only parameter.
+r"""Phase functions in closed form: Henyey-Greenstein, Rayleigh, and Draine's, which includes both and Cornette-Shanks.
 
-.. math:: p(\theta) = \frac{1}{4\pi} \frac{1 - g^2}{D^{3/2}}, \qquad D = 1 + g^2 - 2 g \cos\theta
+.. math:: p_{HG}(\theta) = \frac{1}{4\pi} \frac{1 - g^2}{D^{3/2}}, \quad D = 1 + g^2 - 2 g \cos\theta, \qquad
+          p_{Rayleigh}(\theta) = \frac{3}{16\pi} (1 + \cos^2\theta), \qquad
+          p_{Draine}(\theta) = p_{HG}(\theta; g)\,\frac{1 + \alpha \cos^2\theta}{1 + \alpha (1 + 2 g^2)/3}
 
-Conventions. As in :mod:`mivol.phase`; -1 < g < 1. With a = \|g\| and m = 1 - cos (1 + cos for g < 0) the same D is
-(1 - a)^2 + 2 a m, a sum of positive terms.
+Conventions. As in :mod:`mivol.phase`; -1 < g < 1. With a = |g| and m = 1 - cos (1 + cos for g < 0), D is
+(1 - a)^2 + 2 a m, a sum of positive terms. Rayleigh's phase function describes unpolarised light at particles much smaller
+than the wavelength. In Draine's phase function alpha = 0 is Henyey-Greenstein, alpha = 1 Cornette-Shanks, and alpha = 1 with g
+= 0 Rayleigh; g is the mean cosine for alpha = 0 only (:func:`mean_cosine`).
 
-Source: Henyey & Greenstein 1941 (Astrophysical Journal 93); the inversion is that formula's, with 1 - cos solved for.
+Inversions. Henyey-Greenstein: the usual formula, solved for 1 - cos. Rayleigh: c^3 + 3 c = 4 (2 u - 1) by
+c = 2 sinh(asinh(2 (2 u - 1)) / 3). Draine: the closed-form root of a quartic equation (Jendersie & d'Eon) loses its digits in
+float32. Newton steps invert the cumulative distribution instead, in the variable of the Henyey-Greenstein inversion, in which
+the distribution is smooth for every g.
+
+Source: Henyey & Greenstein 1941 (Astrophysical Journal 93); Rayleigh 1871; Chandrasekhar, Radiative Transfer (1960), chapter 1;
+Draine 2003 (Scattering by Interstellar Dust Grains. I, Astrophysical Journal 598); Cornette & Shanks 1992 (Applied Optics 31);
+droplets by Jendersie & d'Eon 2023 (An Approximate Mie Scattering Function for Fog and Cloud Rendering).
 """
 
 from __future__ import annotations
@@ -30,19 +41,19 @@ __all__ = [
 ]
 
 
-def eval_hg(turn: ScatteringAngle, g: mi.Float) -> mi.Float:
+def eval_hg(angle: ScatteringAngle, g: mi.Float) -> mi.Float:
     r"""Density [1/sr].
 
     .. math:: \partial p/\partial g = \frac{1}{4\pi}\big[-2 g D^{-3/2} - 3 (1 - g^2)(g - \cos\theta) D^{-5/2}\big]
 
     which is 3 cos / (4 pi) at g = 0.
 
-    Error: about 6e-7 of it, for every g in (-1, 1) and every turn.
+    Error: about 6e-7, relative, for every g in (-1, 1) and every angle.
     """
     back = g < 0
     # dr.abs is not used, since its derivative at 0 is 0 and that of p is not.
     a = dr.select(back, -g, g)
-    m = dr.select(back, turn.above_minus_one, turn.below_one)
+    m = dr.select(back, angle.above_minus_one, angle.below_one)
     # As 1 + g^2 - 2 g cos, D has a rounding error of 6e-8 beside a smallest value of (1 - a)^2: several times D at a = 0.9999.
     inv = dr.rcp(dr.fma(2 * a, m, dr.square(1 - a)))
     # inv sqrt(inv) is more accurate than the cube of Dr.Jit's rsqrt, which is approximate.
@@ -50,12 +61,12 @@ def eval_hg(turn: ScatteringAngle, g: mi.Float) -> mi.Float:
 
 
 def sample_hg(u: mi.Float, g: mi.Float) -> ScatteringAngle:
-    r"""Draw a turn with density :func:`eval_hg`.
+    r"""Draw a scattering angle with density :func:`eval_hg`.
 
     .. math:: 1 - \cos = \frac{2 (1 - g)^2 (1 - u)(1 + g u)}{(1 - g + 2 g u)^2}, \qquad
               1 + \cos = \frac{2 (1 + g)^2 u (1 - g + g u)}{(1 - g + 2 g u)^2} \qquad (g \ge 0)
 
-    and the mirror image for g < 0: no branch at small g, no difference of nearly equal numbers at any.
+    and the mirror image for g < 0: no branch at small g, no difference of nearly equal numbers.
 
     Error: 4e-7 of both, for every g and u.
     """
@@ -69,13 +80,13 @@ def sample_hg(u: mi.Float, g: mi.Float) -> ScatteringAngle:
     return ScatteringAngle(below_one, above_minus_one).mirrored(back)
 
 
-def eval_rayleigh(turn: ScatteringAngle) -> mi.Float:
+def eval_rayleigh(angle: ScatteringAngle) -> mi.Float:
     """Density [1/sr]."""
-    return (0.75 * INV_FOUR_PI) * dr.fma(turn.cos, turn.cos, 1)
+    return (0.75 * INV_FOUR_PI) * dr.fma(angle.cos, angle.cos, 1)
 
 
 def sample_rayleigh(u: mi.Float) -> ScatteringAngle:
-    """Draw a turn with density :func:`eval_rayleigh`; u = 0, 1/2 and 1 give cos = -1, 0 and 1.
+    """Draw a scattering angle with density :func:`eval_rayleigh`; u = 0, 1/2 and 1 give cos = -1, 0 and 1.
 
     Error: 2e-7 of cos.
     """
@@ -85,26 +96,28 @@ def sample_rayleigh(u: mi.Float) -> ScatteringAngle:
 
 
 NEWTON_STEPS = 16
-"""Each step divides the error of u by 3.4 at least (where 1 + alpha cos^2 nearly vanishes); elsewhere it squares the error."""
+"""Each step divides the error of u by at least 3.4 (where 1 + alpha cos^2 nearly vanishes); otherwise a step squares the
+error.
+"""
 
 
 def mean_cosine(g: mi.Float | float, alpha: mi.Float | float) -> mi.Float | float:
-    """g (1 + alpha (3 + 2 g^2) / 5) / (1 + alpha (1 + 2 g^2) / 3), Draine 2003."""
+    """The mean cosine g (1 + alpha (3 + 2 g^2) / 5) / (1 + alpha (1 + 2 g^2) / 3) of :func:`eval_draine`, Draine 2003."""
     return g * (1 + alpha * (3 + 2 * g * g) / 5) / (1 + alpha * (1 + 2 * g * g) / 3)
 
 
-def eval_draine(turn: ScatteringAngle, g: mi.Float, alpha: mi.Float) -> mi.Float:
+def eval_draine(angle: ScatteringAngle, g: mi.Float, alpha: mi.Float) -> mi.Float:
     """Density [1/sr].
 
-    Error: about 8e-7 of it.
+    Error: about 8e-7, relative.
     """
-    c = turn.cos
-    return eval_hg(turn, g) * dr.fma(alpha, c * c, 1) * dr.rcp(dr.fma(alpha, (1 + 2 * g * g) * (1 / 3), 1))
+    c = angle.cos
+    return eval_hg(angle, g) * dr.fma(alpha, c * c, 1) * dr.rcp(dr.fma(alpha, (1 + 2 * g * g) * (1 / 3), 1))
 
 
 @dr.syntax
 def sample_draine(u: mi.Float, g: mi.Float, alpha: mi.Float) -> ScatteringAngle:
-    r"""Draw a turn with density :func:`eval_draine`.
+    r"""Draw a scattering angle with density :func:`eval_draine`.
 
     With cos = c(v) the Henyey-Greenstein inversion at v, and y = 2 (1 + g) v / (1 - g + 2 g v) (g >= 0),
 
@@ -142,13 +155,13 @@ def droplets(diameter: float) -> dict[str, float]:
     """The parameters of a mixture of Henyey-Greenstein and Draine that approximates Mie scattering by water droplets.
 
     Args:
-        diameter: of the droplets [micrometre], 5 to 50.
+        diameter: diameter of the droplets [micrometre], 5 to 50.
 
     Returns:
         ``g_hg``, ``g_draine``, ``alpha`` and ``weight_draine``, the fraction of the second component; for white light.
 
     Raises:
-        MivolError: a diameter that the fit does not cover.
+        MivolError: a diameter outside the range of the fit.
     """
     if not 5 <= diameter <= 50:
         raise MivolError(f"droplets of {diameter} micrometre; the fit covers 5 to 50: take mivol.phase.mie for others.")

@@ -1,8 +1,8 @@
-"""Domains of the parameters of phase functions: a value outside is refused where it can be read, and projected where it cannot.
+"""Domains of the parameters of phase functions, with refusal or projection of values outside.
 
-Conventions. A value that an optimiser has moved outside is refused with a sentence when it is set. Inside a recording by
-``dr.freeze``, and for volumes whose values are not known, the host cannot read it: it is replaced by the nearest value inside,
-and its derivative is 0.
+Conventions. A value that an optimizer has moved outside is refused when it is set. The host cannot read a value inside a
+recording by ``dr.freeze``, or in a volume of unknown values. The nearest value inside then replaces the value, with a
+derivative of 0.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Domain:
     """An interval of float32 numbers.
 
     Attributes:
-        low, high: the least and the largest number that is allowed.
-        words: the interval, for the sentence that refuses a value.
-        way_out: what to do about the value, for the same sentence.
+        low, high: the least and the largest allowed number.
+        words: the interval, for the error message.
+        way_out: advice for the same message.
     """
 
     low: float
@@ -38,7 +38,8 @@ class Domain:
         """Refuse values outside.
 
         Raises:
-            MivolError: NaN, or outside the interval after rounding to float32; the first bad value and its index are named.
+            MivolError: NaN, or outside the interval after rounding to float32; the message names the first bad value and its
+                index.
         """
         values = np.asarray(values, dtype=np.float32)
         wrong = np.argwhere(~((values >= np.float32(self.low)) & (values <= np.float32(self.high))))
@@ -49,7 +50,7 @@ class Domain:
         raise MivolError(f"{name} is {float(values[first]):.9g}{place}; {self.words} is expected: {self.way_out}.")
 
     def project(self, x: mi.Float) -> mi.Float:
-        """The nearest value inside; its derivative is 0 where it is another value than ``x``. NaN stays NaN."""
+        """The nearest value inside; its derivative is 0 where the value differs from ``x``. NaN stays NaN."""
         # dr.minimum and dr.maximum are not used: where x lies on a bound, their derivative may be that of the constant.
         x = dr.select(x < self.low, self.low, x)
         return x if math.isinf(self.high) else dr.select(x > self.high, self.high, x)
@@ -69,4 +70,4 @@ COSINE_SQUARED = WEIGHT = Domain(
 )
 
 DOMAINS = {"g": ASYMMETRY, "alpha": COSINE_SQUARED, "weight": WEIGHT}
-"""Parameter -> its domain."""
+"""Domain of each parameter."""

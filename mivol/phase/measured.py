@@ -1,14 +1,15 @@
 """Measured media by name: milk, juices, wine, coffee, soap, marble, skin.
 
 Conventions. Coefficients are per millimetre, rgb, of the undiluted medium; g is the mean cosine of a Henyey-Greenstein phase
-function, rgb. A g of 0 stands where none was measured: in the first table coefficients are reduced (scattering that would look
-isotropic), and in the second one a channel that does not scatter has no phase function.
+function, rgb. A g of 0 marks a missing measurement: coefficients of the first table are reduced (scattering that would look
+isotropic), and in the second table a channel without scattering has no phase function.
 
 Sources: Jensen, Marschner, Levoy & Hanrahan, "A Practical Model for Subsurface Light Transport", SIGGRAPH 2001; Narasimhan,
 Gupta, Donner, Ramamoorthi, Nayar & Jensen, "Acquiring Scattering Properties of Participating Media by Dilution", SIGGRAPH 2006.
 Their numbers were compared in two public tables, pbrt-v4 (src/pbrt/media.cpp at 5f7a6068: reduced scattering, absorption) and
-Mitsuba 0.6 (src/medium/materials.h at 10af06f3: scattering, absorption, g): sigma_s (1 - g) of one is the reduced scattering
-of the other in every channel. They differ in the red absorption of both chickens, a factor of 10; pbrt-v4's is kept.
+Mitsuba 0.6 (src/medium/materials.h at 10af06f3: scattering, absorption, g): sigma_s (1 - g) of Mitsuba equals the reduced
+scattering of pbrt-v4 in every channel. The tables differ in the red absorption of both chickens, a factor of 10; the value of
+pbrt-v4 is used.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ _NARASIMHAN_2006 = {
 _TABLE = {**{name: (*row, (0.0, 0.0, 0.0)) for name, row in _JENSEN_2001.items()}, **_NARASIMHAN_2006}
 
 NAMES = tuple(sorted(_TABLE))
-"""Every medium there is."""
+"""The names of all media."""
 
 ALIASES = {
     "milk": "regular milk",
@@ -96,11 +97,11 @@ ALIASES = {
     "grapefruit juice": "white grapefruit juice",
     "sea water": "pacific ocean surface water",
 }
-"""Everyday names, and what they stand for."""
+"""Everyday names, and the media they stand for."""
 
 
 class MeasuredMedium(NamedTuple):
-    """One medium, undiluted.
+    """A medium, undiluted.
 
     Attributes:
         sigma_a: absorption coefficient [1/mm], rgb.
@@ -113,23 +114,23 @@ class MeasuredMedium(NamedTuple):
     g: Triple
 
     def mean_g(self) -> float:
-        """One g for all channels: the mean, weighted by the scattering coefficients."""
+        """A g for all channels: the mean, weighted by the scattering coefficients."""
         total = sum(self.sigma_s)
         return float(np.dot(self.g, self.sigma_s) / total) if total > 0 else 0.0
 
     def to_dict(self, mm_per_unit: float, dilution: float = 1.0, channel: int | None = None) -> dict[str, object]:
         """The medium as a plugin for ``mi.load_dict``: a ``mivol_medium`` with a ``mivol_hg``.
 
-        A phase function has one g for all channels, so that of an rgb medium is :meth:`mean_g`; where g differs much between
-        channels (low-fat milk: 0.93 to 0.86), render one channel at a time.
+        A phase function has a single g for all channels, so an rgb medium takes :meth:`mean_g`. If g differs much between
+        channels (low-fat milk: 0.93 to 0.86), render the channels separately.
 
         Args:
-            mm_per_unit: length of one scene unit [mm]: 1000 for a scene in metres.
+            mm_per_unit: length of a scene unit [mm]: 1000 for a scene in metres.
             dilution: fraction of the medium in clear water, above 0 and at most 1.
-            channel: 0, 1 or 2 for a grey medium with the coefficients and g of that channel; None for rgb.
+            channel: 0, 1 or 2 for a grey medium with the coefficients and g of this channel; by default rgb.
 
         Raises:
-            MivolError: a unit, dilution or channel that cannot be.
+            MivolError: an impossible unit, dilution or channel.
         """
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise MivolError(f"mm_per_unit is {mm_per_unit}; the length of a scene unit in millimetres is expected, above 0.")
@@ -138,15 +139,15 @@ class MeasuredMedium(NamedTuple):
         if channel not in (None, 0, 1, 2):
             raise MivolError(f"channel is {channel}; 0, 1, 2 or None is expected.")
 
-        def given(coefficient: Triple) -> object:
+        def scene_coefficient(coefficient: Triple) -> object:
             values = [x * mm_per_unit * dilution for x in coefficient]
             return {"type": "rgb", "value": values} if channel is None else values[channel]
 
         g = self.mean_g() if channel is None else self.g[channel]
         return {
             "type": "mivol_medium",
-            "sigma_a": given(self.sigma_a),
-            "sigma_s": given(self.sigma_s),
+            "sigma_a": scene_coefficient(self.sigma_a),
+            "sigma_s": scene_coefficient(self.sigma_s),
             "phase": {"type": "mivol_hg", "g": g},
         }
 
@@ -155,13 +156,13 @@ def named_medium(name: str) -> MeasuredMedium:
     """Look up a measured medium.
 
     Args:
-        name: one of :data:`EXTINCTION_PARAMETERS` or :data:`ALIASES`, in capitals or not, words apart or joined by - or _.
+        name: a name of :data:`NAMES` or :data:`ALIASES`, in capitals or not, words apart or joined by - or _.
 
     Returns:
         ``sigma_a, sigma_s, g``, rgb triples; coefficients in 1/mm.
 
     Raises:
-        MivolError: an unknown name; the nearest known ones are named.
+        MivolError: an unknown name; the message suggests the nearest known names.
     """
     known = {_plain(n): n for n in (*NAMES, *ALIASES)}
     found = known.get(_plain(name))

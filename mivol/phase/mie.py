@@ -5,7 +5,7 @@ r"""Phase functions of droplets and dust by Mie's theory, averaged over their si
           S_2 = \sum_n \frac{2 n + 1}{n (n + 1)} (a_n \tau_n + b_n \pi_n)
 
 Conventions. Lengths in micrometres; unpolarised light; the refractive index is relative to the surroundings and its imaginary
-part, of either sign, absorbs. The coefficients a_n and b_n are those of ``miepython``, an optional package.
+part, of either sign, absorbs. The optional package ``miepython`` computes the coefficients a_n and b_n.
 
 References: Bohren & Huffman, Absorption and Scattering of Light by Small Particles (1983), chapter 4. Size distribution of
 droplets: Hansen & Travis 1974 (Space Science Reviews 16), the gamma distribution by effective radius a and variance b,
@@ -26,20 +26,24 @@ from mivol.phase.table import Table, adapt_nodes
 __all__ = ["WATER_INDEX", "aerosol", "water_droplets"]
 
 WATER_INDEX = 1.333
-"""Refractive index of water in the middle of the visible range; its absorption there does not change the phase function."""
+"""Refractive index of water in the middle of the visible range; the absorption of water there does not change the phase
+function.
+"""
 
 RADII = 1024
-"""Number of radii, in equal steps of their logarithm. The resonances of droplets that do not absorb are narrower than a step:
-for effective radii of 3 to 20 micrometre this leaves an error of 1.5 to 2 % (root mean square over angles), and of 4 to 9 % at
-the worst angle, near backward scattering."""
+"""Number of radii, in equal steps of their logarithm. The resonances of droplets without absorption are narrower than a step:
+for effective radii of 3 to 20 micrometre the error is 1.5 to 2 % (root mean square over angles), and 4 to 9 % at the worst
+angle, near backward scattering.
+"""
 
 
 LARGEST_SIZE = 1e4
-"""Largest size parameter (circumference over wavelength) whose series is summed, which takes a minute and 1 GiB. Larger
-particles are in the regime of geometric optics."""
+"""Largest size parameter (circumference over wavelength) of a summed series, which takes a minute and 1 GiB. Larger particles
+are in the regime of geometric optics.
+"""
 
 CUT = 1e-7
-"""Fraction of a size distribution that is left out at each end."""
+"""Neglected fraction of a size distribution at each end."""
 
 
 def water_droplets(
@@ -52,14 +56,14 @@ def water_droplets(
     """Cloud and fog droplets: a gamma distribution of radii.
 
     Args:
-        effective_radius: mean radius weighted by area [micrometre]; fog and clouds have 3 to 20.
-        effective_variance: its relative variance, above 0 and below 1/2; clouds have about 0.1.
-        wavelength: in the surroundings [micrometre].
+        effective_radius: mean radius weighted by area [micrometre]; 3 to 20 in fog and clouds.
+        effective_variance: relative variance of the radius, above 0 and below 1/2; about 0.1 in clouds.
+        wavelength: wavelength in the surroundings [micrometre].
         index: refractive index relative to the surroundings.
         tolerance: largest relative error of linear interpolation between the nodes of the table.
 
     Raises:
-        MivolError: a size, variance or wavelength that cannot be, or ``miepython`` is not installed.
+        MivolError: an impossible size, variance or wavelength, or ``miepython`` is not installed.
 
     Cost: 0.5 s of a processor and 340 nodes for 3 micrometre, 1.6 s and 640 for 10, 2.3 s and 1010 for 20.
     """
@@ -79,29 +83,28 @@ def aerosol(
 
     Args:
         median_radius: half the particles are smaller [micrometre].
-        geometric_deviation: exp of the standard deviation of log r, above 1; 1.5 to 2.2 is usual.
+        geometric_deviation: exp of the standard deviation of log r, above 1; usually 1.5 to 2.2.
         index: refractive index relative to the surroundings, for instance 1.53 - 0.006j for dust.
-        wavelength: in the surroundings [micrometre].
+        wavelength: wavelength in the surroundings [micrometre].
         tolerance: largest relative error of linear interpolation between the nodes of the table.
 
     Raises:
-        MivolError: a size, deviation or wavelength that cannot be, or ``miepython`` is not installed.
+        MivolError: an impossible size, deviation or wavelength, or ``miepython`` is not installed.
     """
     _check_positive(median_radius=median_radius, wavelength=wavelength, tolerance=tolerance)
     if not geometric_deviation > 1:
         raise MivolError(f"geometric_deviation is {geometric_deviation}; a number above 1 is expected.")
     s = np.log(geometric_deviation)
     low, high = _ends_of_lognormal(median_radius, s)
-    return _average(
-        lambda r: np.log(r) - 0.5 * (np.log(r / median_radius) / s) ** 2, low, high, wavelength, index, tolerance
-    )
+    return _average(lambda r: np.log(r) - 0.5 * (np.log(r / median_radius) / s) ** 2, low, high, wavelength, index, tolerance)
 
 
 def _ends_of_lognormal(median: float, s: float) -> tuple[float, float]:
-    """The smallest and the largest radius of a lognormal distribution that are integrated; log r has standard deviation ``s``.
+    """The smallest and the largest integrated radius of a lognormal distribution; log r has standard deviation ``s``.
 
-    The fraction ``CUT`` of the particles' area lies below the first, and the fraction ``CUT`` of the light that small particles
-    scatter, which goes as r^6, above the second. (A lognormal distribution times r^k is lognormal about log(median) + k s^2.)
+    The fraction ``CUT`` of the area of the particles lies below the smallest radius. The fraction ``CUT`` of the light
+    scattered by small particles, which goes as r^6, lies above the largest. (A lognormal distribution times r^k is lognormal
+    about log(median) + k s^2.)
     """
     reach = -ndtri(CUT) * s
     return median * np.exp(2 * s * s - reach), median * np.exp(6 * s * s + reach)

@@ -1,9 +1,9 @@
-r"""A mixture of phase functions: a convex combination, sampled by choosing one of the components.
+r"""A mixture of phase functions: a convex combination, sampled by the choice of a component.
 
 .. math:: p = \sum_k s_k p_k, \qquad s_k = w_k / \sum_j w_j
 
-Conventions. Weights are at least 0 and need not sum to 1. Where all of them are 0 (a voxel in a grid of weights), the
-components have equal probabilities.
+Conventions. Weights are at least 0 and need not sum to 1. If every weight is 0 (a voxel in a grid of weights), the components
+have equal probabilities.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["choose_lobe", "normalise_weights"]
 
 
 def normalise_weights(weights: Sequence[mi.Float]) -> list[mi.Float]:
-    """Normalise weights by their sum, with derivatives; they become equal where the sum is 0."""
+    """Normalise weights by their sum, with derivatives; the weights become equal for a sum of 0."""
     total = sum(weights[1:], weights[0])
     empty = ~(total > 0) & (total == 0)
     inv = dr.rcp(total)  # infinite where nothing is taken of it: Dr.Jit's derivatives of what is not taken are 0
@@ -28,7 +28,7 @@ def choose_lobe(shares: Sequence[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.
     """Choose a component with its normalised weight as probability.
 
     Returns:
-        The index of the component, and ``u`` rescaled to [0, 1) within its interval, to be used again.
+        The index of the component, and ``u`` rescaled to [0, 1) within its interval, for another use.
     """
     chosen, low, high = mi.UInt32(0), dr.zeros(mi.Float, 1), mi.Float(shares[0])
     start = mi.Float(0)

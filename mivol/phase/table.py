@@ -1,7 +1,13 @@
-"""A table of a phase function: values at cosines, checked, from numbers, Legendre moments or a file.
+r"""A tabulated phase function: checked values at cosines, from numbers, Legendre moments or a file, and their lookup.
 
-Conventions. Cosines rise from exactly -1 (straight back) to exactly 1 (straight on); values need not be normalised. float64
-NumPy; :mod:`mivol.phase.table` is the same on Dr.Jit arrays.
+.. math:: p(c) = \frac{f(c)}{2\pi \int_{-1}^1 f\,dc}, \qquad f \text{ linear between } (c_i, f_i)
+
+Conventions. Cosines rise from exactly -1 (straight back) to exactly 1 (straight on); values need not be normalised.
+:class:`Table` holds the checked data in float64 NumPy; :class:`Lookup` holds the same data on Dr.Jit arrays. A node is stored
+as 1 - c and as 1 + c, so the nodes of a forward peak of a width of 1e-4 remain distinct in float32.
+
+Source of the inversion inside a segment: the smaller root of the quadratic, written without cancellation as in Press et al.,
+Numerical Recipes, section 5.6.
 """
 
 from __future__ import annotations
@@ -29,10 +35,10 @@ class Table:
     Attributes:
         cosines: (n,) rising, from -1 to 1, float64.
         values: (n,) at least 0, not all 0, float64.
-        name: what the table is called in a sentence that refuses it.
+        name: name of the table in error messages.
 
     Raises:
-        MivolError: arrays of another form, or values that no phase function has.
+        MivolError: arrays of another form, or values impossible for a phase function.
     """
 
     cosines: np.ndarray
@@ -64,17 +70,17 @@ class Table:
 
     @classmethod
     def regular(cls, values: np.ndarray, name: str = "the phase table") -> Table:
-        """Values at equally spaced cosines from -1 to 1, as stock ``tabphase`` takes them."""
+        """Values at equally spaced cosines from -1 to 1, as for stock ``tabphase``."""
         return cls(np.linspace(-1, 1, np.size(values)), values, name)
 
     @classmethod
     def from_csv(cls, path: str | os.PathLike) -> Table:
         """Read two columns: cosine and value, or angle in degrees and value if the first column is headed ``angle``.
 
-        Lines may come in either order; a heading is optional; lines that start with ``#`` are left out.
+        Lines may come in either order; a heading is optional; lines starting with ``#`` are ignored.
 
         Raises:
-            MivolError: what is not two columns of numbers, or no phase function.
+            MivolError: other content than two columns of numbers, or no phase function.
         """
         name = f"phase table {os.fspath(path)}"
         try:
@@ -103,17 +109,17 @@ class Table:
 
     @classmethod
     def from_moments(cls, moments: np.ndarray, tolerance: float = 1e-3, name: str = "the phase table") -> Table:
-        r"""Sum a Legendre series and put nodes where a straight line misses it.
+        r"""Sum a Legendre series and put nodes where a straight line misses the series.
 
         .. math:: p(c) = \frac{1}{4\pi} \sum_l (2 l + 1) \chi_l P_l(c), \qquad \chi_l = \int p\,P_l\,d\omega
 
         Args:
             moments: chi_0, chi_1, ...; chi_0 is 1, chi_1 the mean cosine.
-            tolerance: how far a line may miss the series halfway between nodes, as a part of its largest value.
-            name: what the table is called in a sentence that refuses it.
+            tolerance: largest distance of a line from the series halfway between nodes, as a fraction of the largest value.
+            name: name of the table in error messages.
 
         Raises:
-            MivolError: a first moment that is not 1, or a series that is negative somewhere.
+            MivolError: a first moment other than 1, or a series with negative values.
         """
         moments = np.asarray(moments, dtype=np.float64).ravel()
         if len(moments) == 0 or not np.isclose(moments[0], 1, rtol=1e-6) or not np.all(np.isfinite(moments)):
@@ -160,10 +166,10 @@ class Table:
 
 
 def check_values(values: np.ndarray, name: str) -> None:
-    """Refuse values that no phase function has.
+    """Refuse values impossible for a phase function.
 
     Raises:
-        MivolError: NaN, infinite or negative, all of them 0, or the largest beyond 1e-30 to 1e30.
+        MivolError: NaN, infinite or negative values, only zeros, or a largest value outside 1e-30 to 1e30.
     """
     bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
     if len(bad):
@@ -187,12 +193,12 @@ def adapt_nodes(
 
     Args:
         density: function of an array of cosines.
-        tolerance: how far a line may miss it halfway (in angle), as a part of the value there.
-        least: nodes to start with, equally spaced in angle.
-        relative_to_peak: as a part of the largest value instead.
+        tolerance: largest distance of a line from the function halfway (in angle), as a fraction of the value there.
+        least: number of first nodes, equally spaced in angle.
+        relative_to_peak: whether ``tolerance`` is a fraction of the largest value instead.
 
     Returns:
-        cosines (n,) from -1 to 1, and the function there.
+        cosines (n,) from -1 to 1, and the function at these cosines.
     """
     angles = np.linspace(np.pi, 0, least)
     cosines = _cosines(angles)
@@ -229,7 +235,7 @@ def _is_number(text: str) -> bool:
 
 @dataclass
 class Lookup:
-    """The nodes of a table on Dr.Jit arrays. Its methods take the values as an argument, since they may be a parameter.
+    """The nodes of a table on Dr.Jit arrays. Methods take the values as an argument, since the values may be a parameter.
 
     Attributes:
         below_one, above_minus_one: (n,) 1 - c and 1 + c of the nodes.
@@ -244,14 +250,15 @@ class Lookup:
 
     @classmethod
     def from_table(cls, table: Table) -> Lookup:
-        """Round a table's nodes."""
+        """Round the nodes of a table."""
         c = table.cosines
         with np.errstate(divide="ignore"):
             ratio = (1 + c) / (1 - c)
         return cls(*(mi.Float(x.astype(np.float32)) for x in (1 - c, 1 + c, ratio, np.diff(c))))
 
     def normalise(self, values: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Projected values (0 to 1e30; all 1 where none is above 1e-30), their integral and their cumulative distribution.
+        """Project values (to 0 ... 1e30; all 1 if no value is above 1e-30), and find their integral and their cumulative
+        distribution.
 
         Args:
             values: (n,) as given.
@@ -270,17 +277,17 @@ class Lookup:
         dr.scatter(cumulative, mi.Float(sums / total), i + 1)
         return values, dr.sum(parts), cumulative
 
-    def eval(self, turn: ScatteringAngle, values: mi.Float, integral: mi.Float, active: mi.Bool = True) -> mi.Float:
-        """Density [1/sr] at a turn: the first two results of :meth:`normalise` are its values and integral.
+    def eval(self, angle: ScatteringAngle, values: mi.Float, integral: mi.Float, active: mi.Bool = True) -> mi.Float:
+        """Density [1/sr] at an angle, for the values and the integral of :meth:`normalise`.
 
-        Error: 1e-6 of the larger of the two values around it.
+        Error: 1e-6 of the larger of the two neighbouring values.
         """
         # The comparison is ratio (1 - c) < 1 + c, without a quotient: in inactive lanes both directions may be 0, and it 0/0.
-        below, above = dr.detach(turn.below_one), dr.detach(turn.above_minus_one)
+        below, above = dr.detach(angle.below_one), dr.detach(angle.above_minus_one)
         n = len(self.width)
         i = dr.binary_search(0, n, lambda k: dr.gather(mi.Float, self.ratio, k, active) * below < above)
         i = dr.clip(dr.detach(mi.Int32(i)) - 1, 0, n - 1)
-        part = self._offset(turn, i, active) * dr.rcp(dr.gather(mi.Float, self.width, i, active))
+        part = self._offset(angle, i, active) * dr.rcp(dr.gather(mi.Float, self.width, i, active))
         part = dr.clip(part, 0, 1)
         left, right = (dr.gather(mi.Float, values, k, active) for k in (i, i + 1))
         return INV_TWO_PI * dr.fma(part, right - left, left) * dr.rcp(integral)
@@ -304,8 +311,8 @@ class Lookup:
             dr.maximum(dr.gather(mi.Float, self.above_minus_one, i, active) + offset, 0),
         )
 
-    def _offset(self, turn: ScatteringAngle, i: mi.Int32, active: mi.Bool) -> mi.Float:
-        """Difference of the cosine and node i, computed from 1 - c or 1 + c, whichever is smaller and so more accurate."""
-        ahead = dr.gather(mi.Float, self.below_one, i, active) - turn.below_one
-        behind = turn.above_minus_one - dr.gather(mi.Float, self.above_minus_one, i, active)
-        return dr.select(turn.below_one < turn.above_minus_one, ahead, behind)
+    def _offset(self, angle: ScatteringAngle, i: mi.Int32, active: mi.Bool) -> mi.Float:
+        """Difference of the cosine and node i, from the smaller and therefore more accurate of 1 - c and 1 + c."""
+        ahead = dr.gather(mi.Float, self.below_one, i, active) - angle.below_one
+        behind = angle.above_minus_one - dr.gather(mi.Float, self.above_minus_one, i, active)
+        return dr.select(angle.below_one < angle.above_minus_one, ahead, behind)

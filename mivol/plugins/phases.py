@@ -50,10 +50,10 @@ class TurningPhase(mi.PhaseFunction):
     def flags(self, index: int | mi.Bool | None = None, active: mi.Bool = True) -> int:
         return self.m_flags
 
-    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
         raise NotImplementedError
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
+    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         raise NotImplementedError
 
     def at(self, name: str, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
@@ -69,13 +69,13 @@ class TurningPhase(mi.PhaseFunction):
     ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
         with dr.suspend_grad():
             active = mi.Bool(active)
-            turn = self.sample_turn(sample2.x, mei, active)
-            return scattered_direction(mei.wi, turn, sample2.y), mi.Spectrum(1), self.eval_turn(turn, mei, active)
+            angle = self.sample_angle(sample2.x, mei, active)
+            return scattered_direction(mei.wi, angle, sample2.y), mi.Spectrum(1), self.eval_angle(angle, mei, active)
 
     def eval_pdf(
         self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
     ) -> tuple[mi.Spectrum, mi.Float]:
-        value = self.eval_turn(angle_between(mei.wi, wo), mei, mi.Bool(active))
+        value = self.eval_angle(angle_between(mei.wi, wo), mei, mi.Bool(active))
         return mi.Spectrum(value), dr.detach(value)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -99,10 +99,10 @@ class HenyeyGreenstein(TurningPhase):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, {"g": _read(props, "g", 0.8)})
 
-    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-        return eval_hg(turn, self.at("g", mei, active))
+    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return eval_hg(angle, self.at("g", mei, active))
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
+    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         return sample_hg(u, self.at("g", mei, active))
 
 
@@ -112,10 +112,10 @@ class Rayleigh(TurningPhase):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, {})
 
-    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-        return eval_rayleigh(turn)
+    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return eval_rayleigh(angle)
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
+    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         return sample_rayleigh(u)
 
 
@@ -130,10 +130,10 @@ class Draine(TurningPhase):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, {"g": _read(props, "g", 0.8), "alpha": _read(props, "alpha", 1.0)})
 
-    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-        return eval_draine(turn, self.at("g", mei, active), self.at("alpha", mei, active))
+    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return eval_draine(angle, self.at("g", mei, active), self.at("alpha", mei, active))
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
+    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         return sample_draine(u, self.at("g", mei, active), self.at("alpha", mei, active))
 
 
@@ -161,10 +161,10 @@ class Tabulated(TurningPhase):
         self.values, self.integral, self.cumulative = self.nodes.normalise(values)
         dr.make_opaque(self.values, self.integral, self.cumulative)
 
-    def eval_turn(self, turn: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-        return self.nodes.eval(turn, self.values, self.integral, active)
+    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return self.nodes.eval(angle, self.values, self.integral, active)
 
-    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
+    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         return self.nodes.sample(u, self.values, self.integral, self.cumulative, active)
 
     def _name(self) -> str:
