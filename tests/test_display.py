@@ -67,7 +67,7 @@ def test_every_repr_is_a_line(variant_rgb: str, tmp_path: Path) -> None:
     made = objects(tmp_path)
     assert repr(made["volume"]).startswith("VolumeData(values=float32 (30, 20, 10, 1), to_world=float64 (4, 4)")
     assert repr(made["fit"]).startswith("Fit(3 of 3 iterations in ")
-    assert "1 views of 8 x 6 pixels, l2, looks for cube" in repr(made["problem"])
+    assert "1 views of 8 x 6 pixels, l2, fits cube" in repr(made["problem"])
 
 
 def test_notebooks_show_pictures(variant_rgb: str, tmp_path: Path) -> None:

@@ -77,7 +77,9 @@ def with_background(plan: RadiancePlan, background: str | tuple[float, float, fl
 
 def batches_of(plan: RadiancePlan, photos: Photos) -> RayBatches:
     """The photographs in the sizes of the plan, without the distortion of lenses that have an image plane."""
-    return RayBatches.of([rectify(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space)
+    return RayBatches.from_photos(
+        [rectify(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space
+    )
 
 
 def suited(plan: RadiancePlan, photos: Photos) -> RadiancePlan:

@@ -185,7 +185,7 @@ def begin(chosen: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> Beg
     sizes = {stage.shrink for stage in plan.stages}
     taken = sum(view.image.size // 3 * channels // shrink**2 for view in views for shrink in sizes)
     memory = check_memory(replace(plan, start=len(places)), taken, pixels)
-    batches = RayBatches.of(views, [stage.shrink for stage in plan.stages])
+    batches = RayBatches.from_photos(views, [stage.shrink for stage in plan.stages])
     cloud = make_start_cloud(places, views, plan.stages[0].degree)
     return Begun(views, plan, batches, cloud, choices(plan, photos, len(places), whence, memory, plan.minutes(largest)))
 

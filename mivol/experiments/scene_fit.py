@@ -140,7 +140,7 @@ class SceneFit(FitKind):
                 start = find_emissive_start(self.problem, sought.key, place, self.settings.optimiser, self.settings.seed)
                 put(self.problem.params, sought.key, start.value)
                 self.problem.set_reals(self.problem.initial_reals())
-                notes.append(f"{sought.key} {start.text}")
+                notes.append(f"{sought.key} {start.description}")
         self.context.progress.say(notes)
         return notes
 

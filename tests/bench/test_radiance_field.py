@@ -189,7 +189,8 @@ def test_pixels_are_drawn_anywhere(variant_rgb: str) -> None:
     """As many rays as tiles would have; four neighbours of a tile are rarely neighbours here."""
     photos = photograph(FIELDS["fog"](TINY)[0], ring_cameras(16, 3))
     batches = [
-        kind.of(photos).draw(1, np.arange(3), 4, np.random.default_rng(0)) for kind in (fits.PixelBatches, fits.RayBatches)
+        kind.from_photos(photos).draw_tiles(1, np.arange(3), 4, np.random.default_rng(0))
+        for kind in (fits.PixelBatches, fits.RayBatches)
     ]
     widths = [dr.width(batch.rays.d) for batch in batches]
     assert widths == [3 * 4 * 16] * 2

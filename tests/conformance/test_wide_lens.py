@@ -223,22 +223,22 @@ def test_batches_have_the_rays_of_each_lens(variant_rgb: str) -> None:
     pinhole = Camera(intrinsics(40, 40, 24, 24), (48, 48), poses[1])
     other = fisheye(lens=Fisheye(k1=0.01), pose=poses[2])
     cameras = [fisheye(pose=poses[0]), pinhole, other, fisheye(pose=poses[3]), panorama()]
-    batches = RayBatches.of([photo(camera) for camera in cameras], (1, 2))
+    batches = RayBatches.from_photos([photo(camera) for camera in cameras], (1, 2))
     for shrink in (1, 2):
         for number, camera in enumerate(cameras):
-            found = batches.whole(shrink, number)
+            found = batches.all_pixels(shrink, number)
             wanted = np.float32(rays(camera.resized(tuple(n // shrink for n in camera.size)), by_tiles(camera, shrink))[1])
             # float32 directions of three rounded products and sums, normalised: a few times 6e-8.
             np.testing.assert_allclose(np.array(found.rays.d).T, wanted, atol=4e-7)
             np.testing.assert_allclose(np.array(found.rays.o).T[:1], camera.origin[None], rtol=1e-7, atol=1e-7)
     # Three lenses, two of which are one in two places, at both sizes: rays of 2 x 48^2 and 64 x 32 pixels, of 12 bytes each.
-    few = RayBatches.of([photo(pinhole)] * 5, (1, 2))
+    few = RayBatches.from_photos([photo(pinhole)] * 5, (1, 2))
     tables = batches.bytes - sum(len(level.codes) for level in batches.levels.values())
     assert tables == 12 * (2 * 48**2 + 64 * 32) * 5 // 4
     assert all(level.wide is None for level in few.levels.values())
     shown = [photo(camera) for camera in cameras]
     shown[0] = replace(shown[0], camera=replace(cameras[0], distortion=Fisheye(k1=-0.03)))
-    assert RayBatches.of(shown, (1, 2)).digest() != batches.digest()
+    assert RayBatches.from_photos(shown, (1, 2)).digest() != batches.digest()
 
 
 def by_tiles(camera: Camera, shrink: int) -> np.ndarray:
@@ -277,7 +277,7 @@ def test_a_place_is_reconstructed_from_wide_photographs(variant_rgb: str, kind: 
     """
     views = [photo(kind(pose=camera.to_world)) for camera in capture_photos.cameras(28)]
     plan = replace(PRESETS["capture"], stages=(RadianceStage(16, 40, 1, 8, 32), RadianceStage(32, 40, 1, 8, 32)))
-    problem = RadianceProblem(RayBatches.of(views[:24]), np.array([[-0.9] * 3, [0.9] * 3]), plan)
+    problem = RadianceProblem(RayBatches.from_photos(views[:24]), np.array([[-0.9] * 3, [0.9] * 3]), plan)
     reconstruct(problem, plan.optimizer, plan.course())
     for view in views[24:]:
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask

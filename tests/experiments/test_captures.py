@@ -30,7 +30,7 @@ def held_out_psnr(plan: RadiancePlan) -> list[float]:
     photos = capture(24)
     train, aside = [p for n, p in enumerate(photos) if n % 4], photos[::4]
     box = middle_box([photo.camera for photo in train])
-    fit = begin_fit(RadianceProblem(RayBatches.of(train), box, plan), plan.optimizer, plan.course()).complete()
+    fit = begin_fit(RadianceProblem(RayBatches.from_photos(train), box, plan), plan.optimizer, plan.course()).complete()
     seen = [render_view(fit.problem.field, photo.camera, fit.problem.sky).image for photo in aside]
     return [judge(image, photo.image).values["psnr"] for image, photo in zip(seen, aside, strict=True)]
 
@@ -53,7 +53,7 @@ def test_what_is_near_a_camera_moves_less(variant_rgb: str) -> None:
     slopes = []
     for near in (0.0, 100.0):
         plan = replace(PLAN, near=near)
-        problem = RadianceProblem(RayBatches.of(photos), middle_box([photo.camera for photo in photos]), plan)
+        problem = RadianceProblem(RayBatches.from_photos(photos), middle_box([photo.camera for photo in photos]), plan)
         slopes.append(np.linalg.norm(np.array(problem.loss_and_gradient(problem.initial_reals(), 0)[1]["density"])))
     # Of all together: rays that want opposite things of a node may leave any ratio at it.
     assert 0 < slopes[1] < (REACH / 200) ** 2 * slopes[0]

@@ -187,7 +187,7 @@ def test_the_example_is_one_of_gaussians() -> None:
         ("gaussians.ssim=1.5", "gaussians.ssim = 1.5: expected `float` <= 1"),
         ("gaussians.effort=inf", "gaussians.effort = inf: expected a finite number"),
         ("gaussians.minutes=1", "minutes is 1.0 beside effort 0.2"),
-        ("gaussians.exposure=true", "gains were asked for and the photographs have alpha"),
+        ("gaussians.exposure=true", "found gains and photographs with alpha"),
         ("gaussians.most=2000000000", "most = "),
         ("photos.background=sky", 'photos.background = "sky" is not for Gaussians: white, black, random or an rgb triple'),
         ("variant=scalar_rgb", "mivol works in llvm_ad_rgb"),
@@ -210,7 +210,7 @@ def test_photographs_from_one_place_are_refused(photographs: Path, tmp_path: Pat
     (tmp_path / "set/transforms.json").write_text(json.dumps(listed))
     assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 1
     said = capsys.readouterr().err
-    assert "all cameras stand at one place" in said
+    assert "all cameras are at one position" in said
     assert_explained(path, [], said)
 
 
@@ -221,7 +221,7 @@ def test_points_begin_where_no_view_sees_through(photographs: Path) -> None:
     places, whence = find_start_points(photos, 200, 0)
     assert len(places) == 200
     assert np.linalg.norm(places, axis=1).max() < 1.1
-    assert "where no view sees through" in whence
+    assert "that no view shows as transparent" in whence
     assert np.array_equal(places, find_start_points(photos, 200, 0)[0])
     colours = make_start_cloud(places, photos.views, 1)["harmonics"]
     assert not colours[:, 1:].any()

@@ -107,7 +107,7 @@ OPTIMIZE_REFUSED = {
     "a photograph without colours": ([PHOTO.format("grey.exr")], "found the channels Y, expected R, G and B"),
     "a loss that is not squared": (['optimiser={name="gauss_newton"}', 'loss={name="l1"}'], "quadratic in the image"),
     "an emissive start of nothing": ([f'parameter=[{{key="{KEY}", start=0.0, start_fit="emission"}}]'], "a mean of 0"),
-    "an integrator that sees no media": (['fit.integrator="path"'], "no derivative leads from the images to cube"),
+    "an integrator that sees no media": (['fit.integrator="path"'], "the images do not depend on cube"),
     "no grid to refine": (
         ['parameter=[{key="cube.interior_medium.albedo.value.value"}]', 'event=[{name="upsample", at=[1]}]'],
         "the event 'upsample' found no grid",

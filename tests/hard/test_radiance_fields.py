@@ -136,7 +136,7 @@ def test_a_short_fit_makes_matter_opaque() -> None:
     half = 0.02
     photos = [plain_view(4 * half * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [-0.6, -0.6, -0.6])]
     plan = RadiancePlan((RadianceStage(8, 40, 1, 4, 16),), degree=0, delay=0.0)
-    problem = RadianceProblem(RayBatches.of(photos), np.array([[-half] * 3, [half] * 3]), plan)
+    problem = RadianceProblem(RayBatches.from_photos(photos), np.array([[-half] * 3, [half] * 3]), plan)
     reconstruct(problem, plan.optimizer, plan.course())
     opacity = render_view(problem.field, photos[0].camera, np.ones(3)).opacity
     # Rates add up to 100 over half the edge: an optical depth of 25 a voxel if all derivatives agree. A tenth is asked for.
@@ -269,7 +269,7 @@ def test_a_fit_goes_on_from_an_opaque_field() -> None:
     """A step from densities up to 1e5 leaves finite values and a finite state. Defect 4."""
     photos = [plain_view(4 * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0])]
     plan = RadiancePlan((RadianceStage(16, 4, 1, 2, 16),), degree=0)
-    problem = RadianceProblem(RayBatches.of(photos), np.array([[-1.0] * 3, [1.0] * 3]), plan)
+    problem = RadianceProblem(RayBatches.from_photos(photos), np.array([[-1.0] * 3, [1.0] * 3]), plan)
     rng = np.random.default_rng(1)
     dense = mi.Float(rng.uniform(0, 1e5, problem.field.rows).astype(np.float32))
     harmonics = mi.Float(rng.normal(size=dr.width(problem.field.harmonics)).astype(np.float32))
@@ -340,7 +340,7 @@ def test_a_fit_begins_above_zero() -> None:
     """Defect 6."""
     for plan in PRESETS.values():
         small = RadiancePlan((RadianceStage(8, 1, 1, 1, 1),), degree=plan.degree, start=plan.start)
-        batches = RayBatches.of([plain_view(np.array([4.0, 0, 0]))])
+        batches = RayBatches.from_photos([plain_view(np.array([4.0, 0, 0]))])
         field = RadianceProblem(batches, np.array([[-1.0] * 3, [1.0] * 3]), small).field
         assert dr.all(field.density > 0) and field.activation in ACTIVATIONS
 
@@ -491,9 +491,9 @@ def test_photographs_of_different_sizes_without_jitter() -> None:
         camera = Camera(intrinsics(1.3 * width, 1.1 * width, 0.45 * width, 0.6 * height), (width, height), camera.to_world)
         codes = rng.integers(0, 256, (height, width, 4)).astype(np.float32) / 255
         photos.append(Photo("noise", codes[..., :3], codes[..., 3], None, camera, np.ones(3)))
-    views = RayBatches.of(photos)
+    views = RayBatches.from_photos(photos)
     order = np.array([2, 0, 1])
-    batches = [views.draw(1, order, 30, np.random.default_rng(seed)) for seed in range(2)]
+    batches = [views.draw_tiles(1, order, 30, np.random.default_rng(seed)) for seed in range(2)]
     for batch in batches:
         d, slot = np.array(batch.rays.d).T, np.array(batch.slot)
         target = np.concatenate([np.array(batch.target).T, np.array(batch.alpha)[:, None]], axis=1)

@@ -41,22 +41,22 @@ def shot(k: float, side: int = 48) -> Photo:
 
 def problem_of(photos: list[Photo], sky: int = 0) -> RadianceProblem:
     with_alpha = None if sky == 0 else False
-    return RadianceProblem(RayBatches.of(photos, (1, 2), with_alpha, "linear"), BOX, replace(PLAN, start=1.0, sky=sky))
+    return RadianceProblem(RayBatches.from_photos(photos, (1, 2), with_alpha, "linear"), BOX, replace(PLAN, start=1.0, sky=sky))
 
 
 def test_reals_of_radiance_are_its_logarithm_far_from_0(variant_rgb: str) -> None:
     """In float64 asinh; there and back to a few roundings of float32. Codes are their own reals."""
     colours = np.float32([-30, -0.3, 0, 1e-3, 0.4, 90])
     scale = SCALES["linear"]
-    reals = np.array(scale.reals_of(mi.Float(colours)))
+    reals = np.array(scale.to_reals(mi.Float(colours)))
     np.testing.assert_allclose(reals, np.arcsinh(colours.astype(np.float64)), rtol=2e-6, atol=1e-7)
     # sinh of a rounded number r is off by |r| 6e-8 of itself.
-    np.testing.assert_allclose(np.array(scale.colours_of(mi.Float(reals))), colours, rtol=2e-6, atol=1e-7)
-    slopes = np.array(scale.by_reals(mi.Float(2, 2, 2, 2, 2, 2), mi.Float(reals)))
+    np.testing.assert_allclose(np.array(scale.to_colours(mi.Float(reals))), colours, rtol=2e-6, atol=1e-7)
+    slopes = np.array(scale.gradient_by_reals(mi.Float(2, 2, 2, 2, 2, 2), mi.Float(reals)))
     np.testing.assert_allclose(slopes, 2 * np.sqrt(1 + colours.astype(np.float64) ** 2), rtol=4e-6)
     codes = SCALES["srgb"]
     given = mi.Float(colours)
-    for same in (codes.reals_of(given), codes.colours_of(given), codes.by_reals(given, mi.Float(1))):
+    for same in (codes.to_reals(given), codes.to_colours(given), codes.gradient_by_reals(given, mi.Float(1))):
         assert np.array_equal(np.array(same), colours)
 
 
@@ -68,9 +68,9 @@ def test_a_fit_begins_with_a_fog_that_is_not_brighter_than_what_is_seen(variant_
     dim = np.full((400, 3), 0.25)
     dim[:2] = 7  # hot pixels
     scale = SCALES["linear"]
-    np.testing.assert_allclose(scale.fog(lambda: dim * [1, 0.4, 8]), [0.125, 0.05, 0.5])
-    np.testing.assert_allclose(scale.fog(lambda: dim[:0]), 0.5)
-    np.testing.assert_allclose(SCALES["srgb"].fog(lambda: dim), 0.5)
+    np.testing.assert_allclose(scale.fog_colour(lambda: dim * [1, 0.4, 8]), [0.125, 0.05, 0.5])
+    np.testing.assert_allclose(scale.fog_colour(lambda: dim[:0]), 0.5)
+    np.testing.assert_allclose(SCALES["srgb"].fog_colour(lambda: dim), 0.5)
     shots = [shot(k) for k in range(16)]
     around = np.float32([0.25, 0.25, 0.25])
     photos = []
@@ -78,7 +78,7 @@ def test_a_fit_begins_with_a_fog_that_is_not_brighter_than_what_is_seen(variant_
         alpha = one.alpha[..., None]
         image = np.float32(alpha * [0.2, 0.02, 0.05] + (1 - alpha) * around)
         photos.append(replace(one, image=image, alpha=None, background=around))
-    fit = fitted(RayBatches.of(photos[1:], (1, 2), False, "linear"), PLAN)
+    fit = fitted(RayBatches.from_photos(photos[1:], (1, 2), False, "linear"), PLAN)
     seen = render_view(fit.problem.field, photos[0].camera, around).image
     assert judge(seen, photos[0].image, space="linear").values["psnr"] > 25
 
@@ -87,13 +87,13 @@ def test_an_error_weighs_the_slope_of_the_tone_curve(variant_rgb: str) -> None:
     """The loss of a ray, in float64, from what the field shows and the photographs hold; of a photograph beyond 1, too."""
     photos = [shot(k, 16) for k in range(3)]
     problem = problem_of(photos)
-    batch = problem.batches.draw(1, np.array([0, 2]), 6, np.random.default_rng(2))
+    batch = problem.batches.draw_tiles(1, np.array([0, 2]), 6, np.random.default_rng(2))
     target = np.array(batch.target, np.float64).T
     assert target.max() > 3
-    loss, slopes = problem.slopes(batch)
+    loss, slopes = problem.batch_loss_and_gradient(batch)
     source = bake(problem.field, problem._cells, batch.origins, batch.slot)
     seen = render_rays(problem._cells, source, make_model(problem.field, problem.plan.stop), batch.rays)
-    shown = np.array(seen.colour + seen.T * batch.before, np.float64).T
+    shown = np.array(seen.colour + seen.T * batch.background, np.float64).T
     # The photographs have alpha and their own grey behind them, which is behind the field, too: no more is to be taken off.
     wanted = np.mean(((shown - target) / (np.maximum(shown, 0) + EPSILON)) ** 2, axis=1)
     # float32 colours of up to 18: errors of 2e-6, which the weight makes up to 10 times as large, in differences of up to 100.
@@ -149,10 +149,10 @@ def test_pixels_of_radiance_are_kept_as_they_are(variant_rgb: str) -> None:
     photos = [shot(k, 16) for k in range(2)]
     image = photos[0].image.copy()
     image[3, 5] = [70.25, 1e-4, -0.5]
-    batches = RayBatches.of([replace(photos[0], image=image), photos[1]], (1, 2), space="linear")
-    channels, _ = batches.picture(1, 0)
+    batches = RayBatches.from_photos([replace(photos[0], image=image), photos[1]], (1, 2), space="linear")
+    channels, _ = batches.image(1, 0)
     np.testing.assert_array_equal(np.stack([np.array(c) for c in channels[:3]], axis=-1).reshape(16, 16, 3), image)
-    small = np.stack([np.array(c) for c in batches.picture(2, 0)[0][:3]], axis=-1).reshape(8, 8, 3)
+    small = np.stack([np.array(c) for c in batches.image(2, 0)[0][:3]], axis=-1).reshape(8, 8, 3)
     np.testing.assert_allclose(small, image.reshape(8, 2, 8, 2, 3).mean(axis=(1, 3)), rtol=1e-6, atol=1e-7)
     assert batches.bytes == 2 * 4 * 4 * (16 * 16 + 8 * 8)
     assert batches.median() == pytest.approx(np.median(np.stack([p.image for p in photos]).reshape(-1, 3), axis=0), rel=0.5)
@@ -164,7 +164,7 @@ def test_radiance_is_found_over_a_range_of_800(variant_rgb: str) -> None:
     train, held = [shot(k) for k in range(16)], [shot(k + 0.5) for k in range(4)]
     image = np.stack([photo.image for photo in train])
     assert image.max() > 600 * image.min()
-    found = fitted(RayBatches.of(train, (1, 2), space="linear"), PLAN).problem.field
+    found = fitted(RayBatches.from_photos(train, (1, 2), space="linear"), PLAN).problem.field
     assert found.space == "linear"
     quality, ratios = [], []
     for photo in held:

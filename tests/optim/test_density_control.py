@@ -79,7 +79,7 @@ def test_pruning_keeps_moments_and_refuses_to_leave_nothing() -> None:
     change = density_control.prune(cloud(), np.array([True, False, True, False, False, True]))
     assert change.parent.tolist() == [0, 2, 5]
     assert change.carry({"a": np.arange(6.0)})["a"].tolist() == [0, 2, 5]
-    with pytest.raises(MivolError, match="no Gaussian is left"):
+    with pytest.raises(MivolError, match="no Gaussian remains"):
         density_control.prune(cloud(), np.zeros(6, bool))
 
 

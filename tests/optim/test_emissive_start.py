@@ -80,7 +80,7 @@ def test_the_factor_has_the_least_loss(variant_rgb, monkeypatch):
     # truth is 20 to 1 as the shape is: at the right mean it is the truth itself, to float32.
     assert np.abs(found.value - truth).max() <= 1e-6
     assert np.array_equal(np.array(problem.values()[KEY]), np.array(before))
-    assert "4 times" in found.text
+    assert "4 times" in found.description
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ def logs_of(photographs: int, spread: float, seed: int = 3) -> np.ndarray:
 
 
 def problem_of(plan: RadiancePlan = SMALL, count: int = 5, uneven: float = 0.0) -> RadianceProblem:
-    return RadianceProblem(RayBatches.of(capture_photos.capture(count, uneven)), MIDDLE, plan)
+    return RadianceProblem(RayBatches.from_photos(capture_photos.capture(count, uneven)), MIDDLE, plan)
 
 
 # -- Gains --------------------------------------------------------------------------------------------------------
@@ -50,23 +50,23 @@ def problem_of(plan: RadiancePlan = SMALL, count: int = 5, uneven: float = 0.0) 
 
 def test_gains_are_pulled_towards_1_and_have_a_mean_of_1(variant_rgb: str) -> None:
     logs = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
-    found = Exposure(mi.Float(logs.ravel())).pulled(0.3)
+    found = Exposure(mi.Float(logs.ravel())).regularized(0.3)
     wanted = (logs - logs.mean(axis=0)) * (1 - 0.3 * PULL)
     # float32: a mean of seven numbers of up to 3, and two products: a few times 3 x 6e-8.
     np.testing.assert_allclose(np.array(found.tensor), wanted, atol=1e-6)
     np.testing.assert_allclose(found.table(), np.exp(wanted), atol=1e-5)
     assert found.spread == pytest.approx(np.sqrt(np.mean(wanted**2)), rel=1e-6)
-    seen = np.array(found.of(mi.UInt32([6, 2]))).T
+    seen = np.array(found.gains(mi.UInt32([6, 2]))).T
     np.testing.assert_allclose(seen, np.exp(wanted[[6, 2]]), rtol=2e-6)
-    assert np.array_equal(Exposure.even(4).table(), np.ones((4, 3)))
+    assert np.array_equal(Exposure.neutral(4).table(), np.ones((4, 3)))
 
 
 def test_derivatives_of_gains_are_those_of_the_squared_error(variant_rgb: str) -> None:
     """(g s - t)^2, mean over rays and rgb, differentiated by log g in float64 from what the field shows."""
     problem, logs = problem_of(), logs_of(5, 0.2)
     problem.exposure = Exposure(mi.Float(logs.ravel()))
-    batch = problem.batches.draw(1, np.array([0, 2, 3]), 5, np.random.default_rng(2))
-    loss, slopes = problem.slopes(batch)
+    batch = problem.batches.draw_tiles(1, np.array([0, 2, 3]), 5, np.random.default_rng(2))
+    loss, slopes = problem.batch_loss_and_gradient(batch)
     source = bake(problem.field, problem._cells, batch.origins, batch.slot)
     seen = render_rays(problem._cells, source, make_model(problem.field, problem.plan.stop), batch.rays)
     shown = np.array(seen.colour + seen.T * problem.sky.eval(batch.rays.d), np.float64).T
@@ -84,10 +84,10 @@ def test_derivatives_of_gains_are_those_of_the_squared_error(variant_rgb: str) -
 def test_a_brighter_photograph_of_a_gain_says_the_same_of_the_field(variant_rgb: str) -> None:
     """Targets and gains times g: errors are g times as large, and derivatives by the field and the sky g^2 times."""
     problem, gain = problem_of(), 1.7
-    batch = problem.batches.draw(1, np.array([1, 4]), 6, np.random.default_rng(4))
-    _, before = problem.slopes(batch)
+    batch = problem.batches.draw_tiles(1, np.array([1, 4]), 6, np.random.default_rng(4))
+    _, before = problem.batch_loss_and_gradient(batch)
     problem.exposure = Exposure(dr.full(mi.Float, np.log(gain), 15))
-    _, after = problem.slopes(replace(batch, target=batch.target * gain))
+    _, after = problem.batch_loss_and_gradient(replace(batch, target=batch.target * gain))
     for name in ("density", "harmonics", "sky"):
         wanted = gain**2 * np.array(before[name], np.float64)
         # Sums of float32 numbers in another order: a few times 6e-8 of the largest.
@@ -100,7 +100,7 @@ def test_a_brighter_photograph_of_a_gain_says_the_same_of_the_field(variant_rgb:
 
 @pytest.mark.parametrize(
     ("spread", "said"),
-    [(0.9 * AGREE, "photographs agree in exposure to 3.6%, so gains are left out"), (1.1 * AGREE, "")],
+    [(0.9 * AGREE, "photographs agree in exposure to 3.6%, so gains are removed"), (1.1 * AGREE, "")],
     ids=["agree", "differ"],
 )
 def test_gains_of_photographs_that_agree_are_left_out(variant_rgb: str, spread: float, said: str) -> None:
@@ -110,20 +110,20 @@ def test_gains_of_photographs_that_agree_are_left_out(variant_rgb: str, spread: 
     assert (said or "photographs differ in exposure by 4%, so each has gains") in refinement.message
     assert problem.has_gains != bool(said)
     np.testing.assert_array_equal(np.array(refinement.reals["exposure"]), 0 * logs if said else logs)
-    batch = problem.batches.draw(1, np.array([0, 2]), 5, np.random.default_rng(2))
-    slopes = np.array(problem.slopes(batch)[1]["exposure"])
+    batch = problem.batches.draw_tiles(1, np.array([0, 2]), 5, np.random.default_rng(2))
+    slopes = np.array(problem.batch_loss_and_gradient(batch)[1]["exposure"])
     assert slopes.shape == (15,) and slopes.any() != bool(said)
     reals = problem.values() | {"exposure": mi.TensorXf(logs)}
     pulled = np.array(problem.after_step(reals, 0)["exposure"])
-    wanted = logs if said else np.array(Exposure(mi.Float(logs.ravel())).pulled(RATE).tensor)
+    wanted = logs if said else np.array(Exposure(mi.Float(logs.ravel())).regularized(RATE).tensor)
     np.testing.assert_allclose(pulled, wanted, atol=1e-8)
     problem.exposure = Exposure(mi.Float(logs.ravel()))
     assert "exposure" not in problem.refine(2).message and problem.has_gains != bool(said)
 
 
 def test_gains_need_cameras(variant_rgb: str, photos: list[Photo]) -> None:
-    with pytest.raises(MivolError, match="photographs have alpha, as renders have: exposure = false"):
-        RadianceProblem(RayBatches.of(photos[:2], (1, 2)), BOX, replace(PLAN, exposure=True))
+    with pytest.raises(MivolError, match="photographs with alpha, which have equal exposures: set exposure = false"):
+        RadianceProblem(RayBatches.from_photos(photos[:2], (1, 2)), BOX, replace(PLAN, exposure=True))
 
 
 def test_gains_are_what_the_preset_or_the_file_says() -> None:
@@ -147,7 +147,7 @@ def test_a_plan_says_that_there_are_gains(variant_rgb: str) -> None:
     shown = capture_photos.capture(3)
     survey = type("Survey", (), {"box_from": "as given", "points": None})
     photos = type("Photos", (), {"views": shown, "box": MIDDLE, "survey": survey})
-    batches = RayBatches.of(shown)
+    batches = RayBatches.from_photos(shown)
     assert GAINS in choices(SMALL, photos, batches)
     assert GAINS not in choices(replace(SMALL, exposure=False), photos, batches)
 
@@ -168,7 +168,7 @@ def test_a_fit_that_went_on_equals_one_that_did_not_stop(
 ) -> None:
     """To the last bit, before and after gains were left out."""
     monkeypatch.setattr(radiance_problem, "AGREE", agree)
-    batches, path = RayBatches.of(capture_photos.capture(6, 0.3)), tmp_path / "checkpoint.npz"
+    batches, path = RayBatches.from_photos(capture_photos.capture(6, 0.3)), tmp_path / "checkpoint.npz"
 
     def run(store: CheckpointFile, until: int) -> object:
         fit = begin_fit(RadianceProblem(batches, MIDDLE, plan), plan.optimizer, plan.course(), checkpoint=store)

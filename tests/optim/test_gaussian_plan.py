@@ -18,8 +18,8 @@ PLAN = GaussianPlan(
     (GaussianStage(100, 30, 0), GaussianStage(200, 50, 1), GaussianStage(400, 120, 3)),
     start=100,
     most=900,
-    every=7,
-    grows=(0.1, 0.6),
+    control_every=7,
+    growth=(0.1, 0.6),
 )
 
 
@@ -30,7 +30,7 @@ def test_a_plan_counts_its_steps_and_begins_its_stages() -> None:
     assert course.iterations == 200
     assert course.events == (CoarseToFine(at=(30, 80)), ControlDensity(every=7, begin=20, end=120), more)
     # Control begins at 1 at the earliest, when there is something to tell, and ends after it has begun.
-    assert replace(PLAN, grows=(0.0, 0.0)).course().events[1] == ControlDensity(every=7, begin=1, end=2)
+    assert replace(PLAN, growth=(0.0, 0.0)).course().events[1] == ControlDensity(every=7, begin=1, end=2)
     assert PLAN.optimizer == Adam(epsilon=1e-12)
 
 
@@ -43,14 +43,14 @@ def test_growth_is_even_between_its_ends(step: int, start: int) -> None:
 
 
 def test_growth_without_a_length_is_a_step() -> None:
-    sudden = replace(PLAN, grows=(0.1, 0.1))
+    sudden = replace(PLAN, growth=(0.1, 0.1))
     assert [sudden.count_at(step, 100) for step in (0, 13, 14, 50)] == [100, 100, 900, 900]
 
 
 @pytest.mark.parametrize("step", [0, 50, 200])
 def test_rates_are_geometric(step: int) -> None:
     """Places go from their first rate to their last, times the extent; the others by ``end``: two roundings of each."""
-    plan, share = replace(PLAN, place=3e-3, place_end=2e-5, end=0.3), step / 200
+    plan, share = replace(PLAN, position_rate=3e-3, final_position_rate=2e-5, final_rate=0.3), step / 200
     falls = {"log_scales": 2e-2, "quaternions": 4e-3, "opacity_logits": 0.05, "harmonics": 1e-2}
     wanted = {"means": 2.5 * 3e-3 ** (1 - share) * 2e-5**share} | {k: v * 0.3**share for k, v in falls.items()}
     assert plan.learning_rates(step, 2.5) == pytest.approx(wanted, rel=1e-13)
@@ -99,17 +99,17 @@ def test_memory_is_said_and_refused(variant_rgb: str) -> None:
     """What is needed is what is there, to the byte; what fits is what would be taken."""
     pictures, pixels = 3 << 20, 10_000
     needed = pictures + estimate_bytes(PLAN, 900, pixels)
-    said = f"about {needed / 2**20:.0f} MiB: photographs 3, Gaussians and a picture the rest"
+    said = f"about {needed / 2**20:.0f} MiB: photographs 3, Gaussians and an image the rest"
     assert check_memory(PLAN, pictures, pixels, needed) == check_memory(PLAN, pictures, pixels) == said
     assert check_memory(replace(PLAN, start=900, most=1), pictures, pixels, needed) == said
-    wanted = "a fit of 900 Gaussians takes about 0.0 GiB and 0.0 are left; gaussians.most = 899 fits."
+    wanted = "a fit of 900 Gaussians needs about 0.0 GiB, 0.0 are available: gaussians.most = 899 fits."
     with pytest.raises(MivolError) as refused:
         check_memory(PLAN, pictures, pixels, needed - 1)
     assert str(refused.value) == wanted
     with pytest.raises(MivolError, match=r"read the photographs smaller \(photos.scale\)"):
         check_memory(PLAN, pictures, pixels, pictures + estimate_bytes(PLAN, 1, pixels))
     large = 1 << 40
-    with pytest.raises(MivolError, match=r"takes about 1024\.0 GiB and 2\.0 are left; read the photographs smaller"):
+    with pytest.raises(MivolError, match=r"needs about 1024\.0 GiB, 2\.0 are available: read the photographs smaller"):
         check_memory(PLAN, large, 0, 2 << 30)
 
 

@@ -15,7 +15,7 @@ from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Checkpoint
 from mivol.optim.gaussians.density_control import CloudArrays, rotations
 from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan, GaussianStage, check_memory, estimate_bytes, scene_extent
-from mivol.optim.gaussians.gaussian_problem import GaussianProblem, _wandered
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem, _move_randomly
 from mivol.optim.gaussians.gaussian_start import make_start_cloud
 from mivol.optim.loop import Fit, begin_fit, reconstruct
 from mivol.optim.photographs.ray_batches import RayBatches
@@ -25,8 +25,8 @@ from mivol.splatting import Splatter
 SIDE, WHITE = 40, np.ones(3, np.float32)
 
 STEPS = GaussianStage(20, 12, 0, 2), GaussianStage(40, 28, 1, 1)
-RATES = {"end": 0.5, "place": 1.6e-3, "place_end": 1.6e-5}
-PLAN = GaussianPlan(STEPS, start=150, most=220, every=8, grows=(0.1, 0.8), **RATES)
+RATES = {"final_rate": 0.5, "position_rate": 1.6e-3, "final_position_rate": 1.6e-5}
+PLAN = GaussianPlan(STEPS, start=150, most=220, control_every=8, growth=(0.1, 0.8), **RATES)
 """Few steps, so that places move fast."""
 
 
@@ -59,7 +59,7 @@ def views() -> list[Photo]:
 
 def problem_of(views: list[Photo], plan: GaussianPlan = PLAN, count: int = 150, seed: int = 0) -> GaussianProblem:
     """The problem from points that are not the truth's."""
-    batches = RayBatches.of(views, sorted({stage.shrink for stage in plan.stages}))
+    batches = RayBatches.from_photos(views, sorted({stage.shrink for stage in plan.stages}))
     return GaussianProblem(
         batches, [view.camera for view in views], make_start_cloud(places(count, 1), views, plan.degree), plan, seed
     )
@@ -92,13 +92,15 @@ def test_the_gradient_is_that_of_the_loss(
     reals["harmonics"] += mi.TensorXf(rng.normal(0, 0.3, shape).astype(np.float32))
     reals["quaternions"] = mi.TensorXf(rng.normal(size=(6, 4)).astype(np.float32))
     reals["log_scales"] += mi.TensorXf(rng.normal(0, 0.4, (6, 3)).astype(np.float32))
-    gradient = problem.loss_of_view(reals, 3, np.array(behind))[1]
+    gradient = problem.view_loss_and_gradient(reals, 3, np.array(behind))[1]
     steps = {"means": 3e-3, "log_scales": 1e-2, "quaternions": 1e-2, "opacity_logits": 1e-2, "harmonics": 1e-2}
     for name, step in steps.items():
         # Along the gradient's own signs no terms cancel.
         way = np.sign(np.array(gradient[name])) * rng.uniform(0.5, 1, reals[name].shape)
         there = (mi.TensorXf((side * way).astype(np.float32)) for side in (step, -step))
-        moved = [float(problem.loss_of_view({**reals, name: reals[name] + by}, 3, np.array(behind))[0][0]) for by in there]
+        moved = [
+            float(problem.view_loss_and_gradient({**reals, name: reals[name] + by}, 3, np.array(behind))[0][0]) for by in there
+        ]
         if name == "means":
             there = (np.array(reals["means"]) + side * way for side in (step, -step))
             depths = [(mean - views[3].camera.origin) @ views[3].camera.forward for mean in there]
@@ -114,7 +116,7 @@ def test_the_rate_of_higher_harmonics_changes_no_picture(variant_rgb: str, views
     for sheen in (1.0, 0.25):
         problem = problem_of(views, replace(PLAN, stages=(GaussianStage(40, 1, 1, 1),), sheen=sheen), 20)
         problem.cloud["harmonics"][:, 1:] = np.random.default_rng(3).normal(0, 0.3, (20, 3, 3))
-        loss, gradient, _ = problem.loss_of_view(problem.initial_reals(), 2)
+        loss, gradient, _ = problem.view_loss_and_gradient(problem.initial_reals(), 2)
         found.append((float(loss[0]), np.array(gradient["harmonics"]) / np.array([1, sheen, sheen, sheen])[:, None]))
     (loss, slopes), (other, others) = found
     assert other == pytest.approx(loss, rel=1e-6)
@@ -152,14 +154,14 @@ def test_a_resumed_fit_is_an_uninterrupted_one(one_thread: None, views: list[Pho
 @pytest.mark.slow
 def test_growth_changes_what_is_learnt_row_by_row(variant_rgb: str, views: list[Photo]) -> None:
     """Moments follow the rows that stay, and are 0 for those that are new."""
-    fit = fit_of(views, replace(PLAN, grows=(0.9, 1.0)))
+    fit = fit_of(views, replace(PLAN, growth=(0.9, 1.0)))
     while fit.next_iteration < 14:
         fit.advance()
     fit.problem.set_reals(fit.run.reals)
     before = {name: np.array(state[3][2]).reshape(150, -1) for name, state in fit.run.adam.state.items()}
     fit.problem._slopes = np.arange(150.0)
     fit.problem._times[:] = 1
-    fit.problem.plan = replace(fit.problem.plan, grows=(0.0, 0.1), most=153, largest_clone=1e9)
+    fit.problem.plan = replace(fit.problem.plan, growth=(0.0, 0.1), most=153, largest_clone=1e9)
     fit.run.refine(fit.problem.control_density(14))
     assert len(fit.problem.cloud["means"]) == 153
     for name, state in fit.run.adam.state.items():
@@ -175,7 +177,7 @@ def test_growth_changes_what_is_learnt_row_by_row(variant_rgb: str, views: list[
 @pytest.mark.slow
 def test_relocation_keeps_the_picture_and_moves_the_unused(variant_rgb: str, views: list[Photo]) -> None:
     """Gaussians that have become transparent are gone afterwards, and the number is that of the plan's growth."""
-    fit = fit_of(views, replace(PLAN, control="relocation", noise=0.0))
+    fit = fit_of(views, replace(PLAN, control="relocation", position_noise=0.0))
     while fit.next_iteration < 3:
         fit.advance()
     fit.problem.set_reals(fit.run.reals)
@@ -241,15 +243,15 @@ def test_memory_is_counted_and_what_fits_is_said() -> None:
 def test_refusals(variant_rgb: str, views: list[Photo]) -> None:
     with pytest.raises(MivolError, match='control = "clone" is unknown: did you mean "clone_split"'):
         problem_of(views, replace(PLAN, control="clone"))
-    with pytest.raises(MivolError, match="3 points to begin with; 4 are needed"):
+    with pytest.raises(MivolError, match="3 initial points, expected at least 4"):
         make_start_cloud(places(3), views, 0)
     problem = problem_of(views)
-    with pytest.raises(MivolError, match="a fit of Gaussians looks at one"):
+    with pytest.raises(MivolError, match="expected at most 1 view per step of a fit of Gaussians"):
         problem.loss_and_gradient(problem.initial_reals(), 0, 2)
-    with pytest.raises(MivolError, match="views shrunk by 2 are asked for"):
-        GaussianProblem(RayBatches.of(views), [view.camera for view in views], truth(), PLAN)
-    with pytest.raises(MivolError, match="all cameras stand at one place"):
-        GaussianProblem(RayBatches.of(views, (1, 2)), [views[0].camera] * 8, truth(), PLAN)
+    with pytest.raises(MivolError, match="the plan needs views shrunk by 2"):
+        GaussianProblem(RayBatches.from_photos(views), [view.camera for view in views], truth(), PLAN)
+    with pytest.raises(MivolError, match="all cameras are at one position"):
+        GaussianProblem(RayBatches.from_photos(views, (1, 2)), [views[0].camera] * 8, truth(), PLAN)
     assert scene_extent([view.camera for view in views]) > 0
 
 
@@ -263,7 +265,9 @@ def test_transparent_gaussians_wander_along_their_shape(variant_rgb: str) -> Non
         "opacity_logits": np.array([-20, 5], np.float32),
     }
     drawn = rng.normal(size=(2, 3)).astype(np.float32)
-    found = np.array(_wandered({name: mi.TensorXf(a) for name, a in cloud.items()}, mi.Float(drawn.ravel()), mi.Float(0.1)))
+    found = np.array(
+        _move_randomly({name: mi.TensorXf(a) for name, a in cloud.items()}, mi.Float(drawn.ravel()), mi.Float(0.1))
+    )
     turn = rotations(cloud["quaternions"])[0]
     sigma = turn @ np.diag(np.exp(2 * cloud["log_scales"][0])) @ turn.T
     expected = 0.1 * sigma @ drawn[0] / (1 + np.exp(100 * (0 - 0.005)))
@@ -283,8 +287,8 @@ def test_gains_of_photographs_are_found(views: list[Photo]) -> None:
     logs = np.concatenate([logs, -logs])
     twice = [*views[:4], *views[:4]]
     exposed = [replace(v, image=np.float32(v.image * np.exp(log)), alpha=None) for v, log in zip(twice, logs, strict=True)]
-    plan = replace(PLAN, stages=(GaussianStage(20, 320, 0, 2),), exposure=True, every=1000)
-    problem = GaussianProblem(RayBatches.of(exposed, (2,)), [view.camera for view in twice], truth(), plan)
+    plan = replace(PLAN, stages=(GaussianStage(20, 320, 0, 2),), exposure=True, control_every=1000)
+    problem = GaussianProblem(RayBatches.from_photos(exposed, (2,)), [view.camera for view in twice], truth(), plan)
     reconstruct(problem, plan.optimizer, plan.course())
     found = np.log(problem.exposure.table())
     assert np.abs(found.mean(axis=0)).max() < 1e-5
@@ -296,15 +300,17 @@ def test_derivatives_by_gains_are_those_of_the_loss(views: list[Photo]) -> None:
     """Central differences of the loss, which is piecewise smooth in a gain: 1e-2 of it, float32."""
     plan = replace(PLAN, exposure=True, ssim=0.5)
     plain = [replace(view, alpha=None) for view in views]
-    problem = GaussianProblem(RayBatches.of(plain, (1, 2)), [v.camera for v in views], truth(), plan)
+    problem = GaussianProblem(RayBatches.from_photos(plain, (1, 2)), [v.camera for v in views], truth(), plan)
     reals = problem.initial_reals()
     logs = np.zeros((len(views), 3), np.float32)
     logs[2] = [0.3, -0.2, 0.1]
 
     def loss(change: np.ndarray) -> float:
-        return float(problem.loss_of_view(reals | {"exposure": mi.TensorXf(logs + np.float32(change))}, 2)[0].array[0])
+        return float(
+            problem.view_loss_and_gradient(reals | {"exposure": mi.TensorXf(logs + np.float32(change))}, 2)[0].array[0]
+        )
 
-    gradient = np.array(problem.loss_of_view(reals | {"exposure": mi.TensorXf(logs)}, 2)[1]["exposure"])
+    gradient = np.array(problem.view_loss_and_gradient(reals | {"exposure": mi.TensorXf(logs)}, 2)[1]["exposure"])
     assert not gradient[[0, 1, 3]].any()
     for channel in range(3):
         step = np.zeros_like(logs)
@@ -313,5 +319,5 @@ def test_derivatives_by_gains_are_those_of_the_loss(views: list[Photo]) -> None:
 
 
 def test_gains_of_photographs_with_alpha_are_refused(views: list[Photo]) -> None:
-    with pytest.raises(MivolError, match="gains were asked for"):
-        GaussianProblem(RayBatches.of(views, (1, 2)), [v.camera for v in views], truth(), replace(PLAN, exposure=True))
+    with pytest.raises(MivolError, match="found gains and photographs with alpha"):
+        GaussianProblem(RayBatches.from_photos(views, (1, 2)), [v.camera for v in views], truth(), replace(PLAN, exposure=True))

@@ -43,11 +43,11 @@ def test_points_of_a_reconstruction_are_taken_as_they_are() -> None:
     inside = [p for p in points if all(low <= x <= high for low, x, high in zip(BOX[0], p, BOX[1], strict=True))]
     found, says = find_start_points(photos([], points), 7, 3)
     np.testing.assert_array_equal(found, inside)
-    assert says == f"{len(inside)} points of the reconstruction that lie in the box"
+    assert says == f"{len(inside)} points of the reconstruction in the box"
     for few in (points[:99], None):
         found, says = find_start_points(photos([photo(0.0, 0, alpha=False)], few), 7, 3)
         np.testing.assert_array_equal(found, np.random.default_rng((3, 1)).uniform(*BOX, (7, 3)))
-        assert says == "7 points at random in the box"
+        assert says == "7 random points in the box"
     assert len(find_start_points(photos([], points[:100]), 7, 3)[0]) < 100
 
 
@@ -67,10 +67,10 @@ def test_places_are_drawn_where_no_view_sees_through() -> None:
                 kept.append(point)
     found, says = find_start_points(photos(views), 60, 5)
     np.testing.assert_allclose(found, kept[:60], rtol=1e-14)
-    assert says == "60 points at random where no view sees through"
+    assert says == "60 random points that no view shows as transparent"
     assert len(find_start_points(photos(views[:1] + views[3:]), 20, 5)[0]) == 20
     clear = [Photo("clear", v.image, np.zeros_like(v.alpha), None, v.camera, v.background) for v in views]
-    with pytest.raises(MivolError, match="alpha leaves no place in the box"):
+    with pytest.raises(MivolError, match="alpha leaves no part of the box"):
         find_start_points(photos(clear), 10, 5)
 
 
@@ -98,5 +98,5 @@ def test_gaussians_are_as_large_as_their_neighbours_are_far() -> None:
 
 def test_four_places_are_needed() -> None:
     assert len(make_start_cloud(np.eye(4, 3), [], 0)["means"]) == 4
-    with pytest.raises(MivolError, match="found 3 points to begin with; 4 are needed"):
+    with pytest.raises(MivolError, match="found 3 initial points, expected at least 4"):
         make_start_cloud(np.eye(3), [], 0)

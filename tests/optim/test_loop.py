@@ -115,7 +115,7 @@ def test_a_parameter_that_nothing_depends_on(variant_rgb) -> None:
     """An albedo at depth 1 would stay as it is without a word."""
     problem = small_problem(parameters=[Parameter("cube.interior_medium.albedo.value.value", domain=(0.0, 1.0), lr=0.1)])
     problem.integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
-    with pytest.raises(MivolError, match="no derivative leads from the images to cube.interior_medium.albedo"):
+    with pytest.raises(MivolError, match="the images do not depend on cube.interior_medium.albedo"):
         problem.loss_and_gradient(problem.initial_reals(), 0)
 
 

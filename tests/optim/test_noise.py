@@ -263,11 +263,11 @@ def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
         fit = reconstruct(cube_problem(size=64), Adam(), 3, checkpoint=CheckpointFile(path, {}), observer=display)
     fit.save()
     (line,) = fit.log
-    assert line.startswith("iteration 0: the render's noise makes up 0.0")
+    assert line.startswith("iteration 0: the render's noise contributes 0.0")
     share = int(line.partition("%")[0].split()[-1])
     note(2 * stats.norm.sf(8), "share of noise")
     assert 40 <= share <= 75
-    assert "its gradient is not biased" in line
+    assert "the gradient has no bias" in line
     assert "loss.pairs = true" in line
     assert capsys.readouterr().err.count("loss.pairs = true") == 1
     assert reconstruct(cube_problem(size=64), Adam(), 5, checkpoint=CheckpointFile(path, {}, resume=True)).log == [line]
@@ -282,15 +282,15 @@ def test_nothing_is_said_of_exact_renders_and_of_pairs(variant_rgb) -> None:
 
 def test_a_single_sample_tells_nothing(variant_rgb) -> None:
     (line,) = reconstruct(cube_problem(spp=1), Adam(), 2).log
-    assert "fit.spp = 1 does not tell how much" in line
-    with pytest.raises(MivolError, match="fit.spp is 1: set fit.spp to 2"):
+    assert "of unknown size at fit.spp = 1" in line
+    with pytest.raises(MivolError, match="found fit.spp = 1: set fit.spp to 2"):
         reconstruct(cube_problem(spp=1, loss=L2(pairs=True)), Adam(), 1)
 
 
 def test_the_words(variant_rgb) -> None:
     assert describe_noise(L2(), 1.0, 0.04) == describe_noise(L2(), 0.0, 0.0) == ""
     assert "6%" in describe_noise(RelativeL2(), 1.0, 0.06)
-    assert "its gradient is biased too" in describe_noise(Huber(), 1.0, 0.5)
+    assert "the gradient is biased too" in describe_noise(Huber(), 1.0, 0.5)
     assert describe_noise(Huber(pairs=True), 1.0, 0.5) == ""
 
 

@@ -13,7 +13,7 @@ from mivol.photos import Photo
 
 @pytest.mark.slow
 def test_the_field_is_that_of_the_newest_step(variant_rgb: str, photos: list[Photo]) -> None:
-    fit = begin_radiance_fit(RayBatches.of(photos[:4], (1, 2)), BOX, PLAN)
+    fit = begin_radiance_fit(RayBatches.from_photos(photos[:4], (1, 2)), BOX, PLAN)
     before = np.array(current_field(fit).density)
     for _ in range(2):
         fit.advance()

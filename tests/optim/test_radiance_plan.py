@@ -28,7 +28,7 @@ from mivol.photos import Photo
 
 
 def test_memory_is_counted_first(variant_rgb: str, photos: list[Photo]) -> None:
-    views = RayBatches.of(photos[:2])
+    views = RayBatches.from_photos(photos[:2])
     text = check_memory(PRESETS["cpu"], BOX, views, limit=1 << 40)
     assert "MiB" in text
     with pytest.raises(MivolError, match=r"512 nodes along an edge .* longest = (\d+) fits"):
@@ -76,7 +76,7 @@ def test_the_resolution_that_is_said_to_fit_fits(
     variant_rgb: str, photos: list[Photo], preset: str, longest: int, limit: int
 ) -> None:
     """Taken as the next ``longest``, whichever stage then takes the most; one more is refused. Limits in MiB."""
-    views = RayBatches.of(photos[:2])
+    views = RayBatches.from_photos(photos[:2])
 
     def memory(nodes: int) -> str:
         return check_memory(PLANS[preset].with_longest(nodes), BOX, views, limit=limit << 20)

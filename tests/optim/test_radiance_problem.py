@@ -28,12 +28,12 @@ from mivol.transport.line_integrals.radiance_source import bake
 @pytest.mark.slow
 def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) -> None:
     # Total variation of an eighth of the rows a step: of a sixteenth, so few steps leave the surface 2.02 voxels deep.
-    fit = fitted(RayBatches.of(photos, (1, 2)), replace(PLAN, tv_share=1 / 8))
+    fit = fitted(RayBatches.from_photos(photos, (1, 2)), replace(PLAN, tv_share=1 / 8))
     # 0.0032: 25 dB in a view between those it saw. The mean colour of the views alone gives 11 dB.
     assert error_of(fit) < 0.0032
     field = fit.problem.field
     assert field.nodes is not None and field.rows < 0.9 * 24**3
-    assert fit.log == [f"iteration 60: refined to 24 x 24 x 24 nodes, of which {field.rows - 1} are kept"]
+    assert fit.log == [f"iteration 60: refined to 24 x 24 x 24 nodes, {field.rows - 1} of them stored"]
     seen = render_view(field, camera(2.5), WHITE)
     truth = render_view(ball(), camera(2.5), WHITE).depth[22:26, 22:26]
     # Two voxels.
@@ -44,7 +44,7 @@ def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) 
 @pytest.mark.slow
 def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, photos: list[Photo]) -> None:
     """Its first step knows how large derivatives were: begun anew, it would move all that it touches by a whole rate."""
-    fit = fitted(RayBatches.of(photos, (1, 2)), replace(PLAN, tv_density=0.0), PLAN.stages[0].steps)
+    fit = fitted(RayBatches.from_photos(photos, (1, 2)), replace(PLAN, tv_density=0.0), PLAN.stages[0].steps)
     fit.course.events[0].apply(fit)
     fit.events_done = 1
     before = np.array(fit.run.reals["density"])
@@ -58,7 +58,7 @@ def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, phot
 @pytest.mark.parametrize("steps", [9, 14], ids=["first stage", "second stage"])
 def test_a_fit_that_went_on_equals_one_that_did_not_stop(one_thread, photos: list[Photo], tmp_path: Path, steps: int) -> None:
     """With one thread every value and every mean square is equal to the last bit, and what is forgotten shows in it."""
-    batches, path = RayBatches.of(photos[:6], (1, 2)), tmp_path / "checkpoint.npz"
+    batches, path = RayBatches.from_photos(photos[:6], (1, 2)), tmp_path / "checkpoint.npz"
     plan = replace(PLAN, stages=(RadianceStage(8, 10, 2, 3, 8), RadianceStage(16, 10, 1, 3, 8)), tv_density=0.1, first_degree=0)
 
     def begin(store: CheckpointFile) -> Fit:
@@ -96,7 +96,7 @@ def test_steps_take_the_memory_that_is_counted(
 ) -> None:
     """Not more, and more than half: a block that is let go may serve for something else, which is counted as another."""
     plan = replace(PLAN, stages=(RadianceStage(longest, 9, 1, views, 32),), degree=2, tv_every=4)
-    batches = RayBatches.of(photos)
+    batches = RayBatches.from_photos(photos)
 
     give_back()
     before, fit = most_held(), begin_fit(RadianceProblem(batches, BOX, plan), plan.optimizer, plan.course())
@@ -110,7 +110,7 @@ def test_steps_take_the_memory_that_is_counted(
 def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu_back_end: None, photos: list[Photo]) -> None:
     """Though reals and their means are there of old and new nodes, of which most are kept here."""
     plan = replace(PLAN, stages=(RadianceStage(64, 9, 1, 2, 32),), degree=2, keep_weight=0.0, drop=1 / 3)
-    fit = fitted(RayBatches.of(photos), plan, 3)
+    fit = fitted(RayBatches.from_photos(photos), plan, 3)
     rows, dropping = fit.problem.field.rows, fit.course.events[1]
     give_back()
     assert dropping.due(3)
@@ -120,15 +120,15 @@ def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu
     assert held < estimate_bytes(plan, plan.stages[0], BOX, rows)
 
 
-def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> None:
+def test_unvisible_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> None:
     """What is left are the nodes of seen cells and their neighbours, with the values and the squares that they had; Dr.Jit
     holds nothing back of what was there before."""
-    fit = fitted(RayBatches.of(photos, (1, 2)), replace(PLAN, drop=1 / 9), 70)
+    fit = fitted(RayBatches.from_photos(photos, (1, 2)), replace(PLAN, drop=1 / 9), 70)
     problem = fit.problem
     before, squares = problem.field, np.array(fit.run.squares["density"])
     stored = np.zeros(before.node_count, bool)
     stored[before.stored_nodes()] = True
-    expected = stored & maximum_filter(problem.seen_nodes()[0], 3).reshape(-1)
+    expected = stored & maximum_filter(problem.visible_nodes()[0], 3).reshape(-1)
     dropping = fit.course.events[1]
     assert dropping.due(70)
     says = dropping.apply(fit)
@@ -140,7 +140,7 @@ def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> Non
     assert held - most_held() < 1 << 16
     after = problem.field
     np.testing.assert_array_equal(after.stored_nodes(), np.flatnonzero(expected))
-    assert says == f"unseen nodes left out: 24 x 24 x 24 nodes, of which {after.rows - 1} are kept"
+    assert says == f"unseen nodes removed: 24 x 24 x 24 nodes, {after.rows - 1} of them stored"
     assert 100 < after.rows < 0.9 * before.rows
     kept = expected[stored]
     for old, new in zip(before.values(), after.values(), strict=True):
@@ -152,13 +152,13 @@ def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> Non
 def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: list[Photo]) -> None:
     """Its row is a corner of the cells at the edge of what is stored, here of a fog that fills the box's middle: what they
     would have it become, it does not."""
-    problem = RadianceProblem(RayBatches.of(photos[:3], (1, 2)), BOX, PLAN)
+    problem = RadianceProblem(RayBatches.from_photos(photos[:3], (1, 2)), BOX, PLAN)
     middle = np.zeros(problem.field.res, bool)
     middle[3:9, 3:9, 3:9] = True
     problem.field = problem.field.select_nodes(middle)
     problem.update_occupancy()
-    batch = problem.batches.draw(2, np.arange(3), 30, np.random.default_rng(3))
-    _, slopes = problem.slopes(batch)
+    batch = problem.batches.draw_tiles(2, np.arange(3), 30, np.random.default_rng(3))
+    _, slopes = problem.batch_loss_and_gradient(batch)
     density = np.array(slopes["density"])
     harmonics = np.array(slopes["harmonics"]).reshape(len(density), -1)
     assert density[-1] == 0 and not harmonics[-1].any()
@@ -168,7 +168,7 @@ def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: 
 
 @pytest.mark.slow
 def test_backgrounds_that_change_leave_no_white_in_the_air(variant_rgb: str, photos: list[Photo]) -> None:
-    batches = RayBatches.of(photos, (1, 2), with_alpha=True)
+    batches = RayBatches.from_photos(photos, (1, 2), with_alpha=True)
     fit = fitted(batches, replace(PLAN, random_background=True))
     assert error_of(fit) < 0.0064
     # A corner of the view is empty whatever stands behind it.
@@ -178,9 +178,9 @@ def test_backgrounds_that_change_leave_no_white_in_the_air(variant_rgb: str, pho
 
 def slopes_of(photos: list[Photo], shrink: int = 2, background: np.ndarray | None = None) -> list[np.ndarray]:
     """Squared errors and derivatives of the first step of a fog."""
-    problem, chosen = RadianceProblem(RayBatches.of(photos, (1, 2)), BOX, PLAN), np.arange(len(photos))
-    batch = problem.batches.draw(shrink, chosen, 30, np.random.default_rng(3))
-    loss, slopes = problem.slopes(batch, background)
+    problem, chosen = RadianceProblem(RayBatches.from_photos(photos, (1, 2)), BOX, PLAN), np.arange(len(photos))
+    batch = problem.batches.draw_tiles(shrink, chosen, 30, np.random.default_rng(3))
+    loss, slopes = problem.batch_loss_and_gradient(batch, background)
     return [np.array(a) for a in (loss, *slopes.values())]
 
 
@@ -195,14 +195,14 @@ def test_what_a_mask_leaves_out_is_not_fitted(variant_rgb: str, photos: list[Pho
         first, second = (slopes_of(some, shrink) for some in painted)
         for a, b in zip(first, second, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.abs(a).max())  # sums in another order
-        whole = RayBatches.of(painted[0], (1, 2)).whole(shrink, 1)
+        whole = RayBatches.from_photos(painted[0], (1, 2)).all_pixels(shrink, 1)
         tiles = 48 // shrink // TILE
         counted = np.array(whole.counted).reshape(tiles, tiles, TILE, TILE).transpose(0, 2, 1, 3).reshape(2 * [48 // shrink])
         np.testing.assert_array_equal(counted, mask.reshape(48 // shrink, shrink, 48 // shrink, shrink).all(axis=(1, 3)))
         assert np.any(slopes_of(photos[:3], shrink)[0] != first[0])
     some = [*painted[0][:2], photos[2]]
-    assert RayBatches.of(some).bytes == RayBatches.of(photos[:3]).bytes + 3 * 48 * 48
-    assert RayBatches.of(some).digest() != RayBatches.of([replace(p, mask=None) for p in some]).digest()
+    assert RayBatches.from_photos(some).bytes == RayBatches.from_photos(photos[:3]).bytes + 3 * 48 * 48
+    assert RayBatches.from_photos(some).digest() != RayBatches.from_photos([replace(p, mask=None) for p in some]).digest()
 
 
 def test_each_photograph_may_lie_over_its_own_colour(variant_rgb: str, photos: list[Photo]) -> None:
@@ -217,8 +217,8 @@ def test_each_photograph_may_lie_over_its_own_colour(variant_rgb: str, photos: l
     other = slopes_of([over(p, c) for p, c in zip(whole, colours, strict=True)], 1, np.array([0.3, 0.9, 0.1]))
     for a, b in zip(white, other, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(a).max())  # a background added and taken off again
-    kept = RayBatches.of([over(p, c) for p, c in zip(whole, colours, strict=True)], with_alpha=False)
-    np.testing.assert_array_equal(np.array(kept.whole(1, 2).before).T[0], colours[2])
+    kept = RayBatches.from_photos([over(p, c) for p, c in zip(whole, colours, strict=True)], with_alpha=False)
+    np.testing.assert_array_equal(np.array(kept.all_pixels(1, 2).background).T[0], colours[2])
 
 
 @pytest.mark.slow
@@ -229,7 +229,7 @@ def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> N
     sky = Sky.from_image(image)
     images = [np.clip(render_view(ball(), p.camera, sky).image, 0, 1) for p in photos]
     taken = [Photo(p.name, image, None, None, p.camera, WHITE) for p, image in zip(photos, images, strict=True)]
-    fit = fitted(RayBatches.of(taken, (1, 2)), replace(PLAN, sky=8))
+    fit = fitted(RayBatches.from_photos(taken, (1, 2)), replace(PLAN, sky=8))
     seen, truth = render_view(fit.problem.field, camera(2.5), fit.problem.sky), render_view(ball(), camera(2.5), sky)
     # 22 dB between the views; without a sky 16 dB, and the box is full.
     assert np.mean((np.clip(seen.image, 0, 1) - truth.image) ** 2) < 0.0064
@@ -241,8 +241,8 @@ def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> N
     again = RadianceProblem(problem.batches, BOX, problem.plan)
     again.unpack(problem.pack(fit.run.reals), fit.run.reals)
     np.testing.assert_array_equal(again.sky.image(), problem.sky.image())
-    with pytest.raises(MivolError, match="alpha, which says what is behind"):
-        RadianceProblem(RayBatches.of(photos, (1, 2), with_alpha=True), BOX, problem.plan)
+    with pytest.raises(MivolError, match="alpha, which marks their background"):
+        RadianceProblem(RayBatches.from_photos(photos, (1, 2), with_alpha=True), BOX, problem.plan)
 
 
 def test_a_sky_begins_with_what_most_pixels_show(variant_rgb: str, photos: list[Photo]) -> None:
@@ -252,20 +252,20 @@ def test_a_sky_begins_with_what_most_pixels_show(variant_rgb: str, photos: list[
     masks = [np.ones(p.alpha.shape, bool) for p in photos[:3]]
     images[0][:], masks[0][:] = 1, False
     taken = [Photo(p.name, i, None, m, p.camera, WHITE) for p, i, m in zip(photos, images, masks, strict=False)]
-    problem = RadianceProblem(RayBatches.of(taken, (1, 2)), BOX, replace(PLAN, sky=8))
+    problem = RadianceProblem(RayBatches.from_photos(taken, (1, 2)), BOX, replace(PLAN, sky=8))
     np.testing.assert_allclose(problem.sky.image(), np.broadcast_to(dark, (8, 16, 3)), atol=1e-6)
     blind = [replace(p, mask=np.zeros_like(p.mask)) for p in taken]
-    np.testing.assert_array_equal(RayBatches.of(blind).median(), 0.5)
+    np.testing.assert_array_equal(RayBatches.from_photos(blind).median(), 0.5)
 
 
 def test_opacities_are_asked_to_be_none_or_all(variant_rgb: str, photos: list[Photo]) -> None:
     """The beta prior's part of the derivatives is that of the mean of log T + log(1 - T) over the rays."""
-    batches, parts = RayBatches.of(photos[:3], (1, 2)), {}
+    batches, parts = RayBatches.from_photos(photos[:3], (1, 2)), {}
     problem = RadianceProblem(batches, BOX, replace(PLAN, start=1.0))  # a fog: no density is at the ReLU's kink
-    batch = batches.draw(2, np.arange(3), 30, np.random.default_rng(3))
+    batch = batches.draw_tiles(2, np.arange(3), 30, np.random.default_rng(3))
     for beta in (0.0, 0.5):
         problem.plan = replace(PLAN, beta=beta)
-        parts[beta] = np.array(problem.slopes(batch, np.ones(3))[1]["density"], np.float64)
+        parts[beta] = np.array(problem.batch_loss_and_gradient(batch, np.ones(3))[1]["density"], np.float64)
     way = np.random.default_rng(4).normal(size=parts[0.0].shape)
 
     def prior(density: np.ndarray) -> float:
@@ -282,7 +282,7 @@ def test_opacities_are_asked_to_be_none_or_all(variant_rgb: str, photos: list[Ph
 
 
 def test_fits_that_are_refused(variant_rgb: str, photos: list[Photo]) -> None:
-    batches = RayBatches.of(photos[:2])
+    batches = RayBatches.from_photos(photos[:2])
     for box, said in ((BOX[::-1], "lower and its upper"), (np.zeros(3), "lower and its upper")):
         with pytest.raises(MivolError, match=said):
             RadianceProblem(batches, box, replace(PLAN, stages=PLAN.stages[1:]))
@@ -290,12 +290,12 @@ def test_fits_that_are_refused(variant_rgb: str, photos: list[Photo]) -> None:
         RadianceProblem(batches, BOX, PLAN)
     bent = replace(photos[0], camera=replace(photos[0].camera, distortion=Lens(k1=0.1)))
     with pytest.raises(MivolError, match="rectify"):
-        RayBatches.of([bent])
+        RayBatches.from_photos([bent])
     with pytest.raises(MivolError, match="no alpha"):
-        RayBatches.of([replace(photos[0], alpha=None)], with_alpha=True)
+        RayBatches.from_photos([replace(photos[0], alpha=None)], with_alpha=True)
     with pytest.raises(MivolError, match="shrink less"):
-        RayBatches.of(photos[:1], (16,))
+        RayBatches.from_photos(photos[:1], (16,))
     empty = [replace(p, image=np.ones_like(p.image)) for p in photos[:4]]
-    nothing = RadianceProblem(RayBatches.of(empty, (1, 2)), BOX + 50.0, PLAN)
-    with pytest.raises(MivolError, match="no view sees"):
+    nothing = RadianceProblem(RayBatches.from_photos(empty, (1, 2)), BOX + 50.0, PLAN)
+    with pytest.raises(MivolError, match="no view shows matter"):
         reconstruct(nothing, PLAN.optimizer, PLAN.course())

@@ -12,25 +12,25 @@ from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
 
 
 def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo]) -> None:
-    views = RayBatches.of(photos[:3], (1, 2))
-    batch = views.draw(1, np.array([0, 2]), 5, np.random.default_rng(0))
+    views = RayBatches.from_photos(photos[:3], (1, 2))
+    batch = views.draw_tiles(1, np.array([0, 2]), 5, np.random.default_rng(0))
     assert dr.width(batch.slot) == 2 * 5 * TILE**2
-    whole = views.whole(1, 1)
+    whole = views.all_pixels(1, 1)
     _, d = rays(photos[1].camera, pixel_centres((48, 48)))
     found = np.array(whole.rays.d).T.reshape(12, 12, 4, 4, 3).transpose(0, 2, 1, 3, 4).reshape(48, 48, 3)
     np.testing.assert_allclose(found, d, atol=3e-7)
     image = np.array(whole.target).T.reshape(12, 12, 4, 4, 3).transpose(0, 2, 1, 3, 4).reshape(48, 48, 3)
     np.testing.assert_allclose(image, photos[1].image, atol=0.5 / 255 + 1e-6)
-    half = np.array(views.whole(2, 1).rays.d).T[0]
+    half = np.array(views.all_pixels(2, 1).rays.d).T[0]
     assert np.abs(half - d[0:2, 0:2].mean(axis=(0, 1))).max() < 1e-3
-    assert views.digest() != RayBatches.of(photos[1:4], (1, 2)).digest()
+    assert views.digest() != RayBatches.from_photos(photos[1:4], (1, 2)).digest()
 
 
 def test_a_tile_is_the_smallest_view(variant_rgb: str) -> None:
     """A view of one tile is taken as it is; at half its size it is refused, with the way out."""
     camera = Camera(intrinsics(10, 10, TILE / 2, TILE / 2), (TILE, TILE), np.eye(4))
     photo = Photo("a", np.full((TILE, TILE, 3), 0.5, np.float32), None, None, camera, np.zeros(3, np.float32))
-    batch = RayBatches.of([photo]).draw(1, np.array([0]), 1, np.random.default_rng(0))
+    batch = RayBatches.from_photos([photo]).draw_tiles(1, np.array([0]), 1, np.random.default_rng(0))
     np.testing.assert_allclose(np.array(batch.target), 0.5, atol=0.5 / 255 + 1e-6)
-    with pytest.raises(MivolError, match=f"a view of {TILE // 2} pixels an edge was given at 1/2; {TILE} are needed"):
-        RayBatches.of([photo], (1, 2))
+    with pytest.raises(MivolError, match=f"found a view of {TILE // 2} pixels an edge at 1/2, expected at least {TILE}"):
+        RayBatches.from_photos([photo], (1, 2))

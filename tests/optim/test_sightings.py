@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from ball_photos import BOX, PLAN, fitted
 
-from mivol.optim.photographs.depth_supervision import EACH, OFF, WRONG, DepthRays, depth_loss_gradient, sample_depth_rays
+from mivol.optim.photographs.depth_supervision import (
+    OUTLIERS,
+    POINTS_PER_VIEW,
+    UNCERTAINTY,
+    DepthRays,
+    depth_loss_gradient,
+    sample_depth_rays,
+)
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
@@ -32,13 +39,13 @@ def test_points_are_rays_that_end_before_and_behind_them(variant_rgb: str) -> No
     origins = np.array([[3.0, 0, 0], [0, 4, 0], [0, 0, 5], [9, 9, 9]])
     points = [near, far, beyond, np.zeros((0, 3))]
     found = sample_depth_rays(points, origins, BOX, 2, VOXEL, np.random.default_rng(0))
-    assert found.count == 2 * EACH
+    assert found.count == 2 * POINTS_PER_VIEW
     ends, t = ends_of(found)
     for slot, point, voxel in ((0, near, VOXEL), (1, far, 2 * VOXEL)):
-        own = np.arange(found.count) // EACH == slot
+        own = np.arange(found.count) // POINTS_PER_VIEW == slot
         away = point[0] - origins[slot]
         d = np.linalg.norm(away)
-        off = (voxel + OFF * d) * np.array([[-1.0], [1.0]])
+        off = (voxel + UNCERTAINTY * d) * np.array([[-1.0], [1.0]])
         np.testing.assert_allclose(t[:, own] - d, np.broadcast_to(off, (2, own.sum())), atol=1e-5)
         np.testing.assert_allclose(ends[:, own] - point, np.repeat((off * away / d)[:, None], own.sum(), axis=1), atol=1e-5)
     assert sample_depth_rays(points[2:], origins[2:], BOX, 2, VOXEL, np.random.default_rng(0)) is None
@@ -49,7 +56,7 @@ def test_points_are_rays_that_end_before_and_behind_them(variant_rgb: str) -> No
 def energy(T: np.ndarray) -> float:
     """The mean of E over points, of transmittances before (first half) and behind them."""
     before, behind = T.reshape(2, -1)
-    return float(np.mean(-np.log((1 - WRONG) * (before - behind) + WRONG)))
+    return float(np.mean(-np.log((1 - OUTLIERS) * (before - behind) + OUTLIERS)))
 
 
 def test_slopes_of_the_energy_by_transmittances(variant_rgb: str) -> None:
@@ -70,11 +77,11 @@ def sighted(photos: list[Photo]) -> list[Photo]:
 
 def test_derivatives_of_a_fog_are_those_of_a_closed_form(variant_rgb: str, sighted: list[Photo]) -> None:
     """A fog is even, so that the sum over all nodes is the derivative by its one density s: T = exp(-s l)."""
-    problem = RadianceProblem(RayBatches.of(sighted, (1, 2)), BOX, replace(PLAN, depth=0.7))
+    problem = RadianceProblem(RayBatches.from_photos(sighted, (1, 2)), BOX, replace(PLAN, depth=0.7))
     chosen = np.arange(4)
-    batch = problem.batches.draw(2, chosen, 4, np.random.default_rng(0))
-    drawn = problem._sightings(chosen, 3)
-    with_points, without = (problem.slopes(batch, None, points)[1] for points in (drawn, None))
+    batch = problem.batches.draw_tiles(2, chosen, 4, np.random.default_rng(0))
+    drawn = problem._draw_depth_rays(chosen, 3)
+    with_points, without = (problem.batch_loss_and_gradient(batch, None, points)[1] for points in (drawn, None))
     found = {name: np.array(with_points[name], np.float64) - np.array(without[name]) for name in without}
     assert not found["harmonics"].any()
     ends, t = ends_of(drawn)
@@ -84,7 +91,7 @@ def test_derivatives_of_a_fog_are_those_of_a_closed_form(variant_rgb: str, sight
     inside = t - planes.min(axis=0).max(axis=-1)
     s = PLAN.start / problem.unit
     before, behind = np.exp(-s * inside)
-    by_s = -(1 - WRONG) * (-inside[0] * before + inside[1] * behind) / ((1 - WRONG) * (before - behind) + WRONG)
+    by_s = -(1 - OUTLIERS) * (-inside[0] * before + inside[1] * behind) / ((1 - OUTLIERS) * (before - behind) + OUTLIERS)
     # Sums of some thousand numbers of float32 of both signs.
     np.testing.assert_allclose(found["density"].sum(), 0.7 * by_s.mean(), rtol=1e-4)
 
@@ -99,7 +106,7 @@ def test_rays_of_a_fit_end_nearer_to_the_points_that_it_was_told(variant_rgb: st
     ended = []
     for depth in (0.0, 0.01):
         plan = replace(PLAN, stages=PLAN.stages[:1], depth=depth)
-        problem = fitted(RayBatches.of(few, (2,)), plan).problem
+        problem = fitted(RayBatches.from_photos(few, (2,)), plan).problem
         points, origins = problem.batches.points, problem.batches.origins
         drawn = sample_depth_rays(points, origins, BOX, 1, 2 / 12, np.random.default_rng(0))
         cells = find_occupied_cells(problem.field)
@@ -110,14 +117,16 @@ def test_rays_of_a_fit_end_nearer_to_the_points_that_it_was_told(variant_rgb: st
 
 def test_points_change_a_fit_only_where_they_are_asked_for(one_thread: None, photos: list[Photo], sighted: list[Photo]) -> None:
     def slope(some: list[Photo], depth: float) -> np.ndarray:
-        problem = RadianceProblem(RayBatches.of(some, (1, 2)), BOX, replace(PLAN, depth=depth))
+        problem = RadianceProblem(RayBatches.from_photos(some, (1, 2)), BOX, replace(PLAN, depth=depth))
         return np.array(problem.loss_and_gradient(problem.initial_reals(), 0)[1]["density"])
 
     # Nothing is walked for a weight of 0.
-    plain, asked = (RadianceProblem(RayBatches.of(sighted, (1, 2)), BOX, replace(PLAN, depth=d)) for d in (0, 0.1))
-    assert plain._sightings(np.arange(4), 0) is None and asked._sightings(np.arange(4), 0).count == 4 * EACH
+    plain, asked = (RadianceProblem(RayBatches.from_photos(sighted, (1, 2)), BOX, replace(PLAN, depth=d)) for d in (0, 0.1))
+    assert (
+        plain._draw_depth_rays(np.arange(4), 0) is None and asked._draw_depth_rays(np.arange(4), 0).count == 4 * POINTS_PER_VIEW
+    )
     without = slope(photos[:4], 0.1)
     np.testing.assert_array_equal(slope(sighted, 0.0), without)
     assert np.abs(slope(sighted, 0.1) - without).max() > 0
-    digests = {RayBatches.of(some, (1,)).digest() for some in (photos[:4], sighted)}
+    digests = {RayBatches.from_photos(some, (1,)).digest() for some in (photos[:4], sighted)}
     assert len(digests) == 2

@@ -84,7 +84,10 @@ def fit_views(
     half = RadianceStage(size.longest // 2, size.steps // 4, size.shrink, 4, max(size.tiles // size.shrink, 16))
     whole = RadianceStage(size.longest, size.steps - size.steps // 4, 1, 4, size.tiles)
     plan = RadiancePlan((half, whole), degree=degree, **priors)
-    problem, watch = RadianceProblem(RayBatches.of(photos, [stage.shrink for stage in plan.stages]), box, plan), Stopwatch()
+    problem, watch = (
+        RadianceProblem(RayBatches.from_photos(photos, [stage.shrink for stage in plan.stages]), box, plan),
+        Stopwatch(),
+    )
     with watch:
         reconstruct(problem, plan.optimizer, plan.course())
     renders = [render_view(problem.field, photo.camera, photo.background).image for photo in held_out]

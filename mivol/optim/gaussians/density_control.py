@@ -1,4 +1,4 @@
-"""How many Gaussians there are during a fit, and where: clone, split, prune, reset opacities; or relocate the unused ones.
+"""Density control of Gaussians: clone, split, prune, reset opacities; or relocate unused Gaussians.
 
 Conventions. A cloud is a dict of float32 arrays by the names of :mod:`mivol.splatting.splatter` ("means", "log_scales", ...),
 row by row. Arrays are never changed in place: a :class:`CloudChange` holds the new rows, the old row of each, and which rows
@@ -32,13 +32,13 @@ __all__ = [
 ]
 
 CloudArrays = dict[str, NDArray[np.float32]]
-"""A cloud, or what is known of one, by name; the first axis counts Gaussians."""
+"""A cloud, or moments of a cloud, by name; the first axis counts Gaussians."""
 
 SHRINK = 1.6
-"""By how much each of two halves of a Gaussian is smaller (Kerbl et al. 2023)."""
+"""Factor by which each half of a split Gaussian is smaller (Kerbl et al. 2023)."""
 
 MOST_COPIES = 51
-"""Gaussians at one place that are told apart: the sum below loses its digits beyond (as the published code)."""
+"""Maximum number of Gaussians at one position in the sum below, which loses its digits beyond (as the published code)."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class CloudChange:
 
     Attributes:
         cloud: its arrays.
-        parent: (M,) row that each came from.
-        forgets: (M,) bool: what was learnt about the parent does not hold.
+        parent: (M,) old row of each row.
+        forgets: (M,) bool: whether the parent's moments are invalid.
     """
 
     cloud: CloudArrays
@@ -56,25 +56,25 @@ class CloudChange:
     forgets: NDArray[np.bool_]
 
     def carry(self, learnt: CloudArrays) -> CloudArrays:
-        """What was learnt about the old rows, for the new ones; 0 where nothing is known."""
+        """Moments of the old rows, for the new rows; 0 for invalid moments."""
         found = {name: array[self.parent] for name, array in learnt.items()}
         for array in found.values():
             array[self.forgets] = 0
         return found
 
     def then(self, later: CloudChange) -> CloudChange:
-        """This change and another one of its cloud, as one."""
+        """This change, followed by another change of its cloud, as one change."""
         return CloudChange(later.cloud, self.parent[later.parent], self.forgets[later.parent] | later.forgets)
 
 
 def unchanged(cloud: CloudArrays) -> CloudChange:
-    """The cloud as it is."""
+    """A change that keeps the cloud."""
     n = len(cloud["means"])
     return CloudChange(cloud, np.arange(n), np.zeros(n, bool))
 
 
 def select_rows(score: NDArray, least: float, most: int) -> NDArray[np.int64]:
-    """Rows whose score is at least ``least``, in ascending order: the ``most`` highest where there are more."""
+    """Rows with a score of at least ``least``, in ascending order: at most the ``most`` highest."""
     rows = np.flatnonzero(score >= least)
     if len(rows) > most:
         rows = rows[np.argsort(-score[rows], kind="stable")[: max(most, 0)]]
@@ -82,16 +82,16 @@ def select_rows(score: NDArray, least: float, most: int) -> NDArray[np.int64]:
 
 
 def clone_and_split(cloud: CloudArrays, rows: NDArray[np.int64], largest_clone: float, rng: np.random.Generator) -> CloudChange:
-    """One more Gaussian for each of some: small ones are doubled, large ones become two that are drawn from them.
+    """Divide some Gaussians: duplicate small ones, and replace large ones by two halves.
 
-    A clone stands where its parent does; their derivatives differ from the next step on, as their moments do. Both halves of a
-    split are drawn from the normal distribution that the Gaussian is, and are smaller by 1.6.
+    A clone stands at its parent's position; derivatives and moments of both differ from the next step on. Both halves of a
+    split are drawn from the Gaussian's normal distribution, and are smaller by 1.6.
 
     Args:
         cloud: N Gaussians.
-        rows: of those that are divided, each once.
+        rows: rows to divide, each once.
         largest_clone: scale [length] above which a Gaussian is split.
-        rng: where halves stand.
+        rng: positions of the halves.
     """
     n = len(cloud["means"])
     is_large = np.exp(cloud["log_scales"][rows].max(axis=1)) > largest_clone
@@ -109,28 +109,28 @@ def clone_and_split(cloud: CloudArrays, rows: NDArray[np.int64], largest_clone: 
 
 
 def prune(cloud: CloudArrays, keep: NDArray[np.bool_]) -> CloudChange:
-    """Only the Gaussians that are kept.
+    """Only the Gaussians of ``keep``.
 
     Raises:
-        MivolError: none is.
+        MivolError: no Gaussian remains.
     """
     parent = np.flatnonzero(keep)
     if len(parent) == 0:
         raise MivolError(
-            "no Gaussian is left: all have become transparent. Lower the learning rates, or prune at a smaller opacity."
+            "no Gaussian remains, since all became transparent: lower the learning rates, or prune at a smaller opacity."
         )
     return CloudChange({name: array[parent] for name, array in cloud.items()}, parent, np.zeros(len(parent), bool))
 
 
 def reset_opacities(cloud: CloudArrays, highest: float) -> CloudArrays:
-    """The cloud with opacities of at most ``highest``: Gaussians that are needed become opaque again, others can be pruned."""
+    """The cloud with opacities of at most ``highest``: needed Gaussians become opaque again, the others can be pruned."""
     return {**cloud, "opacity_logits": np.minimum(cloud["opacity_logits"], np.float32(logit(highest)))}
 
 
 def relocate(cloud: CloudArrays, unused_below: float, rng: np.random.Generator) -> CloudChange:
-    """Move Gaussians that are all but transparent to where others are, drawn in proportion to their opacity.
+    """Move almost transparent Gaussians to other Gaussians, drawn in proportion to their opacity.
 
-    Those that share a place are made so that their composite is what stood there (:func:`split_opacity_and_scale`).
+    Gaussians that share a position keep the composite of the old one (:func:`split_opacity_and_scale`).
     """
     opacity = expit(cloud["opacity_logits"].astype(np.float64))
     unused, used = np.flatnonzero(opacity < unused_below), np.flatnonzero(opacity >= unused_below)
@@ -143,14 +143,14 @@ def relocate(cloud: CloudArrays, unused_below: float, rng: np.random.Generator) 
 
 
 def grow(cloud: CloudArrays, count: int, least_opacity: float, rng: np.random.Generator) -> CloudChange:
-    """``count`` more Gaussians where others are, drawn in proportion to their opacity, that change no picture."""
+    """Add ``count`` Gaussians at existing ones, drawn in proportion to their opacity, without changing any image."""
     opacity = expit(cloud["opacity_logits"].astype(np.float64))
     source = rng.choice(len(opacity), count, p=opacity / opacity.sum())
     return _shared(cloud, np.concatenate([np.arange(len(opacity)), source]), least_opacity)
 
 
 def _shared(cloud: CloudArrays, parent: NDArray[np.int64], least_opacity: float) -> CloudChange:
-    """Rows that are copies of others: what is at a place is divided among all that stand there."""
+    """Copies of rows, which share the opacity and scale of each position."""
     copies = np.minimum(np.bincount(parent, minlength=len(cloud["means"]))[parent], MOST_COPIES)
     made = {name: array[parent] for name, array in cloud.items()}
     shares = copies > 1
@@ -165,10 +165,11 @@ def _shared(cloud: CloudArrays, parent: NDArray[np.int64], least_opacity: float)
 def split_opacity_and_scale(opacity: NDArray, copies: NDArray) -> tuple[NDArray, NDArray]:
     """Opacity of each of N equal Gaussians that replace one, and the factor on its scale (Kheradmand et al. 2024, eqs. 9, 10).
 
-    Opacities compose to the old one at the middle; the factor keeps the integral of the composite along a line through it.
+    Opacities compose to the old opacity at the centre; the factor keeps the integral of the composite along a line through the
+    centre.
 
     Args:
-        opacity: (M,) of the one, in (0, 1).
+        opacity: (M,) of the replaced Gaussian, in (0, 1).
         copies: (M,) N, 1 to 51.
     """
     each = -np.expm1(np.log1p(-opacity) / copies)

@@ -1,9 +1,9 @@
-"""Gaussians and photographs of what they show as a problem: one whole picture a step, by the tile renderer.
+"""Fit of Gaussians to photographs: one whole image per step, by the tile renderer.
 
-Conventions. The reals are the tensors of :mod:`mivol.splatting.splatter` by name, but for higher harmonics, which are kept
-divided by ``GaussianPlan.sheen``: their rate is smaller by that factor, and all of a tensor has one rate. Colours are code
-values 0..1, as those of the photographs. What a step does is a function of the reals, of the stage, the seed and the step's
-number; what density control does is one of the sums that are kept since it was last done besides.
+Conventions. The reals are the tensors of :mod:`mivol.splatting.splatter` by name. Higher harmonics are stored divided by
+``GaussianPlan.sheen``: their learning rate is smaller by this factor, and all numbers of a tensor share one rate. Colours are
+code values 0..1, as in the photographs. A step depends on the reals, the stage, the seed and its number; density control also
+depends on sums since its last application.
 
 References: Kerbl et al. 2023 (loss, order of views, density control); Kheradmand et al. 2024 (relocation, noise, priors).
 """
@@ -41,31 +41,30 @@ from mivol.splatting.splatter import ScreenStatistics
 
 __all__ = ["GaussianProblem"]
 
-TURN = 0.05
-"""By how much the logarithm of a gain may move at first when its photograph is looked at: a gain of 1.5 takes eight turns or
-more."""
+GAIN_STEP = 0.05
+"""Initial maximum change of a gain's logarithm per visit of its photograph: a gain of 1.5 needs eight visits or more."""
 
 RESET_TO = 0.01
-"""Opacity to which all are lowered now and then."""
+"""Maximum opacity after a reset of all opacities."""
 
 
 @dataclasses.dataclass
 class GaussianProblem:
-    """Gaussians that are fitted to photographs.
+    """Gaussians and photographs of them.
 
     Attributes:
         batches: the photographs, in the sizes of the plan.
-        cameras: of the photographs at full size, pinholes.
-        cloud: where the fit begins; what was found after :meth:`set`.
-        plan: how the fit goes.
-        seed: of the order of views, of backgrounds and of what density control draws.
+        cameras: pinhole cameras of the full-size photographs.
+        cloud: the initial Gaussians; the fitted Gaussians after :meth:`set_reals`.
+        plan: plan of the fit.
+        seed: root of the order of views, of backgrounds and of density control.
         safe_point: called between kernels.
-        stage: the stage at work.
-        exposure: gains of the photographs, where the plan asks for them.
+        stage: number of the current stage.
+        exposure: gains of the photographs, if the plan has gains.
 
     Example:
-        >>> cloud = begin_at(places_of(photos, 5000, 0)[0], photos.views, degree=0)
-        >>> problem = GaussianProblem(RayBatches.of(photos.views, (1, 2)), cameras, cloud, PRESETS["tiny"])
+        >>> cloud = make_start_cloud(find_start_points(photos, 5000, 0)[0], photos.views, degree=0)
+        >>> problem = GaussianProblem(RayBatches.from_photos(photos.views, (1, 2)), cameras, cloud, PRESETS["tiny"])
         >>> reconstruct(problem, problem.plan.optimizer, problem.plan.course())
     """
 
@@ -83,34 +82,34 @@ class GaussianProblem:
             raise MivolError(f'control = "{self.plan.control}" is unknown: {suggest_name(self.plan.control, list(CONTROLS))}')
         absent = {stage.shrink for stage in self.plan.stages} - self.batches.levels.keys()
         if absent:
-            raise MivolError(f"views shrunk by {min(absent)} are asked for; take them over in that size (RayBatches.of).")
+            raise MivolError(f"the plan needs views shrunk by {min(absent)}: give this size to RayBatches.from_photos.")
         self.extent = scene_extent(self.cameras)
         if not self.extent > 1e-6 * max(np.abs(camera.origin).max() for camera in self.cameras):
-            raise MivolError("all cameras stand at one place, which tells no distance: Gaussians need views from several.")
+            raise MivolError("all cameras are at one position, which leaves distances unknown: add views from other positions.")
         if self.plan.exposure:
             if self.batches.channels == 4:
-                raise MivolError("gains were asked for and the photographs have alpha, as renders have: exposure = false.")
-            self.exposure = Exposure.even(len(self.cameras))
-        self.begun_with = len(self.cloud["means"])
+                raise MivolError("found gains and photographs with alpha, which have equal exposures: set exposure = false.")
+            self.exposure = Exposure.neutral(len(self.cameras))
+        self.initial_count = len(self.cloud["means"])
         self._splatters: dict[tuple[int, int, float, float, int], Splatter] = {}
         self._shapes: dict[tuple[int, int], ImageShape] = {}
-        self._looks: dict[tuple[int, int], Camera] = {}
-        self._difference = dr.freeze(image_loss)
-        self.cloud = _of_degree(self.cloud, self.plan.stages[0].degree)
-        self._forget_sums()
+        self._cameras: dict[tuple[int, int], Camera] = {}
+        self._image_loss = dr.freeze(image_loss)
+        self.cloud = _with_degree(self.cloud, self.plan.stages[0].degree)
+        self._reset_statistics()
 
     # -- Values -------------------------------------------------------------------------------------------------------
 
     def initial_reals(self) -> Reals:
-        """The reals of the cloud and of the gains that are there now."""
+        """Reals of the present cloud and gains."""
         return self._with_gains(self._reals_of(self.cloud))
 
     def values(self) -> Reals:
-        """The cloud as tensors, coefficients as they are."""
+        """The cloud as tensors, with unscaled coefficients."""
         return {name: mi.TensorXf(array) for name, array in self.cloud.items()}
 
     def set_reals(self, reals: Reals) -> None:
-        """Take over the cloud and the gains of reals."""
+        """Set the cloud and the gains."""
         if self.exposure is not None:
             self.exposure = Exposure(reals["exposure"].array)
         self.cloud = self._cloud_of({name: value for name, value in reals.items() if name != "exposure"})
@@ -129,71 +128,71 @@ class GaussianProblem:
         return cloud
 
     def _shares(self, count: int) -> np.ndarray:
-        """(count, 1) of a coefficient, over its real."""
+        """(count, 1) ratio of a coefficient to its real."""
         return np.array([1.0] + [self.plan.sheen] * (count - 1), np.float32)[:, None]
 
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
-        """The loss of one view, and its gradient; views take turns in an order that is shuffled each round.
+        """The loss of one view, and its gradient; the views follow a new random order per epoch.
 
         Raises:
-            MivolError: more than one view a step was asked for.
+            MivolError: more than one view per step.
         """
         if views > 1:
-            raise MivolError(f"{views} views a step were asked for; a fit of Gaussians looks at one: leave views out.")
-        round_, at = divmod(iteration, len(self.cameras))
-        view = int(np.random.default_rng((self.seed, 2, round_)).permutation(len(self.cameras))[at])
-        loss, gradient, seen = self.loss_of_view(reals, view, self._background(iteration))
-        self._add_up(seen)
+            raise MivolError(f"found views = {views}, expected at most 1 view per step of a fit of Gaussians: leave views out.")
+        epoch, index = divmod(iteration, len(self.cameras))
+        view = int(np.random.default_rng((self.seed, 2, epoch)).permutation(len(self.cameras))[index])
+        loss, gradient, seen = self.view_loss_and_gradient(reals, view, self._background(iteration))
+        self._add_statistics(seen)
         if self.plan.control == "relocation":
-            loss, gradient = self._sparse(reals, loss, gradient)
+            loss, gradient = self._add_priors(reals, loss, gradient)
         return loss, gradient
 
-    def loss_of_view(
+    def view_loss_and_gradient(
         self, reals: Reals, view: int, background: np.ndarray | None = None
     ) -> tuple[mi.Float, Reals, ScreenStatistics]:
-        """The loss of a view in the size of the stage, its gradient by the reals, and what the screen says of each Gaussian.
+        """The loss of a view in the size of the stage, its gradient by the reals, and the screen statistics of each Gaussian.
 
         Args:
             reals: of the cloud.
-            view: its number.
-            background: put behind the photograph and the cloud (3,); None: the photograph's own.
+            view: number of the view.
+            background: put behind the photograph and the cloud (3,); None keeps the photograph's own background.
         """
         shrink = self.plan.stages[self.stage].shrink
         camera = self._camera(view, shrink)
         splatter = self.splatter_for(camera.size, self.plan.low_pass_at(shrink), self.plan.sheen)
-        picture, kept = splatter.forward(reals, camera)
+        image, saved = splatter.forward(reals, camera)
         self.safe_point()
-        gains = self._gains(reals, view)
-        seen, target, behind, counted = self._compared(picture, view, shrink, background, gains)
-        loss, slope = self._difference(seen, target, self._shape(camera.size), self.plan.ssim)
-        gradient, statistics = splatter.backward(kept, _slope_of_picture(slope, behind, counted, gains, picture.shape))
+        gains = self._gains_of(reals, view)
+        seen, target, behind, counted = self._compare_with_photograph(image, view, shrink, background, gains)
+        loss, slope = self._image_loss(seen, target, self._shape(camera.size), self.plan.ssim)
+        gradient, statistics = splatter.backward(saved, _gradient_of_image(slope, behind, counted, gains, image.shape))
         gradient.pop("pose")
         if self.exposure is not None:
             pixel, by_log = dr.arange(mi.UInt32, dr.width(seen) // 3), seen * slope
             by_log = mi.Color3f(*(dr.sum(dr.gather(mi.Float, by_log, 3 * pixel + c)) for c in range(3)))
-            slopes = self.exposure.slopes(dr.opaque(mi.UInt32, view), by_log)
+            slopes = self.exposure.gradient(dr.opaque(mi.UInt32, view), by_log)
             gradient["exposure"] = mi.TensorXf(slopes, reals["exposure"].shape)
-        # Places on the screen in half edges of the picture, so that a threshold holds for pictures of all sizes.
+        # Screen positions in half edges of the image, so that one threshold fits images of all sizes.
         moved = statistics.d_mean2d * (max(camera.size) / 2)
         return loss, gradient, dataclasses.replace(statistics, d_mean2d=moved)
 
     def _camera(self, view: int, shrink: int) -> Camera:
-        """The camera of a view at a smaller size; rows and columns that fill no square of pixels are left out."""
-        if (view, shrink) not in self._looks:
+        """Camera of a view at a smaller size; incomplete squares of pixels at the border are dropped."""
+        if (view, shrink) not in self._cameras:
             camera, size = self.cameras[view], tuple(int(n) for n in self.batches.levels[shrink].sizes[view])
             smaller = np.diag([1 / shrink, 1 / shrink, 1.0]) @ camera.K
-            self._looks[view, shrink] = dataclasses.replace(camera, K=smaller, size=size)
-        return self._looks[view, shrink]
+            self._cameras[view, shrink] = dataclasses.replace(camera, K=smaller, size=size)
+        return self._cameras[view, shrink]
 
     def splatter_for(self, size: tuple[int, int], low_pass: float, sheen: float = 1.0) -> Splatter:
-        """The renderer of pictures of a size (width, height), for the degree of the stage; each is made once.
+        """Renderer of images of one size (width, height) for the degree of the stage; each is made once.
 
         Args:
-            size: of the picture [pixel].
+            size: of the image [pixel].
             low_pass: variance of the filter [pixel^2].
-            sheen: the plan's for reals; 1 for clouds whose coefficients are as they are.
+            sheen: the plan's for reals; 1 for clouds with unscaled coefficients.
         """
         key = (*size, low_pass, sheen, self.plan.stages[self.stage].degree)
         if key not in self._splatters:
@@ -210,38 +209,40 @@ class GaussianProblem:
         random = self.plan.random_background and self.batches.channels == 4
         return np.random.default_rng((self.seed, 3, iteration)).random(3) if random else None
 
-    def _gains(self, reals: Reals, view: int) -> mi.Float:
-        """By what the three channels of a view are multiplied, evaluated."""
+    def _gains_of(self, reals: Reals, view: int) -> mi.Float:
+        """Gains of the three channels of a view, evaluated."""
         if self.exposure is None:
             return dr.opaque(mi.Float, 1, 3)
         gains = dr.exp(dr.gather(mi.Float, reals["exposure"].array, 3 * dr.opaque(mi.UInt32, view) + dr.arange(mi.UInt32, 3)))
         dr.eval(gains)
         return gains
 
-    def _compared(
-        self, picture: mi.TensorXf, view: int, shrink: int, background: np.ndarray | None, gains: mi.Float
+    def _compare_with_photograph(
+        self, image: mi.TensorXf, view: int, shrink: int, background: np.ndarray | None, gains: mi.Float
     ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
-        """Render and photograph over one background, (H, W, 3) flat and evaluated; the background (3,), and what counts."""
-        codes, counted = self.batches.picture(shrink, view)
-        before = self.batches.behind[view]
+        """Render and photograph over one background, (H, W, 3) flat and evaluated; the background (3,), and the weights of
+        pixels.
+        """
+        codes, counted = self.batches.image(shrink, view)
+        before = self.batches.backgrounds[view]
         behind = before if background is None else background
         colours = [dr.opaque(mi.Float, float(c)) for c in behind]
-        pixels = picture.shape[0] * picture.shape[1]
+        pixels = image.shape[0] * image.shape[1]
         pixel = dr.arange(mi.UInt32, pixels)
-        through = 1 - dr.gather(mi.Float, picture.array, 4 * pixel + 3)
+        through = 1 - dr.gather(mi.Float, image.array, 4 * pixel + 3)
         seen, target = dr.empty(mi.Float, 3 * pixels), dr.empty(mi.Float, 3 * pixels)
         for c, colour in enumerate(colours):
             value = codes[c]
             if len(codes) == 4:
                 value = value + (1 - codes[3]) * (colour - dr.opaque(mi.Float, float(before[c])))
-            shown = dr.gather(mi.Float, picture.array, 4 * pixel + c) + through * colour
+            shown = dr.gather(mi.Float, image.array, 4 * pixel + c) + through * colour
             dr.scatter(seen, shown * dr.gather(mi.Float, gains, mi.UInt32(c)) * counted, 3 * pixel + c)
             dr.scatter(target, value * counted, 3 * pixel + c)
         dr.eval(seen, target)
         return seen, target, mi.Float(np.asarray(behind, np.float32)), counted
 
-    def _sparse(self, reals: Reals, loss: mi.Float, gradient: Reals) -> tuple[mi.Float, Reals]:
-        """With the priors of relocation: the mean opacity and the mean scale [extent]."""
+    def _add_priors(self, reals: Reals, loss: mi.Float, gradient: Reals) -> tuple[mi.Float, Reals]:
+        """Loss and gradient with the priors of relocation: the mean opacity and the mean scale [extent]."""
         n, weight = reals["means"].shape[0], self.plan.sparsity
         each = dr.opaque(mi.Float, weight / n)
         opacity = 1 / (1 + dr.exp(-reals["opacity_logits"].array))
@@ -254,46 +255,45 @@ class GaussianProblem:
     def learning_rates(self, iteration: int) -> dict[str, float]:
         """Learning rate of each parameter.
 
-        A gain has a gradient in one step of n, for n photographs: then Adam moves it by up to sqrt(n) of its rate.
+        With n photographs, a gain has a gradient in one of n steps, and Adam moves it by up to sqrt(n) of its rate.
         """
         found = self.plan.learning_rates(iteration, self.extent)
         if self.exposure is not None:
-            found["exposure"] = self._turn(iteration) / len(self.cameras) ** 0.5
+            found["exposure"] = self._gain_step(iteration) / len(self.cameras) ** 0.5
         return found
 
-    def _turn(self, iteration: int) -> float:
-        """By how much a gain's logarithm may move when its photograph is looked at."""
-        return TURN * self.plan.end ** (iteration / max(self.plan.steps, 1))
+    def _gain_step(self, iteration: int) -> float:
+        """Maximum change of a gain's logarithm per visit of its photograph."""
+        return GAIN_STEP * self.plan.final_rate ** (iteration / max(self.plan.steps, 1))
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
-        """The reals: gains are pulled towards 1; where Gaussians are relocated, transparent ones wander (Kheradmand et al.
-        2024, eq. 8)."""
+        """Pull gains towards 1; for relocation, move transparent Gaussians at random (Kheradmand et al. 2024, eq. 8)."""
         if self.exposure is not None:
-            pulled = Exposure(reals["exposure"].array).pulled(self._turn(iteration) / len(self.cameras))
+            pulled = Exposure(reals["exposure"].array).regularized(self._gain_step(iteration) / len(self.cameras))
             dr.eval(pulled.logs)
             reals = reals | {"exposure": pulled.tensor}
-        if self.plan.control != "relocation" or iteration >= self.plan.grows[1] * self.plan.steps:
+        if self.plan.control != "relocation" or iteration >= self.plan.growth[1] * self.plan.steps:
             return reals
         n = reals["means"].shape[0]
         drawn = np.random.default_rng((self.seed, 4, iteration)).standard_normal((n, 3)).astype(np.float32)
-        size = dr.opaque(mi.Float, self.plan.noise * self.learning_rates(iteration)["means"])
-        return {**reals, "means": _wandered(reals, mi.Float(drawn.ravel()), size)}
+        size = dr.opaque(mi.Float, self.plan.position_noise * self.learning_rates(iteration)["means"])
+        return {**reals, "means": _move_randomly(reals, mi.Float(drawn.ravel()), size)}
 
     def warning(self) -> str:
-        """Nothing: renders have no noise."""
+        """Always empty: renders have no noise."""
         return ""
 
     # -- Density ------------------------------------------------------------------------------------------------------
 
     def control_density(self, iteration: int) -> Refinement:
-        """More Gaussians where the pictures ask for them, fewer where nobody sees them; the sums begin anew."""
+        """Add Gaussians where images need them, remove invisible ones, and restart the sums."""
         rng = np.random.default_rng((self.seed, 5, iteration))
         before = len(self.cloud["means"])
-        room = self.plan.count_at(iteration, self.begun_with) - before
-        change = (self._relocated if self.plan.control == "relocation" else self._divided)(room, rng)
+        room = self.plan.count_at(iteration, self.initial_count) - before
+        change = (self._relocate if self.plan.control == "relocation" else self._clone_and_split)(room, rng)
         reset = self.plan.reset_every and iteration % self.plan.reset_every == 0
         self.cloud = reset_opacities(change.cloud, RESET_TO) if reset else change.cloud
-        self._forget_sums()
+        self._reset_statistics()
 
         def carry(tensors: Reals) -> Reals:
             learnt = change.carry({name: np.array(value) for name, value in tensors.items() if name != "exposure"})
@@ -302,67 +302,67 @@ class GaussianProblem:
             return tensors | {name: mi.TensorXf(array) for name, array in learnt.items()}
 
         now = len(self.cloud["means"])
-        says = f"{now} Gaussians, {before} before" + (", all of opacity 0.01 at most" if reset else "")
-        return Refinement(self.initial_reals(), carry, {}, says)
+        message = f"{now} Gaussians, {before} before" + (", all of opacity 0.01 at most" if reset else "")
+        return Refinement(self.initial_reals(), carry, {}, message)
 
-    def _divided(self, room: int, rng: np.random.Generator) -> CloudChange:
-        """Clone and split where places on the screen are pulled at most; prune what is transparent or too large."""
+    def _clone_and_split(self, room: int, rng: np.random.Generator) -> CloudChange:
+        """Divide Gaussians with the largest gradients of screen positions; prune transparent and very large ones."""
         slope = self._slopes / np.maximum(self._times, 1)
-        rows = select_rows(slope, max(self.plan.threshold, np.finfo(np.float32).tiny), room)
+        rows = select_rows(slope, max(self.plan.split_threshold, np.finfo(np.float32).tiny), room)
         change = clone_and_split(self.cloud, rows, self.plan.largest_clone * self.extent, rng)
         cloud = change.cloud
         keep = expit(cloud["opacity_logits"]) >= self.plan.least_opacity
         keep &= np.exp(cloud["log_scales"].max(axis=1)) <= self.plan.largest * self.extent
         return change.then(prune(cloud, keep))
 
-    def _relocated(self, room: int, rng: np.random.Generator) -> CloudChange:
-        """Move what is transparent to where something is, then grow by at most 5 %."""
+    def _relocate(self, room: int, rng: np.random.Generator) -> CloudChange:
+        """Move transparent Gaussians to opaque ones, then grow by at most 5 %."""
         moved = relocate(self.cloud, self.plan.least_opacity, rng)
         more = min(max(room, 0), max(1, len(self.cloud["means"]) // 20))
         return moved.then(grow(moved.cloud, more, self.plan.least_opacity, rng)) if more else moved
 
-    def _add_up(self, seen: ScreenStatistics) -> None:
+    def _add_statistics(self, seen: ScreenStatistics) -> None:
         self._slopes += np.where(seen.visible, seen.d_mean2d, 0)
         self._times += seen.visible
 
-    def _forget_sums(self) -> None:
-        """Begin to add up anew: the slope of each Gaussian's place on the screen, and how often it was seen."""
+    def _reset_statistics(self) -> None:
+        """Restart the sums of screen gradients and the counts of views of each Gaussian."""
         self._slopes = np.zeros(len(self.cloud["means"]))
         self._times = np.zeros(len(self.cloud["means"]))
 
     # -- Stages -------------------------------------------------------------------------------------------------------
 
     def refine(self, stage: int) -> Refinement:
-        """Go over to photographs of another size, with harmonics of a degree that begin at 0."""
+        """Change to photographs of another size, and to another degree; new harmonics start at 0."""
         self.stage = stage
         now = self.plan.stages[stage]
-        self.cloud = _of_degree(self.cloud, now.degree)
+        self.cloud = _with_degree(self.cloud, now.degree)
 
         def carry(tensors: Reals) -> Reals:
-            learnt = _of_degree({name: np.array(value) for name, value in tensors.items()}, now.degree)
+            learnt = _with_degree({name: np.array(value) for name, value in tensors.items()}, now.degree)
             return {name: mi.TensorXf(array) for name, array in learnt.items()}
 
-        says = f"photographs shrunk by {now.shrink}, harmonics of degree {now.degree}"
-        return Refinement(self.initial_reals(), carry, {}, says)
+        message = f"photographs shrunk by {now.shrink}, harmonics of degree {now.degree}"
+        return Refinement(self.initial_reals(), carry, {}, message)
 
     def update_occupancy(self) -> None:
-        """Nothing is left out of steps but what a camera does not see."""
+        """Do nothing: a step skips Gaussians outside the image only."""
 
     # -- On disk ------------------------------------------------------------------------------------------------------
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
-        """The stage, and the sums since the density was last controlled."""
+        """The stage, and the sums since the last density control."""
         return {"stage": np.array(self.stage), "slopes": self._slopes, "times": self._times}
 
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
-        """Go on from what :meth:`pack` gave; plan, photographs and the first cloud must be the same."""
+        """Continue from the arrays of :meth:`pack`, with the same plan, photographs and initial cloud."""
         self.stage = int(arrays["stage"])
         self.set_reals(reals)
         self._slopes, self._times = np.array(arrays["slopes"]), np.array(arrays["times"])
 
 
-def _of_degree(arrays: CloudArrays, degree: int) -> CloudArrays:
-    """The arrays with harmonics up to a degree: those beyond are left out, new ones are 0."""
+def _with_degree(arrays: CloudArrays, degree: int) -> CloudArrays:
+    """The arrays with harmonics up to a degree: higher ones are dropped, new ones are 0."""
     harmonics, wanted = arrays["harmonics"], (degree + 1) ** 2
     made = np.zeros((len(harmonics), wanted, 3), np.float32)
     shared = min(wanted, harmonics.shape[1])
@@ -370,10 +370,10 @@ def _of_degree(arrays: CloudArrays, degree: int) -> CloudArrays:
     return {**arrays, "harmonics": made}
 
 
-def _slope_of_picture(
+def _gradient_of_image(
     slope: mi.Float, behind: mi.Float, counted: mi.Float, gains: mi.Float, shape: tuple[int, ...]
 ) -> mi.TensorXf:
-    """Derivatives by colour multiplied by alpha, and by alpha, of those by what is seen over a background, times gains."""
+    """Derivatives by premultiplied colour and alpha, from derivatives by the composite over a background, times gains."""
     pixel = dr.arange(mi.UInt32, shape[0] * shape[1])
     dr.eval(slope)
     made, through = dr.empty(mi.Float, 4 * dr.width(pixel)), mi.Float(0)
@@ -386,12 +386,12 @@ def _slope_of_picture(
     return mi.TensorXf(made, shape)
 
 
-STEEPNESS, NEARLY_CLEAR = 100.0, 0.005
-"""How sharply wandering ends where Gaussians are seen, and the opacity about which it does (the published code's)."""
+STEEPNESS, MIDDLE_OPACITY = 100.0, 0.005
+"""Steepness of the logistic function that ends random moves of visible Gaussians, and its middle opacity (published code)."""
 
 
-def _wandered(reals: Reals, drawn: mi.Float, size: mi.Float) -> mi.TensorXf:
-    """Places moved by normal numbers, shaped as the Gaussians are, where their opacity is all but 0."""
+def _move_randomly(reals: Reals, drawn: mi.Float, size: mi.Float) -> mi.TensorXf:
+    """Positions moved by normal numbers with the shape of the Gaussians, where the opacity is almost 0."""
     index = dr.arange(mi.UInt32, reals["means"].shape[0])
 
     def rows(array: mi.Float, count: int) -> list[mi.Float]:
@@ -405,7 +405,7 @@ def _wandered(reals: Reals, drawn: mi.Float, size: mi.Float) -> mi.TensorXf:
     along = mi.Vector3f(*(sum(matrix[i, k] * drawn_rows[i] for i in range(3)) for k in range(3)))
     step = matrix @ (variance * along)
     opacity = 1 / (1 + dr.exp(-reals["opacity_logits"].array))
-    step *= size / (1 + dr.exp(STEEPNESS * (opacity - NEARLY_CLEAR)))
+    step *= size / (1 + dr.exp(STEEPNESS * (opacity - MIDDLE_OPACITY)))
     moved = dr.empty(mi.Float, 3 * dr.width(index))
     for k in range(3):
         dr.scatter(moved, dr.gather(mi.Float, reals["means"].array, 3 * index + k) + step[k], 3 * index + k)

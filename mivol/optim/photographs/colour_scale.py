@@ -1,12 +1,13 @@
-r"""What a fit makes of the numbers of its photographs: the reals that a step moves, and what an error in a pixel weighs.
+r"""Scales of colours in a fit: the reals of a colour, and the weight of a pixel's error.
 
-Codes of 8 bits are even to the eye, so their reals are the colours themselves and all errors weigh the same. Radiance spans
-orders of magnitude. Its reals are :math:`r = \mathrm{asinh}(c)`, near 0 the colour and far from it its logarithm, so one
-learning rate moves lamps and shadows by like shares. An error weighs the slope of a tone curve :math:`\log(y + \epsilon)`,
+8-bit codes are perceptually uniform, so their reals are the colours themselves and all errors have equal weight. Radiance spans
+orders of magnitude. Its reals are :math:`r = \mathrm{asinh}(c)`, the colour near 0 and its logarithm far from 0, so one
+learning rate changes lamps and shadows by equal factors. The weight of an error is the slope of a tone curve :math:`\log(y +
+\epsilon)`,
 
 .. math:: L = \sum_i \Big(\frac{\hat y_i - y_i}{\mathrm{sg}(\hat y_i) + \epsilon}\Big)^2,
 
-where sg takes its argument for a constant: the weight is that of the last step, not a thing to be made smaller.
+where sg makes its argument a constant: the weight comes from the last step and has no derivative.
 
 Source: Mildenhall et al. 2022 (NeRF in the Dark, eq. 4).
 """
@@ -24,9 +25,7 @@ import numpy as np
 __all__ = ["SCALES", "SrgbScale", "LinearScale"]
 
 EPSILON = 0.1
-"""Radiance, over that which is shown white, below which errors weigh about the same. Mildenhall et al. have 0.001: tone-mapped
-views of the ball of tests/optim/test_colour_scale.py then have 31.2 dB in place of 39.8 (45.9
-and 45.5 after four times the steps)."""
+"""Radiance, relative to white, below which all errors have about the same weight. Mildenhall et al. use 0.001."""
 
 
 @dataclass(frozen=True)
@@ -39,51 +38,51 @@ class SrgbScale:
 
     rate: ClassVar[float] = 1.0
 
-    def reals_of(self, colours: mi.Float) -> mi.Float:
-        """Reals of coefficients of colours, or of texels."""
+    def to_reals(self, colours: mi.Float) -> mi.Float:
+        """Reals of colour coefficients, or of texels."""
         return colours
 
-    def colours_of(self, reals: mi.Float) -> mi.Float:
-        """The inverse of :meth:`reals_of`."""
+    def to_colours(self, reals: mi.Float) -> mi.Float:
+        """The inverse of :meth:`to_reals`."""
         return reals
 
-    def by_reals(self, slopes: mi.Float, reals: mi.Float) -> mi.Float:
-        """Derivatives by reals, of those by colours."""
+    def gradient_by_reals(self, slopes: mi.Float, reals: mi.Float) -> mi.Float:
+        """Derivatives by reals, from derivatives by colours."""
         return slopes
 
     def weight(self, shown: mi.Color3f) -> mi.Color3f:
-        """By what an error is multiplied where the fit shows a colour."""
+        """Factor on an error at a rendered colour."""
         return mi.Color3f(1)
 
-    def fog(self, pixels: Callable[[], np.ndarray]) -> np.ndarray:
-        """The colour (3,) of the fog that a fit begins with, of the pixels (N, 3) that it is to explain, if asked."""
+    def fog_colour(self, pixels: Callable[[], np.ndarray]) -> np.ndarray:
+        """Colour (3,) of the initial fog; ``pixels`` returns the pixels (N, 3) of the photographs."""
         return np.full(3, 0.5)
 
 
 @dataclass(frozen=True)
 class LinearScale:
-    """Linear light, in units of about what is shown white; what there is is that of :class:`SrgbScale`."""
+    """Linear radiance, in units of about white; methods as in :class:`SrgbScale`."""
 
     rate: ClassVar[float] = 4.0
-    """A lamp of 100 is as far from grey, in reals, as white would be in codes three times as large; with 4 it is reached."""
+    """A lamp of 100 is as far from grey, in reals, as white would be in codes three times as large; the factor 4 reaches it."""
 
-    def reals_of(self, colours: mi.Float) -> mi.Float:
-        """Numbers that grow with the logarithm of what is large."""
+    def to_reals(self, colours: mi.Float) -> mi.Float:
+        """Reals that grow with the logarithm of large values."""
         return dr.asinh(colours)
 
-    def colours_of(self, reals: mi.Float) -> mi.Float:
-        """The inverse of :meth:`reals_of`."""
+    def to_colours(self, reals: mi.Float) -> mi.Float:
+        """The inverse of :meth:`to_reals`."""
         return dr.sinh(reals)
 
-    def by_reals(self, slopes: mi.Float, reals: mi.Float) -> mi.Float:
-        """Derivatives by reals, of those by colours."""
+    def gradient_by_reals(self, slopes: mi.Float, reals: mi.Float) -> mi.Float:
+        """Derivatives by reals, from derivatives by colours."""
         return slopes * dr.cosh(reals)
 
-    def fog(self, pixels: Callable[[], np.ndarray]) -> np.ndarray:
-        """Half of what the brightest hundredth of the pixels has, at most that of codes.
+    def fog_colour(self, pixels: Callable[[], np.ndarray]) -> np.ndarray:
+        """Half the 99th percentile of the pixels, at most the value of :class:`SrgbScale`.
 
-        A fog brighter than all that is seen is taken away before it has learnt a colour, and for good: densities below 0 have
-        no derivative.
+        A fog brighter than all pixels would vanish before it learns a colour, and never return: densities below 0 have no
+        derivative.
         """
         found = pixels()
         return np.minimum(np.quantile(found, 0.99, axis=0) / 2, 0.5) if len(found) else np.full(3, 0.5)
@@ -94,4 +93,4 @@ class LinearScale:
 
 
 SCALES: dict[str, SrgbScale | LinearScale] = {"srgb": SrgbScale(), "linear": LinearScale()}
-"""By what the values of photographs are (:data:`mivol.photos.photo_file.SPACES`)."""
+"""Scales by the kind of photograph values (:data:`mivol.photos.photo_file.SPACES`)."""

@@ -1,9 +1,9 @@
-"""How bright a camera made each photograph: gains of its three channels, found with the field.
+"""Exposure of photographs: gains of the three channels of each photograph, fitted with the field.
 
-Conventions. A gain multiplies what is seen, in the values that are fitted: of sRGB codes c a gain g says as much as the
-exposure g^2.4, since the curve is nearly a power. Logarithms are stored, (photographs, 3). Their mean over all photographs is
-0: the field could be twice as bright and every photograph half as exposed. Gains are pulled towards 1: what one photograph
-alone sees is told by its gain or by the field's colours, and the colours are to tell it.
+Conventions. A gain multiplies the rendered colour in the values of the photographs. For sRGB codes c, a gain g equals the
+exposure g^2.4, since the curve is nearly a power. The logarithms are stored, (photographs, 3). Their mean over all photographs
+is 0, because a field twice as bright with half the exposure gives the same photographs. Gains are pulled towards 1: for matter
+in a single photograph, gain and field colours are interchangeable, and the field's colours should explain it.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ import numpy as np
 CHANNELS = 3
 
 RATE = 0.01
-"""First learning rate of the logarithms, which falls with the others: 0.5 is reached in 50 steps."""
+"""Initial learning rate of the logarithms, which falls with the other rates: 50 steps reach 0.5."""
 
 PULL = 0.2
-"""Share of a logarithm, times the learning rate, by which it falls in a step: 0.2 % of it at first. Of gains spread by 0.15
-over 20 photographs of a room 79 % were found so, and 72 % with 1, which was 0.5 dB worse on views that were not fitted."""
+"""Share of a logarithm, times the learning rate, by which the logarithm falls per step: initially 0.2 %."""
 
 AGREE = 0.04
-"""Photographs whose gains are spread by less after the first stage (root mean square of the logarithms) are taken to agree, and
-the gains are left out. A tenth of a stop is 0.03."""
+"""Spread (root mean square of the logarithms) after the first stage below which photographs count as equally exposed, and the
+gains are removed. A tenth of a stop is 0.03."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +32,14 @@ class Exposure:
     """Gains of photographs.
 
     Attributes:
-        logs: Float, the natural logarithms of each photograph's three gains.
+        logs: Float, natural logarithms of each photograph's three gains.
     """
 
     logs: mi.Float
 
     @classmethod
-    def even(cls, photographs: int) -> Exposure:
-        """The gain 1 for all."""
+    def neutral(cls, photographs: int) -> Exposure:
+        """Gains of 1."""
         return cls(dr.zeros(mi.Float, photographs * CHANNELS))
 
     @property
@@ -57,19 +56,19 @@ class Exposure:
         """(photographs, 3) gains."""
         return np.exp(np.array(self.logs, np.float64).reshape(-1, CHANNELS))
 
-    def of(self, view: mi.UInt32) -> mi.Color3f:
-        """The gains of photographs, by their numbers."""
+    def gains(self, view: mi.UInt32) -> mi.Color3f:
+        """Gains of photographs, by their numbers."""
         return mi.Color3f(*(dr.exp(dr.gather(mi.Float, self.logs, view * CHANNELS + k)) for k in range(CHANNELS)))
 
-    def slopes(self, view: mi.UInt32, by: mi.Color3f) -> mi.Float:
-        """Derivatives of a scalar with respect to ``logs``, from those with respect to the logarithms of each ray's gains."""
+    def gradient(self, view: mi.UInt32, by: mi.Color3f) -> mi.Float:
+        """Derivatives of a scalar by ``logs``, from its derivatives by the logarithms of each ray's gains."""
         total = dr.zeros(mi.Float, dr.width(self.logs))
         for k in range(CHANNELS):
             dr.scatter_add(total, by[k], view * CHANNELS + k)
         return total
 
-    def pulled(self, rate: float) -> Exposure:
-        """Nearer to 1, as the prior asks after a step of a learning rate, and with a mean of 0 in each channel."""
+    def regularized(self, rate: float) -> Exposure:
+        """Gains after the prior of one step: pulled towards 1, with a mean logarithm of 0 in each channel."""
         entry, photographs = dr.arange(mi.UInt32, dr.width(self.logs)), dr.arange(mi.UInt32, dr.width(self.logs) // CHANNELS)
         means = [dr.mean(dr.gather(mi.Float, self.logs, photographs * CHANNELS + k)) for k in range(CHANNELS)]
         mean = dr.select(entry % CHANNELS == 0, means[0], dr.select(entry % CHANNELS == 1, means[1], means[2]))

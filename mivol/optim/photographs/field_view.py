@@ -1,4 +1,4 @@
-"""A radiance field as a camera sees it."""
+"""Rendering of a radiance field from a camera."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from mivol.transport.line_integrals.radiance_source import bake
 
 @dataclass(frozen=True)
 class FieldView:
-    """A picture of a field: ``image`` (H, W, 3) over its background, ``opacity`` (H, W), ``depth`` (H, W) [length].
+    """A rendered view of a field: ``image`` (H, W, 3) over its background, ``opacity`` (H, W), ``depth`` (H, W) [length].
 
-    ``depth`` is the mean distance of what is seen from the camera; NaN where nothing is.
+    ``depth`` is the mean distance of visible matter from the camera; NaN for empty pixels.
     """
 
     image: np.ndarray
@@ -28,40 +28,40 @@ class FieldView:
 
 
 PASS = 1 << 20
-"""Rays of a picture that are followed at once."""
+"""Maximum number of rays in one pass."""
 
 
 def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0) -> FieldView:
-    """Render what a camera sees.
+    """Render the view of a camera.
 
     Args:
-        field: what is there.
+        field: the radiance field.
         camera: with or without distortion.
-        background: behind the field: a colour (3,), or a sky.
-        stop: a ray ends at this transmittance.
+        background: background of the field: a colour (3,), or a sky.
+        stop: transmittance at which a ray ends.
 
-    Bias: O(h^4) in a cell, and that of :func:`mivol.transport.line_integrals.radiance_source.bake`.
+    Bias: O(h^4) in a cell, and the bias of :func:`mivol.transport.line_integrals.radiance_source.bake`.
     """
     cells, model = find_occupied_cells(field), make_model(field, stop)
     source = bake(field, cells, camera.origin[None], mi.UInt32(0))
     width, height = camera.size
     order = _by_tiles(width, height)
     pixels = pixel_centres(camera.size).reshape(-1, 2)[order]
-    found = np.empty((width * height, 5), np.float32)
+    values = np.empty((width * height, 5), np.float32)
     for start in range(0, len(order), PASS):
         o, d = rays(camera, pixels[start : start + PASS])
         o = np.broadcast_to(o, d.shape)
-        sent = RayBundle(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
-        seen = render_rays(cells, source, model, sent)
-        behind = background.eval(sent.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
-        colour = seen.colour + seen.T * behind
-        dr.eval(colour, seen.T, seen.distance)
-        found[order[start : start + PASS]] = np.stack([*np.array(colour), np.array(seen.T), np.array(seen.distance)], axis=1)
-    found = found.reshape(height, width, 5)
-    opacity = 1 - found[..., 3]
+        bundle = RayBundle(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
+        rendered = render_rays(cells, source, model, bundle)
+        behind = background.eval(bundle.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
+        colour = rendered.colour + rendered.T * behind
+        dr.eval(colour, rendered.T, rendered.distance)
+        values[order[start : start + PASS]] = np.stack([*map(np.array, (*colour, rendered.T, rendered.distance))], axis=1)
+    values = values.reshape(height, width, 5)
+    opacity = 1 - values[..., 3]
     with np.errstate(invalid="ignore", divide="ignore"):
-        depth = np.where(opacity > 0, found[..., 4] / opacity, np.nan)
-    return FieldView(found[..., :3], opacity, depth)
+        depth = np.where(opacity > 0, values[..., 4] / opacity, np.nan)
+    return FieldView(values[..., :3], opacity, depth)
 
 
 def _by_tiles(width: int, height: int) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""How a radiance field is fitted: stages, rates and priors, and the memory that they take.
+"""Plans of radiance field fits: stages, learning rates and priors, and the memory of a fit.
 
-Conventions. Lengths are the world's; learning rates and priors of the density count in half the longest edge of the box, so
-nothing depends on the unit. ``PRESETS`` lists plans by name.
+Conventions. Lengths are in world units. Learning rates and priors of the density are relative to half the longest edge of the
+box, so they do not depend on the unit. ``PRESETS`` lists plans by name.
 """
 
 from __future__ import annotations
@@ -24,24 +24,23 @@ from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.optim.priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
 
 FEW_PHOTOGRAPHS = 50
-"""Photographs below which colours that go with the direction are more than they tell (SH 1 against 2: 23.9 and 23.2 dB)."""
+"""Number of photographs below which view-dependent colours overfit."""
 
 
 @dataclass(frozen=True)
 class RadianceStage:
-    """Some steps on a grid of one resolution.
+    """Steps on a grid of one resolution.
 
     Attributes:
-        longest: nodes along the longest edge of the box; voxels are cubes. Where the plan says ``cubic``, along that of a cube.
-        steps: how many.
-        shrink: edge of the squares of pixels whose means are looked at: where voxels are larger than pixels, a mean says the
-            same with fewer rays.
-        views, tiles: views a step, and tiles of 4 x 4 pixels of each. Each view has a table of all nodes, made and folded in
-            every step: as many rays of fewer views take less time and memory (128^3, 65,536 rays of the chair: 101 ms of
-            processor time from 16 views, 83 ms from 4; held-out views the same to 0.04 dB).
-        rate: factor on the plan's rate of the density. In a voxel of twice the edge a step is twice the optical depth, and thin
-            things are lost where it makes a coarse voxel opaque or empty (rods in 64^3 nodes: 24.6 dB at a rate of 50 in all
-            stages, 28.0 dB at 7.5, 15 and 30 in three).
+        longest: nodes along the longest edge of the box; voxels are cubes. For a ``cubic`` plan, nodes along the edge of a
+            cube.
+        steps: number of steps.
+        shrink: edge of the squares of pixels whose means are fitted. If voxels are larger than pixels, a mean gives the same
+            information with fewer rays.
+        views, tiles: views per step, and tiles of 4 x 4 pixels per view. Each view has a table of all nodes, made and folded in
+            every step, so the same number of rays from fewer views takes less time and memory.
+        rate: factor on the plan's rate of the density. In a voxel of twice the edge a step changes the optical depth twice as
+            much, and thin structures are lost if it makes a coarse voxel opaque or empty.
     """
 
     longest: int
@@ -54,54 +53,54 @@ class RadianceStage:
 
 @dataclass(frozen=True)
 class RadiancePlan:
-    """How a fit goes.
+    """Plan of a radiance field fit.
 
     Attributes:
         stages: in their order.
         degree: of the harmonics, in the last stage.
-        few_degree: the degree where there are fewer than ``FEW`` photographs; None: ``degree`` too.
-        first_degree: in the first one; those between climb evenly. None for ``degree`` in all.
-        density_rate, sh_rate: first learning rates: of the density times half the longest edge [1], of coefficients [radiance].
-        last: factor on both in the last step; they fall exponentially.
+        few_degree: degree for fewer than ``FEW_PHOTOGRAPHS`` photographs; None takes ``degree``.
+        first_degree: degree of the first stage; degrees between rise evenly. None takes ``degree`` in all stages.
+        density_rate, sh_rate: initial learning rates: of the density times half the longest edge [1], of coefficients
+            [radiance].
+        last: factor on both rates in the last step; they fall exponentially.
         delay: share of the steps over which the density's rate rises from a hundredth (a quarter of a sine).
-        memory: of the running mean of squared derivatives.
-        tv_density, tv_sh: total variation of the density and of the coefficients, in photographs: how many of them, all asking
-            for the same, it takes to hold against it. With V photographs a step goes this / V of a learning rate.
-        tv_share: share of the rows that total variation looks at, a step.
-        tv_every: steps from one look to the next, which takes the shares of all between: 1 where there are fewer than ``FEW``
-            photographs, for a look moves values by this / V times the weight in learning rates, and must stay below one.
-        sparsity: Cauchy prior on the density, in photographs.
-        matte: coefficients beyond the constant fall by this / V times their learning rate a step [1 / radiance]: what
-            photographs say about directions is soon more than there is (a room in 52 photographs: 39.2 dB, without 38.2).
-        few_matte: the same where there are fewer than ``FEW`` photographs; None: ``matte`` too. Few gain
-            nothing by it (20 photographs of the fox, and of a room: 23.4 and 28.3 dB with 12, 23.4 and 31.7 with 0).
+        memory: memory of the running mean of squared derivatives.
+        tv_density, tv_sh: total variation of the density and of the coefficients [photographs]: number of agreeing photographs
+            that balance the prior. With V photographs, a step moves values by this / V of a learning rate.
+        tv_share: share of the rows that total variation moves per step.
+        tv_every: steps between two applications of total variation, each with the shares of all these steps. 1 for fewer than
+            ``FEW_PHOTOGRAPHS`` photographs: an application moves values by this / V times the weight in learning rates, and
+            must stay below 1.
+        sparsity: Cauchy prior on the density [photographs].
+        matte: weight decay of the view-dependent coefficients [1 / radiance]: they fall by this / V times their learning rate
+            per step, since they overfit.
+        few_matte: ``matte`` for fewer than ``FEW_PHOTOGRAPHS`` photographs; None takes ``matte``.
         depth: weight of the distances to the points of a reconstruction (:mod:`mivol.optim.photographs.depth_supervision`),
             beside the mean squared error.
-        beta: of log T + log(1 - T), which asks rays to end in matter or to pass; mean over the rays.
-        stop: a ray ends at this transmittance; what is left out is at most that share of the brightest colour.
-        keep_weight: a node is kept where some ray gives a cell of it this weight.
-        start: the first density, times half the longest edge.
-        occupancy_every: steps after which the map of occupied cells is made anew.
-        drop: share of the last stage's steps after which nodes are left out that no view sees, nor a neighbour of theirs, by
-            ``keep_weight``; 0: none are. A stage begins with nodes two voxels beyond what the last one saw.
-        sky: rows of a map of what is behind the field, learned with it (:mod:`mivol.fields.sky`); 0: the photographs' colour.
-        sky_rate: first learning rate of the sky [radiance]; it must lead, or the field fills the box with what is behind.
-        sky_smooth: share of the way that a texel goes to its neighbours in a step, so that none stays as it began.
-        exposure: a gain for each channel of each photograph (:mod:`mivol.optim.photographs.exposure`), where they disagree.
-        levels: nested boxes, each of twice the extent (:mod:`mivol.fields.spherical_grid`).
-        fewer_levels: only as many of them as the points of a reconstruction need, where these are known.
-        near: derivatives of what is nearer to a camera than so many medians of the cameras' distances from the box's middle go
-            down with the square of the distance (Philip & Deschaintre 2023); 0: none do.
-        voxel: pixels along a voxel, seen from the median camera: what photographs are made smaller to, within a factor of
-            sqrt(2), and no box of a ``cubic`` plan is finer. (With 1.2, 2.3 and 4.7 of them held-out training views of the
-            chair came to 30.9, 31.6 and 31.0 dB in as many steps; fits that take longer gain by finer ones.)
-        cubic: a box that is no cube gets as many nodes in all as its stages have in a cube, for memory and time go with them
-            (:func:`scale_longest`); False: ``longest`` is meant as it stands.
-        epochs: times that a stage looks at each pixel of its photographs, at most: few and small ones take fewer steps (230
-            in the last at least), or they are learned by heart (three made-up scenes, 60 photographs of 200 pixels, with 4, 8,
-            16 and 70: 32.5, 33.2, 32.8 and 31.7 dB).
-        random_background: photographs with alpha are seen over another colour each step, so that nothing stands in the air in
-            the background's colour.
+        beta: weight of log T + log(1 - T), mean over the rays, which favours rays that are opaque or empty.
+        stop: transmittance at which a ray ends; the neglected light is at most this share of the brightest colour.
+        keep_weight: a node stays if some ray gives a cell of the node this weight.
+        start: initial density times half the longest edge.
+        occupancy_every: steps between updates of the map of occupied cells.
+        drop: share of the last stage's steps after which nodes are removed if no view sees the node or a neighbour by
+            ``keep_weight``; 0 removes none. A stage begins with nodes up to two voxels beyond the visible nodes of the last
+            stage.
+        sky: rows of a map of the background, fitted with the field (:mod:`mivol.fields.sky`); 0 takes the photographs' colour.
+        sky_rate: initial learning rate of the sky [radiance]; a low rate would let the field fill the box with the background.
+        sky_smooth: share by which a texel moves to its neighbours per step, so that no texel keeps its start.
+        exposure: whether each photograph has a gain per channel (:mod:`mivol.optim.photographs.exposure`), if they disagree.
+        levels: number of nested boxes, each of twice the extent (:mod:`mivol.fields.spherical_grid`).
+        fewer_levels: whether fewer levels suffice if the points of a reconstruction need no more.
+        near: distance in medians of the camera distances from the box's centre, below which derivatives fall with the square of
+            the distance (Philip & Deschaintre 2023); 0 keeps all derivatives.
+        voxel: pixels along a voxel, seen from the median camera. Photographs are shrunk to this size within a factor of
+            sqrt(2), and no box of a ``cubic`` plan is finer.
+        cubic: whether a box that is no cube gets as many nodes as a cube with ``longest`` nodes along its edge, since memory
+            and time follow the number of nodes (:func:`scale_longest`); False takes ``longest`` literally.
+        epochs: maximum number of times that a stage uses each pixel of its photographs. Small sets take fewer steps (at least
+            230 in the last stage), or they would overfit.
+        random_background: whether photographs with alpha get another background colour in each step, so that no matter takes
+            the colour of the background.
     """
 
     stages: tuple[RadianceStage, ...]
@@ -146,18 +145,18 @@ class RadiancePlan:
 
     @property
     def stage_starts(self) -> tuple[int, ...]:
-        """Steps before which the stages after the first begin."""
+        """First steps of all stages but the first."""
         return tuple(int(n) for n in np.cumsum([stage.steps for stage in self.stages])[:-1])
 
     @property
     def drop_steps(self) -> tuple[int, ...]:
-        """Steps before which unseen nodes are left out."""
+        """Steps before which unseen nodes are removed."""
         last = self.stages[-1].steps
         return (self.steps - last + max(1, round(self.drop * last)),) if self.drop > 0 else ()
 
     @property
     def optimizer(self) -> RMSprop:
-        """What takes the steps."""
+        """The optimizer of the plan."""
         return RMSprop(memory=self.memory, half=True)
 
     @property
@@ -171,20 +170,18 @@ class RadiancePlan:
         )
 
     def course(self, *more: Event) -> Course:
-        """All steps, with the stages, the surveys and what else is to happen between them."""
-        between = (
+        """All steps, with the events of the plan and further events."""
+        own = (
             CoarseToFine(at=self.stage_starts),
             DropUnseen(at=self.drop_steps),
             UpdateOccupancy(every=self.occupancy_every),
         )
-        return Course(self.steps, events=(*between, *more))
+        return Course(self.steps, events=(*own, *more))
 
     def with_longest(self, longest: int) -> RadiancePlan:
-        """The plan that ends with so many nodes along the longest edge; stages that are coarser stay.
+        """The plan with another number of nodes along the longest edge at its end; coarser stages stay.
 
-        Where all are, the last of them takes half its steps: it is to find what is empty, and where colours begin (the chair
-        with the nodes of 256^3, in a like time: 31.29 dB with 1159 and 1159 steps of the last two stages, 31.40 with 500 and
-        1400).
+        If all stages are coarser, the last one takes half its steps: it only has to find empty regions and initial colours.
         """
         coarser = [stage for stage in self.stages if stage.longest < longest]
         if len(coarser) == len(self.stages):
@@ -192,11 +189,11 @@ class RadiancePlan:
         return replace(self, stages=(*coarser, replace(self.stages[-1], longest=longest)))
 
     def near_distance(self, origins: np.ndarray, box: np.ndarray) -> float:
-        """The distance from a camera below which derivatives fall [length], of cameras at ``origins`` (V, 3)."""
+        """Distance from a camera below which derivatives fall [length], for cameras at ``origins`` (V, 3)."""
         return self.near * float(np.median(np.linalg.norm(origins - box.mean(axis=0), axis=1)))
 
     def degree_at(self, number: int) -> int:
-        """The degree of the harmonics in a stage."""
+        """Degree of the harmonics in a stage."""
         if self.first_degree is None or len(self.stages) == 1:
             return self.degree
         return round(self.first_degree + (self.degree - self.first_degree) * number / (len(self.stages) - 1))
@@ -223,7 +220,6 @@ CPU = RadiancePlan(
     tv_every=4,
     drop=1 / 4,
 )
-"""The preset ``cpu``."""
 
 PRESETS: dict[str, RadiancePlan] = {
     "tiny": RadiancePlan((RadianceStage(24, 100, 4, tiles=128), RadianceStage(48, 200, 2, tiles=256))),
@@ -264,22 +260,17 @@ PRESETS: dict[str, RadiancePlan] = {
         )
     ),
 }
-"""``tiny`` takes seconds, ``cpu`` a minute on two cores, ``fine`` twenty, for many sharp photographs; ``capture`` takes
-minutes too and is for photographs of a place without bounds; ``gpu`` has the resolutions of Plenoxels (256, then 512; not
+"""``tiny`` takes seconds, ``cpu`` a minute on two cores. ``fine`` takes twenty minutes, for many sharp photographs. ``capture``
+takes minutes, for photographs of a place without bounds. ``gpu`` has the resolutions of Plenoxels (256, then 512; not
 measured).
 
-Rates and priors were chosen on views held out of the chair's training split (32^3 and 64^3), on the still life from 12 and
-60 views and on seven views of the three fields of mivol bench radiance_field. The delay is what few views need most: from
-the first step at the full rate a field is opaque before it has a shape (seven views of a thin shell: 14 dB, with it 28).
-
-With the rates of ``cpu`` a voxel's optical depth moves alike in all stages, and colours move twice as far as by default: half
-the steps end as well. They were chosen on the chair's held-out training views (64^3: densities at 10, 30, 100 and 300, colours
-at 0.05, 0.1 and 0.2), on glossy and on thin things. Few views want lower ones (seven of a thin shell, 64^3, densities at 50 in
-all stages: 1.1 dB less), so they are no default of a plan."""
+Rates and priors were chosen on views held out of training sets. The delay matters most with few views: a field that starts at
+the full rate is opaque before it has a shape. With the rates of ``cpu`` a voxel's optical depth changes equally in all stages,
+and colours move twice as far as by default, so half the steps suffice. Few views need lower rates, so these are no defaults."""
 
 
 def place_grid(box: np.ndarray, longest: int) -> tuple[tuple[int, int, int], np.ndarray]:
-    """Resolution (Z, Y, X) and place of a grid of cubic voxels that fills a box (2, 3), and a little more where it must."""
+    """Resolution (Z, Y, X) and ``to_world`` of a grid of cubic voxels that covers a box (2, 3)."""
     edges = box[1] - box[0]
     h = edges.max() / longest
     counts = np.maximum(np.ceil(edges / h - 1e-9), 1).astype(int)
@@ -289,41 +280,41 @@ def place_grid(box: np.ndarray, longest: int) -> tuple[tuple[int, int, int], np.
 
 
 def scale_longest(longest: int, box: np.ndarray) -> int:
-    """Nodes along the longest edge of a box (2, 3) that has as many in all as a cube with ``longest`` along each edge."""
+    """Nodes along the longest edge of a box (2, 3) for the total of a cube with ``longest`` nodes along each edge."""
     edges = box[1] - box[0]
     return round(longest * edges.max() / float(np.cbrt(edges.prod())))
 
 
 NESTED_FILLED = 0.4
-"""Share of the nodes of a finer stage of nested boxes that are taken to be kept: they hold what is around (0.37 of a room)."""
+"""Assumed share of stored nodes in a finer stage of nested boxes, which hold the surroundings (0.37 for a room)."""
 
 SHELL = 50
-"""Nodes of a finer stage that are taken to be kept, before it is known, for each node of a slice of its box: what is seen is a
-shell, so its share of a grid falls as the edge grows (the chair in the box of its silhouettes: 30, 38 and 52 at 64, 128 and 256
-nodes, the last after short stages)."""
+"""Assumed number of stored nodes in a finer stage, per node of a slice of its box. Visible matter is a shell, so its share of a
+grid falls with the edge (the chair in the box of its silhouettes: 30, 38 and 52 at 64, 128 and 256 nodes, the last value after
+short stages)."""
 
 INDEX = 90
-"""Bytes a row while its cells are listed, beside what stays of them (56 to 98 measured: the chair, the fox, a shell, a fog)."""
+"""Bytes per row while cells are listed, beside the stored list (56 to 98 measured: the chair, the fox, a shell, a fog)."""
 
 RAY = 256
-"""Bytes a ray: its state and what it saw (128 measured), its target, and what is in flight."""
+"""Bytes per ray: state and result (128 measured), target, and temporaries."""
 
 
 def expected_fill(plan: RadiancePlan, stage: RadianceStage) -> float:
-    """Share of the nodes of a finer stage that are taken to be kept."""
+    """Assumed share of stored nodes in a finer stage."""
     return min(1.0, SHELL / stage.longest) if plan.levels == 1 else NESTED_FILLED
 
 
 def estimate_bytes(plan: RadiancePlan, stage: RadianceStage, box: np.ndarray, rows: int | None = None) -> int:
-    """Memory of a stage as Dr.Jit holds it [bytes]: reals, tables of pinholes, neighbours, cells, rays.
+    """Dr.Jit's memory in a stage [bytes]: reals, tables of pinholes, neighbours, cells, rays.
 
-    The end of a step has the most of what is as large as the reals: values and their means in half precision, both before and
-    after the step, and derivatives. A table of pinholes is there with its derivative and, on the CPU, that of each thread. The
-    index of rows and cells takes half a byte a node of the box.
+    The end of a step holds the most arrays of the size of the reals: values and their means in half precision, before and after
+    the step, and derivatives. A table of pinholes exists with its derivative and, on the CPU, one derivative per thread. The
+    index of rows and cells takes half a byte per node of the box.
 
     Args:
-        plan, stage, box: what is asked for.
-        rows: nodes that are stored; None to estimate them. About as many cells are listed.
+        plan, stage, box: plan, stage and box of the fit.
+        rows: number of stored nodes; None estimates it. About as many cells are listed.
     """
     nodes = plan.levels * math.prod(place_grid(box, stage.longest)[0])
     rows = (nodes if stage is plan.stages[0] else int(expected_fill(plan, stage) * nodes)) if rows is None else rows
@@ -337,33 +328,33 @@ def estimate_bytes(plan: RadiancePlan, stage: RadianceStage, box: np.ndarray, ro
 
 
 def allocated_bytes(count: int) -> int:
-    """Bytes that Dr.Jit takes for an array of so many: the next power of two."""
+    """Bytes that Dr.Jit allocates for an array of ``count`` bytes: the next power of two."""
     return 1 << (count - 1).bit_length() if count else 0
 
 
 def check_memory(plan: RadiancePlan, box: np.ndarray, batches: RayBatches, limit: int | None = None) -> str:
-    """What a fit will take, in a sentence.
+    """Check that a fit has enough memory; returns one sentence about its memory.
 
     Args:
-        plan, box, batches: what is asked for.
-        limit: [bytes]; None for what the machine has left (on a GPU nothing is checked).
+        plan, box, batches: plan, box and photographs of the fit.
+        limit: [bytes]; None takes the machine's available memory (unchecked on a GPU).
 
     Raises:
-        MivolError: more than there is; the largest resolution that fits is said.
+        MivolError: the fit needs more memory; the message names the largest resolution that fits.
     """
 
-    def needed(some: RadiancePlan) -> int:
-        return batches.bytes + max(estimate_bytes(some, stage, box) for stage in some.stages)
+    def needed(plan: RadiancePlan) -> int:
+        return batches.bytes + max(estimate_bytes(plan, stage, box) for stage in plan.stages)
 
     most, last = needed(plan), plan.stages[-1]
     if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         limit = available_memory()
     if limit is not None and most > limit:
-        # More nodes never take less, so what fits is found by halving: a longest of 2^31 has that many below it.
+        # Memory never falls with the number of nodes, so bisection finds the largest fit even below 2^31 nodes.
         fitting = 7 + bisect.bisect_right(range(8, last.longest), limit, key=lambda n: needed(plan.with_longest(n)))
         advice = f"longest = {fitting} fits" if fitting > 7 else "no resolution fits: read the photographs smaller"
         taken, left = f"{most / 2**30:.1f} GiB", f"{limit / 2**30:.1f}"
-        raise MivolError(f"a fit with {last.longest} nodes along an edge takes about {taken} and {left} are left; {advice}.")
+        raise MivolError(f"a fit with {last.longest} nodes along an edge needs about {taken}, {left} are available: {advice}.")
     first = estimate_bytes(plan, plan.stages[0], box)
     return (
         f"about {most / 2**20:.0f} MiB: photographs {batches.bytes / 2**20:.0f}, the first grid {first / 2**20:.0f}, "

@@ -1,10 +1,11 @@
-"""Batches of rays of photographs: pixels in memory, in several sizes, and the ray of each.
+"""Batches of rays of photographs: pixels in memory, in several sizes, with the ray of each pixel.
 
-Conventions. A batch is square tiles of pixels: neighbours cross the same cells, so their reads and writes meet in the cache,
-and a packet of lanes walks as one. Tiles lie anywhere in a view, all places alike. Smaller sizes are exact means over area;
-where voxels are larger than pixels, a small image says the same with fewer rays. Values are those of the photographs: codes in
-8-bit steps, not decoded, or radiance. What a mask leaves out has a ray, and counts for nothing. Rays of pinholes are computed;
-those of wide lenses (:mod:`mivol.photos.lens`) are traced once for each lens and size, and looked up.
+Conventions. A batch consists of square tiles of pixels. Neighbouring pixels cross the same cells, so their reads and writes
+share cache lines, and a packet of lanes stays together. Tiles lie anywhere in a view, with uniform probability. Smaller sizes
+are exact area means: if voxels are larger than pixels, a small image gives the same information with fewer rays. Values are the
+photographs' values: codes in 8-bit steps, without decoding, or radiance. A masked pixel has a ray and weight 0. Rays of
+pinholes are computed. Rays of wide lenses (:mod:`mivol.photos.wide_lens`) are traced once for each lens and size, and looked
+up.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ TILE = 4
 class Level:
     """All views in one size: codes 0..255 or radiance, [row][column][rgb] or, with alpha, [rgba], one view after the other.
 
-    ``counted`` is 1 or 0 a pixel; None where no photograph has a mask. ``wide``: rays of wide lenses; None where there is none.
+    ``counted`` is 1 or 0 per pixel; None without masks. ``wide``: rays of wide lenses; None for pinholes only.
     """
 
     codes: mi.UInt8 | mi.Float
@@ -40,26 +41,26 @@ class Level:
     wide: WideRays | None
 
     def values(self, at: mi.UInt32) -> mi.Float:
-        """Numbers of pixels, 0..1 where they are codes."""
-        found = mi.Float(dr.gather(type(self.codes), self.codes, at))
-        return found if dr.is_float_v(self.codes) else found * (1 / 255)
+        """Values of pixels; codes are scaled to 0..1."""
+        value = mi.Float(dr.gather(type(self.codes), self.codes, at))
+        return value if dr.is_float_v(self.codes) else value * (1 / 255)
 
 
 @dataclass
 class WideRays:
-    """Directions through the centres of pixels in the frames of cameras with wide lenses: [row][column][xyz], lens by lens.
+    """Directions through pixel centres in the frames of cameras with wide lenses: [row][column][xyz], lens by lens.
 
     Attributes:
         directions: of all lenses, each once.
-        starts: (V,) the first pixel of each view's lens; -1 for a pinhole.
+        starts: (V,) first pixel of each view's lens; -1 for a pinhole.
     """
 
     directions: mi.Float
     starts: np.ndarray
 
     @classmethod
-    def of(cls, cameras: Sequence[Camera], sizes: np.ndarray, shrink: int) -> WideRays | None:
-        """The rays of cameras whose images have ``sizes`` (V, 2) when shrunk; None where all are pinholes."""
+    def from_cameras(cls, cameras: Sequence[Camera], sizes: np.ndarray, shrink: int) -> WideRays | None:
+        """Rays of cameras whose images have ``sizes`` (V, 2) after shrinking; None for pinholes only."""
         tables, starts, known, count = [], [], {}, 0
         for camera, (width, height) in zip(cameras, sizes, strict=True):
             if not camera.distortion.is_wide:
@@ -73,14 +74,14 @@ class WideRays:
             starts.append(known[lens])
         return cls(mi.Float(np.concatenate(tables)), np.array(starts, np.int32)) if tables else None
 
-    def turned(self, d: mi.Vector3f, slot: mi.UInt32, views: np.ndarray, pixel: mi.UInt32) -> mi.Vector3f:
-        """Directions ``d`` in the cameras' frames, replaced where the view's lens is wide.
+    def replace_directions(self, d: mi.Vector3f, slot: mi.UInt32, views: np.ndarray, pixel: mi.UInt32) -> mi.Vector3f:
+        """Directions ``d`` in the cameras' frames, replaced for views with a wide lens.
 
         Args:
-            d: of pinholes.
-            slot: of each ray's view among ``views``.
+            d: directions of pinholes.
+            slot: index of each ray's view in ``views``.
             views: numbers of views.
-            pixel: its number in its image.
+            pixel: number of each ray's pixel in its image.
         """
         start = dr.gather(mi.Int32, mi.Int32(self.starts[views]), slot)
         is_wide = start >= 0
@@ -91,17 +92,17 @@ class WideRays:
 
 @dataclass
 class RayBatch:
-    """Rays of pixels of some views, and what the photographs show.
+    """Rays of pixels of some views, and the colours of the photographs.
 
     Attributes:
         origins: (V, 3) pinholes of the chosen views.
-        rays: in the world.
-        slot: of each ray's view among the chosen ones.
-        view: of each ray's view among all.
-        target: what the photograph shows.
-        alpha: 1 where the photographs have none.
-        before: the colour that the photograph lies over.
-        counted: 1, or 0 where a mask leaves the pixel out.
+        rays: in world space.
+        slot: index of each ray's view among the chosen views.
+        view: number of each ray's view among all views.
+        target: colour of the photograph.
+        alpha: 1 for photographs without alpha.
+        background: background colour of the photograph.
+        counted: 1, or 0 for a masked pixel.
     """
 
     origins: np.ndarray
@@ -110,20 +111,21 @@ class RayBatch:
     view: mi.UInt32
     target: mi.Color3f
     alpha: mi.Float
-    before: mi.Color3f
+    background: mi.Color3f
     counted: mi.Float
 
 
 @dataclass
 class RayBatches:
-    """Photographs of pinholes and of wide lenses, each of which sees from one point.
+    """Photographs from pinholes and wide lenses, each with a single viewpoint.
 
     Attributes:
-        origins: (V, 3) these points.
-        levels: sizes, by how much they are shrunk: 1, 2, 4 ...
+        origins: (V, 3) viewpoints.
+        lenses: numbers of each lens, ``LENS`` per photograph.
+        levels: sizes by their shrink factor: 1, 2, 4 ...
         channels: 3, or 4 with alpha.
-        space: what their values are, "srgb" (codes) or "linear" (radiance).
-        points: (K, 3) for each photograph, those of a reconstruction that were found in it [length]; empty where none is known.
+        space: kind of the values, "srgb" (codes) or "linear" (radiance).
+        points: (K, 3) visible points of a reconstruction for each photograph [length]; empty without a reconstruction.
     """
 
     origins: np.ndarray
@@ -134,31 +136,31 @@ class RayBatches:
     points: tuple[np.ndarray, ...] = ()
 
     @classmethod
-    def of(
+    def from_photos(
         cls,
         photos: Sequence[Photo],
         shrinks: Sequence[int] = (1,),
         with_alpha: bool | None = None,
         space: str = "srgb",
     ) -> RayBatches:
-        """Take over photographs.
+        """Copy photographs to the device.
 
         Args:
-            photos: at least one.
-            shrinks: sizes to keep, 1 for that of the photographs.
-            with_alpha: keep alpha, for backgrounds that change; None: where all photographs have it.
-            space: what the photographs' values are; codes are kept in steps of 8 bits, between 0 and 1.
+            photos: at least one photograph.
+            shrinks: shrink factors of the sizes to keep, 1 for the full size.
+            with_alpha: keep alpha, for changing backgrounds; None keeps it if all photographs have alpha.
+            space: kind of the photographs' values; codes are stored in steps of 8 bits, between 0 and 1.
 
         Raises:
-            MivolError: a lens that distorts the image plane, or no alpha where it is asked for.
+            MivolError: a lens that distorts the image plane, or a photograph without the required alpha.
         """
         if with_alpha is None:
             with_alpha = all(photo.alpha is not None for photo in photos)
         for photo in photos:
             if photo.camera.distortion and not photo.camera.distortion.is_wide:
-                raise MivolError(f"{photo.name} was taken through a lens with distortion; rectify the photographs first.")
+                raise MivolError(f"the lens of {photo.name} has distortion: rectify the photographs first.")
             if with_alpha and photo.alpha is None:
-                raise MivolError(f"{photo.name} has no alpha; its background cannot be replaced: choose none.")
+                raise MivolError(f"{photo.name} has no alpha, so its background cannot be replaced: set with_alpha to False.")
         lenses = np.array([_lens(photo) for photo in photos], np.float32)
         levels = {shrink: _level(photos, shrink, with_alpha, space) for shrink in sorted(set(shrinks))}
         origins = np.array([photo.camera.origin for photo in photos])
@@ -168,62 +170,62 @@ class RayBatches:
 
     @property
     def bytes(self) -> int:
-        """Memory that the pixels take, and the rays of wide lenses [bytes]."""
+        """Memory of the pixels and the rays of wide lenses [bytes]."""
         wide = sum(4 * dr.width(level.wide.directions) for level in self.levels.values() if level.wide is not None)
         return sum(dr.itemsize_v(pixels) * dr.width(pixels) for pixels in self._pixels()) + wide
 
     @property
-    def behind(self) -> np.ndarray:
-        """(V, 3) the colour that each photograph lies over."""
+    def backgrounds(self) -> np.ndarray:
+        """(V, 3) background colour of each photograph."""
         return np.array(self.lenses).reshape(-1, LENS)[:, 16:]
 
     def _pixels(self) -> list[mi.UInt8 | mi.Float]:
-        """All that is kept of pixels, in the order of the sizes."""
+        """All stored pixel arrays, in the order of the sizes."""
         levels = [level for _, level in sorted(self.levels.items())]
         return [pixels for level in levels for pixels in (level.codes, level.counted) if pixels is not None]
 
     def median(self) -> np.ndarray:
-        """(3,) the median of each colour over the pixels that count, in the smallest size; grey where none does."""
+        """(3,) median of each colour over the counted pixels of the smallest size; grey without such pixels."""
         counted = self.pixels()
         return np.median(counted, axis=0) if len(counted) else np.full(3, 0.5)
 
     def pixels(self) -> np.ndarray:
-        """(N, 3) the colours of the pixels that count, in the smallest size."""
+        """(N, 3) colours of the counted pixels of the smallest size."""
         level = self.levels[max(self.levels)]
         codes = np.array(level.codes).reshape(-1, self.channels)[:, :3]
         counted = codes if level.counted is None else codes[np.array(level.counted) > 0]
         return counted / (255 if self.space == "srgb" else 1)
 
-    def choose(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Numbers of so many views, each at most once, in ascending order; of all where there are fewer."""
-        there = len(self.origins)
-        return np.sort(rng.choice(there, min(count, there), replace=False))
+    def choose_views(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Numbers of ``count`` different views in ascending order; all views if there are fewer."""
+        n = len(self.origins)
+        return np.sort(rng.choice(n, min(count, n), replace=False))
 
-    def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
-        """Draw tiles of some views: ``tiles`` of each, rays of a view side by side."""
+    def draw_tiles(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
+        """Draw ``tiles`` tiles of each of some views; rays of a view are adjacent."""
         level = self.levels[shrink]
-        room = level.sizes[views] - TILE + 1
-        corner = (rng.random((len(views), tiles, 2)) * room[:, None]).astype(np.uint32)
-        # Rays of a view in the order of its rows: neighbours in the image are neighbours in time.
+        corners = level.sizes[views] - TILE + 1
+        corner = (rng.random((len(views), tiles, 2)) * corners[:, None]).astype(np.uint32)
+        # Rays of a view follow its rows: neighbours in the image are close in time.
         order = np.argsort(corner[..., 1] // 32 * 4096 + corner[..., 0], axis=1)
         corner = np.take_along_axis(corner, order[..., None], axis=1)
         lane = dr.arange(mi.UInt32, len(views) * tiles * TILE * TILE)
         tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
         place = [dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(corner[..., a]).reshape(-1)), tile) for a in range(2)]
-        return self.look_up(shrink, views, tile // tiles, place[0] + within % TILE, place[1] + within // TILE)
+        return self.make_batch(shrink, views, tile // tiles, place[0] + within % TILE, place[1] + within // TILE)
 
-    def whole(self, shrink: int, view: int) -> RayBatch:
-        """All pixels of a view, tile by tile; those of tiles that reach over its edge more than once."""
+    def all_pixels(self, shrink: int, view: int) -> RayBatch:
+        """All pixels of a view, tile by tile; tiles that cross the border repeat border pixels."""
         width, height = (int(n) for n in self.levels[shrink].sizes[view])
         across, down = -(-width // TILE), -(-height // TILE)
         lane = dr.arange(mi.UInt32, across * down * TILE * TILE)
         tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
         column = dr.minimum(tile % across * TILE + within % TILE, width - 1)
         row = dr.minimum(tile // across * TILE + within // TILE, height - 1)
-        return self.look_up(shrink, np.array([view]), lane * 0, column, row)
+        return self.make_batch(shrink, np.array([view]), lane * 0, column, row)
 
-    def picture(self, shrink: int, view: int) -> tuple[list[mi.Float], mi.Float]:
-        """A whole view, pixel by pixel: its channels (rgb and, where it is kept, alpha), and what counts (1 or 0)."""
+    def image(self, shrink: int, view: int) -> tuple[list[mi.Float], mi.Float]:
+        """A whole view, pixel by pixel: its channels (rgb and, if kept, alpha), and the weights (1 or 0)."""
         level = self.levels[shrink]
         width, height = (int(n) for n in level.sizes[view])
         pixel = dr.arange(mi.UInt32, width * height) + dr.opaque(mi.UInt32, int(level.starts[view]))
@@ -233,18 +235,18 @@ class RayBatches:
 
     def digest(self) -> str:
         """A fingerprint of cameras, pixels and points."""
-        found = hashlib.sha256(np.array(self.lenses).tobytes())
+        digest = hashlib.sha256(np.array(self.lenses).tobytes())
         for level in self.levels.values():
             if level.wide is not None:
-                found.update(np.array(level.wide.directions).tobytes())
+                digest.update(np.array(level.wide.directions).tobytes())
         for pixels in self._pixels():
-            found.update(np.array(pixels).tobytes())
+            digest.update(np.array(pixels).tobytes())
         for points in self.points:
-            found.update(points.tobytes())
-        return found.hexdigest()[:16]
+            digest.update(points.tobytes())
+        return digest.hexdigest()[:16]
 
-    def look_up(self, shrink: int, views: np.ndarray, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32) -> RayBatch:
-        """The rays through the centres of pixels, and what is there."""
+    def make_batch(self, shrink: int, views: np.ndarray, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32) -> RayBatch:
+        """Rays through pixel centres, with the values of the pixels."""
         level = self.levels[shrink]
         table = np.stack([views, level.starts[views], level.sizes[views][:, 0]], axis=1).astype(np.uint32)
         view, start, width = (dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(table[:, k])), slot) for k in range(3))
@@ -258,12 +260,12 @@ class RayBatches:
         if level.wide is None:
             d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
         else:
-            local = level.wide.turned(mi.Vector3f(x, y, -1), slot, views, within)
+            local = level.wide.replace_directions(mi.Vector3f(x, y, -1), slot, views, within)
             d = mi.Vector3f(*(dr.dot(mi.Vector3f(*lens[4 + 3 * a : 7 + 3 * a]), local) for a in range(3)))
         o = mi.Point3f(lens[13], lens[14], lens[15])
         alpha = values[3] if self.channels == 4 else mi.Float(1)
-        target, before = mi.Color3f(*values[:3]), mi.Color3f(*lens[16:])
-        return RayBatch(self.origins[views], RayBundle(o, dr.normalize(d)), slot, view, target, alpha, before, counted)
+        target, background = mi.Color3f(*values[:3]), mi.Color3f(*lens[16:])
+        return RayBatch(self.origins[views], RayBundle(o, dr.normalize(d)), slot, view, target, alpha, background, counted)
 
 
 LENS = 19
@@ -279,19 +281,19 @@ def _level(photos: Sequence[Photo], shrink: int, with_alpha: bool, space: str) -
     images = [_shrunk(_pixels(photo, with_alpha, space), shrink) for photo in photos]
     sizes = np.array([image.shape[1::-1] for image in images], np.int64)
     if sizes.min() < TILE:
-        raise MivolError(f"a view of {sizes.min()} pixels an edge was given at 1/{shrink}; {TILE} are needed: shrink less.")
+        raise MivolError(f"found a view of {sizes.min()} pixels an edge at 1/{shrink}, expected at least {TILE}: shrink less.")
     counts = sizes.prod(axis=1)
     if counts.sum() * 4 >= 2**32:
-        raise MivolError(f"{counts.sum()} pixels were given; they are counted up to 2^30: read the photographs smaller.")
+        raise MivolError(f"found {counts.sum()} pixels, expected at most 2^30: read the photographs smaller.")
     steps, kind, number = (255, mi.UInt8, np.uint8) if space == "srgb" else (0, mi.Float, np.float32)
     codes = np.concatenate([(np.rint(image * steps) if steps else image).astype(number).reshape(-1) for image in images])
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    wide = WideRays.of([photo.camera for photo in photos], sizes, shrink)
+    wide = WideRays.from_cameras([photo.camera for photo in photos], sizes, shrink)
     return Level(kind(codes), _counted(photos, shrink), sizes, starts, shrink, wide)
 
 
 def _counted(photos: Sequence[Photo], shrink: int) -> mi.UInt8 | None:
-    """Whether a pixel counts: where all that it is the mean of do."""
+    """Whether a pixel counts: all averaged pixels count."""
     if all(photo.mask is None for photo in photos):
         return None
     masks = [np.ones(photo.image.shape[:2]) if photo.mask is None else photo.mask.astype(float) for photo in photos]
@@ -304,7 +306,7 @@ def _pixels(photo: Photo, with_alpha: bool, space: str) -> np.ndarray:
 
 
 def _shrunk(image: np.ndarray, shrink: int) -> np.ndarray:
-    """Means over squares of pixels; rows and columns that fill no square are left out, so that the camera stays the same."""
+    """Means over squares of pixels; incomplete squares at the border are dropped, so the camera stays the same."""
     height, width = (n // shrink * shrink for n in image.shape[:2])
     squares = image[:height, :width].reshape(height // shrink, shrink, width // shrink, shrink, -1)
     return squares.mean(axis=(1, 3))

@@ -1,13 +1,13 @@
-r"""A scene and images of it as a problem: real numbers in, loss and derivatives out, through any Mitsuba integrator.
+r"""Fits of scenes to images: real numbers in, loss and derivatives out, through any Mitsuba integrator.
 
 .. math:: f(u) = \frac{1}{V}\sum_v \mathrm{loss}(I_v(x(u)), I_v^{ref}) + \sum_k \mathrm{energy}_k(x(u))
 
-Conventions. ``u`` are the reals of each :class:`~mivol.optim.parameters.Parameter`, ``x`` the scene's values. An image
-is the mean of passes of at most ``samples_per_pass`` samples: the adjoint of the loss is taken at the whole image, then
-carried back pass by pass, so that non-linear losses do not depend on the split. Where light is sampled, an image is
-the mean of two renders with seeds of their own, which tell how much of the loss is noise. Seeds are a function of (seed,
-iteration, batch, purpose, half, pass) only. Between passes ``safe_point`` is called; nothing that outlives the call has
-changed until it returns, but ``newest_loss``.
+Conventions. ``u`` are the reals of each :class:`~mivol.optim.parameters.Parameter`, ``x`` the scene's values. An image is the
+mean of passes of at most ``samples_per_pass`` samples. The adjoint of the loss is evaluated at the whole image and carried back
+pass by pass, so non-linear losses do not depend on the number of passes. If light is sampled, an image is the mean of two
+renders with independent seeds, whose difference measures the noise in the loss. Seeds are a function of (seed, iteration,
+batch, purpose, half, pass) only. ``safe_point`` is called between passes; until it returns, only ``newest_loss`` may have
+changed.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ from mivol.optim.scenes.views import (
 
 @dataclass(repr=False)
 class SceneProblem:
-    """A scene, what was seen of it, and what is being looked for.
+    """A scene, reference images of it, and the parameters to fit.
 
     Attributes:
         scene: any Mitsuba scene.
-        views: all of one size.
-        parameters: what is looked for.
-        integrator: differentiable; None takes the scene's own.
-        loss: one of LOSSES, or any function of image and reference (:class:`mivol.optim.losses.FunctionLoss`).
+        views: sensors with reference images, all of one size.
+        parameters: the parameters to fit.
+        integrator: differentiable; None takes the scene's integrator.
+        loss: one of LOSSES, or a function of image and reference (:class:`mivol.optim.losses.FunctionLoss`).
         spp: samples per pixel of an image, and of its derivative.
-        samples_per_pass: most samples in one kernel.
+        samples_per_pass: maximum samples in one kernel.
         seed: root of all random numbers.
         safe_point: called between kernels.
-        noisy: whether images hold noise of sampled light, with the values that the scene holds now.
-        newest_loss: loss of the views (no priors) and its noise, of the newest gradient.
+        noisy: whether images hold noise of sampled light, at the scene's present values.
+        newest_loss: loss of the views (no priors) and its noise, from the latest gradient.
     """
 
     scene: mi.Scene
@@ -71,7 +71,7 @@ class SceneProblem:
     def __post_init__(self) -> None:
         check_views(self.views)
         if not self.parameters:
-            raise MivolError("found no parameter to look for: name at least one key of mi.traverse(scene).")
+            raise MivolError("found no parameter to fit: name at least one key of mi.traverse(scene).")
         self.integrator = self.integrator or self.scene.integrator()
         self.params = mi.traverse(self.scene)
         for parameter in self.parameters:
@@ -87,66 +87,66 @@ class SceneProblem:
 
     def __repr__(self) -> str:
         width, height = (int(n) for n in self.views[0].sensor.film().crop_size())
-        sought = ", ".join(f"{p.name} {tuple(as_tensor(self.params[p.name]).shape)}" for p in self.parameters)
-        seen = f"{len(self.views)} views of {width} x {height} pixels"
-        return f"{type(self).__name__}({seen}, {self.loss.label()}, looks for {sought})"
+        parameters = ", ".join(f"{p.name} {tuple(as_tensor(self.params[p.name]).shape)}" for p in self.parameters)
+        views = f"{len(self.views)} views of {width} x {height} pixels"
+        return f"{type(self).__name__}({views}, {self.loss.label()}, fits {parameters})"
 
     # -- Values ---------------------------------------------------------------------------------------------------
 
     def values(self) -> Reals:
-        """What the scene holds now, by parameter."""
+        """The scene's present values by parameter."""
         return {p.name: dr.detach(as_tensor(self.params[p.name])) for p in self.parameters}
 
     def gradients(self) -> Reals:
-        """Sum of the derivatives that renders have brought to the scene since :meth:`set`, by parameter.
+        """Sum of the derivatives from all renders since :meth:`set_reals`, by parameter.
 
         Raises:
-            MivolError: the images do not depend on one of them.
+            MivolError: the images do not depend on a parameter.
         """
-        found = {}
+        gradients = {}
         for p in self.parameters:
             gradient = dr.detach(dr.grad(self.params[p.name]))
             if _is_untouched(gradient):
                 raise missing_derivative_error(p.name)
-            found[p.name] = as_tensor(gradient)
-        return found
+            gradients[p.name] = as_tensor(gradient)
+        return gradients
 
     def initial_reals(self) -> Reals:
-        """The reals of what the scene holds now.
+        """Reals of the scene's present values.
 
         Raises:
-            MivolError: the scene's values lie outside the domain of their parameter.
+            MivolError: a value lies outside the domain of its parameter.
         """
         return {p.name: p.to_reals(value) for p, value in zip(self.parameters, self.values().values(), strict=True)}
 
     def set_reals(self, reals: Reals) -> None:
-        """Put x(u) into the scene, ready to receive gradients."""
+        """Set the scene's values to x(u), ready to receive gradients."""
         for p in self.parameters:
             value = like(dr.detach(p.from_reals(reals[p.name])), self.params[p.name])
             dr.make_opaque(value)
             dr.enable_grad(value)
             self.params[p.name] = value
-        given = {p.name: type(self.params[p.name])(self.params[p.name]) for p in self.parameters}
+        values = {p.name: type(self.params[p.name])(self.params[p.name]) for p in self.parameters}
         self.params.update()
-        # Mitsuba's envmap puts another array in the place of what it was given.
-        for name, value in given.items():
+        # Mitsuba's envmap puts another array into the parameters: restore the attached array.
+        for name, value in values.items():
             self.params[name] = value
         self.noisy = self._has_noise()
 
     # -- Images ---------------------------------------------------------------------------------------------------
 
     def passes(self, sensor: mi.Sensor, spp: int) -> list[int]:
-        """Samples per pixel of each pass; they sum to ``spp`` and hardly differ."""
-        most = max(self.samples_per_pass // count_pixels(sensor), 1)
-        n = math.ceil(spp / most)
+        """Samples per pixel of each pass; they sum to ``spp`` and differ by at most 1."""
+        limit = max(self.samples_per_pass // count_pixels(sensor), 1)
+        n = math.ceil(spp / limit)
         return [spp // n + (i < spp % n) for i in range(n)]
 
     def seed_for(self, iteration: int, index: int, purpose: int) -> int:
-        """Seed of a batch, given its number."""
+        """Seed of a batch, by its number."""
         return derive_seed(self.seed, iteration, index, purpose)
 
     def render(self, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
-        """Mean image of a sensor over all passes, detached; of the problem's ``spp`` by default."""
+        """Mean image of a sensor over all passes, detached; with the problem's ``spp`` by default."""
         total, spp = None, spp or self.spp
         for number, share in enumerate(self.passes(sensor, spp)):
             with dr.suspend_grad():
@@ -155,10 +155,10 @@ class SceneProblem:
             self._finish(total)
         return total / spp
 
-    def images(self, most: int = 3) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """The first views, for notebooks: the name of each, what was seen, and a render of what the scene holds now."""
-        seen = self.views[:most]
-        return [(view.name, np.array(view.reference), np.array(self.render(view.sensor, self.seed))) for view in seen]
+    def images(self, count: int = 3) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """Name, reference and present render of the first views, for notebooks."""
+        views = self.views[:count]
+        return [(view.name, np.array(view.reference), np.array(self.render(view.sensor, self.seed))) for view in views]
 
     def vjp(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
         """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
@@ -180,7 +180,7 @@ class SceneProblem:
         return total / self.spp
 
     def _set_tangents(self, tangents: Reals) -> None:
-        """Once per render: some integrators use the tangents up."""
+        """Set the tangents, before each render: some integrators consume them."""
         for p in self.parameters:
             value = self.params[p.name]
             dr.set_grad(value, like(tangents[p.name], value))
@@ -193,10 +193,10 @@ class SceneProblem:
     # -- Loss and gradient ----------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float, Reals]:
-        """f(u) and its gradient, over so many views, drawn anew in each iteration; 0: over all.
+        """f(u) and its gradient over ``views`` views, drawn anew in each iteration; 0 takes all views.
 
-        The seeds of image and derivative differ: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
-        Noise: of the integrator; none for media that only absorb, beyond the pixel filter's. What it does to the loss:
+        Image and derivative have independent seeds: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
+        Noise: from the integrator; media that only absorb have only the noise of the pixel filter. Its effect on the loss:
         :func:`mivol.optim.scenes.render_noise.compare_with_reference`.
         """
         batches = self.batches
@@ -212,10 +212,11 @@ class SceneProblem:
         return self.remember(compared) + energy, gradients
 
     def rehearse(self) -> None:
-        """Take the derivative of the first batch, for what a first step would refuse; the scene holds its start afterwards.
+        """Compute the derivative of the first batch, to raise errors of a first step early; the scene holds its start
+        afterwards.
 
         Raises:
-            MivolError: what the integrator or the loss refuses, or images that do not depend on a parameter.
+            MivolError: an error of the integrator or the loss, or images that do not depend on a parameter.
         """
         start, batch = self.initial_reals(), self.batches[0]
         self.set_reals(start)
@@ -224,7 +225,7 @@ class SceneProblem:
         self.set_reals(start)
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
-        """Each parameter's own learning rate, the same in all iterations."""
+        """Learning rate of each parameter, the same in all iterations."""
         return {p.name: p.lr for p in self.parameters}
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
@@ -237,15 +238,15 @@ class SceneProblem:
         return self.mean_loss(iteration) + self.energy(reals)
 
     def mean_loss(self, iteration: int) -> float:
-        """Mean loss over all views, of what the scene holds now."""
+        """Mean loss over all views, at the scene's present values."""
         pairs = enumerate(self.batches)
         return math.fsum(self.compare(s, self.seed_for(iteration, i, PRIMAL), len(self.views)).loss for i, s in pairs)
 
     def compare(self, batch: RenderBatch, seed: int, n_views: int) -> Comparison:
-        """Render a batch; its part of the mean loss over ``n_views`` views.
+        """Render a batch; returns its part of the mean loss over ``n_views`` views.
 
         Raises:
-            MivolError: the loss takes pairs, the render is noisy and has one sample per pixel.
+            MivolError: a loss with pairs, for a noisy render of one sample per pixel.
         """
         parts = split_samples(self.spp, self.loss) if self.noisy else (self.spp,)
         if len(parts) == 1:
@@ -257,7 +258,7 @@ class SceneProblem:
         )
 
     def remember(self, compared: Sequence[Comparison]) -> float:
-        """The sum of the losses of some batches, remembered with its noise for :meth:`describe_noise`."""
+        """Sum of the losses of all batches, stored with its noise for :meth:`warning`."""
         unknown = self.noisy and self.spp == 1
         self.newest_loss = math.fsum(c.loss for c in compared), math.nan if unknown else math.fsum(c.noise for c in compared)
         return self.newest_loss[0]
@@ -282,14 +283,14 @@ class SceneProblem:
         return Linearization(self, reals)
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
-        """Nothing: the scene's values are the reals'."""
+        """An empty dictionary: the reals determine the scene's values."""
         return {}
 
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
-        """Nothing to do: every question brings its reals."""
+        """Do nothing: every method takes the reals."""
 
     def warning(self) -> str:
-        """What a reader of the newest loss must know of its noise, or ""."""
+        """A sentence about the noise of the latest loss, or ""."""
         return describe_noise(self.loss, *self.newest_loss)
 
     def energy(self, reals: Reals) -> float:
@@ -357,19 +358,19 @@ class Linearization:
 
 
 def missing_derivative_error(names: str) -> MivolError:
-    """The refusal of parameters that no image depends on."""
+    """The error for parameters on which no image depends."""
     return MivolError(
-        f"no derivative leads from the images to {names}, which would stay as it is: take it out of the fit, or let the images "
-        "depend on it (for scattered light set fit.max_depth to 2 or more, for media choose an integrator that sees them)."
+        f"the images do not depend on {names}, which would keep its start: remove the parameter from the fit, or make the "
+        "images depend on it (set fit.max_depth to 2 or more for scattered light, choose an integrator that renders media)."
     )
 
 
 @contextmanager
 def require_derivative(names: str) -> Iterator[None]:
-    """Say in a sentence that an image depends on no parameter at all, which Dr.Jit answers by an error of its own.
+    """Replace Dr.Jit's error for an image without parameters by a readable error.
 
     Raises:
-        MivolError: it depends on none.
+        MivolError: the image depends on no parameter.
     """
     try:
         yield
@@ -380,7 +381,7 @@ def require_derivative(names: str) -> Iterator[None]:
 
 
 def draw_views(iteration: int, n_views: int, per_iteration: int, seed: int) -> list[int]:
-    """The views of an iteration: a fresh order per epoch, each view once in it; a function of its arguments only."""
+    """Numbers of the views of an iteration, in a new random order per epoch; a function of the arguments only."""
     per_iteration = min(per_iteration, n_views)
     drawn = range(iteration * per_iteration, (iteration + 1) * per_iteration)
     orders = {k: np.random.default_rng([seed, k, n_views]).permutation(n_views) for k in {i // n_views for i in drawn}}
@@ -388,6 +389,6 @@ def draw_views(iteration: int, n_views: int, per_iteration: int, seed: int) -> l
 
 
 def _is_untouched(gradient: object) -> bool:
-    """Whether a gradient is the literal 0 that Dr.Jit gives where no derivative has arrived."""
+    """Whether a gradient is the literal 0 of Dr.Jit, without any contribution."""
     rows = [gradient.array] if dr.is_tensor_v(gradient) else gradient if dr.depth_v(gradient) > 1 else [gradient]
     return all(row.state == dr.VarState.Literal for row in rows)

@@ -1,8 +1,8 @@
 """Views of a scene, rendered several at a time, with independent seeds.
 
-Conventions. A :class:`View` is a sensor with its reference image (height, width, channels). A :class:`RenderBatch` renders
-one view or several views side by side (Mitsuba's ``batch`` sensor). Tracing and launching a kernel costs as much for one
-small view as for twenty. Only views with a box filter are put side by side, since their samples count for one pixel each.
+Conventions. A :class:`View` is a sensor with its reference image (height, width, channels). A :class:`RenderBatch` renders one
+view or several views side by side (Mitsuba's ``batch`` sensor). Tracing and launching a kernel costs as much for one small view
+as for twenty. Only views with a box filter are put side by side, since their samples count for one pixel each.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from mivol.display import with_short_repr
 from mivol.errors import MivolError
 
 PRIMAL, ADJOINT, HELD_OUT, FINAL = range(4)
-"""Purposes: an image of a fit, its derivative, an evaluation, an image that is kept."""
+"""Purposes of seeds: an image of a fit, its derivative, an evaluation, a final image."""
 
 
 def derive_seed(*key: int) -> int:
-    """A 32-bit seed from integers: SeedSequence mixes them, so that neighbours share nothing."""
+    """A 32-bit seed from integers. SeedSequence mixes them, so that similar keys give independent seeds."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
 @with_short_repr
 @dataclass(frozen=True)
 class View:
-    """A sensor and what it saw.
+    """A sensor and its reference image.
 
     Attributes:
         name: for messages and file names.
@@ -45,12 +45,12 @@ class View:
 @with_short_repr
 @dataclass(frozen=True)
 class RenderBatch:
-    """One render.
+    """One render of one or several views.
 
     Attributes:
-        sensor: of one view, or a batch.
+        sensor: sensor of one view, or a batch.
         reference: (height, n width, channels).
-        n_views: how many views lie side by side.
+        n_views: number of views side by side.
     """
 
     sensor: mi.Sensor
@@ -59,15 +59,15 @@ class RenderBatch:
 
 
 def count_pixels(sensor: mi.Sensor) -> int:
-    """Pixels of a sensor's image."""
+    """Number of pixels of a sensor's image."""
     return math.prod(int(n) for n in sensor.film().crop_size())
 
 
 def check_views(views: Sequence[View]) -> None:
-    """Refuse views that cannot be compared with an image.
+    """Check that every view can be compared with its reference.
 
     Raises:
-        MivolError: no views, sizes that differ, a reference of another size than its sensor, or not finite.
+        MivolError: no views, different sizes, a reference of another size than its sensor, or a reference that is not finite.
     """
     if not views:
         raise MivolError("found no views to fit: give at least one sensor with a reference.")
@@ -88,10 +88,10 @@ def check_views(views: Sequence[View]) -> None:
 
 
 def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
-    """Refuse sensors, by name, whose images differ in size.
+    """Check that the images of all sensors (by name) have one size.
 
     Raises:
-        MivolError: with both sizes.
+        MivolError: different sizes, with both.
     """
     sizes = {name: " x ".join(str(int(n)) for n in sensor.film().crop_size()) for name, sensor in sensors.items()}
     (first, size), *others = sizes.items()
@@ -105,16 +105,16 @@ def make_single_batches(views: Sequence[View]) -> list[RenderBatch]:
     return [RenderBatch(view.sensor, view.reference, 1) for view in views]
 
 
-def make_batches(views: Sequence[View], most_pixels: int) -> list[RenderBatch]:
-    """As few renders as there can be with at most ``most_pixels`` pixels each, in the order of the views."""
-    together = max(most_pixels // count_pixels(views[0].sensor), 1)
+def make_batches(views: Sequence[View], max_pixels: int) -> list[RenderBatch]:
+    """The smallest number of renders with at most ``max_pixels`` pixels each, in the order of the views."""
+    together = max(max_pixels // count_pixels(views[0].sensor), 1)
     if together == 1 or len(views) == 1 or not all(can_be_batched(view) for view in views):
         return make_single_batches(views)
     return [join_views(views[first : first + together]) for first in range(0, len(views), together)]
 
 
 def can_be_batched(view: View) -> bool:
-    """Whether a view's samples count for its own pixels only, and its camera stands in no medium."""
+    """Whether a view's samples count for its own pixels only, and its camera is in no medium."""
     film = view.sensor.film()
     whole = all(int(a) == int(b) for a, b in zip(film.crop_size(), film.size(), strict=True))
     plain = film.class_name() == "HDRFilm" and film.rfilter().is_box_filter()

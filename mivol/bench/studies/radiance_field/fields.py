@@ -138,10 +138,10 @@ def fit_field(size: FieldSize) -> tuple[SphericalGrid, str]:
     path = DATA / "multiview" / "chair"
     if path.is_dir():
         photos = load_photos(path, split="train", background="white", scale=0.5)
-        views, box, origin = RayBatches.of(photos.views, (1, 2, 4)), photos.silhouette_box(), "NeRF's chair"
+        views, box, origin = RayBatches.from_photos(photos.views, (1, 2, 4)), photos.silhouette_box(), "NeRF's chair"
     else:
         photos = photograph(make_shell(size)[0], ring_cameras(size.side, 24))
-        views, box, origin = RayBatches.of(photos, (1, 2, 4)), BOX, "views of the shell (no data folder)"
+        views, box, origin = RayBatches.from_photos(photos, (1, 2, 4)), BOX, "views of the shell (no data folder)"
     plan = RadiancePlan(stages)
     problem = RadianceProblem(views, box, plan)
     reconstruct(problem, plan.optimizer, plan.course())

@@ -71,12 +71,12 @@ def follow(steps: Iterable, measure: Callable[[], float]) -> Curve:
 class PixelBatches(RayBatches):
     """Batches of random single pixels in place of tiles."""
 
-    def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
+    def draw_tiles(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
         """Draw as many pixels as the tiles have."""
         width, height = self.levels[shrink].sizes[views[0]]
         n = len(views) * tiles * TILE**2
         slot, column, row = (rng.integers(0, most, n).astype(np.uint32) for most in (len(views), width, height))
-        return self.look_up(shrink, views, mi.UInt32(slot), mi.UInt32(column), mi.UInt32(row))
+        return self.make_batch(shrink, views, mi.UInt32(slot), mi.UInt32(column), mi.UInt32(row))
 
 
 def compile_fit(views: RayBatches, stages: Sequence[RadianceStage]) -> None:
@@ -126,7 +126,7 @@ def fit_mivol(photos: list[Photo], held_out: list[Photo], size: FieldSize) -> Cu
     tiles = max(size.fit_side**2 // 112, 4)
     kinds = ((8, 1, 4, tiles // 4), (4, 1, 2, tiles // 4), (1, 2, 1, tiles))
     stages = tuple(RadianceStage(n // k, steps * s, shrink, 7, count) for k, s, shrink, count in kinds)
-    views = RayBatches.of(photos, (1, 2, 4))
+    views = RayBatches.from_photos(photos, (1, 2, 4))
     compile_fit(views, stages)
     fit = begin_radiance_fit(views, BOX, RadiancePlan(stages))
     return follow(all_steps(fit), lambda: measure_newest(fit, held_out))

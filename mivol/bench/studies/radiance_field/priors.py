@@ -70,7 +70,7 @@ def load_captures(size: PriorSize) -> dict[str, Photos]:
 def judge_plan(plan: RadiancePlan, photos: Sequence[Photo], box: np.ndarray, fold: int) -> float:
     """Mean PSNR of the photographs of a fold, from a fit to all others [dB]; the fold is also the seed."""
     train = [photo for k, photo in enumerate(photos) if k % FOLDS != fold]
-    fit = begin_radiance_fit(RayBatches.of(train, (1,)), box, plan, fold)
+    fit = begin_radiance_fit(RayBatches.from_photos(train, (1,)), box, plan, fold)
     for _ in range(fit.course.iterations):
         fit.advance()
     field, sky = current_field(fit), fit.problem.sky
