@@ -1,4 +1,4 @@
-"""Clouds of points and of Gaussians as NumPy arrays: the model, formats, checks, conversions. Knows nothing of Mitsuba."""
+"""Clouds of points and 3D Gaussians as NumPy arrays: the model, file formats, and conversions. Independent of Mitsuba."""
 
 from __future__ import annotations
 

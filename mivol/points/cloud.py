@@ -1,10 +1,9 @@
-"""Clouds of points: positions, and colours where there are any; from the files that hold them, and to them.
+"""Clouds of points: positions, optional colours, and their file formats.
 
-Conventions. Positions are in the world [length], float64, since surveys count metres from far away. Colours are code values
-0..1. Formats by suffix: ``.ply`` (``x y z``, ``red green blue`` in bytes; also of Gaussians, whose centres these are), ``.npy``
-(N, 3), COLMAP's ``points3D.bin`` and ``points3D.txt``, ``.las`` by the optional package ``laspy``.
-
-Here: :class:`PointCloud`, :func:`read_points`, :func:`write_points`, :data:`CLOUD_READERS`, :data:`CLOUD_WRITERS`.
+Conventions. Positions are in the world [length], float64, since surveys count metres from a distant origin. Colours are code
+values 0..1. Formats by suffix: ``.ply`` (``x y z``, ``red green blue`` in bytes; for Gaussians the centres), ``.npy`` (N, 3),
+COLMAP's ``points3D.bin`` and ``points3D.txt``, ``.las`` through the optional package ``laspy``. A new format is one reader and
+one line in :data:`CLOUD_READERS`.
 """
 
 from __future__ import annotations
@@ -29,9 +28,10 @@ __all__ = ["CLOUD_READERS", "CLOUD_WRITERS", "PointCloud", "read_points", "write
 
 COLOUR = ("red", "green", "blue")
 VLR_HEADER_SIZE, EVLR_HEADER_SIZE = 54, 60
-"""Bytes of the head of a variable length record of LAS, and of an extended one (ASPRS LAS 1.4 R15, sections 2.5 and 2.7)."""
+"""Size of the header of a variable length record of LAS, and of an extended record [bytes] (ASPRS LAS 1.4 R15, sections 2.5 and
+2.7)."""
 LAS_1_0_HEADER_SIZE, LAS_HEADER_SIZE = 227, 375
-"""Bytes of the header of LAS up to version 1.2, and of version 1.4 (section 2.4)."""
+"""Size of the header of LAS up to version 1.2, and of version 1.4 [bytes] (section 2.4)."""
 
 
 @with_short_repr
@@ -41,10 +41,10 @@ class PointCloud:
 
     Attributes:
         positions: (N, 3) world [length], float64.
-        colours: (N, 3) code values 0..1, float32; None: none.
+        colours: (N, 3) code values 0..1, float32; None: no colours.
 
     Raises:
-        MivolError: shapes that do not fit together.
+        MivolError: shapes that contradict each other.
     """
 
     positions: np.ndarray
@@ -62,14 +62,14 @@ class PointCloud:
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number of points, N."""
         return len(self.positions)
 
     def check(self, subject: object = "a cloud of points") -> PointCloud:
-        """Itself, if every number is finite.
+        """Return the cloud if every number is finite.
 
         Raises:
-            MivolError: a number is not, by the index of the first point.
+            MivolError: a number that is not finite; the message names the first point.
         """
         for name, values in (("position", self.positions), ("colour", self.colours)):
             rows = [] if values is None else np.flatnonzero(~np.isfinite(values).all(axis=1))
@@ -80,23 +80,23 @@ class PointCloud:
 
 
 def read_points(path: str | os.PathLike) -> PointCloud:
-    """Read a cloud of any format in :data:`CLOUD_READERS`.
+    """Read a cloud in any format of :data:`CLOUD_READERS`.
 
     Raises:
-        MivolError: missing, foreign, truncated or inconsistent file, a suffix that is not known, a number that is not finite,
-            or ``.las`` without ``laspy``.
+        MivolError: a missing, foreign, truncated or inconsistent file, an unknown suffix, a number that is not finite, or
+            ``.las`` without ``laspy``.
     """
     path = check_file(path)
     return select_by_suffix(path, CLOUD_READERS)(path).check(path)
 
 
 def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
-    """Write a cloud, whole or not at all; the suffix chooses the format (:data:`CLOUD_WRITERS`).
+    """Write a cloud, whole or not at all; the suffix selects the format (:data:`CLOUD_WRITERS`).
 
     Positions are stored in float32, 24 bits of the distance from the origin; ``.npy`` holds no colours.
 
     Raises:
-        MivolError: a suffix that is not known, a number that is not finite, disk full.
+        MivolError: an unknown suffix, a number that is not finite, or a full disk.
     """
     path = Path(path)
     writer = select_by_suffix(path, CLOUD_WRITERS)
@@ -114,7 +114,7 @@ def _read_ply(path: Path) -> PointCloud:
 
 
 def _read_npy(path: Path) -> PointCloud:
-    """The array is mapped first: its shape is known, and no more is there than the file has, before any is taken."""
+    """Map the array first: its shape is known, and the file's size is checked, before memory is taken."""
     try:
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
     except DAMAGE as error:
@@ -152,7 +152,7 @@ def _read_las(path: Path) -> PointCloud:
 
 
 def _check_las_records(path: Path) -> None:
-    """Refuse more variable length records than the file has room for: laspy would read empty ones for hours."""
+    """Refuse more variable length records than fit into the file; laspy would read empty records for hours."""
     with path.open("rb") as file:
         head = file.read(LAS_HEADER_SIZE)
     if len(head) < LAS_1_0_HEADER_SIZE:
@@ -179,7 +179,6 @@ def _write_npy(file: BinaryIO, cloud: PointCloud) -> None:
     np.lib.format.write_array(file, cloud.positions.astype(np.float32), version=(1, 0), allow_pickle=False)
 
 
-#: suffix -> reader(path).
 CLOUD_READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".ply": _read_ply,
     ".npy": _read_npy,
@@ -187,6 +186,7 @@ CLOUD_READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".txt": _read_colmap,
     ".las": _read_las,
 }
+"""Suffix -> reader(path)."""
 
-#: suffix -> writer(file, cloud).
 CLOUD_WRITERS: dict[str, Callable[[BinaryIO, PointCloud], None]] = {".ply": _write_ply, ".npy": _write_npy}
+"""Suffix -> writer(file, cloud)."""

@@ -1,7 +1,7 @@
-"""Points to a density on a grid, and points drawn from a grid.
+"""Points become a density on a grid or Gaussians, and back.
 
 Conventions. Grids are (Z, Y, X) at voxel centres over the unit cube, which ``to_world`` places (:mod:`mivol.space`). A density
-is mass per volume [1/length^3], so that its sum times the volume of a voxel is the mass.
+is mass per volume [1/length^3]: its sum times the volume of a voxel is the mass.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ __all__ = ["points_to_density", "sample_points", "points_to_gaussians", "gaussia
 def points_to_density(
     positions: np.ndarray, resolution: tuple[int, int, int], to_world: np.ndarray, masses: np.ndarray | None = None
 ) -> np.ndarray:
-    """The density of points on a grid: each gives its mass to the eight voxel centres around it by trilinear weights.
+    """The density of points on a grid: each point gives its mass to the eight voxel centres around it by trilinear weights.
 
-    Within half a voxel of a face the weights of centres that would lie outside go to those inside: the mass is kept there too,
-    and everywhere else the centre of mass is kept as well.
+    Within half a voxel of a face the weights of centres outside go to the centres inside. The mass is kept everywhere, the
+    centre of mass only away from the faces.
 
     Args:
         positions: (N, 3) world [length].
@@ -37,7 +37,7 @@ def points_to_density(
         (Z, Y, X) float64 [mass / length^3].
 
     Raises:
-        MivolError: a point outside the box, by the index of the first; shapes that do not fit together.
+        MivolError: a point outside the box (the message names the first index), or shapes that contradict each other.
 
     Source: Hockney, Eastwood, Computer Simulation Using Particles, 1988 (cloud in cell).
     """
@@ -49,38 +49,38 @@ def points_to_density(
     to_lattice = lattice_from_world(to_world, resolution)
     q = positions @ to_lattice[:, :3].T + to_lattice[:, 3]
     size = np.array(resolution[::-1])
-    # A point on a face may be rounded out of the box: by some 2^-50 of the lattice's coordinates.
+    # Rounding may move a point on a face out of the box, by about 2^-50 of the lattice coordinates.
     outside = np.flatnonzero(~((q >= -0.5 - 1e-9 * size) & (q <= size - 0.5 + 1e-9 * size)).all(axis=1))
     if outside.size:
         found = f"point {outside[0]} outside the box (the first of {outside.size})"
         raise refusal("density_of_points", found, "points inside", "enlarge the box, or leave these points out")
     low = np.floor(q)
-    far = q - low
+    fraction = q - low
     mass = np.zeros(np.prod(resolution))
     for corner in itertools.product((0, 1), repeat=3):
         node = np.clip(low + corner, 0, size - 1).astype(np.int64)
-        weight = np.where(corner, far, 1 - far).prod(axis=1) * masses
+        weight = np.where(corner, fraction, 1 - fraction).prod(axis=1) * masses
         mass += np.bincount((node[:, 2] * size[1] + node[:, 1]) * size[0] + node[:, 0], weight, len(mass))
     return mass.reshape(resolution) / _voxel_volume(resolution, to_world)
 
 
 def sample_points(density: np.ndarray, to_world: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Points drawn from a density that is constant in each voxel.
+    """Draw points from a density that is constant in each voxel.
 
-    Voxels are drawn systematically (one random number shifts ``count`` equal steps of the cumulated mass), so that each holds
-    its share of the points to less than one; a point lies anywhere in its voxel with the same probability.
+    Voxels are drawn by systematic sampling (one random number shifts ``count`` equal steps of the cumulated mass), so each
+    voxel gets its share of the points to less than one point. Positions inside a voxel are uniform.
 
     Args:
-        density: (Z, Y, X), not below 0.
+        density: (Z, Y, X), at least 0.
         to_world: (4, 4) unit cube to world.
-        count: how many.
-        seed: of the random numbers.
+        count: number of points.
+        seed: seed of the random numbers.
 
     Returns:
         (count, 3) world [length], float64, in random order.
 
     Raises:
-        MivolError: another shape, a density that is negative or not finite, or one without mass.
+        MivolError: another shape, a density that is negative or not finite, or a density without mass.
     """
     density = np.asarray(density, np.float64)
     if density.ndim != 3 or not np.isfinite(density).all() or (density < 0).any() or not density.any():
@@ -89,7 +89,7 @@ def sample_points(density: np.ndarray, to_world: np.ndarray, count: int, seed: i
     rng = np.random.default_rng(seed)
     cumulated = np.cumsum(density.ravel())
     steps = (np.arange(count) + rng.uniform()) * (cumulated[-1] / count)
-    last = np.flatnonzero(density.ravel())[-1]  # rounding may take the last step to the end of the mass, and beyond its voxel
+    last = np.flatnonzero(density.ravel())[-1]  # rounding may move the last step beyond the last voxel with mass
     voxels = rng.permutation(np.minimum(np.searchsorted(cumulated, steps, side="right"), last))
     corner = np.stack(np.unravel_index(voxels, density.shape), axis=1)[:, ::-1]
     unit = (corner + rng.uniform(size=(count, 3))) / np.array(density.shape[::-1])
@@ -105,24 +105,26 @@ def _voxel_volume(resolution: tuple[int, int, int], to_world: np.ndarray) -> flo
 NEIGHBOURS = 3
 
 MIN_RELATIVE_SCALE = 1e-3
-"""Of a scale over the median: points that coincide get it, so that no scale is 0."""
+"""Smallest scale over the median; coincident points would have scale 0."""
 
 GREY = 0.5
-"""The colour of points that have none."""
+"""Colour of points without colours."""
 
 
 def points_to_gaussians(cloud: PointCloud, opacity: float = 0.1) -> Gaussians:
-    """A ball of a Gaussian at each point: its scale is the root mean square distance to the three nearest points.
+    """Make a round Gaussian at each point, as wide as the root mean square distance to the three nearest points.
 
     Args:
         cloud: at least four points.
-        opacity: of every Gaussian, 0..1.
+        opacity: opacity of every Gaussian, 0..1.
 
     Returns:
         N Gaussians of degree 0, with the colours of the points, or grey.
 
     Raises:
-        MivolError: fewer than four points, points that mostly coincide, or an opacity outside 0..1.
+        MivolError: fewer than four points, mostly coincident points, or an opacity outside 0..1.
+
+    Source: Kerbl et al. 2023, section 5.1.
     """
     if not 0 <= opacity <= 1:
         raise refusal("gaussians_of_points", f"opacity={opacity}", "0 to 1", "choose one of those")

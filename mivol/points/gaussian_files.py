@@ -1,7 +1,6 @@
-"""One door to files of Gaussians: the suffix chooses the format, and every number is looked at before it is handed on.
+"""Files of Gaussians: the tables of formats, and one function to read and one to write any of them.
 
-Here: :data:`GAUSSIAN_READERS` and :data:`GAUSSIAN_WRITERS` (suffix -> function), :func:`read_gaussians`,
-:func:`write_gaussians`.
+A new format is one reader and one line in :data:`GAUSSIAN_READERS`. Every number is checked before Gaussians are returned.
 """
 
 from __future__ import annotations
@@ -27,23 +26,23 @@ def _read_ply(path: Path) -> Gaussians:
     return (parse_compressed_tables if is_compressed(tables) else parse_tables)(tables, path)
 
 
-#: suffix -> reader(path).
 GAUSSIAN_READERS: dict[str, Callable[[Path], Gaussians]] = {
     ".ply": _read_ply,
     ".spz": read_spz,
     ".splat": read_splat,
     ".ksplat": read_ksplat,
 }
+"""Suffix -> reader(path)."""
 
-#: suffix -> writer(file, gaussians).
 GAUSSIAN_WRITERS: dict[str, Callable[[BinaryIO, Gaussians], None]] = {".ply": write_gaussian_ply}
+"""Suffix -> writer(file, gaussians)."""
 
 
 def is_gaussian_file(path: Path) -> bool:
-    """Whether a file is of Gaussians: by its suffix, and a ``.ply`` by the properties that its header lists.
+    """Whether a file holds Gaussians: by its suffix, and for a ``.ply`` by the properties in its header.
 
     Raises:
-        MivolError: a ``.ply`` whose header cannot be read.
+        MivolError: a ``.ply`` with an unreadable header.
     """
     if path.suffix.lower() != ".ply":
         return path.suffix.lower() in GAUSSIAN_READERS
@@ -51,11 +50,11 @@ def is_gaussian_file(path: Path) -> bool:
 
 
 def read_gaussians(path: str | os.PathLike) -> Gaussians:
-    """Read Gaussians of any format in :data:`GAUSSIAN_READERS`.
+    """Read Gaussians in any format of :data:`GAUSSIAN_READERS`.
 
     Raises:
-        MivolError: missing, foreign, truncated or inconsistent file; a suffix that is not known; numbers that cannot be drawn,
-            by the index of the first.
+        MivolError: a missing, foreign, truncated or inconsistent file, an unknown suffix, or numbers that no renderer can draw
+            (the message names the first index).
 
     Example:
         >>> read_gaussians("point_cloud.ply").degree
@@ -66,10 +65,10 @@ def read_gaussians(path: str | os.PathLike) -> Gaussians:
 
 
 def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write Gaussians, whole or not at all; the suffix chooses the format (:data:`GAUSSIAN_WRITERS`).
+    """Write Gaussians, whole or not at all; the suffix selects the format (:data:`GAUSSIAN_WRITERS`).
 
     Raises:
-        MivolError: a suffix that is not known, numbers that cannot be drawn, disk full.
+        MivolError: an unknown suffix, numbers that no renderer can draw, or a full disk.
     """
     path = Path(path)
     writer = select_by_suffix(path, GAUSSIAN_WRITERS)

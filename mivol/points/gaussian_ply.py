@@ -1,10 +1,19 @@
-"""The ``.ply`` of 3D Gaussian splatting, in and out: pre-images of the activations, one property each.
+"""Gaussians in ``.ply``: the format of 3D Gaussian splatting, read and written, and PlayCanvas' compressed format, read.
 
-Conventions. Written in the order of the authors' program: ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3``,
-float32, normals of 0, ``f_rest`` by colour first (all of red, all of green, all of blue), quaternions (w, x, y, z). Read in any
-order and with other properties among them, which are left out; what was read and is written again is the same to the bit.
+The format of 3D Gaussian splatting holds the pre-images of the activations, one property each. Properties are written in the
+order of the authors' program: ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3``, float32, with normals of 0,
+``f_rest`` by colour (all of red, all of green, all of blue), and quaternions (w, x, y, z). Files are read with any order and
+with more properties, which are dropped. Reading and writing again keeps every bit.
 
-Source: Kerbl et al. 2023 and the files that its authors publish.
+In the compressed format 256 Gaussians share a box of positions, of scales and of colours, and store steps inside the boxes. An
+element ``chunk`` holds the ends of the boxes, in float32; without ends, colours lie in 0..1. An element ``vertex`` holds four
+words of 32 bits a Gaussian, highest bits first: positions and logarithms of scales in 11, 10 and 11 bits; colour and opacity in
+8 bits each; of the unit quaternion (w, x, y, z) the number of its largest entry in 2 bits and the other entries in 10 bits each
+over -1/sqrt(2)..1/sqrt(2). An element ``sh`` holds harmonics in 8 bits over -4..4, in the order of the uncompressed file. Steps
+include both ends; the inner values of harmonics are the middles of 256 bins.
+
+Source: Kerbl et al. 2023 and the files published by the authors; PlayCanvas' documentation of the compressed format and its
+open-source converter splat-transform.
 """
 
 from __future__ import annotations
@@ -33,14 +42,14 @@ COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 REST_COUNTS = (0, 9, 24, 45)
-"""So many ``f_rest`` has a file of degree 0, 1, 2, 3."""
+"""Numbers of properties ``f_rest`` in files of degree 0, 1, 2, 3."""
 
 
 def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaussians:
-    """The Gaussians of a file's element ``vertex``.
+    """Make Gaussians from the element ``vertex`` of a file.
 
     Raises:
-        MivolError: a property is missing, or harmonics of no degree.
+        MivolError: a missing property, or harmonics of no degree.
     """
     vertex = tables.get("vertex")
     held = () if vertex is None else vertex.dtype.names
@@ -63,10 +72,10 @@ def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaus
 
 
 def _parse_higher_harmonics(table: np.ndarray, path: str | os.PathLike) -> np.ndarray:
-    """Coefficients above degree 0, (N, K - 1, 3), of the properties ``f_rest_0``, ``f_rest_1``, ...
+    """Coefficients above degree 0, (N, K - 1, 3), from the properties ``f_rest_0``, ``f_rest_1``, ...
 
     Raises:
-        MivolError: their number is that of no degree, or one is missing.
+        MivolError: a missing property, or a number of properties that fits no degree.
     """
     count = sum(name.startswith("f_rest_") for name in table.dtype.names)
     names = [f"f_rest_{i}" for i in range(count)]
@@ -79,7 +88,7 @@ def _parse_higher_harmonics(table: np.ndarray, path: str | os.PathLike) -> np.nd
 
 
 def write_gaussian_ply(file: BinaryIO, gaussians: Gaussians) -> None:
-    """Write them as the authors' program does."""
+    """Write Gaussians in the format of the authors' program."""
     rest = np.swapaxes(gaussians.harmonics[:, 1:], 1, 2).reshape(gaussians.count, -1)
     parts = {
         MEANS: gaussians.means,
@@ -98,12 +107,12 @@ def write_gaussian_ply(file: BinaryIO, gaussians: Gaussians) -> None:
 
 
 def _stack_columns(table: np.ndarray, names: tuple[str, ...] | list[str]) -> np.ndarray:
-    """Some properties as float32 (N, len(names))."""
+    """Properties as float32 (N, len(names))."""
     return np.stack([table[name].astype(np.float32) for name in names], axis=1)
 
 
 CHUNK_SIZE = 256
-"""Gaussians that share a box."""
+"""Gaussians in a box."""
 
 POSITION_BITS = (11, 10, 11)
 AXES = ("x", "y", "z")
@@ -114,16 +123,16 @@ MAX_HARMONIC = 4.0
 
 
 def is_compressed(tables: dict[str, np.ndarray]) -> bool:
-    """Whether tables of a ``.ply`` are of this kind."""
+    """Whether the tables of a ``.ply`` are in the compressed format."""
     return "chunk" in tables and "vertex" in tables and PACKED_PROPERTIES[0] in (tables["vertex"].dtype.names or ())
 
 
 def parse_compressed_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaussians:
-    """The Gaussians of such tables; the opacity 255 of 255 becomes the logit inf, 0 becomes -inf.
+    """Make Gaussians from the tables of a compressed file; the opacity 255 of 255 becomes the logit inf, 0 becomes -inf.
 
     Raises:
-        MivolError: a property is missing or of another type, or numbers of chunks, Gaussians and harmonics that contradict
-            each other.
+        MivolError: a missing property or another type, or numbers of chunks, Gaussians and harmonics that contradict each
+            other.
     """
     chunk, vertex = tables["chunk"], tables["vertex"]
     _check_compressed_tables(tables, Path(path))
@@ -164,19 +173,19 @@ def _check_compressed_tables(tables: dict[str, np.ndarray], path: Path) -> None:
 
 
 def _unpack_bits(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Fields of words, highest first, as steps 0..1 with both ends; (N, len(bits)), float64."""
+    """Fields of words, highest bits first, as steps 0..1 with both ends; (N, len(bits)), float64."""
     shifts = np.cumsum(bits[::-1])[::-1] - bits
     return np.stack([((words >> np.uint32(s)) & ((1 << b) - 1)) / ((1 << b) - 1) for s, b in zip(shifts, bits, strict=True)], 1)
 
 
 def _interpolate_in_box(chunk: np.ndarray, axes: tuple[str, ...], box: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Numbers at ``steps`` between the ends of each Gaussian's box, (N, 3)."""
+    """Values at ``steps`` between the ends of each Gaussian's box, (N, 3)."""
     low, high = (np.stack([chunk[f"{end}_{axis}"].astype(np.float64) for axis in axes], 1)[box] for end in ("min", "max"))
     return low * (1 - steps) + high * steps
 
 
 def _unpack_quaternions(words: np.ndarray) -> np.ndarray:
-    """Unit quaternions of which the largest entry, here positive, was left out; (N, 4)."""
+    """Unit quaternions without their largest entry, which is positive; (N, 4)."""
     others = (_unpack_bits(words & np.uint32((1 << 30) - 1), (2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
     return complete_quaternions(others, (words >> np.uint32(30)).astype(np.int64))
 

@@ -1,13 +1,16 @@
-"""Three-dimensional Gaussians as NumPy arrays: the model that files hold, fits change and renderers draw.
+"""3D Gaussians as NumPy arrays: the model that files hold, fits change and renderers draw.
 
-Conventions. Arrays hold the pre-images of the activations, as published files do, so that what is read can be written again to
-the bit: scales are ``exp(log_scales)``, opacities are ``logistic(opacity_logits)``. Quaternions are (w, x, y, z), of any length
-but 0. ``harmonics`` are coefficients of real spherical harmonics in the basis and order of ``drjit.sh_eval``; the colour seen
-along the unit direction d, from the camera to the mean, is ``max(0, 0.5 + sum_b Y_b(d) k_b)``. Colours are code values (sRGB),
-as in every published file: a renderer composites them as they are.
+Conventions. Arrays hold the pre-images of the activations, as published files do, so a file that was read can be written again
+to the bit: scales are ``exp(log_scales)``, opacities are ``logistic(opacity_logits)``. Quaternions are (w, x, y, z), of any
+length but 0. ``harmonics`` are coefficients of real spherical harmonics in the basis and order of ``drjit.sh_eval``; the colour
+along the unit direction d from the camera to the mean is ``max(0, 0.5 + sum_b Y_b(d) k_b)``. Colours are sRGB code values, as
+in published files, and a renderer composites the code values.
 
-Source: Kerbl, Kopanas, Leimkuehler, Drettakis, 3D Gaussian Splatting for Real-Time Radiance Field Rendering, 2023, section 4
-and the files that its authors publish.
+Compact formats store colours, opacities and rotations in bytes; the functions at the end return their pre-images. The opacity
+255 of 255 is the logit inf, 0 is -inf.
+
+Source: Kerbl, Kopanas, Leimkuehler, Drettakis, 3D Gaussian Splatting for Real-Time Radiance Field Rendering, 2023, section 4,
+and the files published by the authors.
 """
 
 from __future__ import annotations
@@ -28,24 +31,23 @@ __all__ = [
     "logit",
     "complete_quaternions",
     "to_base_harmonics",
-    "logits_of_bytes",
     "to_log_scales",
 ]
 
 CONSTANT_HARMONIC = 0.5 / np.sqrt(np.pi)
-"""The value of the spherical harmonic of degree 0, everywhere."""
+"""The constant value of the spherical harmonic of degree 0."""
 
 HIGHEST_DEGREE = 3
-"""Of the spherical harmonics of colours: published files have no more."""
+"""Highest degree of the harmonics of published files."""
 
 ROW_SHAPES = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": ()}
-"""What each Gaussian has of each array, but for the harmonics."""
+"""Shape of one Gaussian's part of each array, except the harmonics."""
 
 
 @with_short_repr
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians; float32, C-contiguous, whatever real arrays are given.
+    """N Gaussians; float32, C-contiguous, for any real input arrays.
 
     Attributes:
         means: (N, 3) centres, world [length].
@@ -55,7 +57,7 @@ class Gaussians:
         harmonics: (N, K, 3) coefficients of the colour, K = (degree + 1)^2.
 
     Raises:
-        MivolError: shapes that do not fit together. Numbers are looked at by :meth:`check` only.
+        MivolError: shapes that contradict each other. Only :meth:`check` looks at the numbers.
     """
 
     means: np.ndarray
@@ -82,12 +84,12 @@ class Gaussians:
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number of Gaussians, N."""
         return len(self.means)
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics, 0 to 3."""
+        """Degree of the harmonics, 0 to 3."""
         return round(self.harmonics.shape[1] ** 0.5) - 1
 
     def scales(self) -> np.ndarray:
@@ -119,11 +121,11 @@ class Gaussians:
         return np.float32(0.5) + np.float32(CONSTANT_HARMONIC) * self.harmonics[:, 0]
 
     def select(self, index: np.ndarray | slice) -> Gaussians:
-        """Some of them: numbers, truth values (N,), or a slice."""
+        """A subset: numbers, booleans (N,), or a slice."""
         return Gaussians(**{name: getattr(self, name)[index] for name in (*ROW_SHAPES, "harmonics")})
 
     def with_degree(self, degree: int) -> Gaussians:
-        """The same with harmonics up to another degree: what is left out is lost, what is added is 0.
+        """The Gaussians with harmonics up to another degree: higher coefficients are dropped, new coefficients are 0.
 
         Raises:
             MivolError: a degree below 0 or above 3.
@@ -136,13 +138,14 @@ class Gaussians:
         return Gaussians(self.means, self.log_scales, self.quaternions, self.opacity_logits, harmonics)
 
     def check(self, subject: object = "Gaussians") -> Gaussians:
-        """Themselves, if every number can be drawn.
+        """Return the Gaussians if a renderer can draw every number.
 
         Args:
-            subject: named in the refusal: the file that they come from.
+            subject: origin of the Gaussians in messages, for example their file.
 
         Raises:
-            MivolError: NaN; an infinite number, but for a logit; a quaternion of length 0. The first index is named.
+            MivolError: NaN, an infinite number other than a logit, or a quaternion of length 0. The message names the first
+                index.
         """
         for name in ("means", "log_scales", "quaternions", "harmonics"):
             _check_rows(subject, ~np.isfinite(getattr(self, name)), f"{name} that are not finite")
@@ -152,10 +155,10 @@ class Gaussians:
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """All Gaussians of several sets, in their order; harmonics up to the highest degree among them.
+    """All Gaussians of several sets, in order, with harmonics up to the highest degree of a set.
 
     Raises:
-        MivolError: no set at all.
+        MivolError: no sets.
     """
     if not parts:
         raise refusal("concatenate", "no Gaussians", "at least one set", "give some")
@@ -165,23 +168,18 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def logit(opacity: np.ndarray) -> np.ndarray:
-    """The pre-image of opacities: log(o / (1 - o)), float64; -inf for 0 and inf for 1."""
+    """Logits of opacities: log(o / (1 - o)), float64; -inf for 0 and inf for 1."""
     opacity = np.asarray(opacity, np.float64)
     with np.errstate(divide="ignore"):
         return np.log(opacity) - np.log1p(-opacity)
 
 
 def _check_rows(subject: object, wrong: np.ndarray, what: str) -> None:
-    """Refuse a set in which some numbers are wrong: the first index, and how many Gaussians."""
+    """Refuse a set with wrong numbers; the message names the first index and the number of wrong Gaussians."""
     rows = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1)) if wrong.size else np.empty(0, int)
     if rows.size:
         found = f"{what} in Gaussian {rows[0]} (the first of {rows.size})"
         raise refusal(subject, found, "numbers that can be drawn", "remove these Gaussians, or write the file again")
-
-
-def logits_of_bytes(codes: np.ndarray) -> np.ndarray:
-    """Logits of opacities in 0..255."""
-    return logit(codes / 255)
 
 
 def to_base_harmonics(colours: np.ndarray) -> np.ndarray:
@@ -190,17 +188,17 @@ def to_base_harmonics(colours: np.ndarray) -> np.ndarray:
 
 
 def to_log_scales(scales: np.ndarray) -> np.ndarray:
-    """Logarithms; of a scale that is not above 0 -inf or NaN, which is refused by its index when the Gaussians are checked."""
+    """Logarithms of scales; a scale of 0 or below gives -inf or NaN, which :meth:`Gaussians.check` refuses by index."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(np.asarray(scales, np.float64))
 
 
 def complete_quaternions(others: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Unit quaternions of which one entry, not below 0, was left out.
+    """Unit quaternions of which a format leaves out one non-negative entry.
 
     Args:
-        others: (N, 3) the entries that are there, in their order.
-        which: (N,) the number of the one that is not.
+        others: (N, 3) stored entries, in order.
+        which: (N,) number of the missing entry.
 
     Returns:
         (N, 4).

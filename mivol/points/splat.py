@@ -1,11 +1,15 @@
-"""The ``.ksplat`` of the viewer GaussianSplats3D: sections of Gaussians, positions in buckets where they are compressed.
+"""The formats of two web viewers: ``.splat`` (antimatter15) and ``.ksplat`` (GaussianSplats3D).
 
-Conventions. A header of 4096 bytes and one of 1024 a section, then the sections. Level 0 holds float32; levels 1 and 2 hold
-positions in 16 bits around the centre of a bucket and scales and rotations in half precision; harmonics are float32, half
-precision, or bytes between two ends. Colour and opacity are bytes, quaternions (w, x, y, z). Harmonics stand by degree, in each
-by colour. Full buckets come first, each of the same number of Gaussians; a table says how many the others hold.
+``.splat``. 32 bytes a Gaussian, no header, colours without harmonics: position and scale in float32, colour and opacity in a
+byte each, the unit quaternion (w, x, y, z) as 128 + 128 q in a byte each.
 
-Source: the open-source viewer mkkellogg/GaussianSplats3D (MIT licence), formats up to 0.1.
+``.ksplat``. A header of 4096 bytes and 1024 bytes for each section, then the sections. Level 0 stores float32. Levels 1 and 2
+store positions in 16 bits around the centre of a bucket, and scales and rotations in half precision; harmonics are float32,
+half precision, or bytes between two ends. Colour and opacity are bytes, quaternions (w, x, y, z). Harmonics are ordered by
+degree, then by colour. Full buckets come first, with the same number of Gaussians each; a table has the counts of the other
+buckets.
+
+Source: the open-source viewers antimatter15/splat and mkkellogg/GaussianSplats3D (MIT licence), the latter up to version 0.1.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files.source import read_bytes, refusal
-from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, concatenate, logits_of_bytes, to_base_harmonics, to_log_scales
+from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, concatenate, logit, to_base_harmonics, to_log_scales
 
 __all__ = ["read_ksplat", "read_splat"]
 
@@ -26,18 +30,18 @@ NUMBER_TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "
 """Level -> types of positions, of scales and rotations, of harmonics."""
 
 CENTRE_SIZE = 12
-"""Bytes of the centre of a bucket."""
+"""Size of the centre of a bucket [bytes]."""
 
 DEFAULT_MAX_HARMONIC = 1.5
-"""Ends of harmonics in bytes where the header says none."""
+"""Limit of harmonics in bytes if the header has none."""
 
 DEFAULT_STEPS = 32767
-"""Steps of half a bucket where the header says none."""
+"""Steps of half a bucket if the header has none."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """What the header of a section says; counts are of Gaussians, sizes of bytes."""
+    """The header of a section; counts are Gaussians, sizes are bytes."""
 
     count: int
     capacity: int
@@ -51,15 +55,15 @@ class Section:
     degree: int
 
     def storage(self) -> int:
-        """Bytes of the table of partly filled buckets and of the buckets' centres."""
+        """Size of the table of partly filled buckets and of the bucket centres [bytes]."""
         return 4 * self.partial + self.bucket_storage * self.buckets
 
 
 def read_ksplat(path: Path) -> Gaussians:
-    """Read a file.
+    """Read a ``.ksplat``.
 
     Raises:
-        MivolError: another version or level, counts that contradict each other, a truncated file.
+        MivolError: another version or level, counts that contradict each other, or a truncated file.
     """
     data = read_bytes(path)
     if len(data) < HEADER_SIZE:
@@ -102,14 +106,14 @@ def _parse_section(data: bytes, at: int, path: Path) -> Section:
 
 
 def _record_type(level: int, degree: int) -> np.dtype:
-    """What a Gaussian takes."""
+    """The record of one Gaussian."""
     position, number, harmonic = NUMBER_TYPES[level]
     fields = [("mean", position, 3), ("scale", number, 3), ("quaternion", number, 4), ("colour", "u1", 3), ("opacity", "u1")]
     return np.dtype([*fields, ("harmonics", harmonic, 3 * ((degree + 1) ** 2 - 1))])
 
 
 def _parse_buckets(data: bytes, at: int, section: Section, path: Path) -> tuple[np.ndarray, float, int]:
-    """The centre of each Gaussian's bucket (N, 3), the length of a step, and how many steps are half a bucket."""
+    """The centre of each Gaussian's bucket (N, 3), the length of a step, and the number of steps of half a bucket."""
     partial = np.frombuffer(data, "<u4", section.partial, at)
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + 4 * section.partial).reshape(-1, 3)
     held = np.concatenate([np.full(section.full, section.bucket_capacity, np.uint64), partial.astype(np.uint64)])
@@ -133,13 +137,13 @@ def _decode_records(table: np.ndarray, offsets: tuple[np.ndarray, float, int] | 
         means,
         to_log_scales(table["scale"]),
         table["quaternion"],
-        logits_of_bytes(table["opacity"]),
+        logit(table["opacity"] / 255),
         np.concatenate([constant, _decode_harmonics(table["harmonics"], ends)], axis=1),
     )
 
 
 def _decode_harmonics(stored: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
-    """Coefficients above degree 0, (N, K - 1, 3): in the file degree by degree, in each colour by colour."""
+    """Coefficients above degree 0, (N, K - 1, 3); the file orders them by degree, then by colour."""
     values = stored.astype(np.float64)
     if stored.dtype == np.uint8:
         values = ends[0] + values / 255 * (ends[1] - ends[0])
@@ -155,10 +159,10 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 3),
 
 
 def read_splat(path: Path) -> Gaussians:
-    """Read a file.
+    """Read a ``.splat``.
 
     Raises:
-        MivolError: a size that is no multiple of 32 bytes.
+        MivolError: a size that is not a multiple of 32 bytes.
     """
     data = read_bytes(path)
     if len(data) % RECORD.itemsize:
@@ -168,6 +172,6 @@ def read_splat(path: Path) -> Gaussians:
         table["mean"],
         to_log_scales(table["scale"]),
         table["quaternion"] / 128 - 1,
-        logits_of_bytes(table["opacity"]),
+        logit(table["opacity"] / 255),
         to_base_harmonics(table["colour"] / 255)[:, None],
     )

@@ -1,12 +1,12 @@
-"""Niantic's ``.spz``, versions 2 to 4: attributes of all Gaussians one after the other, in bytes, compressed.
+"""Niantic's ``.spz``, versions 2 to 4: the attributes of all Gaussians one after the other, in bytes, compressed.
 
-Conventions. Versions 2 and 3 are one gzip stream (or its bytes as they are) with a header of 16 bytes; version 4 has a header
-of 32 bytes, a table of streams, and a Zstandard stream an attribute, which needs the optional package ``zstandard``. Attributes
-are positions (24 bits, fixed point), opacities, colours, scales, rotations, harmonics. Version 2 holds x, y, z of the unit
-quaternion in bytes; later ones the three smaller entries of (x, y, z, w), 9 bits and a sign each over 0..1/sqrt(2).
+Conventions. Versions 2 and 3 are one gzip stream (or its plain bytes) with a header of 16 bytes. Version 4 has a header of 32
+bytes, a table of streams, and a Zstandard stream for each attribute, which needs the optional package ``zstandard``. Attributes
+are positions (24 bits, fixed point), opacities, colours, scales, rotations, harmonics. Version 2 stores x, y, z of the unit
+quaternion in bytes. Later versions store the three smaller entries of (x, y, z, w), 9 bits and a sign each over 0..1/sqrt(2).
 
-Axes. The format has y up and z backwards; files of the authors of 3D Gaussian splatting have y down and z forwards, and so have
-the Gaussians that are read: y and z change their signs, with the harmonics that are odd in them.
+Axes. The format has y up and z backwards. Files of the authors of 3D Gaussian splatting, and the Gaussians returned here, have
+y down and z forwards: y and z change their signs, with the harmonics that are odd in y or z.
 
 Source: the documentation and the open-source library of Niantic (nianticlabs/spz, MIT licence).
 """
@@ -22,7 +22,7 @@ import numpy as np
 
 from mivol.files.npy import check_memory
 from mivol.files.source import CODECS, decompress, parse_elements, read_bytes, refusal
-from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, complete_quaternions, logits_of_bytes
+from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, complete_quaternions, logit
 
 __all__ = ["read_spz"]
 
@@ -32,18 +32,18 @@ HEAD = struct.Struct("<4sIIBBBB")
 STREAM = struct.Struct("<QQ")
 VERSIONS = (2, 3, 4)
 EXTENSIONS = 2
-"""The bit of the flags that says that records of vendors follow, which may change what numbers mean."""
+"""Flag of vendor extensions, which may change the meaning of numbers."""
 
 COLOUR_SCALE = 0.15
-"""Colours are stored as 0.5 + 0.15 k, k the coefficient of degree 0."""
+"""Colours are stored as 0.5 + 0.15 k, with k the coefficient of degree 0."""
 
 PARITY = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
-"""What a half turn about x, (x, y, z) to (x, -y, -z), makes of each basis function of the harmonics, degrees 0 to 3."""
+"""Sign of each basis function of the harmonics, degrees 0 to 3, under the half turn (x, y, z) to (x, -y, -z)."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says of itself."""
+    """The header of a file."""
 
     version: int
     count: int
@@ -52,7 +52,7 @@ class Header:
     streams: int
 
     def sizes(self) -> list[int]:
-        """Bytes of each attribute."""
+        """Size of each attribute [bytes]."""
         rotation = 3 if self.version == 2 else 4
         return [self.count * n for n in (9, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1))]
 
@@ -61,7 +61,7 @@ def read_spz(path: Path) -> Gaussians:
     """Read a file.
 
     Raises:
-        MivolError: no SPZ, another version, extensions, sizes that contradict each other or exceed the memory, a damaged
+        MivolError: another format or version, extensions, sizes that contradict each other or exceed the memory, a damaged
             stream, or version 4 without ``zstandard``.
     """
     data = read_bytes(path)
@@ -73,7 +73,7 @@ def read_spz(path: Path) -> Gaussians:
 
 
 def _read_header_bytes(data: bytes, path: Path) -> bytes:
-    """The first bytes, decompressed where they are compressed."""
+    """The first bytes, decompressed if necessary."""
     if not data.startswith(GZIP):
         return data[: HEAD.size]
     try:
@@ -146,24 +146,24 @@ def _decode_attributes(attributes: list[np.ndarray], header: Header) -> Gaussian
         _decode_fixed_point(positions) / 2.0**header.fraction_bits * [1, -1, -1],
         scales / 16 - 10,
         quaternions * [1, 1, -1, -1],
-        logits_of_bytes(opacities[:, 0]),
+        logit(opacities[:, 0] / 255),
         all_harmonics * PARITY[: all_harmonics.shape[1], None],
     )
 
 
 def _decode_fixed_point(codes: np.ndarray) -> np.ndarray:
-    """Whole numbers of 24 bits with a sign, lowest byte first; (N, 9) to (N, 3)."""
+    """Signed integers of 24 bits, lowest byte first; (N, 9) to (N, 3)."""
     low, middle, high = np.moveaxis(codes.reshape(len(codes), 3, 3).astype(np.int32), 2, 0)
     return low | middle << 8 | (high ^ 0x80) - 0x80 << 16
 
 
 def _decode_first_three(codes: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of x, y, z in bytes, w not below 0."""
+    """(w, x, y, z) from x, y, z in bytes, with w of at least 0."""
     return complete_quaternions(codes / 127.5 - 1, np.zeros(len(codes), np.int64))
 
 
 def _decode_smallest_three(codes: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a word with the number of the largest of (x, y, z, w) and the others."""
+    """(w, x, y, z) from a word with the number of the largest of (x, y, z, w) and the other entries."""
     words = np.ascontiguousarray(codes).view("<u4")[:, 0]
     fields = np.stack([(words >> np.uint32(shift)) & 1023 for shift in (20, 10, 0)], axis=1)
     others = np.where(fields >> 9, -1, 1) * (fields & 511) / 511 * np.sqrt(0.5)

@@ -1,6 +1,7 @@
-"""What a file of points or of Gaussians holds, in a few lines, and one file made of another.
+"""The contents of a file of points or Gaussians in a few lines, and conversion between file formats.
 
-Conventions. Facts come first, whatever is refused: numbers that cannot be drawn are counted and left out of the extents.
+Conventions. A summary describes the whole file, also if its numbers are refused. Numbers that no renderer can draw are counted,
+and left out of the extents.
 """
 
 from __future__ import annotations
@@ -20,33 +21,33 @@ from mivol.points.gaussians import Gaussians
 __all__ = ["KINDS", "SUFFIXES", "FileSummary", "convert_file", "is_points_file", "summarize_file"]
 
 KINDS = ("gaussians", "points")
-"""What a file can be written as."""
+"""Contents that a file can be converted to."""
 
 SUFFIXES = GAUSSIAN_READERS.keys() | CLOUD_READERS.keys()
-"""Of files of Gaussians and of points."""
+"""Suffixes of files of Gaussians and of points."""
 
 FAINT_OPACITY = 0.05
-"""Gaussians of a smaller opacity are counted: they cost time and show little."""
+"""Gaussians below this opacity are counted: they cost time and have little effect."""
 
 
 @dataclass(frozen=True)
 class FileSummary:
-    """Lines for people; ``refusal`` is the sentence that reading the file would end with, or empty."""
+    """Lines for people, and the message with which reading the file would fail (empty if reading succeeds)."""
 
     text: str
     refusal: str
 
 
 def is_points_file(path: Path) -> bool:
-    """Whether the suffix is one of Gaussians or of points."""
+    """Whether a file has the suffix of Gaussians or of points."""
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
 def summarize_file(path: Path) -> FileSummary:
-    """Count, extent, degree, scales and opacities of a file, and what in it cannot be drawn.
+    """Count, extent, degree, scales and opacities of a file, and the numbers that no renderer can draw.
 
     Raises:
-        MivolError: the file cannot be read at all.
+        MivolError: an unreadable file.
     """
     path = check_file(path)
     if is_gaussian_file(path):
@@ -65,12 +66,12 @@ def convert_file(source: Path, target: Path, kind: str | None = None) -> str:
     """Write the Gaussians or points of a file in another format.
 
     Args:
-        source: any format that :func:`read_gaussians` or :func:`read_points` reads.
-        target: what to write; its suffix chooses the format.
-        kind: one of :data:`KINDS`; None: what the source holds, or points where the suffix holds no Gaussians.
+        source: file in any format of :func:`read_gaussians` or :func:`read_points`.
+        target: destination; its suffix selects the format.
+        kind: one of :data:`KINDS`; None: the kind of the source, or points for a suffix without Gaussians.
 
     Returns:
-        What was written, in a line.
+        A line that describes the written file.
 
     Raises:
         MivolError: as the readers and writers, or another kind.
@@ -110,7 +111,7 @@ def _describe_points(path: Path, held: PointCloud) -> list[str]:
 
 
 def _describe_extent(positions: np.ndarray) -> list[str]:
-    """The box of all that are finite, and of the middle 98 %."""
+    """The box of all finite positions, and of their middle 98 % along each axis."""
     finite = positions[np.isfinite(positions).all(axis=1)]
     if not len(finite):
         return ["nothing in it has a place"]
@@ -124,7 +125,7 @@ def _format_corner(values: np.ndarray) -> str:
 
 
 def _describe_spread(values: np.ndarray) -> str:
-    """Ends and median of the finite ones."""
+    """Ends and median of the finite values."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return "that are finite: none"
