@@ -1,15 +1,22 @@
-r"""What a path is walked for: its radiance, the gradients of its parameters, or the tangent of its radiance.
+r"""Scores: how a walked path accumulates its radiance, the gradients of its parameters, or the tangent of its radiance.
 
-The walk reports two things to its score, in the order of the path: terms, which are added to the radiance, and factors, which
-multiply all light from further along the path (:mod:`mivol.transport.estimators.scores`). There are three scores:
+The radiance of a path is a sum of terms, each multiplied by all factors in front of it:
+
+.. math:: L = t_1 + f_1 (t_2 + f_2 (t_3 + \dots))
+
+The walk reports terms and factors to its score in the order of the path. There are three scores:
 
 * ``Primal`` sums the radiance.
-* ``Replay`` (path replay backpropagation) follows a path whose radiance ``L`` is known. Each term is subtracted from ``L`` when
-  it is reached, so ``L`` is the radiance ahead when a factor is reported, and d loss / d log f = dL L. After the walk ``L`` is
-  0, to rounding.
-* ``Tangent`` carries the tangent of the logarithm of the product of all factors along the path.
+* ``Replay`` (path replay backpropagation) follows a path whose radiance is known. It subtracts each term from ``L``, so ``L``
+  is the radiance from further along the path when the walk reports a factor. A term receives d loss / d t = dL, and a factor
+  receives d loss / d log f = dL L. After the walk ``L`` is 0, up to rounding.
+* ``Tangent`` adds the tangents of terms, and carries the tangent of the logarithm of the product of all factors, f'/f.
 
-Terms and factors know their own derivatives, so a score knows no estimator.
+Terms and factors compute their own derivatives in reverse mode (vjp) and forward mode (jvp), so a score depends on no
+estimator. A factor differentiates its logarithm, so nothing is divided by a factor without a derivative, and never by a
+transmittance.
+
+Conventions. The values of terms contain the throughput of the path in front of them, and are 0 in lanes without the term.
 
 References: Vicini et al. 2021 (replay with a running difference); Nimier-David et al. 2020 (adjoint radiance).
 """
@@ -26,21 +33,109 @@ import mitsuba as mi
 from mivol.transport.media.channels import take_tangent
 
 __all__ = [
+    "FORWARD",
+    "IMAGE",
+    "REVERSE",
+    "Factor",
     "Primal",
     "Replay",
     "Tangent",
-    "Factor",
     "Term",
     "TrackedFactor",
     "TrackedTerm",
-    "IMAGE",
-    "REVERSE",
-    "FORWARD",
 ]
 
 
-IMAGE, REVERSE, FORWARD = "picture", "reverse", "forward"
+IMAGE, REVERSE, FORWARD = "image", "reverse", "forward"
 """Purposes of a walk: the radiance, the gradients of its parameters, or its tangent."""
+
+
+# -- Terms and factors ---------------------------------------------------------------------------------------------------
+
+
+class Term(Protocol):
+    """Radiance added to a path.
+
+    Attributes:
+        value: radiance at the camera, without derivatives; 0 in lanes without the term.
+        is_replayed: whether a replay finds the same value again, and subtracts it from the known radiance. False for light
+            sampled anew for its derivative.
+    """
+
+    value: mi.Spectrum
+    is_replayed: bool
+
+    def vjp(self, dL: mi.Spectrum) -> None:
+        """Add the derivatives of the value, weighted by ``dL``, to the gradients of its parameters."""
+
+    def jvp(self) -> mi.Spectrum:
+        """Tangent of the value, from the tangents of its parameters."""
+
+
+class Factor(Protocol):
+    """A factor on all light from further along the path."""
+
+    def vjp(self, dlog: mi.Spectrum) -> None:
+        """Add the derivatives of the factor's logarithm, weighted by ``dlog`` = dL L, to the gradients of its parameters."""
+
+    def jvp(self) -> mi.Spectrum:
+        """Tangent of the factor's logarithm."""
+
+
+class TrackedTerm:
+    """A radiance differentiated by Dr.Jit (an emitter seen by the path).
+
+    Args:
+        value: radiance, with or without derivatives.
+        active: lanes with the term.
+    """
+
+    is_replayed = True
+
+    def __init__(self, value: mi.Spectrum, active: mi.Bool) -> None:
+        self.attached, self.active = value, active
+        self.value = dr.select(active, dr.detach(value), 0)
+
+    def vjp(self, dL: mi.Spectrum) -> None:
+        with dr.resume_grad():
+            if dr.grad_enabled(self.attached):
+                dr.backward_from(dr.select(self.active, dL * self.attached, 0))
+
+    def jvp(self) -> mi.Spectrum:
+        with dr.resume_grad():
+            tangent = take_tangent(self.attached)
+        return dr.select(self.active, tangent, 0)
+
+
+@dataclass
+class TrackedFactor:
+    """A factor differentiated by Dr.Jit (a BSDF). A factor of 0 has no logarithm; its derivative counts as 0.
+
+    Attributes:
+        evaluate: returns the factor with derivatives; called only for derivatives.
+        active: lanes with the factor.
+    """
+
+    evaluate: Callable[[], mi.Spectrum]
+    active: mi.Bool
+
+    def vjp(self, dlog: mi.Spectrum) -> None:
+        with dr.resume_grad():
+            value = self.evaluate()
+            if dr.grad_enabled(value):
+                f = dr.detach(value)
+                ratio = dr.select(f != 0, value * dr.rcp(dr.select(f != 0, f, 1)), 0)
+                dr.backward_from(dr.select(self.active, dlog * ratio, 0))
+
+    def jvp(self) -> mi.Spectrum:
+        with dr.resume_grad():
+            value = self.evaluate()
+            tangent = take_tangent(value)
+        f = dr.detach(value)
+        return dr.select(self.active & (f != 0), tangent * dr.rcp(dr.select(f != 0, f, 1)), 0)
+
+
+# -- Scores --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -51,36 +146,36 @@ class Primal:
     purpose = IMAGE
 
     def add(self, term: Term) -> Primal:
-        """The score after a term of the path was reached."""
+        """The score after a term of the path."""
         return Primal(self.L + term.value)
 
     def scale(self, factor: Factor) -> Primal:
-        """The score after a factor of all light further along the path was reached; term values contain it already."""
+        """The score after a factor on all light from further along the path; the values of terms contain the factor already."""
         return self
 
 
 @dataclass
 class Replay:
-    """Follow a path again and add its derivatives to the gradients of media, surfaces and emitters.
+    """Follow a path again, and add its derivatives to the gradients of media, surfaces and emitters.
 
     Attributes:
-        L: radiance of the part of the path that is still ahead. It need not be known for a path of one segment (None): the only
-            light behind its factor is the emission at its end, so the factor is kept until that is reached.
+        L: radiance from further along the path. A path of one segment does not need it (None): the only light behind its factor
+            is the emission at its end, so the factor waits for this term.
         dL: d loss / d L.
-        waiting: that factor.
+        pending: the waiting factor.
     """
 
     L: mi.Spectrum | None
     dL: mi.Spectrum
-    waiting: Factor | None = None
+    pending: Factor | None = None
     purpose = REVERSE
 
     def add(self, term: Term) -> Replay:
         term.vjp(self.dL)
         if self.L is not None:
             return Replay(self.L - term.value, self.dL) if term.is_replayed else self
-        if self.waiting is not None:
-            self.waiting.vjp(self.dL * term.value)
+        if self.pending is not None:
+            self.pending.vjp(self.dL * term.value)
         return Replay(None, self.dL)
 
     def scale(self, factor: Factor) -> Replay:
@@ -108,85 +203,3 @@ class Tangent:
 
     def scale(self, factor: Factor) -> Tangent:
         return Tangent(self.dL, self.dlog + factor.jvp())
-
-
-class Term(Protocol):
-    """Radiance that is added to a path.
-
-    Attributes:
-        value: radiance as the camera sees it, without derivatives; 0 in lanes that do not have it.
-        is_replayed: whether the replay of a path finds the same value again and subtracts it from the known radiance. Light
-            that is estimated anew for its derivative is not part of that radiance.
-    """
-
-    value: mi.Spectrum
-    is_replayed: bool
-
-    def vjp(self, dL: mi.Spectrum) -> None:
-        """Add the derivatives of the value, weighted by ``dL``, to the gradients of its parameters."""
-
-    def jvp(self) -> mi.Spectrum:
-        """Tangent of the value, from the tangents of its parameters."""
-
-
-class Factor(Protocol):
-    """A factor of all light further along the path."""
-
-    def vjp(self, dlog: mi.Spectrum) -> None:
-        """Add the derivatives of the factor's logarithm, weighted by ``dlog`` = dL L, to the gradients of its parameters."""
-
-    def jvp(self) -> mi.Spectrum:
-        """Tangent of the factor's logarithm."""
-
-
-class TrackedTerm:
-    """A radiance whose derivatives Dr.Jit tracks (an emitter seen by the path).
-
-    Args:
-        value: attached to its parameters, or not.
-        active: lanes that see it.
-    """
-
-    is_replayed = True
-
-    def __init__(self, value: mi.Spectrum, active: mi.Bool) -> None:
-        self.attached, self.active = value, active
-        self.value = dr.select(active, dr.detach(value), 0)
-
-    def vjp(self, dL: mi.Spectrum) -> None:
-        with dr.resume_grad():
-            if dr.grad_enabled(self.attached):
-                dr.backward_from(dr.select(self.active, dL * self.attached, 0))
-
-    def jvp(self) -> mi.Spectrum:
-        with dr.resume_grad():
-            own = take_tangent(self.attached)
-        return dr.select(self.active, own, 0)
-
-
-@dataclass
-class TrackedFactor:
-    """A factor whose derivatives Dr.Jit tracks (a BSDF). Where it is 0 it has no logarithm, and its derivative counts as 0.
-
-    Attributes:
-        evaluate: returns the factor, attached to its parameters; called only where a derivative is needed.
-        active: lanes that are multiplied by it.
-    """
-
-    evaluate: Callable[[], mi.Spectrum]
-    active: mi.Bool
-
-    def vjp(self, dlog: mi.Spectrum) -> None:
-        with dr.resume_grad():
-            value = self.evaluate()
-            if dr.grad_enabled(value):
-                f = dr.detach(value)
-                ratio = dr.select(f != 0, value * dr.rcp(dr.select(f != 0, f, 1)), 0)
-                dr.backward_from(dr.select(self.active, dlog * ratio, 0))
-
-    def jvp(self) -> mi.Spectrum:
-        with dr.resume_grad():
-            value = self.evaluate()
-            own = take_tangent(value)
-        f = dr.detach(value)
-        return dr.select(self.active & (f != 0), own * dr.rcp(dr.select(f != 0, f, 1)), 0)

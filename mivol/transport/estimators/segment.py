@@ -1,11 +1,17 @@
-r"""The protocol of segment estimators: light that media add along a path segment, and the transmittance of the segment.
+r"""Segment estimators: the light that media add along a segment of a path, and the transmittance of the segment.
 
 .. math:: L = L_{media} + T\, L_{behind}
 
-A segment runs from one event to the next: an opaque surface or, for estimators that end segments in media, a collision. A
-:class:`SegmentEstimator` computes its light: none (:class:`Absorption`), single scattering, or emission. Light and
-transmittance carry their derivatives as a term and a factor (:mod:`.scores`). Where one walk of the cells gives the
-derivatives of both, they share a :class:`SharedSegment`; the walk reports the term first, then the factor.
+A segment runs from one event to the next: to an opaque surface or, with some estimators, to a collision. A
+:class:`SegmentEstimator` computes the light of its media: none (:class:`Absorption`), emission, or scattered light. Light and
+transmittance carry their derivatives as a term and a factor (:mod:`.scores`). If one walk of the cells computes the derivatives
+of both, term and factor share a :class:`SharedSegment`; the path reports the term first, then the factor.
+
+:class:`TrackedAbsorption` serves media with a known majorant only. Its estimate of T is ratio tracking
+(:mod:`.flights.tracking`). The point t of a derivative is drawn uniformly over the length l in the medium, independently of T,
+so the product :math:`\partial L = -L\,\ell\;\partial\sigma(t)` is unbiased too.
+
+References: Novak et al. 2014 (ratio tracking).
 """
 
 from __future__ import annotations
@@ -47,17 +53,18 @@ __all__ = [
 
 @dataclass
 class PathSegment:
-    """The segment that lies ahead of a path.
+    """The next segment of a path.
 
     Attributes:
-        ray: world space, unit direction.
-        medium: the medium around its origin.
-        beta: throughput of the path to there.
+        ray: ray in world space, with a unit direction.
+        medium: medium around the origin of the ray.
+        beta: throughput up to the origin [1].
         may_scatter: lanes whose path may scatter once more.
-        samples: random numbers that the estimator has drawn; None where it needs none.
-        depth: number of scattering events of the path so far.
-        is_side_flight: a side flight, which the path does not take itself (:mod:`mivol.transport.path.side_flight`).
-        emission_weight: of the light that media emit along it, where that was drawn at its origin too; None for 1.
+        samples: random numbers drawn by the estimator; None without random numbers.
+        depth: number of scattering events so far.
+        is_side_flight: a flight beside the path (:mod:`mivol.transport.path.side_flight`).
+        emission_weight: weight of the emission of media along the segment, if the origin has sampled their emission too [1];
+            None for a weight of 1.
     """
 
     ray: Ray
@@ -72,15 +79,15 @@ class PathSegment:
 
 @dataclass
 class Collision:
-    """A collision with a medium that ends the flight along a segment.
+    """A collision with a medium, ending the flight along a segment.
 
     Attributes:
-        mei: the point, and its medium, as Mitsuba's phase functions are evaluated at it.
-        p: the point in float64.
-        albedo: probability [1] that it scatters, of each colour.
-        on: lanes whose flight ends so; the others reach the end of their segment.
-        t: its distance on the ray [length].
-        body: index of its medium.
+        mei: position and medium, for evaluating Mitsuba's phase functions.
+        p: position in float64.
+        albedo: probability of scattering [1], for each colour.
+        on: lanes with a collision; other lanes reach the end of their segment.
+        t: distance on the ray [length].
+        body: index of the medium.
     """
 
     mei: mi.MediumInteraction3f
@@ -93,12 +100,12 @@ class Collision:
 
 @dataclass
 class FlightPoint:
-    """A point that is drawn evenly from a flight.
+    """A point drawn uniformly from a flight.
 
     Attributes:
         point: the point.
-        gain: throughput to it, times the length that it stands for.
-        chance: a number in [0, 1), by which one of several flights' points is kept.
+        gain: throughput up to the point, times the sampled length [length].
+        chance: uniform random number in [0, 1), by which the point of one flight of a path is kept.
     """
 
     point: UniformPoint
@@ -111,12 +118,12 @@ class SegmentEstimate:
     """The result of a segment estimator.
 
     Attributes:
-        end: where the segment ends.
-        T: transmittance of its media, of each colour, or an estimate of it.
-        light: the light of its media; None where they add none.
-        transmittance: the factor of the light behind.
-        collision: where the path meets a medium before that end; None of estimators whose paths go straight on.
-        probe: for derivatives, a point of the flight at which they may be looked at besides; None where none is needed.
+        end: end of the segment.
+        T: transmittance of the media, or an estimate, for each colour [1].
+        light: light of the media; None if they add no light.
+        transmittance: factor on the light behind the segment.
+        collision: collision with a medium before the end; None from estimators without collisions.
+        probe: point of the flight for derivatives; None in images and from estimators without probes.
     """
 
     end: SegmentEnd
@@ -128,91 +135,49 @@ class SegmentEstimate:
 
 
 class SegmentEstimator(Protocol):
-    """How the light of a segment is estimated.
+    """An estimator of the light and the transmittance of a segment.
 
     Attributes:
-        directions: the layout of lanes that its directions need (:func:`mivol.transport.path.film.film_passes`).
-        ends_in_media: a segment may end at a collision with a medium, where the path scatters.
+        directions: layout of lanes required by its directions (:class:`mivol.transport.path.film.RenderSamples`).
+        ends_in_media: segments may end at collisions with media, where the path scatters.
     """
 
     directions: str
     ends_in_media: bool
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
-        """Draw the random numbers of one segment; whatever is returned becomes ``PathSegment.samples``."""
+        """Draw the random numbers of one segment, for ``PathSegment.samples``."""
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        """Follow a segment to its end, for IMAGE, REVERSE or FORWARD."""
+        """Follow a segment to its end, for the purpose IMAGE, REVERSE or FORWARD."""
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
-        """Find what derivatives along camera rays need beforehand; called before each pass, and done once."""
+        """Prepare for derivatives along camera rays; called before each pass, with an effect in the first call only."""
 
     def replayed(self) -> SegmentEstimator:
-        """The estimator of the light that a replay finds again, without light that is sampled anew for its derivatives.
+        """The estimator of the light found again by a replay, without light sampled anew for its derivatives.
 
-        It consumes the same random numbers, so that both passes follow the same path.
+        It consumes the same random numbers, so both passes follow the same path.
         """
 
 
-class Transmittance:
-    """The factor of a segment: the exact transmittance of its media."""
-
-    def __init__(self, media: SceneMedia, segment: RaySegment, active: mi.Bool) -> None:
-        self.media, self.segment, self.active = media, segment, active
-
-    def vjp(self, dlog: mi.Spectrum) -> None:
-        vjp_optical_depth(self.media, self.segment, -dlog, self.active)
-
-    def jvp(self) -> mi.Spectrum:
-        return -jvp_optical_depth(self.media, self.segment, self.active)
-
-
-class Absorption:
-    """The segment estimator for media that only absorb: exact transmittance, no light.
-
-    Args:
-        media: of the scene.
-        drawn_by: an estimator whose random numbers are drawn and not used, so that a replay with it follows the same path.
-
-    Bias: that of the walk, none but rounding. Variance: none. Cost: one walk of each medium.
-    """
-
-    directions = "none"
-    ends_in_media = False
-
-    def __init__(self, media: SceneMedia, drawn_by: SegmentEstimator | None = None) -> None:
-        self.media, self.drawn_by = media, drawn_by
-
-    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
-        if self.drawn_by is not None:
-            self.drawn_by.draw(sampler, active, strata)
-
-    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        end, tau = integrate_optical_depth(self.media, segment.ray, segment.medium, active)
-        passed = RaySegment(segment.ray, segment.medium, end.t)
-        return SegmentEstimate(end, transmittance(tau), None, Transmittance(self.media, passed, active))
-
-    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
-        """Nothing is needed."""
-
-    def replayed(self) -> Absorption:
-        return self
+# -- Light and transmittance with common derivatives ---------------------------------------------------------------------
 
 
 class SharedSegment(Protocol):
-    """Derivatives of a segment's light and of its transmittance that come from one walk of its cells.
+    """Derivatives of a segment's light and of its transmittance, computed in one walk of its cells.
 
     Attributes:
-        dL: d loss / d light, known once the term was reported.
+        dL: d loss / d light, known after the path has reported the term.
     """
 
     dL: mi.Spectrum | None
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
-        """Derivatives of the light that need no walk of the segment."""
+        """Add derivatives of the light that need no walk of the segment."""
 
     def vjp(self, dlog: mi.Spectrum) -> None:
-        """All other derivatives: of the light, weighted by ``dL``, and of log T, weighted by ``dlog``."""
+        """Add all other derivatives: of the light, weighted by ``dL``, and of log T, weighted by ``dlog``."""
 
     def jvp_light(self) -> mi.Spectrum:
         """Tangent of the light."""
@@ -250,14 +215,62 @@ class SegmentTransmittance:
         return self.shared.jvp_transmittance()
 
 
-class TrackedAbsorption:
-    """The segment estimator for media that only absorb, of which some are known by a majorant only.
+# -- Absorption ----------------------------------------------------------------------------------------------------------
+
+
+class Transmittance:
+    """The exact transmittance of a segment's media, as a factor."""
+
+    def __init__(self, media: SceneMedia, segment: RaySegment, active: mi.Bool) -> None:
+        self.media, self.segment, self.active = media, segment, active
+
+    def vjp(self, dlog: mi.Spectrum) -> None:
+        vjp_optical_depth(self.media, self.segment, -dlog, self.active)
+
+    def jvp(self) -> mi.Spectrum:
+        return -jvp_optical_depth(self.media, self.segment, self.active)
+
+
+class Absorption:
+    """The segment estimator for media that only absorb: exact transmittance, no light.
 
     Args:
-        media: of the scene.
+        media: media of the scene.
+        drawn_by: estimator whose random numbers are drawn and ignored, so that a replay with Absorption follows the same path.
 
-    Bias: none, of the radiance and of its derivatives. Variance: that of ratio tracking, and of one point for derivatives.
-    Cost: one walk of each exact medium; look-ups in proportion to the majorants of the others.
+    Bias: none but rounding. Variance: none. Cost: one walk of each medium.
+    """
+
+    directions = "none"
+    ends_in_media = False
+
+    def __init__(self, media: SceneMedia, drawn_by: SegmentEstimator | None = None) -> None:
+        self.media, self.drawn_by = media, drawn_by
+
+    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
+        if self.drawn_by is not None:
+            self.drawn_by.draw(sampler, active, strata)
+
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        end, tau = integrate_optical_depth(self.media, segment.ray, segment.medium, active)
+        passed = RaySegment(segment.ray, segment.medium, end.t)
+        return SegmentEstimate(end, transmittance(tau), None, Transmittance(self.media, passed, active))
+
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """Needs no preparation."""
+
+    def replayed(self) -> Absorption:
+        return self
+
+
+class TrackedAbsorption:
+    """The segment estimator for media that only absorb, some of them with a known majorant only.
+
+    Args:
+        media: media of the scene.
+
+    Bias: none, for the radiance and its derivatives. Variance: ratio tracking, and one point for derivatives. Cost: one walk of
+    each exact medium; look-ups in proportion to the majorants of the others.
     """
 
     directions = "none"
@@ -267,10 +280,10 @@ class TrackedAbsorption:
         self.media = media
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> mi.Float:
-        """One number in every lane.
+        """Draw one number in every lane.
 
-        Not in ``active`` lanes only, which are those that may scatter once more: a sampler does not advance in the others, and
-        would give them the same number at each segment.
+        ``active`` lanes are the lanes allowed to scatter once more. A sampler does not advance in other lanes, and would return
+        the same number there at each segment.
         """
         return sampler.next_1d()
 
@@ -283,7 +296,7 @@ class TrackedAbsorption:
         return SegmentEstimate(end, T, None, Transmittance(self.media, passed, active))
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
-        """Nothing is needed."""
+        """Needs no preparation."""
 
     def replayed(self) -> TrackedAbsorption:
         """This estimator: a replay draws the same numbers, and finds the same transmittance again."""

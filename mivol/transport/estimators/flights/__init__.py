@@ -1,1 +1,1 @@
-"""Paths that scatter any number of times: free flights to collisions, and their derivatives."""
+"""Free flights of paths that scatter any number of times, and their derivatives."""

@@ -1,22 +1,27 @@
-r"""Derivatives of free flights, with respect to the coefficients of media along them and at their collisions.
+r"""Derivatives of free flights, with respect to the coefficients of media along the flights and at their collisions.
 
 .. math:: \partial L = \int_0^D T \left( \partial\sigma\,(\alpha L_s - L_t) + \sigma\,\partial\alpha\,L_s \right) dt
 
-with the in-scattered radiance L_s at t, and L_t the radiance that arrives there from further along the ray. A flight of
-length t that finds the radiance L at its end estimates this by
+with the in-scattered radiance L_s at t, and the radiance L_t arriving at t from further along the ray. A flight of length t
+with the radiance L at its end estimates this derivative by
 
 .. math:: -(L - b) \int_0^t \partial\sigma\,dt' + (L - b)\,\frac{\partial\sigma(t)}{\sigma(t) + \kappa}\,[\text{collision}]
           + \ell\,(\alpha \hat L_s - b)\,\frac{\kappa\,\partial\sigma(s)}{\sigma(s) + \kappa}
 
-The first term is an exact walk back along the flight. Collisions alone would miss the derivative where there is no extinction,
-so they are given the weight sigma / (sigma + kappa), and a probe at a point s, drawn evenly from the flight's length l in the
-media, has the rest: the mean over all flights of an integral over [0, t] is the integral of T times its integrand. Any level b
-leaves the mean as it is, since the same two terms without L have the mean 0; a level about as bright as L takes most of the
-noise.
+The first term is an exact walk along the flight. Collisions alone would miss the derivative in regions without extinction.
+Therefore collisions have the weight sigma / (sigma + kappa), and a probe has the rest: a point s drawn uniformly from the
+length l of the flight in the media. Both are unbiased, since the mean over all flights of an integral over [0, t] is the
+integral of T times its integrand. The baseline b does not change the mean, since the same two terms without L have the mean 0.
+A baseline about as bright as L removes most of the noise.
 
-Where the albedo is below ``LEAST_ALBEDO`` its derivative is found by the probe too, and not by L / albedo.
+For an albedo below ``MIN_ALBEDO``, the probe estimates the derivative by the albedo, in place of L / albedo.
 
-References: Vicini et al. 2021 (path replay); Nimier-David et al. 2022 (probes where there is no extinction); Yu et al. 2026
+A path keeps few of these points and shadow rays, by weighted reservoir sampling (Chao 1982). One probe is kept from its flights
+before the first scattering event, and one from its later flights. Of its shadow rays, one is kept in proportion to its light;
+its derivative is divided by the probability of having been kept. If one vertex carries most of a path's light, so does the kept
+ray.
+
+References: Vicini et al. 2021 (path replay); Nimier-David et al. 2022 (probes in regions without extinction); Yu et al. 2026
 (one point for both terms).
 """
 
@@ -51,49 +56,52 @@ __all__ = [
 
 
 PROBE_TAU = 0.6
-"""Optical depth across a medium of the extinction kappa that is added to collisions (measured in a box: 0.3 per half edge)."""
+"""Optical depth of the extinction kappa across a medium [1] (measured in a box: 0.3 per half edge)."""
 
 MIN_ALBEDO = 0.1
-"""Albedo below which derivatives by it come from probes; L / albedo is at most 10 times L above it."""
+"""Albedo below which probes estimate the derivatives by the albedo [1]; above, L / albedo is at most 10 L."""
 
 
 @dataclass
 class Baseline:
-    """The level b that derivatives of flights are taken from.
+    """The baseline b of derivatives of flights: a radiance subtracted from the light found by the flight.
 
     Attributes:
-        first: of flights before a path has scattered [radiance], one a lane.
-        later: of the others [radiance].
+        first: baseline of flights before the first scattering event, for each lane [radiance].
+        later: baseline of later flights [radiance].
     """
 
     first: mi.Spectrum
     later: mi.Spectrum
 
     def at_depth(self, depth: mi.UInt32) -> mi.Spectrum:
-        """That of flights after so many scatterings."""
+        """The baseline of flights after ``depth`` scattering events."""
         return dr.select(depth == 0, self.first, self.later)
 
     @property
     def for_branches(self) -> Baseline:
-        """That of paths that begin where they have collided."""
+        """The baseline of paths starting at their first collision."""
         return Baseline(self.later, self.later)
+
+
+# -- A flight ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class FlightSegment:
-    """A flight: the derivatives of its emission and of its throughput (a ``SharedSegment``).
+    """A flight, with the derivatives of its emission and of its throughput (a ``SharedSegment``).
 
     Attributes:
-        media: of the scene.
-        segment: ray and throughput.
-        passed: the ray to the end of the flight.
-        collision: where it ends in a medium.
-        weight: of each channel at its end.
-        level: the level b; None for 0.
-        emission: where emission was looked at; None where no medium emits by its place.
-        gaussian_light: the light of Gaussians; None where no medium shows any.
+        media: media of the scene.
+        segment: segment of the path, with its throughput.
+        passed: ray up to the end of the flight.
+        collision: collision at the end of the flight.
+        weight: weight of each channel at the end of the flight [1].
+        baseline: baseline b; None for 0.
+        emission: sampled point of the emission; None without emission by position.
+        gaussian_light: light of Gaussians; None without emitting Gaussians.
         active: lanes that fly.
-        dL: d loss / d emission, once it is known.
+        dL: d loss / d emission, known after the path has reported the emission.
     """
 
     media: SceneMedia
@@ -109,7 +117,7 @@ class FlightSegment:
 
     @property
     def _baseline_light(self) -> mi.Spectrum:
-        """Light of the level as the camera sees it at the end of the flight; 0 where the path may not scatter any more."""
+        """The baseline at the camera, from the end of the flight; 0 for paths that may not scatter any more."""
         if self.baseline is None:
             return mi.Spectrum(0)
         return dr.select(
@@ -118,7 +126,7 @@ class FlightSegment:
 
     @property
     def emitted(self) -> mi.Spectrum:
-        """The light that media emit along the flight, as the camera sees it."""
+        """Light emitted by the media along the flight, at the camera."""
         total = mi.Spectrum(0) if self.gaussian_light is None else self.gaussian_light.value()
         if self.emission is None:
             return total
@@ -132,7 +140,7 @@ class FlightSegment:
     # -- Emission --------------------------------------------------------------------------------------------------------
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
-        """Derivatives of the emission, and of the media in front of the point where it was looked at."""
+        """Add the derivatives of the emission, and of the media in front of its sampled point."""
         if self.gaussian_light is not None:
             self.gaussian_light.vjp(dL)
         if self.emission is None:
@@ -207,7 +215,7 @@ class FlightSegment:
 
     @cached_property
     def _jvp_extinction(self) -> mi.Spectrum:
-        """Tangent of the logarithm of the throughput by the extinction, without the share that probes have."""
+        """Tangent of log throughput by the extinction, without the share of the probes."""
         media, ray, hit = self.media, self.segment.ray, self.collision
         change = -jvp_optical_depth(media, self.passed, self.active)
         for body, on in media.bodies_at(hit.body, hit.on & self.segment.may_scatter):
@@ -217,18 +225,21 @@ class FlightSegment:
         return change
 
 
+# -- Kept points of flights ----------------------------------------------------------------------------------------------
+
+
 @dataclass
 class Probe:
-    """A probe of one of the flights of a path, kept in proportion to the light that it stands for (reservoir sampling).
+    """A point of one of a path's flights, kept in proportion to the light it represents (weighted reservoir sampling).
 
     Attributes:
-        ray: of the flight.
+        ray: ray of the flight.
         t: distance of the point [length].
         body: index of its medium.
-        gain: throughput to the point, times the length that it stands for.
-        depth: of the path there.
-        weight: that it was kept with.
-        total: of the weights of all flights.
+        gain: throughput up to the point, times the sampled length [length].
+        depth: number of scattering events before the point.
+        weight: reservoir weight of the point.
+        total: sum of the weights of all flights.
     """
 
     ray: FineRay
@@ -241,14 +252,14 @@ class Probe:
 
     @classmethod
     def empty(cls, ray: Ray) -> Probe:
-        """No flight yet."""
+        """A reservoir before the first flight."""
         n = dr.width(ray)
         zero = dr.zeros(mi.Float, n)
         nothing = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
         return cls(FineRay.from_ray(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
 
     def offer(self, segment: PathSegment, found: FlightPoint, on: mi.Bool) -> Probe:
-        """Keep a point of one more flight, or the one that was kept before."""
+        """Offer the point of one more flight to the reservoir."""
         point, gain = found.point, found.gain
         weight = dr.select(point.on & segment.may_scatter & on, dr.max(gain), 0)
         total = self.total + weight
@@ -266,26 +277,21 @@ class Probe:
 
 @dataclass
 class Probes:
-    """The probes of a path: one of its flights before it has scattered, and one of those after that.
+    """The probes of a path: one of its flights before the first scattering event, one of its later flights.
 
-    Flights after a scattering are few beside the first ones of all paths that pass the media, and have more than half of the
-    noise: with one probe for both, variance x time over all voxels was 1.2 to 1.4 times as large under a sun or a lamp, and the
-    same in even light.
+    Later flights are few beside the first flights of all paths passing the media, and cause more than half of the noise. (With
+    one probe for both, variance x time over all voxels was 1.2 to 1.4 times as large under a sun or a lamp, and the same in
+    even light.)
 
     Attributes:
-        first, later: they; None for none.
+        first, later: the probes; None if not kept.
     """
 
     first: Probe | None
     later: Probe | None
 
-    @property
-    def kept(self) -> list[Probe]:
-        """Those that there are."""
-        return [probe for probe in (self.first, self.later) if probe is not None]
-
     def offer(self, segment: PathSegment, found: FlightPoint) -> Probes:
-        """The probes after one more flight."""
+        """Offer the point of one more flight to the reservoir of its kind."""
         on = segment.depth == 0
         first = None if self.first is None else self.first.offer(segment, found, on)
         return Probes(first, None if self.later is None else self.later.offer(segment, found, ~on))
@@ -293,15 +299,15 @@ class Probes:
 
 @dataclass
 class ProbeTerm:
-    """The derivatives that a probe finds, as a term of value 0.
+    """The derivatives at a probe, as a term of value 0.
 
     Attributes:
-        media: of the scene.
+        media: media of the scene.
         probe: the probe.
-        mei: its point.
-        source: an estimate of the in-scattered radiance there.
-        level: the level b; None for 0.
-        on: lanes that have one.
+        mei: position of the probe.
+        source: estimate of the in-scattered radiance at the probe.
+        baseline: baseline b; None for 0.
+        on: lanes with a probe.
     """
 
     media: SceneMedia
@@ -314,7 +320,7 @@ class ProbeTerm:
 
     @property
     def value(self) -> mi.Spectrum:
-        """Nothing: the light of the path has been counted."""
+        """Zero: the path has counted this light already."""
         return mi.Spectrum(0)
 
     @property
@@ -322,7 +328,7 @@ class ProbeTerm:
         return dr.select(self.on, self.probe.gain * (self.probe.total / dr.select(self.on, self.probe.weight, 1)), 0)
 
     def _weight(self, body: Body, on: mi.Bool) -> tuple[str, mi.Spectrum]:
-        """The coefficient that the probe is of, and the derivative of the light by it."""
+        """The name of the probe's coefficient, and the derivative of the light by this coefficient."""
         name, weight = _collision_weight(self.media, body, self.probe.ray, self.probe.t, on)
         bracket = self.source
         if body.view.albedo is not None:
@@ -358,60 +364,23 @@ class ProbeTerm:
         return total
 
     def _by_albedo(self, body: Body, albedo: mi.Spectrum, on: mi.Bool) -> mi.Spectrum:
-        """The derivative of the light by an albedo that collisions leave out."""
+        """The derivative of the light by a small albedo, omitted at collisions."""
         sigma_t = to_spectrum(body.extinction_at(self.probe.ray, self.probe.t, self.media.channels, on))
         return dr.select(dr.detach(albedo) < MIN_ALBEDO, self._gain * sigma_t * self.source, 0)
 
 
-def collision_weights(media: SceneMedia, ray: Ray, hit: Collision) -> mi.Spectrum:
-    """The weight [length] that derivatives at collisions have: 1 / (sigma + kappa); 0 where there is none."""
-    weight = mi.Spectrum(0)
-    for body, on in media.bodies_at(hit.body, hit.on):
-        weight = dr.select(on, _collision_weight(media, body, ray, hit.t, on)[1], weight)
-    return weight
-
-
-def _collision_weight(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
-    """The name of the coefficient sigma that makes collisions scatter, and 1 / (sigma + kappa) [length] at a point."""
-    name = "sigma_s" if body.view.albedo is None else "sigma_"
-    sigma = to_spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
-    return name, dr.rcp(sigma + _probe_extinction(media, body))
-
-
-def _probe_extinction(media: SceneMedia, body: Body) -> mi.Float:
-    """The extinction that stands for vacuum [1/length]: an optical depth of ``PROBE_TAU`` across the medium."""
-    return PROBE_TAU / (media.size if body.edge is None else body.edge)
-
-
-def _emits_at_points(body: Body) -> bool:
-    """Whether a medium emits light that is a function of the place."""
-    return body.view.emits and not body.view.shows_gaussians
-
-
-def _albedo_ratio(albedo: mi.Spectrum) -> mi.Spectrum:
-    """An albedo over its own value, where that is not small: its derivative is that of the logarithm."""
-    value = dr.detach(albedo)
-    large = value >= MIN_ALBEDO
-    return dr.select(large, albedo * dr.rcp(dr.select(large, value, 1)), 0)
-
-
-def _emission_slopes(body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> list[tuple[str, mi.Spectrum]]:
-    """The coefficients that emission goes with, and its derivative by each."""
-    if body.view.emission is None:
-        return []
-    name, slope = emission_slope(body, ray, t, on)
-    return [(name, dr.detach(slope))]
+# -- The kept shadow ray ------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class ShadowReservoir:
-    """The shadow ray that was kept so far.
+    """The shadow ray kept from a path's shadow rays.
 
     Attributes:
         ray_segment: the ray.
-        value: its light, as the camera sees it.
-        weight: that it was kept with.
-        total: of the weights of all shadow rays.
+        value: its light at the camera [radiance].
+        weight: its reservoir weight.
+        total: sum of the weights of all shadow rays.
     """
 
     ray_segment: RaySegment
@@ -421,7 +390,7 @@ class ShadowReservoir:
 
     @classmethod
     def empty(cls, media: SceneMedia, ray: Ray) -> ShadowReservoir:
-        """No shadow ray yet."""
+        """A reservoir before the first shadow ray."""
         n = dr.width(ray)
         zero = dr.zeros(mi.Float, n)
         u = zero if media.is_bounded else None
@@ -430,11 +399,11 @@ class ShadowReservoir:
         )
 
     def offer(self, light: DirectLight, chance: mi.Float) -> ShadowReservoir:
-        """The reservoir after one more shadow ray: a step of weighted reservoir sampling.
+        """Offer one more shadow ray to the reservoir.
 
         Args:
-            light: the emitter sample whose shadow ray is offered; its weight is its largest channel.
-            chance: a uniform random number in [0, 1). The new ray is kept where it is below weight / (sum of all weights).
+            light: light of the shadow ray; the weight is its largest channel.
+            chance: uniform random number in [0, 1); the new ray is kept if chance is below weight / (sum of all weights).
         """
         weight = dr.select(light.active, dr.max(dr.abs(light.value)), 0)
         total = self.total + weight
@@ -451,7 +420,7 @@ class ShadowReservoir:
 
 @dataclass
 class ShadowTerm:
-    """The derivatives of the media along the shadow ray that was kept, as a term of value 0."""
+    """The derivatives of the media along the kept shadow ray, as a term of value 0."""
 
     media: SceneMedia
     kept: ShadowReservoir
@@ -459,12 +428,12 @@ class ShadowTerm:
 
     @property
     def value(self) -> mi.Spectrum:
-        """Nothing: the light of the shadow ray has been counted."""
+        """Zero: the path has counted this light already."""
         return mi.Spectrum(0)
 
     @property
     def _light(self) -> mi.Spectrum:
-        """The light over the probability of having been kept."""
+        """The light divided by the probability of having been kept."""
         kept = self.kept
         return dr.select(self._on, kept.value * (kept.total / dr.select(self._on, kept.weight, 1)), 0)
 
@@ -477,3 +446,46 @@ class ShadowTerm:
 
     def jvp(self) -> mi.Spectrum:
         return -self._light * jvp_optical_depth(self.media, self.kept.ray_segment, self._on)
+
+
+# -- Weights and slopes at points --------------------------------------------------------------------------------------
+
+
+def collision_weights(media: SceneMedia, ray: Ray, hit: Collision) -> mi.Spectrum:
+    """The weight of derivatives at collisions, 1 / (sigma + kappa) [length]; 0 without a collision."""
+    weight = mi.Spectrum(0)
+    for body, on in media.bodies_at(hit.body, hit.on):
+        weight = dr.select(on, _collision_weight(media, body, ray, hit.t, on)[1], weight)
+    return weight
+
+
+def _collision_weight(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
+    """The name of the coefficient sigma causing scattering collisions, and 1 / (sigma + kappa) [length] at a point."""
+    name = "sigma_s" if body.view.albedo is None else "sigma_"
+    sigma = to_spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
+    return name, dr.rcp(sigma + _probe_extinction(media, body))
+
+
+def _probe_extinction(media: SceneMedia, body: Body) -> mi.Float:
+    """The extinction kappa [1/length]: an optical depth of ``PROBE_TAU`` across the medium."""
+    return PROBE_TAU / (media.size if body.edge is None else body.edge)
+
+
+def _emits_at_points(body: Body) -> bool:
+    """Whether the emission of a medium is a function of position (unlike the light of Gaussians)."""
+    return body.view.emits and not body.view.shows_gaussians
+
+
+def _albedo_ratio(albedo: mi.Spectrum) -> mi.Spectrum:
+    """A large albedo over its own detached value, with the derivative of its logarithm; 0 for a small albedo."""
+    value = dr.detach(albedo)
+    large = value >= MIN_ALBEDO
+    return dr.select(large, albedo * dr.rcp(dr.select(large, value, 1)), 0)
+
+
+def _emission_slopes(body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> list[tuple[str, mi.Spectrum]]:
+    """The coefficient multiplying the emission, and the derivative of the emission by this coefficient."""
+    if body.view.emission is None:
+        return []
+    name, slope = emission_slope(body, ray, t, on)
+    return [(name, dr.detach(slope))]

@@ -2,16 +2,15 @@ r"""Free flights: a path flies to its first collision with the media, where it m
 
 .. math:: L = \int_0^D T(t) \left( \sigma_s L_s + j \right) dt + T(D)\, L_{behind}, \qquad p(t) = \sigma_t(t)\,T(t)
 
-Each part of an extinction is flown through on its own, and the shortest of the flights is that of their sum, since collisions
-with different parts are independent. So media need no order along the ray, and an exact part may stand beside one that is
-tracked.
+Each part of an extinction has its own flight, and the shortest flight is the flight of the sum, since collisions with different
+parts are independent. So media need no order along the ray, and exact parts combine with tracked parts.
 
-Where an extinction is rgb, one channel is drawn for the flight in proportion to the path's throughput, and both outcomes are
-weighed by the mean of the densities of all channels (the balance heuristic). In a medium of albedo 1 the weights leave the sum
-of the throughputs as it is, so they stay bounded however long a path is.
+With an rgb extinction, one channel is drawn for the flight in proportion to the path's throughput. The mean of the densities of
+all channels weights the outcome (the balance heuristic). In a medium of albedo 1 these weights preserve the sum of the
+throughputs, so they stay bounded on paths of any length.
 
-Emission is looked at in one point of each flight, drawn evenly over its length t: the mean of t j over all flights is
-:math:`\int T j\,dt`, where there is no extinction too. Light that Gaussians show is summed (:mod:`.gaussian_light`).
+One point of each flight, drawn uniformly over its length t, samples the emission j: the mean of t j over all flights is
+:math:`\int T j\,dt`, also in regions without extinction. The light of Gaussians is summed (:mod:`.gaussian_light`).
 
 References: Chandrasekhar 1960 (the equation of transfer); Woodcock et al. 1965, Sutton et al. 1999 (flights); Wilkie et al.
 2014, Miller et al. 2019 (channels); Spanier & Gelbard 1969 (the track-length estimator).
@@ -58,9 +57,9 @@ class _Flight:
     """The state of flights: the first collision found so far.
 
     Attributes:
-        t: its distance on the ray [length]; infinite where there is none.
+        t: distance of the collision on the ray [length]; infinite without a collision.
         body: index of its medium.
-        rng: state of the generator that all further numbers come from.
+        rng: state of the random number generator.
     """
 
     t: mi.Float64
@@ -72,13 +71,13 @@ class FreeFlight:
     """The segment estimator of paths that scatter in media any number of times.
 
     Args:
-        media: of the scene.
+        media: media of the scene.
 
     Attributes:
-        level: the level that derivatives are taken from (:mod:`.flight_derivatives`); None for 0.
+        baseline: baseline of the derivatives (:mod:`.flight_derivatives`); None for 0.
 
-    Bias: none. Variance: that of one flight a segment. Cost: a walk of each medium to the first collision; where an extinction
-    is rgb or a medium emits, one more to there.
+    Bias: none. Variance: one flight a segment. Cost: a walk of each medium to the first collision; one more walk for an rgb
+    extinction or an emitting medium.
     """
 
     directions = "spread"
@@ -89,14 +88,14 @@ class FreeFlight:
         self.baseline: Baseline | None = None
 
     def draw(self, sampler: mi.Sampler | LaneSampler, active: mi.Bool, strata: Strata | None) -> tuple[mi.Float, mi.UInt32]:
-        """The number of the flight, and the generator of all others: in every lane, since all of them fly."""
+        """Draw the number of the flight and the generator of all other numbers, in every lane, since all lanes fly."""
         return sampler.next_1d(), draw_state(sampler)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
-        """The level b is found by the path, which knows how to estimate radiance."""
+        """Needs no preparation here: the path estimates the baseline (:mod:`mivol.transport.path.derivatives`)."""
 
     def replayed(self) -> FreeFlight:
-        """A replay makes the same flights."""
+        """This estimator: a replay repeats the flights."""
         return self
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
@@ -109,59 +108,69 @@ class FreeFlight:
         t = dr.select(collides, flight.t, mi.Float64(end.t))
         passed = RaySegment.upto(ray, segment.medium, t)
         if media.is_bounded:
-            # Derivatives of depths that are not known are looked at in one point of the flight.
+            # One point of the flight estimates the derivatives of bounded media.
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
         collision = make_collision(media, ray, flight.t, flight.body, collides)
-        weight = self._weigh(segment, passed, active, collision)
+        weight = self._channel_weight(segment, passed, active, collision)
         emitting = [body for body in media.bodies if body.view.emits and not body.view.shows_gaussians]
-        emission = self._point_of(segment, passed, emitting, at_emission, chance, active) if emitting else None
+        emission = self._sample_point(segment, passed, emitting, at_emission, chance, active) if emitting else None
         if segment.emission_weight is not None:
             emission.gain *= segment.emission_weight
         gaussian_light = None
         if any(body.view.shows_gaussians for body in media.bodies):
-            weigh = partial(self._weigh, segment, collision=None)
-            gaussian_light = GaussianLight(media, segment, (end.t, t), weigh, active)
-        # What a side flight leaves to probes is found by those of the path itself, and so is the light of the level.
-        level = None if segment.is_side_flight else self.baseline
-        shared = FlightSegment(media, segment, passed, collision, weight, level, emission, gaussian_light, active)
+            channel_weight = partial(self._channel_weight, segment, collision=None)
+            gaussian_light = GaussianLight(media, segment, (end.t, t), channel_weight, active)
+        # The path's own flights and probes account for the baseline; a side flight has none.
+        baseline = None if segment.is_side_flight else self.baseline
+        shared = FlightSegment(media, segment, passed, collision, weight, baseline, emission, gaussian_light, active)
         light = SegmentLight(shared, shared.emitted, is_replayed=True)
-        probe = self._point_of(segment, passed, media.bodies, at_probe, chance, active) if purpose != IMAGE else None
+        probe = self._sample_point(segment, passed, media.bodies, at_probe, chance, active) if purpose != IMAGE else None
         return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)
 
-    def _weigh(self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None) -> mi.Spectrum:
-        """The value of each channel's flight over the mean density of all of them, weighed by their throughputs.
+    def _channel_weight(
+        self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None
+    ) -> mi.Spectrum:
+        """The weight of each channel: its value over the mean density of all channels, in proportion to their throughputs.
 
         Args:
-            segment: the throughputs.
-            passed: the flight.
+            segment: segment of the path, with its throughput.
+            passed: ray up to the end of the flight.
             active: lanes that fly.
-            collision: how it ends; None for its probability to get so far.
+            collision: collision at the end; None for the probability of flying this far.
         """
         if self.media.channels == 1:
             return mi.Spectrum(1)
         tau = segment_optical_depth(self.media, passed, active)
-        # Only ratios of transmittances count, and the largest of them is made 1.
+        # Only ratios of transmittances matter; the largest becomes 1.
         least = minimum(tau)
         value = to_spectrum([dr.exp(least - row) for row in tau])
         hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
-        for body, here in hits:
-            value = dr.select(here, value * _eval_extinction(self.media, body, segment.ray, collision.t, here), value)
+        for body, on in hits:
+            value = dr.select(on, value * _eval_extinction(self.media, body, segment.ray, collision.t, on), value)
         shares = _channel_probabilities(segment.beta)
         density = sum((p * v for p, v in zip(shares, to_components(value), strict=True)), mi.Float(0))
         return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
 
-    def _point_of(
+    def _sample_point(
         self, segment: PathSegment, passed: RaySegment, among: list[Body], u: mi.Float, chance: mi.Float, active: mi.Bool
     ) -> FlightPoint:
-        """Draw a point evenly from what a flight has passed of some media."""
+        """Draw a point uniformly from the intervals of a flight in some media."""
         point = draw_uniform_point(self.media, passed, among, u, active)
         front = RaySegment.upto(segment.ray, segment.medium, dr.select(point.on, point.t, 0))
-        gain = segment.beta * self._weigh(segment, front, point.on, None) * point.length
+        gain = segment.beta * self._channel_weight(segment, front, point.on, None) * point.length
         return FlightPoint(point, gain, chance)
 
 
 def make_collision(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, on: mi.Bool) -> Collision:
-    """The collision of a ray with the medium of a number, at a distance [length] that counts where lanes are ``on``."""
+    """Make the collision of a ray with a medium.
+
+    Args:
+        media: media of the scene.
+        ray: ray of the flight.
+        t: distance of the collision [length], read in ``on`` lanes only.
+        body: index of the medium.
+        on: lanes with a collision.
+    """
     at, albedo = dr.select(on, t, 0), mi.Spectrum(0)
     mei = medium_interaction(ray, at)
     mei.medium = media.medium_of(body, on)
@@ -173,7 +182,7 @@ def make_collision(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, 
 def _scattering_albedo(
     media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool
 ) -> mi.Spectrum:
-    """sigma_s / sigma_t at a point of a body."""
+    """sigma_s / sigma_t at a point of a medium [1]."""
     if body.view.albedo is not None:
         return dr.detach(eval_albedo(body, mei, on))
     sigma_s, sigma_t = (_eval_extinction(media, body, ray, t, on, name) for name in ("sigma_s", "sigma_"))
@@ -187,9 +196,9 @@ def _eval_extinction(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on:
 def _find_first_collision(
     media: SceneMedia, ray: Ray, medium: mi.MediumPtr, u: mi.Float, channel: mi.UInt32, rng: mi.UInt32, active: mi.Bool
 ) -> tuple[SegmentEnd, _Flight]:
-    """Follow a ray to the first opaque surface, and find the first collision on the way."""
+    """Follow a ray to the first opaque surface, and find the first collision in front of it."""
     bodies = media.bodies
-    # A boundary that is traced may be entered several times, and each time takes a number of its own.
+    # A ray may enter a traced boundary several times; each entry needs its own random number.
     first = next((p for b in media.boxed for p in b.view.parts if not _draws_many_numbers(p)), None)
 
     def visit(flight: _Flight, interval: MediumInterval) -> _Flight:
@@ -197,7 +206,7 @@ def _find_first_collision(
         number = next(k for k, other in enumerate(bodies) if other is body)
         scale = dr.detach(body.view.scale) * body.area(ray.d)
         for part in body.view.parts:
-            # What lies behind the first collision so far is not flown through.
+            # No part of the ray behind the first collision so far is followed.
             t0, t1 = mi.Float64(interval.t0), dr.minimum(mi.Float64(interval.t1), t)
             ahead = RayInterval(ray, t0, t1, interval.active & (t1 > t0))
             if not part.exact_line:
@@ -208,7 +217,7 @@ def _find_first_collision(
                 hit, rng = delta_tracking_in_blocks(part, scale, ahead, rng)
             else:
                 rng, (other,) = draw_pcg32(rng, 1)
-                # The sampler's own number, which may be stratified, is the flight of the first part.
+                # The flight of the first part takes the sampler's own number, which may be stratified.
                 goal = -dr.log(1 - u if part is first else other)
                 hit = regular_tracking(part, scale, ahead, goal, channel)
             nearer = ahead.active & (hit < t)
@@ -221,23 +230,23 @@ def _find_first_collision(
 
 
 def _draws_many_numbers(part: Extinction) -> bool:
-    """Whether flights through a part take any number of random numbers."""
+    """Whether flights through a part draw a variable number of random numbers."""
     return _uses_delta_tracking(part) or isinstance(part, GaussianExtinction)
 
 
 def _uses_delta_tracking(part: Extinction) -> bool:
-    """Whether flights through a part are drawn by delta tracking."""
+    """Whether delta tracking draws the flights through a part."""
     return not part.exact_line or (part.lattice is not None and part.lattice.block_ranges is not None and part.channels == 1)
 
 
 def _channel_probabilities(beta: mi.Spectrum) -> list[mi.Float]:
-    """The probability of each channel: its share of the throughput."""
+    """The probability of each channel: its share of the throughput [1]."""
     rows = [dr.abs(row) for row in to_components(beta)]
     total = sum(rows[1:], rows[0])
     return [dr.select(total > 0, row / dr.select(total > 0, total, 1), 1 / len(rows)) for row in rows]
 
 
 def _sample_channel(beta: mi.Spectrum, u: mi.Float) -> mi.UInt32:
-    """A channel in proportion to the throughput."""
+    """Sample a channel in proportion to the throughput."""
     first, second, _ = _channel_probabilities(beta)
     return dr.select(u < first, mi.UInt32(0), dr.select(u < first + second, mi.UInt32(1), mi.UInt32(2)))

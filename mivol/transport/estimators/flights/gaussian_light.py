@@ -1,13 +1,13 @@
-r"""The light that Gaussians show along a flight, with its derivatives.
+r"""The light of Gaussians along a flight, with its derivatives.
 
 .. math:: \int_0^D T(t)\,j\,dt = \sum_k T(t_k)\,N_k, \qquad E\big[\,[t > t_k]\,\big] = T(t_k)
 
-A flight of length t that gets as far as t_k, where the ray enters Gaussians, adds all the light N_k that they show from there
-to where it leaves them (:mod:`mivol.transport.media.gaussian_sweep`), and not that of one point: N_k is the sum in their order,
-which no point has, and has no noise. Its derivative by what lies in front of them is that of the flight's own chance to get so
-far, -N_k times that of its optical depth.
+At t_k the ray enters Gaussians, whose light between entry and exit is N_k (:mod:`mivol.transport.media.gaussian_sweep`). A
+flight reaching t_k adds all of N_k instead of the light of one sampled point: N_k is a sum in the order of the Gaussians, which
+no single point has, and is free of noise. The derivative by the media in front of t_k is the derivative of the probability of
+reaching t_k: -N_k times the derivative of their optical depth.
 
-References: Spanier & Gelbard 1969 (expected values in the place of events).
+References: Spanier & Gelbard 1969 (expected values in place of events).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ __all__ = ["GaussianLight"]
 
 @dataclass
 class _Entry:
-    """Where a flight enters Gaussians.
+    """An entry of a flight into Gaussians.
 
     Attributes:
-        interval: of the ray in them, in the lanes that get so far.
-        front: the flight to there.
-        gain: throughput at its end.
+        interval: interval of the ray in the Gaussians, in lanes whose flight reaches it.
+        front: ray up to the entry.
+        gain: throughput at the entry [1].
     """
 
     interval: MediumInterval
@@ -50,17 +50,17 @@ class _Entry:
 
 
 class GaussianLight:
-    """The light of all Gaussians along a flight, as the camera sees it.
+    """The light of all Gaussians along a flight, at the camera.
 
     Args:
-        media: of the scene.
-        segment: ray and throughput.
-        ends: distances at which the segment ends, at a surface, and the flight, at the latest there [length].
-        weigh: the weight of each channel at the end of a part of the flight.
+        media: media of the scene.
+        segment: segment of the path, with its throughput.
+        ends: distances of the end of the segment, at a surface, and of the end of the flight, at most this far [length].
+        channel_weight: returns the weight of each channel at the end of a part of the flight.
         active: lanes that fly.
 
-    Cost: of each of the methods a walk of the media that show Gaussians, to the end of the segment; derivatives walk what is in
-    front of them too.
+    Cost: each method walks the media with emitting Gaussians to the end of the segment; derivatives walk the media in front
+    too.
     """
 
     def __init__(
@@ -68,15 +68,15 @@ class GaussianLight:
         media: SceneMedia,
         segment: PathSegment,
         ends: tuple[mi.Float, mi.Float64],
-        weigh: Callable[[RaySegment, mi.Bool], mi.Spectrum],
+        channel_weight: Callable[[RaySegment, mi.Bool], mi.Spectrum],
         active: mi.Bool,
     ) -> None:
-        self.media, self.segment, self.weigh, self.active = media, segment, weigh, active
+        self.media, self.segment, self.channel_weight, self.active = media, segment, channel_weight, active
         self.whole, self.reached = RaySegment.upto(segment.ray, segment.medium, ends[0]), ends[1]
         self.rows = dr.size_v(mi.Spectrum)
 
     def value(self) -> mi.Spectrum:
-        """The light."""
+        """The light [radiance]."""
 
         def add(total: mi.Spectrum, entry: _Entry) -> mi.Spectrum:
             N = mi.Spectrum(*GaussianSweep(entry.interval, self.rows).integrate(True).N)
@@ -85,7 +85,7 @@ class GaussianLight:
         return self._visit(add, mi.Spectrum(0))
 
     def vjp(self, dL: mi.Spectrum) -> None:
-        """Add ``dL`` times its derivatives to the gradients of the media."""
+        """Add ``dL`` times the derivatives of the light to the gradients of the media."""
 
         def add(state: tuple, entry: _Entry) -> tuple:
             sweep, weight = GaussianSweep(entry.interval, self.rows), dr.select(entry.on, dL * entry.gain, 0)
@@ -97,7 +97,7 @@ class GaussianLight:
         self._visit(add, ())
 
     def jvp(self) -> mi.Spectrum:
-        """Its tangent."""
+        """Tangent of the light."""
 
         def add(total: mi.Spectrum, entry: _Entry) -> mi.Spectrum:
             own = GaussianSweep(entry.interval, self.rows, tangent=True).integrate(False)
@@ -108,7 +108,7 @@ class GaussianLight:
         return self._visit(add, mi.Spectrum(0))
 
     def _visit(self, add: Callable, state: object) -> object:
-        """Visit each place where the flight enters Gaussians that are shown."""
+        """Visit each entry of the flight into emitting Gaussians."""
 
         def visit(state: object, interval: MediumInterval) -> object:
             if not interval.body.view.shows_gaussians:
@@ -116,7 +116,7 @@ class GaussianLight:
             begin, _ = interval.inside()
             interval = replace(interval, active=interval.active & (begin < self.reached))
             front = RaySegment.upto(self.segment.ray, self.segment.medium, dr.select(interval.active, begin, 0))
-            gain = self.segment.beta * self.weigh(front, interval.active)
+            gain = self.segment.beta * self.channel_weight(front, interval.active)
             return add(state, _Entry(interval, front, gain))
 
         return revisit_media(self.media, self.whole, visit, state, self.active)

@@ -1,9 +1,12 @@
-r"""Free flights in one part of an extinction by regular tracking: the exact optical depth is inverted.
+r"""Regular tracking: free flights in one part of an extinction, by inverting its exact optical depth.
 
-.. math:: \int_{t_0}^{t} s f(x_{t'})\,dt' = -\log(1 - u)
+.. math:: \int_{t_0}^{t} s f(x_{t'})\,dt' = -\log(1 - u), \qquad
+          t = t_p + \frac{1}{|W\omega|}\,\Phi^{-1}\!\Big(\Phi(s_0) - \frac{\log(1 - u)}{s\,\tau}\Big)
 
-A flight of the sum of several parts is the shortest of their own flights, since collisions with different parts are
-independent.
+The first equation is inverted cell by cell in grids. The second is its closed form for a Gaussian of optical depth tau with its
+peak at t_p. Collisions with different Gaussians are independent, so the shortest of their own flights is the flight through
+their sum: nothing is sorted, and no sum is inverted. A Gaussian is flown through in the cell where the ray enters it, so the
+walk ends in the cell of the shortest flight.
 
 References: Sutton et al. 1999 (regular tracking); Amanatides & Woo 1987 (the walk).
 """
@@ -42,20 +45,20 @@ def regular_tracking(
     goal: mi.Float,
     channel: mi.UInt32,
 ) -> mi.Float64:
-    """Find the first collision with a part of an extinction on an interval of a ray.
+    """Find the first collision with a constant or a grid on an interval of a ray.
 
     Args:
-        part: the extinction.
+        part: part of the extinction.
         scale: factor on its values.
-        interval: of the ray; its end may be infinite.
-        goal: the optical depth to go, -log(1 - u) of a uniform number u.
-        channel: the channel whose extinction is followed, where the part has three.
+        interval: interval of the ray; its end may be infinite.
+        goal: optical depth up to the collision [1]: -log(1 - u) of a uniform random number u.
+        channel: channel of an rgb extinction.
 
     Returns:
-        Distance of the collision on the ray [length]; infinite where there is none.
+        Distance of the collision on the ray [length]; infinite without a collision.
 
-    Bias: none, but for extinctions with an activation, which are cubics through four points of a cell. Cost: one walk to the
-    collision.
+    Bias: none, except for an extinction with an activation, interpolated by a cubic through four points of a cell. Cost: one
+    walk up to the collision.
     """
     if part.is_constant:
         return _collide_in_constant(part, scale, interval, goal, channel)
@@ -94,7 +97,7 @@ def _collide_in_grid(
     start = (mi.Float(goal), zero, zero, dr.full(mi.Bool, False, width))
     left, s, dt, found = walk_cells(lattice, segment, visit, start, reads, interval.active, until=lambda state: state[3])
 
-    # -- The cell of the collision once more: where in it --------------------------------------------------------------
+    # -- The position of the collision inside its cell ---------------------------------------------------------------------
     begin = segment.start + mi.Float64(s)
     cell, points, inside = points_of_piece(lattice, ray, begin, dt, found)
     nodes = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
@@ -106,7 +109,7 @@ def _collide_in_grid(
 
 
 def _select_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
-    """The number of one channel; a grey part has but one, and a mono variant sees the luminance of the three."""
+    """Select the value of one channel; a grey part has one channel, and a mono variant uses the luminance of three."""
     rows = to_scene_channels(rows, 1) if mi.is_monochromatic else rows
     value = rows[0]
     for k, row in enumerate(rows[1:], 1):
@@ -122,13 +125,13 @@ def sample_gaussian_flight(
     Args:
         part: the Gaussians.
         scale: factor on their extinction.
-        interval: of the ray; its end may be infinite.
-        rng: state of the generator.
+        interval: interval of the ray; its end may be infinite.
+        rng: state of the random number generator.
 
     Returns:
-        Distance of the collision on the ray [length], infinite where there is none, and the next state.
+        Distance of the collision on the ray [length], infinite without a collision, and the next state of the generator.
 
-    Bias: none but rounding. Cost: one walk to the collision, with a number drawn for each Gaussian that is met.
+    Bias: none but rounding. Cost: one walk up to the collision, and one random number for each Gaussian on the way.
     """
     passage = part.enter(interval)
 
@@ -139,7 +142,7 @@ def sample_gaussian_flight(
         goal = before - dr.log(1 - u) / (scale * line.depth)
         hits = goal < before + line.share(*ends)
         own = line.peak + math.sqrt(2) * dr.erfinv(dr.select(hits, 2 * goal - 1, 0)) / line.speed
-        # Between its ends: in the tails a share of 1e-7 is a long way.
+        # Clamp to the ends: in the tails, a share of 1e-7 is a long way.
         own = fast_min(fast_max(own, ends[0]), ends[1])
         return dr.select(hits & (own < nearest), own, nearest), reached, rng
 

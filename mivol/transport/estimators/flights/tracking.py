@@ -1,17 +1,23 @@
-r"""Residual ratio tracking: an unbiased estimate of transmittance, which is cheaper than a walk of all cells in a fine grid.
+r"""Tracking through fields with a majorant: ratio tracking estimates transmittances, delta tracking finds collisions.
 
 .. math:: \hat T = e^{-\int m\,dt} \prod_j \left(1 - \frac{\sigma(x_j) - m}{\kappa\,(M - m)}\right)
 
-For each block of cells the smallest value m (a control extinction, the minorant) and the largest value M (the majorant) are
-known. The optical depth of m is exact. The residual above m is estimated at the points x_j of a Poisson process with the rate
-kappa (M - m). At each of them one of the eight corners of the cell is read, drawn with its trilinear weight as probability: the
-estimate is linear in each factor, so its mean is that with the interpolated value.
+*Residual ratio tracking* serves grids, and is cheaper than a walk of all cells of a fine grid. Each block of cells has a
+smallest value m (the minorant, a control extinction) and a largest value M (the majorant). The optical depth of m is exact. A
+Poisson process of the rate kappa (M - m) draws the points x_j, which estimate the residual above m. At each point, one of the
+eight corners of the cell is read, drawn with its trilinear weight as probability: the estimate is linear in each factor, so its
+mean is the estimate with the interpolated value. *Ratio tracking* serves bounded fields: m is 0, and M is the majorant of the
+field.
 
-Conventions. m and M bound the values at the corners too, so every factor lies in [0, 1]. An estimate is therefore at most
-exp(-int m), and its variance at most T (exp(-int m) - T). An empty block costs one step and no look-up.
+*Delta tracking* draws tentative collisions at the rate M. A tentative collision at x is real with the probability sigma(x) / M;
+in a grid, with the mean of corner / M over the eight corners.
 
-References: Novak et al. 2014 (residual ratio tracking); Szirmay-Kalos et al. 2011 (blocks); Hofmann et al. 2021 (a corner in
-place of eight).
+Conventions. m and M bound the values at the corners too, so every factor lies in [0, 1]. An estimate is at most exp(-int m),
+and its variance at most T (exp(-int m) - T). An empty block costs one step and no look-up. A collision is real if ``u M <=
+sigma``, with u in (0, 1): if sigma is M, every collision is real.
+
+References: Woodcock et al. 1965 (delta tracking); Cramer 1978, Novak et al. 2014 (residual ratio tracking); Szirmay-Kalos et
+al. 2011 (blocks); Hofmann et al. 2021 (one corner in place of eight).
 """
 
 from __future__ import annotations
@@ -39,7 +45,7 @@ __all__ = [
 
 
 ROULETTE_BELOW = 0.1
-"""Estimate below which Russian roulette may end a ray, to save look-ups for light that hardly counts."""
+"""Estimate below which Russian roulette may end a ray [1], to save look-ups for negligible light."""
 
 LOOKUP_RATE = 4.0
 """kappa: look-ups for each unit of residual optical depth int (M - m) dt."""
@@ -55,12 +61,12 @@ class BlockLattice:
 
 @dataclass
 class _TrackedRay:
-    """State of a tracked ray.
+    """State of residual ratio tracking along a ray.
 
     Attributes:
-        tau: optical depth [1] of the minorant so far, of each channel.
-        weight: product of the factors so far, of each channel.
-        ahead: integral of the rate of the Poisson process to its next point.
+        tau: optical depth of the minorant so far, for each channel [1].
+        weight: product of the factors so far, for each channel [1].
+        ahead: integral of the rate of the Poisson process up to its next point [1].
         rng: state of the random number generator.
     """
 
@@ -81,17 +87,17 @@ def residual_ratio_tracking(
 
     Args:
         lattice: the grid, with its ``block_ranges``.
-        segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
+        segment: segment from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
         scale: factor on the values.
-        rng: state of the generator.
-        active: lanes to track; the others return 1.
+        rng: state of the random number generator.
+        active: lanes to track; other lanes return 1.
 
     Returns:
-        The estimates, and the state of the generator.
+        The estimates, and the next state of the generator.
 
-    Bias: none. Variance: T^2 (exp(int E(c - m)^2 / (kappa (M - m)) dt) - 1), c the corner that is drawn, and what the roulette
-        adds; T (max(exp(-int m dt), FAINT) - T) at most.
-    Cost: one step a block, one read for each look-up, kappa int (M - m) dt of them.
+    Bias: none. Variance: T^2 (exp(int E(c - m)^2 / (kappa (M - m)) dt) - 1) with the drawn corner c, and the variance of the
+    roulette; T (max(exp(-int m dt), ``ROULETTE_BELOW``) - T) at most.
+    Cost: one step a block, and kappa int (M - m) dt look-ups of one value each.
     """
     ahead = segment.d > 0
     blocks, res, channels, values = lattice.block_ranges, lattice.res, lattice.channels, dr.detach(lattice.values.array)
@@ -107,7 +113,7 @@ def residual_ratio_tracking(
         meets = on & (state.ahead < density * cell.dt)
         dt = dr.select(meets, dr.minimum(state.ahead / density, cell.dt), cell.dt)
         tau = [t + dr.select(on, scale * m * dt, 0) for t, m in zip(state.tau, least, strict=True)]
-        # -- The factor, from one corner of the cell there --------------------------------------------------------------
+        # -- The factor, from one corner of the cell -------------------------------------------------------------------
         near = dr.fma(speed, dt, cell.frac)
         inside = dr.select(ahead, near, 1 - near) * (1 << shift)
         rng, u = draw_pcg32(state.rng, 5)
@@ -123,9 +129,9 @@ def residual_ratio_tracking(
         fresh = -dr.log(u[3])
         left = dr.select(meets, fresh, dr.maximum(state.ahead - dr.select(on, density * dt, 0), 0))
         # -- Roulette ---------------------------------------------------------------------------------------------------
-        seen = maximum([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
-        lives = u[4] * ROULETTE_BELOW < seen
-        lift = dr.select(lives, dr.maximum(1, ROULETTE_BELOW / seen), 0)
+        largest = maximum([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
+        survives = u[4] * ROULETTE_BELOW < largest
+        lift = dr.select(survives, dr.maximum(1, ROULETTE_BELOW / largest), 0)
         weight = [dr.select(on, w * lift, w) for w in weight]
         return _TrackedRay(tau, weight, left, rng), dt
 
@@ -159,38 +165,39 @@ def ratio_tracking(
     """Estimate the transmittance of an interval of a ray for each channel.
 
     Args:
-        part: the extinction; that its values are no larger than its majorant is the field's promise.
+        part: bounded extinction; the field promises values up to its majorant.
         scale: factor on the values.
-        interval: of the ray; the field has a box, so it may be infinite. Lanes that are not active return 1.
-        rng: state of the generator.
+        interval: interval of the ray; may be infinite, since the field has a box. Lanes that are not active return 1.
+        rng: state of the random number generator.
 
     Returns:
-        The estimates, and the state of the generator.
+        The estimates, and the next state of the generator.
 
-    Bias: none. Variance: T^2 (exp(int sigma^2 / (kappa M) dt) - 1), and what the roulette adds, which ends rays below FAINT.
+    Bias: none. Variance: T^2 (exp(int sigma^2 / (kappa M) dt) - 1), and the variance of the roulette, which ends rays below
+    ``ROULETTE_BELOW``.
     Cost: kappa M l look-ups for a length l in the box.
     """
     ray = interval.ray
     begin, end = part.clip(interval)
     rate = LOOKUP_RATE * scale * part.majorant
 
-    def look(t: mi.Float, T: list[mi.Float], rng: mi.UInt32, on: mi.Bool) -> tuple:
+    def step(t: mi.Float, T: list[mi.Float], rng: mi.UInt32, on: mi.Bool) -> tuple:
         rng, (u, chance) = draw_pcg32(rng, 2)
-        # Where the majorant is 0 the next point is infinitely far.
+        # The next point is at infinity if the majorant is 0.
         t = t - dr.log(u) / rate
         on &= t < end
         values = part.eval_at(scale, ray, t, on)
         T = [dr.select(on, a * (1 - value / rate), a) for a, value in zip(T, values, strict=True)]
         # -- Roulette ---------------------------------------------------------------------------------------------------
-        seen = maximum(T)
-        lift = dr.select(chance * ROULETTE_BELOW < seen, dr.maximum(1, ROULETTE_BELOW / seen), 0)
+        largest = maximum(T)
+        lift = dr.select(chance * ROULETTE_BELOW < largest, dr.maximum(1, ROULETTE_BELOW / largest), 0)
         T = [dr.select(on, a * lift, a) for a in T]
         return t, T, rng, on & (lift > 0)
 
     width = dr.width(ray)
     T = [dr.full(mi.Float, 1, width) for _ in range(part.channels)]
     start = (begin, T, mi.UInt32(rng), interval.active & (end > begin))
-    _, T, rng, _ = dr.while_loop(start, lambda t, T, rng, on: on, look, label="points of a bounded medium")
+    _, T, rng, _ = dr.while_loop(start, lambda t, T, rng, on: on, step, label="points of a bounded medium")
     return T, rng
 
 
@@ -200,18 +207,18 @@ def delta_tracking_in_blocks(
     interval: RayInterval,
     rng: mi.UInt32,
 ) -> tuple[mi.Float64, mi.UInt32]:
-    """Find the first collision with a grey grid whose block ranges are known.
+    """Find the first collision with a grey grid with block ranges.
 
     Args:
         part: the grid.
         scale: factor on its values.
-        interval: of the ray.
-        rng: state of the generator.
+        interval: interval of the ray.
+        rng: state of the random number generator.
 
     Returns:
-        Distance of the collision on the ray [length], infinite where there is none; and the state of the generator.
+        Distance of the collision on the ray [length], infinite without a collision, and the next state of the generator.
 
-    Bias: none. Cost: one step a block, and one read for each tentative collision: int M dt of them, at most.
+    Bias: none. Cost: one step a block, and one look-up for each tentative collision: at most int M dt look-ups.
     """
     lattice = part.lattice
     segment = clip_interval(lattice, interval)
@@ -227,7 +234,7 @@ def delta_tracking_in_blocks(
         # -- To the end of the block, or to the next tentative collision --------------------------------------------------
         meets = on & (left < rate * cell.dt)
         dt = dr.select(meets, dr.minimum(left / rate, cell.dt), cell.dt)
-        # -- Is it real? One corner of the cell there tells ------------------------------------------------------------------
+        # -- Real or not, from one corner of the cell ------------------------------------------------------------------
         near = dr.fma(speed, dt, cell.frac)
         inside = dr.select(ahead, near, 1 - near) * (1 << shift)
         rng, u = draw_pcg32(rng, 5)
@@ -254,7 +261,7 @@ def delta_tracking(
     interval: RayInterval,
     rng: mi.UInt32,
 ) -> tuple[mi.Float64, mi.UInt32]:
-    """Find the first collision with a grey field of which only a majorant is known; as :func:`delta_tracking_in_blocks`.
+    """Find the first collision with a grey bounded field; arguments and result as for :func:`delta_tracking_in_blocks`.
 
     Cost: int M dt look-ups in the field's box.
     """
@@ -262,9 +269,9 @@ def delta_tracking(
     begin, end = part.clip(interval)
     rate = scale * part.majorant
 
-    def look(t: mi.Float, found: mi.Bool, rng: mi.UInt32, on: mi.Bool) -> tuple:
+    def step(t: mi.Float, found: mi.Bool, rng: mi.UInt32, on: mi.Bool) -> tuple:
         rng, (u, chance) = draw_pcg32(rng, 2)
-        # Where the majorant is 0 the next point is infinitely far.
+        # The next point is at infinity if the majorant is 0.
         t = t - dr.log(u) / rate
         on &= t < end
         (value,) = part.eval_at(scale, ray, t, on)
@@ -273,5 +280,5 @@ def delta_tracking(
 
     none = dr.full(mi.Bool, False, dr.width(ray))
     start = (mi.Float(begin), none, mi.UInt32(rng), interval.active & (end > begin))
-    t, found, rng, _ = dr.while_loop(start, lambda t, found, rng, on: on, look, label="collisions with a bounded medium")
+    t, found, rng, _ = dr.while_loop(start, lambda t, found, rng, on: on, step, label="collisions with a bounded medium")
     return dr.select(found, mi.Float64(t), dr.inf), rng
