@@ -1,1 +1,1 @@
-"""Light from emitters, and from media that emit, at a vertex of a path."""
+"""Light from emitters and emitting media at a vertex of a path."""

@@ -1,4 +1,9 @@
-"""The emitters of a scene: which of them are sampled by direction, which by the phase function, and the choice of one."""
+"""The emitters of a scene, the choice of an emitter for each lane, and the random numbers and distances of samples towards it.
+
+Equiangular sampling draws distances along a ray uniformly in the angle seen from an emitter.
+
+References: Kulla & Fajardo 2012 (equiangular sampling).
+"""
 
 from __future__ import annotations
 
@@ -25,19 +30,19 @@ __all__ = [
 
 
 UNIFORM_EMITTER = "ConstantBackgroundEmitter"
-"""Mitsuba's class of an environment that is the same in all directions; phase samples alone find its light."""
+"""Mitsuba's class of a constant environment, whose light is found by phase samples alone."""
 
 
 class SceneEmitters:
-    """The emitters of a scene, and by which samples their light is found.
+    """The emitters of a scene, and the samples by which their light is found.
 
     Args:
         scene: Mitsuba's scene.
 
     Attributes:
-        sampled: emitters that next-event estimation chooses from with equal probabilities: all but a constant environment.
-        transmissive: emitters on surfaces that transmit part of the light undeviated.
-        samples_phase: directions are drawn from the phase function too, since they can hit some emitter.
+        sampled: emitters that next-event estimation chooses from with equal probabilities: all except a constant environment.
+        transmissive: emitters on surfaces that transmit part of the light without deviation.
+        samples_phase: phase functions are sampled too, since their directions can hit an emitter.
         is_near: some emitter has a finite distance.
     """
 
@@ -53,11 +58,11 @@ class SceneEmitters:
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
 
     def bounding_ball(self, number: int) -> list[mi.Float] | None:
-        """Centre and radius of one of the ``sampled`` emitters; None for one at infinity."""
+        """Centre and radius of a ``sampled`` emitter [length]; None for an emitter at infinity."""
         return self._balls[number]
 
     def draw_event_samples(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> EventSamples:
-        """Draw the random numbers of one scattering event from a sampler."""
+        """Draw the random numbers of one scattering event."""
         return EventSamples(
             sampler.next_1d(active),
             sampler.next_2d(active),
@@ -70,7 +75,7 @@ class SceneEmitters:
         )
 
     def choose_emitter(self, ray: Ray, u: mi.Float) -> ChosenEmitter:
-        """Choose one of the ``sampled`` emitters for each lane, with equal probabilities, by a number in [0, 1)."""
+        """Choose one of the ``sampled`` emitters for each lane with equal probabilities, by ``u`` in [0, 1)."""
         n, width = len(self.sampled), dr.width(ray)
         index = dr.minimum(mi.UInt32(u * n), max(n - 1, 0))
         emitter = dr.zeros(mi.EmitterPtr, width)
@@ -91,7 +96,9 @@ def _is_transmissive(emitter: mi.Emitter) -> bool:
 
 
 def _find_bounding_ball(emitter: mi.Emitter) -> list[float] | None:
-    """Centre of an emitter's bounding box, and the root mean square distance of points in it; None for one at infinity."""
+    """Centre of an emitter's bounding box, and root mean square distance of its points [length]; None for an emitter at
+    infinity.
+    """
     box = emitter.get_shape().bbox() if emitter.get_shape() is not None else emitter.bbox()
     low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
     if emitter.is_environment() or not np.isfinite([low, high]).all() or (high < low).any():
@@ -100,7 +107,7 @@ def _find_bounding_ball(emitter: mi.Emitter) -> list[float] | None:
 
 
 def is_among(emitters: list[mi.Emitter], emitter: mi.EmitterPtr) -> mi.Bool:
-    """Whether the emitter of each lane is one of a list."""
+    """Whether the emitter of each lane is in a list."""
     found = mi.Bool(False)
     for candidate in emitters:
         found |= emitter == mi.EmitterPtr(candidate)
@@ -109,12 +116,12 @@ def is_among(emitters: list[mi.Emitter], emitter: mi.EmitterPtr) -> mi.Bool:
 
 @dataclass
 class ChosenEmitter:
-    """The emitter that was chosen for each lane.
+    """The emitter chosen for each lane.
 
     Attributes:
-        number: its index among the sampled ones.
-        emitter: Mitsuba's object.
-        equiangular: sampler of distances seen from it; None where all emitters are at infinity.
+        number: index in ``SceneEmitters.sampled``.
+        emitter: Mitsuba's emitter.
+        equiangular: sampler of distances by the angle seen from the emitter; None if all emitters are at infinity.
     """
 
     number: mi.UInt32
@@ -127,14 +134,14 @@ class EventSamples:
     """The random numbers of one scattering event, uniform in [0, 1).
 
     Attributes:
-        piece: seeds the reservoir that keeps a piece of the ray.
-        inside: technique of distance sampling, and the distance in the piece.
-        which_emitter: the emitter.
-        emitter: point or direction on it.
-        component: component of the phase function.
-        direction: direction of the phase sample.
-        which_shadow_ray: the shadow ray whose derivative is computed.
-        strata: strata that directions are drawn from; None for the whole square.
+        piece: seed of the reservoir choosing a piece of the ray.
+        inside: numbers for the technique of distance sampling, and for the distance inside the piece.
+        which_emitter: number for the emitter.
+        emitter: numbers for the point or direction on the emitter.
+        component: number for the component of the phase function.
+        direction: numbers for the direction of the phase sample.
+        which_shadow_ray: number for the differentiated shadow ray.
+        strata: strata of directions; None for the whole square.
     """
 
     piece: mi.Float
@@ -149,10 +156,10 @@ class EventSamples:
     def for_event(self, number: mi.UInt32, count: int) -> EventSamples:
         """The numbers of one of ``count`` events on a ray.
 
-        They are those of the first event, shifted by an additive recurrence; directions are stratified over the events.
+        An additive recurrence shifts the numbers of the first event; directions are stratified over the events.
         """
         if count == 1:
-            return self.aim(self.emitter, self.direction)
+            return self.with_directions(self.emitter, self.direction)
         # Additive recurrences with the generalised golden ratios have low discrepancy in one and two dimensions (Roberts 2018).
         k, across = mi.Float(number), max(a for a in range(1, int(count**0.5) + 1) if count % a == 0)
         part = Strata(number, across, count // across)
@@ -173,9 +180,9 @@ class EventSamples:
             one(self.which_shadow_ray),
             self.strata,
         )
-        return moved.aim(part.jitter(two(self.emitter)), part.jitter(two(self.direction)))
+        return moved.with_directions(part.jitter(two(self.emitter)), part.jitter(two(self.direction)))
 
-    def aim(self, emitter: mi.Point2f, direction: mi.Point2f) -> EventSamples:
+    def with_directions(self, emitter: mi.Point2f, direction: mi.Point2f) -> EventSamples:
         """The same numbers with others for directions, which are moved into their strata."""
         if self.strata is not None:
             emitter, direction = self.strata.jitter(emitter), self.strata.jitter(direction)
@@ -187,7 +194,7 @@ def _fractional_part(x: mi.Float) -> mi.Float:
 
 
 def make_ball_sampler(ray: Ray, ball: list[mi.Float] | None) -> EquiangularSampler | None:
-    """The sampler towards one emitter, a ball (x, y, z, radius); None where that is at infinity (no ball)."""
+    """Make the sampler towards an emitter by its bounding ball (x, y, z, radius) [length]; None for an emitter at infinity."""
     if ball is None:
         return None
     x, y, z, r = ball
@@ -195,12 +202,12 @@ def make_ball_sampler(ray: Ray, ball: list[mi.Float] | None) -> EquiangularSampl
 
 
 def make_equiangular_sampler(ray: Ray, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> EquiangularSampler:
-    """The sampler of rays towards a ball about ``centre``, for the lanes whose emitter is ``finite``."""
+    """Make the sampler towards a ball about ``centre``, for lanes with an emitter at a ``finite`` distance."""
     away = centre - mi.Point3f(ray.o)
     t0 = dr.dot(away, ray.d)
     h2 = dr.squared_norm(away - t0 * ray.d)
-    # The distance of the ray from a point light may be 0. It is bounded below by 1e-4 of the distance to the light, so that the
-    # angle stays in the range of float32. That changes the density only, and with it the variance, but no mean.
+    # A ray may pass through a point light. The distance is at least 1e-4 of the distance to the light, so the angle stays in
+    # the range of float32. The bound changes the density, and with it the variance, but no mean.
     rho = dr.sqrt(h2 + radius2 + 1e-8 * dr.squared_norm(away) + 1e-30)
     return EquiangularSampler(t0, dr.select(finite, rho, 1), finite)
 
@@ -211,8 +218,8 @@ class EquiangularSampler:
 
     Attributes:
         t0: distance along the ray at which the emitter is nearest [length].
-        rho: distance from the ray to the emitter there [length].
-        finite: lanes whose emitter is not at infinity; in the others ``t0`` and ``rho`` mean nothing.
+        rho: distance from the ray to the emitter at ``t0`` [length].
+        finite: lanes with an emitter at a finite distance; ``t0`` and ``rho`` have no meaning in other lanes.
     """
 
     t0: mi.Float
@@ -220,21 +227,21 @@ class EquiangularSampler:
     finite: mi.Bool
 
     def angle(self, a: mi.Float, dt: mi.Float) -> mi.Float:
-        """The angle [rad] under which [a, a + dt] is seen; a difference of two arctangents would cancel to 0 far away."""
+        """The angle of [a, a + dt] seen from the emitter [rad]; a difference of two arctangents would cancel to 0 far away."""
         near, far = a - self.t0, (a - self.t0) + dt
         return dr.atan2(self.rho * dt, dr.fma(near, far, dr.square(self.rho)))
 
     def mean(self, a: mi.Float, dt: mi.Float) -> mi.Float:
-        """Mean of 1 / (rho^2 + (t - t0)^2) over [a, a + dt]; 1 where the emitter is at infinity."""
+        """Mean of 1 / (rho^2 + (t - t0)^2) over [a, a + dt] [1/length^2]; 1 for an emitter at infinity."""
         return dr.select(self.finite, self.angle(a, dt) * dr.rcp(self.rho * dt), 1)
 
     def sample(self, a: mi.Float, dt: mi.Float, u: mi.Float) -> mi.Float:
-        """Distance from ``a`` [length] at the fraction ``u`` of the angle, by the addition theorem of the tangent."""
+        """Distance from ``a`` at the fraction ``u`` of the angle [length], by the addition theorem of the tangent."""
         x = (a - self.t0) / self.rho
         sin, cos = dr.sincos(u * self.angle(a, dt))
         return dr.clip(self.rho * sin * dr.fma(x, x, 1) / dr.fma(-x, sin, cos), 0, dt)
 
     def density(self, a: mi.Float, dt: mi.Float, t: mi.Float) -> mi.Float:
-        """Density of :meth:`sample` at a distance ``t`` from ``a`` [1/length]."""
+        """Density of :meth:`sample` at the distance ``t`` from ``a`` [1/length]."""
         r2 = dr.square(self.rho) + dr.square((a - self.t0) + t)
         return self.rho * dr.rcp(r2 * self.angle(a, dt))

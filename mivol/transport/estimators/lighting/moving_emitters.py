@@ -3,13 +3,13 @@ r"""The derivative of the optical depth of a shadow ray with respect to the posi
 .. math:: \frac{\partial \tau}{\partial l} = \frac{\tau}{L}\,\omega + \int_0^L \frac{t}{L} \nabla\sigma\,dt
           \mp \sum_{faces} \frac{t_f}{L}\,\sigma(t_f) \frac{n}{n \cdot \omega}
 
-for tau from x to l = x + L w. The three terms: the ray becomes longer; it rotates about x through the extinction (two Gauss
-points a cell are exact, since t times the gradient of a trilinear function is a cubic along a ray); and it crosses the
-boundaries of media elsewhere.
+for tau from x to l = x + L w. In the first term the ray becomes longer. In the second it rotates about x through the
+extinction; two Gauss points a cell are exact, since t times the gradient of a trilinear function is a cubic along a ray. In the
+third it crosses the boundaries of media at other points.
 
-Conventions. The upper sign is for a face through which the ray leaves. The faces of boxes are known. Other boundaries are
-traced once more; at each, the extinction steps from its value on one side to that on the other, and the step moves along the
-ray.
+Conventions. The upper sign belongs to faces through which the ray leaves. The faces of boxes are known. Other boundaries are
+traced once more; at each of them, the extinction steps from its value on one side to its value on the other, and the step moves
+along the ray.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ __all__ = ["attach_position", "moving_transmittance", "optical_depth_gradient"]
 
 
 SIDE_STEP = 1e-5
-"""How far before and behind a surface the extinction is read, as a fraction of the distance: ten times the rounding of it."""
+"""Distance from a surface at which the extinction is read on either side, as a fraction of the distance along the ray [1]: ten
+times its rounding."""
 
 
 def optical_depth_gradient(
@@ -42,15 +43,15 @@ def optical_depth_gradient(
     """Derivative of the optical depth of a shadow ray with respect to its far end.
 
     Args:
-        media: boundaries and media.
+        media: media and boundaries of the scene.
         ray_segment: the shadow ray; its length is the distance to the emitter.
-        tau: its optical depth, each channel.
+        tau: optical depth of the ray for each channel [1].
         active: lanes to differentiate.
 
     Returns:
-        One vector [1/length] for each channel.
+        One vector for each channel [1/length].
 
-    Cost: one walk of each grid; where boundaries are traced, two more traces.
+    Cost: one walk of each grid; two more traces with traced boundaries.
     """
     d, length = ray_segment.ray.d, dr.maximum(ray_segment.length, 1e-30)
 
@@ -62,7 +63,7 @@ def optical_depth_gradient(
             total = [a + b for a, b in zip(total, rows, strict=True)]
         if body.view.microflakes is None:
             return total
-        # The projected area of microflakes changes with the direction of the ray, which moves perpendicular to itself.
+        # The direction of the ray changes perpendicular to itself, and with it the projected area of microflakes.
         turn = body.apply_microflakes(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
         own = body.optical_depth(interval, media.channels)
         return [a + t * turn for a, t in zip(total, own, strict=True)]
@@ -77,9 +78,9 @@ def optical_depth_gradient(
 def moving_transmittance(
     media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
 ) -> mi.Spectrum:
-    """A factor of value 1 that carries the derivative of a shadow ray's transmittance by the place of its end.
+    """A factor of value 1 carrying the derivative of a shadow ray's transmittance by the position of its end.
 
-    Its derivative is that of log T = -tau, so T times the factor has the value T and the derivative of T.
+    The derivative of the factor is the derivative of log T = -tau, so T times the factor has the value and the derivative of T.
     """
     moved = end - dr.detach(end)
     with dr.suspend_grad():
@@ -89,10 +90,10 @@ def moving_transmittance(
 
 @dr.syntax
 def _boundary_gradient(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[mi.Vector3f]:
-    """L times the term of the derivative from boundaries that are traced, one vector a channel."""
+    """L times the third term for traced boundaries, one vector for each channel."""
     # -- State ------------------------------------------------------------------------------------------------------------
     ray = ray_segment.ray
-    onward = to_mitsuba_ray(ray)  #                        the ray from the last surface on
+    onward = to_mitsuba_ray(ray)  # ray behind the last surface
     going = mi.Bool(active)
     total = [dr.zeros(mi.Vector3f, dr.width(ray)) for _ in range(media.channels)]
 
@@ -109,13 +110,13 @@ def _boundary_gradient(media: SceneMedia, ray_segment: RaySegment, active: mi.Bo
 def _add_boundary(
     total: list[mi.Vector3f], media: SceneMedia, ray: Ray, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
 ) -> list[mi.Vector3f]:
-    """Add the term of one boundary, from the extinctions a little before and a little behind it."""
+    """Add the term of one boundary, from the extinctions slightly in front of it and behind it."""
     slope = dr.dot(hit.n, ray.d)
     face = mi.Vector3f(hit.n) * dr.rcp(dr.select(slope != 0, slope, 1))
     for side, to, sign in ((-ray.d, 1 - SIDE_STEP, -1.0), (ray.d, 1 + SIDE_STEP, 1.0)):
         medium = hit.target_medium(side)
         for body in media.traced:
-            # Where the ray grazes the surface (slope 0), both sides are in the same medium and the two terms cancel.
+            # If the ray grazes the surface (slope 0), both sides lie in the same medium and the two terms cancel.
             on = crosses & (medium == mi.MediumPtr(body.view.medium))
             sigma = body.extinction_at(ray, t * to, media.channels, on)
             total = [v + dr.select(on, sign * t * x * face, 0) for v, x in zip(total, sigma, strict=True)]
@@ -125,7 +126,7 @@ def _add_boundary(
 def _part_gradient(
     body: Body, part: ExactExtinction, ray_segment: RaySegment, t0: mi.Float64, t1: mi.Float64, on: mi.Bool
 ) -> list[mi.Vector3f]:
-    """L times the derivative of one part's optical depth without the first term; one vector a channel."""
+    """L times the second and third term of one part, one vector for each channel."""
     ray, end = ray_segment.ray, mi.Float64(ray_segment.length)
     if part.is_constant:
         value = dr.detach(part.constant)
@@ -142,13 +143,13 @@ def _part_gradient(
     high = tuple(n - 0.5 for n in lattice.res[::-1])
     leaves, enters = b < end * (1 - 1e-6), a > 0
     if body.box is None:
-        # A traced boundary that cuts the grid has terms of its own; of the grid's faces only those inside it count.
+        # A traced boundary cutting the grid has its own terms; only faces of the grid inside the boundary count.
         leaves, enters = leaves & (b < t1 * (1 - 2 * SIDE_STEP)), enters & (a > t0 * (1 + 2 * SIDE_STEP))
     for t, sign, moves in ((b, -1.0, leaves), (a, 1.0, enters)):
         here = inside & moves
         face = _face_direction(lattice.from_world, (-0.5,) * 3, high, ray, t)
         if body.cuts_grids:
-            # The ray leaves (or enters) the medium through a face of its boundary where the boundary cuts the grid.
+            # A boundary cutting the grid: the ray leaves (or enters) the medium through a face of the boundary.
             cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
             face = dr.select(cut, _face_direction(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
         values = part.eval_at(1.0, ray, mi.Float(t), here)
@@ -157,7 +158,7 @@ def _part_gradient(
 
 
 def _rotation_gradient(lattice: Lattice, part: ExactExtinction, segment: Segment, active: mi.Bool) -> list[mi.Vector3f]:
-    """The integral of t grad(sigma) over a grid, one world vector a channel."""
+    """The integral of t grad(sigma) over a grid, one world vector for each channel."""
     values = dr.detach(part.lattice.values.array)
 
     def visit(total: list, cell: Cell, on: mi.Bool) -> list:
@@ -188,7 +189,7 @@ def _trilinear_gradient(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:
 
 
 def _face_direction(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64) -> mi.Vector3f:
-    """n / (n . w) of the face of a box on which a point of a ray lies."""
+    """n / (n . w) of the face of a box at a point of a ray."""
     best, normal = mi.Float64(dr.inf), mi.Vector3f(0)
     p = point_along(ray, t)
     for row, a, b in zip(rows, low, high, strict=True):
@@ -203,11 +204,11 @@ def _face_direction(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64
 
 
 def attach_position(placed: mi.DirectionSample3f, direct: mi.DirectionSample3f) -> mi.DirectionSample3f:
-    """A sample of an emitter of one position or direction, with its derivative by that; other samples stay as they are.
+    """Attach an emitter sample to the position or direction of its emitter; samples of other emitters stay as they are.
 
     Args:
-        placed: the emitter sample, drawn again with the same numbers, attached to the emitter's position or direction.
-        direct: the sample itself.
+        placed: emitter sample drawn again with the same numbers, attached to the emitter's position or direction.
+        direct: the emitter sample.
     """
     placed.p = dr.select(direct.delta, placed.p, direct.p)
     placed.d = dr.select(direct.delta, placed.d, direct.d)

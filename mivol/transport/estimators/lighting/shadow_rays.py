@@ -1,8 +1,8 @@
-r"""Shadow rays: the transmittance of media, and of surfaces that transmit part of the light undeviated.
+r"""Shadow rays: the transmittance of media, and of surfaces transmitting part of the light without deviation.
 
-The transmittance is exact, or an unbiased estimate: by residual ratio tracking in grids whose block ranges are known
+The transmittance is exact or an unbiased estimate: by residual ratio tracking in grids with block ranges
 (:mod:`mivol.transport.estimators.flights.tracking`), or by Russian roulette along the ray. Beyond an optical depth
-:math:`\tau_0` a ray goes on with the probability :math:`e^{-(\tau - \tau_0)}`, and what arrives is :math:`e^{-\tau_0}`.
+:math:`\tau_0`, a ray survives with the probability :math:`e^{-(\tau - \tau_0)}`, and transmits :math:`e^{-\tau_0}`.
 
 References: Arvo & Kirk 1990 (Russian roulette).
 """
@@ -32,12 +32,12 @@ __all__ = ["NEGLIGIBLE_TAU", "ROULETTE_TAU", "estimate_transmittance", "find_tra
 
 
 NEGLIGIBLE_TAU = 30.0
-"""Optical depth beyond which light is neglected: 1e-13 of it is below the rounding of everything that it is added to."""
+"""Optical depth beyond which light is neglected [1]: 1e-13 of the light is below the rounding of any sum it enters."""
 
 
 ROULETTE_TAU = 1.0
-"""Optical depth up to which roulette lets all shadow rays go on (measured, variance x time of paths of 6 to any number of
-scatterings in cloud and smoke: 1.02 to 1.2 times less than without roulette; 2 and 4 gain less)."""
+"""Optical depth up to which all shadow rays survive the roulette [1] (measured, variance x time of paths of 6 to any number of
+scattering events in cloud and smoke: 1.02 to 1.2 times less than without roulette; 2 and 4 gain less)."""
 
 
 def find_transmittance(
@@ -47,15 +47,16 @@ def find_transmittance(
 
     Args:
         media: media and surfaces of the scene.
-        ray: world space, unit direction.
-        medium: the medium around its origin.
+        ray: ray in world space, with a unit direction.
+        medium: medium around the origin of the ray.
         active: lanes to follow.
-        rng: state of a random number generator; where it is given, the transmittance is an unbiased estimate: by tracking where
-            block ranges of some grid are known or some medium is bounded, else by roulette.
+        rng: state of the random number generator for an unbiased estimate: by tracking with block ranges or a bounded medium in
+            the scene, by roulette otherwise; None for the exact transmittance.
 
     Returns:
-        Where the ray ends; its optical depth [1] for each channel, or None where tracking estimated the transmittance; and the
-        transmittance of media and surfaces. Where that is 0 the optical depth may be too small, but not below ``ROULETTE_TAU``.
+        The end of the ray; its optical depth for each channel [1], or None if tracking has estimated the transmittance; and the
+        transmittance of media and surfaces [1]. If the transmittance is 0, the optical depth may be too small, but not below
+        ``ROULETTE_TAU``.
     """
     if rng is not None and media.tracks_shadows:
         end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
@@ -64,7 +65,7 @@ def find_transmittance(
     end, tau = integrate_optical_depth(media, ray, medium, active, enough, passes_null=True)
     if rng is None:
         return end, tau, transmittance(tau) * end.null_transmission
-    # Every channel is divided by the probability of the clearest one, so that weights stay below 1.
+    # Every channel is divided by the survival probability of the clearest channel, so weights stay below 1.
     clearest = minimum(tau)
     thicker = [t - dr.maximum(clearest - ROULETTE_TAU, 0) for t in tau]
     return end, tau, dr.select(clearest <= enough, transmittance(thicker), 0) * end.null_transmission
@@ -73,24 +74,24 @@ def find_transmittance(
 def estimate_transmittance(
     media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32, passes_null: bool = False
 ) -> tuple[SegmentEnd, mi.Spectrum]:
-    """Where a ray ends, and an unbiased estimate of the share of light that its media let through; ``rng`` draws it."""
+    """Follow a ray to its end, and estimate the transmittance of its media without bias, with the random numbers of ``rng``."""
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
     end, (T, _) = visit_media(media, ray, medium, _multiply_transmittance, start, active, passes_null)
     return end, to_spectrum(T)
 
 
 def _multiply_transmittance(state: tuple, interval: MediumInterval) -> tuple:
-    """The visitor that multiplies the transmittances of media along a ray."""
+    """Visitor multiplying the transmittances of media along a ray."""
     T, rng = state
     own, rng = _estimate_medium_transmittance(interval, len(T), rng)
     return [a * b for a, b in zip(T, own, strict=True)], rng
 
 
 def _estimate_medium_transmittance(interval: MediumInterval, channels: int, rng: mi.UInt32) -> tuple[list[mi.Float], mi.UInt32]:
-    """Transmittance [1] of one medium for each channel, and the next state of the generator.
+    """Transmittance of one medium for each channel [1], and the next state of the generator.
 
-    It is estimated by ratio tracking in bounded parts, by residual ratio tracking in grids whose block ranges are known, and
-    exact in all other parts, which are walked to the optical depth ``NEGLIGIBLE_TAU``.
+    Ratio tracking estimates bounded parts, residual ratio tracking grids with block ranges. All other parts are exact, and
+    walked up to the optical depth ``NEGLIGIBLE_TAU``.
     """
     body = interval.body
     known = (p for p in body.exact_parts if p.lattice is not None and p.lattice.block_ranges is not None)
@@ -120,13 +121,13 @@ def trace_shadow_ray(
 
     Args:
         media: media and surfaces of the scene.
-        start: where the ray begins.
-        medium: the medium around that point.
+        start: origin of the ray.
+        medium: medium around the origin.
         direct: Mitsuba's sample of the emitter.
         active, rng: as in :func:`find_transmittance`.
 
     Returns:
-        The shadow ray, whether no opaque surface blocks it, and its optical depth and transmittance as in
+        The shadow ray, lanes in which no opaque surface blocks it, and its optical depth and transmittance as in
         :func:`find_transmittance`.
     """
     u = None

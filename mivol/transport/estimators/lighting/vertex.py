@@ -1,7 +1,7 @@
-"""Vertices of a path: a point of a surface with its BSDF, or of a medium with its phase function, with one interface.
+"""Vertices of a path: a point of a surface with its BSDF, or of a medium with its phase function.
 
-Conventions. ``eval`` is the BSDF times the cosine, or the phase function [1/sr]. ``pdf`` is the density of directions that are
-sampled at the vertex [1/sr]; multiple importance sampling weighs emitter samples against it.
+Conventions. ``eval`` is the BSDF times the cosine, or the phase function [1/sr]. ``pdf`` is the density of directions sampled
+at the vertex [1/sr], for weighting emitter samples by multiple importance sampling.
 """
 
 from __future__ import annotations
@@ -20,18 +20,22 @@ __all__ = ["MixedVertex", "MediumVertex", "SurfaceVertex", "Vertex", "phase_pdf"
 
 
 class Vertex(Protocol):
-    """A point at which light is scattered."""
+    """A point at which light is scattered.
+
+    Attributes:
+        interaction: the point for Mitsuba's BSDFs, phase functions and emitters.
+    """
 
     interaction: mi.Interaction3f
 
     def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
-        """The origin of a ray from the vertex towards ``p``, and the medium around that origin."""
+        """Origin of a ray from the vertex towards ``p``, and the medium around the origin."""
 
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-        """BSDF times cosine, or phase function, for light from the direction ``d`` [1/sr], with its derivatives."""
+        """BSDF times cosine, or phase function, for light from the direction ``d`` [1/sr], with derivatives."""
 
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Density [1/sr] of the direction ``d`` when directions are sampled at the vertex."""
+        """Density of the direction ``d`` among directions sampled at the vertex [1/sr]."""
 
 
 @dataclass
@@ -39,10 +43,10 @@ class SurfaceVertex:
     """A point of a surface.
 
     Attributes:
-        media: of the scene.
+        media: media of the scene.
         interaction: the point.
-        bsdf: of the surface there.
-        medium: the medium around the end of the ray that hit it.
+        bsdf: BSDF of the surface.
+        medium: medium in front of the surface, around the end of the incoming ray.
     """
 
     media: SceneMedia
@@ -67,9 +71,9 @@ class MediumVertex:
     """A point of the medium ``interaction.medium``.
 
     Attributes:
-        media: of the scene.
-        interaction: the point, as Mitsuba's phase functions and emitters see it.
-        p: the point in float64, from which rays leave.
+        media: media of the scene.
+        interaction: the point for Mitsuba's phase functions and emitters.
+        p: the point in float64, as the origin of rays.
     """
 
     media: SceneMedia
@@ -78,7 +82,7 @@ class MediumVertex:
 
     @property
     def phase(self) -> mi.PhaseFunctionPtr:
-        """The phase function there."""
+        """The phase function at the point."""
         return self.interaction.medium.phase_function()
 
     def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
@@ -88,7 +92,7 @@ class MediumVertex:
         return self.phase.eval_pdf(mi.PhaseFunctionContext(None), self.interaction, d, active)[0]
 
     def eval_and_pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
-        """Both, without derivatives."""
+        """Phase function and density of the direction ``d`` [1/sr], without derivatives."""
         return dr.detach(self.eval(d, active)), self.pdf(d, active)
 
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
@@ -97,11 +101,11 @@ class MediumVertex:
 
 @dataclass
 class MixedVertex:
-    """A point of a medium in some lanes, of a surface in the others: one shadow ray serves both.
+    """A point of a medium in some lanes and of a surface in the others, with a common shadow ray.
 
     Attributes:
-        surface, medium: the two.
-        in_medium: lanes that are in a medium.
+        surface, medium: the two vertices.
+        in_medium: lanes with a point of a medium.
     """
 
     surface: SurfaceVertex
@@ -110,7 +114,7 @@ class MixedVertex:
 
     @property
     def interaction(self) -> mi.Interaction3f:
-        """The point."""
+        """The point for Mitsuba's BSDFs, phase functions and emitters."""
         return dr.select(self.in_medium, mi.Interaction3f(self.medium.interaction), mi.Interaction3f(self.surface.interaction))
 
     def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
@@ -135,13 +139,14 @@ def sample_phase(
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
     """Sample a direction from a phase function.
 
-    Microflake phase functions are sampled uniformly over the sphere, since Mitsuba 3.9.1 samples them with another density than
-    its ``eval_pdf`` returns (an error of 6 % in an image under a constant sky).
+    Microflake phase functions are sampled uniformly over the sphere: in Mitsuba 3.9.1 their sampling density differs from the
+    density of their ``eval_pdf`` (an error of 6 % in an image under a constant sky).
 
     Args:
-        media: of the scene.
+        media: media of the scene.
         mei: the point, its medium, and the direction towards the camera.
-        component, direction: three numbers in [0, 1), of which the first chooses a component of the phase function.
+        component: uniform random number in [0, 1) for the component of the phase function.
+        direction: two uniform random numbers in [0, 1) for the direction.
         active: lanes to sample.
 
     Returns:
@@ -160,7 +165,7 @@ def sample_phase(
 def phase_pdf(
     media: SceneMedia, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, d: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:
-    """Density [1/sr] of the direction ``d`` in :func:`sample_phase`."""
+    """Density of the direction ``d`` in :func:`sample_phase` [1/sr]."""
     _, pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, d, active)
     return dr.select(_has_microflakes(phase), INV_FOUR_PI, pdf) if media.has_microflakes else pdf
 
