@@ -12,7 +12,6 @@ import pytest
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
 from mivol.transport.estimators.single_scattering.scattering_derivatives import (
     Scattering,
-    at_event,
     event_interaction,
     event_sigma_s,
     event_sigma_t,
@@ -60,7 +59,8 @@ LANES = [[True, False, False], [False, True, False]]
 
 def test_events_know_their_medium():
     media = scene_of(medium("mivol_medium", **GREY), COLOURS)
-    at, order = at_event(media, event(media)), upwards(media)
+    found, order = event(media), upwards(media)
+    at = media.bodies_at(found.body, found.on)
     assert [np.array(at[k][1]).tolist() for k in order] == LANES
     assert [at[k][0] for k in order] == [media.bodies[k] for k in order]
     mei = event_interaction(media, upward(), event(media))

@@ -1,1 +1,1 @@
-"""Light that is scattered once in media, along one segment."""
+"""Single scattering in media along one segment of a path."""

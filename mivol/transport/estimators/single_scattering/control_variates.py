@@ -1,18 +1,17 @@
-r"""A control variate for derivatives of single scattering: a rough source function on a grid, whose gradient is exact.
+r"""Control variates for derivatives of single scattering: a rough source function S whose derivative is exact.
 
 .. math:: \frac{d}{d\sigma} \int T \sigma (\alpha L_s)\,dt
           = \frac{d}{d\sigma} \int T \sigma S\,dt + \frac{d}{d\sigma} \int T \sigma (\alpha L_s - S)\,dt
 
-In the first term S is constant in a cell, so the integral along a ray is a sum of closed forms,
-:math:`\sum_c T_c S_c (1 - e^{-\tau_c})`, whose derivative is one weight for each cell. The second term is estimated by random
-probes; its variance falls with the square of the difference (measured: 6 times less variance in constant light). The sum is
-unbiased for any S, as long as S is held fixed while the derivative is taken.
+On a grid, S is constant in a cell. The first integral along a ray is then a sum of closed forms,
+:math:`\sum_c T_c S_c (1 - e^{-\tau_c})`, whose derivative is one weight for each cell, found by one sweep of the cells from the
+far end. Random probes estimate the second term; its variance falls with the square of the difference (measured: 6 times less
+variance in constant light). The sum is unbiased for any S, as long as S is held fixed in the derivative.
 
-Conventions. S is estimated on a coarse lattice, from a few directions a node, for light that is scattered towards the mean of
-the cameras' origins, and interpolated to the cells of the grid. Light near an emitter is cut at a few times the mean, since a
-wrong S adds more variance than S = 0.
-
-Where this control does not serve, S may be the same everywhere (:func:`find_constant_control`).
+Conventions. A coarse lattice holds estimates of S, from a few directions at each node, for light scattered towards the mean of
+the cameras' origins; they are interpolated to the cells of the grid. Light near an emitter is limited to a few times the mean,
+since a wrong S adds more variance than S = 0. Scenes without a grid control may have one S for all of space
+(:func:`find_constant_control`).
 
 References: Rousselle et al. 2016 (control variates in rendering).
 """
@@ -69,16 +68,19 @@ DIRECTIONS = 32
 
 MAX_BRIGHTNESS = 4.0
 """Largest S as a multiple of its mean: near an emitter the true source function varies strongly within one cell of the grid,
-and S is interpolated over ``STEP`` cells."""
+and S is interpolated over ``CELLS_PER_NODE`` cells."""
+
+
+# -- One source function on a lattice -----------------------------------------------------------------------------------
 
 
 @dataclass
 class CameraOrigins:
-    """Where the rays of a camera start: all near one point, or spread over an area (an orthographic camera).
+    """The origins of a camera's rays: near one point, or spread over an area (an orthographic camera).
 
     Attributes:
         eye: mean of the origins.
-        spread: root mean square distance of the origins from it [length].
+        spread: root mean square distance of the origins from the mean [length].
         direction: mean direction.
     """
 
@@ -95,7 +97,7 @@ class CameraOrigins:
         return cls(eye, spread, direction)
 
     def towards(self, p: mi.Point3f) -> mi.Vector3f:
-        """The direction of the camera's ray at a point; the mean direction where the point is near the spread origins."""
+        """The direction of the camera's ray at a point; the mean direction for a point near spread origins."""
         away = p - self.eye
         return dr.select(dr.norm(away) > 4 * self.spread, dr.normalize(away), self.direction)
 
@@ -105,8 +107,8 @@ class GridControl:
     """A control variate for one grid.
 
     Attributes:
-        values: S [radiance] of each cell of the grid: flat (Z + 1, Y + 1, X + 1, channels).
-        res: of the grid (Z, Y, X).
+        values: S of each cell of the grid: flat (Z + 1, Y + 1, X + 1, channels) [radiance].
+        res: resolution of the grid (Z, Y, X).
         channels: 1 or 3.
     """
 
@@ -115,7 +117,7 @@ class GridControl:
     channels: int
 
     def at(self, lower: mi.Vector3i, active: mi.Bool) -> list[mi.Float]:
-        """S of the cell with the lower node ``lower``, one number a channel."""
+        """S of the cell with the lower node ``lower``, one number for each channel."""
         _, y, x = self.res
         index = mi.UInt32(((lower.z + 1) * (y + 1) + lower.y + 1) * (x + 1) + lower.x + 1) * self.channels
         return [dr.gather(mi.Float, self.values, index + c, active) for c in range(self.channels)]
@@ -128,21 +130,21 @@ class GridControl:
 
 
 def supports_grid_control(media: SceneMedia) -> bool:
-    """Whether the media can have a grid control: a single medium in a box, one grid of extinction, and an albedo."""
+    """Whether the media can have a grid control: a single medium in a box, with one grid of extinction and an albedo."""
     parts = [p for b in media.bodies for p in b.view.parts]
     alone = len(parts) == 1 and not media.traced and parts[0].lattice is not None
     return alone and media.bodies[0].view.albedo is not None and not media.has_microflakes
 
 
 def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigins) -> GridControl:
-    """Estimate S on a coarse lattice and interpolate it to the cells of a medium's grid.
+    """Estimate S on a coarse lattice, and interpolate it to the cells of a medium's grid.
 
     Args:
         direct: estimator of direct light at the nodes.
-        body: a medium with a single grid.
-        origins: of camera rays.
+        body: medium with a single grid.
+        origins: origins of the camera rays.
 
-    Cost: 64 shadow rays for 512 cells at most, and 8 look-ups a cell.
+    Cost: at most 64 shadow rays for 512 cells, and 8 look-ups a cell.
     """
     lattice = body.view.parts[0].lattice
     nodes = [count_nodes(n) for n in lattice.res]
@@ -171,7 +173,9 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
 
 
 def count_nodes(voxels: int) -> int:
-    """Nodes of the coarse lattice along an axis: one every ``STEP`` cells, from face to face, but no more than ``MOST``."""
+    """Nodes of the coarse lattice along an axis: one every ``CELLS_PER_NODE`` cells, from face to face, and at most
+    ``MAX_NODES``.
+    """
     cells = voxels + 1
     return min(-(-cells // CELLS_PER_NODE) + 1, MAX_NODES)
 
@@ -179,7 +183,7 @@ def count_nodes(voxels: int) -> int:
 def _estimate_node_light(
     direct: DirectLighting, body: Body, origins: CameraOrigins, lattice: Lattice, nodes: list[int]
 ) -> list[mi.Float]:
-    """In-scattered radiance L_s at the nodes of the coarse lattice, towards the camera, one array a channel."""
+    """In-scattered radiance L_s at the nodes of the coarse lattice, towards the camera, one array for each channel."""
     z, y, x = nodes
     lane = dr.arange(mi.UInt32, z * y * x * DIRECTIONS)
     node, turn = lane // DIRECTIONS, mi.Float(lane % DIRECTIONS)
@@ -211,17 +215,17 @@ def _estimate_node_light(
 
 
 def _limit_near_light(sample: DirectSample, apart: float) -> mi.Spectrum:
-    """The value of a direct sample at a node, which stands for all points within the distance ``apart`` of it.
+    """The value of a direct sample at a node representing all points within the distance ``apart``.
 
-    An emitter that is nearer than ``apart`` counts as if it were that far away; one at the node itself, whose light is
-    infinite, counts as 0.
+    An emitter nearer than ``apart`` counts as if it were at this distance; the infinite light of an emitter at the node counts
+    as 0.
     """
     value = dr.select(sample.on, sample.value, 0)
     return dr.select(dr.isfinite(value), value * dr.minimum(dr.square(sample.ray_segment.length / apart), 1), 0)
 
 
 def _merge_equal(rows: list[mi.Float]) -> list[mi.Float]:
-    """One channel where all are the same; a recording by ``dr.freeze`` cannot read the values, and keeps all channels."""
+    """One channel if all are the same; a recording by ``dr.freeze`` cannot read the values, and keeps all channels."""
     if is_recording() or any(dr.any(row != rows[0]) for row in rows[1:]):
         return rows
     return rows[:1]
@@ -238,14 +242,17 @@ def _interaction_at(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteracti
     return mei
 
 
+# -- One source function for all of space -------------------------------------------------------------------------------
+
+
 def find_constant_control(media: SceneMedia) -> mi.Spectrum | None:
-    r"""Find the constant source function S [radiance]: the mean albedo times the radiance of a constant sky.
+    r"""Find the constant source function S: the mean albedo times the radiance of a constant sky [radiance].
 
     The light of S along a ray is :math:`S (1 - T(D))`, and its derivative by the optical depth of any part of the ray is
-    :math:`T(D)\,S`. So it needs no lattice, and serves any number of media in any boundaries.
+    :math:`T(D)\,S`. It needs no lattice, and serves any number of media in any boundaries.
 
     Returns:
-        S; None where there is no constant sky, or a medium has no albedo (but a ``sigma_s``).
+        S; None without a constant sky, or if a medium has ``sigma_s`` in place of an albedo.
     """
     skies = [e for e in media.scene.emitters() if e.class_name() == UNIFORM_EMITTER]
     albedos = [a for body in media.bodies for a in body.view.albedo_arrays]
@@ -256,7 +263,7 @@ def find_constant_control(media: SceneMedia) -> mi.Spectrum | None:
 
 
 def _mean_albedo(albedo: mi.TensorXf | mi.Float | mi.Color3f) -> mi.Spectrum:
-    """Mean over space of an albedo, or of its volume."""
+    """Mean over space of an albedo, or of its volume [1]."""
     flat = dr.ravel(dr.detach(albedo))
     n = albedo.shape[-1] if dr.is_tensor_v(albedo) else dr.width(flat)
     of_each = dr.arange(mi.UInt32, dr.width(flat) // n) * n
@@ -264,16 +271,19 @@ def _mean_albedo(albedo: mi.TensorXf | mi.Float | mi.Color3f) -> mi.Spectrum:
     return mi.Spectrum(*rows) if len(rows) == 3 and not mi.is_monochromatic else mi.Spectrum(sum(rows) / n)
 
 
+# -- The exact derivative of the lattice, cell by cell ------------------------------------------------------------------
+
+
 @dataclass
 class ProbeDifference:
-    """What a probe estimates of the difference between the true source function and S.
+    """A probe's estimate of the difference between the true source function and S.
 
     Attributes:
-        begin: distance at which the piece of the ray that holds the probe starts [length], in float64.
-        t: its own distance [length], in float64.
-        source: derivative of each track by the extinction at the probe.
-        dims: minus the derivative of each track by the optical depth in front of the probe.
-        on: lanes that have one.
+        begin: distance of the start of the piece holding the probe, in float64 [length].
+        t: distance of the probe, in float64 [length].
+        source: derivative of each sum by the extinction at the probe.
+        dims: minus the derivative of each sum by the optical depth in front of the probe.
+        on: lanes with a probe.
     """
 
     begin: mi.Float64
@@ -285,12 +295,12 @@ class ProbeDifference:
 
 @dataclass
 class SweepSums:
-    """The sums that are differentiated: one for each channel of extinction for a gradient, each colour for a tangent.
+    """The differentiated sums: one for each channel of extinction for a gradient, one for each colour for a tangent.
 
     Attributes:
-        shares: (channel of S, factor) pairs of each track.
-        rest: light from behind the ray, which all of its cells dim, of each track.
-        tangent: tangents are summed; else derivatives are added to the gradient of the medium.
+        shares: (channel of S, factor) pairs of each sum.
+        rest: light from behind the ray, attenuated by all of its cells, for each sum.
+        tangent: sum tangents; otherwise add derivatives to the gradient of the medium.
     """
 
     shares: list[list[tuple[int, mi.Float]]]
@@ -303,9 +313,9 @@ class _Sweep:
     """State of a sweep from the far end.
 
     Attributes:
-        behind: light of S from behind, as the camera sees it, of each track.
-        ahead, T: optical depth and transmittance between the camera and the cell, of each channel.
-        change: tangent of each track.
+        behind: light of S from behind, at the camera, for each sum.
+        ahead, T: optical depth and transmittance between the camera and the cell, for each channel [1].
+        change: tangent of each sum.
     """
 
     behind: list[mi.Float]
@@ -316,15 +326,15 @@ class _Sweep:
 
 @dataclass
 class ControlSweep:
-    """A ray through a single medium with a single grid, whose derivatives are swept.
+    """A ray through a single medium with a single grid, for sweeping its derivatives.
 
     Attributes:
         media: the medium.
-        control: the source function S of its cells.
-        passed: the ray, and how far it goes.
-        tau: optical depth [1] of the whole ray, each channel of the extinction.
-        tracks: the sums that are differentiated.
-        probe: estimate of what S misses.
+        control: source function S of its cells.
+        passed: the ray, with its length.
+        tau: optical depth of the whole ray, for each channel of the extinction [1].
+        tracks: the differentiated sums.
+        probe: estimate of the difference to S.
     """
 
     media: SceneMedia
@@ -338,15 +348,15 @@ class ControlSweep:
         """Differentiate the light of a ray with respect to the extinction in each of its cells.
 
         Returns:
-            The tangent of each track; zeros for a gradient, which is added to that of the medium.
+            The tangent of each sum; zeros for a gradient, which is added to the gradient of the medium.
 
-        Bias: none. Cost: one walk, with one packed write of 8 a cell and channel for a gradient.
+        Bias: none. Cost: one walk; for a gradient, one packed write of 8 numbers for each cell and channel.
         """
         (interval,) = find_boxed_intervals(self.media, self.passed.ray, self.passed.length, active)
         return [a + b for a, b in zip(self._pass_cells(interval), self._add_probe(), strict=True)]
 
     def _pass_cells(self, interval: MediumInterval) -> list[mi.Float]:
-        """Pass all cells: each adds light of S, and dims what lies behind it."""
+        """Pass all cells: each adds light of S, and attenuates the light behind it."""
         media, body, ray, tracks, probe = self.media, interval.body, self.passed.ray, self.tracks, self.probe
         (part,) = body.view.parts
         extinction = body.extinction(ray)
@@ -389,7 +399,7 @@ class ControlSweep:
         return walk_cells(lattice, segment, visit, state, reads, interval.active).change
 
     def _add_probe(self) -> list[mi.Float]:
-        """Differentiate the probe: its extinction, and that of the part of its cell in front of it."""
+        """Differentiate the probe: the extinction at the probe, and in the part of its cell in front of it."""
         media, (body,), ray, tracks, probe = self.media, self.media.bodies, self.passed.ray, self.tracks, self.probe
         (part,) = body.view.parts
         cell, frac, inside = locate_cell(part.lattice, ray.o, ray.d, probe.t)

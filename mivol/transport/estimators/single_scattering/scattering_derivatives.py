@@ -1,16 +1,16 @@
-r"""Derivatives of single scattering along a segment: of the in-scattered light and of the segment's transmittance.
+r"""Derivatives of single scattering along a segment: of the in-scattered light and of the transmittance of the segment.
 
-The light is :math:`\int T \sigma_s L_d\,dt`. A probe is a scattering event that is drawn where there is no extinction too. It
-estimates the derivatives with respect to the coefficients at its own position (the weight of the event), with respect to those
-in front of it (which dim the event), and those of the direct light: emitters, phase function, albedo, and the media along one
-shadow ray.
+The light is :math:`\int T \sigma_s L_d\,dt`. A probe is a scattering event drawn also in regions without extinction. It
+estimates the derivatives with respect to the coefficients at its position (the weight of the event), with respect to the
+coefficients in front of it (which attenuate the event), and of the direct light: emitters, phase function, albedo, and the
+media along one shadow ray.
 
-A control variate is subtracted whose own derivative is exact. With one grid and an albedo in a box it is a source function on a
-coarse lattice, swept cell by cell together with the segment's transmittance (:mod:`.control_variates`). Elsewhere, under a
-constant sky, it is one source function for the whole ray: its light :math:`S (1 - T)` has the derivative :math:`S T` by the
-optical depth of any part of the ray.
+A control variate with an exact derivative is subtracted. With one grid and an albedo in a box, the control variate is a source
+function on a coarse lattice, swept cell by cell together with the transmittance of the segment (:mod:`.control_variates`). In
+other scenes under a constant sky, it is one source function S for the whole ray: its light :math:`S (1 - T)` has the derivative
+:math:`S T` by the optical depth of any part of the ray.
 
-Conventions. ``dL`` is d loss / d light and ``dlog`` d loss / d log T, which is dL times the light behind the segment.
+Conventions. ``dL`` is d loss / d light, and ``dlog`` is d loss / d log T: dL times the light behind the segment.
 """
 
 from __future__ import annotations
@@ -37,22 +37,79 @@ from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import Ray
 
-__all__ = ["ScatteredSegment", "Scattering", "at_event", "event_interaction", "event_sigma_s", "event_sigma_t"]
+__all__ = ["ScatteredSegment", "Scattering", "event_interaction", "event_sigma_s", "event_sigma_t"]
+
+
+# -- A scattering event -------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Scattering:
+    """A scattering event, with its direct light.
+
+    Attributes:
+        event: position of the event.
+        mei: position as Mitsuba's interaction.
+        gain: throughput times transmittance to the camera, over the density of the position [length].
+        direct: shadow rays; their values carry derivatives on request.
+        sigma_s: scattering coefficient [1/length].
+        chance: uniform random number in [0, 1) choosing the differentiated shadow ray.
+    """
+
+    event: MediumEvent
+    mei: mi.MediumInteraction3f
+    gain: mi.Spectrum
+    direct: list[DirectSample]
+    sigma_s: mi.Spectrum
+    chance: mi.Float
+
+    @property
+    def weight(self) -> mi.Spectrum:
+        """Radiance at the camera for sigma_s = 1: the light is ``sigma_s * weight``."""
+        return self.gain * sum((dr.detach(a.value) for a in self.direct), mi.Spectrum(0))
+
+
+def event_interaction(media: SceneMedia, ray: Ray, event: MediumEvent) -> mi.MediumInteraction3f:
+    """An event as an interaction, for evaluating Mitsuba's phase functions."""
+    mei = medium_interaction(ray, event.t)
+    mei.medium = media.medium_of(event.body, event.on)
+    return mei
+
+
+def event_sigma_t(media: SceneMedia, body: Body, ray: Ray, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
+    """The extinction at an event [1/length]."""
+    rows = event.sigma_t if media.is_single else body.extinction_at(ray, event.t, media.channels, on)
+    return to_spectrum(rows)
+
+
+def event_sigma_s(media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
+    """The scattering coefficient at an event [1/length]."""
+    total = mi.Spectrum(0)
+    for body, on in media.bodies_at(event.body, event.on):
+        if body.view.albedo is None:
+            value = to_spectrum(body.extinction_at(ray, event.t, media.channels, on, "sigma_s"))
+        else:
+            value = dr.detach(eval_albedo(body, mei, on)) * event_sigma_t(media, body, ray, event, on)
+        total = dr.select(on, value, total)
+    return total
+
+
+# -- A segment and its scattering event ---------------------------------------------------------------------------------
 
 
 @dataclass
 class ScatteredSegment:
-    """A segment, the probe that was drawn on it, and the control variate of its derivatives (a ``SharedSegment``).
+    """A segment, the probe drawn on it, and the control variate of its derivatives (a ``SharedSegment``).
 
     Attributes:
-        media: of the scene.
-        segment: ray and throughput.
-        end: where it ends.
-        tau: its optical depth [1], each channel.
-        probe: the scattering event, and the direct light there.
-        grid_control, constant_control: source functions [radiance] of the control variate; at most one of them is not None.
-        active: lanes that are followed.
-        dL: d loss / d light, once it is known.
+        media: media of the scene.
+        segment: segment of the path, with its throughput.
+        end: end of the segment.
+        tau: optical depth of the segment, for each channel [1].
+        probe: scattering event with its direct light.
+        grid_control, constant_control: source functions of the control variate [radiance]; at least one is None.
+        active: lanes to follow.
+        dL: d loss / d light, known after the path has reported the light.
     """
 
     media: SceneMedia
@@ -68,7 +125,7 @@ class ScatteredSegment:
     # -- Direct light at the event -------------------------------------------------------------------------------------
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
-        """Derivatives of the direct light: emitters and phase function, the media along a shadow ray, and the albedo."""
+        """Add the derivatives of the direct light: emitters, phase function, the media along a shadow ray, and the albedo."""
         probe = self.probe
         carried = dL * probe.sigma_s * probe.gain
         for sample in probe.direct:
@@ -77,7 +134,7 @@ class ScatteredSegment:
                     dr.backward_from(dr.select(sample.on, carried * sample.value, 0))
         shadow, value, on = _choose_shadow_ray(probe)
         vjp_optical_depth(self.media, shadow, -carried * value, on)
-        for body, here in at_event(self.media, probe.event):
+        for body, here in self.media.bodies_at(probe.event.body, probe.event.on):
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
@@ -100,7 +157,7 @@ class ScatteredSegment:
         with dr.resume_grad():
             # The terms are differentiated as one sum: they share edges of the graph, and each traversal clears those behind it.
             value = sum((dr.select(s.on, carried * s.value, 0) for s in probe.direct), mi.Spectrum(0))
-            for body, on in at_event(self.media, probe.event):
+            for body, on in self.media.bodies_at(probe.event.body, probe.event.on):
                 if body.view.albedo is not None:
                     sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, on)
                     value += dr.select(on, probe.weight * sigma_t * eval_albedo(body, probe.mei, on), 0)
@@ -124,10 +181,10 @@ class ScatteredSegment:
         return -jvp_optical_depth(self.media, self._passed, self.active)
 
     def _vjp_coefficients(self) -> None:
-        """Derivatives with respect to the coefficients at the event, and in front of it."""
+        """Add the derivatives with respect to the coefficients at the event and in front of it."""
         media, ray, probe, dL = self.media, self.segment.ray, self.probe, self.dL
         source, lost = self._constant_source_at()
-        for body, on in at_event(media, probe.event):
+        for body, on in media.bodies_at(probe.event.body, probe.event.on):
             albedo, name = mi.Spectrum(1), "sigma_s"
             if body.view.albedo is not None:
                 albedo, name = dr.detach(eval_albedo(body, probe.mei, on)), "sigma_"
@@ -141,7 +198,7 @@ class ScatteredSegment:
         source, lost = self._constant_source_at()
         along = jvp_optical_depth(media, self._in_front, probe.event.on)
         dL = -along * (probe.sigma_s * probe.weight - lost)
-        for body, on in at_event(media, probe.event):
+        for body, on in media.bodies_at(probe.event.body, probe.event.on):
             albedo, name = mi.Spectrum(1), "sigma_s"
             if body.view.albedo is not None:
                 albedo, name = dr.detach(eval_albedo(body, probe.mei, on)), "sigma_"
@@ -176,19 +233,20 @@ class ScatteredSegment:
 
     @property
     def _constant_source(self) -> mi.Spectrum:
-        """The source function of the control variate [radiance], the same all along a ray.
+        """The source function of the control variate, constant along a ray [radiance].
 
-        It is scaled by (1 - T) / tau, since less light of a constant sky reaches the inside of a thicker medium. (Measured:
-        0.01 to 0.06 of the variance without it in thin media, 0.3 to 0.5 in those of a few optical depths, 0.8 beyond.)
+        The factor (1 - T) / tau accounts for the light of a constant sky reaching the inside of thicker media less. (Variance
+        relative to no
+        control: 0.01 to 0.06 in thin media, 0.3 to 0.5 in media of a few optical depths, 0.8 beyond.)
         """
         return self.constant_control * to_spectrum([phi1(t) for t in self.tau])
 
     def _constant_source_at(self) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """The control variate's weight of the event for an extinction of 1, and for its actual extinction."""
+        """The control variate's weight of the event for an extinction of 1, and for the actual extinction."""
         if self.constant_control is None:
             return mi.Spectrum(0), mi.Spectrum(0)
         source, sigma_t, event = self.probe.gain * self._constant_source, mi.Spectrum(0), self.probe.event
-        for body, on in at_event(self.media, event):
+        for body, on in self.media.bodies_at(event.body, event.on):
             sigma_t = dr.select(on, event_sigma_t(self.media, body, self.segment.ray, event, on), sigma_t)
         return source, source * sigma_t
 
@@ -215,7 +273,7 @@ def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.B
     """Choose one of the shadow rays of an event, in proportion to its light.
 
     Returns:
-        The shadow ray, its value over the probability of choosing it, and the lanes that have one.
+        The shadow ray, its value over the probability of the choice, and the lanes with a shadow ray.
     """
     first = probe.direct[0]
     if len(probe.direct) == 1:
@@ -237,65 +295,9 @@ def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.B
 
 
 def _control_factors(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
-    """For each channel of the extinction, the (channel of S, factor) pairs of the control variate, summed over colours."""
+    """The (channel of S, factor) pairs of the control variate for each channel of the extinction, summed over colours."""
     if of_control == 1:
         return [[(0, w)] for w in colours_to_channels(weight, channels)]
     if channels == 1:
         return [list(enumerate(to_components(weight)))]
     return [[(c, w)] for c, w in enumerate(to_components(weight))]
-
-
-@dataclass
-class Scattering:
-    """A scattering event, and the direct light there.
-
-    Attributes:
-        event: its position.
-        mei: the same as Mitsuba's interaction.
-        gain: throughput times transmittance to the camera, over the density of the position.
-        direct: the shadow rays; their values carry derivatives where these are asked for.
-        sigma_s: scattering coefficient [1/length] there.
-        chance: a number in [0, 1), which chooses the shadow ray whose derivative is computed.
-    """
-
-    event: MediumEvent
-    mei: mi.MediumInteraction3f
-    gain: mi.Spectrum
-    direct: list[DirectSample]
-    sigma_s: mi.Spectrum
-    chance: mi.Float
-
-    @property
-    def weight(self) -> mi.Spectrum:
-        """Radiance at the camera for sigma_s = 1: the light is ``sigma_s * weight``."""
-        return self.gain * sum((dr.detach(a.value) for a in self.direct), mi.Spectrum(0))
-
-
-def event_interaction(media: SceneMedia, ray: Ray, event: MediumEvent) -> mi.MediumInteraction3f:
-    """An event as the interaction that Mitsuba's phase functions are evaluated at."""
-    mei = medium_interaction(ray, event.t)
-    mei.medium = media.medium_of(event.body, event.on)
-    return mei
-
-
-def at_event(media: SceneMedia, event: MediumEvent) -> list[tuple[Body, mi.Bool]]:
-    """The bodies, each with the lanes that scatter in it."""
-    return media.bodies_at(event.body, event.on)
-
-
-def event_sigma_t(media: SceneMedia, body: Body, ray: Ray, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
-    """The extinction [1/length] at an event."""
-    rows = event.sigma_t if media.is_single else body.extinction_at(ray, event.t, media.channels, on)
-    return to_spectrum(rows)
-
-
-def event_sigma_s(media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
-    """The scattering coefficient [1/length] at an event."""
-    total = mi.Spectrum(0)
-    for body, on in at_event(media, event):
-        if body.view.albedo is None:
-            value = to_spectrum(body.extinction_at(ray, event.t, media.channels, on, "sigma_s"))
-        else:
-            value = dr.detach(eval_albedo(body, mei, on)) * event_sigma_t(media, body, ray, event, on)
-        total = dr.select(on, value, total)
-    return total

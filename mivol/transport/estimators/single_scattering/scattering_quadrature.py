@@ -3,16 +3,16 @@ r"""Single scattering by quadrature along the camera's ray, without noise, for e
 .. math:: \int_a^b T \sigma c\,dt \approx \frac{\Delta}{2}\,\kappa\,(w_1 c_1 + w_2 c_2), \qquad
           w_q = \sigma_q e^{-\tau_q}, \quad \kappa = \frac{\varphi_1(\tau)(\sigma_1 + \sigma_2)}{w_1 + w_2}
 
-with the source function c = albedo L_s at the two Gauss points of a piece of the ray, and tau_q the optical depth in front of
+with the source function c = albedo L_s at the two Gauss points of a piece of the ray, and the optical depth tau_q in front of
 them by two-stage Gauss collocation (order 4). The factor kappa makes the weights sum to 1 - exp(-tau), so a constant source
 function is exact at any optical depth.
 
-Each cell is cut into pieces of an optical depth of at most ``PIECE``, and of an angle of at most ``TURN`` as seen from an
-emitter near by; then the cuts are uniform in that angle. A cell that would need more than ``MOST`` pieces is cut only as far as
-light comes: to the optical depth ``DARK`` of each channel.
+Each cell is cut into pieces of at most the optical depth ``MAX_PIECE_TAU``. With an emitter at a finite distance, the pieces
+are uniform in the angle seen from it, and span at most ``MAX_PIECE_ANGLE``. A cell in need of more than ``MAX_PIECES`` pieces
+is cut only as far as light arrives: up to the optical depth ``NEGLIGIBLE_TAU`` of each channel.
 
-A cell's distance from where the ray enters its grid is a float32 number. With an extinction sigma, the optical depth of a lit
-layer is therefore off by sigma times the rounding of that distance: 1 % where 1e5 optical depths lie in front of the layer.
+The distance of a cell from the ray's entry into its grid is a float32 number. With an extinction sigma, the optical depth of a
+lit layer therefore has an error of sigma times the rounding of this distance: 1 % behind 1e5 optical depths.
 
 Conventions. One medium, whose grids share their cells. Shadows are exact walks, or interpolated in a transmittance grid.
 
@@ -52,39 +52,39 @@ __all__ = ["ScatteringQuadrature"]
 
 
 MAX_PIECE_TAU = 0.25
-"""Largest optical depth of a piece. Where the shadow has a kink in it (a shadow ray begins to cross other cells) the error is
-up to PIECE^2 / 8 of its light; smooth light is exact to 1e-6 of it."""
+"""Largest optical depth of a piece [1]. A kink of the shadow inside (a shadow ray begins to cross other cells) causes an error
+of up to MAX_PIECE_TAU^2 / 8 of its light; smooth light is exact to 1e-6 of it."""
 
 MAX_PIECE_ANGLE = 0.1
-"""Largest angle [rad] of a piece as seen from a near emitter (the integrand 1/r^2 dt is constant in that angle)."""
+"""Largest angle of a piece seen from a near emitter [rad] (the integrand 1/r^2 dt is constant in this angle)."""
 
 MAX_PIECES = 256
-"""Largest number of pieces of a cell, or of a region of constant extinction, that is cut to its end."""
+"""Largest number of pieces of a cell, or of a region of constant extinction, cut up to its end."""
 
 DEEP_PIECES = 2 * int(NEGLIGIBLE_TAU / MAX_PIECE_TAU)
-"""Pieces of a deeper cell between the positions where one channel and the next become dark. They are equal in length, so there
-are twice as many as a constant extinction would need."""
+"""Pieces of a deeper cell between the positions where successive channels become dark. Their lengths are equal, so there are
+twice as many as needed for a constant extinction."""
 
 BISECTIONS = 12
-"""Bisections in the logarithm of the fraction of a cell at which it is dark: from [2^-30, 1] to 0.5 % of it."""
+"""Bisections in the logarithm of the fraction of a cell at which it becomes dark: from [2^-30, 1] to 0.5 % of it."""
 
 CONSTANT_PIECES = 64
 """Least number of pieces of a region of constant extinction, which may be as long as the medium."""
 
 SKEW = math.sqrt(3) / 6
-"""The coefficients of the two-stage Gauss method are 1/4, and 1/4 minus and plus this."""
+"""The coefficients of the two-stage Gauss method are 1/4, and 1/4 minus and plus this number."""
 
 
 class ScatteringQuadrature:
     """The segment estimator of single scattering by quadrature in images; derivatives are Monte Carlo estimates.
 
     Args:
-        drawn: the estimator of derivatives; it knows the media (a single one) and the emitters.
-        transmittance_grid: optical depths that replace shadow rays; None for exact shadow rays.
+        drawn: estimator of derivatives, with the media (a single one) and the emitters.
+        transmittance_grid: optical depths replacing shadow rays; None for exact shadow rays.
 
-    Bias: of fourth order in the size of a cell where the light is smooth; of first order across the edge of a shadow.
+    Bias: of fourth order in the size of a cell for smooth light; of first order across the edge of a shadow.
     Variance: none in images.
-    Cost: one walk for each emitter, and two shadow rays (or look-ups) a piece.
+    Cost: one walk for each emitter, and two shadow rays (or look-ups) for each piece.
     """
 
     directions = "spread"
@@ -123,7 +123,7 @@ class _LightSum:
     """Sums over the pieces of a ray so far.
 
     Attributes:
-        tau, T: optical depth and transmittance, of each channel.
+        tau, T: optical depth and transmittance, for each channel [1].
         light: scattered radiance.
     """
 
@@ -133,22 +133,22 @@ class _LightSum:
 
 
 ExtinctionProfile = Callable[..., list]
-"""``sigma(x)``: extinction [1/length] of each channel at the fraction x of a span."""
+"""``sigma(x)``: extinction of each channel at the fraction x of a span [1/length]."""
 
 SourceFunction = Callable[..., Any]
-"""``source(t, active)``: source function [radiance] at a distance along the ray, in float64."""
+"""``source(t, active)``: source function at a distance along the ray, in float64 [radiance]."""
 
 
 @dataclass
 class _Span:
-    """A part of the ray that is cut into pieces: in one cell, or of constant extinction.
+    """A part of the ray to be cut into pieces: in one cell, or of constant extinction.
 
     Attributes:
-        start, length: its near end, in float64, and its length [length].
-        sigma: extinction along it.
+        start, length: near end, in float64, and length [length].
+        sigma: extinction along the span.
         source: source function along the ray.
-        equiangular: sampler towards the emitter; None where that is at infinity.
-        on: lanes that have it.
+        equiangular: sampler towards the emitter; None for an emitter at infinity.
+        on: lanes with the span.
     """
 
     start: mi.Float64
@@ -166,13 +166,13 @@ def _empty_sum(media: SceneMedia, width: int) -> _LightSum:
 
 @dataclass
 class _LitRay:
-    """A ray and the emitter whose light is integrated along it.
+    """A ray, and the emitter whose light is integrated along it.
 
     Attributes:
         quadrature: media, emitters and shadows.
-        ray: world space, unit direction.
-        number: of the emitter.
-        equiangular: sampler towards it; None where it is at infinity.
+        ray: ray in world space, with a unit direction.
+        number: index of the emitter.
+        equiangular: sampler towards the emitter; None for an emitter at infinity.
     """
 
     quadrature: ScatteringQuadrature
@@ -217,7 +217,7 @@ class _LitRay:
         return add_constant(state, dr.select(hit, segment.end, t1), t1)
 
     def _source(self, body: Body, t: mi.Float64, on: mi.Bool) -> mi.Spectrum:
-        """Albedo times the emitter's light that is scattered towards the camera, at a distance along the ray."""
+        """Albedo times the emitter's light scattered towards the camera, at a distance along the ray [radiance]."""
         media, grid = self.quadrature.media, self.quadrature.transmittance_grid
         emitter = self.quadrature.emitters.sampled[self.number]
         mei = medium_interaction(self.ray, t, body.view.medium)
@@ -232,7 +232,7 @@ class _LitRay:
 
 
 def _add_span(state: _LightSum, span: _Span, least: mi.Float) -> _LightSum:
-    """Cut a span into pieces, ``least`` of them or more, and add them in their order."""
+    """Cut a span into at least ``least`` pieces, and add them in their order."""
     dt, sigma, equiangular = span.length, span.sigma, span.equiangular
     near, far = sigma(mi.Float(GAUSS_POINT)), sigma(mi.Float(1 - GAUSS_POINT))
     thick = maximum([0.5 * dt * (a + b) for a, b in zip(near, far, strict=True)])
@@ -250,7 +250,9 @@ def _add_span(state: _LightSum, span: _Span, least: mi.Float) -> _LightSum:
 
 @dr.syntax
 def _dark_fractions(front: list[mi.Float], dt: mi.Float, sigma: ExtinctionProfile, is_deep: mi.Bool) -> list[mi.Float]:
-    """The fraction of a cell at which each channel reaches the optical depth ``DARK``, by bisection; 1 where it never does."""
+    """The fraction of a cell at which each channel reaches the optical depth ``NEGLIGIBLE_TAU``, by bisection; 1 if it never
+    does.
+    """
     low = [dr.full(mi.Float, 2.0**-30, dr.width(dt)) for _ in front]
     high = [dr.full(mi.Float, 1, dr.width(dt)) for _ in front]
     step = dr.zeros(mi.UInt32, dr.width(dt))
@@ -273,7 +275,7 @@ def _bisect_once(
 
 
 def _optical_depth_to(x: mi.Float, dt: mi.Float, sigma: ExtinctionProfile) -> list[mi.Float]:
-    """Optical depth of each channel from the start of a cell to a fraction of it."""
+    """Optical depth of each channel from the start of a cell to a fraction of the cell [1]."""
     return [0.5 * x * dt * (a + b) for a, b in zip(sigma(GAUSS_POINT * x), sigma((1 - GAUSS_POINT) * x), strict=True)]
 
 
@@ -308,7 +310,9 @@ def _add_pieces(state: _LightSum, span: _Span, is_deep: mi.Bool, edges: list[mi.
 
 
 def _deep_fraction(edges: list[mi.Float], index: mi.UInt32) -> mi.Float:
-    """The fraction of a cell at which its first ``index`` pieces end, with ``DEEP`` up to the first edge and between edges."""
+    """The fraction of a cell at the end of its first ``index`` pieces, with ``DEEP_PIECES`` up to the first edge and between
+    edges.
+    """
     share, begin = mi.Float(0), mi.Float(0)
     for k, end in enumerate(edges):
         part = dr.clip((mi.Float(index) - k * DEEP_PIECES) / DEEP_PIECES, 0, 1)
@@ -341,7 +345,7 @@ def _add_piece(state: _LightSum, span: _Span, near: mi.Float, far: mi.Float, on:
 
 
 def _scattering_albedo(media: SceneMedia, body: Body, ray: Ray, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
-    """The albedo, or sigma_s / sigma_t where the medium has both coefficients; 0 where its extinction is 0."""
+    """The albedo, or sigma_s / sigma_t for a medium with both coefficients [1]; 0 for an extinction of 0."""
     if body.view.albedo is not None:
         return eval_albedo(body, mei, on)
     scattered, whole = (to_spectrum(body.extinction_at(ray, mei.t, media.channels, on, name)) for name in ("sigma_s", "sigma_"))

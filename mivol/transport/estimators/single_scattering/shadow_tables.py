@@ -1,11 +1,15 @@
-r"""A visibility cache: rough transmittance towards emitters for each block of a grid, which guides distance sampling.
+r"""Optical depth towards the emitters, tabulated over a grid: to guide distance sampling, or in place of shadow rays.
 
 .. math:: w_b = e^{-\overline{\tau}_l(x_b)} + w_0
 
-Light of an emitter with one position or one direction reaches only parts of a dense medium, and the extinction along a camera
-ray does not tell which. The optical depth from the middle of each block of cells to the emitter does, so distances are drawn in
-proportion to w_b. The optical depth is integrated over a grid that is as coarse as the blocks. Shadow rays stay exact, so
-nothing is biased. The floor ``w_0`` bounds the sample weights where a block lies across the edge of a shadow.
+A *visibility cache* guides distance sampling. Light of an emitter with one position or direction reaches only parts of a dense
+medium, and the extinction along a camera ray does not tell which. The optical depth from the centre of each block of cells to
+the emitter does, so distances are drawn in proportion to w_b. It is integrated over a grid as coarse as the blocks. Shadow rays
+stay exact, so nothing is biased. The floor ``w_0`` bounds the sample weights in blocks across the edge of a shadow.
+
+A *transmittance grid* holds the optical depth at the nodes of a lattice, and replaces shadow rays; it is biased. Its optical
+depth is
+interpolated: an interpolated transmittance would be too bright between nodes (by 54 % for a step of 2 in optical depth).
 """
 
 from __future__ import annotations
@@ -36,19 +40,34 @@ __all__ = [
 ]
 
 
+def optical_depth_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitter) -> list[mi.Float]:
+    """Optical depth from points in a medium to an emitter of one position or direction, for each channel [1].
+
+    It is at most ``NEGLIGIBLE_TAU``, its value behind an opaque surface.
+    """
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p = p
+    medium = dr.select(dr.full(mi.Bool, True, dr.width(p)), mi.MediumPtr(body.view.medium), None)
+    direct, _ = emitter.sample_direction(it, mi.Point2f(0.5), mi.Bool(True))
+    _, clear, tau, _ = trace_shadow_ray(media, p, medium, direct, mi.Bool(True))
+    return [dr.select(clear, dr.minimum(t, NEGLIGIBLE_TAU), NEGLIGIBLE_TAU) for t in tau]
+
+
+# -- The visibility cache -----------------------------------------------------------------------------------------------
+
 MIN_WEIGHT = 0.02
-"""w_0, the weight of a block in full shadow: the sample weight of a lit point in it is at most 50 times as large."""
+"""w_0, the weight of a block in full shadow [1]: a lit point inside has at most 50 times its sample weight."""
 
 RAY_FRACTION = 0.2
-"""Largest number of shadow rays of the cache, as a fraction of those of the image. The smallest blocks that keep to it are
-chosen. (Measured: under a directional light on smoke, blocks of 2 cells divide the variance by 2.7, blocks of 4 do nothing;
-under a point light on a CT of 256^3, blocks of 4 halve the variance that blocks of 8 leave.)"""
+"""Largest number of shadow rays of the cache, as a fraction of the shadow rays of the image [1]. The smallest blocks within
+this bound are chosen. (Measured: under a directional light on smoke, blocks of 2 cells divide the variance by 2.7, blocks of 4
+have no effect; under a point light on a CT of 256^3, blocks of 4 halve the variance of blocks of 8.)"""
 
 MAX_SHIFT = 3
 """log2 of the edge of the largest blocks [cells]; shadows vary too much within larger ones."""
 
 MAX_EMITTERS = 8
-"""Largest number of emitters for which a cache is built."""
+"""Largest number of emitters with a cache."""
 
 
 @dataclass
@@ -86,14 +105,14 @@ def build_visibility_cache(
 
     Args:
         media: surfaces and media.
-        emitters: of the scene.
-        rays: number of shadow rays of the image, which decides how fine a cache pays.
-        occupied: fraction of the grid's blocks that are not empty, if only those are needed; None for all blocks.
-        take: :func:`coarsen_grid`, or a function that remembers its results.
+        emitters: emitters of the scene.
+        rays: number of shadow rays of the image, limiting the resolution of the cache.
+        occupied: fraction of the grid's blocks that are not empty, to build only these; None for all blocks.
+        take: :func:`coarsen_grid`, or a function remembering its results.
 
     Returns:
-        The cache; None where no emitter has one position or direction, there are several media or grids or more than
-        ``MOST_EMITTERS`` emitters, or the image is too small for a cache to pay.
+        The cache; None if no emitter has one position or direction, with several media or grids or more than ``MAX_EMITTERS``
+        emitters, or for an image too small for a cache to pay.
 
     Cost: one shadow ray through the coarse grid for each block and emitter.
     """
@@ -131,7 +150,7 @@ def _count_blocks(lattice: Lattice, shift: int) -> int:
 
 
 def _replace_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
-    """The media, with the grid of their only medium replaced."""
+    """The media, with another grid in their only medium."""
     (body,) = media.bodies
     parts = [p if p.is_constant else replace(p, lattice=lattice) for p in body.view.parts]
     other, bodies = copy.copy(media), [Body(replace(body.view, parts=parts), body.box)]
@@ -140,7 +159,7 @@ def _replace_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
 
 
 def _block_centres(lattice: Lattice, blocks: tuple[int, int, int], shift: int, index: mi.UInt32) -> mi.Point3f:
-    """The middles of blocks in the world."""
+    """The centres of blocks in the world."""
     _, y, x = blocks
     at = (index % x, (index // x) % y, index // (x * y))
     # Block b holds the cells from b 2^shift - 1 on, of which the outermost are half as wide. As a fraction of the box, the
@@ -153,21 +172,10 @@ def _block_centres(lattice: Lattice, blocks: tuple[int, int, int], shift: int, i
     return lattice.place(mi.Vector3f(*u))
 
 
-def optical_depth_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitter) -> list[mi.Float]:
-    """Optical depth [1] of each channel from points in a medium to an emitter of one position or direction.
-
-    It is at most ``DARK``, and ``DARK`` where an opaque surface hides the emitter.
-    """
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
-    medium = dr.select(dr.full(mi.Bool, True, dr.width(p)), mi.MediumPtr(body.view.medium), None)
-    direct, _ = emitter.sample_direction(it, mi.Point2f(0.5), mi.Bool(True))
-    _, clear, tau, _ = trace_shadow_ray(media, p, medium, direct, mi.Bool(True))
-    return [dr.select(clear, dr.minimum(t, NEGLIGIBLE_TAU), NEGLIGIBLE_TAU) for t in tau]
-
+# -- The transmittance grid ---------------------------------------------------------------------------------------------
 
 INSET = 1e-5
-"""Distance inside the box from which the nodes in its faces send shadow rays, as a fraction of the box."""
+"""Distance from the faces of the box at which the outermost nodes send shadow rays, as a fraction of the box [1]."""
 
 
 @dataclass
@@ -175,7 +183,7 @@ class TransmittanceGrid:
     """Optical depth towards each emitter at the nodes of a lattice over a grid's box.
 
     Attributes:
-        tau: flat (nodes in z, y, x; emitters; channels).
+        tau: flat (nodes in z, y, x; emitters; channels) [1].
         nodes: number of nodes along z, y, x; the first and the last lie in the faces of the box.
         lattice: the grid.
         emitters, channels: their numbers in ``tau``.
@@ -188,7 +196,7 @@ class TransmittanceGrid:
     channels: int
 
     def transmittance(self, p: mi.Point3f, number: int, active: mi.Bool) -> mi.Spectrum:
-        """exp(-tau) towards one emitter, with tau interpolated trilinearly at a point."""
+        """exp(-tau) towards one emitter, with tau interpolated trilinearly at a point [1]."""
         z, y, x = self.nodes
         q = []
         for row, n, m in zip(self.lattice.from_world, self.lattice.res[::-1], (x, y, z), strict=True):
@@ -210,11 +218,11 @@ def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: 
 
     Args:
         media: surfaces, and a single medium with one grid.
-        emitters: of the scene, each with one position or direction.
+        emitters: emitters of the scene, each with one position or direction.
         cells: number of cells of the grid between two nodes.
 
     Bias: O(h^2) of tau in the distance h of nodes; a cell across the edge of an opaque shadow leaks light.
-    Cost: one shadow ray a node and emitter.
+    Cost: one shadow ray for each node and emitter.
     """
     (body,) = media.bodies
     lattice = next(p.lattice for p in body.view.parts if p.lattice is not None)
@@ -240,7 +248,7 @@ def measure_transmittance_bias(
     """Compare a transmittance grid with exact shadow rays at points of the grid's box.
 
     Returns:
-        Mean of T_grid - T_exact, and its root mean square, over points and emitters; points are weighted by their extinction.
+        Mean and root mean square of T_grid - T_exact over points and emitters [1]; the extinction weights the points.
     """
     (body,) = media.bodies
     k = mi.Float64(dr.arange(mi.UInt32, points)) + 0.5

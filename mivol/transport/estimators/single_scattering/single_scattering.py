@@ -1,12 +1,12 @@
-r"""Single scattering along a path segment: Monte Carlo integration of the in-scattered radiance.
+r"""Single scattering along a segment: Monte Carlo integration of the in-scattered radiance.
 
 .. math:: L = \int_0^D T(t)\,\sigma_s(x_t)\,L_d(x_t, \omega)\,dt \approx \frac{T \sigma_s L_d}{p(t)}
 
-Conventions. The segment is walked once, for its optical depth and for the points at which light is scattered. The weight of a
-point is T L_d / p, the radiance at the camera for a scattering coefficient of 1: the light is ``sigma_s * weight``, and its
-derivative with respect to sigma_s is the weight itself, so nothing is divided by an extinction or by an albedo that may be 0.
+Conventions. One walk of the segment finds its optical depth and its scattering points. The weight of a point is T L_d / p, the
+radiance at the camera for a scattering coefficient of 1. The light is ``sigma_s * weight``, and its derivative with respect to
+sigma_s is the weight itself, so nothing is divided by an extinction or an albedo of possibly 0.
 
-References: the equation of transfer with the in-scattered radiance of one order (Chandrasekhar 1960).
+References: the equation of transfer with in-scattered radiance of one order (Chandrasekhar 1960).
 """
 
 from __future__ import annotations
@@ -59,17 +59,17 @@ __all__ = ["SingleScattering"]
 
 
 PROBE_DEPTH = 4.0
-"""Optical depth that a probe for derivatives adds over a medium (measured: the variance is flat between 2 and 8)."""
+"""Optical depth added over a medium by a probe for derivatives [1] (measured: the variance is flat between 2 and 8)."""
 
 
 @dataclass
 class _WalkedSegment:
-    """A segment that has been walked for one emitter.
+    """A segment walked for one emitter.
 
     Attributes:
-        end: where it ends.
-        reservoir: the candidates of scattering points.
-        proposal: that the reservoir was filled with.
+        end: end of the segment.
+        reservoir: candidates of scattering points.
+        proposal: proposal of the reservoir's weights.
     """
 
     end: SegmentEnd
@@ -81,14 +81,14 @@ class SingleScattering:
     """The segment estimator of single scattering, at points drawn by weighted reservoir sampling.
 
     Args:
-        direct: estimator of direct lighting at a point.
-        count: scattering points on a segment, in images; derivatives have one.
-        visibility_cache: rough visibility of emitters, which distances in images are drawn by; None for none.
+        direct: estimator of direct lighting.
+        count: number of scattering points on a segment in images; derivatives use one.
+        visibility_cache: rough visibility of the emitters, for drawing distances in images; None for no cache.
 
     Bias: none.
-    Variance: that of the distance, of one direction to an emitter and of one of the phase function; the points of a segment
-        share the emitter. It need not be finite near a point light.
-    Cost: one walk of the segment, and one of each shadow ray; where several media lie along a ray, one walk to each point.
+    Variance: the distance, one direction towards an emitter and one of the phase function; the points of a segment share the
+        emitter. It may be infinite near a point light.
+    Cost: one walk of the segment and of each shadow ray; with several media along a ray, one walk up to each point.
     """
 
     ends_in_media = False
@@ -166,7 +166,7 @@ class SingleScattering:
     def _scatter(
         self, segment: PathSegment, flight: _WalkedSegment, candidate: Candidate, samples: EventSamples, active: mi.Bool
     ) -> Scattering:
-        """Draw a scattering point in a candidate, and estimate the direct light there."""
+        """Draw a scattering point in a candidate, and estimate the direct light at the point."""
         media, ray, proposal = self.media, segment.ray, flight.proposal
         chosen, probes = proposal.chosen, proposal.probe_depth > 0
         on = active & segment.may_scatter
