@@ -238,7 +238,7 @@ class _Filling:
             reservoir = add_constant(reservoir, t0, dr.select(hit, segment.start, t1))
         # Light from beyond the optical depth DARK is negligible in an image. Derivatives need the whole optical depth, since
         # they are swept from the far end.
-        until = None if self.proposal.probe_depth else lambda p: least_of(p.tau) > NEGLIGIBLE_TAU
+        until = None if self.proposal.probe_depth else lambda p: minimum(p.tau) > NEGLIGIBLE_TAU
         reservoir = walk_cells(lattice, segment, visit, reservoir, extinction.reads, on, until)
         if extinction.has_constants:
             reservoir = add_constant(reservoir, dr.select(hit, segment.end, t1), t1)
