@@ -1,8 +1,8 @@
-"""Volumes that benches measure on: the Mitsuba tutorial's smoke, a CT scan, a cloud, sparse threads, or made-up ones.
+"""Volumes of the studies: the smoke of the Mitsuba tutorial, a CT scan, a cloud, sparse threads, and made-up volumes.
 
-Conventions. Values are (Z, Y, X) float32 [1/length] at voxel centres of the box [-1, 1]^3. Files are read from MIVOL_DATA
-(default: shared/data beside the checkout). Where a file is missing a made-up volume of the same size takes its place, and
-``origin``, which goes into the JSON, says so.
+Conventions. Values are (Z, Y, X) float32 [1/length] at voxel centres of the box [-1, 1]^3. Files come from MIVOL_DATA
+(default: shared/data beside the checkout). A made-up volume of the same size replaces a missing file, and ``origin``, which
+the JSON holds, says so.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("MIVOL_DATA", CHECKOUT.parent / "shared" / "data"))
 
 TO_WORLD = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]], np.float64)
-"""From the unit cube to [-1, 1]^3, which every volume fills, as in the tutorial."""
+"""Transform from the unit cube to [-1, 1]^3, the box of every volume, as in the tutorial."""
 
 TUTORIAL_SCALE = 40.0
-"""By which the tutorial multiplies its smoke: optical depths up to 65."""
+"""Factor on the smoke in the tutorial; optical depths reach 65."""
 
 
 class Extinction(NamedTuple):
-    """An extinction (Z, Y, X) float32 [1/length] and where it is from."""
+    """An extinction (Z, Y, X) float32 [1/length] and its origin."""
 
     values: np.ndarray
     origin: str
@@ -54,7 +54,7 @@ class Extinction(NamedTuple):
 
 
 def smoke() -> Extinction:
-    """The tutorial's smoke at the tutorial's density, or a made-up one of its size."""
+    """The smoke of the tutorial at its density, or made-up smoke of the same size."""
     path = DATA / "volumes_vol" / "tutorials_volume.vol"
     if path.is_file():
         return Extinction(np.float32(TUTORIAL_SCALE) * read_volume(path, frame="unit").values[..., 0], "Mitsuba tutorial, x 40")
@@ -62,19 +62,19 @@ def smoke() -> Extinction:
 
 
 def fine_smoke(res: int) -> Extinction:
-    """The smoke, interpolated to res^3 voxels."""
+    """The smoke upsampled to res^3 voxels."""
     coarse = smoke()
     fine = upsample(mi.TensorXf(np.ascontiguousarray(coarse.values[..., None])), (res,) * 3)
     return Extinction(np.array(fine)[..., 0], f"{coarse.origin}, upsampled")
 
 
 def made_up(shape: tuple[int, int, int], peak: float, why: str = "no data folder") -> Extinction:
-    """Soft blobs and filaments (Z, Y, X) from the seed 0, and why they are made up."""
+    """Made-up soft blobs and filaments (Z, Y, X) with the seed 0; ``why`` is the reason in their origin."""
     return Extinction(make_procedural("tangle", shape, 0, peak)[..., 0], f"procedural ({why})")
 
 
 def ct_scan(res: int) -> Extinction:
-    """The CT of a bonsai at 256^3, 0 to 2 [1/length]; a made-up volume at another resolution."""
+    """The CT scan of a bonsai at 256^3 voxels, 0 to 2 [1/length]; a made-up volume at another resolution."""
     path = DATA / "ct_mri" / "bonsai.vti"
     if res == 256 and path.is_file():
         values = read_volume(path, frame="unit").values[..., 0]
@@ -83,7 +83,7 @@ def ct_scan(res: int) -> Extinction:
 
 
 def threads_in_space(res: int, share: float = 0.01) -> Extinction:
-    """Thin curved threads that fill ``share`` of res^3 voxels, the rest exactly 0."""
+    """Thin curved threads in a ``share`` of res^3 voxels; all other voxels are exactly 0."""
     rng = np.random.default_rng(0)
     values = np.zeros((res,) * 3, np.float32)
     offsets = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -99,20 +99,20 @@ def threads_in_space(res: int, share: float = 0.01) -> Extinction:
 
 
 def les_cloud() -> Extinction:
-    """A cloud of a large-eddy simulation, stretched to the box so that the optical depth of its height stays what it was."""
+    """A cloud of a large-eddy simulation, stretched to the box; its optical depth along the vertical stays the same."""
     path = DATA / "clouds_les" / "rico32x37x26.txt"
     if not path.is_file():
         return made_up((26, 37, 32), TUTORIAL_SCALE)
-    found = read_volume(path)
-    height = np.linalg.norm(found.to_world[:3, 2])
-    return Extinction(found.values[..., 0] * np.float32(height / 2), "LES cloud (RICO), stretched to a cube")
+    cloud = read_volume(path)
+    height = np.linalg.norm(cloud.to_world[:3, 2])
+    return Extinction(cloud.values[..., 0] * np.float32(height / 2), "LES cloud (RICO), stretched to a cube")
 
 
-def as_dense_as_smoke(found: Extinction) -> Extinction:
-    """A volume scaled to the smoke's largest extinction, its outermost voxels empty.
+def as_dense_as_smoke(volume: Extinction) -> Extinction:
+    """Scale a volume to the largest extinction of the smoke, and empty its outermost voxels.
 
-    Mitsuba starts rays anew (1 + |p|) 9e-5 behind a boundary. A medium that touches it lacks that skin, which holds 2 % of
-    the light at such an extinction (against quadrature in float64, which mivol agrees with).
+    Mitsuba continues rays (1 + |p|) 9e-5 behind a boundary. A medium that touches the boundary loses this skin, which holds 2 %
+    of the light at such an extinction (measured by quadrature in float64, which agrees with mivol).
     """
-    values = np.pad(found.values[1:-1, 1:-1, 1:-1], 1)
-    return Extinction(values * np.float32(smoke().values.max() / values.max()), f"{found.origin}, as dense as the smoke")
+    values = np.pad(volume.values[1:-1, 1:-1, 1:-1], 1)
+    return Extinction(values * np.float32(smoke().values.max() / values.max()), f"{volume.origin}, as dense as the smoke")

@@ -1,7 +1,7 @@
-"""Scenes of stock plugins that every renderer takes: a box of extinction, a camera of the tutorial's, a kind of light.
+"""Scenes of stock plugins for all renderers: a box with an extinction, a camera of the tutorial, and lights.
 
-Conventions. The box is [-1, 1]^3. Lights are functions that return the parts of a scene which they change: ``emitter`` and
-the medium's ``phase``.
+Conventions. The box is [-1, 1]^3. A light is a function that returns the changed parts of a scene: ``emitter``, and ``phase``
+of the medium.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = [
     "box_scene",
     "constant_light",
     "directional_light",
-    "directions_of_map",
+    "map_directions",
     "emitter_inside",
     "glass_under_a_sky",
     "milk_in_a_glass",
@@ -32,7 +32,7 @@ __all__ = [
 
 
 def perspective(side: int) -> dict:
-    """One of the tutorial's cameras: 4 away, 45 degrees wide, turned by 18 degrees; the smoke's own z is up."""
+    """A camera of the tutorial: distance 4, field of view 45 degrees, turned by 18 degrees; z of the smoke is up."""
     angle = math.radians(18)
     origin = [4 * math.sin(angle), -4 * math.cos(angle), 0]
     return {
@@ -51,13 +51,13 @@ def perspective(side: int) -> dict:
 
 
 def box_scene(values: np.ndarray, side: int, albedo: float | Sequence[float] = 0.0, **more: dict) -> dict:
-    """A box that holds an extinction, seen by one of the tutorial's cameras.
+    """A box with an extinction, seen by a camera of the tutorial.
 
     Args:
-        values: (Z, Y, X), or (3,) of a homogeneous medium in rgb [1/length].
-        side: of the picture [pixels].
-        albedo: of the medium; rgb where the extinction is.
-        more: ``phase`` of the medium, ``bsdf`` of the box; all else are parts of the scene. Without emitters, a sky of
+        values: extinction (Z, Y, X), or (3,) of a homogeneous rgb medium [1/length].
+        side: edge of the image [pixels].
+        albedo: albedo of the medium; rgb for an rgb extinction.
+        more: ``phase`` of the medium, ``bsdf`` of the box, and parts of the scene. A scene without parts gets a sky of
             radiance 1.
     """
     medium = liquid(values, albedo) if values.ndim == 1 else grid_medium(values, albedo)
@@ -81,7 +81,7 @@ def grid_medium(values: np.ndarray, albedo: float) -> dict:
 
 def liquid(sigma_t: np.ndarray, albedo: Sequence[float]) -> dict:
     """A homogeneous medium of an extinction (3,) [1/length] and an albedo in rgb."""
-    # Colours of a scene are at most 1; what is above that is a scale.
+    # Colours of a scene are at most 1; a scale holds the rest.
     most = float(sigma_t.max())
     share = {"type": "rgb", "value": [float(x) / most for x in sigma_t]}
     return {
@@ -93,7 +93,7 @@ def liquid(sigma_t: np.ndarray, albedo: Sequence[float]) -> dict:
 
 
 def constant_light() -> dict:
-    """Light of radiance 1 from everywhere, isotropic scattering."""
+    """Radiance 1 from all directions, isotropic scattering."""
     return {"emitter": {"type": "constant"}, "phase": {"type": "isotropic"}}
 
 
@@ -104,49 +104,49 @@ def point_light(position: tuple[float, float, float]) -> dict:
 
 
 def sun_and_sky(height: int = 128) -> dict:
-    """A sky that brightens upwards and a sun of 2 degrees' radius that gives a third of the light; HG g = 0.8.
+    """A sky that brightens upwards, and a sun of 2 degrees' radius with a third of the light; HG g = 0.8.
 
     Args:
-        height: of the environment map [pixels].
+        height: height of the environment map [pixels].
     """
-    d = directions_of_map(height)
+    d = map_directions(height)
     sky = (0.25 + 0.15 * d[..., 2:]) * np.array([0.8, 1.0, 1.3])
     sun = d @ np.array([0.48, 0.6, 0.64]) > math.cos(math.radians(2.0))
-    picture = np.where(sun[..., None], np.array([420.0, 390.0, 330.0]), sky)
-    return _sky_of(picture) | {"phase": {"type": "hg", "g": 0.8}}
+    image = np.where(sun[..., None], np.array([420.0, 390.0, 330.0]), sky)
+    return _environment(image) | {"phase": {"type": "hg", "g": 0.8}}
 
 
 def sun_before_the_camera(height: int = 128) -> dict:
-    """A sun of 4 degrees' radius, 35 degrees off where the camera looks, in a sky that is nearly black; HG g = 0.8.
+    """A sun of 4 degrees' radius, 35 degrees off the axis of the camera, in a nearly black sky; HG g = 0.8.
 
     Args:
-        height: of the environment map [pixels].
+        height: height of the environment map [pixels].
     """
-    d = directions_of_map(height)
+    d = map_directions(height)
     sun = d @ np.array([-0.253, 0.778, 0.574]) > math.cos(math.radians(4.0))
-    return _sky_of(np.where(sun[..., None], np.array([105.0, 97.0, 82.0]), 0.01)) | {"phase": {"type": "hg", "g": 0.8}}
+    return _environment(np.where(sun[..., None], np.array([105.0, 97.0, 82.0]), 0.01)) | {"phase": {"type": "hg", "g": 0.8}}
 
 
 def glass_under_a_sky(height: int = 16) -> dict:
     """A box of smooth glass under a sky that brightens upwards, isotropic scattering.
 
     Args:
-        height: of the environment map [pixels].
+        height: height of the environment map [pixels].
     """
-    picture = (1 + 0.5 * directions_of_map(height)[..., 2:]) * np.array([0.8, 1.0, 1.2])
-    return _sky_of(picture) | {"phase": {"type": "isotropic"}, "bsdf": {"type": "dielectric"}}
+    image = (1 + 0.5 * map_directions(height)[..., 2:]) * np.array([0.8, 1.0, 1.2])
+    return _environment(image) | {"phase": {"type": "isotropic"}, "bsdf": {"type": "dielectric"}}
 
 
-def directions_of_map(height: int) -> np.ndarray:
-    """World directions (H, 2 H, 3) of the pixels of an environment map that :func:`_sky_of` places, z up."""
+def map_directions(height: int) -> np.ndarray:
+    """World directions (H, 2 H, 3) of the pixels of an environment map in :func:`_environment`, z up."""
     theta, phi = np.meshgrid((np.arange(height) + 0.5) / height * np.pi, np.arange(2 * height) / height * np.pi, indexing="ij")
     return np.stack([np.sin(theta) * np.sin(phi), np.sin(theta) * np.cos(phi), np.cos(theta)], axis=-1)
 
 
-def _sky_of(picture: np.ndarray) -> dict:
-    """An environment map (H, 2 H, 3). Mitsuba's maps have y up, the benches z."""
+def _environment(image: np.ndarray) -> dict:
+    """An environment map (H, 2 H, 3). Mitsuba's maps have y up, these scenes have z up."""
     turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
-    return {"emitter": {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "to_world": turned}}
+    return {"emitter": {"type": "envmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "to_world": turned}}
 
 
 def directional_light() -> dict:
@@ -169,7 +169,7 @@ def milky_glass() -> dict:
 
 
 def milk_in_a_glass() -> dict:
-    """The light of :func:`milky_glass`; liquid of the index of water in a glass, a twentieth of the box thick on each side."""
+    """The light of :func:`milky_glass`; a liquid with the index of water in a glass of a twentieth of the box on each side."""
     water, glass, air = 1.333, 1.5, 1.0
     wall = {"type": "dielectric", "int_ior": glass, "ext_ior": air}
     outside = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(1.1), "bsdf": wall}
@@ -177,8 +177,8 @@ def milk_in_a_glass() -> dict:
 
 
 def make_integrator(name: str, depth: int, hide_emitters: bool = False) -> mi.Integrator:
-    """That integrator with this ``max_depth``, made anew for each scene: ``prbvolpath`` keeps flags of the first scene it sees.
+    """An integrator with a ``max_depth``, to be made anew for each scene: ``prbvolpath`` keeps flags of its first scene.
 
-    Roulette begins at depth 64 for all, beyond which a path of an unlimited one hardly counts in scenes that absorb.
+    Russian roulette begins at depth 64 for all integrators. In absorbing scenes, paths beyond this depth hardly count.
     """
     return mi.load_dict({"type": name, "max_depth": depth, "rr_depth": 64, "hide_emitters": hide_emitters})

@@ -93,7 +93,7 @@ def test_levels_of_each_number_of_scatterings_take_more_noise(variant_rgb: str) 
     of them alone 0.73."""
     empty = np.broadcast_to(np.arange(5) < 2, NOISE.shape)
     made = Twin(np.where(empty, 0, NOISE), np.where(empty, 1.0, 0.0), SIDE, UNLIMITED[CONSTANT])
-    levels = made._choose_levels(3, 4096)
+    levels = made._choose_multiples(3, 4096)
     _, found, idle = made.paths(4, 4096)
     alone = np.cov(found, idle[0])
     left = alone[0, 0] - alone[0, 1] ** 2 / alone[1, 1]

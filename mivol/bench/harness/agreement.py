@@ -1,4 +1,4 @@
-"""Agreement of two noisy means: z, its bound by Student's t, and the smallest bias that the comparison would see.
+"""Agreement of two noisy means: z, its bound by Student's t, and the smallest visible bias.
 
 Conventions. Values are float64, one for each round; a round has its own seed. An error is the variance of a mean with the
 degrees of freedom of its estimate (:class:`mivol.validate.statistics.Estimate`). A time ratio of two methods is meaningless

@@ -1,4 +1,4 @@
-"""Measured figures beside their bars. A bar is the bound that the project promises for a figure."""
+"""Measured figures beside their bars. A bar is the promised bound of a figure."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ __all__ = ["AT_LEAST", "AT_MOST", "Bar", "find_disagreements", "judge", "judge_a
 
 AT_LEAST, AT_MOST = "at least", "at most"
 AGREEMENT = "|z|: "
-"""Prefix of the figures that :func:`judge_agreement` returns."""
+"""Prefix of the figures of :func:`judge_agreement`."""
 
 
 class Bar(TypedDict):
-    """A figure: its label, its value, the sense and value of its bound, and whether the value meets the bound."""
+    """A figure: label, value, sense and value of the bound, and whether the bound is met."""
 
     figure: str
     value: float
@@ -41,7 +41,7 @@ def judge(figure: str, value: float, sense: str, bar: float, quiet: bool = False
         value: measured value.
         sense: AT_LEAST or AT_MOST.
         bar: bound.
-        quiet: print only figures that miss their bar.
+        quiet: print only missed bars.
     """
     met = value >= bar if sense == AT_LEAST else value <= bar
     if not (quiet and met):
@@ -52,7 +52,7 @@ def judge(figure: str, value: float, sense: str, bar: float, quiet: bool = False
 def judge_agreement(label: str, z: float | None, bound: float) -> Bar:
     """Compare the difference of two means, in standard errors, with its bound; print only a difference above the bound.
 
-    Two different means without noise have no z (None) and miss every bound.
+    Different means without noise have no z (None) and miss every bound.
     """
     return judge(AGREEMENT + label, sys.float_info.max if z is None else abs(z), AT_MOST, bound, quiet=True)
 

@@ -64,7 +64,7 @@ class Contest:
         return np.array(self.timings[name, level].results, np.float64)
 
     def variances(self, name: str, level: int = 1) -> np.ndarray:
-        """Variance of one result, for each of its numbers."""
+        """Variance of one result, for each number."""
         return Moments.of(self.results(name, level)).variance
 
     def time_ratios(self, slow: str, fast: str) -> dict[str, float]:
@@ -87,7 +87,7 @@ def compete(
     Args:
         methods: by name; each has its own seeds.
         rounds: calls of each method and level, 99 at most.
-        seconds: processor time of one call, which decides its samples [s].
+        seconds: processor time of one call [s]; decides the number of samples.
         spp: samples per pixel of one call; 0: decided by ``seconds``.
         levels: divisors of the samples, for curves of error against time; the first is 1.
         seed: other values give independent results.

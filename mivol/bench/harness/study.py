@@ -1,4 +1,4 @@
-"""A study: its questions, the amount of work, its command line, and one JSON file with the machine and the versions."""
+"""A study: questions, amount of work, command line, and one JSON file with the machine and the versions."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def header(size: str, variant: str, load: float | None, start: float) -> dict:
 
 
 def mean_load() -> float | None:
-    """Mean number of runnable processes in the last minute; None on Windows, which does not count them."""
+    """Mean number of runnable processes in the last minute; None on Windows."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 

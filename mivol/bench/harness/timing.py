@@ -1,7 +1,7 @@
 """Seconds of calls on the device: contestants in rounds, warm calls apart from first calls.
 
-Conventions. A contestant takes the number of a round, makes its seed from the number, and returns Dr.Jit arrays that are not
-evaluated yet. The contestants of a question take turns within each round, in an order that changes from round to round, so
+Conventions. A contestant takes the number of a round, makes a seed from the number, and returns unevaluated Dr.Jit
+arrays. The contestants of a question take turns within each round, in an order that changes from round to round, so
 that other work on the machine slows all of them alike. Processor seconds are summed over all threads of the process; other
 work on the machine changes them less than it changes the wall clock.
 """
@@ -19,7 +19,7 @@ import numpy as np
 __all__ = ["Contestant", "Stopwatch", "Timing", "fastest", "peak_bytes", "race", "ratio_of", "time_call"]
 
 Contestant = Callable[[int], object]
-"""Number of the round (a seed) -> Dr.Jit arrays that are not evaluated yet."""
+"""Number of the round (a seed) -> unevaluated Dr.Jit arrays."""
 
 
 @dataclass

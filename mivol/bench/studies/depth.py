@@ -9,9 +9,9 @@ and directions, and returns the scattered radiance: S2 with ``max_depth`` 2, S w
 share at depth 2, e = 1 - S2 / S, with its standard error. Both renders use the same random numbers, so common noise cancels.
 Optical depth is E[tau^2] / E[tau] over the same lines; mivol/scene/depth_two.py explains why.
 
-Question ``beside`` tests the table elsewhere: in the smoke of the Mitsuba tutorial (or a made-up smoke, and the JSON says so)
-in both lights, and in the cube below a point light one edge above its top. The JSON also holds the table as source text for
-mivol/scene/depth_two.py.
+Question ``beside`` tests the table elsewhere: in the smoke of the Mitsuba tutorial (or a made-up smoke, and the JSON records
+this) in both lights, and in the cube below a point light one edge above its top. The JSON also holds the table as source text
+for mivol/scene/depth_two.py.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def set_medium(scene: mi.Scene, albedo: float, scale: float) -> None:
 
 
 def trace_lines(scene: mi.Scene, max_depth: int, n: int, seed: int) -> np.ndarray:
-    """Scattered radiance along n lines (n,). Russian roulette starts late: it adds more noise than it saves time."""
+    """Scattered radiance along n lines (n,). Russian roulette starts late, because the added noise outweighs the saved time."""
     tracer = mi.load_dict({"type": "volpath", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True})
     o, d, _ = draw_lines(UNIT_BOX, n, seed)
     ray = mi.Ray3f(mi.Point3f(np.ascontiguousarray((o - d).T, np.float32)), mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
@@ -194,7 +194,7 @@ def measure_beside(size: DepthSize) -> dict:
 
 
 def table_source(cells: list[Cell]) -> list[str]:
-    """Lines of mivol/scene/depth_two.py that hold the table."""
+    """Lines of the table in mivol/scene/depth_two.py."""
     lines = []
     for light, phase in TABLES:
         errors = {(c.albedo, c.tau): c.error for c in cells if (c.light, c.phase) == (light, phase)}

@@ -3,12 +3,12 @@
     mivol bench ladder              # 3 minutes on 2 idle cores
     mivol bench ladder --quick      # small sizes, for CI
 
-The smoke of the Mitsuba tutorial (or a made-up smoke, and the JSON says so) under a sky, in four models: absorption; absorption
-and emission; single scattering below a sun (albedo 0.75, HG 0.8, ``max_depth`` 2); multiple scattering (``max_depth`` 6). The
-grid is the same in all models, and gradients are with respect to its density. Mitsuba renders images by ``volpath`` and
-gradients of the mean of an image by ``prbvolpath``; Mitsuba 3.9 has no media that emit. Each method gets 1/16, 1/4 and all of
-the samples that take 0.8 s of processor time, in turns, in 8 rounds. The figure shows the error of a pixel over the mean
-radiance, and the error of a voxel with sigma_t >= 1 over the root mean square of the gradient.
+The smoke of the Mitsuba tutorial (or a made-up smoke, and the JSON records this) under a sky, in four models: absorption;
+absorption and emission; single scattering below a sun (albedo 0.75, HG 0.8, ``max_depth`` 2); multiple scattering
+(``max_depth`` 6). The grid is the same in all models, and gradients are with respect to its density. Mitsuba renders images by
+``volpath`` and gradients of the mean of an image by ``prbvolpath``; Mitsuba 3.9 has no media that emit. Each method gets 1/16,
+1/4 and all of the samples that take 0.8 s of processor time, in turns, in 8 rounds. The figure shows the error of a pixel over
+the mean radiance, and the error of a voxel with sigma_t >= 1 over the root mean square of the gradient.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Model:
         parts: makes the parts of the scene.
         albedo: albedo of the medium.
         depth: ``max_depth``.
-        emits: the medium has a source function of 1; Mitsuba has no such medium.
+        emits: the medium has a source function of 1; Mitsuba has no emitting medium.
     """
 
     parts: Callable[[], dict]
@@ -127,8 +127,8 @@ def error_figures(contest: Contest, counts: np.ndarray, scale: Callable[[np.ndar
 
     Args:
         contest: results of mivol and perhaps of a peer.
-        counts: mask of the numbers that count (n,).
-        scale: mean values that count -> scale of the errors.
+        counts: mask of the counted numbers (n,).
+        scale: counted mean values -> scale of the errors.
 
     Returns:
         Rows of each method, ``agreement`` and ``variance_x_time`` of a contest with a peer; and the mean of mivol (n,).

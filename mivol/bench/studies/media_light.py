@@ -5,7 +5,7 @@
 
 Three scenes with ``max_depth`` 3: two blobs of fire over a diffuse floor before a glossy wall; the same in fog; and a room that
 glows evenly, in which sampling would add noise. ``media_light`` is chosen by the plan ("auto") and compared with "met".
-Samples, rounds and variance x time are those of ``mivol bench single_scattering``, over the pixels that do not see the medium
+Samples, rounds and variance x time are as in ``mivol bench single_scattering``, over the pixels that do not see the medium
 itself (in the room, which fills the image, over all pixels).
 """
 
@@ -28,7 +28,7 @@ __all__ = ["BARS", "STUDY", "find_dark_pixels", "make_scene"]
 
 DEPTH = 3
 BARS = {"fire": 10, "fog": 10, "room": 0.8}
-"""Smallest ratio of variance x time, median over the pixels that count."""
+"""Smallest ratio of variance x time, median over the counted pixels."""
 
 FIRE, ROOM = ((-0.3, -0.3, 0.0), 0.6), ((-2.0, -2.0, -0.01), 4.0)
 """Low corner and edge of the cube that emits."""
@@ -76,7 +76,7 @@ def make_scene(name: str, side: int) -> mi.Scene:
 
 
 def find_dark_pixels(scene: mi.Scene) -> NDArray[np.bool_]:
-    """Pixels (H, W) that do not see the emitting medium; all pixels if each of them sees it."""
+    """Pixels (H, W) that do not see the emitting medium; all pixels if each pixel sees the medium."""
     image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "mivol", "max_depth": 1}), spp=64, seed=1))
     dark = image[..., :3].max(axis=-1) == 0
     return dark if dark.any() else np.full(dark.shape, True)

@@ -7,7 +7,7 @@
 The volumes fill [-1, 1]^3: the smoke of the Mitsuba tutorial at its density (x 40) and at a twentieth of this density, the
 smoke upsampled to 256^3, threads in 512^3, a cloud of a large-eddy simulation with an albedo of 0.999, a white box of optical
 depth 64, and milk in a glass. Other albedos are 0.75; ``max_depth`` is 6 or unlimited. Samples, rounds and variance x time are
-those of ``mivol bench single_scattering``. Bars are on the mean over pixels, and on the median for unlimited depth.
+as in ``mivol bench single_scattering``. Bars are on the mean over pixels, and on the median for unlimited depth.
 
 Errors of unlimited paths have heavy tails. There one render takes ``LONGER`` times as long, because the variance of few samples
 misses the tails, most of all for the method with the fewest samples: in the cloud the median ratio to ``volpath`` is 21 with 8

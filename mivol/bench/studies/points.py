@@ -8,7 +8,7 @@
 
 Clouds are random: means uniform in a unit cube, scales about a quarter of the mean distance, opacities by the logistic function
 of a normal variable, harmonics of degree 2. The camera sees the whole cube. The reference walk through the tutorial's smoke
-runs in turns with the clouds; "scaled" rates are those of a machine that walks 25 M rays per second.
+runs in turns with the clouds; "scaled" rates hold for a machine walking 25 M rays per second.
 
 The peer is Mitsuba's ``ellipsoids`` with ``volprim_rf_basic``, one ray per pixel. It sorts ellipsoids by the entry points of
 the ray and stops after 64 of them. The two images differ by the order, the ends of the ellipsoids (three standard deviations),
@@ -17,7 +17,7 @@ the low-pass filter, and the positions within the pixel.
 Question ``rays`` traces one ray per pixel through the same cloud, in turns with the peer: as emission of a medium
 (``mivol_gaussians``), composited in the order of the peaks, and as extinction of a medium before a white sky, without any
 sorting. The biker (152,746 Gaussians) comes from MIVOL_DATA (default ../shared/data). Without the data, a random cloud of the
-same size takes its place, and the JSON says so.
+same size takes its place, and the JSON records this.
 
 The fits of the chair of NeRF-synthetic are those of ``mivol optimize``. Minutes are those of the reference machine. Training
 and judged views are averaged over squares of pixels of the files; PSNR is the mean over views, over white. ``mip`` and

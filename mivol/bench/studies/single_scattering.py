@@ -35,7 +35,7 @@ Student's t with effective degrees of freedom (false alarm in one run in 1000), 
 meaningless. Sample rates are camera paths per second of a warm render.
 
 The figure shows error against time in the smoke and the ratios of all volumes. Data comes from MIVOL_DATA (default
-../shared/data). Without the data, made-up fields take its place, and the JSON says so.
+../shared/data). Without the data, made-up fields take its place, and the JSON records this.
 """
 
 from __future__ import annotations
@@ -118,12 +118,12 @@ class Light(NamedTuple):
 
     @property
     def average(self) -> str:
-        """Average over pixels that the bar is on."""
+        """Average over pixels for the bar."""
         return "median" if self.by_pixel else "mean"
 
     @property
     def ratio_key(self) -> str:
-        """Key of the figure that the bar is on."""
+        """Key of the judged figure."""
         return f"variance_x_time_{self.average}_over_pixels"
 
 
@@ -220,7 +220,7 @@ def emitter_distances(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
 
 
 def image_errors(contest: Contest, name: str, level: int, counts: np.ndarray) -> dict:
-    """Mean, variance, relative error and time of the images of one integrator, over the pixels that count."""
+    """Mean, variance, relative error and time of the images of one integrator, over the counted pixels."""
     m, spp = Moments.of(contest.results(name, level)), contest.spp[name, level]
     variance, mean = m.variance.mean(axis=-1)[counts], m.mean.mean(axis=-1)[counts]
     return {
@@ -235,7 +235,7 @@ def image_errors(contest: Contest, name: str, level: int, counts: np.ndarray) ->
 
 
 def gain_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray) -> dict:
-    """Ratios of times and of variance x time, over the pixels that count."""
+    """Ratios of times and of variance x time, over the counted pixels."""
     a, b = (contest.variances(name).mean(axis=-1)[counts] for name in (slow, fast))
     times = contest.time_ratios(slow, fast)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -247,7 +247,7 @@ def gain_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray) -> 
 
 
 def agreement_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray) -> dict:
-    """z of the means over the pixels that count, its bound, and the standard error relative to the mean of ``slow``."""
+    """z of the means over the counted pixels, its bound, and the standard error relative to the mean of ``slow``."""
     means = (mean_of_pixels(contest.results(name).mean(axis=-1)[:, counts]) for name in (fast, slow))
     agreement = compare_means(*means, len(VOLUMES) * len(LIGHTS) * len(PEERS))
     error = agreement["standard_error_percent"]

@@ -8,8 +8,8 @@ of 128 x 128 pixels by Mitsuba's path tracer, 15 of them held out, between the o
 runs/still_life/photographs if they are missing. Fits have 64 nodes along the longest edge, and a coarser stage before that.
 
 degree: one colour for all directions (harmonics of degree 0, with total variation or without, whichever is better) against
-degree 2, on the held-out views. few: degree 2 from 12 of the 60 views, with the total variation of density and colours that
-every fit has, against none, on the same held-out views. Each pair has the same rays, steps and rates. PSNR is that of
+degree 2, on the held-out views. few: degree 2 from 12 of the 60 views, with total variation of density and colours as in
+every fit, and without, on the same held-out views. Each pair has the same rays, steps and rates. PSNR is computed by
 mivol.validate.images, over white.
 """
 

@@ -75,7 +75,7 @@ def index_bytes(res: Sequence[int], cells: int, rows: int, bricks: int) -> int:
         res: nodes along the axes.
         cells: number of cells near a surface.
         rows: number of different rows at their corners.
-        bricks: number of bricks of 4^3 cells that hold such cells.
+        bricks: number of bricks of 4^3 cells with such cells.
     """
     nodes, all_bricks = math.prod(res), math.prod(-(-(n + 1) // 4) for n in res)
     return 8 * -(-nodes // 32) + 4 * all_bricks + 12 * bricks + 4 * 8 * cells + 4 * rows
@@ -155,7 +155,7 @@ def index_layout(kept: float) -> Layout:
 
 @dataclass(frozen=True)
 class FittedField:
-    """A fitted field: its memory [bytes], the size of its file [bytes], and its quality [dB]."""
+    """A fitted field: memory [bytes], size of the file [bytes], quality [dB]."""
 
     title: str
     longest: int

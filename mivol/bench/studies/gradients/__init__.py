@@ -15,11 +15,11 @@ smoke: the smoke of the Mitsuba tutorial at its density (x 40), in constant ligh
 gradients: of the mean of the image (a call of ``render_backward``), and of an L2 loss, the mean squared difference to the image
 of 0.7 of the density (a whole step: ``mi.render``, loss, ``dr.backward``). Both integrators get the samples that take the same
 processor time (a power of two per pixel) and run in turns, in 8 rounds with their own seeds. The study reports the sum over
-voxels of the variances over the 8 gradients, times the processor time: over the voxels with sigma_t >= 1 (the bars), over those
-between 0 and 1, and over those at 0. The last two ratios say little, because ``prbvolpath`` is biased there. Beside the ratio
-stands z: the difference of the derivatives along sigma_t itself, summed over the same voxels, in standard errors. If z exceeds
-its bound for sigma_t >= 1 (false alarm in one run in 1000, Student's t), the ratio is meaningless and the study ends with
-status 1.
+voxels of the variances over the 8 gradients, times the processor time: over the voxels with sigma_t >= 1 (the bars), over
+voxels between 0 and 1, and over voxels at 0. The last two ratios say little, because ``prbvolpath`` is biased there. Beside the
+ratio stands z: the difference of the derivatives along sigma_t itself, summed over the same voxels, in standard errors. If z
+exceeds its bound for sigma_t >= 1 (false alarm in one run in 1000, Student's t), the ratio is meaningless and the study ends
+with status 1.
 
 estimators: bias and variance of both integrators in four cases: density 0, half empty, thin, dense (16^3 voxels). The
 derivative of the mean of the image along a fixed direction in the space of voxels (thin, dense: the density itself; density 0:

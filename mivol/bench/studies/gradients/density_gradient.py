@@ -54,7 +54,7 @@ class Light:
         return make_integrator(name, self.depth, self.hidden)
 
     def gradients(self, values: np.ndarray, side: int) -> dict[str, DensityGradient]:
-        """The gradients of both integrators, each with its own scene."""
+        """The gradients of both integrators, with separate scenes."""
         return {name: DensityGradient(self.scene(values, side), self.integrator(name)) for name in INTEGRATORS}
 
 

@@ -10,7 +10,7 @@ reported apart: seconds in the compiler, or kernels found on disk (HOME=$(mktemp
 slow twin in float64 NumPy.
 
 The smoke of the Mitsuba tutorial and a CT scan come from MIVOL_DATA (default ../shared/data). Without the data, made-up fields
-of the same sizes take their place, and the JSON says so.
+of the same sizes take their place, and the JSON records this.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@
 
 The peer (:mod:`mivol.bench.studies.radiance_field.peer`) takes uniform steps through textures. Fields: a thin shell, a fog that
 fills the box, and a fitted scene (the chair of NeRF's synthetic scenes from MIVOL_DATA, fitted here for a minute; without the
-data, views of the shell, and the JSON says so). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
+data, views of the shell, and the JSON records this). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
 
 step: forward and backward, the same 65,536 rays for both, in turns; ratios of processor time, with those of the wall clock.
 Three kinds of rays: ``camera``, the pixels of one view; ``pixels``, random pixels of 8 views, as the loader of the tutorial
@@ -230,7 +230,7 @@ def measure_memory(size: RadianceSize) -> dict:
 
 
 def resident_bytes() -> int | None:
-    """Largest memory of this process so far; None on Windows, whose Python does not report it."""
+    """Largest memory of this process so far; None on Windows."""
     if sys.platform == "win32":
         return None
     import resource

@@ -1,11 +1,12 @@
-"""The peer of the radiance-field bench: the method of Mitsuba's tutorial, written afresh from its description.
+"""The peer of the study of radiance fields: the method of Mitsuba's tutorial, written from its description.
 
-A density (1 channel) and harmonics of degree 2 (27 channels) live in two ``mi.Texture3f`` over the unit cube. A ray takes steps
-of 1 / resolution from where it enters; at each, density = max(0, texture), colour = clip(sum of harmonics, 0, 1), opacity
-1 - exp(-density step). The second pass follows the ray again, subtracts what each step added from the radiance that is left,
-and lets Dr.Jit differentiate the step alone (path replay: Vicini et al. 2021). The fit: 4 stages of doubling resolution up to
-128^3, 105 steps each, in turns over 7 views of 256 x 256 pixels, all rays of a view a step, Adam with 0.05 for both grids, L1
-loss; start: density 0.01, coefficients 0.1. No step is skipped, no ray ends early unless nothing is left of it.
+A density (1 channel) and harmonics of degree 2 (27 channels) are two ``mi.Texture3f`` over the unit cube. A ray takes steps of
+1 / resolution from its entry point. At each step, density = max(0, texture), colour = clip(sum of harmonics, 0, 1), opacity =
+1 - exp(-density step). The second pass follows the ray again, subtracts the light of each step from the remaining radiance, and
+lets Dr.Jit differentiate the step alone (path replay: Vicini et al. 2021). The fit has 4 stages of doubling resolution up to
+128^3 with 105 steps each, in turns over 7 views of 256 x 256 pixels, all rays of a view in each step, Adam with a rate of 0.05
+for both grids, and an L1 loss; it starts from density 0.01 and coefficients 0.1. No step is skipped, and a ray ends early only
+at transmittance 0.
 """
 
 from __future__ import annotations
@@ -23,7 +24,12 @@ START_DENSITY, START_COEFFICIENT = 0.01, 0.1
 
 @dataclass
 class Peer:
-    """Two textures and a step."""
+    """A field in two textures.
+
+    Attributes:
+        density: (n, n, n, 1) [1/length].
+        harmonics: (n, n, n, 27).
+    """
 
     density: mi.TensorXf
     harmonics: mi.TensorXf
@@ -33,12 +39,12 @@ class Peer:
 
     @classmethod
     def start(cls, resolution: int) -> Peer:
-        """The tutorial's start."""
+        """The initial field of the tutorial."""
         made = [(START_DENSITY, 1), (START_COEFFICIENT, CHANNELS)]
         return cls(*(dr.full(mi.TensorXf, value, (*(resolution,) * 3, channels)) for value, channels in made))
 
     def textures(self) -> tuple[mi.Texture3f, mi.Texture3f]:
-        """The textures, which follow the tensors' derivatives."""
+        """Textures that propagate derivatives to the tensors."""
         how = {"wrap_mode": dr.WrapMode.Clamp, "use_accel": False, "migrate": False}
         return mi.Texture3f(self.density, **how), mi.Texture3f(self.harmonics, **how)
 
@@ -46,7 +52,7 @@ class Peer:
     def follow(
         self, textures: tuple, o: mi.Point3f, d: mi.Vector3f, left: mi.Color3f | None = None, by: mi.Color3f | None = None
     ) -> mi.Color3f:
-        """Radiance along rays of the unit cube, or, given it and a derivative with respect to it, their derivatives."""
+        """Radiance along rays of the unit cube; with ``left`` (the radiance) and ``by`` (its derivative), the reverse pass."""
         density, harmonics = textures
         primal = by is None
         box = mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])
@@ -85,7 +91,7 @@ class Peer:
             return self.follow(self.textures(), o, d)
 
     def backward(self, o: mi.Point3f, d: mi.Vector3f, radiance: mi.Color3f, by: mi.Color3f) -> tuple[mi.Float, mi.Float]:
-        """Derivatives of a scalar, from those with respect to the radiance."""
+        """Derivatives of a scalar by density and harmonics, from its derivative by the radiance."""
         for tensor in (self.density, self.harmonics):
             dr.enable_grad(tensor)
             dr.set_grad(tensor, 0)
@@ -97,7 +103,7 @@ class Peer:
         return slopes
 
     def fit(self, views: list[tuple[mi.Point3f, mi.Vector3f, mi.Color3f]], steps: int) -> Iterator[None]:
-        """Take steps, one view each; yields after each."""
+        """Take steps with one view each; yields after each step."""
         adam = mi.ad.Adam(lr=LEARNING_RATE)
         adam["density"], adam["harmonics"] = self.density, self.harmonics
         for step in range(steps):
@@ -112,6 +118,6 @@ class Peer:
             yield
 
     def refined(self) -> Peer:
-        """The next stage: twice the resolution."""
+        """The field of the next stage, with twice the resolution."""
         n = 2 * self.resolution
         return Peer(*(dr.resample(t, (n, n, n, t.shape[3]), filter="linear") for t in (self.density, self.harmonics)))

@@ -82,7 +82,7 @@ def make_photos(count: int, size: tuple[int, int]) -> list[Photo]:
 
 
 def make_points(cameras: list[Camera], rng: np.random.Generator) -> tuple[NDArray, NDArray]:
-    """Points (N, 3) [length], and the cameras that find them (V, N)."""
+    """Points (N, 3) [length], and their finding cameras (V, N)."""
     hits = []
     for camera in cameras:
         o, d = rays(camera, rng.uniform(0, camera.size, (PIXELS, 2)))

@@ -78,7 +78,7 @@ def measure_trials(size: RandomSize) -> dict:
 
 
 def try_scene(seed: int, size: RandomSize) -> dict:
-    """Compare one scene: its largest z over the bound and its pixels that are no radiance, or the reason of a refusal."""
+    """Compare one scene: the largest z over the bound and the pixels without a valid radiance, or the reason of a refusal."""
     scene = draw_scene(seed)
     answer: dict = {"features": scene.features}
     try:
@@ -107,7 +107,7 @@ def quarter_means(images: np.ndarray) -> np.ndarray:
 
 
 def render_rounds(drawn: RandomScene, name: str, rounds: int, spp: int) -> np.ndarray:
-    """Images (rounds, height, width, 3) by one integrator, each with its own seed."""
+    """Images (rounds, height, width, 3) by one integrator, with separate seeds."""
     scene = mi.load_dict(drawn.parts)
     integrator = mi.load_dict({"type": name, **drawn.settings})
     first = 1000 if name == "mivol" else 5000
@@ -123,7 +123,7 @@ def _constant_box(sigma_t: float, albedo: float, light: dict, res: int = 4) -> d
 
 
 def _rgb_box() -> dict:
-    """Extinctions of three colours at ratios of 10,000; one of them is 0 in half of the box."""
+    """Extinctions of three colours at ratios of 10,000; red is 0 in half of the box."""
     values = np.random.default_rng(1).uniform(0, 1, (8, 8, 8, 3)) * np.array([4.0, 4e-4, 40.0])
     values[:4, ..., 0] = 0
     scene = box_scene(np.zeros((2, 2, 2), np.float32), HARD_SIDE, 0.99, **emitter_inside())
@@ -176,7 +176,7 @@ def measure_hard(size: RandomSize) -> dict:
 
 
 def compare(question: str, answer: dict) -> list[Bar]:
-    """Judge refusals, pixels that are no radiance, and every z."""
+    """Judge refusals, pixels without a valid radiance, and every z."""
     if question == "hard":
         faults = {f"samples that are no radiance: {name}": f["not_finite"] + f["negative"] for name, f in answer.items()}
         return [judge(label, count, AT_MOST, 0, quiet=True) for label, count in faults.items()]

@@ -1,7 +1,8 @@
-"""Random scenes with media that Mitsuba renders rightly: what bounds and fills them, what lights them, how far light may go.
+"""Random scenes with media that Mitsuba renders correctly: boundaries, media, surfaces, emitters, a camera and a depth.
 
-A seed decides everything. An rgb extinction is judged by the grey scenes of its channels, since ``heterogeneous`` follows one
-grey majorant; each grid fills the box of its boundary, since Mitsuba's volumes go on outside theirs; emitters are not hidden.
+The seed decides everything. Scenes avoid known errors of Mitsuba. ``heterogeneous`` has one grey majorant, so an rgb extinction
+is compared with the grey scenes of its channels. Mitsuba's volumes continue outside their box, so each grid fills the box of
+its boundary. Emitters are not hidden.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ import numpy as np
 __all__ = ["RandomScene", "draw_scene"]
 
 SIDE = 12
-"""Of the picture [pixels]."""
+"""Edge of the image [pixels]."""
 
 DEPTHS = (2, 3, 4, 6, 12, -1)
 
 
 @dataclass
 class RandomScene:
-    """A scene that was drawn.
+    """A random scene.
 
     Attributes:
-        parts: for ``mi.load_dict``.
-        settings: of the integrators, ``max_depth`` and ``rr_depth``.
-        features: what is in it, in words.
-        is_rgb: some extinction has a value for each colour.
+        parts: dictionary for ``mi.load_dict``.
+        settings: ``max_depth`` and ``rr_depth`` of the integrators.
+        features: names of the parts.
+        is_rgb: an extinction has a value for each colour.
     """
 
     parts: dict
@@ -39,13 +40,13 @@ class RandomScene:
 
 @dataclass
 class _Draw:
-    """What is drawn so far.
+    """A scene in the making.
 
     Attributes:
-        rng: of all numbers.
-        channel: the one that rgb extinctions are reduced to; None for all three.
-        features: in words.
-        is_rgb: some extinction had three.
+        rng: source of all random numbers.
+        channel: channel of rgb extinctions; None: all three.
+        features: names of the parts so far.
+        is_rgb: an extinction has three channels.
     """
 
     rng: np.random.Generator
@@ -54,22 +55,22 @@ class _Draw:
     is_rgb: bool = False
 
     def one_of(self, kinds: dict[str, float]) -> str:
-        """A kind in proportion to its weight, remembered as a feature."""
+        """Draw a kind in proportion to its weight, and add it to the features."""
         names, weights = list(kinds), np.array(list(kinds.values()))
         name = names[self.rng.choice(len(names), p=weights / weights.sum())]
         self.features.append(name)
         return name
 
     def number(self, low: float, high: float) -> float:
-        """A uniform number."""
+        """Draw a uniform number."""
         return float(self.rng.uniform(low, high))
 
     def chance(self, p: float) -> bool:
-        """Whether something of this probability happens."""
+        """Draw an event of probability ``p``."""
         return bool(self.rng.uniform() < p)
 
     def colour(self, low: float, high: float) -> dict:
-        """A uniform colour."""
+        """Draw a uniform colour."""
         return {"type": "rgb", "value": [self.number(low, high) for _ in range(3)]}
 
 
@@ -78,7 +79,7 @@ def draw_scene(seed: int, channel: int | None = None) -> RandomScene:
 
     Args:
         seed: decides everything.
-        channel: reduces rgb extinctions to this one of theirs; None leaves all three.
+        channel: keep only this channel of rgb extinctions; None: keep all three.
     """
     draw = _Draw(np.random.default_rng(seed), channel)
     parts: dict = {"type": "scene"}
@@ -96,7 +97,7 @@ def draw_scene(seed: int, channel: int | None = None) -> RandomScene:
 
 
 def _bodies(draw: _Draw) -> dict:
-    """One body, or two side by side, or one inside the other."""
+    """Draw one body, two side by side, or one inside the other."""
     kind = draw.one_of({"one body": 0.65, "side by side": 0.2, "nested": 0.15})
     first = _body(draw, [-0.9 if kind == "side by side" else 0.0, 0, 0], draw.number(0.7, 1.1), "m1")
     if kind == "one body":
@@ -105,12 +106,12 @@ def _bodies(draw: _Draw) -> dict:
         return {"body": first, "other": _body(draw, [1.6, 0, 0], draw.number(0.5, 0.7), "m2")}
     inner = _body(draw, [0.05, -0.1, 0.02], 0.3, "m2")
     inner["exterior"] = {"type": "ref", "id": "m1"}
-    # A reference is found where what it names has been loaded before.
+    # Mitsuba resolves a reference only to an object that it has loaded before.
     return {"a": first, "b": inner}
 
 
 def _body(draw: _Draw, centre: list[float], size: float, name: str) -> dict:
-    """A closed shape with a medium in it."""
+    """Draw a closed shape with a medium."""
     place = mi.ScalarTransform4f().translate(centre)
     if draw.one_of({"cube": 0.6, "sphere": 0.4}) == "cube":
         axis = draw.rng.normal(size=3)
@@ -202,7 +203,7 @@ def _surfaces(draw: _Draw) -> dict:
 
 
 def _emitters(draw: _Draw) -> dict:
-    """A faint sky, so that no scene is black, and one or two emitters."""
+    """Draw one or two emitters, and add a faint sky to scenes without a sky, which could be black."""
     parts: dict = {}
     for k in range(1 if draw.chance(0.6) else 2):
         kind = draw.one_of({name: 1.0 for name in EMITTERS if name not in SKIES or not SKIES & set(draw.features)})
@@ -213,13 +214,13 @@ def _emitters(draw: _Draw) -> dict:
 
 
 def _direction(draw: _Draw) -> np.ndarray:
-    """From somewhere above."""
+    """Draw a direction, mostly upwards."""
     d = draw.rng.normal(size=3) * [1, 1, 0.5] + [0, 0, 1.2]
     return d / np.linalg.norm(d)
 
 
 def _from(draw: _Draw, distance: float) -> mi.ScalarTransform4f:
-    """A place at a distance that looks at the middle."""
+    """Draw a position at a distance, aimed at the centre."""
     origin = (distance * _direction(draw)).tolist()
     return mi.ScalarTransform4f().look_at(origin=origin, target=[0, 0, 0], up=[0.1, 0.9, 0.2])
 
@@ -250,7 +251,7 @@ EMITTERS: dict[str, Callable[[_Draw], dict]] = {
 }  # fmt: skip
 
 SKIES = {"constant", "envmap"}
-"""A scene has one environment at most."""
+"""Emitters of which a scene has one at most."""
 
 
 def _camera(draw: _Draw, parts: dict) -> dict:
@@ -262,7 +263,7 @@ def _camera(draw: _Draw, parts: dict) -> dict:
         "film": {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
         "sampler": {"type": "independent"},
     }
-    # Among nested bodies the place could lie in the inner one, while the sensor names the outer.
+    # For nested bodies the position could lie in the inner body, but the sensor names the outer one.
     if body["bsdf"]["type"] == "null" and draw.chance(0.15) and "b" not in parts:
         draw.features.append("camera inside")
         origin = [0.02, -0.35, 0.05] if "other" not in parts else [-0.9, -0.2, 0.05]

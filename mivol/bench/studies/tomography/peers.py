@@ -172,7 +172,7 @@ PEERS: dict[str, tuple[str, Callable[[Slice], dict[str, Curve]]]] = {
     "astra-toolbox": ("astra", run_astra),
     "scikit-image": ("skimage", run_scikit_image),
 }
-"""Package -> its module, and its methods."""
+"""Package -> module and methods."""
 
 
 # -- Questions --------------------------------------------------------------------------------------------------------------

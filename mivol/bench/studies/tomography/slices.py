@@ -33,7 +33,7 @@ __all__ = ["MeasuredSlice", "Slice", "centre_axis", "load_tooth", "make_slice"]
 
 @dataclass(frozen=True)
 class Slice:
-    """One slice and its projections.
+    """A slice and its projections.
 
     Attributes:
         beam, grid: geometry; lengths in voxels.
