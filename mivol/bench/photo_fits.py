@@ -1,7 +1,7 @@
 """Fits of photographs as ``mivol optimize`` makes them: quality of held-out views, time on the reference machine, memory.
 
 Conventions. Times are processor time, converted to seconds of the machine of :mod:`mivol.bench.reference_walk`. The walk is
-timed before and after each fit. Memory is what Dr.Jit holds at most, without the photographs. Views are judged over white.
+timed before and after each fit. Memory is the largest memory of Dr.Jit, without the photographs. Views are judged over white.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from mivol import config
 from mivol.bench.extinctions import CHECKOUT, DATA
 from mivol.bench.harness.bars import say
+from mivol.bench.harness.study import Size, amount
 from mivol.bench.harness.timing import Stopwatch
 from mivol.bench.reference_walk import measure_walk_rate, reference_seconds
 from mivol.errors import MivolError
@@ -34,7 +35,16 @@ from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Photo, Photos, rectify
 from mivol.validate import images
 
-__all__ = ["PhotoFit", "PhotoProblem", "find_data", "find_photographs", "fit_photographs", "load_photographer", "prepare_fit"]
+__all__ = [
+    "PhotoFit",
+    "PhotoProblem",
+    "PhotoSize",
+    "find_data",
+    "find_photographs",
+    "fit_photographs",
+    "load_photographer",
+    "prepare_fit",
+]
 
 SCRIPT = CHECKOUT / "scenes" / "still_life" / "photographs.py"
 
@@ -65,13 +75,23 @@ def find_data(name: str) -> Path:
     return folder
 
 
-def find_photographs(name: str, folder: Path, views: int, side: int, spp: int) -> Path | None:
-    """Folder of a data set: the chair from MIVOL_DATA, or rendered photographs of another scene.
+@dataclass(frozen=True)
+class PhotoSize(Size):
+    """Amount of work of fits of photographs."""
+
+    photo_folder: str = amount("runs/photographs", "runs/quick_photographs", "folder of rendered photographs")
+    photo_views: int = amount(75, 15, "number of rendered photographs")
+    photo_side: int = amount(200, 48, "edge of rendered photographs [pixels]")
+    photo_spp: int = amount(32, 2, "samples per pixel of rendered photographs")
+    walk_side: int = amount(1024, 64, "the reference walk has the square of this number of rays")
+
+
+def find_photographs(name: str, size: PhotoSize) -> Path | None:
+    """Folder of a data set: the chair from MIVOL_DATA, or photographs of another scene, rendered if they are missing.
 
     Args:
         name: "chair", or a scene of the still life's script.
-        folder: folder of rendered data sets; missing photographs are rendered.
-        views, side, spp: number of rendered photographs, their edge [pixels], samples per pixel.
+        size: folder, number, edge and samples of rendered photographs.
 
     Returns:
         The folder; None if the chair is missing, which is printed.
@@ -81,8 +101,9 @@ def find_photographs(name: str, folder: Path, views: int, side: int, spp: int) -
             return DATA / "multiview" / name
         say(f"  {name}: left out, its data is missing (MIVOL_DATA names the folder)")
         return None
-    load_photographer().make(folder / name, views, side, spp, name)
-    return folder / name
+    folder = Path(size.photo_folder) / name
+    load_photographer().make(folder, size.photo_views, size.photo_side, size.photo_spp, name)
+    return folder
 
 
 @dataclass(frozen=True)

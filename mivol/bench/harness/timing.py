@@ -2,7 +2,7 @@
 
 Conventions. A contestant takes the number of a round, makes a seed from the number, and returns unevaluated Dr.Jit
 arrays. The contestants of a question take turns within each round, in an order that changes from round to round, so
-that other work on the machine slows all of them alike. Processor seconds are summed over all threads of the process; other
+that other work on the machine slows all contestants alike. Processor seconds are summed over all threads of the process; other
 work on the machine changes them less than it changes the wall clock.
 """
 

@@ -1,4 +1,4 @@
-"""Light of media that emit: how much sooner does mivol reach an error if it samples this light, not finds it by chance?
+"""Light of emitting media: how much sooner does mivol reach an error by sampling this light than by hitting it by chance?
 
     mivol bench media_light             # a minute on 2 idle cores
     mivol bench media_light --quick     # small sizes: are the means the same?

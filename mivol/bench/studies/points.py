@@ -19,7 +19,7 @@ Question ``rays`` traces one ray per pixel through the same cloud, in turns with
 sorting. The biker (152,746 Gaussians) comes from MIVOL_DATA (default ../shared/data). Without the data, a random cloud of the
 same size takes its place, and the JSON records this.
 
-The fits of the chair of NeRF-synthetic are those of ``mivol optimize``. Minutes are those of the reference machine. Training
+Photographs of the chair (NeRF-synthetic) are fitted as by ``mivol optimize``. Minutes hold for the reference machine. Training
 and judged views are averaged over squares of pixels of the files; PSNR is the mean over views, over white. ``mip`` and
 ``exposure`` compare pairs of fits with the same photographs, steps, rates and seed. At each size the image has the low-pass
 filter of its own pixels, compensated if the fit was compensated.

@@ -5,9 +5,9 @@
 
 The photographs of the still life (200 x 200 pixels; missing photographs are rendered to runs/photographs) and of the chair
 (same size, from MIVOL_DATA, default ../shared/data) are fitted as ``mivol optimize`` does with the settings of the presets. The
-test views judge the fits, over white. Minutes and pixels per second are those of a machine that walks 25 M rays per second
-through the tutorial's smoke. Memory is what Dr.Jit holds at most, without the photographs. A view of a grid is that of a
-pinhole, one ray per pixel; a view of Gaussians is splatted.
+test views judge the fits, over white. Minutes and pixels per second hold for a machine walking 25 M rays per second through the
+tutorial's smoke. Memory is the largest memory of Dr.Jit, without the photographs. A grid is rendered with one ray per pixel;
+Gaussians are splatted.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from matplotlib.ticker import MaxNLocator
 
 from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.figures import new_figure, show_images
-from mivol.bench.harness.study import Size, Study, amount, ask
+from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.harness.timing import Stopwatch
-from mivol.bench.photo_fits import find_photographs, fit_photographs, prepare_fit
+from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs, prepare_fit
 from mivol.bench.reference_walk import REFERENCE_RATE
 from mivol.experiments import field_fit
 from mivol.optim.photographs.radiance_problem import RadianceProblem
@@ -34,23 +34,18 @@ __all__ = ["STUDY", "RepresentationSize"]
 
 
 @dataclass(frozen=True)
-class RepresentationSize(Size):
+class RepresentationSize(PhotoSize):
     """Amount of work."""
 
     edge: int = amount(200, 48, "longest edge of photographs and views [pixels]")
     grids: tuple[int, ...] = amount((64, 128), (16,), "nodes along the longest edge of the grids")
     gaussians: tuple[str, ...] = amount(("minute", "minutes"), ("minute",), "presets of the fits of Gaussians")
     effort: float = amount(1.0, 0.02, "factor on the steps of the presets")
-    photo_folder: str = amount("runs/photographs", "runs/quick_photographs", "folder of rendered photographs")
-    photo_views: int = amount(75, 15, "number of rendered photographs")
-    photo_side: int = amount(200, 48, "edge of rendered photographs [pixels]")
-    photo_spp: int = amount(32, 2, "samples per pixel of rendered photographs")
-    walk_side: int = amount(1024, 64, "the reference walk has the square of this number of rays")
 
 
 def measure(name: str, size: RepresentationSize) -> dict:
     """Fit the photographs of a data set as grids and as Gaussians."""
-    folder = find_photographs(name, Path(size.photo_folder), size.photo_views, size.photo_side, size.photo_spp)
+    folder = find_photographs(name, size)
     if folder is None:
         return {}
     fits = {f"grid, {n} nodes": {"field": {"longest": n, "effort": size.effort}} for n in size.grids}

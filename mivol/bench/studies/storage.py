@@ -118,7 +118,7 @@ class Layout:
 
 
 def ball_shell(share: float) -> np.ndarray:
-    """Mask (BALL_RES,)^3 of the share of all nodes that is suggest_name to the surface of a ball."""
+    """Mask (BALL_RES,)^3 of the nodes nearest to the surface of a ball; ``share``: their share of all nodes."""
     axis = (np.arange(BALL_RES) + 0.5) / BALL_RES - 0.5
     distance = np.abs(np.sqrt(axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2) - 0.35)
     return distance < np.quantile(distance, min(share, 1.0))

@@ -49,7 +49,7 @@ from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, say_row
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import Study, amount
 from mivol.bench.harness.timing import Stopwatch, peak_bytes, race, ratio_of
-from mivol.bench.photo_fits import find_photographs, fit_photographs, prepare_fit
+from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs, prepare_fit
 from mivol.bench.studies.radiance_field.fields import (
     STOP,
     load_field,
@@ -108,7 +108,7 @@ ALL_FITS = (
 
 
 @dataclass(frozen=True)
-class RadianceSize(PriorSize):
+class RadianceSize(PriorSize, PhotoSize):
     """Amount of work."""
 
     side: int = amount(256, 64, "edge of images whose rays are timed [pixels]")
@@ -116,11 +116,6 @@ class RadianceSize(PriorSize):
     photo_fits: tuple[PhotoFit, ...] = amount(
         ALL_FITS, (PhotoFit("chair", 32, 0.03), PhotoFit("wires", 32, 0.03)), "fits", tuple
     )
-    photo_folder: str = amount("runs/photographs", "runs/quick_photographs", "folder of rendered photographs")
-    photo_views: int = amount(75, 15, "number of rendered photographs")
-    photo_side: int = amount(200, 48, "edge of rendered photographs [pixels]")
-    photo_spp: int = amount(32, 2, "samples per pixel of rendered photographs")
-    walk_side: int = amount(1024, 64, "the reference walk has the square of this number of rays")
 
 
 # -- Steps ------------------------------------------------------------------------------------------------------------------
@@ -254,7 +249,7 @@ def measure_photographs(size: RadianceSize) -> dict:
     """How good are held-out views, after how long, and how much memory does a fit hold?"""
     answer = {}
     for wanted in size.photo_fits:
-        folder = find_photographs(wanted.name, Path(size.photo_folder), size.photo_views, size.photo_side, size.photo_spp)
+        folder = find_photographs(wanted.name, size)
         if folder is not None:
             answer[str(wanted)] = figures = fit_and_judge(folder, wanted, size)
             say_row(str(wanted), **{key: figures[key] for key in ("psnr", "seconds", "held_gib")})

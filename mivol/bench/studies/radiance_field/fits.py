@@ -163,7 +163,7 @@ def peer_steps(peers: list[Peer], views: list, steps: int) -> Iterator[None]:
 
 
 def measure_fit(size: FieldSize) -> dict:
-    """How long until held-out views are as good as those of the peer?"""
+    """How long until the PSNR of held-out views reaches the best PSNR of the peer?"""
     answer = {}
     for name in size.fields:
         field, origin = load_field(name, size)

@@ -99,8 +99,8 @@ def is_visible(camera: Camera, points: NDArray) -> NDArray:
     at, depth = project(camera, points)
     away = points - camera.origin
     distance = np.linalg.norm(away, axis=1)
-    suggest_name = hit_distance(np.broadcast_to(camera.origin, away.shape), away / distance[:, None])
-    return (depth > 0) & ((at >= 0) & (at <= camera.size)).all(axis=1) & (np.abs(suggest_name - distance) < 1e-3 * distance)
+    nearest = hit_distance(np.broadcast_to(camera.origin, away.shape), away / distance[:, None])
+    return (depth > 0) & ((at >= 0) & (at <= camera.size)).all(axis=1) & (np.abs(nearest - distance) < 1e-3 * distance)
 
 
 def triangulate(points: NDArray, finds: NDArray, cameras: list[Camera], rng: np.random.Generator) -> NDArray:
