@@ -1,4 +1,4 @@
-"""The bench of depth 2: it measures the table of mivol.scene.depth_two again, and says how sure it is."""
+"""Study of depth 2: it measures the table of mivol.scene.depth_two again, with its standard error."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def test_standard_error_of_a_ratio() -> None:
     rng = np.random.default_rng(fresh(0))
     every = rng.exponential(1.0, (2000, 400))
     once = 0.6 * every * rng.random((2000, 400))
-    found = [study.missing_share(a, b) for a, b in zip(once, every, strict=True)]
-    errors, said = np.array(found).T
+    result = [study.missing_share(a, b) for a, b in zip(once, every, strict=True)]
+    errors, standard_errors = np.array(result).T
     assert_same_mean(Moments.of(errors), 0.7, rounding=1e-3, what="ratios")
-    assert_same_variance(errors, np.mean(said**2), what="ratios")
+    assert_same_variance(errors, np.mean(standard_errors**2), what="ratios")
 
 
 def test_the_table_is_printed_as_the_module_holds_it() -> None:

@@ -1,4 +1,4 @@
-"""Figures of panels are written when their block ends; axes of ratios have plain numbers."""
+"""Figures are written when their block ends; axes of ratios have plain numbers."""
 
 from __future__ import annotations
 

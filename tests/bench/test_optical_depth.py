@@ -1,4 +1,4 @@
-"""The bench of optical depths: its contestants compute the same, and its errors, which no machine moves, are within their bars.
+"""Study of optical depths: its contestants compute the same, and its errors, which no machine moves, are within their bars.
 
 Everything runs in this process at sizes of a few hundred rays; times are looked at by nobody.
 """
@@ -142,14 +142,14 @@ def test_rays_of_a_pixel_go_through_its_parts(variant_rgb: str) -> None:
 
 def test_a_gradient_step_derives_the_sum_of_squares(variant_rgb: str) -> None:
     values = mi.TensorXf([1.0, -2.0, 4.0])
-    found = gradient_step(values, lambda v: 3 * v.array)
-    assert np.array(found).tolist() == [18.0, -36.0, 72.0] and not dr.grad_enabled(values)
+    result = gradient_step(values, lambda v: 3 * v.array)
+    assert np.array(result).tolist() == [18.0, -36.0, 72.0] and not dr.grad_enabled(values)
 
 
 def test_errors_of_optical_depths_by_hand(variant_rgb: str) -> None:
     """Over the measure where there is one; where nothing is the optical depth itself."""
-    found = tau_errors(mi.Float(1.0, 2.5, 3.0, 0.25), np.array([1.0, 2.0, 4.0, 0.0]), np.array([1.0, 2.0, 4.0, 0.0]))
-    assert found == pytest.approx({
+    result = tau_errors(mi.Float(1.0, 2.5, 3.0, 0.25), np.array([1.0, 2.0, 4.0, 0.0]), np.array([1.0, 2.0, 4.0, 0.0]))
+    assert result == pytest.approx({
         "rays": 3, "largest_error": 0.25, "rms_error": math.sqrt((0.25**2 + 0.25**2) / 3),
         "error_of_99.9_percent": 0.25, "error_where_exactly_empty": 0.25,
     })  # fmt: skip
@@ -171,8 +171,8 @@ def test_rays_across_the_box() -> None:
     d[:, :6] = np.eye(3)[:, [0, 0, 1, 1, 2, 2]]
     d /= np.linalg.norm(d, axis=0)
     o = rng.uniform(-1, 1, (3, n)) - rng.uniform(2, 8, n) * d
-    found = rays_across(np.random.default_rng(3), n)
-    assert np.array_equal(found[0], np.float32(o)) and np.array_equal(found[1], np.float32(d))
+    result = rays_across(np.random.default_rng(3), n)
+    assert np.array_equal(result[0], np.float32(o)) and np.array_equal(result[1], np.float32(d))
 
 
 def test_rays_are_spread_over_all(variant_rgb: str) -> None:
@@ -181,8 +181,8 @@ def test_rays_are_spread_over_all(variant_rgb: str) -> None:
     rays = GridRays(np.ones((2, 2, 2), np.float32), mi.Point3f(numbers), mi.Vector3f(-numbers))
     assert rays.n == 10 and rays.tensor.shape == (2, 2, 2, 1)
     for count, index in ((4, [0, 3, 6, 9]), (20, list(range(10)))):
-        found, o, d = rays.select(count)
-        assert found.tolist() == index and o.dtype == d.dtype == np.float64
+        result, o, d = rays.select(count)
+        assert result.tolist() == index and o.dtype == d.dtype == np.float64
         assert np.array_equal(o, numbers.T[index]) and np.array_equal(d, -numbers.T[index])
 
 
@@ -204,11 +204,11 @@ def test_the_transpose_is_that_of_the_walk(variant_rgb: str, monkeypatch: pytest
     assert answer["reverse"]["rays_per_second_median"] == 32 and "forward over forward" not in answer
     tau, lengths = np.array(caught["forward"](0)), np.array(caught["reverse"](0)).ravel()
     assert tau.sum() == pytest.approx((lengths * values.ravel()).sum(), rel=1e-4)
-    ours, theirs = (np.array(caught[name](0)) for name in names[1:])
+    mivol, peer = (np.array(caught[name](0)) for name in names[1:])
     # d sum tau^2: along the values themselves twice the sum.
-    assert (ours.ravel() * values.ravel()).sum() == pytest.approx(2 * (tau.astype(float) ** 2).sum(), rel=1e-4)
+    assert (mivol.ravel() * values.ravel()).sum() == pytest.approx(2 * (tau.astype(float) ** 2).sum(), rel=1e-4)
     padded_values = np.pad(values, 1, mode="edge").ravel()
-    assert (theirs.ravel() * padded_values).sum() == pytest.approx(2 * (tau.astype(float) ** 2).sum(), rel=1e-3)
+    assert (peer.ravel() * padded_values).sum() == pytest.approx(2 * (tau.astype(float) ** 2).sum(), rel=1e-3)
 
 
 @pytest.mark.slow

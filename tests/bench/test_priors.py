@@ -1,4 +1,4 @@
-"""The bench of priors: what it fits, what a gain is, and which photographs a fold holds out."""
+"""Study of priors: the small plan, the gain of a prior, and the photographs of a fold."""
 
 from __future__ import annotations
 
@@ -67,16 +67,16 @@ def test_a_fold_is_judged_by_what_it_holds_out(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_room_is_read_as_a_model_of_colmap() -> None:
     """Photographs of 8 bits and cameras as they were traced; every point is found by the photographs that its track names."""
-    found = load_captures(SIZE)["room"]
-    assert len(found.views) == 25 and found.views[0].image.shape == (12, 16, 3)
+    result = load_captures(SIZE)["room"]
+    assert len(result.views) == 25 and result.views[0].image.shape == (12, 16, 3)
     traced = {camera.name: camera for camera in make_cameras(25, (16, 12))}
-    for view in found.views:
+    for view in result.views:
         camera = traced[view.name]
         np.testing.assert_allclose(view.camera.to_world, camera.to_world, atol=1e-12)
         np.testing.assert_allclose(view.image, trace_image(camera), atol=0.51 / 255)
-    places, by = make_points([traced[view.name] for view in found.views], np.random.default_rng(11))
-    np.testing.assert_array_equal(found.survey.points, places)
-    for view, own in zip(found.views, by, strict=True):
+    places, by = make_points([traced[view.name] for view in result.views], np.random.default_rng(11))
+    np.testing.assert_array_equal(result.survey.points, places)
+    for view, own in zip(result.views, by, strict=True):
         np.testing.assert_array_equal(view.points, places[own])
 
 

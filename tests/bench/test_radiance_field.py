@@ -1,4 +1,4 @@
-"""The bench of radiance fields: the peer computes the same light and derivatives, so its ratios compare the same work."""
+"""Study of radiance fields: the peer computes the same light and derivatives, so its ratios compare the same work."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ def test_the_peer_sees_the_same_and_derives_the_same(variant_rgb: str) -> None:
     field = type(field).from_dense(density, sh * np.float32(0.3), field.to_world)
     task = make_tasks(RadianceSize.quick())["camera"]
     cells, peer = find_occupied_cells(field), to_peer(field)
-    seen = render_rays(cells, bake(field, cells, task.pinholes, mi.UInt32(0)), make_model(field), task.rays)
-    ours = np.array(seen.colour)
+    image = render_rays(cells, bake(field, cells, task.pinholes, mi.UInt32(0)), make_model(field), task.rays)
+    mivol = np.array(image.colour)
     theirs = np.array(peer.render(mi.Point3f((task.rays.o + 1) * 0.5), task.rays.d))
     # The peer's last step reaches up to a whole one behind the box: an optical depth of 1.5 * 2 / 32 too much.
-    assert np.abs(ours - theirs).max() < 1.5 * 2 / 32
-    assert np.abs(ours - theirs).mean() < 0.02 * ours.max()
-    assert ours.max() > 0.2
+    assert np.abs(mivol - theirs).max() < 1.5 * 2 / 32
+    assert np.abs(mivol - theirs).mean() < 0.02 * mivol.max()
+    assert mivol.max() > 0.2
     slopes = [[np.array(a) for a in step(0)] for step in (mivol_step(field, task), peer_step(peer, task))]
     # The longer way again, twice over: the derivative is of a square.
     density = slopes[0][0], slopes[1][0] * 2  # the peer's lengths are half of ours
@@ -78,9 +78,9 @@ def test_the_peer_takes_a_step_for_each_cell(variant_rgb: str) -> None:
     """Along an axis, where the last step ends on the far face exactly: an optical depth of 0.5 in each of four cells."""
     density, harmonics = np.full((4, 4, 4, 1), 2.0, np.float32), np.zeros((4, 4, 4, 27), np.float32)
     harmonics[..., :3] = 0.6 / 0.28209479
-    seen = Peer(mi.TensorXf(density), mi.TensorXf(harmonics)).render(mi.Point3f(0.5, 0.5, [-1.0, 0.0]), mi.Vector3f(0, 0, 1))
+    image = Peer(mi.TensorXf(density), mi.TensorXf(harmonics)).render(mi.Point3f(0.5, 0.5, [-1.0, 0.0]), mi.Vector3f(0, 0, 1))
     # Four factors and sums of float32.
-    np.testing.assert_allclose(np.array(seen), 0.6 * (1 - np.exp(-2.0)), rtol=1e-6)
+    np.testing.assert_allclose(np.array(image), 0.6 * (1 - np.exp(-2.0)), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -111,16 +111,16 @@ def test_both_fits_learn_the_views(variant_rgb: str) -> None:
 
 def asked_plans(monkeypatch: pytest.MonkeyPatch, fit: Callable[[], object]) -> list[list[tuple]]:
     """The stages of each plan that a bench fits: resolution, steps, shrinking, views and tiles of a step."""
-    asked = []
+    calls = []
 
     def begin(views: object, box: object, plan: object) -> SimpleNamespace:
-        asked.append([(s.longest, s.steps, s.shrink, s.views, s.tiles) for s in plan.stages])
+        calls.append([(s.longest, s.steps, s.shrink, s.views, s.tiles) for s in plan.stages])
         return SimpleNamespace(course=SimpleNamespace(iterations=0), advance=lambda: None)
 
     monkeypatch.setattr(fits, "begin_radiance_fit", begin)
     monkeypatch.setattr(fits.RayBatches, "of", lambda *of: of)
     fit()
-    return asked
+    return calls
 
 
 def test_fit_mivol_has_three_stages(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
@@ -219,37 +219,37 @@ def test_the_fitted_field_is_the_chair_where_there_is_one(monkeypatch: pytest.Mo
     monkeypatch.setattr(fields, "DATA", tmp_path)
     monkeypatch.setattr(fields, "load_photos", ask)
     monkeypatch.setattr(fields, "make_shell", lambda size: ask("shell"))
-    with pytest.raises(Asked) as asked:
+    with pytest.raises(Asked) as calls:
         fields.fit_field(TINY)
     chair = (tmp_path / "multiview" / "chair", {"split": "train", "background": "white", "scale": 0.5})
-    assert asked.value.args == (chair if there else ("shell", {}))
+    assert calls.value.args == (chair if there else ("shell", {}))
 
 
 def test_a_smaller_array_stands_in_the_middle() -> None:
-    found = centre(np.ones((2, 3, 4, 2), np.float32), 6)
-    assert found.shape == (6, 6, 6, 2)
-    assert np.all(found[2:4, 1:4, 1:5] == 1) and found.sum() == 2 * 24
+    result = centre(np.ones((2, 3, 4, 2), np.float32), 6)
+    assert result.shape == (6, 6, 6, 2)
+    assert np.all(result[2:4, 1:4, 1:5] == 1) and result.sum() == 2 * 24
 
 
 def test_rays_are_float32(variant_rgb: str) -> None:
-    made = to_bundle(BOX.repeat(2, axis=0), np.ones((4, 3)))
-    assert np.array_equal(np.array(made.o).T, BOX.repeat(2, axis=0).astype(np.float32))
+    created = to_bundle(BOX.repeat(2, axis=0), np.ones((4, 3)))
+    assert np.array_equal(np.array(created.o).T, BOX.repeat(2, axis=0).astype(np.float32))
 
 
 @pytest.mark.slow
 def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
-    asked = (PhotoFit("wires", 16, 0.03), PhotoFit("wires", effort=0.01, preset="tiny"))
-    size = replace(TINY, photo_fits=asked, photo_folder=str(tmp_path / "photographs"))
+    calls = (PhotoFit("wires", 16, 0.03), PhotoFit("wires", effort=0.01, preset="tiny"))
+    size = replace(TINY, photo_fits=calls, photo_folder=str(tmp_path / "photographs"))
     answers = STUDY.answer(tuple(STUDY.questions), size)
     assert all(answers["step"]["fog"][kind]["ratio_of_processor_time"] > 0 for kind in ("camera", "pixels", "any"))
     assert set(answers["locality"]) == {"tiles", "pixels"}
     assert answers["fit"]["fog"]["peer_psnr"] > 5
     assert set(answers["photographs"]) == {"wires at 16", "wires, tiny"}
-    found = answers["photographs"]["wires at 16"]
-    assert found["psnr"] > 10 and found["counted_gib"] > 0 and found["held_gib"] > 0
+    result = answers["photographs"]["wires at 16"]
+    assert result["psnr"] > 10 and result["counted_gib"] > 0 and result["held_gib"] > 0
     # Seconds of a machine that is as fast as this one are those of its threads.
-    threads, rate = dr.thread_count(), found["walk_rays_per_second"]
-    assert found["seconds"] == pytest.approx(found["processor_seconds"] / threads * rate / 25e6)
+    threads, rate = dr.thread_count(), result["walk_rays_per_second"]
+    assert result["seconds"] == pytest.approx(result["processor_seconds"] / threads * rate / 25e6)
     assert len(answers.pop("bars")) == 3 + 1 + 1
     STUDY.draw(answers, tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
@@ -296,23 +296,23 @@ def test_a_fit_is_as_good_as_the_peers_best(monkeypatch: pytest.MonkeyPatch, our
     monkeypatch.setattr(fits, "photograph", lambda field, cameras: [])
     monkeypatch.setattr(fits, "fit_mivol", lambda *asked: ours)
     monkeypatch.setattr(fits, "fit_peer", lambda *asked: [(10.0, 18.0), (20.0, 24.0), (30.0, 23.0)])
-    found = fits.measure_fit(TINY)["fog"]
-    assert (found["peer_psnr"], found["ratio"], found["field"]) == (24.0, ratio, "made")
+    result = fits.measure_fit(TINY)["fog"]
+    assert (result["peer_psnr"], result["ratio"], result["field"]) == (24.0, ratio, "made")
 
 
 @pytest.mark.slow
 def test_the_peer_takes_one_view_after_the_other(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
+    image = []
 
     class Watched(Peer):
         def render(self, o: mi.Point3f, d: mi.Vector3f) -> mi.Color3f:
-            seen.append(float(o.x[0]))
+            image.append(float(o.x[0]))
             return Peer.render(self, o, d)
 
     start = Peer.start(2)
     views = [(mi.Point3f(x, 0.5, -1.0), mi.Vector3f(0, 0, 1), mi.Color3f(0.5)) for x in (0.25, 0.5, 0.75)]
     assert len(list(Watched(start.density, start.harmonics).fit(views, 5))) == 5
-    assert seen == [0.25, 0.5, 0.75, 0.25, 0.5]
+    assert image == [0.25, 0.5, 0.75, 0.25, 0.5]
 
 
 def test_missing_photographs_are_left_out(

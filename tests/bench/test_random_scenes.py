@@ -1,4 +1,4 @@
-"""Random scenes: what is drawn, what is compared, and a sample of them against volpath."""
+"""Random scenes: drawn features, compared means, and a sample of scenes against volpath."""
 
 from __future__ import annotations
 
@@ -69,9 +69,9 @@ def test_a_channel_is_that_of_the_rgb_extinction(variant_rgb: str) -> None:
 def test_places_are_quarters_and_colours() -> None:
     """One picture whose quarters are 1, 2, 3 and 4, times 1, 10 and 100 by colour."""
     quarter = np.repeat(np.repeat([[1.0, 2.0], [3.0, 4.0]], 3, axis=0), 3, axis=1)
-    found = quarter_means((quarter[..., None] * [1.0, 10.0, 100.0])[None])
-    assert found.shape == (random_scenes.MEANS, 1)
-    assert sorted(found[:, 0]) == [v * s for s in (1, 10, 100) for v in (1, 2, 3, 4)]
+    result = quarter_means((quarter[..., None] * [1.0, 10.0, 100.0])[None])
+    assert result.shape == (random_scenes.MEANS, 1)
+    assert sorted(result[:, 0]) == [v * s for s in (1, 10, 100) for v in (1, 2, 3, 4)]
 
 
 def test_refusals_are_counted_by_their_sentence(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,9 +81,9 @@ def test_refusals_are_counted_by_their_sentence(variant_rgb: str, monkeypatch: p
         raise MivolError(f"an albedo of {len(drawn.features)} was found.")
 
     monkeypatch.setattr(random_scenes, "render_rounds", refuse)
-    found = measure_trials(TINY)
-    assert found["refusals"] == {"an albedo of # was found#": 2}
-    bars = STUDY.bars("trials", found)
+    result = measure_trials(TINY)
+    assert result["refusals"] == {"an albedo of # was found#": 2}
+    bars = STUDY.bars("trials", result)
     assert [(row["figure"], row["met"]) for row in bars] == [("refused scenes", False), ("pixels that are no radiance", True)]
 
 
@@ -92,17 +92,17 @@ def test_samples_that_are_no_radiance_are_counted(variant_rgb: str, monkeypatch:
     rng = np.random.default_rng(0)
 
     def picture(drawn: object, name: str, *_: object) -> np.ndarray:
-        made = rng.uniform(0, 1, (4, 4, 4, 3))
+        created = rng.uniform(0, 1, (4, 4, 4, 3))
         if name == "mivol":
-            made[0, 0, 0] = np.nan, np.inf, -1e-9
-        return made
+            created[0, 0, 0] = np.nan, np.inf, -1e-9
+        return created
 
     monkeypatch.setattr(random_scenes, "render_rounds", picture)
     with np.errstate(invalid="ignore"):
-        found = try_scene(0, TINY)
-    assert found["not_a_radiance"] == 3
-    assert found["z"] is None
-    answer = {"refusals": {}, "trials": {0: found}}
+        result = try_scene(0, TINY)
+    assert result["not_a_radiance"] == 3
+    assert result["z"] is None
+    answer = {"refusals": {}, "trials": {0: result}}
     assert [row["met"] for row in STUDY.bars("trials", answer)] == [True, False, False]
 
 
@@ -112,20 +112,20 @@ def test_a_sample_of_scenes_agrees_with_volpath(variant_rgb: str, monkeypatch: p
     """Ten that the quoted run does not have."""
     monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
     note(ALPHA, "random scenes")
-    found = measure_trials(replace(RandomSize.quick(), scenes=10, first=10_000))
-    assert not found["refusals"]
-    assert all(row["met"] for row in STUDY.bars("trials", found))
-    STUDY.draw({"trials": found}, tmp_path / "a.png")
+    result = measure_trials(replace(RandomSize.quick(), scenes=10, first=10_000))
+    assert not result["refusals"]
+    assert all(row["met"] for row in STUDY.bars("trials", result))
+    STUDY.draw({"trials": result}, tmp_path / "a.png")
 
 
 @pytest.mark.slow
 def test_every_path_of_hard_scenes_is_a_radiance(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """65,536 paths of each."""
     monkeypatch.setattr(random_scenes, "HARD_SIDE", 256)
-    found = measure_hard(TINY)
-    assert {f["paths"] for f in found.values()} == {1 << 16}
-    assert all(row["met"] for row in STUDY.bars("hard", found))
-    assert all(f["brightest"] > 0.1 for f in found.values())
+    result = measure_hard(TINY)
+    assert {f["paths"] for f in result.values()} == {1 << 16}
+    assert all(row["met"] for row in STUDY.bars("hard", result))
+    assert all(f["brightest"] > 0.1 for f in result.values())
 
 
 def test_a_fault_of_a_hard_scene_is_counted(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,40 +134,40 @@ def test_a_fault_of_a_hard_scene_is_counted(variant_rgb: str, monkeypatch: pytes
     bad[0, 0] = np.nan, -1.0, -2.0
     monkeypatch.setattr(random_scenes, "HARD", {"made up": lambda: {"type": "scene"}})
     monkeypatch.setattr(mi, "render", lambda *_, **__: bad)
-    found = measure_hard(TINY)
-    assert found == {"made up": {"paths": 4, "not_finite": 1, "negative": 2, "brightest": 1.0}}
-    assert [row["met"] for row in STUDY.bars("hard", found)] == [False]
+    result = measure_hard(TINY)
+    assert result == {"made up": {"paths": 4, "not_finite": 1, "negative": 2, "brightest": 1.0}}
+    assert [row["met"] for row in STUDY.bars("hard", result)] == [False]
 
 
 @pytest.mark.parametrize("is_rgb", [False, True])
 def test_a_scene_is_judged_by_what_differs_most(monkeypatch: pytest.MonkeyPatch, is_rgb: bool) -> None:
     """Colours of an rgb extinction are those of the grey scenes of their channels; the bound allows for all comparisons."""
-    rng, heard = np.random.default_rng(4), []
-    ours, noise = rng.uniform(1, 2, (4, 4, 4, 3)), rng.uniform(1, 2, (4, 4, 4, 3))
+    rng, calls = np.random.default_rng(4), []
+    mivol, noise = rng.uniform(1, 2, (4, 4, 4, 3)), rng.uniform(1, 2, (4, 4, 4, 3))
     noise[:, 2:, 2:, 1] += 3
 
     def pictures(drawn: RandomScene, name: str, rounds: int, spp: int) -> np.ndarray:
-        heard.append((drawn.parts["channel"], name, rounds, spp))
-        return ours if name == "mivol" else noise
+        calls.append((drawn.parts["channel"], name, rounds, spp))
+        return mivol if name == "mivol" else noise
 
     monkeypatch.setattr(random_scenes, "draw_scene", lambda seed, c=None: RandomScene({"channel": c}, {}, ["f"], is_rgb))
     monkeypatch.setattr(random_scenes, "render_rounds", pictures)
     size = replace(TINY, scenes=5, rounds=4, spp=2, stock_spp=3)
-    found = try_scene(9, size)
+    result = try_scene(9, size)
     channels = (0, 1, 2) if is_rgb else (None,)
-    assert heard == [(None, "mivol", 4, 2), *((c, "volpath", 4, 3) for c in channels)]
-    one, other = (mean_of_rounds(p[:, 2:, 2:, 1].mean(axis=(1, 2))) for p in (ours, noise))
+    assert calls == [(None, "mivol", 4, 2), *((c, "volpath", 4, 3) for c in channels)]
+    one, other = (mean_of_rounds(p[:, 2:, 2:, 1].mean(axis=(1, 2))) for p in (mivol, noise))
     wanted = agreement.compare_means(one, other, 12 * 5)
-    assert found == {"features": ["f"], "not_a_radiance": 0, "mean": pytest.approx(noise.mean()), **wanted}
-    ours[0, 0, 0, 0], ours[0, 0, 0, 1] = 0.0, -1e-30
+    assert result == {"features": ["f"], "not_a_radiance": 0, "mean": pytest.approx(noise.mean()), **wanted}
+    mivol[0, 0, 0, 0], mivol[0, 0, 0, 1] = 0.0, -1e-30
     assert try_scene(9, size)["not_a_radiance"] == 1
 
 
 def test_a_figure_of_the_largest_differences(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares of the bounds, of scenes that have one."""
     judged = {number: {"z": z, "z_bound": 4.0} for number, z in enumerate((-2.0, None, 1.0))}
-    found = judged | {3: {"refused": ["no"]}}
-    figure = drawn(random_scenes, monkeypatch, {"trials": {"trials": found}}, Path())
+    result = judged | {3: {"refused": ["no"]}}
+    figure = drawn(random_scenes, monkeypatch, {"trials": {"trials": result}}, Path())
     (axes,) = figure.axes
     bars = {round(p.get_x() + p.get_width() / 2, 3): p.get_height() for p in axes.patches if p.get_height()}
     assert bars == {0.275: 1, 0.525: 1} and len(axes.patches) == 30
@@ -178,10 +178,10 @@ def test_a_figure_of_the_largest_differences(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_bars_of_scenes_and_of_paths() -> None:
     """No refusal, no sample that is no radiance, and z within its bound."""
-    found = {1: {"z": 3.0, "z_bound": 4.0, "not_a_radiance": 0}, 2: {"z": -5.0, "z_bound": 4.0, "not_a_radiance": 2}}
-    rows = STUDY.bars("trials", {"refusals": {"a": 1, "b": 2}, "trials": found | {3: {"refused": ["a"]}}})
+    result = {1: {"z": 3.0, "z_bound": 4.0, "not_a_radiance": 0}, 2: {"z": -5.0, "z_bound": 4.0, "not_a_radiance": 2}}
+    rows = STUDY.bars("trials", {"refusals": {"a": 1, "b": 2}, "trials": result | {3: {"refused": ["a"]}}})
     assert [(row["value"], row["met"]) for row in rows] == [(3, False), (2, False), (3.0, True), (5.0, False)]
-    almost = {"refusals": {"a": 1}, "trials": {1: found[1] | {"not_a_radiance": 1}}}
+    almost = {"refusals": {"a": 1}, "trials": {1: result[1] | {"not_a_radiance": 1}}}
     assert [row["met"] for row in STUDY.bars("trials", almost)] == [False, False, True]
     assert not STUDY.bars("hard", {"a": {"not_finite": 0, "negative": 1}})[0]["met"]
     faults = {"a": {"not_finite": 1, "negative": 2}, "b": {"not_finite": 0, "negative": 0}}

@@ -1,4 +1,4 @@
-"""The bench of representations: what is fitted to which photographs, and what is counted of it."""
+"""Study of representations: all fits get the same photographs, and files are measured."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def test_all_fits_see_the_same_photographs(variant_rgb: str, tmp_path: Path) -> 
     small = {"photo_folder": str(tmp_path / "photographs"), "photo_side": 32, "photo_views": 9, "edge": 16}
     answer = STUDY.answer(("still_life",), replace(RepresentationSize.quick(), **small))["still_life"]
     assert set(answer) == {"grid, 16 nodes", "Gaussians, minute"}
-    assert len({found["photograph"].tobytes() for found in answer.values()}) == 1
-    for found in answer.values():
+    assert len({result["photograph"].tobytes() for result in answer.values()}) == 1
+    for result in answer.values():
         # Half the edge of the files, which have 32 pixels.
-        assert found["view"].shape == found["photograph"].shape == (16, 16, 3)
-        assert found["psnr"] > 8
-        assert found["file_mib"] > 0
-        seconds = found["processor_seconds"] / dr.thread_count() * found["walk_rays_per_second"] / 25e6
-        assert found["minutes"] == pytest.approx(seconds / 60)
+        assert result["view"].shape == result["photograph"].shape == (16, 16, 3)
+        assert result["psnr"] > 8
+        assert result["file_mib"] > 0
+        seconds = result["processor_seconds"] / dr.thread_count() * result["walk_rays_per_second"] / 25e6
+        assert result["minutes"] == pytest.approx(seconds / 60)
     # As published: places, normals, opacity, scales, rotation (14 numbers of 4 bytes), harmonics; a header of less than 4 kB.
     gaussians = answer["Gaussians, minute"]
     headers = [gaussians["file_mib"] * 2**20 - 4 * gaussians["count"] * (14 + 3 * (d + 1) ** 2) for d in range(4)]

@@ -1,4 +1,4 @@
-"""The scenes that every renderer of a bench takes."""
+"""Scenes of the studies, which every renderer takes."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def test_the_box_holds_its_grid(variant_rgb: str) -> None:
 
 
 def test_an_emitter_takes_the_place_of_the_sky(variant_rgb: str) -> None:
-    made = box_scene(np.zeros((2, 2, 2), np.float32), 8, 0.5, **point_light((1, 2, 3)))
-    assert {"emitter"} == set(made) - {"type", "box", "sensor"}
-    assert made["box"]["interior"]["phase"] == {"type": "isotropic"}
-    assert made["box"]["interior"]["albedo"] == 0.5
+    created = box_scene(np.zeros((2, 2, 2), np.float32), 8, 0.5, **point_light((1, 2, 3)))
+    assert {"emitter"} == set(created) - {"type", "box", "sensor"}
+    assert created["box"]["interior"]["phase"] == {"type": "isotropic"}
+    assert created["box"]["interior"]["albedo"] == 0.5
 
 
 def test_the_sun_gives_a_third_of_the_light(variant_rgb: str) -> None:

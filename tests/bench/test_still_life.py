@@ -1,4 +1,4 @@
-"""The still life's photographs: what they show is view-dependent where it should be, and lies in the box that is said."""
+"""Photographs of the still life: view-dependent where they should be, and inside their box; their fits."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def test_photographs_of_the_still_life(still_life, variant_rgb, tmp_path):
 
 def test_the_box_holds_all_of_the_still_life(still_life, variant_rgb, tmp_path):
     still_life.write_mesh(tmp_path / "knot.ply", still_life.knot())
-    found = mi.load_dict(still_life.still_life(tmp_path / "knot.ply")).bbox()
-    low, high = (np.array(corner).reshape(3) for corner in (found.min, found.max))
+    result = mi.load_dict(still_life.still_life(tmp_path / "knot.ply")).bbox()
+    low, high = (np.array(corner).reshape(3) for corner in (result.min, result.max))
     # The sky of the scene has no size; float32 places corners within 1e-6.
     assert (low >= still_life.BOX[0] - 1e-6).all()
     assert (high <= still_life.BOX[1] + 1e-6).all()
@@ -88,13 +88,13 @@ def test_a_fit_is_judged_by_held_out_views(variant_rgb, tmp_path):
     size = replace(TINY, folder=str(tmp_path / "photographs"))
     train, held_out, box = load_still_life(size)
     assert (len(train), len(held_out)) == (8, 2)
-    found = fit_views(train, held_out, box, size, 2)
-    assert found["psnr"] == pytest.approx(np.mean(found["each"]))
+    result = fit_views(train, held_out, box, size, 2)
+    assert result["psnr"] == pytest.approx(np.mean(result["each"]))
     white = np.mean([-10 * np.log10(np.mean((1 - photo.image) ** 2)) for photo in held_out])
-    assert found["psnr"] > white + 1
-    assert (found["degree"], found["views"], len(found["each"])) == (2, 8, 2)
-    assert found["photograph"] is held_out[1].image and found["view"].shape == held_out[1].image.shape
-    figures = {"few": {"TV": found, "no TV": found | {"psnr": found["psnr"] - 1}}}
+    assert result["psnr"] > white + 1
+    assert (result["degree"], result["views"], len(result["each"])) == (2, 8, 2)
+    assert result["photograph"] is held_out[1].image and result["view"].shape == held_out[1].image.shape
+    figures = {"few": {"TV": result, "no TV": result | {"psnr": result["psnr"] - 1}}}
     (bar,) = STUDY.bars("few", figures["few"])
     assert bar["value"] == pytest.approx(1)
     STUDY.draw(figures, tmp_path / "a.png")

@@ -1,4 +1,4 @@
-"""The storage table: its formulas are the bytes of real fields, in memory and on disk."""
+"""Storage: the formulas give the bytes of real fields, in memory and on disk."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def held(*arrays: object) -> int:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_formulas_are_the_bytes(variant_rgb, tmp_path: Path, degree: int, sparse: bool) -> None:
     keep = np.random.default_rng(9).random(RES) < 0.2
-    made = field(degree, keep if sparse else None)
+    created = field(degree, keep if sparse else None)
     kept = int(keep.sum()) if sparse else math.prod(RES)
-    nodes = [made.nodes] if sparse else []
+    nodes = [created.nodes] if sparse else []
     expected = storage.sparse_bytes(kept, degree) if sparse else storage.dense_bytes(kept, degree)
-    assert held(made.density, made.harmonics, *nodes) == made.bytes == expected
+    assert held(created.density, created.harmonics, *nodes) == created.bytes == expected
 
-    write_field(tmp_path / "field.npz", made)
+    write_field(tmp_path / "field.npz", created)
     with zipfile.ZipFile(tmp_path / "field.npz") as archive:
         sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
     # An .npy has a header of 128 bytes.
@@ -52,21 +52,21 @@ def test_formulas_are_the_bytes(variant_rgb, tmp_path: Path, degree: int, sparse
 @pytest.mark.parametrize("share", [0.02, 0.3, 1.0])
 def test_the_index_is_what_the_walk_reads(variant_rgb, share: float) -> None:
     keep = np.random.default_rng(1).random(RES) <= share
-    made = field(0, keep)
-    cells = find_occupied_cells(made)
+    created = field(0, keep)
+    cells = find_occupied_cells(created)
     listed, rows, bricks = storage.count_cells(keep)
     assert (cells.count, dr.width(cells.rows)) == (listed, rows)
-    index = made.sparse_index().bytes + cells.index.bytes + held(cells.corners, cells.rows)
+    index = created.sparse_index().bytes + cells.index.bytes + held(cells.corners, cells.rows)
     assert index == storage.index_bytes(RES, listed, rows, bricks)
 
 
 def test_the_lecture_counts_4_gigabytes() -> None:
     """1024^3 cells of 4 bytes; degree 2 is 27 numbers a cell in rows of 28, and the density; sparse falls as 1/N."""
-    found = {kind.name: kind for kind in storage.make_layouts(0.1)}
-    assert found["dense rgba, 8 bits (the lecture's)"].scenes[1024] == (4 * 2**30, 4 * 2**30)
-    assert found["dense SH 2"].per_cell == (4 * 29, 2 * 28)
-    assert found["sparse SH 2"].per_cell == (4 * 29 + 4, 2 * 28 + 4)
-    ratio = found["sparse SH 2"].scenes[1024][0] / found["dense SH 2"].scenes[1024][0]
+    result = {kind.name: kind for kind in storage.make_layouts(0.1)}
+    assert result["dense rgba, 8 bits (the lecture's)"].scenes[1024] == (4 * 2**30, 4 * 2**30)
+    assert result["dense SH 2"].per_cell == (4 * 29, 2 * 28)
+    assert result["sparse SH 2"].per_cell == (4 * 29 + 4, 2 * 28 + 4)
+    ratio = result["sparse SH 2"].scenes[1024][0] / result["dense SH 2"].scenes[1024][0]
     assert ratio == pytest.approx(0.1 / 8 * 30 / 29, rel=1e-6)
     # Hundreds of nodes of 64^3 lie at one distance: a share is met to a thousandth or two.
     assert storage.ball_shell(0.2).mean() == pytest.approx(0.2, abs=2e-3)
@@ -77,13 +77,13 @@ def test_the_index_grows_with_the_surface() -> None:
     which a surface has as at 64^3."""
     shell = storage.ball_shell(0.1 * 128 / 64)
     listed, rows, bricks = (count / shell.sum() for count in storage.count_cells(shell))
-    found = storage.make_layouts(0.1)[-1]
+    result = storage.make_layouts(0.1)[-1]
     for n in (128, 1024):
         near = 0.1 * 128 / n * n**3
         expected = n**3 // 4 + 4 * (n // 4 + 1) ** 3 + 12 * round(bricks * near)
         expected += 32 * round(listed * near) + 4 * round(rows * near)
-        assert found.scenes[n] == (expected, 0)
-    assert found.per_cell == (found.scenes[128][0] / 128**3, 0)
+        assert result.scenes[n] == (expected, 0)
+    assert result.per_cell == (result.scenes[128][0] / 128**3, 0)
     assert [kind.sparse for kind in storage.make_layouts(0.1)] == [False] * 6 + [True] * 4 + [False]
 
 

@@ -17,11 +17,11 @@ def test_contestants_take_turns(variant_rgb: str) -> None:
     """Each is called once uncounted, with the number 0, then in every round, in another order than in the round before."""
     calls = []
     contestants = {name: lambda k, name=name: calls.append((k, name)) or mi.Float(k) for name in "abc"}
-    found = race(contestants, 3, keep=True)
+    result = race(contestants, 3, keep=True)
     assert calls[:3] == [(0, "a"), (0, "b"), (0, "c")]
     assert ["".join(name for k, name in calls if k == number) for number in (1, 2, 3)] == ["bca", "cab", "abc"]
-    assert [np.ravel(r).tolist() for r in found["b"].results] == [[1], [2], [3]]
-    assert len(found["c"].seconds) == len(found["c"].processor) == 3
+    assert [np.ravel(r).tolist() for r in result["b"].results] == [[1], [2], [3]]
+    assert len(result["c"].seconds) == len(result["c"].processor) == 3
 
 
 def test_first_calls_count_their_kernels(variant_rgb: str) -> None:
@@ -39,8 +39,8 @@ def test_first_calls_add_up_what_the_compiler_took(monkeypatch: pytest.MonkeyPat
     """Milliseconds of Dr.Jit; kernels that were known or found on disk are not compiled, and other entries are no kernels."""
     jit, other = dr.KernelType.JIT, next(kind for kind in dr.KernelType if kind != dr.KernelType.JIT)
     kernel = {"type": jit, "codegen_time": 200.0, "backend_time": 300.0, "cache_hit": False, "cache_disk": False}
-    found = [kernel, {**kernel, "cache_hit": True, "cache_disk": True}, {**kernel, "type": other}]
-    monkeypatch.setattr(dr, "kernel_history", lambda: found)
+    result = [kernel, {**kernel, "cache_hit": True, "cache_disk": True}, {**kernel, "type": other}]
+    monkeypatch.setattr(dr, "kernel_history", lambda: result)
     first = timing.time_first_call(lambda _: mi.Float(1))
     assert (first["compile_seconds"], first["kernels_compiled"], first["kernels_from_disk"]) == (1.0, 1, 1)
 

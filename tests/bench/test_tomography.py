@@ -1,4 +1,4 @@
-"""The bench of tomography: every method nears the truth, and what the bench says of the operator is so."""
+"""Study of tomography: every method nears the truth, and the operator has the reported properties."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def test_the_pair_is_adjoint(head: study.Scan) -> None:
 
 
 def test_costs(head: study.Scan) -> None:
-    found = study.measure_costs(head)
-    assert set(found) == {
+    result = study.measure_costs(head)
+    assert set(result) == {
         *("seconds_A", "seconds_AT", "rays_per_second_A", "AT_over_A", "adjoint_mismatch", "voxels_own_error"),
     }
-    assert found["rays_per_second_A"] == pytest.approx(24 * 16 * 16 / found["seconds_A"])
-    assert 0 < found["voxels_own_error"] < 0.3
+    assert result["rays_per_second_A"] == pytest.approx(24 * 16 * 16 / result["seconds_A"])
+    assert 0 < result["voxels_own_error"] < 0.3
 
 
 def test_a_volume_is_projected_at_twice_the_resolution(variant_rgb: str, tmp_path: Path) -> None:

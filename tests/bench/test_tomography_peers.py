@@ -1,4 +1,4 @@
-"""The bench of slices beside other programs: all see the same object the same way round."""
+"""Slices by several programs: all get the same object in the same orientation."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ def test_everyone_finds_the_object(variant_rgb: str, monkeypatch: pytest.MonkeyP
     for turned in (scan.truth[:, ::-1], scan.truth[:, :, ::-1], scan.truth.transpose(0, 2, 1)):
         assert scan.error(turned) > 0.75
     assert scan.error(0 * scan.truth) == pytest.approx(1)
-    found = run(scan)
-    for curve in found.values():
+    result = run(scan)
+    for curve in result.values():
         assert min(curve["errors"]) < 0.75
         assert np.all(np.diff(curve["seconds"]) >= 0)
 
 
 def test_the_table_has_the_least_error_of_each() -> None:
-    found = {"few": {"a": curve([0.5, 0.25, 0.3], [1.0, 2.0, 3.0])}, "many": {"a": curve([0.1], [0.5])}}
-    assert peers.error_rows(found)[2] == "| a | 0.2500 (2, 2.00 s) | 0.1000 (1, 0.50 s) |"
-    found["many"]["b"] = curve([0.2], [3.0])
-    assert peers.error_rows(found)[3] == "| b |  | 0.2000 (1, 3.00 s) |"
+    result = {"few": {"a": curve([0.5, 0.25, 0.3], [1.0, 2.0, 3.0])}, "many": {"a": curve([0.1], [0.5])}}
+    assert peers.error_rows(result)[2] == "| a | 0.2500 (2, 2.00 s) | 0.1000 (1, 0.50 s) |"
+    result["many"]["b"] = curve([0.2], [3.0])
+    assert peers.error_rows(result)[3] == "| b |  | 0.2000 (1, 3.00 s) |"
 
 
 def test_times_are_compared_at_the_error_that_both_reach(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ours has 0.2 after 2 s, theirs in the end after 4; and ours ends at 0.4, which theirs has after 1 s."""
     monkeypatch.setattr(peers, "PAIRS", (("a", "b"), ("a", "who is missing")))
-    ours = {"few": curve([0.5, 0.2, 0.1], [1.0, 2.0, 3.0]), "many": curve([0.5, 0.4], [1.0, 2.0])}
-    theirs = {"few": curve([0.3, 0.2], [1.0, 4.0]), "many": curve([0.4, 0.3], [1.0, 4.0])}
-    found = {kind: {"a": ours[kind], "b": theirs[kind]} for kind in ours}
-    assert peers.ratio_rows(found)[2:] == ["| a / b | 0.50 (0.2000) | 2.00 (0.4000) |"]
+    mivol = {"few": curve([0.5, 0.2, 0.1], [1.0, 2.0, 3.0]), "many": curve([0.5, 0.4], [1.0, 2.0])}
+    peer = {"few": curve([0.3, 0.2], [1.0, 4.0]), "many": curve([0.4, 0.3], [1.0, 4.0])}
+    result = {kind: {"a": mivol[kind], "b": peer[kind]} for kind in mivol}
+    assert peers.ratio_rows(result)[2:] == ["| a / b | 0.50 (0.2000) | 2.00 (0.4000) |"]
 
 
 def test_times_are_medians_of_runs() -> None:
@@ -130,16 +130,16 @@ def sliced(views: int = 3) -> Slice:
 
 def test_scikit_image_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows of its images run against y, and its images are as wide as the detector: what is judged is the middle, turned."""
-    scan, asked = sliced(), []
+    scan, calls = sliced(), []
     sinogram, theta = scan.y[:, 0].T, [0.0, 60.0, 120.0]
     image = np.arange(81.0).reshape(9, 9)
 
     def iradon(given: np.ndarray, angles: np.ndarray, output_size: int) -> np.ndarray:
-        asked.append((given.tolist(), angles.round(9).tolist(), output_size))
+        calls.append((given.tolist(), angles.round(9).tolist(), output_size))
         return np.arange(25.0).reshape(5, 5)
 
     def iradon_sart(given: np.ndarray, angles: np.ndarray, image: np.ndarray | None) -> np.ndarray:
-        asked.append((given.tolist(), angles.round(9).tolist(), None if image is None else image[0, 0]))
+        calls.append((given.tolist(), angles.round(9).tolist(), None if image is None else image[0, 0]))
         return np.arange(81.0).reshape(9, 9) + (0 if image is None else image[0, 0] + 100)
 
     transform = SimpleNamespace(iradon=iradon, iradon_sart=iradon_sart)
@@ -148,17 +148,17 @@ def test_scikit_image_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(
         peers, "time_states", lambda scan, states, steps: (list(itertools.islice(states, min(steps, 2))), steps)
     )
-    found = peers.run_scikit_image(scan)
-    (filtered, one), (swept, six) = found["scikit-image iradon"], found["scikit-image iradon_sart"]
+    result = peers.run_scikit_image(scan)
+    (filtered, one), (swept, six) = result["scikit-image iradon"], result["scikit-image iradon_sart"]
     assert (one, six, len(filtered), len(swept)) == (1, 6, 1, 2)
     assert np.array_equal(filtered[0], np.arange(25.0).reshape(5, 5)[::-1])
     assert np.array_equal(swept[0], image[::-1][2:7, 2:7]) and np.array_equal(swept[1], image[::-1][2:7, 2:7] + 100)
-    assert asked == [(sinogram.tolist(), theta, last) for last in (5, None, 0.0)]
+    assert calls == [(sinogram.tolist(), theta, last) for last in (5, None, 0.0)]
 
 
 def test_astra_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """SART's iterations are views, and a sweep is all of them; what is below 0 is cut off where ours is; rows run against y."""
-    scan, ran, made = sliced(), [], []
+    scan, ran, created = sliced(), [], []
     geometry = ("parallel", 1.0, 9, scan.beam.angles.tolist())
     image = np.arange(25.0).reshape(5, 5)
 
@@ -174,14 +174,14 @@ def test_astra_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
         astra_dict=lambda name: {"type": name},
         algorithm=SimpleNamespace(
-            create=lambda settings: made.append(settings) or len(made), run=lambda *asked: ran.append(asked)
+            create=lambda settings: created.append(settings) or len(created), run=lambda *asked: ran.append(asked)
         ),
     )
     monkeypatch.setitem(sys.modules, "astra", astra)
     monkeypatch.setattr(peers, "time_states", lambda scan, states, steps: (next(states).tolist(), steps))
-    found = peers.run_astra(scan)
+    result = peers.run_astra(scan)
     steps = {"FBP": 1, "CGLS": 20, "SIRT": 60, "SART": 6}
-    assert found == {f"astra {name}": (image[::-1].tolist(), n) for name, n in steps.items()}
+    assert result == {f"astra {name}": (image[::-1].tolist(), n) for name, n in steps.items()}
     volume = ("volume", 5, 5)
     common = {
         "ProjectorId": ("projector", "linear", geometry, volume),
@@ -189,7 +189,7 @@ def test_astra_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
         "ReconstructionDataId": ("data", "-vol", volume, 0.0),
     }
     bounded = {"option": {"MinConstraint": 0.0}}
-    assert made == [{"type": name} | common | (bounded if name in ("SIRT", "SART") else {}) for name in steps]
+    assert created == [{"type": name} | common | (bounded if name in ("SIRT", "SART") else {}) for name in steps]
     assert ran == [(1, 1), (2, 1), (3, 1), (4, 3)]
 
 
