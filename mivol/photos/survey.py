@@ -256,8 +256,8 @@ def _box(
     if isinstance(box, str):
         if box != "middle":
             raise refusal("box", f'"{box}"', '"middle", or two corners', "choose one")
-        found = region.middle_box(cameras, path)
-        return found, f"{region.MIDDLE:g} of the median distance of the cameras from their focus, on each side"
+        cube = region.middle_box(cameras, path)
+        return cube, f"{region.MIDDLE:g} of the median distance of the cameras from their focus, on each side"
     if box is not None:
         return region.check_box(box), "as given"
     if points is not None and len(points) >= region.FEWEST_POINTS:
