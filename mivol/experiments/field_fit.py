@@ -25,7 +25,7 @@ from mivol.optim.photographs.field_view import FieldView, render_view
 from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos
-from mivol.photos.photo_file import SPACES, decode_srgb
+from mivol.photos.photo_file import CONVERSIONS, decode_srgb
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
 from mivol.report.record import Image, PlanLine, RunRecord, Table, Volume
 from mivol.validate.images import Quality, judge
@@ -80,7 +80,7 @@ class FieldFit(PhotoFit):
 
     def film_frame(self, camera: Camera) -> NDArray:
         view = render_view(self.problem.field, camera, behind(self.problem, self.photos.views[0]))
-        return SPACES[self.photos.space, "srgb"](view.image)
+        return CONVERSIONS[self.photos.space, "srgb"](view.image)
 
     def write_model(self, run: RunFolder) -> dict[str, float]:
         run.make("volumes")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mivol.files import write_png
 from mivol.photos import Camera, Photo
-from mivol.photos.photo_file import SPACES
+from mivol.photos.photo_file import CONVERSIONS
 from mivol.report.record import CODES, Image, Table
 from mivol.validate.images import METRICS, Quality, colour_fitted, judge
 
@@ -120,8 +120,8 @@ def write_view(
     written = []
     for role, values in {"render": image, "reference": photo.image}.items():
         path = f"views/{number:03d}_{role}.png"
-        codes = SPACES[space, "srgb"](np.clip(values, 0, 1))
-        write_png(folder / path, SPACES["srgb", "linear"](codes if edge is None else _shrunk(codes, edge)))
+        codes = CONVERSIONS[space, "srgb"](np.clip(values, 0, 1))
+        write_png(folder / path, CONVERSIONS["srgb", "linear"](codes if edge is None else _shrunk(codes, edge)))
         said = caption if role == "render" else ""
         small = edge is not None
         written.append(Image(path=path, role=role, view=photo.name, held_out=True, quantity=CODES, caption=said, small=small))
@@ -146,7 +146,7 @@ def said_of(views: Iterable[Photo]) -> str:
 
 def judge_colour_fitted(image: NDArray, photo: Photo, space: str) -> float:
     """PSNR [dB] of a view whose colours, as a screen shows them, were fitted to its photograph's."""
-    shown, wanted = (SPACES[space, "srgb"](values) for values in (image, photo.image))
+    shown, wanted = (CONVERSIONS[space, "srgb"](values) for values in (image, photo.image))
     return judge(colour_fitted(shown, wanted, photo.mask), wanted, mask=photo.mask).values["psnr"]
 
 

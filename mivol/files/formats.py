@@ -26,7 +26,7 @@ HEAD = 4096
 
 
 @dataclasses.dataclass(frozen=True)
-class Format:
+class VolumeFormat:
     """A format of volume files.
 
     Attributes:
@@ -48,25 +48,25 @@ def _is_metaimage(head: bytes) -> bool:
     return re.search(rb"(?m)^\s*(NDims|DimSize|ObjectType)\s*=", head) is not None
 
 
-_METAIMAGE = Format("MetaImage", _is_metaimage, metaimage.read_metaimage)
-_NRRD = Format("NRRD", _starts_with(nrrd.MAGIC), nrrd.read_nrrd)
-_HDF5 = Format("HDF5", _starts_with(hdf5.MAGIC), hdf5.read_hdf5)
-_LES = Format("LES cloud text", les.is_les, les.read_les)
+_METAIMAGE = VolumeFormat("MetaImage", _is_metaimage, metaimage.read_metaimage)
+_NRRD = VolumeFormat("NRRD", _starts_with(nrrd.MAGIC), nrrd.read_nrrd)
+_HDF5 = VolumeFormat("HDF5", _starts_with(hdf5.MAGIC), hdf5.read_hdf5)
+_LES = VolumeFormat("LES cloud text", les.is_les, les.read_les)
 
 #: suffix -> format; a longer suffix is tried first.
-FORMATS: dict[str, Format] = {
-    ".vol": Format("Mitsuba grid", _starts_with(vol.MAGIC), vol.read_vol),
-    ".npy": Format("NumPy array", _starts_with(npy.NPY_MAGIC), npy.read_npy),
-    ".npz": Format("NumPy archive", _starts_with(npy.NPZ_MAGIC), npy.read_npz),
+FORMATS: dict[str, VolumeFormat] = {
+    ".vol": VolumeFormat("Mitsuba grid", _starts_with(vol.MAGIC), vol.read_vol),
+    ".npy": VolumeFormat("NumPy array", _starts_with(npy.NPY_MAGIC), npy.read_npy),
+    ".npz": VolumeFormat("NumPy archive", _starts_with(npy.NPZ_MAGIC), npy.read_npz),
     ".nrrd": _NRRD,
     ".nhdr": _NRRD,
     ".mhd": _METAIMAGE,
     ".mha": _METAIMAGE,
-    ".nii": Format("NIfTI", nifti.is_nifti, nifti.read_nifti),
-    ".nii.gz": Format("gzip-compressed NIfTI", nifti.is_nifti_gz, nifti.read_nifti),
-    ".vti": Format("VTK XML image", lambda head: b"<VTKFile" in head, vti.read_vti),
-    ".vtk": Format("legacy VTK", _starts_with(vtk_legacy.MAGIC), vtk_legacy.read_vtk),
-    ".pbrt": Format("pbrt volumegrid", pbrt.is_pbrt, pbrt.read_pbrt),
+    ".nii": VolumeFormat("NIfTI", nifti.is_nifti, nifti.read_nifti),
+    ".nii.gz": VolumeFormat("gzip-compressed NIfTI", nifti.is_nifti_gz, nifti.read_nifti),
+    ".vti": VolumeFormat("VTK XML image", lambda head: b"<VTKFile" in head, vti.read_vti),
+    ".vtk": VolumeFormat("legacy VTK", _starts_with(vtk_legacy.MAGIC), vtk_legacy.read_vtk),
+    ".pbrt": VolumeFormat("pbrt volumegrid", pbrt.is_pbrt, pbrt.read_pbrt),
     ".csv": _LES,
     ".txt": _LES,
     ".h5": _HDF5,
@@ -101,7 +101,7 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
             volume on the unit cube.
 
     Returns:
-        Values, placement and facts. NaN, Inf and negative numbers are kept; :func:`check_volume` refuses them.
+        Values, placement and facts. NaN, Inf and negative numbers are kept; :func:`mivol.files.check_volume` refuses them.
 
     Raises:
         MivolError: a missing, empty, foreign, truncated or inconsistent file; an unknown suffix or type; a degenerate box.

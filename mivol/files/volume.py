@@ -24,7 +24,7 @@ SMALLEST_SIDE = float(np.finfo(np.float32).tiny)
 FLATTEST = 16 * float(np.finfo(np.float32).eps)
 
 #: medical frame -> signs of its x, y, z axes relative to right-anterior-superior.
-SPACES: dict[str, tuple[int, int, int]] = {"RAS": (1, 1, 1), "LPS": (-1, -1, 1), "LAS": (-1, 1, 1)}
+MEDICAL_FRAMES: dict[str, tuple[int, int, int]] = {"RAS": (1, 1, 1), "LPS": (-1, -1, 1), "LAS": (-1, 1, 1)}
 
 
 @with_short_repr
@@ -134,18 +134,18 @@ def to_space(volume: VolumeData, space: str) -> VolumeData:
     (LPS).
 
     Args:
-        volume: volume with a key of :data:`SPACES` in ``meta["space"]``.
-        space: key of :data:`SPACES`.
+        volume: volume with a key of :data:`MEDICAL_FRAMES` in ``meta["space"]``.
+        space: key of :data:`MEDICAL_FRAMES`.
 
     Raises:
         MivolError: an unknown frame.
     """
     current = volume.meta.get("space")
     for name in (current, space):
-        if name not in SPACES:
-            expected = f"one of {', '.join(SPACES)}"
+        if name not in MEDICAL_FRAMES:
+            expected = f"one of {', '.join(MEDICAL_FRAMES)}"
             raise refusal(volume.meta.get("path", "volume"), f"the frame {name!r}", expected, "set to_world by hand")
-    signs = np.array(SPACES[current]) * np.array(SPACES[space])
+    signs = np.array(MEDICAL_FRAMES[current]) * np.array(MEDICAL_FRAMES[space])
     return dataclasses.replace(volume, to_world=np.diag([*signs, 1.0]) @ volume.to_world, meta={**volume.meta, "space": space})
 
 

@@ -10,12 +10,12 @@ from mivol.photos.camera import Camera, directions, intrinsics, pixel_centres, p
 from mivol.photos.camera_path import aim_camera, follow_keyframes, interpolate_cameras, turntable
 from mivol.photos.dataset import BACKGROUNDS, Photo, Photos, load_photos, rectify, to_pinhole
 from mivol.photos.lens import Lens, distort, undistort
-from mivol.photos.survey import FORMATS, SPLITS, PhotoFrame, PhotoSurvey, find_format, survey_photos
+from mivol.photos.survey import DATA_SET_FORMATS, SPLITS, PhotoFrame, PhotoSurvey, find_format, survey_photos
 from mivol.photos.transforms import write_transforms
 
 __all__ = [
     "BACKGROUNDS",
-    "FORMATS",
+    "DATA_SET_FORMATS",
     "SPLITS",
     "Camera",
     "Lens",

@@ -138,7 +138,7 @@ def load_photos(
     """Read a data set of posed photographs.
 
     Args:
-        path: folder, or file of cameras; the format is recognised (:data:`mivol.photos.survey.FORMATS`).
+        path: folder, or file of cameras; the format is recognised (:data:`mivol.photos.survey.DATA_SET_FORMATS`).
         split: one of :data:`mivol.photos.survey.SPLITS`.
         scale: scale of the images in (0, 1]; 0.5 halves width and height by exact means over area.
         background: colour behind images with alpha: "white", "black", "random" (one colour per view; :meth:`Photo.over`

@@ -2,8 +2,8 @@
 
 Conventions. Images are float32 (rows, columns, 3), row 0 at the top; alpha is (rows, columns) in 0..1. **PNG and JPEG hold
 sRGB code values 0..1, OpenEXR holds linear light, and no value is converted unless the caller asks for the other space**
-(:data:`SPACES`). Radiance fields are usually fitted to the code values. A PNG with a gAMA chunk of 1 holds linear light, and
-the caller can declare other files linear. PNG stores colour without alpha, OpenEXR stores colour multiplied by alpha. Here
+(:data:`CONVERSIONS`). Radiance fields are usually fitted to the code values. A PNG with a gAMA chunk of 1 holds linear light,
+and the caller can declare other files linear. PNG stores colour without alpha, OpenEXR stores colour multiplied by alpha. Here
 colour is multiplied by alpha before averaging and before blending over a background. Both happen in the values of the fit, as
 in NeRF's protocol. PNG of 16 bits per channel is read at full depth.
 
@@ -25,7 +25,7 @@ from mivol.files import encode_srgb, read_exr, read_exr_header
 from mivol.files.source import check_file, refusal
 
 __all__ = [
-    "SPACES",
+    "CONVERSIONS",
     "SUFFIXES",
     "PhotoHeader",
     "decode_srgb",
@@ -56,7 +56,7 @@ def decode_srgb(code: np.ndarray) -> np.ndarray:
 
 
 #: (space of the file, requested space) -> conversion.
-SPACES: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
+CONVERSIONS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
     ("srgb", "srgb"): lambda values: values,
     ("linear", "linear"): lambda values: values,
     ("srgb", "linear"): decode_srgb,
@@ -131,7 +131,7 @@ def read_photo(path: Path, space: str, stored: str | None = None) -> tuple[np.nd
         if space == "linear":
             return colour, alpha
         colour = colour / np.where(alpha > 0, alpha, 1)[..., None]
-    colour = SPACES[stored, space](colour).astype(np.float32)
+    colour = CONVERSIONS[stored, space](colour).astype(np.float32)
     return (colour if alpha is None else colour * alpha[..., None]), alpha
 
 

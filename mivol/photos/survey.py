@@ -26,13 +26,13 @@ from mivol.photos.listing import UNLISTED, Entry, Listing
 from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
 
-__all__ = ["FORMATS", "SPLITS", "Format", "PhotoFrame", "PhotoSurvey", "find_format", "survey_photos"]
+__all__ = ["DATA_SET_FORMATS", "SPLITS", "DataSetFormat", "PhotoFrame", "PhotoSurvey", "find_format", "survey_photos"]
 
 SPLITS = ("train", "held_out", "val", "test", "all")
 
 
 @dataclass(frozen=True)
-class Format:
+class DataSetFormat:
     """A format of data sets: a test of a path, and the reader."""
 
     recognise: Callable[[Path], bool]
@@ -40,10 +40,12 @@ class Format:
 
 
 #: name -> format, in the order of the trials.
-FORMATS: dict[str, Format] = {
-    "Blender (NeRF)": Format(lambda path: (path / "transforms_train.json").is_file(), read_blender),
-    "transforms.json": Format(lambda path: (path / "transforms.json").is_file() or path.suffix == ".json", read_transforms),
-    "COLMAP": Format(lambda path: find_model(path) is not None, read_colmap),
+DATA_SET_FORMATS: dict[str, DataSetFormat] = {
+    "Blender (NeRF)": DataSetFormat(lambda path: (path / "transforms_train.json").is_file(), read_blender),
+    "transforms.json": DataSetFormat(
+        lambda path: (path / "transforms.json").is_file() or path.suffix == ".json", read_transforms
+    ),
+    "COLMAP": DataSetFormat(lambda path: find_model(path) is not None, read_colmap),
 }
 
 
@@ -157,7 +159,7 @@ def survey_photos(
 
 def find_format(path: Path) -> str | None:
     """Return the key of ``FORMATS`` of a folder or file of cameras; None for other paths."""
-    return next((name for name, kind in FORMATS.items() if kind.recognise(path)), None)
+    return next((name for name, kind in DATA_SET_FORMATS.items() if kind.recognise(path)), None)
 
 
 def _read(path: Path) -> tuple[str, Listing]:
@@ -165,9 +167,9 @@ def _read(path: Path) -> tuple[str, Listing]:
         raise refusal(path, "nothing there", "a folder of photographs or a file of cameras", "check the path")
     name = find_format(path)
     if name is None:
-        known = ", ".join(FORMATS)
+        known = ", ".join(DATA_SET_FORMATS)
         raise refusal(path, "no cameras", f"one of {known}", "name the folder of the file of cameras")
-    return name, FORMATS[name].read(path)
+    return name, DATA_SET_FORMATS[name].read(path)
 
 
 def _assign_held_out(entries: list[Entry], held_out: int | Sequence[str], path: Path) -> list[Entry]:

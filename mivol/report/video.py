@@ -20,7 +20,7 @@ from scipy.sparse import csr_matrix
 from mivol.errors import MivolError
 from mivol.files import whole_file
 
-__all__ = ["NO_FFMPEG_NOTE", "WRITERS", "film_suffix", "write_video", "FEWEST_LAYERS", "volume_frames"]
+__all__ = ["NO_FFMPEG_NOTE", "FILM_WRITERS", "film_suffix", "write_video", "FEWEST_LAYERS", "volume_frames"]
 
 Frames = Iterator[NDArray[np.uint8]]
 
@@ -55,12 +55,12 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], *, fps: f
         MivolError: another suffix, no frame, frames of different sizes or of another type, or a missing imageio-ffmpeg.
     """
     path = Path(path)
-    if path.suffix not in WRITERS:
-        raise MivolError(f'a film cannot be written as "{path.name}"; choose the suffix {", ".join(WRITERS)}.')
+    if path.suffix not in FILM_WRITERS:
+        raise MivolError(f'a film cannot be written as "{path.name}"; choose the suffix {", ".join(FILM_WRITERS)}.')
     if not 0 < fps <= 1000:
         raise MivolError(f"a film cannot have {fps} frames per second; choose a number above 0 and at most 1000, such as 25.")
     with whole_file(path) as temporary:
-        WRITERS[path.suffix](temporary, _check_frames(frames), fps)
+        FILM_WRITERS[path.suffix](temporary, _check_frames(frames), fps)
     return path
 
 
@@ -117,7 +117,7 @@ def _write_animation(path: Path, frames: Frames, fps: float, **more: str | int) 
 
 
 #: suffix -> writer.
-WRITERS: dict[str, Callable[[Path, Frames, float], None]] = {
+FILM_WRITERS: dict[str, Callable[[Path, Frames, float], None]] = {
     ".mp4": _write_mp4,
     ".webp": partial(_write_animation, format="WEBP", quality=90),
     ".gif": partial(_write_animation, format="GIF"),

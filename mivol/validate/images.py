@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.photos.photo_file import SPACES
+from mivol.photos.photo_file import CONVERSIONS
 from mivol.validate.metrics import check_window, psnr, ssim
 
 __all__ = ["METRICS", "Quality", "Score", "check_metrics", "colour_fitted", "flip", "judge", "quantised", "score"]
@@ -121,12 +121,12 @@ def quantised(image: np.ndarray, space: str = "srgb") -> np.ndarray:
     values = np.asarray(image, np.float64)
     if values.ndim != 3 or values.shape[2] != 3 or values.size == 0:
         raise MivolError(f"an image of shape {values.shape} cannot be judged; give (height, width, 3).")
-    if (space, "srgb") not in SPACES:
+    if (space, "srgb") not in CONVERSIONS:
         raise MivolError(f'the values of an image are "srgb" or "linear", found "{space}"; choose one of those.')
     if np.isnan(values).any():
         row, column = (int(i) for i in np.argwhere(np.isnan(values))[0][:2])
         raise MivolError(f"an image holds NaN at row {row}, column {column}; find its cause.")
-    return np.round(np.clip(SPACES[space, "srgb"](values), 0, 1) * 255) / 255
+    return np.round(np.clip(CONVERSIONS[space, "srgb"](values), 0, 1) * 255) / 255
 
 
 def judge(

@@ -93,4 +93,4 @@ class LinearScale:
 
 
 SCALES: dict[str, SrgbScale | LinearScale] = {"srgb": SrgbScale(), "linear": LinearScale()}
-"""Scales by the kind of photograph values (:data:`mivol.photos.photo_file.SPACES`)."""
+"""Scales by the kind of photograph values (:data:`mivol.photos.photo_file.CONVERSIONS`)."""
