@@ -128,10 +128,10 @@ def verb_page() -> str:
 
     lines = ["# Command line", "", "`mivol VERB --help` prints the same. Exit codes: 0, 1 for what was refused, 2 for wrong"]
     lines += ["arguments, 130 for Ctrl-C; `mivol validate` has two more.", ""]
-    for name, (verb, flags) in VERBS.items():
+    for name, verb in VERBS.items():
         sub = argparse.ArgumentParser(prog=f"mivol {name}")
-        flags(sub)
-        lines += [f"## `mivol {name}`", "", as_markdown(inspect.getdoc(verb) or ""), ""]
+        verb.add_flags(sub)
+        lines += [f"## `mivol {name}`", "", as_markdown(verb.description), ""]
         rows = flag_rows(sub)
         lines += table(("argument", ""), rows) if rows else []
     return page(lines)
@@ -166,7 +166,7 @@ def toml_page() -> str:
     from mivol import config
 
     kinds = {
-        "Pictures of a scene (a table `[scene]`)": config.SceneExperiment,
+        "Images of a scene (a table `[scene]`)": config.SceneExperiment,
         "Projections (a table `[scan]`)": config.ScanExperiment,
         "Photographs (a table `[photos]`)": config.FieldExperiment,
         "Gaussians (tables `[photos]` and `[gaussians]`)": config.GaussianExperiment,

@@ -1,7 +1,7 @@
-"""The command ``mivol``: each verb is one call per arrow of the scene's way to an image, a volume or a page.
+"""The command ``mivol``: a verb is one function and one entry of ``VERBS``.
 
-Conventions. What mivol refuses, a full disk or memory and Ctrl-C become one sentence on the error output and an exit code that
-is not 0; only a mistake of the program itself shows a traceback. Slow imports wait for the verb that needs them.
+Conventions. A refusal of mivol, a full disk or memory, and Ctrl-C become one sentence on the error output and a nonzero exit
+code; only a bug of the program shows a traceback. Slow imports wait for the verb that needs them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mivol
 from mivol.cli.interrupts import Signals
@@ -19,15 +19,15 @@ from mivol.errors import MivolError
 
 USAGE, STOPPED = 2, 130
 
-DESCRIPTION = """Differentiable and inverse volume rendering on Mitsuba 3. Begin with "mivol doctor", which says whether a
-render would work here, and "mivol demo", which lists examples. "mivol VERB --help" says what a verb takes."""
+DESCRIPTION = """Differentiable and inverse volume rendering on Mitsuba 3. "mivol doctor" checks whether this machine can
+render. "mivol demo" lists examples. "mivol VERB --help" explains a verb."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``mivol`` with these arguments (by default the process's own).
+    """Run ``mivol`` with these arguments (default: the arguments of the process).
 
     Returns:
-        Exit code: 0, 1 for what was refused, 2 for wrong arguments, 130 for Ctrl-C and SIGTERM; ``validate`` has more.
+        Exit code: 0 for success, 1 for a refusal, 2 for wrong arguments, 130 for Ctrl-C and SIGTERM; ``validate`` has more.
     """
     signals = Signals()
     try:
@@ -35,23 +35,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         return arguments.verb(arguments) or 0
     except BaseException as error:
         if signals.are_behind(error):
-            print("mivol: stopped; what was finished is kept.", file=sys.stderr)
+            print("mivol: stopped; finished work is kept.", file=sys.stderr)
             return STOPPED
         if not isinstance(error, MivolError | OSError | MemoryError):
             raise
-        print(f"mivol: {sentence_of(error)}", file=sys.stderr)
+        print(f"mivol: {describe_error(error)}", file=sys.stderr)
         return 1
 
 
-def sentence_of(error: MivolError | OSError | MemoryError) -> str:
-    """What is said of an error that is no mistake of the program."""
+def describe_error(error: MivolError | OSError | MemoryError) -> str:
+    """The sentence for an error that is no bug of the program."""
     if isinstance(error, MemoryError):
         return f"the memory does not suffice ({error or 'nothing more is known'}): take fewer voxels, pixels or views."
     return str(error)
 
 
 def parse(given: Sequence[str]) -> argparse.Namespace:
-    """The flags of a command, with the command as it was typed and what is a study's own; wrong ones end the process."""
+    """Parse a command; wrong arguments end the process.
+
+    Returns:
+        The flags, with the verb's function as ``verb``, the whole command line as ``command``, and the own flags of a study as
+        ``rest``.
+    """
     known = parser()
     arguments, rest = known.parse_known_args(given)
     arguments.rest = rest
@@ -62,258 +67,283 @@ def parse(given: Sequence[str]) -> argparse.Namespace:
 
 
 def parser() -> argparse.ArgumentParser:
-    """All verbs and their flags."""
+    """The parser of all verbs and their flags."""
     top = argparse.ArgumentParser(prog="mivol", description=DESCRIPTION)
     top.add_argument("--version", action="version", version=f"mivol {mivol.__version__}")
-    verbs = top.add_subparsers(required=True, metavar="verb")
-    for name, (verb, flags) in VERBS.items():
+    verbs = top.add_subparsers(required=True, metavar="verb", title="verbs")
+    for name, verb in VERBS.items():
         sub = verbs.add_parser(
-            name, help=first_line(verb), description=verb.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+            name, help=verb.summary, description=verb.description, formatter_class=argparse.RawDescriptionHelpFormatter
         )
-        sub.set_defaults(verb=verb)
-        flags(sub)
+        sub.set_defaults(verb=verb.run)
+        verb.add_flags(sub)
     return top
 
 
-def first_line(verb: Callable) -> str:
-    """What a verb does, in a line."""
-    return (verb.__doc__ or "").partition("\n")[0]
+class Verb(NamedTuple):
+    """A verb of the command.
+
+    Attributes:
+        run: function of the parsed flags; its docstring is the help, and it returns the exit code or None for 0.
+        flags: function that returns the flags; its imports wait until the parser is made.
+        epilog: function that returns the last part of the help.
+    """
+
+    run: Callable[[argparse.Namespace], int | None]
+    flags: Callable[[], list[tuple[tuple[str, ...], dict[str, Any]]]] = list
+    epilog: Callable[[], str] = str
+
+    @property
+    def description(self) -> str:
+        """The docstring of the function."""
+        lines = (self.run.__doc__ or "").strip().splitlines()
+        return "\n".join(line.removeprefix("    ") for line in lines)
+
+    @property
+    def summary(self) -> str:
+        """The first line of the docstring."""
+        return self.description.partition("\n")[0]
+
+    def add_flags(self, sub: argparse.ArgumentParser) -> None:
+        """Add the flags and the epilog to the parser of the verb."""
+        for names, options in self.flags():
+            sub.add_argument(*names, **options)
+        sub.epilog = self.epilog().replace("%", "%%")
 
 
-# -- Flags --------------------------------------------------------------------------------------------------------
+# -- Flags -----------------------------------------------------------------------------------------------------------------
 
 
-def scene_flags(sub: argparse.ArgumentParser, what: str = "Mitsuba XML") -> None:
-    """Mitsuba's own flags for what is loaded."""
-    sub.add_argument("scene", type=Path, help=what)
-    sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant (default: %(default)s)")
-    sub.add_argument("-D", "--define", action="append", default=[], metavar="name=value", help="fill in $name")
-    sub.add_argument("-a", default="", metavar="path;path", help="more folders to look for files in")
-    sub.add_argument("-t", "--threads", type=int, default=0, help="threads of the CPU back end; 0: all cores")
-    sub.add_argument("-v", "--verbose", action="store_true", help="Mitsuba's own messages")
+def flag(*names: str, **options: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return the arguments of ``ArgumentParser.add_argument``."""
+    return names, options
 
 
-def explain_flags(sub: argparse.ArgumentParser) -> None:
-    """A scene, or a data set with a picture of its cameras."""
-    kinds = "Mitsuba XML, an experiment (.toml), points or Gaussians (.ply, .spz, ...), or photographs: a folder or its file"
-    scene_flags(sub, kinds)
-    sub.add_argument("-o", "--output", type=Path, help="draw the cameras of photographs, and the boxes (.png, .svg)")
-    sub.add_argument("--preset", help="of photographs: what mivol optimize --preset would do with them; capture, cpu, ...")
-    sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of such a fit")
-    sub.add_argument("--max-depth", type=int, help="longest path asked about; default: that of the scene's integrator")
-    aim = "noise of a pixel over the mean radiance; max_depth has to leave out less (default: %(default)s)"
-    sub.add_argument("--noise", type=float, default=0.02, help=aim)
+MODE = flag("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
+SENSOR = flag("-s", "--sensor", type=int, default=0, help="index of the sensor (default: %(default)s)")
+SEED = flag("--seed", type=int, default=0, help="seed of the random numbers (default: %(default)s)")
+MAX_DEPTH = flag("--max-depth", type=int, help="longest path (default: the max_depth of the scene's integrator)")
 
 
-def render_flags(sub: argparse.ArgumentParser) -> None:
-    """Mitsuba's own flags for an image, and the camera of a radiance field, of points and of Gaussians."""
+def list_flag(name: str, metavar: str, text: str) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """A flag that may be given several times."""
+    return flag(name, action="append", default=[], metavar=metavar, help=text)
+
+
+def scene_flags(text: str = "scene: Mitsuba XML") -> list[tuple[tuple[str, ...], dict[str, Any]]]:
+    """The flags of the command ``mitsuba`` for a scene."""
+    return [
+        flag("scene", type=Path, help=text),
+        MODE,
+        flag("-D", "--define", action="append", default=[], metavar="name=value", help="value of the scene's $name"),
+        flag("-a", default="", metavar="path;path", help="more folders with files of the scene"),
+        flag("-t", "--threads", type=int, default=0, help="threads of the CPU back end; 0: all cores (default: %(default)s)"),
+        flag("-v", "--verbose", action="store_true", help="show Mitsuba's messages"),
+    ]
+
+
+def explain_flags() -> list:
+    """Flags of ``mivol explain``."""
+    return [
+        *scene_flags("scene (.xml), experiment (.toml), points or Gaussians (.ply, .spz, ...), or photographs (folder, file)"),
+        flag("-o", "--output", type=Path, help="image (.png, .svg) of the cameras of photographs, and of the boxes"),
+        flag("--preset", help="for photographs: explain the fit of mivol optimize --preset (capture, cpu, ...)"),
+        list_flag("--set", "key=value", "override a setting of the experiment"),
+        MAX_DEPTH,
+        flag(
+            "--noise", type=float, default=0.02,
+            help="noise of a pixel over the mean radiance; the proposed max_depth neglects less (default: %(default)s)",
+        ),
+    ]  # fmt: skip
+
+
+def render_flags() -> list:
+    """Flags of ``mivol render``."""
     from mivol.experiments.render import DRAWN_AS
 
-    scene_flags(sub, "Mitsuba XML, a radiance field (.npz) with --look-at, or points or Gaussians (.ply, .npy, .spz, ...)")
-    where = "of a field or points: where the camera stands, and what it looks at [length]; default for points: all is seen"
-    sub.add_argument("--look-at", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"), help=where)
-    sub.add_argument("--up", type=float, nargs=3, metavar=("x", "y", "z"), default=[0.0, 0.0, 1.0], help="of such a picture")
-    sub.add_argument("--fov", type=float, default=50.0, help="of such a picture, across [degree] (default: %(default)s)")
-    sub.add_argument("--size", type=int, nargs=2, metavar=("width", "height"), default=[640, 480], help="of such a picture")
-    sub.add_argument("--points", choices=DRAWN_AS, default=DRAWN_AS[0], help="what points are drawn as (default: %(default)s)")
-    sizes = "of points: radius, or standard deviation of splats [length]; default: half their distance"
-    sub.add_argument("--radius", type=float, help=sizes)
-    sub.add_argument("--opacity", type=float, default=1.0, help="of points (default: %(default)s)")
-    sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
-    sub.add_argument("-o", "--output", type=Path, help="image (.exr or .png); default: the XML's name with .exr")
-    sub.add_argument("--integrator", help="in place of the scene's own, with its max_depth: mivol, volpath, ...")
-    sub.add_argument("--spp", type=int, help="samples per pixel; default: those of the sensor's sampler")
-    sub.add_argument("--seed", type=int, default=0, help="of the random numbers (default: %(default)s)")
+    return [
+        *scene_flags("scene (.xml), radiance field (.npz) with --look-at, or points or Gaussians (.ply, .npy, .spz, ...)"),
+        flag(
+            "--look-at", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
+            help="for a field or points: positions of camera and target [length] (default for points: a view of all points)",
+        ),
+        flag("--up", type=float, nargs=3, metavar=("x", "y", "z"), default=[0.0, 0.0, 1.0],
+             help="upward direction of that camera (default: 0 0 1)"),
+        flag("--fov", type=float, default=50.0, help="horizontal field of view of that camera [degree] (default: %(default)s)"),
+        flag("--size", type=int, nargs=2, metavar=("width", "height"), default=[640, 480],
+             help="image size of that camera [pixel] (default: 640 480)"),
+        flag("--points", choices=DRAWN_AS, default=DRAWN_AS[0], help="shape of drawn points (default: %(default)s)"),
+        flag("--radius", type=float,
+             help="radius of discs, or standard deviation of splats [length] (default: half the median distance of points)"),
+        flag("--opacity", type=float, default=1.0, help="opacity of points (default: %(default)s)"),
+        SENSOR,
+        flag("-o", "--output", type=Path, help="image, .exr or .png (default: the name of the input with .exr)"),
+        flag("--integrator", help="integrator in place of the scene's, with the same max_depth: mivol, volpath, ..."),
+        flag("--spp", type=int, help="samples per pixel (default: the number of the sensor's sampler)"),
+        SEED,
+    ]  # fmt: skip
 
 
-def reference_flags(sub: argparse.ArgumentParser) -> None:
-    """Flags of a reference."""
-    scene_flags(sub)
-    sub.add_argument("-s", "--sensor", type=sensor_number, default=0, help='its number, or "all": a set of photographs')
-    sub.add_argument("-o", "--output", type=Path, default=Path("references"), help=".exr, or a folder")
-    sub.add_argument("--max-depth", type=int, required=True, help="longest path; -1 is unlimited")
-    sub.add_argument("--target", type=float, help="RMS standard error of the mean to reach [radiance]")
-    sub.add_argument("--spp", type=int, default=1 << 16, help="most samples per pixel (default: %(default)s)")
-    sub.add_argument("--seed", type=int, default=0, help="root of its random numbers")
-    sub.add_argument("--integrator", default="volpath", help="volpath or volpathmis")
+def reference_flags() -> list:
+    """Flags of ``mivol reference``."""
+    return [
+        *scene_flags(),
+        flag("-s", "--sensor", type=lambda text: text if text == "all" else int(text), default=0,
+             help="index of the sensor, or all for a set of photographs (default: %(default)s)"),
+        flag("-o", "--output", type=Path, default=Path("references"), help=".exr file, or a folder (default: %(default)s)"),
+        flag("--max-depth", type=int, required=True, help="longest path; -1: unlimited"),
+        flag("--target", type=float, help="RMS standard error of the mean at which rendering stops [radiance]"),
+        flag("--spp", type=int, default=1 << 16, help="largest number of samples per pixel (default: %(default)s)"),
+        SEED,
+        flag("--integrator", default="volpath", help="volpath or volpathmis (default: %(default)s)"),
+    ]  # fmt: skip
 
 
-def sensor_number(text: str) -> int | str:
-    """The number of a sensor, or "all"."""
-    return text if text == "all" else int(text)
+def optimize_flags() -> list:
+    """Flags of ``mivol optimize``."""
+    return [
+        flag("experiment", type=Path, help="experiment (.toml), or posed photographs: a folder or a file of cameras"),
+        flag("--preset", help="for photographs without a TOML file: capture for a place around the cameras, cpu for an object"),
+        list_flag("--set", "key=value", "override a setting of the experiment"),
+        flag("-o", "--output", type=Path, help="run folder (default: the experiment's output)"),
+        flag("--resume", action="store_true", help="continue from the checkpoint in the run folder"),
+    ]
 
 
-def optimize_flags(sub: argparse.ArgumentParser) -> None:
-    """Flags of a fit; the settings of the file come from the schema."""
+def describe_settings() -> str:
+    """All settings of a TOML file, by kind of experiment."""
     from mivol import config
     from mivol.schema import describe
 
-    lines: list[str] = []
+    lines = ["Settings of the TOML file, by kind of experiment."]
     for kind in config.KINDS.values():
-        lines += ["", kind.__doc__.replace("``", "").rstrip(".") + ":", *describe(kind)]
-    sub.epilog = "Settings of the TOML file, by kind of experiment.\n" + "\n  ".join(line.replace("%", "%%") for line in lines)
-    sub.add_argument("experiment", type=Path, help="TOML file, or posed photographs: a folder or its file of cameras")
-    sub.add_argument("--preset", help="of photographs without a TOML file: capture for a place around the cameras, or cpu, ...")
-    sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of the file")
-    sub.add_argument("-o", "--output", type=Path, help="run folder")
-    sub.add_argument("--resume", action="store_true", help="continue from the run folder's checkpoint")
+        lines += ["", f"{kind.__doc__}".replace("``", "").rstrip(".") + ":", *describe(kind)]
+    return "\n  ".join(lines)
 
 
-def report_flags(sub: argparse.ArgumentParser) -> None:
-    """Flags of the page."""
-    sub.add_argument("folder", type=Path, help="run folder")
+def validate_flags() -> list:
+    """Flags of ``mivol validate``."""
+    return [
+        *scene_flags(),
+        SENSOR,
+        flag("-o", "--output", type=Path, default=Path("validation"), help="folder of the results (default: %(default)s)"),
+        MAX_DEPTH,
+        flag("--spp", type=int, default=256, help="samples per pixel of mivol (default: %(default)s)"),
+        flag("--reference-spp", type=int, default=1024, help="samples per pixel of Mitsuba's volpath (default: %(default)s)"),
+        SEED,
+        list_flag("--parameter", "key", "check the gradient of this parameter too"),
+    ]
 
 
-def export_flags(sub: argparse.ArgumentParser) -> None:
-    """Flags of a field that becomes a file of another program."""
+def export_flags() -> list:
+    """Flags of ``mivol export``."""
     from mivol.fields.field_files import FIELD_FORMATS
 
-    known = ", ".join(f"{suffix} ({kind.name})" for suffix, kind in FIELD_FORMATS.items())
-    sub.add_argument("field", type=Path, help="radiance field (.npz): mivol's, or a checkpoint of svox2")
-    sub.add_argument("output", type=Path, help=f"what to write, by its suffix: {known}")
-    default = "where a voxel is half opaque, or half of what thinner matter has"
-    sub.add_argument("--level", type=float, help=f"extinction of a mesh's surface [1/length]; default: {default}")
-    sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant (default: %(default)s)")
+    formats = ", ".join(f"{suffix} ({kind.name})" for suffix, kind in FIELD_FORMATS.items())
+    return [
+        flag("field", type=Path, help="radiance field (.npz) of mivol, or a checkpoint of svox2"),
+        flag("output", type=Path, help=f"file to write; its suffix chooses the format: {formats}"),
+        flag("--level", type=float,
+             help="extinction at a mesh's surface [1/length] (default: a voxel of opacity 0.5, or half the maximum if lower)"),
+        MODE,
+    ]  # fmt: skip
 
 
-def convert_flags(sub: argparse.ArgumentParser) -> None:
-    """From which file to which."""
+def convert_flags() -> list:
+    """Flags of ``mivol convert``."""
     from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS
     from mivol.points.gaussian_files import GAUSSIAN_READERS, GAUSSIAN_WRITERS
     from mivol.points.summary import KINDS
 
-    known = ", ".join({**GAUSSIAN_WRITERS, **CLOUD_WRITERS})
-    sub.add_argument(
-        "source", type=Path, help=f"what to read: {', '.join({**GAUSSIAN_READERS, **CLOUD_READERS})}, .npz (field)"
-    )
-    sub.add_argument("output", type=Path, help=f"what to write: {known}, .npz (field), .obj (mesh)")
-    kinds = (*KINDS, "field", "mesh")
-    sub.add_argument("--to", choices=kinds, help="what to write it as; default: what the source holds, if the format can")
-    along = "of a field or a mesh: voxels along the longest edge (default: 128); of Gaussians of a field: Gaussians along it"
-    sub.add_argument("--resolution", type=int, help=f"{along} (default: one for two voxels)")
-    corners = ("x", "y", "z", "to_x", "to_y", "to_z")
-    held = "of a field or a mesh [length]; default: three standard deviations of all Gaussians"
-    sub.add_argument("--box", type=float, nargs=6, metavar=corners, help=held)
-    sub.add_argument(
-        "-m", "--mode", default="llvm_ad_rgb", help="variant of the views of a field or a mesh (default: %(default)s)"
-    )
+    readable, writable = ({**GAUSSIAN_READERS, **CLOUD_READERS}, {**GAUSSIAN_WRITERS, **CLOUD_WRITERS})
+    return [
+        flag("source", type=Path, help=f"file to read: {', '.join(readable)}, .npz (field)"),
+        flag("output", type=Path, help=f"file to write: {', '.join(writable)}, .npz (field), .obj (mesh)"),
+        flag("--to", choices=(*KINDS, "field", "mesh"), help="kind of the output (default: as the source, if possible)"),
+        flag("--resolution", type=int,
+             help="for a field or a mesh: voxels along the longest edge (default: 128); for Gaussians from a field: Gaussians "
+             "along that edge (default: one per two voxels)"),
+        flag("--box", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
+             help="box of a field or a mesh [length] (default: three standard deviations around all Gaussians)"),
+        MODE,
+    ]  # fmt: skip
 
 
-def demo_flags(sub: argparse.ArgumentParser) -> None:
-    """Which example, and what to do with it."""
-    sub.add_argument("name", nargs="?", default="", help="which; without one they are listed")
-    sub.add_argument("--into", type=Path, metavar="folder", help="copy the example's files there instead of running it")
-    sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting")
-    sub.add_argument("-o", "--output", type=Path, help="run folder (default: runs/NAME)")
+# -- Verbs -----------------------------------------------------------------------------------------------------------------
 
 
-def fetch_flags(sub: argparse.ArgumentParser) -> None:
-    """Which data."""
-    sub.add_argument("name", nargs="?", default="", help="which; without one they are listed, with licence and size")
-    sub.add_argument("--into", type=Path, metavar="folder", help="where to keep it; default: MIVOL_CACHE, or the user's cache")
+def demo(arguments: argparse.Namespace) -> None:
+    """Run an example, list the examples, or copy one to start from."""
+    from mivol.cli.progress import TerminalProgress
+    from mivol.experiments.examples import copy_example, list_examples, run_example
 
-
-def validate_flags(sub: argparse.ArgumentParser) -> None:
-    """Flags of a comparison with Mitsuba's own path tracer."""
-    scene_flags(sub)
-    sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
-    sub.add_argument("-o", "--output", type=Path, default=Path("validation"), help="folder (default: %(default)s)")
-    sub.add_argument("--max-depth", type=int, help="longest path; default: that of the scene's integrator")
-    sub.add_argument("--spp", type=int, default=256, help="samples per pixel of ours (default: %(default)s)")
-    sub.add_argument("--reference-spp", type=int, default=1024, help="of Mitsuba's volpath (default: %(default)s)")
-    sub.add_argument("--seed", type=int, default=0, help="root of all random numbers")
-    sub.add_argument("--parameter", action="append", default=[], metavar="key", help="check the gradient of this parameter too")
-
-
-def bench_flags(sub: argparse.ArgumentParser) -> None:
-    """Flags that every study knows; what else is given is the study's own."""
-    sub.add_argument("study", nargs="?", default="", help="which; without one they are listed")
-    sub.add_argument("--quick", action="store_true", help="small work: whether it runs; its times mean nothing")
-    sub.add_argument("--compare", type=Path, metavar="old.json", help="say what has changed since this result")
-    sub.epilog = "Other flags are the study's own: --only, --out, --variant, ..."
-
-
-def no_flags(sub: argparse.ArgumentParser) -> None:
-    """None."""
-
-
-# -- Verbs --------------------------------------------------------------------------------------------------------
+    if not arguments.name:
+        print(list_examples())
+    elif arguments.into is not None:
+        print(copy_example(arguments.name, arguments.into))
+    else:
+        options = {"changes": tuple(arguments.set), "progress": TerminalProgress(), "command": arguments.command}
+        print(run_example(arguments.name, arguments.output, **options))
 
 
 def explain(arguments: argparse.Namespace) -> int:
-    """What a scene or a fit needs, and what mivol would do: facts, choices, reasons; a small preview says which depth it needs.
+    """Say what mivol would do with a scene or an experiment, and why, before it renders more than a small preview.
 
-    Of posed photographs: what there is, what is missing, and where asked for a picture of the cameras and the box that they
-    look at. Of points and Gaussians: how many, where, how large and opaque. What is refused is said after the facts, and the
-    exit code is 1.
+    For photographs, explain lists what is there and what is missing, and draws the cameras with --output. For points and
+    Gaussians, it prints their number, extent, sizes and opacities. A refusal comes after the facts, with exit code 1.
     """
     from mivol.photos import find_format
-    from mivol.points.summary import is_points_file
+    from mivol.points.summary import is_points_file, summarize_file
 
-    if arguments.set and arguments.preset is None and arguments.scene.suffix.lower() != ".toml":
+    is_experiment = arguments.scene.suffix.lower() == ".toml" or arguments.preset is not None
+    if arguments.set and not is_experiment:
         raise MivolError(f"--set is for fits, and {arguments.scene} is none: give --preset, or the file of an experiment.")
-    if arguments.scene.suffix.lower() == ".toml" or arguments.preset is not None:
-        return explain_experiment(arguments)
-    if is_points_file(arguments.scene):
-        return explain_points(arguments)
-    kind = explain_photos if arguments.scene.is_dir() or find_format(arguments.scene) else explain_scene
-    return kind(arguments)
+    if is_experiment:
+        from mivol.experiments.kinds import explain_experiment
+
+        answer = explain_experiment(*load_experiment(arguments.scene, arguments), arguments.output)
+    elif is_points_file(arguments.scene):
+        answer = summarize_file(arguments.scene)
+    elif arguments.scene.is_dir() or find_format(arguments.scene):
+        return explain_photos(arguments.scene, arguments.output)
+    else:
+        from mivol.cli.loading import load
+        from mivol.scene.explain import examine
+
+        answer = examine(load(arguments).scene, arguments.max_depth, noise=arguments.noise)
+    print(answer.text)
+    return int(bool(answer.refusal))
 
 
-def explain_scene(arguments: argparse.Namespace) -> int:
-    """Facts, choices, reasons."""
-    from mivol.cli.loading import load
-    from mivol.scene.explain import examine
-
-    said = examine(load(arguments).scene, arguments.max_depth, noise=arguments.noise)
-    print(said.text)
-    return int(bool(said.refusal))
-
-
-def explain_experiment(arguments: argparse.Namespace) -> int:
-    """Facts, choices, reasons of a fit, with every check that it would make."""
-    from mivol.experiments.kinds import explain_experiment as explain_settings
-
-    said = explain_settings(*chosen_of(arguments.scene, arguments), arguments.output)
-    print(said.text)
-    return int(bool(said.refusal))
-
-
-def explain_points(arguments: argparse.Namespace) -> int:
-    """Facts of a file of points or Gaussians."""
-    from mivol.points.summary import summarize_file
-
-    facts = summarize_file(arguments.scene)
-    print(facts.text)
-    return int(bool(facts.refusal))
-
-
-def explain_photos(arguments: argparse.Namespace) -> int:
-    """Facts of a data set, and a picture of its cameras where one is asked for."""
+def explain_photos(path: Path, picture: Path | None) -> int:
+    """Print the facts of a data set, and draw its cameras into an image."""
     from mivol.experiments.photo_data import note_on_alpha
     from mivol.photos import survey_photos
     from mivol.report.cameras import plot_cameras
 
-    survey = survey_photos(arguments.scene)
+    survey = survey_photos(path)
     print(survey.describe())
     if note := note_on_alpha(survey):
         print(note)
-    print("--preset capture says what a fit of a place around the cameras would do, --preset cpu what one of a thing would")
-    if arguments.output is not None:
-        plot_cameras(survey, arguments.output)
-        print(arguments.output)
+    print("--preset capture explains a fit of a place around the cameras, --preset cpu a fit of an object")
+    if picture is not None:
+        plot_cameras(survey, picture)
+        print(picture)
     return 0
 
 
 def render(arguments: argparse.Namespace) -> None:
-    """Render a scene to an image, with the flags of the command ``mitsuba``; or a field or points, from where one likes."""
+    """Render an image of a scene, a radiance field, points or Gaussians.
+
+    For a scene, the flags are the flags of the command mitsuba.
+    """
     from mivol.cli.loading import load
     from mivol.experiments.render import check_output, choose_integrator, name_of, render_image, write_image
 
     path = arguments.output or arguments.scene.with_suffix(".exr")
     check_output(path)
-    if own := own_picture(arguments):
-        write_image(path, own(), ["R", "G", "B"])
+    if view := view_without_scene(arguments):
+        write_image(path, view(), ["R", "G", "B"])
         print(path)
         return
     scene = load(arguments).scene
@@ -324,11 +354,11 @@ def render(arguments: argparse.Namespace) -> None:
     print(path)
 
 
-def own_picture(arguments: argparse.Namespace) -> Callable | None:
-    """What draws a picture of what is no scene: of a radiance field, of points or Gaussians; None: it is a scene.
+def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
+    """Return the function that renders a radiance field, points or Gaussians; None for a scene.
 
     Raises:
-        MivolError: a camera for a scene, or none for a field.
+        MivolError: a camera for a scene, or no camera for a field.
     """
     from mivol.experiments.back_end import set_variant
     from mivol.experiments.render import PointLook, view_field, view_points
@@ -337,8 +367,8 @@ def own_picture(arguments: argparse.Namespace) -> Callable | None:
     suffix = arguments.scene.suffix.lower()
     is_field, is_cloud = suffix == ".npz", suffix in SUFFIXES
     if not is_cloud and is_field != (arguments.look_at is not None):
-        wanted = "a radiance field needs --look-at" if is_field else "--look-at is for a radiance field (.npz) or points"
-        raise MivolError(f"{arguments.scene}: {wanted}; a scene has its own cameras.")
+        fault = "a radiance field needs --look-at" if is_field else "--look-at is for a radiance field (.npz) or points"
+        raise MivolError(f"{arguments.scene}: {fault}; a scene has its own cameras.")
     look = PointLook(arguments.points, arguments.radius, arguments.opacity)
     if not is_cloud and look != PointLook():
         raise MivolError(f"{arguments.scene}: --points, --radius and --opacity are for clouds of points: leave them out.")
@@ -350,43 +380,49 @@ def own_picture(arguments: argparse.Namespace) -> Callable | None:
 
 
 def reference(arguments: argparse.Namespace) -> None:
-    """Render a reference with Mitsuba's own path tracer, with its variance, until it is good enough.
+    """Render a reference with Mitsuba's path tracer, with its variance, up to a given error.
 
-    Of all sensors (-s all) with a file of cameras beside them: photographs that a radiance field is fitted to.
+    With --sensor all, all sensors are rendered, with a file of cameras: photographs for a fit.
     """
     from mivol.cli.loading import load
     from mivol.validate.photographs import photograph
     from mivol.validate.reference import render_reference
 
-    settings = {
+    options = {
         "max_depth": arguments.max_depth, "target_se": arguments.target, "max_spp": arguments.spp,
         "seed": arguments.seed, "integrator": arguments.integrator,
     }  # fmt: skip
     if arguments.sensor == "all":
-        made = photograph(load(arguments), arguments.output, **settings)
+        results = photograph(load(arguments), arguments.output, **options)
     else:
         if not arguments.output.suffix:
             arguments.output.mkdir(parents=True, exist_ok=True)
-        made = [render_reference(load(arguments), arguments.output, sensor=arguments.sensor, **settings)]
-    print("\n".join(result.text for result in made))
+        results = [render_reference(load(arguments), arguments.output, sensor=arguments.sensor, **options)]
+    print("\n".join(result.text for result in results))
 
 
 def optimize(arguments: argparse.Namespace) -> None:
-    """Reconstruct a volume from its views; everything that comes of it lies in the run folder."""
+    """Fit a volume, scene parameters, a radiance field or Gaussians to images, projections or photographs.
+
+    All results are written into the run folder.
+    """
     from mivol.cli.progress import TerminalProgress
     from mivol.experiments.fit_kind import RunContext
     from mivol.experiments.kinds import run_experiment
 
-    chosen, base = chosen_of(arguments.experiment, arguments)
-    folder = arguments.output or Path(chosen.output)
-    print(run_experiment(RunContext(chosen, base, folder, arguments.resume, TerminalProgress(), arguments.command)))
+    settings, base = load_experiment(arguments.experiment, arguments)
+    folder = arguments.output or Path(settings.output)
+    print(run_experiment(RunContext(settings, base, folder, arguments.resume, TerminalProgress(), arguments.command)))
 
 
-def chosen_of(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path]:
-    """The experiment of a file or of photographs, with --preset and --set, and the folder that its paths begin at.
+def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path]:
+    """Load the experiment of a TOML file or of photographs, with --preset and --set.
+
+    Returns:
+        The settings, and the folder from which their relative paths start.
 
     Raises:
-        MivolError: photographs without a preset, a preset with a file, or as ``config.load``.
+        MivolError: photographs without a preset, a preset for another file, or as ``config.load``.
     """
     from mivol import config
     from mivol.photos import find_format
@@ -397,21 +433,31 @@ def chosen_of(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path]:
         return config.of_photographs(path, arguments.preset, arguments.set), Path()
     if arguments.preset is not None:
         is_experiment = path.suffix.lower() == ".toml"
-        found = f"--preset is for photographs, and {path} {'is an experiment' if is_experiment else 'holds none'}"
+        fault = f"--preset is for photographs, and {path} {'is an experiment' if is_experiment else 'holds none'}"
         advice = f"--set field.preset={arguments.preset} changes it" if is_experiment else "leave it out"
-        raise MivolError(f"{found}: {advice}.")
+        raise MivolError(f"{fault}: {advice}.")
     return config.load(path, arguments.set), path.parent
 
 
-def report(arguments: argparse.Namespace) -> None:
-    """Write the page of a run folder again."""
-    from mivol.report.page import write_page
+def validate(arguments: argparse.Namespace) -> int:
+    """Compare mivol with Mitsuba's path tracer on a scene: bias, z-image, relMSE, gradients and a verdict.
 
-    print(write_page(arguments.folder))
+    The exit code is 0 if both agree, 3 if they differ, and 4 if Mitsuba's image cannot be trusted.
+    """
+    from mivol.cli.loading import load
+    from mivol.experiments.validation import Validation, validate_scene
+
+    options = Validation(
+        max_depth=arguments.max_depth, spp=arguments.spp, reference_spp=arguments.reference_spp, seed=arguments.seed,
+        sensor=arguments.sensor, parameters=tuple(arguments.parameter),
+    )  # fmt: skip
+    verdict = validate_scene(load(arguments), arguments.output, options)
+    print(verdict.text)
+    return verdict.code
 
 
 def export(arguments: argparse.Namespace) -> None:
-    """Write a radiance field as a mesh, as volumes, as a scene with the sky beside its file, or for another program."""
+    """Write a radiance field as a mesh, volumes, a scene with its sky, or a file of another program."""
     from mivol.experiments.back_end import set_variant
     from mivol.experiments.render import sky_beside
     from mivol.fields.field_files import read_field, write_field
@@ -422,67 +468,55 @@ def export(arguments: argparse.Namespace) -> None:
 
 
 def convert(arguments: argparse.Namespace) -> None:
-    """Write the points or Gaussians of a file in another format, or one as the other, as a radiance field or as a mesh.
+    """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats.
 
-    A field (.npz) stands in scenes as mivol_sh, and becomes Gaussians (.ply) again; what either loses is said in dB, by views
-    of the field and of splatted Gaussians. A mesh (.obj, or .ply with --to mesh) is fused from depths of splatted views; how
-    far it lies from them is said.
+    A field (.npz) is the mivol_sh of a scene. Conversions between a field and Gaussians (.ply) print their error in dB, from
+    views of the field and of splatted Gaussians. A mesh (.obj, or .ply with --to mesh) is fused from depths of splatted views;
+    convert prints its distance from them.
     """
     source, target = arguments.source, arguments.output
-    made_of_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
+    from_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
     kind = arguments.to or WRITTEN_AS.get(target.suffix.lower())
     if is_field != (kind == "field"):
         raise MivolError(f"{target}: a radiance field is written as .npz, and nothing else is; leave out --to {arguments.to}.")
-    if made_of_field and kind not in (None, "gaussians"):
+    if from_field and kind not in (None, "gaussians"):
         raise MivolError(
             f"{source}: a radiance field becomes Gaussians (.ply) here; mivol export writes it as a mesh and more."
         )
     is_gridded = kind in ("field", "mesh")
     has_box, has_resolution = arguments.box is not None, arguments.resolution is not None
-    if (has_box and not is_gridded) or (has_resolution and not (is_gridded or made_of_field)):
+    if (has_box and not is_gridded) or (has_resolution and not (is_gridded or from_field)):
         raise MivolError(f"{target}: --resolution and --box are for a radiance field (.npz) or a mesh: leave them out.")
-    print(convert_from_field(arguments) if made_of_field else convert_points(arguments, kind))
+    print(convert_cloud(arguments, "from field" if from_field else kind))
 
 
 WRITTEN_AS = {".npz": "field", ".obj": "mesh"}
-"""What files of these suffixes hold."""
+"""Kind of the file by its suffix, where only one is possible."""
 
 
-def convert_from_field(arguments: argparse.Namespace) -> str:
-    """Gaussians of a radiance field; what was written."""
-    from mivol.experiments.gaussian_conversion import convert_to_gaussians
-
-    return convert_to_gaussians(arguments.source, arguments.output, arguments.resolution, arguments.mode)
-
-
-def convert_points(arguments: argparse.Namespace, kind: str | None) -> str:
-    """Points or Gaussians as a file of a kind; what was written."""
-    from mivol.experiments.gaussian_conversion import convert_to_field, convert_to_mesh
+def convert_cloud(arguments: argparse.Namespace, kind: str | None) -> str:
+    """Convert a file; return the lines to print."""
+    from mivol.experiments import gaussian_conversion
     from mivol.points.summary import convert_file
 
+    source, target, resolution = arguments.source, arguments.output, arguments.resolution
+    if kind == "from field":
+        return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
     if kind not in ("field", "mesh"):
-        return convert_file(arguments.source, arguments.output, kind)
-    resolution = 128 if arguments.resolution is None else arguments.resolution
-    make = convert_to_field if kind == "field" else convert_to_mesh
-    return make(arguments.source, arguments.output, resolution, arguments.box, arguments.mode)
+        return convert_file(source, target, kind)
+    make = gaussian_conversion.convert_to_field if kind == "field" else gaussian_conversion.convert_to_mesh
+    return make(source, target, 128 if resolution is None else resolution, arguments.box, arguments.mode)
 
 
-def demo(arguments: argparse.Namespace) -> None:
-    """Run an example that comes with mivol, list them, or copy one to begin from."""
-    from mivol.cli.progress import TerminalProgress
-    from mivol.experiments.examples import copy_example, list_examples, run_example
+def report(arguments: argparse.Namespace) -> None:
+    """Write the report page of a run folder again."""
+    from mivol.report.page import write_page
 
-    if not arguments.name:
-        print(list_examples())
-    elif arguments.into is not None:
-        print(copy_example(arguments.name, arguments.into))
-    else:
-        settings = {"changes": tuple(arguments.set), "progress": TerminalProgress(), "command": arguments.command}
-        print(run_example(arguments.name, arguments.output, **settings))
+    print(write_page(arguments.folder))
 
 
 def fetch(arguments: argparse.Namespace) -> None:
-    """Bring public data that the examples show from its public address, checked and kept in a cache."""
+    """Download public data of the examples into a cache, and check them."""
     from mivol.files.fetch import DATA, fetch_data, find_data_set
 
     if not arguments.name:
@@ -493,25 +527,8 @@ def fetch(arguments: argparse.Namespace) -> None:
     print(fetch_data(data, arguments.into))
 
 
-def validate(arguments: argparse.Namespace) -> int:
-    """Compare mivol with Mitsuba's own path tracer on a scene: bias, z-image, relMSE, gradients, a verdict.
-
-    The exit code is 0 where they agree, 3 where they differ, 4 where Mitsuba itself cannot be trusted.
-    """
-    from mivol.cli.loading import load
-    from mivol.experiments.validation import Validation, validate_scene
-
-    chosen = Validation(
-        max_depth=arguments.max_depth, spp=arguments.spp, reference_spp=arguments.reference_spp, seed=arguments.seed,
-        sensor=arguments.sensor, parameters=tuple(arguments.parameter),
-    )  # fmt: skip
-    verdict = validate_scene(load(arguments), arguments.output, chosen)
-    print(verdict.text)
-    return verdict.code
-
-
 def bench(arguments: argparse.Namespace) -> int:
-    """Run a bench: a question about speed or accuracy beside what else could be used; JSON, a figure and its bars."""
+    """Run a study of speed or accuracy beside other programs; write JSON and a figure, and check limits."""
     from mivol.bench.harness.catalogue import list_studies, run_study
 
     if not arguments.study:
@@ -522,23 +539,47 @@ def bench(arguments: argparse.Namespace) -> int:
 
 
 def doctor(arguments: argparse.Namespace) -> int:
-    """Say whether a render would work on this machine, and what to do where not."""
+    """Check whether this machine can render, and say how to fix what is missing."""
     from mivol.doctor import main
 
     return main([])
 
 
-VERBS: dict[str, tuple[Callable, Callable]] = {
-    "demo": (demo, demo_flags),
-    "explain": (explain, explain_flags),
-    "render": (render, render_flags),
-    "reference": (reference, reference_flags),
-    "optimize": (optimize, optimize_flags),
-    "validate": (validate, validate_flags),
-    "export": (export, export_flags),
-    "convert": (convert, convert_flags),
-    "report": (report, report_flags),
-    "fetch": (fetch, fetch_flags),
-    "bench": (bench, bench_flags),
-    "doctor": (doctor, no_flags),
+VERBS: dict[str, Verb] = {
+    "demo": Verb(
+        demo,
+        lambda: [
+            flag("name", nargs="?", default="", help="name of the example; without a name, demo lists the examples"),
+            flag("--into", type=Path, metavar="folder", help="copy the example's files into this folder, and do not run it"),
+            list_flag("--set", "key=value", "override a setting"),
+            flag("-o", "--output", type=Path, help="run folder (default: runs/NAME)"),
+        ],
+    ),
+    "explain": Verb(explain, explain_flags),
+    "render": Verb(render, render_flags),
+    "reference": Verb(reference, reference_flags),
+    "optimize": Verb(optimize, optimize_flags, describe_settings),
+    "validate": Verb(validate, validate_flags),
+    "export": Verb(export, export_flags),
+    "convert": Verb(convert, convert_flags),
+    "report": Verb(report, lambda: [flag("folder", type=Path, help="run folder")]),
+    "fetch": Verb(
+        fetch,
+        lambda: [
+            flag(
+                "name", nargs="?", default="", help="name of the data; without a name, fetch lists them with licence and size"
+            ),
+            flag("--into", type=Path, metavar="folder", help="folder (default: MIVOL_CACHE, or the user's cache)"),
+        ],
+    ),
+    "bench": Verb(
+        bench,
+        lambda: [
+            flag("study", nargs="?", default="", help="name of the study; without a name, bench lists the studies"),
+            flag("--quick", action="store_true", help="run small work that tests the study; its times mean nothing"),
+            flag("--compare", type=Path, metavar="old.json", help="print the changes since an earlier result"),
+        ],
+        lambda: "A study has more flags of its own: --only, --out, --variant, ...",
+    ),
+    "doctor": Verb(doctor),
 }

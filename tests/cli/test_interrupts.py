@@ -46,14 +46,14 @@ def chained() -> None:
 def test_ctrl_c_behind_another_error_is_one_sentence(
     strike, ctrl_c: None, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(cli.VERBS, "doctor", (lambda arguments: strike(), cli.no_flags))
+    monkeypatch.setitem(cli.VERBS, "doctor", cli.Verb(lambda arguments: strike()))
     assert cli.main(["doctor"]) == 130
-    assert capsys.readouterr().err == "mivol: stopped; what was finished is kept.\n"
+    assert capsys.readouterr().err == "mivol: stopped; finished work is kept.\n"
 
 
 def test_another_error_shows_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     """A mistake of the program itself is not called an interruption."""
-    monkeypatch.setitem(cli.VERBS, "doctor", (lambda arguments: {}["no"], cli.no_flags))
+    monkeypatch.setitem(cli.VERBS, "doctor", cli.Verb(lambda arguments: {}["no"]))
     with pytest.raises(KeyError):
         cli.main(["doctor"])
     assert not Signals().came
@@ -63,9 +63,9 @@ def test_ctrl_c_while_flags_are_read_is_one_sentence(
     ctrl_c: None, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a verb's flags need is imported then, which takes a second."""
-    monkeypatch.setitem(cli.VERBS, "doctor", (cli.doctor, lambda sub: os.kill(os.getpid(), signal.SIGINT)))
+    monkeypatch.setitem(cli.VERBS, "doctor", cli.Verb(cli.doctor, lambda: os.kill(os.getpid(), signal.SIGINT)))
     assert cli.main(["doctor"]) == 130
-    assert capsys.readouterr().err == "mivol: stopped; what was finished is kept.\n"
+    assert capsys.readouterr().err == "mivol: stopped; finished work is kept.\n"
 
 
 STRIKES = {
