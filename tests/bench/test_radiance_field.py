@@ -118,7 +118,7 @@ def asked_plans(monkeypatch: pytest.MonkeyPatch, fit: Callable[[], object]) -> l
         return SimpleNamespace(course=SimpleNamespace(iterations=0), advance=lambda: None)
 
     monkeypatch.setattr(fits, "begin_radiance_fit", begin)
-    monkeypatch.setattr(fits.RayBatches, "of", lambda *of: of)
+    monkeypatch.setattr(fits.RayBatches, "from_photos", lambda *of: of)
     fit()
     return calls
 

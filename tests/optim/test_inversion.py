@@ -45,7 +45,7 @@ def test_steps_are_those_of_the_solver(scan, name):
 
 def test_nothing_to_reconstruct_is_refused(scan):
     empty = ProjectionProblem(LeastSquares(scan[0], scan[2], weights=np.zeros(len(scan[2]))))
-    with pytest.raises(MivolError, match="the projections hold nothing to reconstruct"):
+    with pytest.raises(MivolError, match="so nothing to reconstruct"):
         LinearSolve().begin(empty).step(0, 1.0)
 
 

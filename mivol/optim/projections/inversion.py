@@ -25,17 +25,17 @@ from mivol.optim.strategy import setting
 from mivol.tomography.preprocess import LightDrift, fit_light_drift
 
 KEY = "x"
-"""The name of the volume among values."""
+"""Name of the volume among the values."""
 
 
 @dataclass
 class ProjectionProblem:
-    """A volume behind projections.
+    """A volume and projections of it.
 
     Attributes:
-        linear_problem: what a solver minimises.
-        x: (n,) what was found; None before the first step.
-        times: (views,) when each was taken, where the light drifts; None where it does not.
+        linear_problem: the problem of line integrals.
+        x: (n,) the reconstructed volume; None before the first step.
+        times: (views,) time of each view, for light that drifts; None for constant light.
         safe_point: called before each iteration.
     """
 
@@ -45,43 +45,43 @@ class ProjectionProblem:
     safe_point: Callable[[], None] = lambda: None
 
     def initial_reals(self) -> Reals:
-        """Nothing: a solver begins where its problem says."""
+        """An empty dictionary: the solver takes its start from the problem of line integrals."""
         return {}
 
     def set_reals(self, reals: Reals) -> None:
-        """Take over what was found."""
+        """Store the volume."""
         self.x = reals.get(KEY)
 
     def values(self) -> Reals:
-        """What was found."""
+        """The reconstructed volume."""
         return {} if self.x is None else {KEY: self.x}
 
     def warning(self) -> str:
-        """Nothing: projections are computed without noise."""
+        """Always empty: projections are computed without noise."""
         return ""
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
-        """Nothing: the solver's state is all there is."""
+        """An empty dictionary: the solver's state is complete."""
         return {}
 
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
 
 class LinearSolve(Optimizer, tag="solve"):
     """The iterations of a linear solver."""
 
-    solver: Annotated[str, setting("1", "key of METHODS", min_length=1)] = "pcg"
+    solver: Annotated[str, setting("1", "key of ALL_SOLVERS", min_length=1)] = "pcg"
     subsets: Annotated[int, setting("1", "subsets of views, for os-sart", ge=1)] = 10
-    drift: Annotated[int, setting("iteration", "how often the drift of the light is fitted, where views have times", ge=0)] = 0
-    relaxation: Annotated[float, setting("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
-    decay: Annotated[float, setting("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
+    drift: Annotated[int, setting("iteration", "interval between fits of the light drift; 0: never", ge=0)] = 0
+    relaxation: Annotated[float, setting("1", "relaxation of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
+    decay: Annotated[float, setting("1", "factor on the relaxation per sweep", gt=0, le=1)] = 0.99
     window: Annotated[str, setting("1", "key of mivol.tomography.ramp.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
-    cutoff: Annotated[float, setting("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
-    stop_norm: Annotated[float, setting("1", "stop where the norm of the residual is at most this", ge=0)] = 0.0
+    cutoff: Annotated[float, setting("1", "end of the window, as a share of the Nyquist frequency", gt=0, le=1)] = 1.0
+    stop_norm: Annotated[float, setting("1", "stop at this norm of the residual", ge=0)] = 0.0
 
     def options(self) -> dict[str, object]:
-        """What is given to the solver."""
+        """Options of the solver."""
         if self.solver in DIRECT:
             return {"window": self.window, "cutoff": self.cutoff}
         steps = {"relaxation": self.relaxation, "decay": self.decay}
@@ -92,59 +92,59 @@ class LinearSolve(Optimizer, tag="solve"):
 
 
 class SolverRun(OptimizerRun):
-    """State: that of the solver, whose arrays are never written again.
+    """State: the solver's state, whose arrays are never overwritten.
 
     Attributes:
-        state: the newest; None before the first iteration.
+        state: the latest state; None before the first iteration.
     """
 
     def __init__(self, settings: LinearSolve, problem: ProjectionProblem) -> None:
         super().__init__(problem)
         self.settings = settings
         self.state: SolverState | None = None
-        self._go_on(None)
+        self._resume(None)
 
-    def _go_on(self, state: SolverState | None) -> None:
-        method = ALL_SOLVERS[self.settings.solver]
+    def _resume(self, state: SolverState | None) -> None:
+        solver = ALL_SOLVERS[self.settings.solver]
         problem, options = self.problem.linear_problem, self.settings.options()
-        method.check(problem, **options)
+        solver.check(problem, **options)
         if self.problem.times is not None and self.settings.drift:
-            self._states = solve_with_drift(method.run, problem, self.problem.times, self.settings.drift, state, **options)
+            self._states = solve_with_drift(solver.run, problem, self.problem.times, self.settings.drift, state, **options)
         else:
-            self._states = method.run(problem, state, **options)
-        self._keep(state)
+            self._states = solver.run(problem, state, **options)
+        self._store(state)
 
-    def _keep(self, state: SolverState | None) -> None:
+    def _store(self, state: SolverState | None) -> None:
         self.state = state
         self.reals = {} if state is None else {KEY: state.x}
         if state is not None and state.residual_norm <= self.settings.stop_norm:
             self.stop_reason = "the residual is as small as the noise"
 
     def step(self, iteration: int, factor: float) -> float | None:
-        """The solver's next iteration; what it minimises, after it.
+        """Take the solver's next iteration; returns the objective after the iteration.
 
         Raises:
-            MivolError: the projections hold nothing, so that there is no first iteration.
+            MivolError: no data, so that no iteration is possible.
         """
         self.problem.safe_point()
         state = next(self._states, None)
         if state is None:
             if self.state is None:
-                raise MivolError("the projections hold nothing to reconstruct: all weights are 0, or all line integrals.")
+                raise MivolError("found only weights or line integrals of 0, so nothing to reconstruct: check the data.")
             self.stop_reason = "no direction lowers the objective"
             return None
-        self._keep(state)
+        self._store(state)
         return state.objective
 
     def pack(self) -> dict[str, np.ndarray]:
         return {} if self.state is None else self.state.to_arrays()
 
     def unpack(self, arrays: dict[str, np.ndarray]) -> None:
-        self._go_on(SolverState.from_arrays(arrays) if arrays else None)
+        self._resume(SolverState.from_arrays(arrays) if arrays else None)
 
 
 INNER = "inner."
-"""Begins the names of what the solver itself must know."""
+"""Prefix for the names of the solver's own memory."""
 
 
 def solve_with_drift(
@@ -155,15 +155,15 @@ def solve_with_drift(
     state: SolverState | None = None,
     **options: object,
 ) -> Iterator[SolverState]:
-    """Iterations of a solver with the drift fitted anew after ``every`` of them.
+    """Iterations of a solver, with a new fit of the drift after every ``every`` iterations.
 
     Args:
-        run: of a :class:`~mivol.optim.projections.linear_problems.Solver` of least squares.
+        run: of a least-squares :class:`~mivol.optim.projections.linear_problems.Solver`.
         problem: its ``A`` is a projector, its ``b`` and ``weights`` are (views, rows, cols).
-        times: (views,) when each was taken, best about 0.
+        times: (views,) time of each view, preferably centred at 0.
         every: iterations of one turn.
-        state: where to go on; all that a turn knows is in its memory.
-        options: of the solver.
+        state: state to resume from; its memory holds the whole turn.
+        options: options of the solver.
 
     Yields:
         States of the solver, with the drift (``offset``, ``slope``) in their memory.
@@ -181,8 +181,8 @@ def solve_with_drift(
         for inner in itertools.islice(states, every - turn):
             done, turn = done + 1, turn + 1
             memory = {INNER + name: value for name, value in inner.memory.items()}
-            about = {"offset": drift.offset, "slope": drift.slope, "turn": np.asarray(turn)}
-            yield replace(inner, iteration=done, memory=memory | about)
+            drift_memory = {"offset": drift.offset, "slope": drift.slope, "turn": np.asarray(turn)}
+            yield replace(inner, iteration=done, memory=memory | drift_memory)
         if inner is None:
             return
         drift = fit_drift(problem, inner.x, times)
@@ -190,6 +190,6 @@ def solve_with_drift(
 
 
 def fit_drift(problem: LeastSquares, x: np.ndarray, times: np.ndarray) -> LightDrift:
-    """The drift that explains best what the volume ``x`` does not."""
-    left = problem.b - (problem.A @ np.reshape(x, -1)).reshape(problem.b.shape)
-    return fit_light_drift(left, problem.weights, times)
+    """The drift that best explains the residual of the volume ``x``."""
+    residual = problem.b - (problem.A @ np.reshape(x, -1)).reshape(problem.b.shape)
+    return fit_light_drift(residual, problem.weights, times)

@@ -34,19 +34,17 @@ def ordered_subsets_sart(
 ) -> Iterator[SolverState]:
     """Simultaneous algebraic reconstruction over subsets of views, one sweep of all subsets per iteration.
 
-    ``x <- P(x + lambda C_s A_s^T R_s (b_s - A_s x))`` with ``R_s = 1 / (A_s 1)``, ``C_s = 1 / (A_s^T 1)``, lambda
-    falling by ``decay`` after each sweep, and P the projection on x >= 0 where asked for. Subset s holds every
-    ``n_subsets``-th view, and the subsets come in golden-section order, so that successive ones look from far apart.
-    One subset is SIRT.
+    ``x <- P(x + lambda C_s A_s^T R_s (b_s - A_s x))`` with ``R_s = 1 / (A_s 1)`` and ``C_s = 1 / (A_s^T 1)``. lambda falls by
+    ``decay`` after each sweep; P is the projection onto x >= 0, if requested. Subset s holds every ``n_subsets``-th view. The
+    subsets follow in golden-section order, so successive subsets have distant directions. One subset is SIRT.
 
     Args:
         n_subsets: 1 to the number of views.
         relaxation: lambda of the first sweep, in (0, 2).
-        decay: in (0, 1]; below 1 the limit cycle of inconsistent data shrinks, and the method stops short of
-            convergence.
+        decay: in (0, 1]; a decay below 1 shrinks the limit cycle of inconsistent data, but stops before convergence.
 
-    Weights: only where they are 0 is heeded (the ray is left out). A prior is refused.
-    Cost per iteration: one A and one A^T, and once one A and one A^T more for the sums; memory: ``n_subsets`` fields.
+    Weights: only weights of 0 matter (they exclude a ray). A prior is refused.
+    Cost per iteration: one A and one A^T, and once one more A and A^T for the sums; memory: ``n_subsets`` fields.
     """
     check_sweeps(problem, n_subsets, relaxation, decay)
     a = problem.A
@@ -67,34 +65,34 @@ def ordered_subsets_sart(
 
 
 def check_sweeps(problem: LeastSquares, n_subsets: int = 1, relaxation: float = 1.0, decay: float = 1.0) -> None:
-    """Refuse what :func:`ordered_subsets_sart` cannot do; arguments as there.
+    """Check the arguments of :func:`ordered_subsets_sart`.
 
     Raises:
-        MivolError: a prior, steps outside their domain, or subsets that the views cannot be shared out to.
+        MivolError: a prior, relaxation or decay outside its domain, or an invalid number of subsets.
     """
     if problem.prior is not None:
         raise MivolError(
-            "Found a prior with SIRT or OS-SART, expected none: use pcg or ml-tr, which minimise a penalised objective."
+            "found a prior with SIRT or OS-SART, expected none: use pcg or ml-tr, which minimise a penalised objective."
         )
     if not 0 < relaxation < 2 or not 0 < decay <= 1:
-        raise MivolError(f"Found relaxation {relaxation} and decay {decay}, expected 0 < relaxation < 2 and 0 < decay <= 1.")
+        raise MivolError(f"found relaxation {relaxation} and decay {decay}, expected 0 < relaxation < 2 and 0 < decay <= 1.")
     n_views = getattr(problem.A, "n_views", None)
     if n_subsets != 1 and (n_views is None or not 1 <= n_subsets <= n_views):
         raise MivolError(
-            f"Found {n_subsets} subsets of {n_views or 'no'} views, expected at least 1, at most as many as views, "
-            "and an operator with n_views and subset(views)."
+            f"found {n_subsets} subsets of {n_views or 'no'} views, expected 1 to the number of views, and an operator with "
+            "n_views and subset(views)."
         )
 
 
 def sirt(problem: LeastSquares, state: SolverState | None = None, relaxation: float = 1.0) -> Iterator[SolverState]:
-    """One subset, and a relaxation that stays."""
+    """SART with one subset and constant relaxation."""
     return ordered_subsets_sart(problem, state, 1, relaxation, 1.0)
 
 
 def sart(
     problem: LeastSquares, state: SolverState | None = None, relaxation: float = 1.0, decay: float = 0.99
 ) -> Iterator[SolverState]:
-    """A subset for each view, as Andersen and Kak have it; one sweep over all views per iteration."""
+    """SART with a subset for each view (Andersen and Kak); one sweep over all views per iteration."""
     return ordered_subsets_sart(problem, state, getattr(problem.A, "n_views", 1), relaxation, decay)
 
 
@@ -127,22 +125,20 @@ def _block(problem: LeastSquares, views: np.ndarray | None, chord: np.ndarray) -
 
 
 def _golden_order(n: int) -> np.ndarray:
-    """A permutation of 0..n-1 whose neighbours are far apart."""
+    """A permutation of 0..n-1 with distant neighbours."""
     return np.argsort(np.argsort(np.arange(n) * (np.sqrt(5) - 1) / 2 % 1.0))
 
 
 def projected_cg(problem: LeastSquares, state: SolverState | None = None, precondition: bool = True) -> Iterator[SolverState]:
     """Preconditioned conjugate gradients on the (weighted, penalised) least squares.
 
-    Without bounds and prior this is linear CG (CGLS where not preconditioned). With them it is Polak-Ribiere CG on the
-    voxels that are free (x > 0, or pushed up by the gradient); a step that would leave the domain is bent back on to it
-    (projected) and followed to the minimum of the majoriser along the bent direction; where a bent direction does not
-    lead down the diagonally scaled gradient replaces it, whose projection always does. The objective therefore never
-    rises.
+    Without bounds and prior this is linear CG (CGLS if not preconditioned). Otherwise it is Polak-Ribiere CG on the free voxels
+    (x > 0, or pushed up by the gradient). A step that would leave the domain is projected onto the domain, and followed to the
+    minimum of the majoriser along the projected direction. If the projected direction does not descend, the diagonally scaled
+    gradient replaces the direction; its projection always descends. The objective therefore never rises.
 
-    Preconditioner: ``diag(A^T W A 1 + separable majoriser of the prior)^-1`` (SQS). Voxels that no ray sees stay at
-        ``x0``.
-    Cost per iteration: one A and one A^T, one A more where a step is bent.
+    Preconditioner: ``diag(A^T W A 1 + separable majoriser of the prior)^-1`` (SQS). Voxels that no ray crosses keep ``x0``.
+    Cost per iteration: one A and one A^T, and one more A for a projected step.
     """
     a = problem.A
     weights = flat_weights(problem)
@@ -154,17 +150,17 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
         r = flatten(problem.b, a.dtype) - a @ x
         state = _ls_state(problem, x, 0, r, {"residual": r})
     while True:
-        found = _direction(problem, state, data_diagonal, weights)
-        if found is None:
+        directions = _direction(problem, state, data_diagonal, weights)
+        if directions is None:
             return
-        direction, downhill, memory = found
+        direction, downhill, memory = directions
         g = memory["gradient"]
         step = _descend(problem, weights, state.x, g, direction) or _descend(problem, weights, state.x, g, downhill)
         if step is None:
             return
         x, r = state.x + step[0], state.memory["residual"] - step[1]
         if problem.nonnegative:
-            x = np.maximum(x, 0)  # rounding only: the step ends in the domain
+            x = np.maximum(x, 0)  # rounding: the step ends in the domain
         state = _ls_state(problem, x, state.iteration + 1, r, {"residual": r, **memory})
         yield state
 
@@ -172,9 +168,9 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
 def _direction(
     problem: LeastSquares, state: SolverState, data_diagonal: np.ndarray | None, weights: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
-    """The conjugate direction, the scaled downhill one, and what the next direction must know; None at the minimum."""
-    x, old, prior = state.x, state.memory, problem.prior
-    g = -(problem.A.T @ apply_weights(weights, old["residual"]))
+    """The conjugate direction, the scaled descent direction, and memory for the next direction; None at the minimum."""
+    x, memory, prior = state.x, state.memory, problem.prior
+    g = -(problem.A.T @ apply_weights(weights, memory["residual"]))
     if prior:
         g = g + prior.gradient(x)
     free = (x > 0) | (g < 0) if problem.nonnegative else None
@@ -186,16 +182,17 @@ def _direction(
     if not gz > 0:
         return None
     direction = -z
-    if "direction" in old:
-        beta = max(0.0, (gz - dot(old["gradient"], z)) / float(old["gz"]))
-        direction = direction + np.asarray(beta, x.dtype) * (old["direction"] if free is None else old["direction"] * free)
+    if "direction" in memory:
+        beta = max(0.0, (gz - dot(memory["gradient"], z)) / float(memory["gz"]))
+        last = memory["direction"] if free is None else memory["direction"] * free
+        direction = direction + np.asarray(beta, x.dtype) * last
     return direction, -z, {"direction": direction, "gradient": g, "gz": np.asarray(gz)}
 
 
 def _descend(
     problem: LeastSquares, weights: np.ndarray | None, x: np.ndarray, g: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """(step, A step) to the minimum along ``direction``, bent on to the domain; None where it does not lead down."""
+    """(step, A step) to the minimum along ``direction``, projected onto the domain; None if the direction does not descend."""
 
     def minimum(d: np.ndarray) -> tuple[float, np.ndarray] | None:
         image = problem.A @ d
@@ -203,23 +200,23 @@ def _descend(
         slope = dot(g, d)
         return (-slope / curvature, image) if slope < 0 and curvature > 0 else None
 
-    found = minimum(direction)
-    if found is None:
+    lowest = minimum(direction)
+    if lowest is None:
         return None
-    step = np.asarray(found[0], x.dtype) * direction
+    step = np.asarray(lowest[0], x.dtype) * direction
     if not problem.nonnegative or (x + step).min() >= 0:
-        return step, np.asarray(found[0], x.dtype) * found[1]
-    bent = np.maximum(x + step, 0) - x
-    found = minimum(bent)
-    if found is None:
+        return step, np.asarray(lowest[0], x.dtype) * lowest[1]
+    projected = np.maximum(x + step, 0) - x
+    lowest = minimum(projected)
+    if lowest is None:
         return None
-    # Beyond length 1 the bent step could leave the domain again.
-    length = np.asarray(min(1.0, found[0]), x.dtype)
-    return length * bent, length * found[1]
+    # Beyond length 1 the projected step could leave the domain again.
+    length = np.asarray(min(1.0, lowest[0]), x.dtype)
+    return length * projected, length * lowest[1]
 
 
 def cgls(problem: LeastSquares, state: SolverState | None = None) -> Iterator[SolverState]:
-    """The same without a preconditioner."""
+    """:func:`projected_cg` without a preconditioner."""
     return projected_cg(problem, state, precondition=False)
 
 
@@ -233,7 +230,7 @@ def transmission_likelihood(problem: PoissonCounts, state: SolverState | None = 
     """Maximum likelihood of transmission counts (ML-TR) with Erdogan and Fessler's optimum curvatures.
 
     ``x <- max(0, x - grad / (A^T(c . A 1) + separable majoriser of the prior))`` with the gradient ``A^T(mu (y / yhat
-    - 1))``, ``mu = blank e^-l``, ``yhat = mu + background``, ``l = A x`` and per ray the smallest curvature c whose
+    - 1))``, ``mu = blank e^-l``, ``yhat = mu + background``, ``l = A x``, and for each ray the smallest curvature c whose
     parabola at l lies above the negative log-likelihood for all l >= 0. Nuyts' ML-TR is the same with c = mu, which
     may overshoot. The objective never rises. ``objective`` is the sum of ``yhat - y log yhat`` (and the prior);
     ``residual_norm`` is Pearson's ``|(y - yhat) / sqrt(yhat)|``.
@@ -285,15 +282,15 @@ class _Counts:
         h0 = blank + background - y * np.log(blank + background)
         h = mu + background - y * np.log(mu + background)
         at_zero = blank * (1.0 - y * background / (blank + background) ** 2)
-        # The bracket is of order l^2 h'' and its terms of order h: below l = 1e-3 less than 9 digits of float64 are left,
-        # and h''(0), the limit, is off by l h'''/3 only.
+        # The bracket is of order l^2 h'' and its terms of order h: below l = 1e-3 fewer than 9 digits of float64 remain,
+        # and the limit h''(0) has an error of l h'''/3 only.
         small = line < 1e-3
         l2 = np.where(small, 1.0, line * line)
-        # At a ray that is not used the slope is 0 and the rest means nothing.
+        # At an unused ray the slope is 0 and the other terms have no meaning.
         return self.used * np.maximum(np.where(small, at_zero, 2.0 * (h0 - h + line * self.slope(line)) / l2), 0.0)
 
     def state(self, x: np.ndarray, iteration: int, line: np.ndarray) -> SolverState:
-        """Where the solver stands with a field whose line integrals are ``line``."""
+        """State of the solver with a field whose line integrals are ``line``."""
         expected = self.blank * np.exp(-line.astype(np.float64)) + self.background
         # y log(yhat) -> 0 for y = 0 even where yhat underflows.
         log_expected = np.log(np.maximum(expected, np.finfo(float).tiny))

@@ -23,12 +23,12 @@ from mivol.errors import MivolError
 
 
 class Penalty(Protocol):
-    """A convex penalty with a quadratic majoriser that touches it at x."""
+    """A convex penalty with a quadratic majoriser that touches the penalty at x."""
 
     def value(self, x: np.ndarray) -> float: ...
     def gradient(self, x: np.ndarray) -> np.ndarray: ...
     def curvature(self, x: np.ndarray, p: np.ndarray) -> float:
-        """Second derivative along ``p`` of the majoriser at ``x``."""
+        """Second derivative of the majoriser at ``x``, along ``p``."""
 
     def separable(self, x: np.ndarray) -> np.ndarray:
         """Diagonal of a separable quadratic that majorises the majoriser."""
@@ -36,13 +36,13 @@ class Penalty(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Minimise ``1/2 |W^(1/2) (A x - b)|^2 + prior(x)``, over ``x >= 0`` where ``nonnegative``.
+    """Minimise ``1/2 |W^(1/2) (A x - b)|^2 + prior(x)``, over ``x >= 0`` if ``nonnegative``.
 
     Args:
         A: linear operator (m, n).
         b: (m,) line integrals, of any shape with m entries.
-        weights: inverse variances of ``b``, or None for all 1.
-        x0: start, or None for 0.
+        weights: inverse variances of ``b``; None for 1.
+        x0: start; None for 0.
         nonnegative: keep every voxel at or above 0.
         prior: optional penalty.
     """
@@ -57,21 +57,21 @@ class LeastSquares:
     def __post_init__(self) -> None:
         check_sizes(self.A, self.x0, b=self.b, weights=self.weights)
         if self.weights is not None and np.min(self.weights) < 0:
-            raise MivolError("Found a negative weight, expected inverse variances (0 for rays that are not to be used).")
+            raise MivolError("found a negative weight, expected inverse variances: set the weight of unused rays to 0.")
 
 
 @dataclass(frozen=True, eq=False)
 class PoissonCounts:
-    """Maximise the likelihood of ``counts ~ Poisson(blank exp(-A x) + background)`` over ``x >= 0``, less a prior.
+    """Maximise the likelihood of ``counts ~ Poisson(blank exp(-A x) + background)`` over ``x >= 0``, minus a prior.
 
     Args:
         A: linear operator (m, n) with entries >= 0.
-        counts: (m,) numbers of quanta; a detector's reading divided by its gain.
+        counts: (m,) numbers of quanta: a detector's reading over its gain.
         blank: quanta without an object, one number or (m,).
-        background: expected quanta that are not the object's (dark, scatter), one number or (m,).
-        x0: start, >= 0, or None for 0.
+        background: expected quanta from other sources (dark, scatter), one number or (m,).
+        x0: start, >= 0; None for 0.
         prior: optional penalty.
-        used: (m,) whether a ray is used, or None for all (dead and saturated pixels are not).
+        used: (m,) whether a ray is used (dead and saturated pixels are not); None for all.
     """
 
     A: Any
@@ -85,11 +85,11 @@ class PoissonCounts:
     def __post_init__(self) -> None:
         check_sizes(self.A, self.x0, counts=self.counts, used=self.used)
         if np.min(self.counts) < 0 or np.min(self.blank) <= 0 or np.min(self.background) < 0:
-            raise MivolError("Found negative counts or background or a blank of 0, expected counts >= 0 and a blank above 0.")
+            raise MivolError("found negative data or a blank of 0, expected counts >= 0, background >= 0 and blank > 0.")
 
 
 def check_sizes(a: Any, x0: np.ndarray | None, **data: np.ndarray | None) -> None:
-    """Refuse data that do not fit an operator.
+    """Check that data fit an operator.
 
     Raises:
         MivolError: another number of values than rays or voxels, or a value that is not finite.
@@ -99,20 +99,20 @@ def check_sizes(a: Any, x0: np.ndarray | None, **data: np.ndarray | None) -> Non
         if value is None:
             continue
         if np.size(value) != m:
-            raise MivolError(f"Found {np.size(value)} values in '{name}', expected {m}, one for each ray of the operator.")
+            raise MivolError(f"found {np.size(value)} values in '{name}', expected {m}, one for each ray of the operator.")
         if not np.isfinite(value).all():
             raise MivolError(
-                f"Found a value that is not finite in '{name}' at flat index {int(np.argmin(np.isfinite(value)))}, "
-                "expected finite numbers: give unusable rays a weight of 0 and any value."
+                f"found a value that is not finite in '{name}' at flat index {int(np.argmin(np.isfinite(value)))}: give "
+                "unusable rays a weight of 0 and a finite value."
             )
     if x0 is not None and (np.size(x0) != n or not np.isfinite(x0).all()):
         raise MivolError(
-            f"Found a start of {np.size(x0)} values, expected {n} finite ones, one for each voxel of the operator."
+            f"found a start of {np.size(x0)} values, expected {n} finite ones, one for each voxel of the operator."
         )
 
 
 def flatten(a: np.ndarray, dtype: Any) -> np.ndarray:
-    """A vector of any array."""
+    """An array as a vector."""
     return np.asarray(a, dtype).reshape(-1)
 
 
@@ -122,36 +122,36 @@ def start_field(a: Any, x0: np.ndarray | None) -> np.ndarray:
 
 
 def flat_weights(problem: LeastSquares) -> np.ndarray | None:
-    """Weights of rays (m,), or None for all 1."""
+    """Weights of rays (m,); None for 1."""
     return None if problem.weights is None else flatten(problem.weights, problem.A.dtype)
 
 
 def apply_weights(weights: np.ndarray | None, v: np.ndarray) -> np.ndarray:
-    """Weights times a vector of rays."""
+    """Weighted vector; None stands for weights of 1."""
     return v if weights is None else weights * v
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Sum in float64 in a fixed order (BLAS promises neither)."""
+    """Sum in float64 in a fixed order, which BLAS does not guarantee."""
     return float(np.sum(a * b, dtype=np.float64))
 
 
 def reciprocal(v: np.ndarray) -> np.ndarray:
-    """1 / v, and 0 where v is below 1e-6 of the largest: such rays and voxels are only grazed, and are left alone."""
+    """1 / v; 0 for v below 1e-6 of the largest value: such rays and voxels are only grazed, and stay unchanged."""
     floor = 1e-6 * float(np.max(v, initial=0.0))
     return np.where(v > floor, 1.0 / np.where(v > floor, v, 1.0), 0.0).astype(v.dtype)
 
 
 @dataclass(frozen=True, eq=False)
 class SolverState:
-    """Where a solver stands after an iteration.
+    """State of a solver after an iteration.
 
     Args:
         x: (n,) the field.
-        iteration: iterations done.
-        objective: value of what the solver minimises, at ``x``; for SIRT and OS-SART half the squared residual.
-        residual_norm: ``|W^(1/2) (b - A x)|``; for OS-SART of the residuals as each subset met them, before its update.
-        memory: what else the solver must know to go on.
+        iteration: number of completed iterations.
+        objective: minimised value at ``x``; for SIRT and OS-SART half the squared residual.
+        residual_norm: ``|W^(1/2) (b - A x)|``; for OS-SART from the residuals of each subset before its update.
+        memory: further arrays that the next iteration needs.
     """
 
     x: np.ndarray
@@ -168,21 +168,21 @@ class SolverState:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> SolverState:
-        """The state that :meth:`to_arrays` gave."""
+        """State from the arrays of :meth:`to_arrays`."""
         memory = {name.removeprefix("memory."): arrays[name] for name in arrays if name.startswith("memory.")}
         scalars = int(arrays["iteration"]), float(arrays["objective"]), float(arrays["residual_norm"])
         return cls(arrays["x"], *scalars, memory)
 
 
 def accept_all(problem: object, **options: object) -> None:
-    """The check of a method that has nothing to refuse."""
+    """The check of a solver without restrictions."""
 
 
 @dataclass(frozen=True)
 class Solver:
-    """A method: ``run(problem, state=None, **options)`` yields states.
+    """A solver: ``run(problem, state=None, **options)`` yields states.
 
-    ``check(problem, **options)`` raises what ``run`` would raise in its first iteration, and computes nothing.
+    ``check(problem, **options)`` raises the errors of the first iteration of ``run``, without computing.
     """
 
     run: Callable[..., Iterator[SolverState]]
@@ -194,14 +194,14 @@ class Solver:
 
 
 UNWEIGHTED = ("sirt", "sart", "os-sart")
-"""Solvers whose residual has no weights."""
+"""Solvers with an unweighted residual."""
 
 
 def expected_residual_norm(problem: LeastSquares | PoissonCounts, solver: str) -> float:
-    """The norm that a solver's ``residual_norm`` has where the volume is the true one.
+    """The expected ``residual_norm`` of a solver at the true volume.
 
-    The square of a weighted residual ``r sqrt(w)``, and of Pearson's, has a mean of 1 at each ray that is used; without
-    weights the variances are left, ``sum 1 / w``.
+    The squares of a weighted residual ``r sqrt(w)``, and of Pearson's residual, have a mean of 1 for each used ray. Unweighted
+    residuals have the mean ``sum 1 / w``.
     """
     if isinstance(problem, PoissonCounts):
         return float(np.sqrt(np.size(problem.counts) if problem.used is None else np.sum(problem.used)))

@@ -17,13 +17,13 @@ from mivol.tomography.projector import Projector
 class SmoothedTV:
     """Total variation with a quadratic bottom (Huber on the length of the gradient): ``strength sum psi(|grad x|) dV``.
 
-    ``psi(t) = t^2 / (2 delta)`` below ``delta`` and ``t - delta / 2`` above; differences are forward and 0 at the far
+    ``psi(t) = t^2 / (2 delta)`` below ``delta`` and ``t - delta / 2`` above; differences are forward, and 0 at the far
     borders.
 
     Args:
         shape: (Z, Y, X).
-        strength: multiplies the sum [1/length], which makes the whole dimensionless.
-        delta: slope [value per length] below which noise is smoothed instead of kept as an edge.
+        strength: factor on the sum [1/length], which makes the penalty dimensionless.
+        delta: slope [value per length] below which noise is smoothed instead of preserved as an edge.
         voxel_size: one number or (x, y, z) [length].
 
     References: Huber 1964; Charbonnier et al. 1997 (half-quadratic majoriser).
@@ -67,7 +67,7 @@ class SmoothedTV:
         return (total * self._scale).reshape(-1).astype(x.dtype)
 
     def share_of_edges(self, x: np.ndarray) -> float:
-        """The share of voxels whose slope is ``delta`` or more: kept as edges, not smoothed as noise."""
+        """Share of voxels with a slope of ``delta`` or more, which are preserved as edges."""
         t = np.sqrt(sum(d * d for d in self._differences(x)))
         return float(np.mean(t >= self.delta))
 
@@ -94,24 +94,24 @@ def _part(axis: int, where: slice) -> tuple[slice, ...]:
 
 
 CHORD = 0.47
-"""``sum a^2 / sum a`` of the rays that meet a voxel of edge 1, whose share of a trilinear field falls to 0 at its neighbours:
-2/3 for the distance along the detector's rows (0.70 in the mean over directions), times 2/3 for that along z. Rays through the
-middles of layers alone have the first factor only: their balance is 1.2 times as strong."""
+"""``sum a^2 / sum a`` over the rays through a voxel of edge 1, whose share of a trilinear field falls to 0 at its neighbours:
+2/3 for the distance along the detector's rows (0.70 averaged over directions), times 2/3 for the distance along z. Rays through
+the centres of layers have the first factor only, and a balance 1.2 times as strong."""
 
 
 def scale_tv_to_noise(a: Projector, y: np.ndarray, weights: np.ndarray, tv: float, delta: float) -> SmoothedTV:
-    """Total variation in units of the scan's own noise and values: lengths, quanta and materials do not matter.
+    """Total variation in units of the scan's own noise and values, independent of lengths, quanta and materials.
 
-    The data pull at a voxel with the slope ``A^T W r``, whose standard deviation from noise is ``sqrt(sum_i w_i a_ij^2)``;
-    total variation pulls through each face with at most ``strength dV / h``. At ``tv`` = 1 the two are equal at the median of
-    the voxels seen, ``a_ij^2`` taken as ``0.47 h a_ij``. ``delta`` = 1 is a slope of the scan's mean value over one voxel,
-    which is ``sum w y c / sum w c^2``, c being a ray's way through the grid.
+    The data act on a voxel with the gradient ``A^T W r``, whose standard deviation from noise is ``sqrt(sum_i w_i a_ij^2)``.
+    Total variation acts through each face with at most ``strength dV / h``. At ``tv`` = 1 both are equal at the median of the
+    visible voxels, with ``a_ij^2`` approximated by ``0.47 h a_ij``. ``delta`` = 1 is a slope of the scan's mean value over one
+    voxel. The mean value is ``sum w y c / sum w c^2``, with a ray's path length c in the grid.
 
     Args:
-        a: of the views that are fitted.
+        a: projector of the fitted views.
         y, weights: (views, rows, cols), with variances 1 / weights.
-        tv: in parts of the balance.
-        delta: in parts of the mean value a voxel.
+        tv: strength in units of the balance.
+        delta: in units of the mean value per voxel.
     """
     edge = float(np.prod(a.grid.voxel_size) ** (1 / 3))
     w = np.asarray(weights, np.float64)

@@ -34,55 +34,55 @@ from mivol.tomography.filtered import check_circle, check_parallel, feldkamp, fi
 from mivol.tomography.preprocess import bridge_gaps
 from mivol.tomography.projector import Projector
 
-Method = Callable[[Projector, np.ndarray, str, float], np.ndarray]
+FilteredBackprojection = Callable[[Projector, np.ndarray, str, float], np.ndarray]
 
 
 def fbp(
     problem: LeastSquares, state: SolverState | None = None, window: str = "ram-lak", cutoff: float = 1.0
 ) -> Iterator[SolverState]:
-    """:func:`~mivol.tomography.filtered.filtered_backprojection` of a parallel beam: one state, and no more."""
+    """:func:`~mivol.tomography.filtered.filtered_backprojection` of a parallel beam, as a single state."""
     return _once(filtered_backprojection, problem, state, window, cutoff)
 
 
 def fdk(
     problem: LeastSquares, state: SolverState | None = None, window: str = "ram-lak", cutoff: float = 1.0
 ) -> Iterator[SolverState]:
-    """:func:`~mivol.tomography.filtered.feldkamp` of a circular cone beam: one state, and no more."""
+    """:func:`~mivol.tomography.filtered.feldkamp` of a circular cone beam, as a single state."""
     return _once(feldkamp, problem, state, window, cutoff)
 
 
 def check_fbp(problem: LeastSquares, **options: object) -> None:
-    """Refuse what :func:`fbp` cannot do.
+    """Check that :func:`fbp` can solve a problem.
 
     Raises:
-        MivolError: a prior, another beam, or directions that are missing.
+        MivolError: a prior, another beam, or missing directions.
     """
     check_prior(problem)
     check_parallel(problem.A)
 
 
 def check_fdk(problem: LeastSquares, **options: object) -> None:
-    """Refuse what :func:`fdk` cannot do.
+    """Check that :func:`fdk` can solve a problem.
 
     Raises:
-        MivolError: a prior, another trajectory than a circle, or directions that are missing.
+        MivolError: a prior, another trajectory than a circle, or missing directions.
     """
     check_prior(problem)
     check_circle(problem.A)
 
 
 def check_prior(problem: LeastSquares) -> None:
-    """Refuse a prior, which a method of one step has no use for.
+    """Check that a problem has no prior, which a direct method cannot use.
 
     Raises:
-        MivolError: there is one.
+        MivolError: a prior.
     """
     if problem.prior is not None:
         raise MivolError("found a prior with filtered back-projection, expected none: use pcg, or a window and a cutoff.")
 
 
 def _once(
-    method: Method, problem: LeastSquares, state: SolverState | None, window: str, cutoff: float
+    method: FilteredBackprojection, problem: LeastSquares, state: SolverState | None, window: str, cutoff: float
 ) -> Iterator[SolverState]:
     a = problem.A
     check_prior(problem)
@@ -97,12 +97,11 @@ def _once(
     yield SolverState(x, 1, norm2 / 2, float(np.sqrt(norm2)))
 
 
-#: Iterative methods by name. ``run(problem, state=None, **options)``.
 SOLVERS: dict[str, Solver] = {
     "pcg": Solver(
         projected_cg,
         LeastSquares,
-        needs="A and its exact transpose; weights, x >= 0 and a prior if wanted",
+        needs="A and its exact transpose; optionally weights, x >= 0 and a prior",
         promises="the objective never rises; without bounds and prior, the least error in the energy norm at each step",
         citation="Hestenes & Stiefel 1952; Polak & Ribiere 1969; Bertsekas 1982; preconditioner Erdogan & Fessler 1999",
     ),
@@ -110,7 +109,7 @@ SOLVERS: dict[str, Solver] = {
         cgls,
         LeastSquares,
         needs="A and its exact transpose",
-        promises="the least residual over the Krylov space of each iteration; stopping early regularises",
+        promises="the least residual over the Krylov space of each iteration; early stopping regularises",
         citation="Hestenes & Stiefel 1952; Paige & Saunders 1982",
     ),
     "sirt": Solver(
@@ -141,18 +140,18 @@ SOLVERS: dict[str, Solver] = {
         transmission_likelihood,
         PoissonCounts,
         needs="A with entries >= 0 and its transpose; counts, blank and background in quanta",
-        promises="the negative log-likelihood never rises; x >= 0; no logarithm of a count is taken",
+        promises="the negative log-likelihood never rises; x >= 0; takes no logarithm of counts",
         citation="Nuyts et al. 1998; Erdogan & Fessler 1999",
     ),
 }
+"""Iterative solvers by name. ``run(problem, state=None, **options)``."""
 
-#: Methods of one step. ``run(problem, state=None, window=..., cutoff=...)``; the problem's operator is a projector.
 DIRECT: dict[str, Solver] = {
     "fbp": Solver(
         fbp,
         LeastSquares,
         needs="a parallel beam over half a turn or more",
-        promises="exact for many views without noise; linear, so that values below 0 stay",
+        promises="exact for many views without noise; linear, so values below 0 remain",
         citation="Kak & Slaney 1988, section 3.3",
         check=check_fbp,
     ),
@@ -160,11 +159,12 @@ DIRECT: dict[str, Solver] = {
         fdk,
         LeastSquares,
         needs="a cone beam on a circle, over half a turn and the fan or more",
-        promises="exact in the source's plane for many views without noise; linear, so that values below 0 stay",
+        promises="exact in the source's plane for many views without noise; linear, so values below 0 remain",
         citation="Feldkamp, Davis & Kress 1984; Parker 1982; Wang 2002",
         check=check_fdk,
     ),
 }
+"""Direct solvers by name. ``run(problem, state=None, window=..., cutoff=...)``; the problem's operator is a projector."""
 
 ALL_SOLVERS: dict[str, Solver] = SOLVERS | DIRECT
-"""What a file may ask for."""
+"""Solvers that a file can name."""
