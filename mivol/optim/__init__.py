@@ -1,1 +1,1 @@
-"""Change the field until it explains what was seen."""
+"""Optimization: fit a field to images, photographs or projections."""

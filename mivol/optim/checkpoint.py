@@ -1,8 +1,8 @@
-"""Checkpoints: files from which a run continues as if it had never stopped.
+"""Checkpoints: files from which a run continues without a difference.
 
-Conventions. One ``.npz`` file, written whole. It holds the arrays of the optimizer and the problem, and one JSON text ``about``
-with the next iteration, the history and the fingerprint (all settings that change the result, and the scene's hash, by dotted
-key). A file with another fingerprint is refused; only the number of iterations may grow. No pickles.
+Conventions. The file is a ``.npz`` archive, written whole, with the arrays of the optimizer and the problem, and a JSON text
+``about`` with the next iteration, the history and the fingerprint (all settings with an effect on the result, and the scene's
+hash, by dotted key). A file with another fingerprint is refused; only the number of iterations may grow. No pickles.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from mivol.files.npy import read_archive
 ABOUT = "about"
 
 DIGESTS = ("scene", "references", "photos", "data")
-"""Fingerprint keys that are not settings: digests of input data."""
+"""Fingerprint keys besides settings: digests of input data."""
 
 REQUIRED_KEYS = ("fingerprint",)
 """Keys of every checkpoint."""
 
 GROWABLE_SETTINGS = ("fit.iterations", "solve.iterations")
-"""Settings that may grow on resuming: the run continues from its old end."""
+"""Settings with larger values allowed on resuming: the run continues from the old end."""
 
 
 @dataclass(frozen=True)
 class CheckpointFile:
-    """The checkpoint file of one run.
+    """The checkpoint file of a run.
 
     Attributes:
         path: the file.

@@ -1,7 +1,7 @@
 """Events between the steps of a fit: refine the grid, write a checkpoint, measure the error.
 
-Conventions. Before each iteration the fit asks each event whether it is ``due``, and applies it if so. The returned message
-goes into the log. Events of one iteration are applied in the given order, checkpoints first.
+Conventions. Before each iteration the fit applies the events that are ``due``. The returned messages go into the log.
+Events of an iteration are applied in the given order, checkpoints first.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class RunningFit(Protocol):
         """Write the checkpoint."""
 
     def evaluate(self) -> None:
-        """Measure the errors and record them."""
+        """Measure and record the errors."""
 
 
 def upsample(field: mi.TensorXf, shape: tuple[int, int, int]) -> mi.TensorXf:
@@ -76,7 +76,7 @@ class Event(Strategy, tag="event"):
 
 
 def check_for_grids(count: int) -> None:
-    """Check that at least one parameter is a grid.
+    """Check for a grid among the parameters.
 
     Raises:
         MivolError: no parameter is a grid.
@@ -162,7 +162,7 @@ class UpdateOccupancy(Event, tag="update_occupancy"):
 
 
 class ControlDensity(Event, tag="control_density"):
-    """Let a problem add Gaussians where images need them and remove invisible ones."""
+    """Let a problem add Gaussians to poorly fitted regions and remove invisible Gaussians."""
 
     every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 100
     begin: Annotated[int, setting("iteration", "first iteration", ge=1)] = 500
@@ -205,12 +205,12 @@ class Evaluate(Event, tag="evaluate"):
 
 
 EVENTS = make_table(Upsample, Checkpoint, Evaluate)
-"""Events that a file can name."""
+"""Events available in files."""
 
 PLAN_EVENTS = make_table(CoarseToFine, DropUnseen, UpdateOccupancy, ControlDensity)
 """Events of the plans of radiance fields and Gaussians."""
 
 
 def checkpoints_first(events: tuple[Event, ...]) -> list[Event]:
-    """Events in their order, checkpoints first, so that a checkpoint holds the state before the other events."""
+    """Events in the given order, checkpoints first, with the state before the other events."""
     return sorted(events, key=lambda event: not isinstance(event, Checkpoint))

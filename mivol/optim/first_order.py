@@ -1,6 +1,6 @@
-"""Optimizers that follow gradients: Adam, and RMSprop without momentum.
+"""Gradient-based optimizers: Adam, and RMSprop without momentum.
 
-Conventions. A step changes each real number by a multiple of its learning rate. RMSprop leaves a number and its running mean
+Conventions. A step changes each real number by a multiple of the learning rate. RMSprop leaves a number and the running mean
 unchanged where the derivative is 0: a batch of rays reaches few rows of a sparse field, and the other rows keep their means.
 
 References: Kingma and Ba 2015 (Adam); Hinton 2012 (RMSprop; Coursera, lecture 6e).
@@ -101,7 +101,7 @@ class AdamRun(OptimizerRun):
 UNIT = 64.0
 """Factor on stored fourth roots. A half has 11 bits from 2^-14 to 2^16, and fewer bits down to 2^-24. Derivatives with a root
 mean square between 1e-12 and 1e6 [loss / real] keep full precision, and those above 1e-18 are stored. Smaller ones are lost:
-the next derivative then moves its number by a whole learning rate, as a first derivative does."""
+the next derivative then moves the number by a whole learning rate, as a first derivative does."""
 
 LARGEST = 65504.0
 """The largest half. A larger root is stored as this value, so a derivative above 1e6 takes a step above the rate."""
@@ -122,7 +122,7 @@ class RMSprop(FirstOrder, tag="rmsprop"):
     half: Annotated[bool, setting("1", "store the running means as fourth roots in half precision")] = False
 
     def begin(self, problem: DifferentiableProblem) -> OptimizerRun:
-        """Start from the values that the problem holds.
+        """Start from the problem's present values.
 
         Raises:
             MivolError: a memory too long for means in half precision.

@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM stop a run at its next safe point.
+"""Ctrl-C and SIGTERM stop a run at the next safe point.
 
-Conventions. The first signal is recorded, and :meth:`InterruptGuard.check` raises between kernels, before any state changes.
-The second signal raises at once. Kernels take at most seconds (``samples_per_pass``), so the wait does too. A signal that the
-process was started to ignore (Ctrl-C of a background job of a script) stays ignored.
+Conventions. The first signal is recorded, and :meth:`InterruptGuard.check` raises between kernels, before state changes. The
+second signal raises at once. Kernels take at most seconds (``samples_per_pass``), as does the wait. A signal ignored from the
+start of the process (Ctrl-C of a background job of a script) stays ignored.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class InterruptGuard:
-    """Context manager that records signals; outside the main thread it records nothing.
+    """Context manager that records signals; outside the main thread without effect.
 
     Attributes:
         is_requested: whether a signal has arrived.

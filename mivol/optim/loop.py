@@ -1,4 +1,4 @@
-"""One fit from its first iteration to its last: steps, events, history, and a clean stop at any moment.
+"""The fit loop: steps, events, history, and a clean stop at any moment.
 
 Conventions. Iteration i depends on the problem, the optimizer's state and i only. A checkpoint holds the state before an
 iteration; Ctrl-C and SIGTERM save the state before the interrupted iteration. A resumed run therefore equals an uninterrupted
@@ -59,11 +59,11 @@ class Fit:
         checkpoint: file of the checkpoint; None writes no checkpoint.
         next_iteration: number of the next iteration, which equals the number of completed iterations.
         events_done: number of applied events of the next iteration.
-        history: one record (iteration, loss, seconds) per iteration.
-        evaluations: one record (iteration, seconds, ...) per evaluation.
-        log: messages of events, and one message about the noise of renders in the loss.
+        history: records (iteration, loss, seconds) of the iterations.
+        evaluations: records (iteration, seconds, ...) of the evaluations.
+        log: messages of events, and a message about the noise of renders in the loss.
         has_warned: whether the log holds the message about noise.
-        seconds: time of all iterations [s], without interruptions.
+        seconds: time of the iterations [s], without interruptions.
     """
 
     problem: Problem
@@ -109,7 +109,7 @@ class Fit:
         return self.problem.values()
 
     def evaluate(self) -> None:
-        """Measure the errors now and record them."""
+        """Measure and record the errors."""
         if self.measure is None:
             return
         self.problem.set_reals(self.run.reals)
@@ -187,7 +187,7 @@ class Fit:
     # -- On disk ------------------------------------------------------------------------------------------------------
 
     def save(self) -> None:
-        """Write the checkpoint, if the fit has a file for it."""
+        """Write the checkpoint, if the fit has a file."""
         if self.checkpoint is None:
             return
         problem = {f"problem/{name}": array for name, array in self.problem.pack(self.run.reals).items()}
@@ -260,7 +260,7 @@ def reconstruct(
 
     Args:
         problem: model, data and parameters; the model holds the start and, afterwards, the result.
-        optimizer: one of OPTIMIZERS.
+        optimizer: of OPTIMIZERS, or an adapter of a Mitsuba optimizer.
         course: iterations, schedule and events, or the number of iterations only.
         measure: error measures by name, for evaluations.
         observer: called after each iteration (progress bars).

@@ -1,9 +1,9 @@
-"""Difference between an image and its reference: one penalty per pixel and channel, averaged.
+"""Difference between an image and a reference: a penalty per pixel and channel, averaged.
 
 Conventions. Images are tensors (height, width, channels) of radiance; the residual is ``image - reference``. A loss is the mean
 penalty over pixels and channels, independent of the size of the sensor. Penalties are differentiable through Dr.Jit in
-``image``; weights depend on ``reference`` only. LOSSES lists the losses that a file can name. The noise of a render adds to
-every loss unless ``pairs`` removes it (:mod:`mivol.optim.scenes.render_noise`).
+``image``; weights depend on ``reference`` only. LOSSES lists the losses available in files. The noise of a render adds to
+every loss unless ``pairs`` is set (:mod:`mivol.optim.scenes.render_noise`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Loss(Strategy, tag="loss"):
 
 
 def check_shapes(image: mi.TensorXf, reference: mi.TensorXf) -> None:
-    """Check that an image and its reference have the same shape.
+    """Check the shapes of an image and a reference.
 
     Raises:
         MivolError: different shapes.
@@ -160,7 +160,7 @@ class Log(Loss, tag="log"):
 
 
 LOSSES = make_table(L1, L2, RelativeL2, Huber, Log)
-"""Losses that a file can name."""
+"""Losses available in files."""
 
 
 class FunctionLoss(Loss, tag="given", kw_only=True):

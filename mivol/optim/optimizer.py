@@ -1,8 +1,8 @@
-"""Base classes of optimizers: the settings, and the run that they start.
+"""Base classes of optimizers: the settings, and the started run.
 
 Conventions. An :class:`Optimizer` holds settings only. :meth:`Optimizer.begin` returns an :class:`OptimizerRun`, which owns the
 reals. :meth:`OptimizerRun.step` completes or, interrupted at a safe point, leaves the run unchanged. ``pack`` returns and
-``unpack`` restores all inputs of the next step, so a restored run continues with the same bits.
+``unpack`` restores all inputs of the next step, and a restored run continues with the same bits.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class OptimizerRun:
         self.reals: Reals = problem.initial_reals()
 
     def step(self, iteration: int, factor: float) -> float | mi.Float | None:
-        """Take one iteration with learning rates times ``factor``.
+        """Take an iteration with learning rates times ``factor``.
 
         Returns:
-            The loss before the step; None if the optimizer stopped without a step.
+            The loss before the step; None if the optimizer had stopped.
         """
         raise NotImplementedError
 
@@ -61,7 +61,7 @@ class Optimizer(Strategy, tag="optimiser"):
     """Settings of a minimisation."""
 
     def begin(self, problem: Problem) -> OptimizerRun:
-        """Start from the values that the problem holds."""
+        """Start from the problem's present values."""
         raise NotImplementedError
 
 

@@ -16,13 +16,13 @@ from mivol.optim.second_order import GaussNewton, Lbfgs
 from mivol.optim.strategy import make_table
 
 OPTIMIZERS = make_table(Adam, RMSprop, Lbfgs, GaussNewton)
-"""Optimizers that a file can name."""
+"""Optimizers available in files."""
 
 
 class MitsubaOptimizer(Optimizer, tag="given", kw_only=True):
-    """An optimizer of ``mi.ad`` with its own learning rates.
+    """An optimizer of ``mi.ad`` with separate learning rates.
 
-    Mivol cannot save its state, so a fit with it has no checkpoint.
+    Mivol cannot save the optimizer's state, and the fit has no checkpoint.
     """
 
     optimizer: Any

@@ -1,7 +1,7 @@
 """Parameters of a scene: their domains, priors, and the real numbers that an optimizer moves.
 
 Conventions. ``name`` is a key of ``mi.traverse(scene)``. A map takes the domain [low, high] to the reals and back. Optimizers
-step and project in the reals, so the fit loop is the same for all parameters. MAPS lists the maps.
+step and project in the reals, and the fit loop is the same for all parameters. MAPS lists the maps.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def log1p_unit(x: mi.Float) -> mi.Float:
 def softplus(u: mi.Float) -> mi.Float:
     """log(1 + e^u) = max(u, 0) + log1p(e^-|u|): no overflow above, full relative precision below.
 
-    Written with selections, since max(u, 0) and |u| have no slope at 0; the slope there is 1/2.
+    Written with selections, since max(u, 0) and |u| have no slope at 0; here the slope is 1/2.
     """
     rises = u >= 0.0
     return dr.select(rises, u, 0.0) + log1p_unit(dr.exp(dr.select(rises, -u, u)))
@@ -201,7 +201,7 @@ class Parameter:
         return dr.minimum(u, high) if high < math.inf else u
 
     def check_priors(self, shape: tuple[int, ...]) -> None:
-        """Check that priors that compare neighbours act on a grid: an image's third axis holds its colours.
+        """Check the shape for spatial priors: they need a grid, since an image's third axis holds colours.
 
         Raises:
             MivolError: with the prior.
@@ -246,7 +246,7 @@ def check_names(names: Sequence[str]) -> None:
     """Check that no parameter appears twice in a fit.
 
     Raises:
-        MivolError: with its name.
+        MivolError: with the name.
     """
     twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
     if twice is not None:

@@ -1,17 +1,18 @@
-r"""What is known of a field before the measurement: smooth, piecewise constant, sparse, bounded, matte.
+r"""Prior knowledge of a field: smooth, piecewise constant, sparse, bounded, matte.
 
 .. math:: TV = \sum_k \sqrt{\delta^2 + |\nabla_h v_k|^2}, \qquad S = \sum_k \log(1 + 2 \sigma_k^2)
 
-Conventions. A :class:`Prior` is an energy in the loss. Its field is a tensor (Z, Y, X, C) of values at voxel centres with the
-spacing (z, y, x) [length]; differences across the border vanish (clamped borders). The energy is a mean over the volume, so
-refining the grid keeps it. Gradients come from Dr.Jit's AD; :meth:`Prior.value_and_gradient` serves NumPy. A non-quadratic
-energy also gives the parabola that touches it from above (lagged diffusivity), for Gauss-Newton and conjugate gradients.
+Conventions. A :class:`Prior` is an energy in the loss. The field is a tensor (Z, Y, X, C) of values at voxel centres with the
+spacing (z, y, x) [length]; differences across the border vanish (clamped borders). The energy is a mean over the volume and
+does not change on refining the grid. Gradients come from Dr.Jit's AD; :meth:`Prior.value_and_gradient` serves NumPy. A
+non-quadratic energy also gives a parabola touching the energy from above (lagged diffusivity), for Gauss-Newton and conjugate
+gradients.
 
 A :class:`DecoupledPrior` moves the values of a radiance field after each step, as decoupled weight decay does. Inside RMSprop's
 quotient even a weak prior would move an untouched row by a whole learning rate. The move is a share of the learning rate,
 because photographs that agree move a value by about one learning rate. Differences go to the next node along each axis (0 at
-the border; a node without a row holds the vacuum). PRIORS lists energies that a
-file can name, DECOUPLED_PRIORS the others.
+the border; a node without a row holds the vacuum). PRIORS lists the
+energies, DECOUPLED_PRIORS the moves.
 
 References: Rudin, Osher & Fatemi 1992; Fridovich-Keil, Yu et al. 2022 (runs of voxels; the Cauchy prior of Hedman et al. 2021);
 Loshchilov & Hutter 2019 (decoupling).
@@ -86,7 +87,7 @@ class Prior(Strategy, tag="prior"):
         return dr.grad(v)
 
     def value_and_gradient(self, x: np.ndarray, spacing: Spacing) -> tuple[float, np.ndarray]:
-        """weight * energy and its gradient, for solvers that keep their field in NumPy.
+        """weight * energy and gradient, for solvers with fields in NumPy.
 
         Args:
             x: field (Z, Y, X, C) or (Z, Y, X).
@@ -129,7 +130,7 @@ class HuberTotalVariation(Prior, tag="huber_tv"):
     """|g| - edge / 2 for |g| = |grad x| > edge, |g|^2 / (2 edge) below: total variation that is exactly quadratic inside the
     noise.
 
-    Source: Huber 1964 for the function; Fessler and others use it as "edge-preserving" penalty.
+    Source: Huber 1964 for the function; known as "edge-preserving" penalty (Fessler and others).
     """
 
     cites = ("rudin_1992", "huber_1964")
@@ -197,7 +198,7 @@ class Neighbours:
     Attributes:
         after: UInt32 each, row of the next node along x, y and z: the vacuum's row for a node that is not stored, the own row
             at the border and at an inner level that covers the next node.
-        before: row of the previous node along x, y and z: the own row for a node that is not stored and at the border.
+        before: row of the previous node along x, y and z: the own row for an absent node and at the border.
     """
 
     after: list[mi.UInt32]
@@ -205,7 +206,7 @@ class Neighbours:
 
     @classmethod
     def from_field(cls, field: SphericalGrid) -> Neighbours:
-        """Find the neighbours of all rows of a field."""
+        """Find the neighbours of each row of a field."""
         z, y, x = field.res
         node = mi.UInt32(field.stored_nodes().astype(np.uint32))
         own = dr.arange(mi.UInt32, dr.width(node))
@@ -223,14 +224,14 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows of one parameter of a field, for a decoupled prior.
+    """The rows of a parameter of a field, for a decoupled prior.
 
     Attributes:
         width: numbers per row.
         neighbours: the rows beside each row.
-        rate: learning rate over the number of photographs, times ``unit``: the move that one photograph causes in a step.
-        unit: factor that makes values dimensionless.
-        first: first row of a prior that moves a share of the rows.
+        rate: learning rate over the number of photographs, times ``unit``: move by a single photograph in a step.
+        unit: factor for dimensionless values.
+        first: first row to move, if a prior moves a share of the rows.
         step: number of the preceding step.
     """
 
@@ -243,7 +244,7 @@ class Rows:
 
 
 class DecoupledPrior(Strategy, tag="decoupled prior"):
-    """A move of the values of one parameter after each step; ``is_spatial`` marks priors that compare neighbours."""
+    """A move of a parameter's values after each step; ``is_spatial`` marks priors that compare neighbours."""
 
     is_spatial: ClassVar[bool] = False
 
@@ -282,7 +283,7 @@ class Sparsity(DecoupledPrior, tag="sparsity"):
 
 
 class ViewDependence(DecoupledPrior, tag="view_dependence"):
-    """Weight decay on the view-dependent coefficients. With few photographs they overfit."""
+    """Weight decay on the view-dependent coefficients. These overfit with few photographs."""
 
     def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
         return decay_view_dependence(values, rows.width, rows.rate * self.weight)
@@ -301,7 +302,7 @@ def smooth(values: mi.Float, rows: Rows, weight: float, share: float) -> None:
         weight: weight of the prior; 0 moves nothing.
         share: share of the rows to move; these rows stand for all rows.
 
-    Cost: 13 rows read and one row written per moved row. One lane writes each row, so no atomic addition is needed.
+    Cost: 13 rows read and 1 row written per moved row. A row is written by a single lane, without atomic addition.
     """
     amount = rows.rate * weight / rows.unit
     if amount == 0:
@@ -354,4 +355,4 @@ PRIORS = make_table(TotalVariation, HuberTotalVariation, Laplacian, Sparse, Boun
 """Priors in the loss, which a file can name."""
 
 DECOUPLED_PRIORS = make_table(Smoothness, Sparsity, ViewDependence)
-"""Priors of radiance fields that move values after a step."""
+"""Priors of radiance fields, which move values after a step."""

@@ -1,10 +1,10 @@
-r"""Protocols of problems: the methods that the fit loop, optimizers and events call on a model and its data.
+r"""Protocols of problems: methods of a model with data, for the fit loop, optimizers and events.
 
 .. math:: \min_u f(u), \qquad f(u) = \mathrm{loss}(x(u)) + \mathrm{energy}(x(u))
 
-Conventions. ``u`` are the *reals*, tensors by the name of their parameter; the model turns them into values ``x``. A scene with
+Conventions. ``u`` are the *reals*, tensors by the name of their parameter; the model maps reals to values ``x``. A scene with
 images, a radiance field with rays of photographs, Gaussians with photographs, and a volume with projections are problems. A
-network or a hash grid would be another class with these methods, and an event for changes of its shape.
+network or a hash grid would be another class with these methods, and an event for changes of shape.
 
 Iteration i depends on the reals, on the arrays of :meth:`Problem.pack`, and on i. All random numbers are a function of the
 problem's seed and i.
@@ -22,7 +22,7 @@ import numpy as np
 from mivol.optim.parameters import Parameter
 
 Reals: TypeAlias = "dict[str, mi.TensorXf]"
-"""The unknowns of an optimizer: one tensor for each parameter."""
+"""The unknowns of an optimizer: a tensor for each parameter."""
 
 
 class Problem(Protocol):
@@ -35,7 +35,7 @@ class Problem(Protocol):
     safe_point: Callable[[], None]
 
     def initial_reals(self) -> Reals:
-        """Reals of the values that the model holds now."""
+        """Reals of the model's present values."""
 
     def set_reals(self, reals: Reals) -> None:
         """Give the model the values of these reals."""
@@ -49,7 +49,7 @@ class Problem(Protocol):
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
         """Inputs of the next step beside the reals, as the nodes of a sparse field.
 
-        State that :meth:`unpack` rebuilds is rebuilt here as well, so that a resumed run equals an uninterrupted run.
+        State rebuilt by :meth:`unpack` is rebuilt here as well: a resumed run then equals an uninterrupted run.
         """
 
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:

@@ -1,7 +1,7 @@
 """Schedules: factors on the learning rate by iteration.
 
 Conventions. ``factor(iteration, iterations)`` takes ``iteration`` in 0 .. iterations - 1; every schedule starts at 1. SCHEDULES
-lists the schedules that a file can name.
+lists the schedules available in files.
 """
 
 from __future__ import annotations

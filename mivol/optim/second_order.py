@@ -1,6 +1,6 @@
-r"""Optimizers that use curvature: L-BFGS and Gauss-Newton, each with bounds and a projected line search.
+r"""Curvature-based optimizers: L-BFGS and Gauss-Newton, each with bounds and a projected line search.
 
-Conventions. All reals form one float64 vector, each parameter in units of its learning rate (:class:`Packing`). Every iteration
+Conventions. The reals form a float64 vector, each parameter in units of the learning rate (:class:`Packing`). Every iteration
 renders with the same random numbers.
 
 A filtered pixel averages transmittance, not optical depth. Absorption is therefore linear only along a single ray, since -log
@@ -27,7 +27,7 @@ from mivol.optim.strategy import setting
 
 
 class Packing:
-    """Conversion of all reals to one float64 vector, each parameter in units of its learning rate, and back."""
+    """Conversion of reals to a float64 vector, each parameter in units of the learning rate, and back."""
 
     def __init__(self, problem: BoundedProblem, reals: Reals) -> None:
         self.parts = [(p.name, p.lr, tuple(reals[p.name].shape)) for p in problem.parameters]

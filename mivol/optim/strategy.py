@@ -18,12 +18,12 @@ S = TypeVar("S")
 
 
 def setting(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
-    """Unit, meaning and domain (``gt``, ``ge``, ``lt``, ``le``, ``min_length``, ``max_length``) of one setting."""
+    """Unit, meaning and domain (``gt``, ``ge``, ``lt``, ``le``, ``min_length``, ``max_length``) of a setting."""
     return msgspec.Meta(description=meaning, extra={"unit": unit}, **domain)
 
 
 class Strategy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="name"):
-    """Base of all named choices; ``cites`` are keys of ``mivol.cite.CITATIONS``."""
+    """Base of named choices; ``cites`` are keys of ``mivol.cite.CITATIONS``."""
 
     cites: ClassVar[tuple[str, ...]] = ()
 
@@ -34,7 +34,7 @@ class Strategy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 def make_table(*strategies: type[S]) -> dict[str, type[S]]:
-    """Strategies by name; two strategies of one name are a programming error."""
+    """Strategies by name; equal names are a programming error."""
     named = {strategy.label(): strategy for strategy in strategies}
     if len(named) != len(strategies):
         raise AssertionError("two strategies of one table share a name")
@@ -42,7 +42,7 @@ def make_table(*strategies: type[S]) -> dict[str, type[S]]:
 
 
 def union_type(strategies: dict[str, type[S]]) -> Any:
-    """The type of a setting that can be each strategy of a table."""
+    """The type of a setting with the strategies of a table as values."""
     return Union[tuple(strategies.values())]  # noqa: UP007  (the members are known only at run time)
 
 
@@ -56,13 +56,13 @@ def choose(strategies: dict[str, type[S]], name: str, kind: str, **settings: Any
     """The strategy of a name, with checked settings.
 
     Args:
-        strategies: one of the tables (``LOSSES``, ``PRIORS``, ...).
+        strategies: a table (``LOSSES``, ``PRIORS``, ...).
         name: key of the table.
         kind: kind of strategy for the message ("loss").
         settings: fields of the strategy.
 
     Raises:
-        MivolError: unknown name (the message offers the nearest), unknown setting, or a value outside its domain.
+        MivolError: unknown name (the message offers the nearest), unknown setting, or a value outside the domain.
     """
     if name not in strategies:
         raise MivolError(f'unknown {kind} "{name}": {suggest_name(name, list(strategies))}')

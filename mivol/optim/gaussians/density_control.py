@@ -38,7 +38,7 @@ SHRINK = 1.6
 """Factor by which each half of a split Gaussian is smaller (Kerbl et al. 2023)."""
 
 MOST_COPIES = 51
-"""Maximum number of Gaussians at one position in the sum below, which loses its digits beyond (as the published code)."""
+"""Maximum number of Gaussians at a position in the sum below, which loses digits beyond (as the published code)."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class CloudChange:
         return found
 
     def then(self, later: CloudChange) -> CloudChange:
-        """This change, followed by another change of its cloud, as one change."""
+        """This change, followed by another change of the cloud, as a single change."""
         return CloudChange(later.cloud, self.parent[later.parent], self.forgets[later.parent] | later.forgets)
 
 
 def unchanged(cloud: CloudArrays) -> CloudChange:
-    """A change that keeps the cloud."""
+    """A change without effect on the cloud."""
     n = len(cloud["means"])
     return CloudChange(cloud, np.arange(n), np.zeros(n, bool))
 
@@ -82,9 +82,9 @@ def select_rows(score: NDArray, least: float, most: int) -> NDArray[np.int64]:
 
 
 def clone_and_split(cloud: CloudArrays, rows: NDArray[np.int64], largest_clone: float, rng: np.random.Generator) -> CloudChange:
-    """Divide some Gaussians: duplicate small ones, and replace large ones by two halves.
+    """Divide some Gaussians: duplicate small Gaussians, and replace large Gaussians by two halves.
 
-    A clone stands at its parent's position; derivatives and moments of both differ from the next step on. Both halves of a
+    A clone stands at the parent's position; derivatives and moments of both differ from the next step on. Both halves of a
     split are drawn from the Gaussian's normal distribution, and are smaller by 1.6.
 
     Args:
@@ -143,7 +143,7 @@ def relocate(cloud: CloudArrays, unused_below: float, rng: np.random.Generator) 
 
 
 def grow(cloud: CloudArrays, count: int, least_opacity: float, rng: np.random.Generator) -> CloudChange:
-    """Add ``count`` Gaussians at existing ones, drawn in proportion to their opacity, without changing any image."""
+    """Add ``count`` Gaussians at existing Gaussians, drawn in proportion to their opacity, without changing images."""
     opacity = expit(cloud["opacity_logits"].astype(np.float64))
     source = rng.choice(len(opacity), count, p=opacity / opacity.sum())
     return _shared(cloud, np.concatenate([np.arange(len(opacity)), source]), least_opacity)
@@ -163,7 +163,7 @@ def _shared(cloud: CloudArrays, parent: NDArray[np.int64], least_opacity: float)
 
 
 def split_opacity_and_scale(opacity: NDArray, copies: NDArray) -> tuple[NDArray, NDArray]:
-    """Opacity of each of N equal Gaussians that replace one, and the factor on its scale (Kheradmand et al. 2024, eqs. 9, 10).
+    """Opacity and scale factor of N equal Gaussians that replace a single Gaussian (Kheradmand et al. 2024, eqs. 9, 10).
 
     Opacities compose to the old opacity at the centre; the factor keeps the integral of the composite along a line through the
     centre.
@@ -183,7 +183,7 @@ def split_opacity_and_scale(opacity: NDArray, copies: NDArray) -> tuple[NDArray,
 
 
 def rotations(quaternions: NDArray) -> NDArray:
-    """(N, 3, 3) rotations of quaternions (w, x, y, z) of any length above 0."""
+    """(N, 3, 3) rotations of quaternions (w, x, y, z) of a length above 0."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T.astype(np.float64)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

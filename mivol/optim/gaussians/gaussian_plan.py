@@ -1,7 +1,7 @@
 """Plans of Gaussian fits: image sizes, degrees, numbers of Gaussians over time, learning rates; presets by name.
 
-Conventions. Plans count steps and never read the clock, so a fit can be repeated and resumed. Learning rates of positions are
-relative to the scene's extent (1.1 times the largest distance of a camera from the mean of all cameras).
+Conventions. Plans count steps and never read the clock, and a fit can be repeated and resumed. Learning rates of positions are
+relative to the scene's extent (1.1 times the largest distance of a camera from the mean camera position).
 
 References: Kerbl et al. 2023 (rates, thresholds, loss); Kheradmand et al. 2024 (relocation, noise, priors); Yu et al. 2024
 (the mip filter).
@@ -52,17 +52,17 @@ class GaussianPlan:
     """Plan of a Gaussian fit.
 
     Attributes:
-        stages: in their order, with image sizes that do not shrink and degrees that do not fall.
+        stages: in their order, with rising or constant image sizes and degrees.
         start: initial number of Gaussians, if drawn at random.
         most: number of Gaussians at the end of growth.
-        control: one of ``CONTROLS``.
+        control: of ``CONTROLS``.
         control_every: steps between two changes of the density.
-        growth: shares of all steps between which the density changes.
+        growth: shares of the steps between which the density changes.
         split_threshold: gradient of a Gaussian's screen position above which the Gaussian is divided [1 / half an image edge].
         least_opacity: Gaussians below this opacity are removed, or relocated.
         largest_clone: scale up to which a Gaussian is cloned and not split [extent].
         largest: scale above which a Gaussian is removed [extent].
-        reset_every: steps between two resets of all opacities to 0.01; 0: none.
+        reset_every: steps between two resets of opacities to 0.01; 0: none.
         ssim: share of SSIM in the loss.
         low_pass: variance added to each ellipse in full-size images [pixel^2].
         mip: whether Gaussians smaller than a pixel keep their light (Yu et al. 2024), instead of their opacity. Renderers with
@@ -73,7 +73,7 @@ class GaussianPlan:
         scale_rate, rotation_rate, opacity_rate, colour_rate: rates of log-scales, quaternions, opacity logits and constant
             coefficients.
         sheen: rate of higher coefficients over the rate of constant coefficients.
-        final_rate: last over first rate of all parameters but positions.
+        final_rate: last over first rate, except for positions.
         position_noise: for relocation: random moves of transparent Gaussians, in position rates.
         sparsity: for relocation: weight of the mean opacity and of the mean scale [extent].
     """
@@ -107,7 +107,7 @@ class GaussianPlan:
 
     @property
     def steps(self) -> int:
-        """Steps of all stages."""
+        """Total steps."""
         return sum(stage.steps for stage in self.stages)
 
     @property
@@ -117,12 +117,12 @@ class GaussianPlan:
 
     @property
     def stage_starts(self) -> tuple[int, ...]:
-        """First steps of all stages but the first."""
+        """First steps of the stages after the first."""
         return tuple(int(n) for n in np.cumsum([stage.steps for stage in self.stages])[:-1])
 
     @property
     def optimizer(self) -> Adam:
-        """The optimizer of the plan. Its epsilon is small: derivatives of single Gaussians are many orders below the largest
+        """The optimizer of the plan. A small epsilon: derivatives of single Gaussians are many orders below the largest
         one.
         """
         return Adam(epsilon=1e-12)
@@ -232,7 +232,7 @@ published steps (not measured)."""
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 times the largest distance of a camera from the mean of all cameras [length] (Kerbl et al. 2023, released code)."""
+    """1.1 times the largest distance of a camera from the mean camera position [length] (Kerbl et al. 2023, released code)."""
     origins = np.array([camera.origin for camera in cameras])
     return 1.1 * float(np.linalg.norm(origins - origins.mean(axis=0), axis=1).max())
 
@@ -257,16 +257,16 @@ def estimate_bytes(plan: GaussianPlan, count: int, pixels: int) -> int:
 
 
 def check_memory(plan: GaussianPlan, photographs: int, pixels: int, limit: int | None = None) -> str:
-    """Check that a fit has enough memory; returns one sentence about its memory.
+    """Check that a fit has enough memory; returns a sentence about the memory.
 
     Args:
         plan: plan of the fit.
-        photographs: bytes of all photographs.
+        photographs: bytes of the photographs.
         pixels: pixels of the largest photograph.
         limit: [bytes]; None takes the machine's available memory (unchecked on a GPU).
 
     Raises:
-        MivolError: the fit needs more memory; the message names a number of Gaussians that fits.
+        MivolError: the fit needs more memory; the message names a possible number of Gaussians.
     """
     most = max(plan.most, plan.start)
     needed = photographs + estimate_bytes(plan, most, pixels)

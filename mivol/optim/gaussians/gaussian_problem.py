@@ -1,9 +1,9 @@
-"""Fit of Gaussians to photographs: one whole image per step, by the tile renderer.
+"""Fit of Gaussians to photographs: a whole image per step, by the tile renderer.
 
 Conventions. The reals are the tensors of :mod:`mivol.splatting.splatter` by name. Higher harmonics are stored divided by
-``GaussianPlan.sheen``: their learning rate is smaller by this factor, and all numbers of a tensor share one rate. Colours are
-code values 0..1, as in the photographs. A step depends on the reals, the stage, the seed and its number; density control also
-depends on sums since its last application.
+``GaussianPlan.sheen``: their learning rate is smaller by this factor, and all numbers of a tensor have the same rate. Colours
+are code values 0..1, as in the photographs. A step depends on the reals, the stage, the seed and its number; density control
+also depends on sums since its last application.
 
 References: Kerbl et al. 2023 (loss, order of views, density control); Kheradmand et al. 2024 (relocation, noise, priors).
 """
@@ -42,15 +42,15 @@ from mivol.splatting.splatter import ScreenStatistics
 __all__ = ["GaussianProblem"]
 
 GAIN_STEP = 0.05
-"""Initial maximum change of a gain's logarithm per visit of its photograph: a gain of 1.5 needs eight visits or more."""
+"""Initial maximum change of a gain's logarithm per visit of the photograph: a gain of 1.5 needs eight visits or more."""
 
 RESET_TO = 0.01
-"""Maximum opacity after a reset of all opacities."""
+"""Maximum opacity after a reset of opacities."""
 
 
 @dataclasses.dataclass
 class GaussianProblem:
-    """Gaussians and photographs of them.
+    """Gaussians with photographs.
 
     Attributes:
         batches: the photographs, in the sizes of the plan.
@@ -128,13 +128,13 @@ class GaussianProblem:
         return cloud
 
     def _shares(self, count: int) -> np.ndarray:
-        """(count, 1) ratio of a coefficient to its real."""
+        """(count, 1) ratio of a coefficient to the real."""
         return np.array([1.0] + [self.plan.sheen] * (count - 1), np.float32)[:, None]
 
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
-        """The loss of one view, and its gradient; the views follow a new random order per epoch.
+        """Loss and gradient of a single view; the views follow a new random order per epoch.
 
         Raises:
             MivolError: more than one view per step.
@@ -187,7 +187,7 @@ class GaussianProblem:
         return self._cameras[view, shrink]
 
     def splatter_for(self, size: tuple[int, int], low_pass: float, sheen: float = 1.0) -> Splatter:
-        """Renderer of images of one size (width, height) for the degree of the stage; each is made once.
+        """Renderer of images of a size (width, height) for the degree of the stage; each is made once.
 
         Args:
             size: of the image [pixel].
@@ -255,7 +255,7 @@ class GaussianProblem:
     def learning_rates(self, iteration: int) -> dict[str, float]:
         """Learning rate of each parameter.
 
-        With n photographs, a gain has a gradient in one of n steps, and Adam moves it by up to sqrt(n) of its rate.
+        With n photographs, a gain has a gradient every n steps, and Adam moves the gain by up to sqrt(n) rates.
         """
         found = self.plan.learning_rates(iteration, self.extent)
         if self.exposure is not None:
@@ -263,7 +263,7 @@ class GaussianProblem:
         return found
 
     def _gain_step(self, iteration: int) -> float:
-        """Maximum change of a gain's logarithm per visit of its photograph."""
+        """Maximum change of a gain's logarithm per visit of the photograph."""
         return GAIN_STEP * self.plan.final_rate ** (iteration / max(self.plan.steps, 1))
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
@@ -286,7 +286,7 @@ class GaussianProblem:
     # -- Density ------------------------------------------------------------------------------------------------------
 
     def control_density(self, iteration: int) -> Refinement:
-        """Add Gaussians where images need them, remove invisible ones, and restart the sums."""
+        """Add Gaussians to poorly fitted regions, remove invisible Gaussians, and restart the sums."""
         rng = np.random.default_rng((self.seed, 5, iteration))
         before = len(self.cloud["means"])
         room = self.plan.count_at(iteration, self.initial_count) - before
@@ -316,7 +316,7 @@ class GaussianProblem:
         return change.then(prune(cloud, keep))
 
     def _relocate(self, room: int, rng: np.random.Generator) -> CloudChange:
-        """Move transparent Gaussians to opaque ones, then grow by at most 5 %."""
+        """Move transparent Gaussians to opaque Gaussians, then grow by at most 5 %."""
         moved = relocate(self.cloud, self.plan.least_opacity, rng)
         more = min(max(room, 0), max(1, len(self.cloud["means"]) // 20))
         return moved.then(grow(moved.cloud, more, self.plan.least_opacity, rng)) if more else moved
@@ -362,7 +362,7 @@ class GaussianProblem:
 
 
 def _with_degree(arrays: CloudArrays, degree: int) -> CloudArrays:
-    """The arrays with harmonics up to a degree: higher ones are dropped, new ones are 0."""
+    """The arrays with harmonics up to a degree: higher harmonics are dropped, new harmonics are 0."""
     harmonics, wanted = arrays["harmonics"], (degree + 1) ** 2
     made = np.zeros((len(harmonics), wanted, 3), np.float32)
     shared = min(wanted, harmonics.shape[1])
@@ -387,7 +387,7 @@ def _gradient_of_image(
 
 
 STEEPNESS, MIDDLE_OPACITY = 100.0, 0.005
-"""Steepness of the logistic function that ends random moves of visible Gaussians, and its middle opacity (published code)."""
+"""Steepness of the logistic function ending random moves of visible Gaussians, and the middle opacity (published code)."""
 
 
 def _move_randomly(reals: Reals, drawn: mi.Float, size: mi.Float) -> mi.TensorXf:

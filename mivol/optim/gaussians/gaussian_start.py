@@ -88,7 +88,7 @@ def make_start_cloud(places: np.ndarray, views: Sequence[Photo], degree: int) ->
 
 
 def _may_be_matter(views: Sequence[Photo], points: np.ndarray) -> np.ndarray:
-    """Whether enough views contain each point (N, 3), and none shows it as transparent."""
+    """Whether enough views contain each point (N, 3), and no view shows the point as transparent."""
     kept = count_views([view.camera for view in views], points) >= SHARE * len(views)
     for view in views:
         visible, row, column = _look_up(view, points)
@@ -97,7 +97,7 @@ def _may_be_matter(views: Sequence[Photo], points: np.ndarray) -> np.ndarray:
 
 
 def _mean_colour(views: Sequence[Photo], points: np.ndarray) -> np.ndarray:
-    """(N, 3) mean colour over the views that contain a point; grey without such views. Occlusion is ignored."""
+    """(N, 3) mean colour over the views containing a point; grey without such views. Occlusion is ignored."""
     total, count = np.full((len(points), 3), 0.5), np.ones(len(points))
     for view in views:
         visible, row, column = _look_up(view, points)

@@ -21,7 +21,7 @@ import numpy as np
 __all__ = ["ImageShape", "image_loss", "mean_ssim"]
 
 REACH, SIGMA = 5, 1.5
-"""Half width of the window [pixel], and its standard deviation [pixel]."""
+"""Half width and standard deviation of the window [pixel]."""
 
 C1, C2 = 0.01**2, 0.03**2
 """Constants of SSIM for values in a range of 1."""

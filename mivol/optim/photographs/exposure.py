@@ -68,7 +68,7 @@ class Exposure:
         return total
 
     def regularized(self, rate: float) -> Exposure:
-        """Gains after the prior of one step: pulled towards 1, with a mean logarithm of 0 in each channel."""
+        """Gains after a step's prior: pulled towards 1, with a mean logarithm of 0 in each channel."""
         entry, photographs = dr.arange(mi.UInt32, dr.width(self.logs)), dr.arange(mi.UInt32, dr.width(self.logs) // CHANNELS)
         means = [dr.mean(dr.gather(mi.Float, self.logs, photographs * CHANNELS + k)) for k in range(CHANNELS)]
         mean = dr.select(entry % CHANNELS == 0, means[0], dr.select(entry % CHANNELS == 1, means[1], means[2]))

@@ -1,7 +1,7 @@
 """Plans of radiance field fits: stages, learning rates and priors, and the memory of a fit.
 
 Conventions. Lengths are in world units. Learning rates and priors of the density are relative to half the longest edge of the
-box, so they do not depend on the unit. ``PRESETS`` lists plans by name.
+box, and do not depend on the unit. ``PRESETS`` lists plans by name.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FEW_PHOTOGRAPHS = 50
 
 @dataclass(frozen=True)
 class RadianceStage:
-    """Steps on a grid of one resolution.
+    """Steps on a grid of fixed resolution.
 
     Attributes:
         longest: nodes along the longest edge of the box; voxels are cubes. For a ``cubic`` plan, nodes along the edge of a
@@ -37,8 +37,8 @@ class RadianceStage:
         steps: number of steps.
         shrink: edge of the squares of pixels whose means are fitted. If voxels are larger than pixels, a mean gives the same
             information with fewer rays.
-        views, tiles: views per step, and tiles of 4 x 4 pixels per view. Each view has a table of all nodes, made and folded in
-            every step, so the same number of rays from fewer views takes less time and memory.
+        views, tiles: views per step, and tiles of 4 x 4 pixels per view. Each view has a table of the nodes, made and folded in
+            every step, and the same number of rays from fewer views takes less time and memory.
         rate: factor on the plan's rate of the density. In a voxel of twice the edge a step changes the optical depth twice as
             much, and thin structures are lost if it makes a coarse voxel opaque or empty.
     """
@@ -59,7 +59,7 @@ class RadiancePlan:
         stages: in their order.
         degree: of the harmonics, in the last stage.
         few_degree: degree for fewer than ``FEW_PHOTOGRAPHS`` photographs; None takes ``degree``.
-        first_degree: degree of the first stage; degrees between rise evenly. None takes ``degree`` in all stages.
+        first_degree: degree of the first stage; degrees between rise evenly. None takes ``degree`` in every stage.
         density_rate, sh_rate: initial learning rates: of the density times half the longest edge [1], of coefficients
             [radiance].
         last: factor on both rates in the last step; they fall exponentially.
@@ -68,12 +68,12 @@ class RadiancePlan:
         tv_density, tv_sh: total variation of the density and of the coefficients [photographs]: number of agreeing photographs
             that balance the prior. With V photographs, a step moves values by this / V of a learning rate.
         tv_share: share of the rows that total variation moves per step.
-        tv_every: steps between two applications of total variation, each with the shares of all these steps. 1 for fewer than
+        tv_every: steps between two applications of total variation, each with the shares of these steps. 1 for fewer than
             ``FEW_PHOTOGRAPHS`` photographs: an application moves values by this / V times the weight in learning rates, and
             must stay below 1.
         sparsity: Cauchy prior on the density [photographs].
         matte: weight decay of the view-dependent coefficients [1 / radiance]: they fall by this / V times their learning rate
-            per step, since they overfit.
+            per step, to avoid overfitting.
         few_matte: ``matte`` for fewer than ``FEW_PHOTOGRAPHS`` photographs; None takes ``matte``.
         depth: weight of the distances to the points of a reconstruction (:mod:`mivol.optim.photographs.depth_supervision`),
             beside the mean squared error.
@@ -87,7 +87,7 @@ class RadiancePlan:
             stage.
         sky: rows of a map of the background, fitted with the field (:mod:`mivol.fields.sky`); 0 takes the photographs' colour.
         sky_rate: initial learning rate of the sky [radiance]; a low rate would let the field fill the box with the background.
-        sky_smooth: share by which a texel moves to its neighbours per step, so that no texel keeps its start.
+        sky_smooth: share by which a texel moves to its neighbours per step; no texel then stays at its start.
         exposure: whether each photograph has a gain per channel (:mod:`mivol.optim.photographs.exposure`), if they disagree.
         levels: number of nested boxes, each of twice the extent (:mod:`mivol.fields.spherical_grid`).
         fewer_levels: whether fewer levels suffice if the points of a reconstruction need no more.
@@ -140,12 +140,12 @@ class RadiancePlan:
 
     @property
     def steps(self) -> int:
-        """Steps of all stages."""
+        """Total steps."""
         return sum(stage.steps for stage in self.stages)
 
     @property
     def stage_starts(self) -> tuple[int, ...]:
-        """First steps of all stages but the first."""
+        """First steps of the stages after the first."""
         return tuple(int(n) for n in np.cumsum([stage.steps for stage in self.stages])[:-1])
 
     @property

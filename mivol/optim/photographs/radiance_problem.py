@@ -53,7 +53,7 @@ from mivol.transport.traversal.occupied_cells import OccupiedCells
 
 @dataclasses.dataclass
 class RadianceProblem:
-    """A radiance field in a box, and photographs of it.
+    """A radiance field in a box, with photographs.
 
     Attributes:
         batches: the photographs.
@@ -367,7 +367,7 @@ def _with_tensors(grid: SphericalGrid, reals: Reals) -> SphericalGrid:
 def _fog(
     res: tuple[int, int, int], to_world: np.ndarray, degree: int, density: float, levels: int, space: str
 ) -> SphericalGrid:
-    """A thin grey fog in the boxes of all levels."""
+    """A thin grey fog in the boxes of every level."""
     nodes, width = None, row_width(basis_size(degree))
     if levels > 1:
         nodes = dr.compress(~is_covered_by_inner(dr.arange(mi.UInt32, levels * math.prod(res)), res))
@@ -381,7 +381,7 @@ def _fog(
 
 
 def _coloured(fog: SphericalGrid, colour: np.ndarray) -> SphericalGrid:
-    """A fog of one colour (3,) in all directions, from a fog with harmonics 0."""
+    """A fog with a constant colour (3,), from a fog with harmonics 0."""
     row = np.zeros(fog.width, np.float32)
     row[:3] = (colour - fog.offset) * math.sqrt(4 * math.pi)  # the first harmonic is 1 / sqrt(4 pi)
     return fog.with_values(fog.density, dr.tile(mi.Float(row), dr.width(fog.density)))

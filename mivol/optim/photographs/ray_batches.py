@@ -30,7 +30,7 @@ TILE = 4
 class Level:
     """All views in one size: codes 0..255 or radiance, [row][column][rgb] or, with alpha, [rgba], one view after the other.
 
-    ``counted`` is 1 or 0 per pixel; None without masks. ``wide``: rays of wide lenses; None for pinholes only.
+    ``counted`` is 1 or 0 per pixel; None without masks. ``wide``: rays of wide lenses; None without wide lenses.
     """
 
     codes: mi.UInt8 | mi.Float
@@ -51,7 +51,7 @@ class WideRays:
     """Directions through pixel centres in the frames of cameras with wide lenses: [row][column][xyz], lens by lens.
 
     Attributes:
-        directions: of all lenses, each once.
+        directions: of the lenses, each once.
         starts: (V,) first pixel of each view's lens; -1 for a pinhole.
     """
 
@@ -60,7 +60,7 @@ class WideRays:
 
     @classmethod
     def from_cameras(cls, cameras: Sequence[Camera], sizes: np.ndarray, shrink: int) -> WideRays | None:
-        """Rays of cameras whose images have ``sizes`` (V, 2) after shrinking; None for pinholes only."""
+        """Rays of cameras whose images have ``sizes`` (V, 2) after shrinking; None without wide lenses."""
         tables, starts, known, count = [], [], {}, 0
         for camera, (width, height) in zip(cameras, sizes, strict=True):
             if not camera.distortion.is_wide:
@@ -197,7 +197,7 @@ class RayBatches:
         return counted / (255 if self.space == "srgb" else 1)
 
     def choose_views(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Numbers of ``count`` different views in ascending order; all views if there are fewer."""
+        """Numbers of ``count`` different views in ascending order; at most all views."""
         n = len(self.origins)
         return np.sort(rng.choice(n, min(count, n), replace=False))
 

@@ -1,6 +1,6 @@
 """Projections as a problem of the fit loop, with linear solvers as optimizers.
 
-Conventions. A solver computes products of its operator that a gradient does not contain, so it runs its own iterations.
+Conventions. A solver needs products with the operator beyond a gradient, and therefore runs separate iterations.
 :func:`solve_with_drift` alternates between object and light drift (block descent): a few iterations of the solver explain
 ``b - drift``, then the drift is fitted to the remaining part of ``b``. Each turn lowers the joint weighted least squares.
 
@@ -30,12 +30,12 @@ KEY = "x"
 
 @dataclass
 class ProjectionProblem:
-    """A volume and projections of it.
+    """A volume and its projections.
 
     Attributes:
         linear_problem: the problem of line integrals.
         x: (n,) the reconstructed volume; None before the first step.
-        times: (views,) time of each view, for light that drifts; None for constant light.
+        times: (views,) time of each view, for drifting light; constant light: None.
         safe_point: called before each iteration.
     """
 
@@ -124,7 +124,7 @@ class SolverRun(OptimizerRun):
         """Take the solver's next iteration; returns the objective after the iteration.
 
         Raises:
-            MivolError: no data, so that no iteration is possible.
+            MivolError: no data, and no possible iteration.
         """
         self.problem.safe_point()
         state = next(self._states, None)
@@ -159,10 +159,10 @@ def solve_with_drift(
 
     Args:
         run: of a least-squares :class:`~mivol.optim.projections.linear_problems.Solver`.
-        problem: its ``A`` is a projector, its ``b`` and ``weights`` are (views, rows, cols).
+        problem: ``A`` is a projector, ``b`` and ``weights`` are (views, rows, cols).
         times: (views,) time of each view, preferably centred at 0.
-        every: iterations of one turn.
-        state: state to resume from; its memory holds the whole turn.
+        every: iterations of a turn.
+        state: state to resume from; the memory holds the whole turn.
         options: options of the solver.
 
     Yields:
@@ -190,6 +190,6 @@ def solve_with_drift(
 
 
 def fit_drift(problem: LeastSquares, x: np.ndarray, times: np.ndarray) -> LightDrift:
-    """The drift that best explains the residual of the volume ``x``."""
+    """The drift with the best fit to the residual of the volume ``x``."""
     residual = problem.b - (problem.A @ np.reshape(x, -1)).reshape(problem.b.shape)
     return fit_light_drift(residual, problem.weights, times)

@@ -2,9 +2,9 @@
 
 Conventions. The operator A maps voxels (n,) to rays (m,), both flat; ``A.shape`` is (m, n). ``b`` are line integrals
 (dimensionless), ``weights`` their inverse variances (0 excludes a ray), x the field (1/length). Vectors keep the operator's
-dtype. Sums are float64 in a fixed order, so a run is bitwise repeatable if the operator is.
+dtype. Sums are float64 in a fixed order: a run is bitwise repeatable with a repeatable operator.
 
-A solver is a generator. It yields one :class:`SolverState` per iteration, without end or until nothing improves, so the caller
+A solver is a generator. The generator yields a :class:`SolverState` per iteration, without end or until the minimum. The caller
 controls progress, checkpoints and stopping. Arrays of a state are never overwritten, and ``run(problem, state=saved)``
 continues an interrupted run.
 
@@ -40,9 +40,9 @@ class LeastSquares:
 
     Args:
         A: linear operator (m, n).
-        b: (m,) line integrals, of any shape with m entries.
-        weights: inverse variances of ``b``; None for 1.
-        x0: start; None for 0.
+        b: (m,) line integrals, in a shape with m entries.
+        weights: inverse variances of ``b``; None: 1.
+        x0: start; None: 0.
         nonnegative: keep every voxel at or above 0.
         prior: optional penalty.
     """
@@ -66,12 +66,12 @@ class PoissonCounts:
 
     Args:
         A: linear operator (m, n) with entries >= 0.
-        counts: (m,) numbers of quanta: a detector's reading over its gain.
-        blank: quanta without an object, one number or (m,).
-        background: expected quanta from other sources (dark, scatter), one number or (m,).
-        x0: start, >= 0; None for 0.
+        counts: (m,) numbers of quanta: detector readings over the gain.
+        blank: quanta without an object, a number or (m,).
+        background: expected quanta from other sources (dark, scatter), a number or (m,).
+        x0: start, >= 0; None: 0.
         prior: optional penalty.
-        used: (m,) whether a ray is used (dead and saturated pixels are not); None for all.
+        used: (m,) whether a ray is used (dead and saturated pixels are not); None: all rays.
     """
 
     A: Any
@@ -89,10 +89,10 @@ class PoissonCounts:
 
 
 def check_sizes(a: Any, x0: np.ndarray | None, **data: np.ndarray | None) -> None:
-    """Check that data fit an operator.
+    """Check data for an operator.
 
     Raises:
-        MivolError: another number of values than rays or voxels, or a value that is not finite.
+        MivolError: another number of values than rays or voxels, or a nonfinite value.
     """
     m, n = a.shape
     for name, value in data.items():
@@ -122,7 +122,7 @@ def start_field(a: Any, x0: np.ndarray | None) -> np.ndarray:
 
 
 def flat_weights(problem: LeastSquares) -> np.ndarray | None:
-    """Weights of rays (m,); None for 1."""
+    """Weights of rays (m,); None: 1."""
     return None if problem.weights is None else flatten(problem.weights, problem.A.dtype)
 
 

@@ -167,4 +167,4 @@ DIRECT: dict[str, Solver] = {
 """Direct solvers by name. ``run(problem, state=None, window=..., cutoff=...)``; the problem's operator is a projector."""
 
 ALL_SOLVERS: dict[str, Solver] = SOLVERS | DIRECT
-"""Solvers that a file can name."""
+"""Solvers available in files."""

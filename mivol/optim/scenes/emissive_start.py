@@ -6,11 +6,11 @@ sigma-bar is the density of a radiance field, fitted to the views, averaged over
 of the grid's own start. C are the powers of 2 in :data:`FACTORS`, and S^n the first :data:`TRIAL` steps of the fit.
 
 A dense scattering medium has local minima: matter in the shadow of other matter is as dark as empty space. A radiance field
-emits its light, so its fit carves the shape from the silhouettes and puts the shading into the colours. Its density is no
+is emissive, and the fit carves the shape from the silhouettes and puts the shading into the colours. The density is no
 extinction of the scattering model (a surface is as opaque as the views allow), hence the factor. The loss of a start does not
-predict the best factor, so each factor gets a few steps.
+predict the best factor; each factor therefore gets a few steps.
 
-Bias: none in the following fit, whose loss is unchanged; only its start differs. Cost: a fit of a radiance field (about 15 s of
+Bias: none in the following fit, whose loss is unchanged; only the start differs. Cost: a fit of a radiance field (about 15 s of
 processor time on 32^3 nodes), and :data:`TRIAL` steps and a loss for each factor.
 
 Reference: Nimier-David, Müller, Keller, Jakob 2022 (Unbiased inverse volume rendering with differential trackers, section 6),
@@ -52,7 +52,7 @@ PLAN = RadiancePlan((RadianceStage(16, 100, 2, 16, 32), RadianceStage(32, 200, 1
 sky, because views of a scene show its background."""
 
 BRIGHTEST = 99.5
-"""Percentile of the radiance that becomes white. Photographs have 8 bits, and a sun would leave none for other pixels."""
+"""Percentile of the radiance shown as white. Photographs have 8 bits, and a sun would use all of them."""
 
 LEAST = 1e-3
 """Smallest value of the start over its mean: maps to the logarithm have no 0, and a fit leaves 0 slowly."""
@@ -77,7 +77,7 @@ class EmissiveStart:
 
     @property
     def description(self) -> str:
-        """One sentence for the report."""
+        """A sentence for the report."""
         trials = ", ".join(f"{loss:.3g} for {factor:g}" for factor, loss in zip(FACTORS, self.losses, strict=True))
         return (
             f"starts from an emissive fit of the same views, at {self.factor:g} times the mean of the given start "
@@ -88,7 +88,7 @@ class EmissiveStart:
 def find_emissive_start(
     problem: SceneProblem, name: str, to_world: np.ndarray, optimizer: Optimizer, seed: int = 0
 ) -> EmissiveStart:
-    """Fit an emissive volume to a problem's views, and scale its density by the best factor.
+    """Fit an emissive volume to a problem's views, and scale the density by the best factor.
 
     Args:
         problem: with the scene at its own start, whose mean the factors multiply; the problem holds this start again
@@ -117,10 +117,10 @@ def find_emissive_start(
 
 
 def check_given_start(name: str, value: np.ndarray) -> None:
-    """Check that an emissive start can replace a start.
+    """Check the start to be replaced by an emissive start.
 
     Raises:
-        MivolError: a parameter that is no grid, or a start of 0.
+        MivolError: a parameter without a grid, or a start of 0.
     """
     if value.ndim != 4:
         raise MivolError(f"{name} has the shape {value.shape}, an emissive start needs a grid (Z, Y, X, C): set start instead.")
@@ -140,7 +140,7 @@ def fit_emission(views: Sequence[View], to_world: np.ndarray, seed: int = 0) -> 
 
 
 def to_photographs(views: Sequence[View]) -> list[Photo]:
-    """Photographs of views: sRGB codes of the radiance, white at the percentile :data:`BRIGHTEST` of all views."""
+    """Photographs of views: sRGB codes of the radiance, white at the percentile :data:`BRIGHTEST` of the views."""
     images = [np.array(view.reference, dtype=np.float32) for view in views]
     images = [image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2) for image in images]
     white = float(np.percentile(np.concatenate([image.ravel() for image in images]), BRIGHTEST))
@@ -171,7 +171,7 @@ def _try(problem: SceneProblem, optimizer: Optimizer, reals: dict[str, mi.Tensor
 
 
 def _reals(problem: SceneProblem, start: dict[str, mi.TensorXf], name: str, value: np.ndarray) -> dict[str, mi.TensorXf]:
-    """The reals of a problem with another value of one parameter, clipped to its domain."""
+    """The reals of a problem with another value of a parameter, clipped to the domain."""
     parameter = next(p for p in problem.parameters if p.name == name)
     low, high = parameter.domain
     return start | {name: parameter.to_reals(mi.TensorXf(np.clip(value, low, high).astype(np.float32)))}

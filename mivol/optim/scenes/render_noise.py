@@ -52,12 +52,12 @@ class Comparison:
 def compare_with_reference(
     loss: Loss, renders: Sequence[mi.TensorXf], shares: Sequence[float], reference: mi.TensorXf, weight: float = 1.0
 ) -> Comparison:
-    r"""Compare one render, or two renders with independent seeds, with a reference.
+    r"""Compare a render, or two renders with independent seeds, with a reference.
 
     Args:
-        loss: one of LOSSES; ``loss.pairs`` removes the noise.
-        renders: one or two images (height, width, channels).
-        shares: share of the samples of each render; they sum to 1.
+        loss: of LOSSES; ``loss.pairs`` removes the noise.
+        renders: 1 or 2 images (height, width, channels).
+        shares: share of the samples of each render, with a sum of 1.
         reference: same shape.
         weight: factor on loss, noise and adjoint.
 
@@ -70,7 +70,7 @@ def compare_with_reference(
         of "l1" below the noise s, 0.8 s becomes 0.47 s. The reference's own noise stays.
     Variance: of a pixel's squared loss with Gaussian noise s^2 and residual r: 4 r^2 s^2 + 2 s^4 without pairs, 4 r^2 s^2 +
         4 s^4 with pairs.
-    Cost: the penalty of three images instead of one; no additional sample.
+    Cost: the penalty of three images instead of a single image; no additional sample.
     """
     mean = dr.detach(sum(share * image for share, image in zip(shares, renders, strict=True)))
     image = mi.TensorXf(mean)
@@ -88,7 +88,7 @@ def compare_with_reference(
 
 
 def split_samples(spp: int, loss: Loss) -> tuple[int, ...]:
-    """Samples per pixel of the renders of one noisy image: two nearly equal halves.
+    """Samples per pixel of the renders of a noisy image: two nearly equal halves.
 
     Raises:
         MivolError: the loss takes pairs, and a pixel has a single sample.
@@ -125,12 +125,12 @@ def make_noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[],
 
 
 def describe_noise(loss: Loss, value: float, noise: float) -> str:
-    """A sentence about the noise in a loss, with its size, or "".
+    """A sentence about the noise in a loss, with the size, or "".
 
     Args:
         loss: the loss to minimise.
-        value: its mean over the views.
-        noise: part of ``value`` that is noise; nan if unknown.
+        value: the mean over the views.
+        noise: noise in ``value``; nan if unknown.
     """
     if loss.pairs or (not math.isnan(noise) and abs(noise) <= NOTABLE * abs(value)):
         return ""

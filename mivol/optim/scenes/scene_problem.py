@@ -4,9 +4,9 @@ r"""Fits of scenes to images: real numbers in, loss and derivatives out, through
 
 Conventions. ``u`` are the reals of each :class:`~mivol.optim.parameters.Parameter`, ``x`` the scene's values. An image is the
 mean of passes of at most ``samples_per_pass`` samples. The adjoint of the loss is evaluated at the whole image and carried back
-pass by pass, so non-linear losses do not depend on the number of passes. If light is sampled, an image is the mean of two
+pass by pass, and non-linear losses do not depend on the number of passes. If light is sampled, an image is the mean of two
 renders with independent seeds, whose difference measures the noise in the loss. Seeds are a function of (seed, iteration,
-batch, purpose, half, pass) only. ``safe_point`` is called between passes; until it returns, only ``newest_loss`` may have
+batch, purpose, half, pass) only. ``safe_point`` is called between passes; until the return, only ``newest_loss`` may have
 changed.
 """
 
@@ -42,14 +42,14 @@ from mivol.optim.scenes.views import (
 
 @dataclass(repr=False)
 class SceneProblem:
-    """A scene, reference images of it, and the parameters to fit.
+    """A scene, reference images, and the parameters to fit.
 
     Attributes:
-        scene: any Mitsuba scene.
-        views: sensors with reference images, all of one size.
+        scene: a Mitsuba scene.
+        views: sensors with reference images, all of equal size.
         parameters: the parameters to fit.
         integrator: differentiable; None takes the scene's integrator.
-        loss: one of LOSSES, or a function of image and reference (:class:`mivol.optim.losses.FunctionLoss`).
+        loss: of LOSSES, or a function of image and reference (:class:`mivol.optim.losses.FunctionLoss`).
         spp: samples per pixel of an image, and of its derivative.
         samples_per_pass: maximum samples in one kernel.
         seed: root of all random numbers.
@@ -142,7 +142,7 @@ class SceneProblem:
         return [spp // n + (i < spp % n) for i in range(n)]
 
     def seed_for(self, iteration: int, index: int, purpose: int) -> int:
-        """Seed of a batch, by its number."""
+        """Seed of a batch, by number."""
         return derive_seed(self.seed, iteration, index, purpose)
 
     def render(self, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
@@ -180,7 +180,7 @@ class SceneProblem:
         return total / self.spp
 
     def _set_tangents(self, tangents: Reals) -> None:
-        """Set the tangents, before each render: some integrators consume them."""
+        """Set the tangents, before each render: some integrators consume tangents."""
         for p in self.parameters:
             value = self.params[p.name]
             dr.set_grad(value, like(tangents[p.name], value))
@@ -195,8 +195,8 @@ class SceneProblem:
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float, Reals]:
         """f(u) and its gradient over ``views`` views, drawn anew in each iteration; 0 takes all views.
 
-        Image and derivative have independent seeds: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
-        Noise: from the integrator; media that only absorb have only the noise of the pixel filter. Its effect on the loss:
+        Image and derivative have independent seeds: an estimate of d(I^2) = 2 I dI from the same samples is biased.
+        Noise: from the integrator; absorbing media have only the noise of the pixel filter. Effect on the loss:
         :func:`mivol.optim.scenes.render_noise.compare_with_reference`.
         """
         batches = self.batches
@@ -243,10 +243,10 @@ class SceneProblem:
         return math.fsum(self.compare(s, self.seed_for(iteration, i, PRIMAL), len(self.views)).loss for i, s in pairs)
 
     def compare(self, batch: RenderBatch, seed: int, n_views: int) -> Comparison:
-        """Render a batch; returns its part of the mean loss over ``n_views`` views.
+        """Render a batch; returns the part of the mean loss over ``n_views`` views.
 
         Raises:
-            MivolError: a loss with pairs, for a noisy render of one sample per pixel.
+            MivolError: a loss with pairs, for a noisy render with a sample per pixel.
         """
         parts = split_samples(self.spp, self.loss) if self.noisy else (self.spp,)
         if len(parts) == 1:
@@ -258,7 +258,7 @@ class SceneProblem:
         )
 
     def remember(self, compared: Sequence[Comparison]) -> float:
-        """Sum of the losses of all batches, stored with its noise for :meth:`warning`."""
+        """Sum of the batches' losses, stored with the noise for :meth:`warning`."""
         unknown = self.noisy and self.spp == 1
         self.newest_loss = math.fsum(c.loss for c in compared), math.nan if unknown else math.fsum(c.noise for c in compared)
         return self.newest_loss[0]
@@ -294,7 +294,7 @@ class SceneProblem:
         return describe_noise(self.loss, *self.newest_loss)
 
     def energy(self, reals: Reals) -> float:
-        """Sum of all weighted prior energies."""
+        """Sum of weighted prior energies."""
         return math.fsum(float(p.energy(p.from_reals(dr.detach(reals[p.name])))[0]) for p in self.parameters)
 
     def through_priors_and_maps(self, reals: Reals, gradients: Reals) -> tuple[float, Reals]:
@@ -389,6 +389,6 @@ def draw_views(iteration: int, n_views: int, per_iteration: int, seed: int) -> l
 
 
 def _is_untouched(gradient: object) -> bool:
-    """Whether a gradient is the literal 0 of Dr.Jit, without any contribution."""
+    """Whether a gradient is the literal 0 of Dr.Jit, without contributions."""
     rows = [gradient.array] if dr.is_tensor_v(gradient) else gradient if dr.depth_v(gradient) > 1 else [gradient]
     return all(row.state == dr.VarState.Literal for row in rows)

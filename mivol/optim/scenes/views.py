@@ -1,8 +1,8 @@
 """Views of a scene, rendered several at a time, with independent seeds.
 
-Conventions. A :class:`View` is a sensor with its reference image (height, width, channels). A :class:`RenderBatch` renders one
+Conventions. A :class:`View` is a sensor with a reference image (height, width, channels). A :class:`RenderBatch` renders one
 view or several views side by side (Mitsuba's ``batch`` sensor). Tracing and launching a kernel costs as much for one small view
-as for twenty. Only views with a box filter are put side by side, since their samples count for one pixel each.
+as for twenty. Only views with a box filter are put side by side, since each sample counts for a single pixel.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ PRIMAL, ADJOINT, HELD_OUT, FINAL = range(4)
 
 
 def derive_seed(*key: int) -> int:
-    """A 32-bit seed from integers. SeedSequence mixes them, so that similar keys give independent seeds."""
+    """A 32-bit seed from integers. SeedSequence makes the seeds of similar keys independent."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
 @with_short_repr
 @dataclass(frozen=True)
 class View:
-    """A sensor and its reference image.
+    """A sensor and a reference image.
 
     Attributes:
         name: for messages and file names.
-        sensor: any Mitsuba sensor.
+        sensor: a Mitsuba sensor.
         reference: (height, width, channels), radiance.
     """
 
@@ -45,10 +45,10 @@ class View:
 @with_short_repr
 @dataclass(frozen=True)
 class RenderBatch:
-    """One render of one or several views.
+    """A render of one or several views.
 
     Attributes:
-        sensor: sensor of one view, or a batch.
+        sensor: sensor of a view, or a batch.
         reference: (height, n width, channels).
         n_views: number of views side by side.
     """
@@ -64,10 +64,10 @@ def count_pixels(sensor: mi.Sensor) -> int:
 
 
 def check_views(views: Sequence[View]) -> None:
-    """Check that every view can be compared with its reference.
+    """Check sizes and values of views.
 
     Raises:
-        MivolError: no views, different sizes, a reference of another size than its sensor, or a reference that is not finite.
+        MivolError: no views, different sizes, a reference of another size than the sensor, or not finite.
     """
     if not views:
         raise MivolError("found no views to fit: give at least one sensor with a reference.")
@@ -88,7 +88,7 @@ def check_views(views: Sequence[View]) -> None:
 
 
 def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
-    """Check that the images of all sensors (by name) have one size.
+    """Check for equal image sizes of sensors, by name.
 
     Raises:
         MivolError: different sizes, with both.
@@ -101,7 +101,7 @@ def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
 
 
 def make_single_batches(views: Sequence[View]) -> list[RenderBatch]:
-    """One render for each view."""
+    """A render for each view."""
     return [RenderBatch(view.sensor, view.reference, 1) for view in views]
 
 
@@ -114,7 +114,7 @@ def make_batches(views: Sequence[View], max_pixels: int) -> list[RenderBatch]:
 
 
 def can_be_batched(view: View) -> bool:
-    """Whether a view's samples count for its own pixels only, and its camera is in no medium."""
+    """Whether a view's samples count for the view's pixels only, and the camera is in no medium."""
     film = view.sensor.film()
     whole = all(int(a) == int(b) for a, b in zip(film.crop_size(), film.size(), strict=True))
     plain = film.class_name() == "HDRFilm" and film.rfilter().is_box_filter()
@@ -122,7 +122,7 @@ def can_be_batched(view: View) -> bool:
 
 
 def join_views(views: Sequence[View]) -> RenderBatch:
-    """One render of several views, from left to right."""
+    """A render of several views, from left to right."""
     height, width, channels = views[0].reference.shape
     film = {
         "type": "hdrfilm",
