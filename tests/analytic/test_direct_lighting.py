@@ -1,4 +1,4 @@
-"""Direct light of emitters on paper: at a wall and at a point of smoke, dimmed by fog on the way."""
+"""Direct light of emitters at a wall and at a point of smoke, attenuated by fog, against formulas on paper."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting, DistantEmitterSample
+from mivol.transport.estimators.lighting.direct_lighting import (
+    DirectLight,
+    DirectLighting,
+    DistantEmitterSample,
+    power_heuristic,
+)
 from mivol.transport.estimators.lighting.emitters import EventSamples
 from mivol.transport.estimators.lighting.vertex import MediumVertex, SurfaceVertex
 from mivol.transport.media.body import medium_interaction
@@ -149,3 +154,16 @@ def test_a_sample_at_infinity_is_the_same_from_everywhere(kind):
     np.testing.assert_allclose(ahead, np.array(drawn.direct.d), rtol=0, atol=4 * ROUNDING)
     box = media.scene.bbox()
     assert np.all(np.linalg.norm(np.array(moved.direct.p - box.center()), axis=0) > np.linalg.norm(box.extents()) / 2)
+
+
+def test_weights_of_two_techniques_sum_to_1():
+    """Densities of 1e-30 to 1e30, whose squares are no float32 numbers; each weight is rounded four times."""
+    a, b = 10 ** np.random.default_rng(1).uniform(-30, 30, (2, 1000)).astype(np.float32)
+    total = np.array(power_heuristic(mi.Float(a), mi.Float(b))) + np.array(power_heuristic(mi.Float(b), mi.Float(a)))
+    np.testing.assert_allclose(total, 1, atol=8 * 2.0**-24)
+
+
+def test_values():
+    """(a / b)^2 / (1 + (a / b)^2); a sample that cannot be drawn has no weight, one that only it can draw has all."""
+    found = np.array(power_heuristic(mi.Float(3, 0, 0, 2), mi.Float(1, 1, 0, 0)))
+    np.testing.assert_allclose(found, [0.9, 0, 0, 1], rtol=4 * 2.0**-24)

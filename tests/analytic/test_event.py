@@ -1,4 +1,4 @@
-"""The end of a segment as an event: a surface, a collision with a medium, or escape."""
+"""The end of a segment (collision, surface or escape), and the direction in which the path continues."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mivol.transport.estimators.flights.free_flight import FreeFlight
+from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.vertex import MediumVertex, MixedVertex
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.ray_intervals import SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.path.event import PathEvent
+from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.event import NextDirection, PathEvent, sample_next_direction
 from mivol.transport.traversal.rays import point_along
 from scenes import box_of, camera, media_of, medium
 
@@ -62,3 +65,87 @@ def test_where_there_are_no_surfaces_a_collision_has_a_vertex_of_a_medium_alone(
     hit = Collision(mei, place, mi.Spectrum(0.5), True, mi.Float64(0.5), mi.UInt32(0))
     vertex = PathEvent.from_estimate(SegmentEstimate(end, mi.Spectrum(1), None, None, hit), mi.Bool(True)).vertex(media)
     assert isinstance(vertex, MediumVertex) and vertex.interaction is hit.mei
+
+
+DIFFUSE = {"type": "diffuse", "reflectance": 0.5}
+MASK = {"type": "mask", "opacity": 0.25, "nested": DIFFUSE}
+ROUNDING = 8 * 2.0**-23
+G, ALBEDO = 0.5, 0.75
+ENDLESS = 1e30
+"""Length [length] of rays without an end, at least: Mitsuba's are as long as the largest float32."""
+
+
+class FallingRays:
+    """Rays that fall from z = 2 on a rectangle in the plane z = 0, and end 5 farther on."""
+
+    def __init__(self, bsdf: dict, lights_media: bool = True) -> None:
+        self.fog = mi.load_dict(medium("homogeneous", 0.5, phase={"type": "hg", "g": G}))
+        wall = {"type": "rectangle", "bsdf": bsdf}
+        media = media_of(mi.load_dict({"type": "scene", "wall": wall, "sensor": camera([0, -1, 4], [0, 0, 0])}))
+        self.estimators = Estimators(DirectLighting(media), FreeFlight(media), Settings(), True, lights_media)
+        zero = dr.zeros(mi.Float, 4)
+        self.ray = mi.Ray3f(mi.Point3f(zero, 0, 2), mi.Vector3f(0, 0, -1), mi.Float(7), zero, mi.Color0f())
+
+    def turn(self, in_medium: list[bool] | None, may_scatter: list[bool], component: list[float]) -> NextDirection:
+        """Of four lanes; those in the medium have collided 0.5 from the origin."""
+        ray, si = self.ray, self.estimators.media.scene.ray_intersect(self.ray)
+        on = mi.Bool([False] * 4 if in_medium is None else in_medium)
+        mei, t = medium_interaction(ray, mi.Float(0.5), self.fog), mi.Float64(0.5)
+        hit = None if in_medium is None else Collision(mei, mi.Point3d(mei.p), mi.Spectrum(ALBEDO), on, t, mi.UInt32(0))
+        around = dr.select(dr.full(mi.Bool, True, 4), mi.MediumPtr(self.fog), None)
+        event = PathEvent(si, si.t, around, ~on & si.is_valid(), hit)
+        with dr.suspend_grad():
+            return sample_next_direction(
+                self.estimators, ray, event, mi.Float(component), mi.Point2f(0.3, 0.6), mi.Bool(may_scatter)
+            )
+
+
+def test_a_diffuse_wall_turns_paths_that_may_scatter():
+    """The weight is the reflectance, the density the cosine over pi; the new ray leaves the wall, in the medium before it."""
+    bench = FallingRays(DIFFUSE)
+    turn = bench.turn(None, [True, True, False, True], [0.5] * 4)
+    assert np.array(turn.on).tolist() == [True, True, False, True] and not np.array(turn.through).any()
+    np.testing.assert_allclose(np.array(turn.weight)[:, 0], 0.5, rtol=ROUNDING)
+    cosine = np.array(turn.ray.d.z)
+    np.testing.assert_allclose(np.array(turn.pdf), cosine / np.pi, rtol=ROUNDING)
+    assert np.all(cosine > 0) and not np.array(turn.delta).any() and np.all(np.array(turn.eta) == 1)
+    assert np.all(np.array(turn.medium == mi.MediumPtr(bench.fog))) and np.all(np.array(turn.ray.maxt) > ENDLESS)
+    assert np.all(np.array(turn.origin.p.z) == 0) and len(turn.factors) == 1
+
+
+def test_what_a_mask_transmits_goes_straight_on_however_deep_the_path_is():
+    """Numbers above the opacity pass; the ray keeps its direction and the rest of its length, whether or not it may scatter."""
+    turn = FallingRays(MASK).turn(None, [True, True, False, False], [0.9, 0.1, 0.9, 0.1])
+    assert np.array(turn.through).tolist() == [True, False, True, False]
+    assert np.array(turn.on).tolist() == [True, True, True, False]
+    np.testing.assert_allclose(np.array(turn.ray.d)[:, [0, 2]], [[0, 0], [0, 0], [-1, -1]], atol=ROUNDING)
+    length = np.array(turn.ray.maxt)
+    assert length[::2].tolist() == [5, 5] and np.all(length[1::2] > ENDLESS)
+
+
+@pytest.mark.parametrize("lights_media", [True, False])
+def test_a_medium_turns_paths_by_its_phase_function(lights_media):
+    """The weight is the albedo; light along the direction is found by emitter samples too, unless all emitters are uniform."""
+    bench = FallingRays(DIFFUSE, lights_media)
+    turn = bench.turn([True] * 4, [True, True, False, True], [0.5] * 4)
+    assert np.array(turn.on).tolist() == [True, True, False, True] and not np.array(turn.through).any()
+    on, cosine = np.array(turn.on), -np.array(turn.ray.d.z)
+    # Henyey-Greenstein sampled by the inverse of its distribution: the roundings of the cosine are those of the number.
+    expected = (1 - G**2) / (1 + G**2 - 2 * G * cosine) ** 1.5 / (4 * np.pi)
+    np.testing.assert_allclose(np.array(turn.pdf)[on], expected[on], rtol=1e-5)
+    np.testing.assert_allclose(np.array(turn.weight)[:, on], ALBEDO, rtol=1e-5)
+    assert np.all(np.array(turn.delta) != lights_media)
+    assert np.all(np.array(turn.medium == mi.MediumPtr(bench.fog))[on]) and np.all(np.array(turn.ray.maxt) > ENDLESS)
+    np.testing.assert_array_equal(np.array(turn.origin.p.z), 1.5)
+
+
+def test_lanes_in_media_and_at_surfaces_turn_together():
+    """Each as it would alone; the factors of both are told."""
+    bench, numbers, may = FallingRays(DIFFUSE), [0.5] * 4, [True] * 4
+    both = bench.turn([True, False, True, False], may, numbers)
+    inside, outside = bench.turn([True] * 4, may, numbers), bench.turn(None, may, numbers)
+    for lane, alone in enumerate((inside, outside, inside, outside)):
+        for found, expected in ((both.ray.d, alone.ray.d), (both.weight, alone.weight), (both.origin.p, alone.origin.p)):
+            np.testing.assert_array_equal(np.array(found)[:, lane], np.array(expected)[:, lane])
+        assert np.array(both.pdf)[lane] == np.array(alone.pdf)[lane]
+    assert len(both.factors) == 2 and np.array(both.on).all()

@@ -1,7 +1,7 @@
-r"""The first collision with one part of an extinction: the optical depth to it is the one asked for, by the float64 twin.
+"""Regular tracking: the optical depth of the first collision, in constants, grids and Gaussians, against the float64 twin.
 
 Bounds. Depths of walks are exact to BOUND of tau_scale. In the cell of the collision a cubic is inverted, to 1.4e-4 of the
-largest extinction times the length of the piece (derived in test_cubic.py), which is a cell's diagonal at most.
+largest extinction times the length of the piece (derived in test_interpolation.py), which is at most the diagonal of a cell.
 """
 
 from __future__ import annotations
@@ -9,15 +9,23 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import oracle_gaussians as oracle
 import pytest
+from false_alarms import Estimate, assert_precise, assert_same_mean, fresh
 from hard_rays import BOUND
 from oracle import tau_scale, tau_twin
 from scattering_scenes import PLACE, aimed, rough_grid
+from scipy.special import logit
 
+from mivol.fields import gaussian_cells
 from mivol.fields.activation import select_activation
-from mivol.transport.estimators.flights.regular_tracking import regular_tracking
+from mivol.fields.gaussian_field import GaussianField
+from mivol.points.gaussians import Gaussians
+from mivol.transport.estimators.flights.regular_tracking import regular_tracking, sample_gaussian_flight
 from mivol.transport.media.extinction import ConstantExtinction, ExactExtinction, RayInterval
+from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
+from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import as_float32, make_lattice, to_lanes
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -112,3 +120,34 @@ def test_a_mono_variant_flies_through_the_luminance():
         mi.set_variant("llvm_ad_rgb")
     sigma = 0.212671 * 0.2 + 0.715160 * 1.0 + 0.072169 * 3.0
     np.testing.assert_allclose(t, 1 + np.array([0.3, 1.0]) / (SCALE * sigma), rtol=2 * ROUNDING)
+
+
+FLIGHTS, GAUSSIAN_SCALE = 1 << 16, 0.6
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("cells", [0.5, 50.0])
+def test_flights_end_where_the_depth_of_the_twin_says(cells: float, variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The share of flights that end before t is 1 - exp(-tau(t)), in few cells and in many; the others are infinite."""
+    monkeypatch.setattr(gaussian_cells, "CELLS_PER_GAUSSIAN", cells)
+    rng = np.random.default_rng(0)
+    means, scales = np.linspace([-1, 0, 0], [1, 0, 0], 20) + rng.uniform(-0.3, 0.3, (20, 3)), rng.uniform(0.1, 0.4, (20, 3))
+    turns, opacities = rng.normal(size=(20, 4)), rng.uniform(0.05, 0.5, 20)
+    # The long one is entered first, and the small one may end a flight before it does.
+    means[:2], scales[:2], turns[:2], opacities[:2] = [[0.5, 0, 0], [-1, 0, 0]], [[1, 0.3, 0.3], [0.1] * 3], [1, 0, 0, 0], 0.9
+    gaussians = Gaussians(means, np.log(scales), turns, logit(opacities), np.zeros((20, 1, 3)))
+    part = GaussianExtinction("sigma_t", GaussianField.from_gaussians(gaussians, np.eye(4)), mi.Float(GAUSSIAN_SCALE))
+    o, d, end = np.array([[-4.0, 0.1, 0.05]]), np.array([[1.0, 0.0, 0.0]]), 4.8
+    ray = mi.Ray3f(dr.zeros(mi.Point3f, FLIGHTS) + mi.Point3f(*o[0].tolist()), mi.Vector3f(*d[0].tolist()))
+    interval = RayInterval(ray, mi.Float64(0), mi.Float64(end), dr.full(mi.Bool, True, FLIGHTS))
+    seed = mi.Float(np.random.default_rng(fresh(3)).uniform())
+    t = np.array(sample_gaussian_flight(part, mi.Float(GAUSSIAN_SCALE), interval, seed_pcg32(seed, FLIGHTS))[0])
+    twin = oracle.Cloud.of(gaussians)
+    assert (np.isinf(t) | (t <= end + 1e-5)).all()
+    for place in np.linspace(2.6, end, 6):
+        tau = GAUSSIAN_SCALE * oracle.optical_depth(twin, o, d, np.zeros(1), np.full(1, place))[0]
+        ended = t < (np.inf if place == end else place)
+        shares = ended.reshape(64, -1).mean(axis=1)
+        found = Estimate(shares.mean(), shares.var(ddof=1) / 64, 63)
+        assert_same_mean(found, -np.expm1(-tau), rounding=1e-5, what=f"flights that end before {place:.2f}")
+        assert_precise(found, 0.004, what="the share")

@@ -1,4 +1,4 @@
-"""Emitters of every kind light a medium as in volpath."""
+"""Emitters of every kind light a medium as in volpath; random numbers and equiangular distances of their samples."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from volpath_scenes import (
     same,
 )
 
-from mivol.transport.estimators.lighting.emitters import SceneEmitters
+from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, SceneEmitters, make_ball_sampler
+from mivol.transport.traversal.random_numbers import Strata
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -66,3 +67,84 @@ def test_what_is_sampled_and_what_is_seen_through() -> None:
     for emitter, at_hand in ((sun, False), (near, True), ({**panel, "bsdf": masked}, True)):
         found = SceneEmitters(mi.load_dict({"type": "scene", "only": emitter}))
         assert not found.samples_phase and found.is_near == at_hand
+
+
+def samples(strata: Strata | None = None) -> EventSamples:
+    u, uv = mi.Float(0.3), mi.Point2f(0.6, 0.9)
+    return EventSamples(u, uv, u, uv, u, uv, u, strata)
+
+
+def test_each_event_draws_directions_from_its_part_of_the_square():
+    """Four events: one in each quarter, for emitters and for the phase function alike."""
+    parts = [samples().for_event(mi.UInt32(k), 4) for k in range(4)]
+    for name in ("emitter", "direction"):
+        cells = [tuple(np.floor(2 * np.array(getattr(p, name)).ravel()).astype(int)) for p in parts]
+        assert cells == [(0, 0), (1, 0), (0, 1), (1, 1)]
+
+
+def test_events_of_a_ray_share_the_emitter_and_little_else():
+    first, second = (samples().for_event(mi.UInt32(k), 4) for k in range(2))
+    assert first.which_emitter[0] == second.which_emitter[0] == np.float32(0.3)
+    assert second.component[0] == pytest.approx((0.3 + 0.6180339887) % 1, abs=2.0**-23)
+    assert np.array(second.inside).ravel() == pytest.approx([(0.6 + 0.7548776662) % 1, (0.9 + 0.5698402910) % 1], abs=2.0**-22)
+
+
+def test_a_single_event_has_the_strata_of_its_lane():
+    only = samples(Strata(mi.UInt32(3), 2, 2)).for_event(mi.UInt32(0), 1)
+    assert np.array(only.direction).ravel() == pytest.approx([0.8, 0.95], abs=2.0**-23)
+    assert only.strata is None and only.component[0] == np.float32(0.3)
+
+
+ROUNDING = 2.0**-22
+
+
+def pieces(n: int = 2000) -> tuple[np.ndarray, ...]:
+    """Pieces [a, a + dt] of rays, the nearest distance t0 and rho of an emitter, and numbers u, as float32."""
+    rng = np.random.default_rng(5)
+    a, t0 = rng.uniform(0, 4, (2, n))
+    dt, rho = 10 ** rng.uniform(-2, 1, (2, n))
+    return tuple(x.astype(np.float32).astype(np.float64) for x in (a, dt, t0, rho, rng.uniform(0.01, 0.99, n)))
+
+
+def sampler_of(t0: np.ndarray, rho: np.ndarray) -> EquiangularSampler:
+    return EquiangularSampler(mi.Float(t0), mi.Float(rho), mi.Bool(True))
+
+
+def angle_error(a: np.ndarray, dt: np.ndarray, t0: np.ndarray, rho: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    near, far = a - t0, a + dt - t0
+    return ROUNDING * (theta + (np.abs(near * far) + rho**2) / np.hypot(rho * dt, near * far + rho**2))
+
+
+def test_samples_divide_the_angle():
+    """A distance drawn with u divides the angle in u : 1 - u; a distance rounded by e moves the angle by e rho / r^2."""
+    a, dt, t0, rho, u = pieces()
+    sampler = sampler_of(t0, rho)
+    t = np.array(sampler.sample(mi.Float(a), mi.Float(dt), mi.Float(u)), dtype=np.float64)
+    assert (t >= 0).all() and (t <= dt).all()
+    begin, there, end = (np.arctan((x - t0) / rho) for x in (a, a + t, a + dt))
+    # t = rho sin (1 + x^2) / (cos - x sin): its denominator is cancelled by at most its terms, 1 + |x|, x = (a - t0) / rho.
+    x, part = (a - t0) / rho, u * (end - begin)
+    lost = ROUNDING * (1 + np.abs(x)) / np.abs(np.cos(part) - x * np.sin(part))
+    moved = (4 * ROUNDING + lost) * t * rho / (rho**2 + (a + t - t0) ** 2)
+    np.testing.assert_array_less(np.abs(there - begin - part), 2 * (moved + angle_error(a, dt, t0, rho, end - begin)))
+
+
+def test_density_is_the_derivative_of_the_angle():
+    a, dt, t0, rho, u = pieces()
+    t = (u * dt).astype(np.float32).astype(np.float64)
+    found = np.array(sampler_of(t0, rho).density(mi.Float(a), mi.Float(dt), mi.Float(t)), dtype=np.float64)
+    theta = np.arctan((a + dt - t0) / rho) - np.arctan((a - t0) / rho)
+    exact = rho / ((rho**2 + (a + t - t0) ** 2) * theta)
+    # r^2 has the rounding of (a - t0) + t, whose square it holds.
+    off = np.abs(a - t0) + t
+    relative = angle_error(a, dt, t0, rho, theta) / theta + ROUNDING * (2 + 2 * off**2 / (rho**2 + (a + t - t0) ** 2))
+    np.testing.assert_array_less(np.abs(found - exact), relative * exact)
+
+
+def test_mean_of_the_inverse_square():
+    """theta / (rho dt) where the emitter has a place, 1 where it is at infinity."""
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
+    found = make_ball_sampler(ray, [3.0, 0.0, 4.0, 0.0]).mean(mi.Float(4), mi.Float(3))
+    assert found[0] == pytest.approx(np.arctan(1) / 9, rel=1e-5)  # 1e-8 of the squared distance is added to rho^2: 1.4e-8
+    assert make_ball_sampler(ray, None) is None
+    assert EquiangularSampler(mi.Float(0), mi.Float(1), mi.Bool(False)).mean(mi.Float(4), mi.Float(3))[0] == 1

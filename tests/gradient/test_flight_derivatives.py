@@ -1,5 +1,4 @@
-"""Derivatives of light that scatters any number of times: against the float64 twin at one scattering, forward against reverse,
-furnaces that no density changes, and differences of renders."""
+"""Derivatives of free flights, of their probes, and of the kept shadow ray."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ import numpy as np
 import oracle_scattering as twins
 import pytest
 import scattering_scenes as small
-from false_alarms import assert_precise, assert_same_mean, difference, fresh
+from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh
 from scattering_gradients import BATCHES, DENSITIES, GRID, assert_gradient, gradients, release, vjp, watched, weights
 from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
 
@@ -20,13 +19,15 @@ from mivol.bench.scenes import box_scene, constant_light
 from mivol.bench.studies.gradients.density_gradient import DensityGradient, Light
 from mivol.bench.studies.gradients.twin import Twin
 from mivol.scene import plan
-from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes
+from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes, ShadowReservoir, ShadowTerm
+from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import FlightPoint, PathSegment
+from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.uniform_points import UniformPoint
+from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from mivol.transport.traversal.rays import FineRay
 from mivol.validate.moments import Moments
-from mivol.validate.statistics import Estimate
-from scenes import as_float32, ball_of, box_of, camera, grid_volume, medium
+from scenes import as_float32, ball_of, box_of, camera, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -363,3 +364,43 @@ def test_coefficients_are_those_of_density_and_albedo():
     total = Estimate(a.mean + s.mean, a.var + s.var, np.minimum(a.dof, s.dof))
     assert_same_mean(total, by_density, rounding=1e-6, what="derivative")
     assert_precise(difference(total, by_density), 0.2 * np.abs(by_density.mean) + 1e-3, what="derivative")
+
+
+LIGHTS, LENGTHS = (0.5, 0.0, 2.0, 0.1), (0.3, 0.9, 0.2, 0.7)
+
+
+def fog() -> object:
+    """Media of one homogeneous box, ready to take derivatives."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "fog": box_of(medium("mivol_medium", 0.5, 0.8), np.diag([2.0, 2.0, 2.0, 1.0])),
+            "sky": {"type": "constant"},
+            "sensor": camera((0, -4, 0), (0, 0, 0), res=2),
+        }
+    )
+    return media_of(scene)
+
+
+@pytest.mark.statistical
+def test_mean_is_the_sum() -> None:
+    """The derivative of light L over a length l by a constant extinction is -L l."""
+    media, n = fog(), 1 << 14
+    ray = FineRay.from_ray(mi.Ray3f(dr.full(mi.Point3f, 0.1, n), mi.Vector3f(0, 0, 1)))
+    rng, kept = seed_pcg32(mi.Float((0.4 + fresh(0) * 0.6180339887498949) % 1), n), ShadowReservoir.empty(media, ray)
+    for light, length in zip(LIGHTS, LENGTHS, strict=True):
+        rng, (chance,) = draw_pcg32(rng, 1)
+        segment = RaySegment(ray, dr.zeros(mi.MediumPtr, n), dr.full(mi.Float, length, n), True)
+        term = DirectLight(media, segment, dr.full(mi.Spectrum, light, n), mi.Bool(light > 0))
+        kept = kept.offer(term, chance)
+    term = ShadowTerm(media, kept)
+    assert np.all(np.array(term.value) == 0)
+    media.bodies[0].tangents = [mi.Float(1)]
+    media.bodies[0].has_tangent = [True]
+    found = np.array(term.jvp().x, dtype=np.float64) * np.ones(n)
+    truth = -sum(a * b for a, b in zip(LIGHTS, LENGTHS, strict=True))
+    assert_same_mean(Estimate(found.mean(), found.var(ddof=1) / n, n - 1), truth, rounding=1e-6, what="derivative")
+    # The transpose, lane by lane: 16384 terms summed in float32.
+    media.start_gradients()
+    term.vjp(dr.full(mi.Spectrum, 1, n))
+    assert float(np.array(media.bodies[0].gradients[0]).sum()) == pytest.approx(3 * found.sum(), rel=1e-4)
