@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tiny_experiment import refused, run
 
 from mivol.bench.harness import catalogue
-from mivol.bench.harness.study import ResultKind
 from mivol.errors import MivolError
 
 
@@ -39,11 +39,10 @@ def test_changes_since_an_older_result(tmp_path: Path, capsys: pytest.CaptureFix
     runs = []
 
     class FixedStudy:
-        def result_kind(self, argv: list[str]) -> ResultKind:
-            return ResultKind({"size": "quick"}, ("walk", "run"))
+        stem = "new"
 
-        def result_path(self, argv: list[str]) -> Path:
-            return tmp_path / "new.json"
+        def parse(self, argv: list[str]) -> SimpleNamespace:
+            return SimpleNamespace(size=SimpleNamespace(name="quick"), only=("walk", "run"), out=tmp_path)
 
         def run(self, argv: list[str]) -> int:
             runs.append(argv)

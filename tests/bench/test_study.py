@@ -87,8 +87,8 @@ def test_every_amount_of_work_is_an_option(capsys: pytest.CaptureFixture) -> Non
     size = TOY.parse(["--quick", "--height", "7", "--colours", "green", "pink"]).size
     assert size == ToySize("quick, height=7.0, colours=('green', 'pink')", 7.0, ("green", "pink"))
     assert TOY.parse([]).size == ToySize()
-    assert TOY.result_kind(["--quick"]) == ({"size": "quick"}, ("height",))
-    assert TOY.result_kind(["--height", "1", "--only", "width,height"]) == ({"size": "full, height=1.0"}, ("width", "height"))
+    assert TOY.parse([]).only == ("height",)
+    assert TOY.parse(["--only", "width,height"]).only == ("width", "height")
     for options, message in ((["--only", "height,depth"], "depth is not a question"), (["--parts", "1"], "unrecognized")):
         with pytest.raises(SystemExit) as ended:
             TOY.parse(options)

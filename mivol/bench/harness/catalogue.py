@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mivol.bench import studies
 from mivol.bench.harness.bars import say
-from mivol.bench.harness.study import ResultKind, Study
+from mivol.bench.harness.study import Study
 from mivol.errors import MivolError
 from mivol.optim.strategy import suggest_name
 
@@ -59,32 +59,31 @@ def run_study(name: str, argv: Sequence[str], older: Path | None = None) -> int:
     """
     study, before = load_study(name), None
     if older is not None:
-        before = read_result(older)
-        check_kind(name, before, study.result_kind(argv))
+        before, args = read_result(older), study.parse(argv)
+        check_kind(name, before, args.size.name, args.only)
     code = study.run(argv)
     if before is not None and code == 0:
-        changes = find_changes(before, read_result(study.result_path(argv)))
+        changes = find_changes(before, read_result(args.out / f"{study.stem}.json"))
         say("\n".join(changes) or f"no figure has changed by {NOTABLE:.0%} or more")
     return code
 
 
-def check_kind(name: str, before: dict, kind: ResultKind) -> None:
+def check_kind(name: str, before: dict, size: str, questions: Sequence[str]) -> None:
     """Refuse an older result of another study, of other questions or of another size.
 
     Raises:
         MivolError: the result is of another kind.
     """
-    if not any(question in before for question in kind.questions):
+    if not any(question in before for question in questions):
         raise MivolError(
-            f"the older result answers no question of {name} in this run ({', '.join(kind.questions)}): "
+            f"the older result answers no question of {name} in this run ({', '.join(questions)}): "
             f"give the JSON file of mivol bench {name}."
         )
-    for key, value in kind.same.items():
-        if before.get(key) != value:
-            raise MivolError(
-                f"the {key} of the older result is {before.get(key)}, and the {key} of this run is {value}: "
-                "use the options of the older run."
-            )
+    if before.get("size") != size:
+        raise MivolError(
+            f"the size of the older result is {before.get('size')}, and the size of this run is {size}: "
+            "use the options of the older run."
+        )
 
 
 def read_result(path: Path) -> dict:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +23,7 @@ from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report.record import describe_machine, package_versions
 
-__all__ = ["Question", "ResultKind", "Size", "Study", "amount", "ask"]
+__all__ = ["Question", "Size", "Study", "amount", "ask"]
 
 
 def amount(full: Any, quick: Any = None, doc: str = "", kind: type | None = None) -> Any:
@@ -69,13 +69,6 @@ def ask(text: str, measure: Callable[..., dict], *arguments: object) -> Question
     question = partial(measure, *arguments)
     question.__doc__ = text
     return question
-
-
-class ResultKind(NamedTuple):
-    """Kind of a result: required values by key, and questions of which the result answers one at least."""
-
-    same: dict[str, object]
-    questions: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -143,7 +136,7 @@ class Study:
         """Ask the questions of a parsed command line, and write the result, which is returned."""
         mi.set_variant(args.variant)
         start, load = time.perf_counter(), mean_load()
-        answers = self.answer(args.only.split(","), args.size)
+        answers = self.answer(args.only, args.size)
         result = header(args.size.name, args.variant, load, start) | answers
         args.out.mkdir(parents=True, exist_ok=True)
         self.draw({name: answer for name, answer in answers.items() if name != "bars"}, args.out / f"{self.stem}.png")
@@ -152,17 +145,12 @@ class Study:
         sys.stdout.write(text)
         return result
 
-    def result_kind(self, argv: Sequence[str]) -> ResultKind:
-        """Kind of the result of these arguments; the process ends if they are wrong."""
-        args = self.parse(argv)
-        return ResultKind({"size": args.size.name}, tuple(args.only.split(",")))
-
-    def result_path(self, argv: Sequence[str]) -> Path:
-        """Path of the JSON file."""
-        return self.parse(argv).out / f"{self.stem}.json"
-
     def parse(self, argv: Sequence[str]) -> argparse.Namespace:
-        """Parse the command line; the process ends with a usage message if an argument is wrong."""
+        """Parse the command line; the process ends with a usage message if an argument is wrong.
+
+        Returns:
+            ``size``, ``only`` (the questions), ``out`` (the folder) and ``variant``.
+        """
         default = [name for name in self.questions if name not in self.on_request]
         parser = argparse.ArgumentParser(
             prog=f"mivol bench {self.name}", description=self.doc, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -173,7 +161,8 @@ class Study:
         parser.add_argument("--variant", default="llvm_ad_rgb", help="variant of Mitsuba (llvm_ad_rgb)")
         self._add_amounts(parser.add_argument_group("amount of work"))
         args = parser.parse_args(argv)
-        if unknown := set(args.only.split(",")) - set(self.questions):
+        args.only = tuple(args.only.split(","))
+        if unknown := set(args.only) - set(self.questions):
             parser.error(f"--only: {', '.join(sorted(unknown))} is not a question; choose from {', '.join(self.questions)}")
         changes = {f.name: getattr(args, f.name) for f in fields(self.size) if getattr(args, f.name, None) is not None}
         changes = {key: tuple(value) if isinstance(value, list) else value for key, value in changes.items() if key != "name"}
