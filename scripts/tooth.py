@@ -24,7 +24,7 @@ from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.smoothed_tv import SmoothedTV
 from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
-from mivol.tomography.preprocess import LightDrift, correct_transmission, fit_light_drift, line_integrals, normalise_air
+from mivol.tomography.preprocess import LightDrift, correct_transmission, fit_light_drift, normalise_air, to_line_integrals
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import Axis, find_axis
 
@@ -65,7 +65,7 @@ def reconstruct(
         strength: of the total variation.
         rounds: iterations of the solver between two fits of the drift.
     """
-    y, weights = line_integrals(normalise_air(correct_transmission(scan.projections, scan.flats, scan.darks), air))
+    y, weights = to_line_integrals(normalise_air(correct_transmission(scan.projections, scan.flats, scan.darks), air))
     axis = find_axis(y, weights, scan.angles)
     say(f"axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})")
     views = np.arange(len(y))

@@ -143,9 +143,11 @@ def _reference(path: Path) -> None:
 
 def _state(path: Path) -> None:
     from mivol.validate.moments import Moments
-    from mivol.validate.reference_file import save_state
+    from mivol.validate.reference_file import write_checkpoint
 
-    save_state(path.with_suffix("").with_suffix(".exr"), IDENTITY, Moments(3, np.ones((4, 5, 3)), np.ones((4, 5, 3))), 1.0)
+    write_checkpoint(
+        path.with_suffix("").with_suffix(".exr"), IDENTITY, Moments(3, np.ones((4, 5, 3)), np.ones((4, 5, 3))), 1.0
+    )
 
 
 def _detached_nrrd(folder: Path) -> None:
@@ -271,9 +273,9 @@ def _read_reference(path: Path) -> object:
 
 
 def _read_state(path: Path) -> object:
-    from mivol.validate.reference_file import read_state
+    from mivol.validate.reference_file import read_checkpoint
 
-    return read_state(path)
+    return read_checkpoint(path)
 
 
 def _read_nikon(folder: Path) -> object:

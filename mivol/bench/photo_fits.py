@@ -129,11 +129,11 @@ class PhotoProblem:
 
     def score(self, views: Iterable[Photo], metrics: tuple[str, ...] = ("psnr",)) -> dict[str, float]:
         """Mean metrics of views."""
-        return images.score([self.judge(self.show(view), view, metrics) for view in map(rectify, views)]).values
+        return images.average_scores([self.judge(self.show(view), view, metrics) for view in map(rectify, views)]).values
 
-    def judge(self, image: np.ndarray, view: Photo, metrics: tuple[str, ...] = ("psnr",)) -> images.Quality:
+    def judge(self, image: np.ndarray, view: Photo, metrics: tuple[str, ...] = ("psnr",)) -> images.ImageScore:
         """Compare an image with the photograph of the same view."""
-        return images.judge(image, view.image, space=self.judged.space, mask=view.mask, metrics=metrics)
+        return images.score_image(image, view.image, space=self.judged.space, mask=view.mask, metrics=metrics)
 
 
 def prepare_fit(

@@ -308,9 +308,9 @@ def explain(arguments: argparse.Namespace) -> int:
         return explain_photos(arguments.scene, arguments.output)
     else:
         from mivol.cli.loading import load
-        from mivol.scene.explain import examine
+        from mivol.scene.explain import explain_scene
 
-        answer = examine(load(arguments).scene, arguments.max_depth, noise=arguments.noise)
+        answer = explain_scene(load(arguments).scene, arguments.max_depth, noise=arguments.noise)
     print(answer.text)
     return int(bool(answer.refusal))
 
@@ -385,7 +385,7 @@ def reference(arguments: argparse.Namespace) -> None:
     With --sensor all, all sensors are rendered, with a file of cameras: photographs for a fit.
     """
     from mivol.cli.loading import load
-    from mivol.validate.photographs import photograph
+    from mivol.validate.photographs import render_photographs
     from mivol.validate.reference import render_reference
 
     options = {
@@ -393,7 +393,7 @@ def reference(arguments: argparse.Namespace) -> None:
         "seed": arguments.seed, "integrator": arguments.integrator,
     }  # fmt: skip
     if arguments.sensor == "all":
-        results = photograph(load(arguments), arguments.output, **options)
+        results = render_photographs(load(arguments), arguments.output, **options)
     else:
         if not arguments.output.suffix:
             arguments.output.mkdir(parents=True, exist_ok=True)

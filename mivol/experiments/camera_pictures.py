@@ -14,8 +14,8 @@ from mivol.photos import PhotoFrame, Photos, PhotoSurvey
 from mivol.report.cameras import PARTS, list_parts, plot_cameras
 from mivol.report.record import Image
 from mivol.report.scanner import plot_scanner, select_views
-from mivol.scene.camera_rigs import find_box
-from mivol.scene.sensors import camera_of
+from mivol.scene.camera_rigs import find_media_box
+from mivol.scene.sensors import to_camera
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
 __all__ = ["pictures_of_photos", "pictures_of_scan", "pictures_of_views", "survey_of"]
@@ -54,14 +54,14 @@ def pictures_of_views(folder: Path, scene: mi.Scene, views: Mapping[str, Sequenc
         views: by key of ``mivol.photos.SPLITS``.
     """
     frames = tuple(
-        PhotoFrame(Path(view.name), camera_of(view.sensor, view.name), split)
+        PhotoFrame(Path(view.name), to_camera(view.sensor, view.name), split)
         for split, of in views.items()
         for view in of
         if view.sensor.class_name() == "PerspectiveCamera"
     )
     if not frames:
         return []
-    return _pictures(folder, PhotoSurvey(folder, "a scene", frames, (), find_box(scene), "about its media", (0.0, 0.0)))
+    return _pictures(folder, PhotoSurvey(folder, "a scene", frames, (), find_media_box(scene), "about its media", (0.0, 0.0)))
 
 
 def pictures_of_scan(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held_out: NDArray) -> list[Image]:

@@ -28,7 +28,7 @@ from mivol.photos import Camera, Photo, Photos
 from mivol.photos.photo_file import CONVERSIONS, decode_srgb
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
 from mivol.report.record import Image, PlanLine, RunRecord, Table, Volume
-from mivol.validate.images import Quality, judge
+from mivol.validate.images import ImageScore, score_image
 
 
 class FieldFit(PhotoFit):
@@ -75,7 +75,7 @@ class FieldFit(PhotoFit):
         names = ("field_best.npz", *(["sky_best.exr"] if self.problem.sky is not None else []))
         return BestFiles(names, lambda folder: save_found(folder, self.problem, "_best", self.photos.white))
 
-    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, Quality]:
+    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, ImageScore]:
         return compare(self.problem, self.judged, photo, metrics)
 
     def film_frame(self, camera: Camera) -> NDArray:
@@ -110,10 +110,10 @@ def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: f
         write_exr(folder / f"sky{which}.exr", {"": white * problem.sky.image()})
 
 
-def compare(problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, Quality]:
+def compare(problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, ImageScore]:
     """A photograph's view of the field, and how alike they are."""
     seen = render_view(problem.field, photo.camera, behind(problem, photo))
-    return seen, judge(seen.image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
+    return seen, score_image(seen.image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
 
 def behind(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:

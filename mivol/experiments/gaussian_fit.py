@@ -26,7 +26,7 @@ from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.points import Gaussians, write_gaussians
 from mivol.report.record import PlanLine, RunRecord, Table
-from mivol.validate.images import Quality, judge
+from mivol.validate.images import ImageScore, score_image
 
 __all__ = ["Begun", "GaussianFit", "begin", "compare", "make_gaussian_plan", "picture_of"]
 
@@ -79,7 +79,7 @@ class GaussianFit(PhotoFit):
     def rectified(self, photo: Photo) -> Photo:
         return rectify(photo)
 
-    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, Quality]:
+    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, ImageScore]:
         return compare(self.problem, self.judged, photo, metrics)
 
     def film_frame(self, camera: Camera) -> NDArray:
@@ -96,11 +96,11 @@ class GaussianFit(PhotoFit):
         return None if self.problem.exposure is None else self.problem.exposure.table()
 
 
-def compare(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, Quality]:
+def compare(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, ImageScore]:
     """A photograph's view of the Gaussians (H, W, 3), and how alike they are; what a lens distorts is rectified first."""
     photo = rectify(photo)
     seen = picture_of(problem, photo.camera, photo.background, problem.plan.low_pass)
-    return seen, judge(seen, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
+    return seen, score_image(seen, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
 
 def picture_of(problem: GaussianProblem, camera: Camera, behind: NDArray, low_pass: float) -> NDArray:

@@ -13,7 +13,7 @@ from mivol.files import write_png
 from mivol.photos import Camera, Photo
 from mivol.photos.photo_file import CONVERSIONS
 from mivol.report.record import CODES, Image, Table
-from mivol.validate.images import METRICS, Quality, colour_fitted, judge
+from mivol.validate.images import METRICS, ImageScore, fit_colours, score_image
 
 __all__ = [
     "JudgedViews",
@@ -38,7 +38,7 @@ def spread_over(count: int, shown: int) -> frozenset[int]:
     return frozenset(np.linspace(0, count - 1, min(shown, count)).astype(int).tolist())
 
 
-def caption_of(quality: Quality, fitted: float | None = None) -> str:
+def caption_of(quality: ImageScore, fitted: float | None = None) -> str:
     """What is said beside a view: its metrics, and its PSNR [dB] where its colours are fitted to the photograph's first."""
     found = [said_as(name, value) for name, value in quality.values.items()]
     return ", ".join(found if fitted is None else [*found, f"{fitted:.2f} dB with its colours fitted"])
@@ -147,10 +147,10 @@ def said_of(views: Iterable[Photo]) -> str:
 def judge_colour_fitted(image: NDArray, photo: Photo, space: str) -> float:
     """PSNR [dB] of a view whose colours, as a screen shows them, were fitted to its photograph's."""
     shown, wanted = (CONVERSIONS[space, "srgb"](values) for values in (image, photo.image))
-    return judge(colour_fitted(shown, wanted, photo.mask), wanted, mask=photo.mask).values["psnr"]
+    return score_image(fit_colours(shown, wanted, photo.mask), wanted, mask=photo.mask).values["psnr"]
 
 
-def table_of_views(camera: Camera, found: Sequence[Quality], fitted: Sequence[float] = ()) -> Table:
+def table_of_views(camera: Camera, found: Sequence[ImageScore], fitted: Sequence[float] = ()) -> Table:
     """Every judged view with its own figures, the worst one first.
 
     Args:

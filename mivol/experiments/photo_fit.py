@@ -36,7 +36,7 @@ from mivol.photos import Camera, Photo
 from mivol.report.cameras import plot_cameras
 from mivol.report.record import Image, PlanLine, Table
 from mivol.scene.explain import Explanation
-from mivol.validate.images import Quality, score
+from mivol.validate.images import ImageScore, average_scores
 
 __all__ = ["PhotoFit", "table_of_gains"]
 
@@ -125,7 +125,7 @@ class PhotoFit(FitKind):
     # -- Outputs ---------------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView | NDArray, Quality]:
+    def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView | NDArray, ImageScore]:
         """Return a photograph's view of the model, and the metrics between both."""
 
     @abstractmethod
@@ -182,7 +182,7 @@ class PhotoFit(FitKind):
         self.record.images += [*pictures.images(), *first]
         self.record.judged = said_of(views)
         self.record.tables.append(table_of_views(views[0].camera, qualities, fitted))
-        means = rename_metrics(score(qualities).values)
+        means = rename_metrics(average_scores(qualities).values)
         return means | ({"psnr_colour_fitted": float(np.mean(fitted))} if fitted else {})
 
     # -- Explain ---------------------------------------------------------------------------------------------------

@@ -19,16 +19,16 @@ from mivol.files.fetch import resolve_path
 from mivol.machine import check_memory
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
-from mivol.tomography.fan_axis import axis_from_fans, offset_of_cone
+from mivol.tomography.fan_axis import axis_from_fans, cone_axis_offset
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
-from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_of_matrices
+from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import (
     Quanta,
     count_quanta,
-    find_air,
-    line_integrals,
+    fit_air,
     normalise_air,
+    to_line_integrals,
 )
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import find_axis
@@ -91,7 +91,7 @@ def place_beam(
         return PanelViews(read_columns(base / wanted.file, COLUMNS), detector)
     if isinstance(wanted, Matrices):
         matrices = read_columns(base / wanted.file, COLUMNS).reshape(-1, 3, 4)
-        return panels_of_matrices(matrices, detector, chosen.grid.centre, wanted.first_pixel)
+        return panels_from_matrices(matrices, detector, chosen.grid.centre, wanted.first_pixel)
     offsets = {
         "axis_offset": wanted.axis_offset if axis_offset is None else axis_offset,
         "detector_offset": wanted.detector_offset,
@@ -207,7 +207,7 @@ def read_measured(chosen: config.ScanExperiment, base: Path) -> Projections:
     notes, angles = list(found.notes), found.angles
     if angles is not None:
         notes += note_order(angles)
-    y, weights = line_integrals(normalise_air(found.transmission, wanted.air) if wanted.air else found.transmission)
+    y, weights = to_line_integrals(normalise_air(found.transmission, wanted.air) if wanted.air else found.transmission)
     offset = None
     if isinstance(chosen.scan, Parallel | Cone):
         offset, said = settle_axis(chosen, base, y, weights, angles)
@@ -257,7 +257,7 @@ def look_for_axis(
             axis = axis_from_fans(y, weights, beam)
         except MivolError as error:
             return None, f"the rotation axis is where scan.axis_offset has it, {beam.axis_offset:g}: {error}"
-        offset = offset_of_cone(axis, beam)
+        offset = cone_axis_offset(axis, beam)
     return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
 
 
@@ -275,7 +275,7 @@ def quanta_of(chosen: config.ScanExperiment, found: ScanReadings) -> Quanta:
     quanta = count_quanta(*found.intensity, chosen.data.saturation)
     if not chosen.data.air:
         return quanta
-    return replace(quanta, blank=quanta.blank * find_air(found.transmission.value, chosen.data.air))
+    return replace(quanta, blank=quanta.blank * fit_air(found.transmission.value, chosen.data.air))
 
 
 def held_out_views(chosen: config.ScanExperiment, count: int) -> np.ndarray:

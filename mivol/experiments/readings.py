@@ -16,8 +16,8 @@ from mivol.files.fetch import resolve_path
 from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.files.source import refusal
 from mivol.tomography.geometry import ConeBeam, FlatDetector, VoxelGrid
-from mivol.tomography.panel_views import PanelViews, nikon_geometry
-from mivol.tomography.preprocess import Transmission, correct_transmission, of_unknown_noise
+from mivol.tomography.panel_views import PanelViews, geometry_from_nikon
+from mivol.tomography.preprocess import Transmission, assume_quantum_noise, correct_transmission
 
 
 @with_short_repr
@@ -75,7 +75,7 @@ def read_stack_scan(chosen: config.ScanExperiment, base: Path) -> ScanReadings:
     if fields:
         transmission = correct_transmission(*fields, wanted.saturation)
     else:
-        transmission = of_unknown_noise(np.exp(-readings.astype(float)) if wanted.reading == "line_integral" else readings)
+        transmission = assume_quantum_noise(np.exp(-readings.astype(float)) if wanted.reading == "line_integral" else readings)
     return ScanReadings(transmission, read_angles(chosen, base, len(readings)), intensity=fields)
 
 
@@ -140,8 +140,8 @@ def read_nikon_scan(wanted: Nikon, base: Path) -> tuple[Transmission, ConeBeam |
     """
     scan = read_nikon(base / wanted.file)
     angles = read_nikon_angles(base / wanted.angles, len(scan.images)) if wanted.angles else scan.angles
-    geometry = nikon_geometry(scan, angles)
-    return of_unknown_noise(read_nikon_transmission(scan, wanted.saturation)), geometry, notes_of(scan, geometry)
+    geometry = geometry_from_nikon(scan, angles)
+    return assume_quantum_noise(read_nikon_transmission(scan, wanted.saturation)), geometry, notes_of(scan, geometry)
 
 
 def notes_of(scan: NikonScan, geometry: ConeBeam | PanelViews) -> list[str]:

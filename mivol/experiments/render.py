@@ -29,8 +29,8 @@ from mivol.points.cloud import PointCloud, read_points
 from mivol.points.conversions import points_to_gaussians
 from mivol.points.gaussian_files import is_gaussian_file, read_gaussians
 from mivol.points.gaussians import Gaussians
-from mivol.scene.description import reason_of
-from mivol.scene.explain import settings_of
+from mivol.scene.description import describe_error
+from mivol.scene.explain import read_settings
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.splatting import Splatter, to_tensors
 
@@ -68,11 +68,11 @@ def choose_integrator(scene: mi.Scene, name: str | None = None) -> mi.Integrator
             raise MivolError("the scene has no integrator: add one to it, or name one (--integrator mivol).")
         return scene.integrator()
     try:
-        return mi.load_dict({"type": name, "max_depth": settings_of(scene).max_depth})
+        return mi.load_dict({"type": name, "max_depth": read_settings(scene).max_depth})
     except RuntimeError as error:
         if "max_depth" in str(error):
             return mi.load_dict({"type": name})
-        raise MivolError(f'the integrator "{name}" cannot be loaded ({reason_of(error)}): "mivol" is ours.') from None
+        raise MivolError(f'the integrator "{name}" cannot be loaded ({describe_error(error)}): "mivol" is ours.') from None
 
 
 def render_image(

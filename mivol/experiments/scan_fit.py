@@ -37,8 +37,8 @@ from mivol.report.pixel_scale import is_preview_due, write_preview
 from mivol.report.record import PlanLine, RunRecord
 from mivol.scene.explain import Explanation
 from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
-from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide, voxel_means
-from mivol.tomography.preprocess import bridge_gaps
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
+from mivol.tomography.preprocess import interpolate_gaps
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
 
@@ -178,7 +178,7 @@ def make_projector(chosen: config.ScanExperiment, data: Projections, grid: Voxel
     Raises:
         MivolError: more unknowns than the solver can keep in memory.
     """
-    unknowns = subdivide(grid, chosen.solve.supersampling, data.geometry)
+    unknowns = subdivide_grid(grid, chosen.solve.supersampling, data.geometry)
     check_grid(chosen, unknowns)
     return Projector(data.geometry, unknowns)
 
@@ -224,7 +224,7 @@ def start_volume(wanted: config.SolveSettings, a: Projector, data: Projections, 
     if wanted.start == "empty" or wanted.name in DIRECT:
         return None
     method = filtered_backprojection if isinstance(a.geometry, ParallelBeam) else feldkamp
-    x = method(a, bridge_gaps(data.y[kept], data.weights[kept]), wanted.window, wanted.cutoff)
+    x = method(a, interpolate_gaps(data.y[kept], data.weights[kept]), wanted.window, wanted.cutoff)
     return np.maximum(x, 0) if wanted.nonnegative else x
 
 

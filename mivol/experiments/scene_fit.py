@@ -41,11 +41,11 @@ from mivol.optim.scenes.emissive_start import check_given_start, find_emissive_s
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import HELD_OUT, RenderBatch, derive_seed, make_batches
 from mivol.report.record import PlanLine, RunRecord
-from mivol.scene.explain import Explanation, examine
+from mivol.scene.explain import Explanation, explain_scene
 from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
-from mivol.scene.previews import measure_depths
+from mivol.scene.previews import find_sufficient_depth
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.validate.metrics import nrmse, psnr
@@ -193,7 +193,7 @@ class SceneFit(FitKind):
         if self.truth is not None:
             put(params, settings.truth.key, self.truth)
         say(f"  holding   {'the truth' if self.truth is not None else 'the start'}, in what follows")
-        return examine(scene, settings.fit.max_depth, camera_of(self.sensors[0]))
+        return explain_scene(scene, settings.fit.max_depth, camera_of(self.sensors[0]))
 
 
 def resolve_depth(
@@ -214,7 +214,7 @@ def resolve_depth(
     else:
         with nullcontext() if truth is None else holding(loaded.scene, settings.truth.key, truth):
             sensor = camera_of(next(iter(settings.views.sensors(loaded.scene))))
-            answer = measure_depths(loaded.scene, sensor, Settings(), settings.fit.noise)
+            answer = find_sufficient_depth(loaded.scene, sensor, Settings(), settings.fit.noise)
         depth, reason = answer.depth, answer.reason
     fit = msgspec.structs.replace(settings.fit, max_depth=depth)
     return msgspec.structs.replace(settings, fit=fit), [PlanLine(choice=f"max_depth: {depth}", reason=reason)]

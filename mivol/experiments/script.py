@@ -31,7 +31,7 @@ from mivol.optim.parameters import Parameter
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 from mivol.points import Gaussians, read_gaussians
-from mivol.scene.explain import examine, settings_of
+from mivol.scene.explain import explain_scene, read_settings
 from mivol.scene.load import SceneSource, load_scene
 
 __all__ = ["Problem", "explain", "fit_gaussians", "fit_photographs", "optimize"]
@@ -91,7 +91,7 @@ def ours_for(scene: mi.Scene) -> mi.Integrator:
     own = scene.integrator()
     if hasattr(own, "session") and not list(own.aov_names()):
         return own
-    return mi.load_dict({"type": "mivol", "max_depth": settings_of(scene).max_depth})
+    return mi.load_dict({"type": "mivol", "max_depth": read_settings(scene).max_depth})
 
 
 def make_parameters(parameters: Sequence[str | Parameter]) -> list[Parameter]:
@@ -207,7 +207,7 @@ def explain(
         MivolError: as :func:`mivol.scene.load.load_scene`.
     """
     loaded = scene if isinstance(scene, mi.Scene) else load_scene(scene).scene
-    return examine(loaded, max_depth, sensor, noise).text
+    return explain_scene(loaded, max_depth, sensor, noise).text
 
 
 def fit_photographs(

@@ -26,9 +26,9 @@ from mivol.optim.projections.smoothed_tv import SmoothedTV, scale_tv_to_noise
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions
-from mivol.tomography.geometry import VoxelGrid, subdivide
+from mivol.tomography.geometry import VoxelGrid, subdivide_grid
 from mivol.tomography.projector import Projector
-from mivol.tomography.stored import bytes_to_store, is_worth_storing, store
+from mivol.tomography.stored import is_worth_storing, matrix_bytes, store_matrix
 
 MOST_UNKNOWNS = 1 << 24
 """More unknowns than 256^3 are taken only where they are asked for: with a hundred views an iteration takes ten seconds on two
@@ -76,7 +76,7 @@ def settle_supersampling(wanted: config.SolveSettings, walk: Projector) -> tuple
     """Unknowns along an edge of a voxel, and why where it was left open to "auto"."""
     if wanted.supersampling is not None or wanted.name != AUTO:
         return wanted.supersampling or 1, []
-    unknowns = subdivide(walk.grid, 2, walk.geometry).size
+    unknowns = subdivide_grid(walk.grid, 2, walk.geometry).size
     if unknowns > MOST_UNKNOWNS:
         reason = f"twice as many along each edge were {unknowns / 2**20:.4g} Mi, of at most {MOST_UNKNOWNS >> 20} Mi"
         return 1, [PlanLine(choice="unknowns: the voxels", reason=f"{reason} (solve.supersampling = 2 takes them)")]
@@ -117,7 +117,7 @@ class Storage:
     def apply(self, problem: ProjectionProblem) -> None:
         """Give the solver's problem the operator that was chosen."""
         if self.is_stored:
-            problem.linear_problem = replace(problem.linear_problem, A=store(problem.linear_problem.A))
+            problem.linear_problem = replace(problem.linear_problem, A=store_matrix(problem.linear_problem.A))
 
 
 def choose_storage(wanted: config.SolveSettings, walk: Projector) -> Storage:
@@ -134,7 +134,7 @@ def choose_storage(wanted: config.SolveSettings, walk: Projector) -> Storage:
         return walked("as asked for")
     if wanted.name in DIRECT:
         return refused(wanted, f"{wanted.name} takes one step, without a matrix")
-    size = bytes_to_store(walk)
+    size = matrix_bytes(walk)
     if size is None:
         return refused(wanted, "only the rays of a parallel beam, or of a fan of one row, lie in layers that share a matrix")
     rows, said = walk.projection_shape[1], f"{size / 2**20:.3g} MiB, of at most {wanted.memory:.3g} GiB"

@@ -24,7 +24,7 @@ from mivol.files import write_whole_text
 from mivol.optim.parameters import as_tensor, find
 from mivol.optim.scenes.views import derive_seed
 from mivol.report import figures
-from mivol.scene.explain import settings_of
+from mivol.scene.explain import read_settings
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.validate.compare import Comparison, compare
@@ -32,7 +32,7 @@ from mivol.validate.moments import BATCHES, Moments
 from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult
 from mivol.validate.statistics import Estimate, Significance, effective_dof, z_bound
-from mivol.validate.trust import Doubt, trust
+from mivol.validate.trust import Doubt, find_doubts
 
 AGREES, DIFFERS, UNTRUSTED = 0, 3, 4
 """Exit codes."""
@@ -164,10 +164,10 @@ def validate_scene(loaded: LoadedScene, folder: Path, chosen: Validation) -> Ver
     for key in chosen.parameters:
         find(key, mi.traverse(scene))
     folder.mkdir(parents=True, exist_ok=True)
-    depth = settings_of(scene).max_depth if chosen.max_depth is None else chosen.max_depth
+    depth = read_settings(scene).max_depth if chosen.max_depth is None else chosen.max_depth
     ours = mi.load_dict({"type": "mivol", "max_depth": depth})
     image = render_batches(scene, camera, ours, chosen)
-    doubts = tuple(trust(scene, [camera]))
+    doubts = tuple(find_doubts(scene, [camera]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # doubts are part of the verdict
         reference = render_reference(

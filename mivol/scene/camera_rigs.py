@@ -18,7 +18,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["RIGS", "Hemisphere", "LookAts", "Rig", "Ring", "SceneSensors", "find_box", "look_at", "rig_from"]
+__all__ = ["RIGS", "Hemisphere", "LookAts", "Rig", "Ring", "SceneSensors", "find_media_box", "look_at", "parse_rig"]
 
 Vector = tuple[float, float, float]
 
@@ -63,7 +63,7 @@ class PlacedRig(Rig, frozen=True, kw_only=True):
 
     def sensors(self, scene: mi.Scene) -> list[dict | mi.Sensor]:
         """Perspective cameras about the scene's media, or about all of it where it has none."""
-        return self.sensors_about(find_box(scene))
+        return self.sensors_about(find_media_box(scene))
 
     def sensors_about(self, box: np.ndarray) -> list[dict]:
         """Perspective cameras about a box.
@@ -74,13 +74,13 @@ class PlacedRig(Rig, frozen=True, kw_only=True):
         Raises:
             MivolError: an empty or infinite box, or a camera that looks at its own position.
         """
-        center, radius = _sphere_of(box)
+        center, radius = _bounding_sphere(box)
         return [self._sensor(*pose, radius) for pose in self.poses(center, radius)]
 
     def _sensor(self, origin: np.ndarray, target: np.ndarray, up: np.ndarray, radius: float) -> dict:
         return {
             "type": "perspective",
-            "fov": self.fov or _fov_that_fits(radius, float(np.linalg.norm(target - origin))),
+            "fov": self.fov or _fitting_fov(radius, float(np.linalg.norm(target - origin))),
             "fov_axis": "smaller",
             "near_clip": self.near,
             "far_clip": self.far,
@@ -116,7 +116,7 @@ class Ring(PlacedRig, frozen=True, tag="ring"):
         steps = self.count if self.arc == 360 else max(self.count - 1, 1)
         for azimuth in self.start + self.arc * np.arange(self.count) / steps:
             direction = _direction(azimuth, np.sin(np.radians(self.elevation)), self.up)
-            yield center + self.distance * radius * direction, center, _axis(self.up)
+            yield center + self.distance * radius * direction, center, _unit_vector(self.up)
 
 
 class Hemisphere(PlacedRig, frozen=True, tag="hemisphere"):
@@ -138,7 +138,7 @@ class Hemisphere(PlacedRig, frozen=True, tag="hemisphere"):
         golden = 180 * (3 - np.sqrt(5))
         for i in range(self.count):
             direction = _direction(self.start + i * golden, low + (1 - low) * (i + 0.5) / self.count, self.up)
-            yield center + self.distance * radius * direction, center, _axis(self.up)
+            yield center + self.distance * radius * direction, center, _unit_vector(self.up)
 
 
 class LookAts(PlacedRig, frozen=True, tag="look_at"):
@@ -188,7 +188,7 @@ class SceneSensors(Rig, frozen=True, tag="scene"):
 RIGS: dict[str, type[Rig]] = {r.__struct_config__.tag: r for r in (Ring, Hemisphere, LookAts, SceneSensors)}
 
 
-def rig_from(table: Mapping[str, Any]) -> Rig:
+def parse_rig(table: Mapping[str, Any]) -> Rig:
     """A rig from a table such as ``[views]`` of a TOML file.
 
     Args:
@@ -240,7 +240,7 @@ def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
     return pose
 
 
-def find_box(scene: mi.Scene) -> np.ndarray:
+def find_media_box(scene: mi.Scene) -> np.ndarray:
     """Box (2, 3) of all shapes that bound a medium, or of the whole scene where none does [length].
 
     Raises:
@@ -255,7 +255,7 @@ def find_box(scene: mi.Scene) -> np.ndarray:
     return np.array([low, high], dtype=np.float64)
 
 
-def _sphere_of(box: np.ndarray) -> tuple[np.ndarray, float]:
+def _bounding_sphere(box: np.ndarray) -> tuple[np.ndarray, float]:
     low, high = np.asarray(box, dtype=np.float64)
     if not np.all(np.isfinite([low, high])) or np.any(low > high) or np.all(low == high):
         text = np.asarray(box).tolist()
@@ -263,7 +263,7 @@ def _sphere_of(box: np.ndarray) -> tuple[np.ndarray, float]:
     return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
 
-def _fov_that_fits(radius: float, distance: float) -> float:
+def _fitting_fov(radius: float, distance: float) -> float:
     """Full angle of the cone that touches a sphere: sin(fov/2) = radius/distance."""
     if distance <= radius:
         raise MivolError(
@@ -272,7 +272,7 @@ def _fov_that_fits(radius: float, distance: float) -> float:
     return float(2 * np.degrees(np.arcsin(radius / distance)))
 
 
-def _axis(name: str) -> np.ndarray:
+def _unit_vector(name: str) -> np.ndarray:
     return np.eye(3)["xyz".index(name)]
 
 

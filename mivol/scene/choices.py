@@ -10,50 +10,50 @@ from mivol.transport.media.body import flight_parts
 from mivol.transport.path.estimators import Settings
 
 __all__ = [
-    "SKIP_BELOW",
+    "MAX_SKIPPED_SHARE",
     "Choice",
     "choose_branches",
     "choose_channels",
     "choose_emission",
-    "choose_events",
+    "choose_scattering_points",
     "choose_flights",
     "choose_lighting",
     "choose_media_light",
     "choose_shadows",
     "choose_side_flights",
     "choose_skipping",
-    "choose_successive",
+    "choose_successive_paths",
     "choose_tracing",
     "choose_transport",
-    "is_lit",
+    "is_scattering_visible",
     "shares_cells",
 ]
 
 
-SKIP_BELOW = 0.45
+MAX_SKIPPED_SHARE = 0.45
 """Share of occupied blocks below which skipping pays (it costs 8 reads a cell in place of 4; measured, as fast as
 without: smoke of 48 % 0.9 times, CT of 43 % 1.05 to 1.1 times, smoke of 256^3, 43 %, 1.3 to 1.4 times)."""
 
-FINE = 300
+MIN_ESTIMATED_CELLS = 300
 """Occupied cells along the three axes together from which look-ups for a shadow cost less than its cells (measured on 2 cores,
 variance x time: smoke of 142 cells 0.4 times as fast, of 256^3 twice; CT of 445 cells 1.9 times; threads of 111 0.9)."""
 
-EVENTS = {(True, False): 4, (True, True): 8, (False, False): 2, (False, True): 2}
+SCATTERING_POINTS = {(True, False): 4, (True, True): 8, (False, False): 2, (False, True): 2}
 """Points of a camera ray that scatter, by whether its grid is filled and whether every emitter has one position or direction,
 so that a walk costs more and a shadow ray less (measured, variance x time over that of 1 point: smoke 1.5 to 2, CT 1.5 to 2.4;
 threads, whose noise is what a pixel sees of them: 1.0 to 1.2, 4 points 0.9 to 1.3; of 8 points over 4, point lights: smoke 1.1,
 CT 1.1 and 1.3)."""
 
-PEAKED = 0.5
+MIN_SIDE_FLIGHT_COSINE = 0.5
 """Mean cosine of a phase function from which side flights pay: below it the phase function's own directions find the light
 (measured, variance x time: HG 0.8 under a sun 2 to 4 times less)."""
 
-SUCCESSIVE, LONG = 16, 16
+SUCCESSIVE_PATHS, MIN_SUCCESSIVE_SCATTERINGS = 16, 16
 """Paths that a lane walks one after the other, and the number of scatterings from which they do (measured on 2 cores, processor
 time of one path a lane over that of 16: at depth 6, 16, 64 and unlimited smoke 1.0, 1.0, 1.1; a cloud of albedo 0.999 0.9, 1.2,
 1.5, 1.4; a white box of optical depth 64 0.8, 1.0, 1.35, 2.2)."""
 
-FILLED = 0.25
+MIN_FILLED_SHARE = 0.25
 """Share of occupied blocks from which a grid counts as filled."""
 
 
@@ -72,7 +72,7 @@ def shares_cells(needs: Needs) -> bool:
     return len(flight_parts(parts)) == len(parts)
 
 
-def is_lit(needs: Needs, settings: Settings) -> bool:
+def is_scattering_visible(needs: Needs, settings: Settings) -> bool:
     """Whether media scatter light to the camera.
 
     Media whose values a recording cannot read count as scattering, unless an earlier render has read them.
@@ -88,8 +88,8 @@ def choose_transport(needs: Needs, settings: Settings, segment: str) -> Choice:
         often = (
             "any number of scatterings" if math.isinf(settings.scatterings) else f"at most {settings.scatterings} scatterings"
         )
-        return Choice("media", f"free flights from collision to collision; {often}", _why_free_flights(needs, settings))
-    if is_lit(needs, settings):
+        return Choice("media", f"free flights from collision to collision; {often}", _explain_free_flights(needs, settings))
+    if is_scattering_visible(needs, settings):
         where = "by quadrature" if settings.deterministic else "at a distance drawn in proportion to the light it takes"
         shadows = "a light grid for shadows" if settings.shadows == "grid" else "exact shadow rays"
         what = f"exact optical depth; one scattering {where}, {shadows}"
@@ -103,7 +103,7 @@ def choose_transport(needs: Needs, settings: Settings, segment: str) -> Choice:
     return Choice("media", what, why)
 
 
-def _why_free_flights(needs: Needs, settings: Settings) -> str:
+def _explain_free_flights(needs: Needs, settings: Settings) -> str:
     """What a single scattering on straight segments would leave out."""
     reasons = [f"{m.name} emits beside scattering" for m in needs.media if m.emits]
     reasons += [f"{m.name} is bounded" for m in needs.media if m.bounded]
@@ -131,7 +131,7 @@ def choose_emission(needs: Needs, segment: str) -> list[Choice]:
 
 def choose_lighting(needs: Needs, settings: Settings, segment: str) -> list[Choice]:
     """How scattered light is found."""
-    if not is_lit(needs, settings):
+    if not is_scattering_visible(needs, settings):
         return []
     drawn = [kind for kind in needs.emitter_kinds if kind != "uniform"]
     met = [kind for kind in needs.emitter_kinds if kind != "delta"]
@@ -209,7 +209,7 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
 
 def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Choice | None:
     """Whether shadow rays walk every cell of a medium or look here and there; None where the question does not arise."""
-    if not medium.resolutions or not is_lit(needs, settings) or settings.deterministic:
+    if not medium.resolutions or not is_scattering_visible(needs, settings) or settings.deterministic:
         return None
     about, cells = f"shadows of {medium.name}", medium.occupied * max(sum(r) for r in medium.resolutions)
     if medium.unread:
@@ -217,7 +217,7 @@ def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Cho
     if settings.shadows != "auto":
         return Choice(about, settings.shadows, "it was asked for")
     size = f"{cells:.0f} occupied cells along the three axes"
-    if cells < FINE:
+    if cells < MIN_ESTIMATED_CELLS:
         return Choice(about, "exact", f"{size}: they are soon walked")
     if set(needs.emitter_kinds) == {"delta"}:
         return Choice(about, "exact", "no emitter is extended: where all light is faint, estimates are coarse")
@@ -229,21 +229,23 @@ def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple
     if segment != "free_flight" or settings.scatterings < 2 or not needs.are_emitters_far or needs.is_sealed:
         return None, []
     cosine = max((m.mean_cosine for m in needs.media if m.mean_cosine is not None), default=0.0)
-    if cosine < PEAKED:
+    if cosine < MIN_SIDE_FLIGHT_COSINE:
         return None, []
     why = f"emitters are at infinity, and a phase function has a mean cosine of {cosine:.2f}"
     return min(cosine, 0.95), [Choice("side flights", "towards the emitter of the next collision", why)]
 
 
-def choose_successive(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
+def choose_successive_paths(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
     """How many paths a lane walks one after the other, in pictures, where there are enough of them."""
-    if segment != "free_flight" or settings.scatterings < LONG:
+    if segment != "free_flight" or settings.scatterings < MIN_SUCCESSIVE_SCATTERINGS:
         return 1, []
     about = "lanes"
     if not needs.are_samples_independent:
         return 1, [Choice(about, "one path each", "the sampler has numbers for one path a lane")]
-    many = f"up to {SUCCESSIVE} paths one after the other"
-    return SUCCESSIVE, [Choice(about, many, "their lengths differ, and lanes would wait for the longest of their neighbours")]
+    many = f"up to {SUCCESSIVE_PATHS} paths one after the other"
+    return SUCCESSIVE_PATHS, [
+        Choice(about, many, "their lengths differ, and lanes would wait for the longest of their neighbours")
+    ]
 
 
 def choose_branches(needs: Needs, settings: Settings, segment: str) -> tuple[bool, list[Choice]]:
@@ -265,13 +267,13 @@ def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Cho
         return False, [Choice(about, "met by chance", "it was asked for")]
     found = needs.media_light
     if found is None:
-        return False, [Choice(about, "met by chance", _why_unread(needs))]
+        return False, [Choice(about, "met by chance", _explain_missing_light(needs))]
     draws, gain = settings.media_light == "drawn" or found.gain > 1, f"{found.gain:.2g} times as soon as chance alone"
     what = "drawn by where they emit, and met by chance" if draws else "met by chance"
     return draws, [Choice(about, what, f"draws reach an error {gain}")]
 
 
-def _why_unread(needs: Needs) -> str:
+def _explain_missing_light(needs: Needs) -> str:
     """Why light of media cannot be drawn."""
     if any(m.unread for m in needs.media):
         return "where media emit cannot be read while dr.freeze records"
@@ -280,7 +282,7 @@ def _why_unread(needs: Needs) -> str:
     return "a medium that emits fills no shape of its own, or shapes are instances"
 
 
-def choose_events(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
+def choose_scattering_points(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
     """How many points of a camera ray scatter."""
     if segment != "single_scattering":
         return 1, []
@@ -288,5 +290,5 @@ def choose_events(needs: Needs, settings: Settings, segment: str) -> tuple[int, 
     if len(needs.media) != 1 or len(needs.media[0].resolutions) != 1:
         return 1, [Choice(about, "1 of a camera ray", "there is more than one grid or none")]
     share = needs.media[0].occupied
-    count = EVENTS[share >= FILLED, set(needs.emitter_kinds) == {"delta"}]
+    count = SCATTERING_POINTS[share >= MIN_FILLED_SHARE, set(needs.emitter_kinds) == {"delta"}]
     return count, [Choice(about, f"{count} of a camera ray", f"one walk for them all; {share:.0%} of the blocks hold anything")]

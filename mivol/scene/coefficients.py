@@ -18,9 +18,9 @@ from mivol.transport.traversal.box import clip_to_box
 
 __all__ = ["Coefficients"]
 
-PAIRS = (("sigma_t", "albedo"), ("sigma_a", "sigma_s"))
+COEFFICIENT_PAIRS = (("sigma_t", "albedo"), ("sigma_a", "sigma_s"))
 
-OPAQUE = 1e10
+OPAQUE_EXTINCTION = 1e10
 """Extinction [1/length] at which no ray of Mitsuba's integrators misses a medium."""
 
 
@@ -42,7 +42,7 @@ class Coefficients:
         Raises:
             MivolError: both pairs, half of a pair, a negative number, or a radiance field for another thing than the emission.
         """
-        given = [n for pair in PAIRS for n in pair if n in props]
+        given = [n for pair in COEFFICIENT_PAIRS for n in pair if n in props]
         if is_radiance_field(props.get("emission", 0.0)) or _is_made_of_gaussians(props, "emission"):
             return cls._of_field(props, given)
         fields = [n for n in (*given, "emission_density") if is_radiance_field(props.get(n, 0.0))]
@@ -65,15 +65,15 @@ class Coefficients:
             raise MivolError(
                 f"mivol_medium was given a shaded mivol_transfer as {shaded[0]}; shade what it emits (emission) alone."
             )
-        pair = next((p for p in PAIRS if set(given) <= set(p)), None)
+        pair = next((p for p in COEFFICIENT_PAIRS if set(given) <= set(p)), None)
         if pair is None or not given or given == ["albedo"]:
             raise MivolError(
                 f"mivol_medium was given {' and '.join(given) or 'no coefficient'}; give sigma_t (with albedo, if it scatters) "
                 "or sigma_a and sigma_s."
             )
         return cls(
-            {name: _volume(props, name) for name in pair},
-            {name: _volume(props, name) for name in ("emission", "emission_density") if name in props},
+            {name: _to_volume(props, name) for name in pair},
+            {name: _to_volume(props, name) for name in ("emission", "emission_density") if name in props},
         )
 
     @classmethod
@@ -108,7 +108,7 @@ class Coefficients:
         """
         for name, volume in {**self.volumes, **self.lights}.items():
             if _is_constant(volume):
-                check_constant(_constant(volume), name, " of a mivol_medium")
+                check_constant(_constant_value(volume), name, " of a mivol_medium")
 
     @property
     def is_homogeneous(self) -> bool:
@@ -118,7 +118,7 @@ class Coefficients:
     @property
     def is_rgb(self) -> bool:
         """Whether the extinction differs between channels."""
-        return any(_channels(v) == 3 for v in self.extinction)
+        return any(_channel_count(v) == 3 for v in self.extinction)
 
     def bound(self) -> mi.Spectrum:
         """Largest extinction over space, without the medium's scale.
@@ -127,9 +127,9 @@ class Coefficients:
         channels together elsewhere, as stock ``heterogeneous`` has it. A medium that emits stops every ray, see :meth:`eval`.
         """
         if self.lights:
-            return mi.Spectrum(OPAQUE)
+            return mi.Spectrum(OPAQUE_EXTINCTION)
         if self.is_homogeneous:
-            return sum((mi.Spectrum(dr.detach(_constant(v))) for v in self.extinction), mi.Spectrum(0))
+            return sum((mi.Spectrum(dr.detach(_constant_value(v))) for v in self.extinction), mi.Spectrum(0))
         return mi.Spectrum(sum(_maximum(v) for v in self.extinction))
 
     def reach(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
@@ -192,7 +192,7 @@ def _is_shaded(props: mi.Properties, name: str) -> bool:
     return transfer is not None and transfer.effects.shading is not None
 
 
-def _volume(props: mi.Properties, name: str) -> mi.Volume:
+def _to_volume(props: mi.Properties, name: str) -> mi.Volume:
     """One coefficient as a volume: a number, an rgb triple (of any size) or a volume."""
     value = props.get(name, 0.0)
     if isinstance(value, mi.Volume):
@@ -243,19 +243,19 @@ def _is_constant(volume: mi.Volume) -> bool:
     return volume.class_name() == "ConstVolume"
 
 
-def _constant(volume: mi.Volume) -> mi.Float | mi.Color3f:
+def _constant_value(volume: mi.Volume) -> mi.Float | mi.Color3f:
     return mi.traverse(volume)["value.value"]
 
 
-def _channels(volume: mi.Volume) -> int:
-    return dr.size_v(_constant(volume)) if _is_constant(volume) else volume.channel_count()
+def _channel_count(volume: mi.Volume) -> int:
+    return dr.size_v(_constant_value(volume)) if _is_constant(volume) else volume.channel_count()
 
 
 def _maximum(volume: mi.Volume) -> float:
-    return float(np.max(np.array(dr.detach(_constant(volume))))) if _is_constant(volume) else volume.max()
+    return float(np.max(np.array(dr.detach(_constant_value(volume))))) if _is_constant(volume) else volume.max()
 
 
 def _eval(volume: mi.Volume, it: mi.Interaction3f, active: mi.Bool) -> mi.Spectrum:
-    if _channels(volume) == 3:
+    if _channel_count(volume) == 3:
         return volume.eval(it, active)
     return mi.Spectrum(volume.eval_1(it, active))

@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.scene.nesting import extent
+from mivol.scene.nesting import scene_diagonal
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.medium_view import MediumView
@@ -35,7 +35,7 @@ from mivol.transport.media.optical_depth import integrate_optical_depth
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
 
-__all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "draw_lines", "mean_albedo", "scattering_depth"]
+__all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "sample_lines", "mean_albedo", "scattering_depth"]
 
 ALBEDOS = (0.2, 0.5, 0.75, 0.9, 0.99, 1.0)
 TAUS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -118,7 +118,7 @@ def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: s
     return thin * float(np.interp(albedo, (0.0, *ALBEDOS), column))
 
 
-def draw_lines(box: Box, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample_lines(box: Box, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lines through a box, uniform in place and direction: uniform over its faces, cosine-weighted inwards.
 
     Args:
@@ -140,7 +140,7 @@ def draw_lines(box: Box, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray,
     rows = np.arange(n)
     local[rows, axis] = far
     local[rows, (axis + 1) % 3], local[rows, (axis + 2) % 3] = u[:, 1], u[:, 2]
-    d = _cosine(normals[axis] * np.where(far, -1.0, 1.0)[:, None], u[:, 3], u[:, 4])
+    d = _sample_cosine(normals[axis] * np.where(far, -1.0, 1.0)[:, None], u[:, 3], u[:, 4])
     slope = d @ np.linalg.inv(edges)
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.where(slope > 0, (1 - local) / slope, np.where(slope < 0, -local / slope, np.inf))
@@ -149,7 +149,7 @@ def draw_lines(box: Box, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray,
     return local @ edges + box.to_world[:3, 3], d, ends.min(axis=1)
 
 
-def _cosine(normal: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _sample_cosine(normal: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Unit directions (n, 3) about normals, of density cos / pi: a point on the unit sphere added to the normal."""
     z, phi = 2 * u - 1, 2 * np.pi * v
     r = np.sqrt(np.maximum(1 - z * z, 0))
@@ -172,7 +172,7 @@ def scattering_depth(view: MediumView, box: Box, n: int = 1 << 14, scene: mi.Sce
         The optical depth [1] of the densest channel; 0 for an empty medium. Its standard error is 0.3 % for a cube, 0.7 % for
         the tutorial's smoke.
     """
-    o, d, length = draw_lines(box, n)
+    o, d, length = sample_lines(box, n)
     origin, direction = (kind(np.ascontiguousarray(x.T, np.float32)) for kind, x in ((mi.Point3f, o), (mi.Vector3f, d)))
     with dr.suspend_grad():
         if scene is not None:
@@ -194,7 +194,7 @@ def _depths(view: MediumView, o: mi.Point3f, d: mi.Vector3f, length: np.ndarray)
 
 def _traced_depths(scene: mi.Scene, view: MediumView, ray: mi.Ray3f) -> np.ndarray:
     """Optical depth (n, channels) of lines in a boundary of any shape, up to the first opaque surface."""
-    media = SceneMedia(scene, [Body(view, None)], has_surfaces=True, size=extent(scene))
+    media = SceneMedia(scene, [Body(view, None)], has_surfaces=True, size=scene_diagonal(scene))
     nowhere = dr.zeros(mi.MediumPtr, dr.width(ray))
     _, tau = integrate_optical_depth(media, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
     return np.stack([np.array(t, np.float64) for t in tau], axis=-1)

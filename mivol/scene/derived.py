@@ -23,7 +23,7 @@ __all__ = ["carry_tangents", "recompute_derived"]
 
 
 @dataclass
-class _Asked:
+class _DifferentiatedParameter:
     """A parameter whose derivative is asked for: a copy of what stands there, since an update may put other arrays there."""
 
     params: mi.SceneParameters
@@ -48,7 +48,7 @@ class _Asked:
 
 def recompute_derived(scene: mi.Scene) -> None:
     """Compute the derived values of all parameters with gradients anew. While ``dr.freeze`` records, nothing is done."""
-    for asked in _find_asked(scene):
+    for asked in _find_differentiated(scene):
         asked.make_of(asked.value)
         asked.put_back()
 
@@ -57,7 +57,7 @@ def recompute_derived(scene: mi.Scene) -> None:
 def carry_tangents(scene: mi.Scene) -> Iterator[None]:
     """Within this context derived values come from copies of the parameters, and have their tangents."""
     with dr.resume_grad():
-        found = _find_asked(scene)
+        found = _find_differentiated(scene)
         copies = [dr.detach(asked.numbers) for asked in found]
         for asked, copy in zip(found, copies, strict=True):
             dr.enable_grad(copy)
@@ -75,21 +75,21 @@ def carry_tangents(scene: mi.Scene) -> Iterator[None]:
                 asked.put_back()
 
 
-def _find_asked(scene: mi.Scene) -> list[_Asked]:
+def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
     """Arrays with derivatives, by the plugin that they belong to."""
     if is_recording():
         return []
     inside = [shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None]
-    owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _parts_of(m))]
+    owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _find_derived_owners(m))]
     found = []
     for owner in {o.ptr: o for o in owners if o is not None}.values():
         params = mi.traverse(owner)
-        asked = [(k, v) for k, v in params if _is_followed(v) and not _is_made(params, k)]
-        found += [_Asked(params, k, type(v)(v)) for k, v in asked]
+        asked = [(k, v) for k, v in params if _is_differentiated(v) and not _is_computed(params, k)]
+        found += [_DifferentiatedParameter(params, k, type(v)(v)) for k, v in asked]
     return found
 
 
-def _parts_of(medium: mi.Medium) -> list[mi.Object]:
+def _find_derived_owners(medium: mi.Medium) -> list[mi.Object]:
     """The phase function of a medium, and its volumes but for those whose numbers transport reads where they stand."""
     known = traverse_medium(medium).properties
     volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
@@ -98,12 +98,12 @@ def _parts_of(medium: mi.Medium) -> list[mi.Object]:
     return [medium.phase_function(), *(v for n, v in volumes.items() if n not in read)]
 
 
-def _is_followed(value: Any) -> bool:
+def _is_differentiated(value: Any) -> bool:
     """Whether the derivative of an array or of a transform is asked for."""
     array = value if dr.is_array_v(value) else getattr(value, "matrix", None)
     return array is not None and dr.is_diff_v(array) and dr.grad_enabled(array)
 
 
-def _is_made(params: mi.SceneParameters, key: str) -> bool:
+def _is_computed(params: mi.SceneParameters, key: str) -> bool:
     """Whether a parameter is what a plugin makes of its others: the grid of a ``mivol_transfer``."""
     return key == "data" and "table" in params

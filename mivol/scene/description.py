@@ -17,35 +17,35 @@ import numpy as np
 from mivol.errors import MivolError
 
 __all__ = [
-    "NO_TEXT",
+    "NOT_UTF8",
     "VARIANTS",
-    "as_text",
+    "format_override",
     "check_variant",
-    "file_of",
-    "named_files",
+    "find_named_file",
+    "find_named_files",
     "parse_dict",
     "parse_file",
-    "reason_of",
-    "resolving_beside",
-    "with_companion",
+    "describe_error",
+    "resolve_beside",
+    "list_data_files",
     "content_hash",
     "hash_object",
-    "hash_state",
+    "hash_description",
 ]
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
-LONGEST_REASON = 700
+MAX_REASON_LENGTH = 700
 """Characters of a message of Mitsuba's that are quoted: its lists of plugins and parameters are shorter."""
 
-NO_TEXT = "it names things in bytes that are not UTF-8; correct them"
+NOT_UTF8 = "it names things in bytes that are not UTF-8; correct them"
 """What is wrong with a file that Mitsuba quotes in a refusal that is no text."""
 
 TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)+(?:(?:[\w.]+\.)?MivolError: )?")
 """A traceback in a text, up to what was raised; the name of a refusal of mivol's belongs to it."""
 
 # Header formats whose voxels lie in a second file: the key of the line that names it.
-DETACHED = {".mhd": "ElementDataFile", ".nhdr": "data file"}
+DATA_FILE_KEYS = {".mhd": "ElementDataFile", ".nhdr": "data file"}
 
 
 def check_variant() -> str:
@@ -62,24 +62,24 @@ def check_variant() -> str:
     return variant
 
 
-def as_text(value: Any) -> str:
+def format_override(value: Any) -> str:
     """A value as an override of an XML parameter."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def reason_of(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """Mitsuba's message without its source position, in one line that does not quote all of a long file.
 
     Of an error of a plugin in Python, mivol's own among them, Mitsuba quotes the traceback: what the plugin says is at its end.
     A message that is no UTF-8 is lost in Python 3.11.2 (later ones raise UnicodeDecodeError in its place).
     """
     text = TRACEBACK.sub("", re.sub(r"^\s*\[[\w.]+:\d+\]\s*", "", str(error)))
-    text = " ".join(text.split()) or NO_TEXT
-    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]} ..."
+    text = " ".join(text.split()) or NOT_UTF8
+    return text if len(text) <= MAX_REASON_LENGTH else f"{text[:MAX_REASON_LENGTH]} ..."
 
 
 @contextmanager
-def resolving_beside(path: Path) -> Iterator[None]:
+def resolve_beside(path: Path) -> Iterator[None]:
     """Look for files beside the XML, and forget its ``<path>`` elements afterwards."""
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
@@ -104,8 +104,8 @@ def parse_file(path: Path, overrides: dict[str, str]) -> Any:
         state = parser.parse_file(config, str(path), **overrides)
     except RuntimeError as error:
         if "unused parameters" in str(error):
-            raise MivolError(_unused(path, overrides, str(error))) from None
-        raise MivolError(f"{path} cannot be read: {reason_of(error)}") from error
+            raise MivolError(_describe_unused_override(path, overrides, str(error))) from None
+        raise MivolError(f"{path} cannot be read: {describe_error(error)}") from error
     return _resolve(parser, config, state, path)
 
 
@@ -121,7 +121,7 @@ def parse_dict(source: dict) -> Any:
     try:
         state = parser.parse_dict(config, source)
     except RuntimeError as error:
-        raise MivolError(f"the scene dict cannot be read: {reason_of(error)}") from error
+        raise MivolError(f"the scene dict cannot be read: {describe_error(error)}") from error
     return _resolve(parser, config, state, "the scene dict")
 
 
@@ -130,11 +130,11 @@ def _resolve(parser: Any, config: Any, state: Any, origin: Any) -> Any:
         parser.transform_upgrade(config, state)
         parser.transform_resolve(config, state)
     except RuntimeError as error:
-        raise MivolError(f"{origin} cannot be read: {reason_of(error)}") from error
+        raise MivolError(f"{origin} cannot be read: {describe_error(error)}") from error
     return state
 
 
-def _unused(path: Path, overrides: dict[str, str], message: str) -> str:
+def _describe_unused_override(path: Path, overrides: dict[str, str], message: str) -> str:
     name = next((key for key in overrides if f"${key}=" in message), next(iter(overrides)))
     names = sorted(_parameter_names(path))
     close = difflib.get_close_matches(name, names, n=1)
@@ -152,16 +152,16 @@ def _parameter_names(path: Path) -> set[str]:
     return names
 
 
-def named_files(state: Any) -> Iterator[Path]:
+def find_named_files(state: Any) -> Iterator[Path]:
     """The files that parsed objects name, each with its companion."""
     for node in state.nodes:
         for key in node.props.keys():  # noqa: SIM118  (Properties is not iterable)
-            found = file_of(key, node.props[key])
+            found = find_named_file(key, node.props[key])
             if found:
-                yield from with_companion(found)
+                yield from list_data_files(found)
 
 
-def file_of(key: str, value: Any) -> Path | None:
+def find_named_file(key: str, value: Any) -> Path | None:
     """The file that a setting names; None where it names none that is there."""
     if not (isinstance(value, str) and key.endswith("filename")):
         return None
@@ -169,10 +169,10 @@ def file_of(key: str, value: Any) -> Path | None:
     return path if path.is_file() else None
 
 
-def with_companion(path: Path) -> Iterator[Path]:
+def list_data_files(path: Path) -> Iterator[Path]:
     """The file, and the one that holds its voxels where its header names another."""
     yield path
-    key = DETACHED.get(path.suffix.lower())
+    key = DATA_FILE_KEYS.get(path.suffix.lower())
     if key:
         match = re.search(rf"(?im)^\s*{key}\s*[:=]\s*(\S+)\s*$".encode(), path.read_bytes())
         beside = path.parent / match[1].decode() if match else None
@@ -181,7 +181,7 @@ def with_companion(path: Path) -> Iterator[Path]:
 
 
 # Kinds of objects that say how an image is computed, not what is in it.
-METHODS = ("Integrator", "Sampler")
+UNHASHED_KINDS = ("Integrator", "Sampler")
 
 
 def content_hash(source: str | os.PathLike | Mapping | mi.Object, overrides: Mapping[str, Any] | None = None) -> str:
@@ -198,13 +198,13 @@ def content_hash(source: str | os.PathLike | Mapping | mi.Object, overrides: Map
     if isinstance(source, mi.Object):
         return hash_object(source)
     if isinstance(source, Mapping):
-        return hash_state(parse_dict(dict(source)))
-    overrides = {key: as_text(value) for key, value in (overrides or {}).items()}
-    with resolving_beside(Path(source)):
-        return hash_state(parse_file(Path(source), overrides))
+        return hash_description(parse_dict(dict(source)))
+    overrides = {key: format_override(value) for key, value in (overrides or {}).items()}
+    with resolve_beside(Path(source)):
+        return hash_description(parse_file(Path(source), overrides))
 
 
-def hash_state(state: Any) -> str:
+def hash_description(state: Any) -> str:
     """Hash the tree of parsed objects from the root; an object met again is named by the number of its first visit."""
     h = hashlib.sha256(b"mivol scene 1")
     visited: dict[int, int] = {}
@@ -215,14 +215,14 @@ def hash_state(state: Any) -> str:
             return
         visited[index] = len(visited)
         node = state.nodes[index]
-        h.update(f"({_kind(node)} {node.props.plugin_name()} {node.props.id()}".encode())
+        h.update(f"({_node_kind(node)} {node.props.plugin_name()} {node.props.id()}".encode())
         for key in node.props.keys():  # noqa: SIM118  (Properties is not iterable)
             value = node.props[key]
             if not isinstance(value, mi.Properties.ResolvedReference):
-                h.update(f" {_stable(key)}=".encode())
-                _update(h, value, key)
-            elif _kind(state.nodes[value.index()]) not in METHODS:
-                h.update(f" {_stable(key)}=".encode())
+                h.update(f" {_stable_key(key)}=".encode())
+                _hash_value(h, value, key)
+            elif _node_kind(state.nodes[value.index()]) not in UNHASHED_KINDS:
+                h.update(f" {_stable_key(key)}=".encode())
                 visit(value.index())
         h.update(b")")
 
@@ -230,39 +230,39 @@ def hash_state(state: Any) -> str:
     return h.hexdigest()
 
 
-def _kind(node: Any) -> str:
+def _node_kind(node: Any) -> str:
     return str(node.type).rpartition(".")[2]
 
 
-def _stable(key: str) -> str:
+def _stable_key(key: str) -> str:
     """A key without the counters and addresses that Mitsuba puts into the names of unnamed objects."""
     return re.sub(r"^_arg_\d+$", "_arg", re.sub(r"\bobject_\d+", "object", key))
 
 
-def _update(h: Any, value: Any, key: str) -> None:
+def _hash_value(h: Any, value: Any, key: str) -> None:
     """Feed one value, with its type, to the hash."""
-    path = file_of(key, value)
+    path = find_named_file(key, value)
     if path is not None:
-        for part in with_companion(path):
+        for part in list_data_files(path):
             with part.open("rb") as file:
                 h.update(hashlib.file_digest(file, "sha256").digest())
     elif value is None or isinstance(value, bool | int | float | str):
         h.update(repr(value).encode())
     elif hasattr(value, "wavelengths"):
-        _update_array(h, value.wavelengths, key)
-        _update_array(h, value.values, key)
+        _hash_array(h, value.wavelengths, key)
+        _hash_array(h, value.values, key)
     elif isinstance(value, mi.Bitmap):
         h.update(f"{value.pixel_format()} {value.srgb_gamma()}".encode())
-        _update_array(h, np.array(value), key)
+        _hash_array(h, np.array(value), key)
     elif isinstance(value, mi.VolumeGrid):
-        _update_array(h, np.array(value), key)
+        _hash_array(h, np.array(value), key)
     elif isinstance(value, mi.Object):
         h.update(hash_object(value).encode())
     else:
-        _update_array(h, getattr(value, "matrix", value), key)
+        _hash_array(h, getattr(value, "matrix", value), key)
 
 
-def _update_array(h: Any, value: Any, key: str) -> None:
+def _hash_array(h: Any, value: Any, key: str) -> None:
     try:
         array = np.ascontiguousarray(np.array(value))
     except (TypeError, ValueError, RuntimeError):
@@ -279,23 +279,23 @@ def _update_array(h: Any, value: Any, key: str) -> None:
 def hash_object(thing: mi.Object) -> str:
     """Hash an object already made: what Mitsuba prints of it, and every value that can be traversed."""
     h = hashlib.sha256(b"mivol object 1")
-    h.update(_settings(thing).encode())
+    h.update(_printed_settings(thing).encode())
     params = mi.traverse(thing)
-    for key in sorted(params.keys(), key=_stable):
-        h.update(_stable(key).encode())
-        _update(h, params[key], key)
+    for key in sorted(params.keys(), key=_stable_key):
+        h.update(_stable_key(key).encode())
+        _hash_value(h, params[key], key)
     return h.hexdigest()
 
 
-def _settings(thing: mi.Object) -> str:
+def _printed_settings(thing: mi.Object) -> str:
     """The object's printed form without integrators, samplers and addresses."""
     text = str(thing)
     for match in reversed(list(re.finditer(r"\b\w*(Sampler|Integrator)\[", text))):
-        text = text[: match.start()] + text[_closing(text, match.end()) :]
+        text = text[: match.start()] + text[_find_closing_bracket(text, match.end()) :]
     return re.sub(r"0x[0-9a-f]+|object_\d+", "", text)
 
 
-def _closing(text: str, start: int) -> int:
+def _find_closing_bracket(text: str, start: int) -> int:
     """Position after the bracket that closes the one before ``start``."""
     depth = 1
     for match in re.finditer(r"[\[\]]", text[start:]):

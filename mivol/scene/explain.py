@@ -14,12 +14,12 @@ import numpy as np
 
 from mivol.cite import list_citations
 from mivol.errors import MivolError
-from mivol.scene.choices import is_lit, shares_cells
+from mivol.scene.choices import is_scattering_visible, shares_cells
 from mivol.scene.depth_two import depth_two_error, mean_albedo, scattering_depth
 from mivol.scene.needs import MediumFacts, Needs, find_needs, mean_cosine
-from mivol.scene.nesting import bounds
+from mivol.scene.nesting import shape_bounds
 from mivol.scene.plan import Plan, build_media, make_plan
-from mivol.scene.previews import measure_depths, measure_draws
+from mivol.scene.previews import find_sufficient_depth, measure_media_light
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
@@ -31,13 +31,13 @@ from mivol.transport.media.medium_view import traverse_medium
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.transport.traversal.box import Box
 
-__all__ = ["Explanation", "examine", "settings_of"]
+__all__ = ["Explanation", "explain_scene", "read_settings"]
 
 UNLIMITED = 0xFFFFFFFF
 """The depth that Mitsuba's integrators print for -1."""
 
 
-def settings_of(scene: mi.Scene) -> Settings:
+def read_settings(scene: mi.Scene) -> Settings:
     """What the scene's own integrator is set to: all of it where it is mivol, the depth of others, which they print."""
     integrator = scene.integrator()
     session = getattr(integrator, "session", None)
@@ -66,7 +66,7 @@ class Explanation:
         return "\n".join([*self.lines, *(["refused", f"  {self.refusal}"] if self.refusal else [])])
 
 
-def examine(
+def explain_scene(
     scene: mi.Scene,
     max_depth: int | None = None,
     sensor: int | mi.Sensor = 0,
@@ -80,23 +80,23 @@ def examine(
         Facts, choices with their reasons, and by itself what is refused, where something is.
     """
     eye = find_sensor(scene, sensor)
-    settings = settings_of(scene) if max_depth is None else Settings(max_depth=max_depth)
+    settings = read_settings(scene) if max_depth is None else Settings(max_depth=max_depth)
     try:
         survey = survey_scene(scene)
         needs = find_needs(scene, eye, survey, reads_emission=settings.may_draw_emission)
     except MivolError as error:
-        return Explanation(("facts", *_plain_facts(scene), *_warnings(scene)), str(error))
-    facts = ("facts", *_facts(needs), *_warnings(scene))
+        return Explanation(("facts", *_describe_unread_scene(scene), *_find_warnings(scene)), str(error))
+    facts = ("facts", *_describe_facts(needs), *_find_warnings(scene))
     try:
         check_film(eye)
         make_plan(needs, settings)
-        needs = measure_draws(scene, eye, needs, survey, settings)
-        return Explanation((*facts, *_plan(scene, eye, needs, settings, noise)))
+        needs = measure_media_light(scene, eye, needs, survey, settings)
+        return Explanation((*facts, *_describe_plan(scene, eye, needs, settings, noise)))
     except MivolError as error:
         return Explanation(facts, str(error))
 
 
-def _facts(needs: Needs) -> list[str]:
+def _describe_facts(needs: Needs) -> list[str]:
     lines = []
     for m in needs.media:
         grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or _kind_without_grids(m)
@@ -121,7 +121,7 @@ def _kind_without_grids(medium: MediumFacts) -> str:
     return f"a bounded {medium.bounded}" if medium.bounded else "homogeneous"
 
 
-def _plain_facts(scene: mi.Scene) -> list[str]:
+def _describe_unread_scene(scene: mi.Scene) -> list[str]:
     """What Mitsuba itself tells of a scene that mivol refuses to look into."""
     lines = []
     for shape in scene.shapes():
@@ -138,7 +138,7 @@ def _plain_facts(scene: mi.Scene) -> list[str]:
     ]
 
 
-def _warnings(scene: mi.Scene) -> list[str]:
+def _find_warnings(scene: mi.Scene) -> list[str]:
     """Media that no light reaches: behind a BSDF that lets none through, as Mitsuba's default one."""
     lines, open_ = [], int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Transmission)
     for shape in scene.shapes():
@@ -159,24 +159,24 @@ def _flags(bsdf: mi.BSDF) -> int:
     return int(flags[0]) if dr.is_array_v(flags) else int(flags)
 
 
-def _plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Settings, noise: float | None) -> list[str]:
+def _describe_plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Settings, noise: float | None) -> list[str]:
     plan = make_plan(needs, settings)
     width = max(len(c.about) for c in plan.choices)
     lines = ["plan", *(f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices)]
-    lines += [f"  table     {text}" for text in _tables(needs)]
+    lines += [f"  table     {text}" for text in _describe_transfer_tables(needs)]
     if settings.scatterings == 1:
-        lines += [f"  model     {text}" for text in _depth_two(scene, needs)]
-        lines += [f"  shadows   {text}" for text in _transmittance_grid(scene, needs, plan, settings)]
-    if noise is not None and is_lit(needs, settings):
-        answer = measure_depths(scene, eye, settings, noise)
+        lines += [f"  model     {text}" for text in _describe_depth_two(scene, needs)]
+        lines += [f"  shadows   {text}" for text in _describe_light_grid(scene, needs, plan, settings)]
+    if noise is not None and is_scattering_visible(needs, settings):
+        answer = find_sufficient_depth(scene, eye, settings, noise)
         depth = "without a limit (-1)" if answer.depth < 0 else answer.depth
         lines += [f"  depth     {depth} is enough\n              because {answer.reason}"]
     return [*lines, "references", *(f"  {source}" for source in list_citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
 
 
-def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
+def _describe_light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
     """What a transmittance grid in place of shadow rays costs, and its measured bias."""
-    if not is_lit(needs, settings) or set(needs.emitter_kinds) != {"delta"} or len(needs.media) != 1:
+    if not is_scattering_visible(needs, settings) or set(needs.emitter_kinds) != {"delta"} or len(needs.media) != 1:
         return []
     if not shares_cells(needs) or any(part.lattice is None for part in needs.views[0].parts):
         return []
@@ -194,7 +194,7 @@ def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Set
     ]
 
 
-def _tables(needs: Needs) -> list[str]:
+def _describe_transfer_tables(needs: Needs) -> list[str]:
     """How far each ``mivol_transfer``, whose nodes are made by a table, departs from that table between its nodes."""
     lines = []
     for facts, boundary in zip(needs.media, needs.boundaries, strict=True):
@@ -212,7 +212,7 @@ def _tables(needs: Needs) -> list[str]:
     return lines
 
 
-def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
+def _describe_depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
     """Which share of the light that each medium scatters is missing at max_depth 2 (:mod:`mivol.scene.depth_two`).
 
     Nothing is said of a bounded medium, whose optical depth is not known.
@@ -220,7 +220,7 @@ def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
     lines = []
     light = "collimated" if "delta" in needs.emitter_kinds else "constant"
     for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
-        box, traced = (boundary.box, None) if boundary.box is not None else (_box_around(scene, boundary.medium), scene)
+        box, traced = (boundary.box, None) if boundary.box is not None else (_padded_box(scene, boundary.medium), scene)
         if not facts.is_scattering or facts.bounded or box is None:
             continue
         tau, albedo = scattering_depth(view, box, scene=traced), mean_albedo(view)
@@ -234,14 +234,14 @@ def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
     return lines
 
 
-def _box_around(scene: mi.Scene, medium: mi.Medium) -> Box | None:
+def _padded_box(scene: mi.Scene, medium: mi.Medium) -> Box | None:
     """A box around all that a medium fills; None where it lies outside of shapes, without an end."""
     inside = [s.interior_medium() for s in scene.shapes()]
-    boxes = [bounds(s) for s, m in zip(scene.shapes(), inside, strict=True) if m is not None and m.ptr == medium.ptr]
+    boxes = [shape_bounds(s) for s, m in zip(scene.shapes(), inside, strict=True) if m is not None and m.ptr == medium.ptr]
     if not boxes:
         return None
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    # A little larger than the medium, so that the lines of :func:`draw_lines` begin outside of its boundary.
+    # A little larger than the medium, so that the lines of :func:`sample_lines` begin outside of its boundary.
     room, place = 1e-3 * (high - low).max(), np.eye(4)
     place[:3, :3], place[:3, 3] = np.diag(high - low + 2 * room), low - room
     return Box(place)

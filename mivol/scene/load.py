@@ -19,18 +19,18 @@ import mitsuba as mi
 from mivol.display import text_html, with_short_repr
 from mivol.errors import MivolError
 from mivol.scene.description import (
-    NO_TEXT,
-    as_text,
+    NOT_UTF8,
     check_variant,
+    describe_error,
+    find_named_files,
+    format_override,
+    hash_description,
     hash_object,
-    hash_state,
-    named_files,
     parse_dict,
     parse_file,
-    reason_of,
-    resolving_beside,
+    resolve_beside,
 )
-from mivol.scene.explain import examine
+from mivol.scene.explain import explain_scene
 from mivol.threads import set_thread_count
 
 __all__ = ["LoadedScene", "SceneSource", "load_scene"]
@@ -58,7 +58,7 @@ class LoadedScene:
 
     def _repr_html_(self) -> str:
         """The scene's facts, for notebooks."""
-        return text_html(f"{self!r}\n{examine(self.scene).text}")
+        return text_html(f"{self!r}\n{explain_scene(self.scene).text}")
 
     @property
     def content_hash(self) -> str:
@@ -73,7 +73,7 @@ class LoadedScene:
 
 
 @contextmanager
-def two_threads() -> Iterator[None]:
+def ensure_two_threads() -> Iterator[None]:
     """Give Dr.Jit a second thread while Mitsuba reads files, where it has one only.
 
     Mitsuba hands an EXR to another thread of the pool and waits for it: without end in a process that is pinned to one CPU, or
@@ -106,12 +106,12 @@ def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] |
         >>> image = mi.render(loaded.scene, spp=16)
     """
     check_variant()
-    overrides = {key: as_text(value) for key, value in (overrides or {}).items()}
+    overrides = {key: format_override(value) for key, value in (overrides or {}).items()}
     if isinstance(source, str | os.PathLike):
         try:
             return _load_file(Path(source), overrides)
         except UnicodeDecodeError as error:  # of Mitsuba's refusals and settings, which quote the file
-            raise MivolError(f"{source} cannot be read: {NO_TEXT}.") from error
+            raise MivolError(f"{source} cannot be read: {NOT_UTF8}.") from error
     if overrides:
         name = next(iter(overrides))
         raise MivolError(f'override "{name}" was given, but only XML files have parameters; change the scene itself.')
@@ -130,32 +130,32 @@ def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] |
 def _load_file(path: Path, overrides: dict[str, str]) -> LoadedScene:
     if not path.is_file():
         raise MivolError(f"there is no scene file {path}; give the path of a Mitsuba XML file.")
-    with resolving_beside(path):
+    with resolve_beside(path):
         state = parse_file(path, overrides)
-        files = tuple(dict.fromkeys([*(Path(str(f)) for f in state.files), *named_files(state)]))
-        digest, obstacle = _try_hash(lambda: hash_state(state))
+        files = tuple(dict.fromkeys([*(Path(str(f)) for f in state.files), *find_named_files(state)]))
+        digest, obstacle = _try_hash(lambda: hash_description(state))
     try:
         # One thread of a process uses Dr.Jit: not parallel.
-        with two_threads():
+        with ensure_two_threads():
             scene = mi.load_file(str(path), parallel=False, **overrides)
     except RuntimeError as error:
-        raise MivolError(f"{path} cannot be loaded: {reason_of(error)}") from error
-    return LoadedScene(_check_is_scene(scene, path), path.stem, "file", files, digest, obstacle)
+        raise MivolError(f"{path} cannot be loaded: {describe_error(error)}") from error
+    return LoadedScene(_check_scene(scene, path), path.stem, "file", files, digest, obstacle)
 
 
 def _load_dict(source: dict) -> LoadedScene:
     state = parse_dict(source)
-    files = tuple(dict.fromkeys(named_files(state)))
-    digest, obstacle = _try_hash(lambda: hash_state(state))
+    files = tuple(dict.fromkeys(find_named_files(state)))
+    digest, obstacle = _try_hash(lambda: hash_description(state))
     try:
-        with two_threads():
+        with ensure_two_threads():
             scene = mi.load_dict(source, parallel=False)
     except RuntimeError as error:
-        raise MivolError(f"the scene dict cannot be loaded: {reason_of(error)}") from error
-    return LoadedScene(_check_is_scene(scene, "the dict"), "scene", "dict", files, digest, obstacle)
+        raise MivolError(f"the scene dict cannot be loaded: {describe_error(error)}") from error
+    return LoadedScene(_check_scene(scene, "the dict"), "scene", "dict", files, digest, obstacle)
 
 
-def _check_is_scene(thing: Any, origin: Any) -> mi.Scene:
+def _check_scene(thing: Any, origin: Any) -> mi.Scene:
     if not isinstance(thing, mi.Scene):
         kind = type(thing).__name__
         raise MivolError(f"{origin} describes a {kind}, not a scene; its outermost element must be a scene.")

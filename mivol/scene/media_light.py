@@ -22,8 +22,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.kernel_recording import without_garbage_collection
-from mivol.scene.nesting import bounds
-from mivol.scene.survey import AROUND, Boundary, SceneSurvey, is_instance
+from mivol.scene.nesting import shape_bounds
+from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, is_instance
 from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
 from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
@@ -36,7 +36,7 @@ from mivol.transport.traversal.box import Box
 __all__ = ["find_emitting_boxes", "predict_gain", "read_media_light", "MediaLight"]
 
 
-COST = 2.0
+SAMPLING_COST = 2.0
 """Time of a path with draws over that of a path without (measured on two cores: 1.4 to 2.5)."""
 
 SIDE, DIRECTIONS, SEED = 32, 32, 0xF12E
@@ -55,7 +55,7 @@ def read_media_light(
     if boxes is None:
         return None
     # Arrays are kept with what was made of them, so that their numbers cannot be given to others.
-    arrays = [array for box in boxes for array in _arrays_of(box.body.view)]
+    arrays = [array for box in boxes for array in _emission_state(box.body.view)]
     state = (*(a.index if dr.is_array_v(a) else a for a in arrays), *(box.box.to_world.tobytes() for box in boxes))
     if survey.media_light is None or survey.media_light[0] != state:
         with without_garbage_collection(), dr.suspend_grad():
@@ -67,23 +67,23 @@ def read_media_light(
 
 def find_emitting_boxes(media: SceneMedia, boundaries: Sequence[Boundary]) -> list[EmittingBox] | None:
     """The media that emit, each with a box that all of its light comes from; None where that is not known of one."""
-    scene, lost = media.scene, {b.medium.ptr for b in boundaries if b.shape == AROUND}
+    scene, lost = media.scene, {b.medium.ptr for b in boundaries if b.shape == OUTSIDE_SHAPES}
     has_instances, boxes = any(is_instance(s) for s in scene.shapes()), []
     for body in media.bodies:
         if not body.view.emits:
             continue
-        places = _places_of(body.view)
+        places = _emission_boxes(body.view)
         if body.box is not None:
             places.append(body.box.to_world)
         elif body.view.medium.ptr in lost or has_instances:
             return None
         else:
-            places.append(_place_of_shapes(scene, body.view.medium))
+            places.append(_box_of_shapes(scene, body.view.medium))
         boxes.append(EmittingBox(body, Box(min(places, key=lambda m: abs(np.linalg.det(m[:3, :3]))))))
     return boxes
 
 
-def _places_of(view: MediumView) -> list[np.ndarray]:
+def _emission_boxes(view: MediumView) -> list[np.ndarray]:
     """The boxes of grids outside of which a medium does not emit."""
     if view.emission_density is not None:
         light = [view.emission_density] if view.emission is None else []
@@ -99,16 +99,18 @@ def _places_of(view: MediumView) -> list[np.ndarray]:
     return places
 
 
-def _place_of_shapes(scene: mi.Scene, medium: mi.Medium) -> np.ndarray:
+def _box_of_shapes(scene: mi.Scene, medium: mi.Medium) -> np.ndarray:
     """The box around all shapes that a medium fills."""
-    inside = [bounds(s) for s in scene.shapes() if s.interior_medium() is not None and s.interior_medium().ptr == medium.ptr]
+    inside = [
+        shape_bounds(s) for s in scene.shapes() if s.interior_medium() is not None and s.interior_medium().ptr == medium.ptr
+    ]
     low, high = np.min([b[0] for b in inside], axis=0), np.max([b[1] for b in inside], axis=0)
     place = np.diag([*(np.asarray(high, np.float64) - low), 1.0])
     place[:3, 3] = low
     return place
 
 
-def _arrays_of(view: MediumView) -> list:
+def _emission_state(view: MediumView) -> list:
     """What the light of a medium depends on: flat arrays, and numbers that are none."""
     found = []
     for _, value in traverse_medium(view.medium):
@@ -142,17 +144,17 @@ def predict_gain(media: SceneMedia, table: EmissionTable, sensor: mi.Sensor, sca
         si = end.si
         lit = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         normal = mi.Vector3f(dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n))
-        noise = _noise(table, si.p, normal, lit)
+        noise = _estimate_variances(table, si.p, normal, lit)
         chance, drawn = chance + noise[0], drawn + noise[1]
     if scattering:
         passed = RaySegment(ray, media.medium_at(ray), end.t)
         point = draw_uniform_point(media, passed, list(scattering), sampler.next_1d(), on)
-        noise = _noise(table, ray(mi.Float(point.t)), None, point.on)
+        noise = _estimate_variances(table, ray(mi.Float(point.t)), None, point.on)
         chance, drawn = chance + noise[0], drawn + noise[1]
-    return chance / (COST * drawn) if drawn > 0 else 0.0
+    return chance / (SAMPLING_COST * drawn) if drawn > 0 else 0.0
 
 
-def _noise(table: EmissionTable, p: mi.Point3f, normal: mi.Vector3f | None, on: mi.Bool) -> tuple[float, float]:
+def _estimate_variances(table: EmissionTable, p: mi.Point3f, normal: mi.Vector3f | None, on: mi.Bool) -> tuple[float, float]:
     """The variance of the light that points scatter, by chance and with draws, each summed over the points.
 
     Args:

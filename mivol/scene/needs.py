@@ -17,9 +17,9 @@ import numpy as np
 from mivol.kernel_recording import is_recording
 from mivol.scene.description import check_variant
 from mivol.scene.media_light import MediaLight, read_media_light
-from mivol.scene.nesting import bounds
-from mivol.scene.readings import Reading, check_light, check_numbers, is_scattering, read_part
-from mivol.scene.survey import AROUND, Boundary, SceneSurvey, find_around, is_instance, survey_scene
+from mivol.scene.nesting import shape_bounds
+from mivol.scene.readings import GridReading, check_constants, check_emission, is_scattering, read_extinction
+from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, find_outside_media, is_instance, survey_scene
 from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.medium_view import MediumView, medium_kind
@@ -47,11 +47,11 @@ def find_needs(
     survey = survey or survey_scene(scene)
     recording = is_recording()
     start = [] if sensor.get_medium() is None else [sensor.get_medium()]
-    boundaries = (*survey.boundaries, *find_around(start, survey.boundaries))
+    boundaries = (*survey.boundaries, *find_outside_media(start, survey.boundaries))
     views = tuple(b.view(survey.places) for b in boundaries)
     params = mi.traverse(scene)
     asked = tuple(k for k, v in params if dr.grad_enabled(v))
-    media = tuple(_facts(b, view, survey, recording) for b, view in zip(boundaries, views, strict=True))
+    media = tuple(_read_medium_facts(b, view, survey, recording) for b, view in zip(boundaries, views, strict=True))
     needs = Needs(
         variant=mi.variant(),
         boundaries=boundaries,
@@ -65,9 +65,9 @@ def find_needs(
         refractive=survey.refractive,
         is_sealed=survey.is_sealed,
         start=sensor.get_medium(),
-        camera_inside=_camera_inside(scene, sensor, survey),
+        camera_inside=_may_camera_be_inside(scene, sensor, survey),
         parameters=asked,
-        places=tuple(k for k in asked if _is_place(k, params.properties[k][2])),
+        places=tuple(k for k in asked if _is_placement(k, params.properties[k][2])),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
     )
@@ -81,19 +81,19 @@ def find_needs(
     return replace(needs, media_light=light)
 
 
-def _is_place(key: str, owner: object) -> bool:
+def _is_placement(key: str, owner: object) -> bool:
     """Whether a parameter says where a shape or a sensor is; what is painted on a mesh does not."""
     name = key.rsplit(".", 1)[-1]
     painted = name.startswith(("vertex_", "face_")) and name not in ("vertex_positions", "vertex_normals", "vertex_texcoords")
     return isinstance(owner, mi.Shape | mi.Sensor) and not painted
 
 
-def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> bool:
+def _may_camera_be_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> bool:
     """Whether the sensor may lie in the bounding box of a boundary that has to be traced."""
     if all(b.box is not None for b in survey.boundaries):
         return False
     eye = sensor.bbox()
-    boxes = [bounds(s) for s in scene.shapes() if s.is_medium_transition() or is_instance(s)]
+    boxes = [shape_bounds(s) for s in scene.shapes() if s.is_medium_transition() or is_instance(s)]
     # A sensor at infinity has no box of its own: its rays start outside the scene. Walls of a room are flat.
     if not eye.valid() or not boxes:
         return False
@@ -103,14 +103,14 @@ def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> b
     return bool((np.array(eye.max) + ahead >= low).all() and (np.array(eye.min) - ahead <= high).all())
 
 
-def _facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording: bool) -> MediumFacts:
+def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording: bool) -> MediumFacts:
     grids = [p.lattice for p in view.parts if p.lattice is not None]
     phase = boundary.medium.phase_function()
     common = {
         "mean_cosine": survey.cosines.get(boundary.name),
         "name": boundary.name,
         "kind": medium_kind(boundary.medium),
-        "boundary": _where(boundary),
+        "boundary": _describe_boundary(boundary),
         "extinction": "rgb" if view.channels == 3 else "grey",
         "resolutions": tuple(g.res for g in grids),
         "phase": _phase_name(phase),
@@ -122,21 +122,21 @@ def _facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording:
         # What it was when it was last read; a medium that was never read may scatter.
         known = survey.scatters.get(boundary.name, True)
         return MediumFacts(**common, is_scattering=known, occupied=1.0, tau_max=None, unread=True)
-    check_numbers(view, survey, boundary.name)
-    check_light(view, survey, boundary.name)
-    reads = [read_part(p, survey, boundary.name) for p in view.parts if p.lattice is not None]
+    check_constants(view, survey, boundary.name)
+    check_emission(view, survey, boundary.name)
+    reads = [read_extinction(p, survey, boundary.name) for p in view.parts if p.lattice is not None]
     occupied = min((r.occupied for r in reads), default=1.0)
     scatters = survey.scatters[boundary.name] = is_scattering(view, survey, boundary.name)
     if scatters and survey.are_emitters_far and common["mean_cosine"] is None:
         # Once: where a fit changes the phase function, what is made of this stays unbiased.
         common["mean_cosine"] = survey.cosines[boundary.name] = mean_cosine(phase)
-    return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_tau_max(boundary, view, reads))
+    return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_bound_optical_depth(boundary, view, reads))
 
 
-def _where(boundary: Boundary) -> str:
+def _describe_boundary(boundary: Boundary) -> str:
     if boundary.box is not None:
         return "a box"
-    return f"{AROUND}, traced" if boundary.shape == AROUND else f"a {boundary.shape}, traced"
+    return f"{OUTSIDE_SHAPES}, traced" if boundary.shape == OUTSIDE_SHAPES else f"a {boundary.shape}, traced"
 
 
 def _phase_name(phase: mi.PhaseFunction | None) -> str:
@@ -146,7 +146,7 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
     return phase.class_name() if phase.class_name() != "PhaseFunction" else str(phase).partition("[")[0]
 
 
-def _tau_max(boundary: Boundary, view: MediumView, reads: list[Reading]) -> float | None:
+def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridReading]) -> float | None:
     """Bound the optical depth through a medium: its largest extinction times the diagonal of its box."""
     bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
     bounds += [p.field.bound()[0] for p in view.parts if isinstance(p, GaussianExtinction)]

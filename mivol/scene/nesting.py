@@ -19,24 +19,24 @@ import numpy as np
 from mivol.transport.traversal.box import fit_box
 from mivol.transport.traversal.rays import spawn_ray
 
-__all__ = ["OrientedBox", "bounds", "box_around", "extent", "nesting_fault"]
+__all__ = ["OrientedBox", "shape_bounds", "oriented_box", "scene_diagonal", "find_nesting_fault"]
 
-RAYS = 512
+RAYS_PER_PAIR = 512
 """Rays for each pair of shapes that share space, through what their boxes share."""
 
 CROSSINGS = 16
 """Surfaces that a ray is followed through."""
 
-MOST_PAIRS = 64
+MAX_PAIRS = 64
 """Pairs that are looked at: more have the same fault as these, or none."""
 
-SHARE = 0.01
+MIN_FAULT_SHARE = 0.01
 """Share of a pair's rays that must find the fault: single ones graze an edge, and miss where they leave a shape."""
 
-SHARE_OPEN = 0.2
+MIN_OPEN_FAULT_SHARE = 0.2
 """The same where a shape has holes: rays that leave through them seem to be inside still."""
 
-ON_FACE = 1e-6
+FACE_TOLERANCE = 1e-6
 """Depth, in sizes, to which neighbours may reach into each other: faces of float32 vertices agree to it."""
 
 UNKNOWN = -1
@@ -55,28 +55,28 @@ class OrientedBox:
     corners: np.ndarray
     edges: np.ndarray
 
-    def shares(self, other: OrientedBox, margin: float = -ON_FACE) -> bool:
+    def shares(self, other: OrientedBox, margin: float = -FACE_TOLERANCE) -> bool:
         """Whether no plane separates two boxes by less than ``margin`` (in sizes; negative: they may reach into each other)."""
         across = [np.cross(a, b) for a in self.edges for b in other.edges]
         across += [np.cross(r.edges[i], r.edges[i - 1]) for r in (self, other) for i in range(3)]
-        axes = np.array([a / n for a in across if (n := np.linalg.norm(a)) > ON_FACE])
+        axes = np.array([a / n for a in across if (n := np.linalg.norm(a)) > FACE_TOLERANCE])
         one, two = axes @ self.corners.T, axes @ other.corners.T
         gap = np.maximum(one.min(axis=1) - two.max(axis=1), two.min(axis=1) - one.max(axis=1))
         size = max(np.abs(self.corners).max(), np.abs(other.corners).max())
         return bool((gap < margin * size).all())
 
 
-def box_around(shape: mi.Shape) -> OrientedBox:
+def oriented_box(shape: mi.Shape) -> OrientedBox:
     """A box around a shape."""
     if shape.class_name() == "Cube":
         box = fit_box(shape)
         edges = box.to_world[:3, :3].T
         return OrientedBox(box.corners(), edges / np.linalg.norm(edges, axis=1, keepdims=True))
-    low, high = bounds(shape)
+    low, high = shape_bounds(shape)
     return OrientedBox(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high), np.eye(3))
 
 
-def nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | None:
+def find_nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | None:
     """Find boundaries that do not agree which medium lies between them.
 
     Args:
@@ -89,29 +89,31 @@ def nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | Non
     Cost: nothing where no boundaries share space and none is a mesh; else 512 rays for each pair, up to 64 pairs.
     """
     shapes = [s for s in scene.shapes() if s.is_medium_transition()]
-    pairs = _pairs(shapes, {_number(mi.ShapePtr(s)) for s in traced})
+    pairs = _pairs(shapes, {_registry_id(mi.ShapePtr(s)) for s in traced})
     if not pairs:
         return None
-    closed = {_number(mi.ShapePtr(s)) for s in {t.ptr: t for pair in pairs for t in pair}.values() if _is_closed(s)}
-    size = extent(scene)
-    found = _disagreements(scene, _rays(pairs, 2 * size), closed, size)
+    closed = {_registry_id(mi.ShapePtr(s)) for s in {t.ptr: t for pair in pairs for t in pair}.values() if _is_closed(s)}
+    size = scene_diagonal(scene)
+    found = _find_disagreements(scene, _make_rays(pairs, 2 * size), closed, size)
     for k, pair in enumerate(pairs):
-        numbers = {_number(mi.ShapePtr(s)) for s in pair}
-        rays = {ray for ray, *shapes in found if ray // RAYS == k and numbers.issuperset(shapes)}
-        if len(rays) >= (SHARE if closed.issuperset(numbers) else SHARE_OPEN) * RAYS:
-            return _sentence(*pair)
+        numbers = {_registry_id(mi.ShapePtr(s)) for s in pair}
+        rays = {ray for ray, *shapes in found if ray // RAYS_PER_PAIR == k and numbers.issuperset(shapes)}
+        if len(rays) >= (MIN_FAULT_SHARE if closed.issuperset(numbers) else MIN_OPEN_FAULT_SHARE) * RAYS_PER_PAIR:
+            return _describe_fault(*pair)
     return None
 
 
 def _pairs(shapes: list[mi.Shape], traced: set[int]) -> list[tuple[mi.Shape, mi.Shape]]:
     """Shapes that share space, or touch where it matters; meshes, which may hold several pieces, with themselves."""
-    boxes = [(s, box_around(s), _number(mi.ShapePtr(s)) in traced) for s in shapes]
+    boxes = [(s, oriented_box(s), _registry_id(mi.ShapePtr(s)) in traced) for s in shapes]
     alone = [(s, s) for s in shapes if s.is_mesh() and s.class_name() not in ("Cube", "Rectangle")]
-    close = ((a, b) for a, b in combinations(boxes, 2) if a[1].shares(b[1], ON_FACE if a[2] or b[2] else -ON_FACE))
-    return [*alone, *((a[0], b[0]) for a, b in close)][:MOST_PAIRS]
+    close = (
+        (a, b) for a, b in combinations(boxes, 2) if a[1].shares(b[1], FACE_TOLERANCE if a[2] or b[2] else -FACE_TOLERANCE)
+    )
+    return [*alone, *((a[0], b[0]) for a, b in close)][:MAX_PAIRS]
 
 
-def bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+def shape_bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner of a shape. Meshes that Mitsuba 3.9.1 has merged have no valid box of their own."""
     box = shape.bbox()
     if box.valid():
@@ -120,9 +122,9 @@ def bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
-def extent(scene: mi.Scene) -> float:
+def scene_diagonal(scene: mi.Scene) -> float:
     """Diagonal of the box around all shapes [length]; 0 where there are none."""
-    corners = [c for s in scene.shapes() for c in bounds(s)]
+    corners = [c for s in scene.shapes() for c in shape_bounds(s)]
     return float(np.linalg.norm(np.ptp(corners, axis=0))) if corners else 0.0
 
 
@@ -138,21 +140,21 @@ def _is_closed(shape: mi.Shape) -> bool:
     return bool(np.array_equal(there, back))
 
 
-def _rays(pairs: list[tuple[mi.Shape, mi.Shape]], far: float) -> mi.Ray3f:
+def _make_rays(pairs: list[tuple[mi.Shape, mi.Shape]], far: float) -> mi.Ray3f:
     """Rays from so far away through the box that the boxes of two shapes share."""
     rng, origins, targets = np.random.default_rng(0), [], []
     for a, b in pairs:
-        one, two = bounds(a), bounds(b)
+        one, two = shape_bounds(a), shape_bounds(b)
         low, high = np.maximum(one[0], two[0]), np.minimum(one[1], two[1])
-        d = rng.normal(size=(RAYS, 3))
-        targets.append(rng.uniform(np.minimum(low, high), np.maximum(low, high), (RAYS, 3)))
+        d = rng.normal(size=(RAYS_PER_PAIR, 3))
+        targets.append(rng.uniform(np.minimum(low, high), np.maximum(low, high), (RAYS_PER_PAIR, 3)))
         origins.append(targets[-1] + d / np.linalg.norm(d, axis=1, keepdims=True) * far)
     o, d = np.concatenate(origins), np.concatenate(targets) - np.concatenate(origins)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     return mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
 
 
-def _disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int], size: float) -> list[tuple[int, int, int]]:
+def _find_disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int], size: float) -> list[tuple[int, int, int]]:
     """The (ray, shape, shape) of each time that the second names another medium than the one the ray is in since the first.
 
     Between closed shapes every side counts, and a ray that leaves the scene must be in the medium that it came from. Of shapes
@@ -163,7 +165,7 @@ def _disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int], size: float
     going, sure, found = np.ones(n, bool), np.ones(n, bool), []
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, mi.RayFlags.All, False, mi.Bool(going))
-        sides = [_numbers(p) for p in (si.shape, si.target_medium(-ray.d), si.target_medium(ray.d))]
+        sides = [_registry_ids(p) for p in (si.shape, si.target_medium(-ray.d), si.target_medium(ray.d))]
         facts = [si.is_valid(), si.is_medium_transition(), dr.dot(si.n, ray.d) < 0, _is_opaque(si)]
         ray = spawn_ray(si, ray.d, size)
         # At once, and the next ray too: otherwise the kernels of each crossing would repeat all crossings before it, so that
@@ -193,16 +195,16 @@ def _is_opaque(si: mi.SurfaceInteraction3f) -> mi.Bool:
     return si.is_valid() & ~si.is_medium_transition() & ((si.bsdf().flags() & mi.UInt32(clear)) == 0)
 
 
-def _numbers(pointers: mi.ShapePtr | mi.MediumPtr) -> mi.UInt32:
+def _registry_ids(pointers: mi.ShapePtr | mi.MediumPtr) -> mi.UInt32:
     """What Dr.Jit calls objects by; 0 for none."""
     return dr.reinterpret_array(mi.UInt32, pointers)
 
 
-def _number(pointer: mi.ShapePtr) -> int:
-    return int(_numbers(pointer)[0])
+def _registry_id(pointer: mi.ShapePtr) -> int:
+    return int(_registry_ids(pointer)[0])
 
 
-def _sentence(a: mi.Shape, b: mi.Shape) -> str:
+def _describe_fault(a: mi.Shape, b: mi.Shape) -> str:
     one, two = (s.id() or f"a {s.class_name()}" for s in (a, b))
     if a is b:
         return (

@@ -14,35 +14,35 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.machine import available_memory
 from mivol.scene.choices import (
-    SKIP_BELOW,
+    MAX_SKIPPED_SHARE,
     Choice,
     choose_branches,
     choose_channels,
     choose_emission,
-    choose_events,
     choose_flights,
     choose_lighting,
     choose_media_light,
+    choose_scattering_points,
     choose_shadows,
     choose_side_flights,
     choose_skipping,
-    choose_successive,
+    choose_successive_paths,
     choose_tracing,
     choose_transport,
-    is_lit,
+    is_scattering_visible,
 )
 from mivol.scene.media_light import find_emitting_boxes
 from mivol.scene.needs import Needs
-from mivol.scene.readings import read_block_ranges, read_coarse, read_empty_distances
+from mivol.scene.readings import read_block_ranges, read_coarse_grid, read_empty_distances
 from mivol.scene.refusals import (
-    refuse_bounded,
-    refuse_draws,
-    refuse_emission,
-    refuse_gaussians,
-    refuse_nested,
-    refuse_places,
-    refuse_quadrature,
-    refuse_scattering,
+    check_bounded,
+    check_emission_cells,
+    check_gaussians,
+    check_media_light,
+    check_nested,
+    check_placements,
+    check_quadrature,
+    check_scattering,
 )
 from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
@@ -106,15 +106,15 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         MivolError: what is asked for is not there (quadrature of several scatterings, derivatives of shapes), or a gradient
             step would not fit into memory.
     """
-    refuse_scattering(needs, settings)
-    refuse_emission(needs, settings)
-    refuse_quadrature(needs, settings)
-    refuse_places(needs)
-    refuse_bounded(needs, settings, aovs)
-    refuse_gaussians(needs, aovs)
-    refuse_nested(needs)
-    refuse_draws(needs, settings)
-    segment = _segment(needs, settings)
+    check_scattering(needs, settings)
+    check_emission_cells(needs, settings)
+    check_quadrature(needs, settings)
+    check_placements(needs)
+    check_bounded(needs, settings, aovs)
+    check_gaussians(needs, aovs)
+    check_nested(needs)
+    check_media_light(needs, settings)
+    segment = _choose_segment(needs, settings)
     choices = [
         choose_transport(needs, settings, segment),
         *choose_emission(needs, segment),
@@ -122,36 +122,36 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         choose_tracing(needs),
         choose_channels(needs),
     ]
-    skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
+    skips = tuple(bool(m.resolutions) and m.occupied < MAX_SKIPPED_SHARE for m in needs.media)
     choices += [choose_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
     choices += [choice for m in needs.media if (choice := choose_flights(m, segment)) is not None]
     shadows = [choose_shadows(m, needs, settings) for m in needs.media]
     tracks = tuple(choice is not None and choice.choice == "estimated" for choice in shadows)
     choices += [choice for choice in shadows if choice is not None]
-    events, why = choose_events(needs, settings, segment)
+    events, why = choose_scattering_points(needs, settings, segment)
     choices += why
-    pass_rays = _pass_rays(needs)
+    pass_rays = _rays_per_pass(needs)
     passes = -(-needs.film_samples // pass_rays)
     choices.append(
         Choice("passes", f"{passes} of at most {pass_rays} rays", f"{needs.film_samples} samples; a pass ends within seconds")
     )
-    memory, choice = _gradient(needs)
+    memory, choice = _plan_gradient_memory(needs)
     choices.append(choice)
     lobe, why = choose_side_flights(needs, settings, segment)
     choices += why
     draws_emission, why = choose_media_light(needs, settings)
     choices += why
-    successive, why = choose_successive(needs, settings, segment)
+    successive, why = choose_successive_paths(needs, settings, segment)
     choices += why
     branches, why = choose_branches(needs, settings, segment)
     choices += why
     return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe, draws_emission, successive, branches)
 
 
-def _segment(needs: Needs, settings: Settings) -> str:
+def _choose_segment(needs: Needs, settings: Settings) -> str:
     """Name of the estimator of what media add along a segment; what no estimator answers has been refused."""
     emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
-    scatters = (emits or bool(needs.emitter_kinds)) and is_lit(needs, settings)
+    scatters = (emits or bool(needs.emitter_kinds)) and is_scattering_visible(needs, settings)
     question = SegmentNeeds(
         scatters,
         emits,
@@ -164,14 +164,14 @@ def _segment(needs: Needs, settings: Settings) -> str:
     return choose_segment_estimator(question)
 
 
-def _pass_rays(needs: Needs) -> int:
+def _rays_per_pass(needs: Needs) -> int:
     """How many rays a pass may hold: fewer where each has many cells to cross."""
     backend = needs.variant.split("_")[0]
     cells = sum(sum(res) for medium in needs.media for res in medium.resolutions)
     return min(PASS_RAYS[backend], PASS_STEPS[backend] // max(cells, 1))
 
 
-def _gradient(needs: Needs) -> tuple[int, Choice]:
+def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
     memory, ways = 0, set()
     for medium in needs.media:
         channels = 3 if medium.extinction == "rgb" else 1
@@ -216,7 +216,7 @@ def build_estimators(
     choice = SegmentInputs(direct, plan.events)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():
-            choice.visibility_cache = _find_visibility(direct, needs, plan, survey, pictures)
+            choice.visibility_cache = _make_visibility_cache(direct, needs, plan, survey, pictures)
             if settings.shadows == "grid":
                 choice.transmittance_grid = build_transmittance_grid(media, direct.emitters)
     lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1
@@ -224,24 +224,24 @@ def build_estimators(
     is_even = all(kind == "uniform" for kind in needs.emitter_kinds)
     lights_media = segment.ends_in_media and not needs.is_sealed and not is_even
     lobe = None if plan.lobe is None else dr.opaque(mi.Float, plan.lobe)
-    emission = _draw_emission(scene, media, needs) if plan.draws_emission else None
+    emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)
     return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count)
 
 
-def _draw_emission(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:
+def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:
     """The estimator of light of media, by the table that was read of them."""
     found = needs.media_light
     table = EmissionTable(find_emitting_boxes(media, needs.boundaries), found.density, found.cumulative)
     return EmissionSampling(media, table)
 
 
-def _find_visibility(
+def _make_visibility_cache(
     direct: DirectLighting, needs: Needs, plan: Plan, survey: SceneSurvey, pictures: bool
 ) -> VisibilityCache | None:
     """Find where emitters shine; derivatives are not 0 in empty blocks, which only values that were read can tell."""
     blind = not pictures or any(m.unread for m in needs.media)
     rays = needs.film_samples * (plan.events if pictures else 1)
     occupied = None if blind else needs.media[0].occupied
-    take = lambda *asked: read_coarse(survey, *asked)  # noqa: E731
+    take = lambda *asked: read_coarse_grid(survey, *asked)  # noqa: E731
     return build_visibility_cache(direct.media, direct.emitters, rays, occupied, take)

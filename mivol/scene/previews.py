@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.kernel_recording import without_garbage_collection
-from mivol.scene.media_light import COST
+from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import Needs, find_needs
 from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import SceneSurvey, survey_scene
@@ -33,12 +33,12 @@ from mivol.transport.path.walk import walk_path
 __all__ = [
     "DEPTHS",
     "NOISE",
-    "DepthAnswer",
-    "LeftOut",
-    "leaves_out",
-    "measure_depths",
-    "gain_of_draws",
-    "measure_draws",
+    "SufficientDepth",
+    "DepthError",
+    "measure_depth_error",
+    "find_sufficient_depth",
+    "sampling_gain",
+    "measure_media_light",
 ]
 
 DEPTHS = (2, 3, 6, -1)
@@ -55,7 +55,7 @@ DEPTH_SEED = 0xDE97
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class DepthError:
     """What a depth leaves out.
 
     Attributes:
@@ -75,7 +75,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class DepthAnswer:
+class SufficientDepth:
     """The depth that a scene needs.
 
     Attributes:
@@ -83,7 +83,7 @@ class DepthAnswer:
         noise: of a pixel over the mean radiance that is asked for [1].
     """
 
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[DepthError, ...]
     noise: float
 
     @property
@@ -98,7 +98,7 @@ class DepthAnswer:
         return f"{measured}; noise of {self.noise:.2%} is asked for"
 
 
-def measure_depths(scene: mi.Scene, sensor: mi.Sensor, settings: Settings, noise: float = NOISE) -> DepthAnswer:
+def find_sufficient_depth(scene: mi.Scene, sensor: mi.Sensor, settings: Settings, noise: float = NOISE) -> SufficientDepth:
     """Measure what each depth leaves out of the light that a sensor sees.
 
     Args:
@@ -115,20 +115,22 @@ def measure_depths(scene: mi.Scene, sensor: mi.Sensor, settings: Settings, noise
     with dr.suspend_grad():
         survey = survey_scene(scene)
         seen = [_render_depth_preview(scene, sensor, survey, replace(settings, max_depth=depth)) for depth in DEPTHS]
-    return DepthAnswer(tuple(leaves_out(depth, some, seen[-1]) for depth, some in zip(DEPTHS, seen[:-1], strict=False)), noise)
+    return SufficientDepth(
+        tuple(measure_depth_error(depth, some, seen[-1]) for depth, some in zip(DEPTHS, seen[:-1], strict=False)), noise
+    )
 
 
-def leaves_out(depth: int, some: NDArray, full: NDArray) -> LeftOut:
+def measure_depth_error(depth: int, some: NDArray, full: NDArray) -> DepthError:
     """Compare the cells (batches, cells) of a depth with those of all light."""
     lost, level = full - some, full.mean()
     if level <= 0:
-        return LeftOut(depth, 0.0, 0.0, 0.0)
+        return DepthError(depth, 0.0, 0.0, 0.0)
     count = len(lost)
     square = _mean_square(lost)
     without = np.array([_mean_square(np.delete(lost, k, axis=0)) for k in range(count)])
     error = math.sqrt((count - 1) / count * np.square(without - without.mean()).sum())
     rms, most = (math.sqrt(max(value, 0.0)) / level for value in (square, square + 2 * error))
-    return LeftOut(depth, float(lost.mean() / level), rms, most)
+    return DepthError(depth, float(lost.mean() / level), rms, most)
 
 
 def _mean_square(lost: NDArray) -> float:
@@ -160,7 +162,7 @@ DRAW_SIDE, DRAW_SAMPLES, DRAW_SEED = 24, 48, 0xD3A4
 """Cells along an edge of the preview, samples of each, seed."""
 
 
-def measure_draws(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
+def measure_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
     """The needs of a scene with the gain of draws as it is measured, where it is predicted to be above 1.
 
     Args:
@@ -179,16 +181,16 @@ def measure_draws(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: Scen
             met, drawn = (
                 _render_draw_preview(scene, sensor, needs, survey, replace(settings, media_light=m)) for m in ("met", "drawn")
             )
-        survey.gain_of_draws = gain_of_draws(met, drawn)
+        survey.gain_of_draws = sampling_gain(met, drawn)
     return replace(needs, media_light=replace(light, gain=survey.gain_of_draws))
 
 
-def gain_of_draws(met: NDArray, drawn: NDArray) -> float:
+def sampling_gain(met: NDArray, drawn: NDArray) -> float:
     """How much sooner draws reach an error than chance does [1], from samples (cells, n) of both; 0 where all is black."""
     n = met.shape[1]
     missed = n * np.square(met.mean(axis=1) - drawn.mean(axis=1))
     noise = np.maximum(met.var(axis=1, ddof=1), missed)
-    rest = COST * drawn.var(axis=1, ddof=1)
+    rest = SAMPLING_COST * drawn.var(axis=1, ddof=1)
     lit = (noise > 0) | (rest > 0)
     with np.errstate(divide="ignore"):
         return float(np.median(noise[lit] / rest[lit])) if lit.any() else 0.0

@@ -35,11 +35,11 @@ from mivol.transport.traversal.grid_walk import corner_nodes
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice, locate_cell
 
-__all__ = ["Reading", "check_light", "check_numbers", "is_scattering", "read_part"]
+__all__ = ["GridReading", "check_emission", "check_constants", "is_scattering", "read_extinction"]
 
 
 @dataclass
-class Reading:
+class GridReading:
     """What was read of an array; ``floored``: its values with 0 for those below it, None where there are none."""
 
     bounds: mi.Float | None
@@ -48,7 +48,7 @@ class Reading:
     floored: mi.Float | None = None
 
 
-def _once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
+def _read_once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
     """Make something once for each state of an array, which is kept so that its number cannot be given to another one.
 
     While a function is being recorded it is made anew: a recording can use no array that was made before it.
@@ -63,7 +63,7 @@ def _once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], 
     return survey.values[key][1]
 
 
-def read_part(part: ExactExtinction, survey: SceneSurvey, name: str) -> Reading:
+def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> GridReading:
     """Read the bounds of a part of an extinction once for each state of its array.
 
     Voxels below 0, where a step of an optimiser or a filter overshot, count as 0 from here on, and have the derivative that
@@ -76,22 +76,22 @@ def read_part(part: ExactExtinction, survey: SceneSurvey, name: str) -> Reading:
     """
     array = dr.detach(part.lattice.values.array)
 
-    def make() -> Reading:
+    def make() -> GridReading:
         values, activation, floored = part.lattice.values, part.activation, None
         if activation is not None:
-            _check_stored(array, activation, name)
+            _check_stored_density(array, activation, name)
             # Nothing is below an empty value; an extinction rises with what is stored.
             empty = activation.empty_below
             values = mi.TensorXf(dr.maximum(array, empty) if empty is not None else dr.abs(array) + 1, values.shape)
         elif not dr.all((array >= 0) & dr.isfinite(array)):
-            floored = _floor(part, survey, name)
+            floored = _clip_negative(part, survey, name)
             values = mi.TensorXf(floored, values.shape)
         blocks = bound_blocks(values)
         host = np.array(blocks)
         _check_look_up(part, survey, name)
-        return Reading(blocks, float((host > 0).mean()), float(host.max(initial=0.0)), floored)
+        return GridReading(blocks, float((host > 0).mean()), float(host.max(initial=0.0)), floored)
 
-    read = _once(survey, ("part",), array, make)
+    read = _read_once(survey, ("part",), array, make)
     if read.floored is not None:
         values = part.lattice.values
         # The stock grid is not looked up again: it interpolates the values below 0, these do not.
@@ -99,7 +99,7 @@ def read_part(part: ExactExtinction, survey: SceneSurvey, name: str) -> Reading:
     return read
 
 
-def _floor(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.Float:
+def _clip_negative(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.Float:
     """The values of a grid with 0 for those below it; says so once for each grid of a scene.
 
     Raises:
@@ -121,7 +121,7 @@ def _floor(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.Float:
     return floored
 
 
-def _check_stored(array: mi.Float, activation: Activation, name: str) -> None:
+def _check_stored_density(array: mi.Float, activation: Activation, name: str) -> None:
     """Refuse densities of a radiance field that are none: an activation would make vacuum of them in silence."""
     if not bool(dr.all(dr.isfinite(array) & (activation.signed | (array >= 0)))):
         low, high = float(dr.min(array)[0]), float(dr.max(array)[0])
@@ -132,10 +132,10 @@ def _check_stored(array: mi.Float, activation: Activation, name: str) -> None:
         )
 
 
-PROBES = 2048
+LOOK_UP_POINTS = 2048
 """Points at which a stock grid is looked up, half of them in its outermost half voxels, half around voxels that are not 0."""
 
-ALIKE = 0.02
+LOOK_UP_TOLERANCE = 0.02
 """How far a look-up may be from the trilinear one, in differences between the 8 voxels around (it is 5e-6 of a grid's size off
 where a turned stock grid does not fill its boundary; the nearest voxel is about 0.4 off)."""
 
@@ -147,13 +147,17 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
     if volume is None or volume.ptr in survey.looked_up or mixes:
         return
     rng, sizes = np.random.default_rng(0), np.array(lattice.res[::-1])
-    u, axis, border = rng.uniform(1e-3, 1 - 1e-3, (PROBES, 3)), rng.integers(3, size=PROBES), np.arange(PROBES // 2)
+    u, axis, border = (
+        rng.uniform(1e-3, 1 - 1e-3, (LOOK_UP_POINTS, 3)),
+        rng.integers(3, size=LOOK_UP_POINTS),
+        np.arange(LOOK_UP_POINTS // 2),
+    )
     u[border, axis[border]] = rng.uniform(0.05, 0.45, len(border)) / sizes[axis[border]]
     held = np.argwhere(np.array(lattice.values).any(axis=3))[:, ::-1]
     if len(held):
-        chosen = held[rng.integers(len(held), size=PROBES - len(border))]
+        chosen = held[rng.integers(len(held), size=LOOK_UP_POINTS - len(border))]
         u[len(border) :] = np.clip((chosen + rng.uniform(0, 1, chosen.shape)) / sizes, 1e-3, 1 - 1e-3)
-    it = dr.zeros(mi.Interaction3f, PROBES)
+    it = dr.zeros(mi.Interaction3f, LOOK_UP_POINTS)
     it.p = lattice.place(mi.Vector3f(u.T.astype(np.float32)))
     cell, frac, _ = locate_cell(lattice, it.p, mi.Vector3f(0, 0, 1), mi.Float(0))
     nodes, c = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res), lattice.channels
@@ -163,7 +167,7 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
     spread = np.ptp(np.array([[np.array(v) for v in row] for row in corners]), axis=1)
     off, most = np.abs(ours - theirs), float(np.abs(ours).max())
     groups = [*(border[axis[border] == a] for a in range(3)), slice(len(border), None)]
-    if any(off[:, s].sum() > ALIKE * spread[:, s].sum() + 1e-5 * most * PROBES for s in groups):
+    if any(off[:, s].sum() > LOOK_UP_TOLERANCE * spread[:, s].sum() + 1e-5 * most * LOOK_UP_POINTS for s in groups):
         raise MivolError(
             f"{part.name} of the medium in {name} is a gridvolume with another filter_type than trilinear or another wrap_mode "
             "than clamp: its values between voxels are not those that rays are integrated over; leave both at these, or "
@@ -176,21 +180,21 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
 def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt8:
     """Measure how far each block of a part is from the nearest one that is not empty, once for each state of its array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
-    return _once(
-        survey, ("empty distances",), array, lambda: find_distances_of_bounds(read_part(part, survey, name).bounds, res)
+    return _read_once(
+        survey, ("empty distances",), array, lambda: find_distances_of_bounds(read_extinction(part, survey, name).bounds, res)
     )
 
 
 def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges:
     """Read what the blocks of a grid hold, once for each state of its array."""
     values = part.lattice.values
-    return _once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values))
+    return _read_once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values))
 
 
-def read_coarse(survey: SceneSurvey, lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
+def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
     """Make a grid coarser once for each state of its array and place."""
     kind = ("coarse", shift, lists, lattice.empty_distances is None, lattice.to_world.tobytes())
-    return _once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
+    return _read_once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
 
 
 def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:
@@ -216,10 +220,10 @@ def _is_positive(values: mi.TensorXf, survey: SceneSurvey, name: str, is_albedo:
             )
         return high > 0
 
-    return _once(survey, ("albedo",), flat, make) or dr.grad_enabled(values)
+    return _read_once(survey, ("albedo",), flat, make) or dr.grad_enabled(values)
 
 
-def check_numbers(view: MediumView, survey: SceneSurvey, name: str) -> None:
+def check_constants(view: MediumView, survey: SceneSurvey, name: str) -> None:
     """Look at the constants of an extinction and its scale. Each state of them is read once.
 
     Raises:
@@ -228,20 +232,20 @@ def check_numbers(view: MediumView, survey: SceneSurvey, name: str) -> None:
     for key, given in view.numbers.items():
         # A copy is kept: what traverse hands out changes in place, and the index of an array that is gone is given to others.
         value = dr.detach(given)
-        state = _state(value)
+        state = _constant_state(value)
         if survey.numbers.get((view.medium.ptr, key), (None, None))[1] != state:
             check_constant(value, key, f" of the medium in {name}")
             survey.numbers[view.medium.ptr, key] = (value, state)
 
 
-def _state(value: float | mi.Float | mi.Color3f) -> float | tuple[int, ...]:
+def _constant_state(value: float | mi.Float | mi.Color3f) -> float | tuple[int, ...]:
     """What changes with a number: itself, or the indices of its arrays."""
     if not dr.is_array_v(value):
         return value
     return (value.index,) if dr.depth_v(value) == 1 else tuple(v.index for v in value)
 
 
-def check_light(view: MediumView, survey: SceneSurvey, name: str) -> None:
+def check_emission(view: MediumView, survey: SceneSurvey, name: str) -> None:
     """Look at what a medium emits. Each array is read once.
 
     Raises:
@@ -249,10 +253,10 @@ def check_light(view: MediumView, survey: SceneSurvey, name: str) -> None:
     """
     for values in view.emission_arrays:
         flat = dr.detach(dr.ravel(values))
-        _once(survey, ("light",), flat, lambda flat=flat: _check_emission(flat, name))
+        _read_once(survey, ("light",), flat, lambda flat=flat: _check_emission_values(flat, name))
 
 
-def _check_emission(flat: mi.Float, name: str) -> None:
+def _check_emission_values(flat: mi.Float, name: str) -> None:
     if not bool(dr.all(dr.isfinite(flat) & (flat >= 0))):
         low, high = float(dr.min(flat)[0]), float(dr.max(flat)[0])
         raise MivolError(

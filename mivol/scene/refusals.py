@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.scene.choices import choose_media_light, is_lit, shares_cells
+from mivol.scene.choices import choose_media_light, is_scattering_visible, shares_cells
 from mivol.scene.needs import Needs
 from mivol.transport.line_integrals.aovs import AOVS
 from mivol.transport.media.grid_extinction import have_same_cells
@@ -16,15 +16,15 @@ from mivol.transport.media.medium_view import MediumView
 from mivol.transport.path.estimators import Settings
 
 __all__ = [
-    "check_aovs",
-    "refuse_bounded",
-    "refuse_draws",
-    "refuse_emission",
-    "refuse_gaussians",
-    "refuse_nested",
-    "refuse_places",
-    "refuse_quadrature",
-    "refuse_scattering",
+    "parse_aovs",
+    "check_bounded",
+    "check_media_light",
+    "check_emission_cells",
+    "check_gaussians",
+    "check_nested",
+    "check_placements",
+    "check_quadrature",
+    "check_scattering",
 ]
 
 
@@ -36,7 +36,7 @@ MEDIA_LIGHT = ("auto", "drawn", "met")
 """How light that media emit finds what scatters it: points of them are ``drawn`` too, or it is ``met`` by chance."""
 
 
-def check_aovs(names: str) -> tuple[str, ...]:
+def parse_aovs(names: str) -> tuple[str, ...]:
     """Split a comma list of AOVs.
 
     Raises:
@@ -52,9 +52,9 @@ def check_aovs(names: str) -> tuple[str, ...]:
     return asked
 
 
-def refuse_scattering(needs: Needs, settings: Settings) -> None:
+def check_scattering(needs: Needs, settings: Settings) -> None:
     """Refuse quadrature of light that scatters more than once."""
-    if not is_lit(needs, settings):
+    if not is_scattering_visible(needs, settings):
         return
     medium = next(m.name for m in needs.media if m.is_scattering)
     if settings.deterministic and settings.scatterings > 1:
@@ -64,7 +64,7 @@ def refuse_scattering(needs: Needs, settings: Settings) -> None:
         )
 
 
-def refuse_emission(needs: Needs, settings: Settings) -> None:
+def check_emission_cells(needs: Needs, settings: Settings) -> None:
     """Refuse emission that varies faster than the cells that are summed."""
     for facts, view in zip(needs.media, needs.views, strict=True):
         if isinstance(view.emission_density, mi.Volume) and not have_same_cells(view.walked_lattice, view.emission_lattice):
@@ -74,7 +74,7 @@ def refuse_emission(needs: Needs, settings: Settings) -> None:
                 "extinction: give both the same resolution and to_world."
             )
         for name, volume in (("emission", view.emission), ("albedo", view.albedo)) if view.emission is not None else ():
-            least = _voxel_over_cells(volume, view) if isinstance(volume, mi.Volume) else 1.0
+            least = _voxel_to_cell_ratio(volume, view) if isinstance(volume, mi.Volume) else 1.0
             if least < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
                 led = any(p.lattice is not None for p in view.parts)
                 whose, advice = ("extinction", ", or give it as a number") if led else ("emission_density", "")
@@ -84,7 +84,7 @@ def refuse_emission(needs: Needs, settings: Settings) -> None:
                 )
 
 
-def _voxel_over_cells(volume: mi.Volume, view: MediumView) -> float:
+def _voxel_to_cell_ratio(volume: mi.Volume, view: MediumView) -> float:
     """A voxel of a volume over the longest edge of a cell that is walked, both as the volume counts lengths."""
     cells = view.walked_lattice
     place = volume.mivol_to_world if hasattr(volume, "mivol_to_world") else view.stock_boxes[volume.ptr].to_world
@@ -93,7 +93,7 @@ def _voxel_over_cells(volume: mi.Volume, view: MediumView) -> float:
     return 1 / float(np.linalg.norm(voxels, axis=0).max())
 
 
-def refuse_places(needs: Needs) -> None:
+def check_placements(needs: Needs) -> None:
     """Refuse derivatives of places that are not followed."""
     if needs.places:
         raise MivolError(
@@ -102,7 +102,7 @@ def refuse_places(needs: Needs) -> None:
         )
 
 
-def refuse_quadrature(needs: Needs, settings: Settings) -> None:
+def check_quadrature(needs: Needs, settings: Settings) -> None:
     """Refuse settings of shadows that contradict each other, and quadrature of scenes that it does not serve."""
     if settings.shadows not in SHADOWS:
         raise MivolError(f"shadows is {settings.shadows!r}; {', '.join(SHADOWS[:-1])} or {SHADOWS[-1]} is expected.")
@@ -110,7 +110,7 @@ def refuse_quadrature(needs: Needs, settings: Settings) -> None:
         raise MivolError("shadows is 'estimated' and deterministic is set: estimates are noise; set shadows to exact or grid.")
     if settings.shadows == "grid" and not settings.deterministic:
         raise MivolError("shadows is 'grid' without deterministic, and drawn light has exact shadows: set deterministic too.")
-    if not settings.deterministic or not is_lit(needs, settings):
+    if not settings.deterministic or not is_scattering_visible(needs, settings):
         return
     other = [name for name, kind in zip(needs.emitters, needs.emitter_kinds, strict=True) if kind != "delta"]
     if other:
@@ -132,7 +132,7 @@ def refuse_quadrature(needs: Needs, settings: Settings) -> None:
         )
 
 
-def refuse_draws(needs: Needs, settings: Settings) -> None:
+def check_media_light(needs: Needs, settings: Settings) -> None:
     """Refuse draws of light of media where they are asked for and cannot be made."""
     if settings.media_light not in MEDIA_LIGHT:
         known = f"{', '.join(MEDIA_LIGHT[:-1])} or {MEDIA_LIGHT[-1]}"
@@ -142,13 +142,13 @@ def refuse_draws(needs: Needs, settings: Settings) -> None:
         raise MivolError(f"media_light is 'drawn', and {why[0].reason}: leave it at auto.")
 
 
-def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> None:
+def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> None:
     """Refuse what needs an exact optical depth where a field declares none."""
     medium = next((m for m in needs.media if m.bounded), None)
     if medium is None:
         return
-    moved = _moved_emitters(needs)
-    rgb = [m.name for m in needs.media if m.extinction == "rgb"] if is_lit(needs, settings) else []
+    moved = _emitter_placements(needs)
+    rgb = [m.name for m in needs.media if m.extinction == "rgb"] if is_scattering_visible(needs, settings) else []
     reasons = [
         (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
         (settings.deterministic, "deterministic is set", "leave it out, for transmittance is estimated"),
@@ -158,26 +158,26 @@ def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> N
         (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
     ]
     kind = f"is a {medium.bounded}, which is bounded (a majorant is known, and no optical depth of a ray)"
-    _refuse_medium(f"the medium in {medium.name} {kind}", reasons, "voxelise the field")
+    _raise_first(f"the medium in {medium.name} {kind}", reasons, "voxelise the field")
 
 
-def refuse_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
+def check_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
     """Refuse what needs the cells of a grid where a medium is made of Gaussians."""
     medium = next((m for m in needs.media if m.gaussians), None)
     if medium is None:
         return
-    moved = _moved_emitters(needs)
+    moved = _emitter_placements(needs)
     reasons = [
         ("depth" in aovs, "aovs asks for depth", "ask for tau and alpha only"),
         (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
     ]
     kind = f"is made of {medium.gaussians} Gaussians that rays are traced through"
-    _refuse_medium(f"the medium in {medium.name} {kind}", reasons, "convert them to a grid (mivol convert)")
+    _raise_first(f"the medium in {medium.name} {kind}", reasons, "convert them to a grid (mivol convert)")
 
 
-def refuse_nested(needs: Needs) -> None:
+def check_nested(needs: Needs) -> None:
     """Refuse derivatives of the place of emitters where a field is nested: no terms of its levels' faces are known."""
-    moved = _moved_emitters(needs)
+    moved = _emitter_placements(needs)
     level = next((b.name for b in needs.boundaries if b.hole is not None), None)
     if moved and level is not None:
         raise MivolError(
@@ -186,13 +186,13 @@ def refuse_nested(needs: Needs) -> None:
         )
 
 
-def _refuse_medium(medium: str, reasons: list[tuple[bool, str, str]], other_way: str) -> None:
+def _raise_first(medium: str, reasons: list[tuple[bool, str, str]], other_way: str) -> None:
     """Refuse for the first of the reasons (does it hold, what was found, the way out) that holds."""
     for holds, what, way_out in reasons:
         if holds:
             raise MivolError(f"{medium}, and {what}: {way_out}, or {other_way}.")
 
 
-def _moved_emitters(needs: Needs) -> list[str]:
+def _emitter_placements(needs: Needs) -> list[str]:
     """The parameters asked for that say where an emitter is."""
     return [k for k in needs.parameters if k.endswith((".position", ".to_world"))]

@@ -13,7 +13,7 @@ from mivol.machine import check_memory
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera import PIXELS_LOST
 
-__all__ = ["check_film", "find_sensor", "camera_of", "sensor_of"]
+__all__ = ["check_film", "find_sensor", "to_camera", "to_sensor"]
 
 FILM_NUMBERS = 5
 """Red, green, blue, alpha and the filter's weight, which a film sums for each pixel."""
@@ -60,7 +60,7 @@ AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
 """Mitsuba's camera axes in ours."""
 
 
-def sensor_of(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pixel_format: str = "rgb") -> dict:
+def to_sensor(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pixel_format: str = "rgb") -> dict:
     """A perspective sensor with a box filter, for ``mitsuba.load_dict``.
 
     Args:
@@ -98,7 +98,7 @@ def sensor_of(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pi
     }
 
 
-def camera_of(sensor: mi.Sensor, name: str = "sensor") -> Camera:
+def to_camera(sensor: mi.Sensor, name: str = "sensor") -> Camera:
     """The camera of a perspective sensor; of a cropped film, that of the crop.
 
     Raises:

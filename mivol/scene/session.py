@@ -16,8 +16,8 @@ from mivol.kernel_recording import is_recording, without_garbage_collection
 from mivol.scene.derived import carry_tangents, recompute_derived
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, build_estimators, make_plan
-from mivol.scene.previews import measure_draws
-from mivol.scene.refusals import check_aovs
+from mivol.scene.previews import measure_media_light
+from mivol.scene.refusals import parse_aovs
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
@@ -59,7 +59,7 @@ class Session:
 
     def __init__(self, settings: Settings, aovs: str = "") -> None:
         self.settings = settings
-        self.aovs = check_aovs(aovs)
+        self.aovs = parse_aovs(aovs)
         self._surveyed: _SurveyedScene | None = None
 
     def __repr__(self) -> str:
@@ -76,7 +76,7 @@ class Session:
         """
         if not develop:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
-        sensor = _sensor_with_room(scene, sensor)
+        sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, pictures=True)
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
@@ -87,7 +87,7 @@ class Session:
 
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients that were set on the parameters."""
-        sensor = _sensor_with_room(scene, sensor)
+        sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad(), carry_tangents(scene):
             with dr.resume_grad():
                 estimators, plan = self._open(scene, sensor, spp)
@@ -100,7 +100,7 @@ class Session:
 
         Cost: a render and its replay; memory independent of the samples, beyond those of a pass.
         """
-        sensor = _sensor_with_room(scene, sensor)
+        sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
             with dr.resume_grad():
                 recompute_derived(scene)
@@ -125,7 +125,7 @@ class Session:
             named = [sensor.get_medium() for sensor in scene.sensors()]
             media.start = named[0] if all(medium is named[0] for medium in named) else None
             media.locates_camera = bool(media.traced)
-            score, alpha = walk_path(estimators, sampler, ray, Primal(_black(ray)), active)
+            score, alpha = walk_path(estimators, sampler, ray, Primal(_zero_radiance(ray)), active)
             # To an integrator that nests this one alpha is a mask, whether something is seen: it is drawn with that chance.
             return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
@@ -136,7 +136,7 @@ class Session:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
         survey = self._surveyed.survey
         needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
-        needs = measure_draws(scene, sensor, needs, survey, self.settings)
+        needs = measure_media_light(scene, sensor, needs, survey, self.settings)
         plan = make_plan(needs, self.settings, self.aovs)
         return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan
 
@@ -145,14 +145,14 @@ class Session:
         if count > 1:
             L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
         else:
-            score = Primal(_black(rays.ray))
+            score = Primal(_zero_radiance(rays.ray))
             score, alpha = walk_path(estimators, rays.sampler, rays.ray, score, strata=rays.strata)
             L = score.L
         return L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
 
     def _tangent(self, estimators: Estimators, rays: CameraRays) -> tuple:
         prepare_derivatives(estimators, rays.ray, rays.on_film)
-        black = _black(rays.ray)
+        black = _zero_radiance(rays.ray)
         score = Tangent(black, black)
         score, _ = walk_path(estimators, rays.sampler, rays.ray, score, strata=rays.strata)
         return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
@@ -171,18 +171,18 @@ class Session:
     def _replay_whole(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
         again, L = rays.sampler.clone(), None
         if not has_one_segment(estimators):
-            known = Primal(_black(rays.ray))
+            known = Primal(_zero_radiance(rays.ray))
             L = walk_path(estimators.replayed(), rays.sampler, rays.ray, known, strata=rays.strata)[0].L
             dr.eval(L)
         walk_path(estimators, again, rays.ray, Replay(L, dL), strata=rays.strata)
 
 
-def _sensor_with_room(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+def _find_renderable_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
     """The sensor that is rendered, whose pictures fit into memory."""
     found = find_sensor(scene, sensor)
     check_film(found)
     return found
 
 
-def _black(ray: mi.Ray3f) -> mi.Spectrum:
+def _zero_radiance(ray: mi.Ray3f) -> mi.Spectrum:
     return dr.zeros(mi.Spectrum, dr.width(ray))

@@ -10,16 +10,16 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording
-from mivol.scene.nesting import OrientedBox, box_around, extent, nesting_fault
+from mivol.scene.nesting import OrientedBox, find_nesting_fault, oriented_box, scene_diagonal
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
 from mivol.transport.traversal.box import Box, fit_box
 
-__all__ = ["AROUND", "SceneSurvey", "find_around", "is_instance", "survey_scene", "Boundary"]
+__all__ = ["OUTSIDE_SHAPES", "SceneSurvey", "find_outside_media", "is_instance", "survey_scene", "Boundary"]
 
 
-AROUND = "space around shapes"
+OUTSIDE_SHAPES = "space around shapes"
 
 
 @dataclass
@@ -66,7 +66,7 @@ class SceneSurvey:
     @property
     def is_current(self) -> bool:
         """Whether no boundary has been moved since. While ``dr.freeze`` records, which cannot be told, all count as unmoved."""
-        return is_recording() or all(_is_at(shape, mark) for shape, mark in self.marks)
+        return is_recording() or all(_is_unmoved(shape, mark) for shape, mark in self.marks)
 
 
 def survey_scene(scene: mi.Scene) -> SceneSurvey:
@@ -77,12 +77,12 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     """
     boundaries, surfaces, refractive, has_null = [], [], [], False
     shapes = scene.shapes()
-    boxes = {s.ptr: box_around(s) for s in shapes if s.is_medium_transition()}
+    boxes = {s.ptr: oriented_box(s) for s in shapes if s.is_medium_transition()}
     for index, shape in enumerate(shapes):
         if shape.is_medium_transition():
             name = shape.id() or f"shape {index}"
             if shape.interior_medium() is not None:
-                boundaries.append(_boundary(shape, name, boxes))
+                boundaries.append(_make_boundary(shape, name, boxes))
             if int(shape.bsdf().flags()) & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)):
                 refractive.append(f"{name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
@@ -95,28 +95,28 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
     boxed = {b.medium.ptr for b in boundaries if b.box is not None}
     edges = [s for s in shapes if s.is_medium_transition() and not (s.interior_medium() and s.interior_medium().ptr in boxed)]
-    fault = None if is_recording() else nesting_fault(scene, edges)
+    fault = None if is_recording() else find_nesting_fault(scene, edges)
     if fault is not None:
         raise MivolError(fault)
-    around = find_around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
-    boundaries = [part for boundary in boundaries for part in _levels(boundary)] + around
+    around = find_outside_media([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
+    boundaries = [part for boundary in boundaries for part in _split_levels(boundary)] + around
     kinds = tuple(_emitter_kind(e) for e in scene.emitters())
-    marks = tuple((s, _mark(s)) for s in shapes if s.is_medium_transition())
+    marks = tuple((s, _read_placement(s)) for s in shapes if s.is_medium_transition())
     return SceneSurvey(
         tuple(boundaries),
         tuple(surfaces),
         bool(has_null),
         names,
         kinds,
-        _are_far(scene.emitters()),
+        _are_emitters_far(scene.emitters()),
         tuple(refractive),
         _are_sealed(boundaries, shapes, scene.emitters()),
         marks,
-        extent(scene),
+        scene_diagonal(scene),
     )
 
 
-def _mark(shape: mi.Shape) -> object:
+def _read_placement(shape: mi.Shape) -> object:
     """What another place would change of a shape: the array of a mesh's vertices, else its box."""
     params = mi.traverse(shape)
     # A rectangle is a mesh that keeps its vertices to itself.
@@ -125,8 +125,8 @@ def _mark(shape: mi.Shape) -> object:
     return [*shape.bbox().min, *shape.bbox().max]
 
 
-def _is_at(shape: mi.Shape, mark: object) -> bool:
-    now = _mark(shape)
+def _is_unmoved(shape: mi.Shape, mark: object) -> bool:
+    now = _read_placement(shape)
     return now == mark if isinstance(mark, list) else now.index == mark.index
 
 
@@ -136,7 +136,7 @@ def _emitter_kind(emitter: mi.Emitter) -> str:
     return "delta" if int(emitter.flags()) & int(mi.EmitterFlags.Delta) else "extended"
 
 
-def _are_far(emitters: list[mi.Emitter]) -> bool:
+def _are_emitters_far(emitters: list[mi.Emitter]) -> bool:
     """Whether every emitter is at infinity, and one of them is not the same from everywhere."""
     infinite = all(int(e.flags()) & int(mi.EmitterFlags.Infinite) for e in emitters)
     return infinite and any(_emitter_kind(e) != "uniform" for e in emitters)
@@ -144,16 +144,16 @@ def _are_far(emitters: list[mi.Emitter]) -> bool:
 
 def _are_sealed(boundaries: Sequence[Boundary], shapes: Sequence[mi.Shape], emitters: Sequence[mi.Emitter]) -> bool:
     """Whether every medium fills shapes that bend all light, outside of which all emitters lie, which paths can hit."""
-    if not boundaries or any(b.shape == AROUND for b in boundaries):
+    if not boundaries or any(b.shape == OUTSIDE_SHAPES for b in boundaries):
         return False
     holders = [s for s in shapes if s.is_medium_transition() and s.interior_medium() is not None]
-    if not all(_bends_all(s) for s in holders) or any(_emitter_kind(e) == "delta" for e in emitters):
+    if not all(_refracts_all_light(s) for s in holders) or any(_emitter_kind(e) == "delta" for e in emitters):
         return False
-    lamps = [box_around(s) for s in shapes if s.is_emitter()]
-    return not any(box_around(s).shares(lamp) for s in holders for lamp in lamps)
+    lamps = [oriented_box(s) for s in shapes if s.is_emitter()]
+    return not any(oriented_box(s).shares(lamp) for s in holders for lamp in lamps)
 
 
-def _bends_all(shape: mi.Shape) -> bool:
+def _refracts_all_light(shape: mi.Shape) -> bool:
     """Whether a shape lets light through by refraction alone."""
     flags = int(shape.bsdf().flags())
     bends = flags & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission))
@@ -171,20 +171,20 @@ def is_instance(shape: mi.Shape) -> bool:
     return shape.class_name() == "Instance"
 
 
-def _boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox]) -> Boundary:
+def _make_boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox]) -> Boundary:
     alone = not any(box.shares(boxes[shape.ptr]) for other, box in boxes.items() if other != shape.ptr)
     is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
     return Boundary(shape.interior_medium(), name, shape.class_name(), fit_box(shape) if is_box else None)
 
 
-def find_around(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:
+def find_outside_media(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:
     """The media that fill no shape of their own: a ray learns of them from the exterior of a boundary, or from the sensor."""
     held = {b.medium.ptr for b in boundaries}
-    found = [Boundary(m, m.id() or "a medium without an id", AROUND, None) for m in media if m.ptr not in held]
-    return [part for boundary in found for part in _levels(boundary)]
+    found = [Boundary(m, m.id() or "a medium without an id", OUTSIDE_SHAPES, None) for m in media if m.ptr not in held]
+    return [part for boundary in found for part in _split_levels(boundary)]
 
 
-def _levels(boundary: Boundary) -> list[Boundary]:
+def _split_levels(boundary: Boundary) -> list[Boundary]:
     """A boundary for each level of a nested radiance field; any other one by itself.
 
     A level fills its own box, as far as the boundary holds that, but for the box of the level before it.
@@ -205,7 +205,7 @@ def _levels(boundary: Boundary) -> list[Boundary]:
         replace(
             boundary,
             name=boundary.name if level == 0 else f"{boundary.name} (level {level})",
-            box=box if boundary.box.contains(box.to_world, FITS) else boundary.box,
+            box=box if boundary.box.contains(box.to_world, LEVEL_TOLERANCE) else boundary.box,
             level=level,
             hole=None if level == 0 else boxes[level - 1],
         )
@@ -213,7 +213,7 @@ def _levels(boundary: Boundary) -> list[Boundary]:
     ]
 
 
-FITS = 1e-6
+LEVEL_TOLERANCE = 1e-6
 """How far a level may stand out of its boundary, in edges: the boundary's vertices are float32."""
 
 

@@ -21,29 +21,29 @@ from scipy import interpolate, ndimage
 
 from mivol.errors import MivolError
 from mivol.tomography.geometry import ConeBeam
-from mivol.tomography.preprocess import bridge_gaps
-from mivol.tomography.redundancy import covers, widest_gap
+from mivol.tomography.preprocess import interpolate_gaps
+from mivol.tomography.redundancy import covers_circle, widest_gap
 from mivol.tomography.rotation_axis import Axis
 
-MOST_ROWS, MOST_DIRECTIONS = 4, 360
+MAX_ROWS, MAX_DIRECTIONS = 4, 360
 """So many rows and directions of lines are enough: each pair of views of a row alone tells the axis to a part of a column."""
 
-SOME_DIRECTIONS, LEAST_OVERLAP, LEAST_ALIKE = 24, 0.02, 0.5
+SEARCH_DIRECTIONS, MIN_OVERLAP, MIN_CORRELATION = 24, 0.02, 0.5
 """Of the search for the nearest column: directions that are looked at; the share of all slopes that must be seen twice; the
 correlation of slopes below which the two ends are not alike (1: without noise; noise alone stays below 0.2, where 24
 directions have 5 columns each that are independent)."""
 
-PARTS = 24
+SECTORS = 24
 """The uncertainty comes from how far so many sectors of directions disagree: Student's t of 23 degrees of freedom."""
 
 
-SAMPLED = 0.01
+SAMPLING_ERROR = 0.01
 """One standard deviation [columns] of what edges between columns and views add: the axis of a head in 60 to 360 views is found
 so far from where it is, at most, when nothing is noisy."""
 
 
 @dataclass(frozen=True, eq=False)
-class Mirrors:
+class MirroredRows:
     """Projections of one row, sorted by the direction of their lines, and those half a turn away.
 
     Attributes:
@@ -74,7 +74,7 @@ def axis_from_fans(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> Axis:
     Raises:
         MivolError: no row near the plane of the circle, no line that was measured twice, or no least misfit.
     """
-    pairs = [_mirrors(y[:, row], weights[:, row], beam) for row in _rows_in_the_plane(beam)]
+    pairs = [_pair_rows(y[:, row], weights[:, row], beam) for row in _rows_in_the_plane(beam)]
     alpha = _fan_angles(beam)
     column = _nearest_column(pairs[0], beam, alpha)
     for width in (2.0, 0.5, 0.5):
@@ -83,31 +83,31 @@ def axis_from_fans(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> Axis:
 
         def misfit(trial: float, fixed: list[np.ndarray] = fixed) -> np.ndarray:
             columns = _mirrored_columns(beam, alpha, trial)
-            return np.sum([_misfit(pair, columns, w) for pair, w in zip(pairs, fixed, strict=True)], axis=0)
+            return np.sum([_sector_misfits(pair, columns, w) for pair, w in zip(pairs, fixed, strict=True)], axis=0)
 
-        column, sigma = _least_of_parts(misfit, column, width)
+        column, sigma = _sector_minimum(misfit, column, width)
     said = f"rays measured from both ends, {len(pairs)} row" + "s" * (len(pairs) > 1)
-    return Axis(column, float(np.hypot(sigma, SAMPLED)), said)
+    return Axis(column, float(np.hypot(sigma, SAMPLING_ERROR)), said)
 
 
-def offset_of_cone(axis: Axis, beam: ConeBeam) -> float:
+def cone_axis_offset(axis: Axis, beam: ConeBeam) -> float:
     """The ``axis_offset`` of a cone beam whose axis is seen at a column [length]."""
-    return _place(beam, axis.column) * beam.source_to_axis / beam.source_to_detector
+    return _detector_position(beam, axis.column) * beam.source_to_axis / beam.source_to_detector
 
 
-def _place(beam: ConeBeam, column: float | np.ndarray) -> float | np.ndarray:
+def _detector_position(beam: ConeBeam, column: float | np.ndarray) -> float | np.ndarray:
     """Distance of a column from the central ray, on the detector [length]."""
     return (column - (beam.detector[1] - 1) / 2) * beam.pitch[1] + beam.detector_offset[1]
 
 
 def _fan_angles(beam: ConeBeam) -> np.ndarray:
     """Alpha of each column."""
-    return np.arctan(_place(beam, np.arange(beam.detector[1])) / beam.source_to_detector)
+    return np.arctan(_detector_position(beam, np.arange(beam.detector[1])) / beam.source_to_detector)
 
 
 def _mirrored_columns(beam: ConeBeam, alpha: np.ndarray, column: float) -> np.ndarray:
     """Columns (cols,) that see each column's line from its other end where the axis is at ``column``."""
-    epsilon = np.arctan(_place(beam, column) / beam.source_to_detector)
+    epsilon = np.arctan(_detector_position(beam, column) / beam.source_to_detector)
     place = beam.source_to_detector * np.tan(2 * epsilon - alpha)
     return (place - beam.detector_offset[1]) / beam.pitch[1] + (beam.detector[1] - 1) / 2
 
@@ -118,27 +118,27 @@ def _rows_in_the_plane(beam: ConeBeam) -> np.ndarray:
     The two rays of a line that rises by ``v / source_to_detector`` cross at the axis; at a distance r they are ``2 r v /
     source_to_detector`` apart, which must be at most half of a row as wide as the axis sees it.
     """
-    widest = np.abs(_place(beam, np.array([0, beam.detector[1] - 1]))).max()
+    widest = np.abs(_detector_position(beam, np.array([0, beam.detector[1] - 1]))).max()
     reach = widest * beam.source_to_axis / beam.source_to_detector
     limit = max(beam.pitch[0] * beam.source_to_axis / (4 * reach), 0.5 * beam.pitch[0] * (1 + 1e-9))
-    near = np.argsort(np.abs(beam.v), kind="stable")[:MOST_ROWS]
+    near = np.argsort(np.abs(beam.v), kind="stable")[:MAX_ROWS]
     near = near[np.abs(beam.v[near]) <= limit]
     if not len(near):
         raise MivolError("found no row of the detector in the plane of the source's circle, expected one to find the axis by.")
     return near
 
 
-def _mirrors(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> Mirrors:
+def _pair_rows(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> MirroredRows:
     """A row (views, cols) sorted by direction."""
     alpha, cols = _fan_angles(beam), beam.detector[1]
-    turn = _Turn.of(bridge_gaps(y[:, None], weights[:, None])[:, 0], weights, beam.angles)
+    turn = _ViewSpline.of(interpolate_gaps(y[:, None], weights[:, None])[:, 0], weights, beam.angles)
     phi = np.pi * np.arange(turn.directions) / turn.directions
     # An edge at the widest ray moves by so many columns from one view to the next.
     step = np.ptp(alpha) / 2 * (np.pi / turn.directions) * beam.source_to_detector / beam.pitch[1]
     width = max(1.0, step)
     sides = [_smooth(*turn.at(phi[:, None] + alpha + half), width) for half in (0.0, np.pi)]
     (here, weights_here), (there, weights_there) = sides
-    return Mirrors(here, interpolate.CubicSpline(np.arange(cols), there, axis=1), weights_here, weights_there)
+    return MirroredRows(here, interpolate.CubicSpline(np.arange(cols), there, axis=1), weights_here, weights_there)
 
 
 def _smooth(value: np.ndarray, weights: np.ndarray, was_seen: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +149,7 @@ def _smooth(value: np.ndarray, weights: np.ndarray, was_seen: np.ndarray, width:
 
 
 @dataclass(frozen=True, eq=False)
-class _Turn:
+class _ViewSpline:
     """A row of a scan between its views: a spline in theta, around the circle where views lie all around it."""
 
     spline: interpolate.CubicSpline
@@ -159,15 +159,15 @@ class _Turn:
     directions: int
 
     @classmethod
-    def of(cls, y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> _Turn:
+    def of(cls, y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> _ViewSpline:
         """Args: y, weights: (views, cols)."""
-        is_closed = covers(angles, 2 * np.pi)
+        is_closed = covers_circle(angles, 2 * np.pi)
         start = 0.0 if is_closed else widest_gap(angles, 2 * np.pi)[1]
         theta, first = np.unique(np.round(np.mod(angles - start + 1e-9, 2 * np.pi) - 1e-9, 9), return_index=True)
         y, weights = y[first], weights[first]
         if len(theta) < 4:
             raise MivolError(f"found {len(theta)} different view angles, expected at least 4 to find the rotation axis by.")
-        directions = int(min(np.ceil(np.pi / np.median(np.diff(theta))), MOST_DIRECTIONS))
+        directions = int(min(np.ceil(np.pi / np.median(np.diff(theta))), MAX_DIRECTIONS))
         theta = theta + start
         if is_closed:
             theta = np.append(theta, theta[0] + 2 * np.pi)
@@ -192,7 +192,7 @@ class _Turn:
         return value, np.minimum(self.weights[before, columns], self.weights[before + 1, columns]), was_seen
 
 
-def _pair_weights(pair: Mirrors, columns: np.ndarray) -> np.ndarray:
+def _pair_weights(pair: MirroredRows, columns: np.ndarray) -> np.ndarray:
     """Inverse variances (directions, cols) of the differences of mirrored rays; 0 where one of the two was not measured."""
     nearest = np.rint(columns).astype(int)
     inside = (columns >= 0) & (columns <= len(columns) - 1)
@@ -201,18 +201,18 @@ def _pair_weights(pair: Mirrors, columns: np.ndarray) -> np.ndarray:
     return np.where(both, pair.weights_here * there / np.where(both, pair.weights_here + there, 1.0), 0.0)
 
 
-def _misfit(pair: Mirrors, columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _sector_misfits(pair: MirroredRows, columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Weighted squares of the differences of mirrored rays, (sectors,) sums over sectors of directions."""
     squares = weights * (pair.here - pair.there(np.clip(columns, 0, len(columns) - 1))) ** 2
-    bounds = np.linspace(0, len(squares), min(PARTS, len(squares)) + 1).astype(int)[:-1]
+    bounds = np.linspace(0, len(squares), min(SECTORS, len(squares)) + 1).astype(int)[:-1]
     return np.add.reduceat(squares.sum(1), bounds)
 
 
-def _nearest_column(pair: Mirrors, beam: ConeBeam, alpha: np.ndarray) -> float:
+def _nearest_column(pair: MirroredRows, beam: ConeBeam, alpha: np.ndarray) -> float:
     """The whole column about which mirrored slopes are alike most: their correlation where both were measured."""
-    some = slice(None, None, max(1, len(pair.here) // SOME_DIRECTIONS))
+    some = slice(None, None, max(1, len(pair.here) // SEARCH_DIRECTIONS))
     here, rising = np.gradient(pair.here[some], axis=1), pair.there.derivative()
-    thinned = Mirrors(here, pair.there, pair.weights_here[some], pair.weights_there[some])
+    thinned = MirroredRows(here, pair.there, pair.weights_here[some], pair.weights_there[some])
     energy = np.sum(thinned.weights_here * here**2)
     best, found = -np.inf, 0.0
     for column in range(len(alpha)):
@@ -220,16 +220,16 @@ def _nearest_column(pair: Mirrors, beam: ConeBeam, alpha: np.ndarray) -> float:
         w = _pair_weights(thinned, columns)
         there = -rising(np.clip(columns, 0, len(alpha) - 1))[some]
         ours, theirs = np.sum(w * here**2), np.sum(w * there**2)
-        if 2 * min(ours, theirs) <= LEAST_OVERLAP * energy:
+        if 2 * min(ours, theirs) <= MIN_OVERLAP * energy:
             continue
         alike = np.sum(w * here * there) / np.sqrt(ours * theirs)
         best, found = max((best, found), (alike, float(column)))
-    if best < LEAST_ALIKE:
+    if best < MIN_CORRELATION:
         raise MivolError("found no lines of a structure that both of their ends show, expected some: check the angles.")
     return found
 
 
-def _least_of_parts(misfit: Callable[[float], np.ndarray], centre: float, width: float) -> tuple[float, float]:
+def _sector_minimum(misfit: Callable[[float], np.ndarray], centre: float, width: float) -> tuple[float, float]:
     """(column, standard deviation) of the least of a parabola, fitted to the misfits (sectors,) at five columns.
 
     The slope of the misfit is a sum over sectors of independent noise; at the minimum it is 0, and the slopes of

@@ -18,7 +18,7 @@ from mivol.threads import check_one_thread
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 from mivol.tomography.ramp import filter_ramp
-from mivol.tomography.redundancy import angle_steps, covers, full_turn_shares, half_scan_shares, widest_gap
+from mivol.tomography.redundancy import angle_steps, covers_circle, full_turn_weights, parker_weights, widest_gap
 
 __all__ = [
     "check_circle",
@@ -27,7 +27,7 @@ __all__ = [
     "feldkamp",
     "filtered_backprojection",
     "pixel_matrices",
-    "smear",
+    "backproject_voxels",
 ]
 
 
@@ -36,7 +36,7 @@ def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "
 
     The views may be spread in any way over half a turn or more: each stands for the directions nearest to it. A detector
     that the rotation axis divides unevenly reaches its whole width over a whole turn
-    (:func:`~mivol.tomography.redundancy.full_turn_shares`).
+    (:func:`~mivol.tomography.redundancy.full_turn_weights`).
 
     Args:
         projector: of a :class:`~mivol.tomography.geometry.ParallelBeam`; its views are those of ``y``.
@@ -53,8 +53,8 @@ def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "
     Cost: four reads a voxel and view.
     """
     beam, weights = projector.geometry, _parallel_weights(projector)
-    weighted, matrices = _on_both_sides(y * weights[:, None], pixel_matrices(beam, projector.grid, projector.views), beam.u)
-    return smear(matrices, filter_ramp(weighted, beam.pitch[1], window, cutoff), projector.grid, weighted=False)
+    weighted, matrices = _pad_detector(y * weights[:, None], pixel_matrices(beam, projector.grid, projector.views), beam.u)
+    return backproject_voxels(matrices, filter_ramp(weighted, beam.pitch[1], window, cutoff), projector.grid, weighted=False)
 
 
 def _parallel_weights(projector: Projector) -> np.ndarray:
@@ -65,14 +65,14 @@ def _parallel_weights(projector: Projector) -> np.ndarray:
             f"Found {type(beam).__name__}, expected a ParallelBeam: fdk is filtered back-projection of a ConeBeam."
         )
     angles, u = beam.angles[projector.views], beam.u
-    if not covers(angles, np.pi):
+    if not covers_circle(angles, np.pi):
         gap = np.degrees(widest_gap(angles, np.pi)[0])
         raise MivolError(
             f"found views with a gap of {gap:.1f} degrees among the directions of half a turn, expected them all around: "
             "choose an iterative solver (and give the angles in the unit that is asked for: radians here, degrees in files)."
         )
-    if covers(angles, 2 * np.pi):
-        return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_shares(u)
+    if covers_circle(angles, 2 * np.pi):
+        return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_weights(u)
     return np.broadcast_to(angle_steps(angles, np.pi)[:, None], (len(angles), len(u)))
 
 
@@ -98,10 +98,10 @@ def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutof
     # From the central ray, on a detector that is scaled down to the axis.
     p, q = (beam.u + tau) * scale, beam.v * scale
     cosine = (distance**2 + tau * p) / (distance * np.sqrt(distance**2 + p**2 + q[:, None] ** 2))
-    weighted, matrices = _on_both_sides(y * weights[:, None] * cosine, pixel_matrices(beam, grid, projector.views), p)
+    weighted, matrices = _pad_detector(y * weights[:, None] * cosine, pixel_matrices(beam, grid, projector.views), p)
     filtered = filter_ramp(weighted, beam.pitch[1] * scale, window, cutoff)
     # t of the matrices is the depth over source_to_detector, U the depth over source_to_axis.
-    return smear(matrices, filtered * scale**2, grid, weighted=True)
+    return backproject_voxels(matrices, filtered * scale**2, grid, weighted=True)
 
 
 def check_directions(projector: Projector) -> None:
@@ -145,7 +145,7 @@ def _circle_weights(projector: Projector) -> np.ndarray:
         )
     distance, tau = beam.source_to_axis, beam.axis_offset
     gamma = np.arctan2((beam.u + tau) * _scale_to_axis(beam), distance) - np.arctan2(tau, distance)
-    return cone_weights(beam.angles[projector.views], gamma, _needed_fan(projector, gamma))
+    return cone_weights(beam.angles[projector.views], gamma, _object_fan(projector, gamma))
 
 
 def cone_weights(angles: np.ndarray, gamma: np.ndarray, needed: float) -> np.ndarray:
@@ -154,8 +154,8 @@ def cone_weights(angles: np.ndarray, gamma: np.ndarray, needed: float) -> np.nda
     Raises:
         MivolError: the views cover less than half a turn and twice ``needed``.
     """
-    if covers(angles, 2 * np.pi):
-        return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_shares(gamma)
+    if covers_circle(angles, 2 * np.pi):
+        return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_weights(gamma)
     gap, start = widest_gap(angles, 2 * np.pi)
     beta = np.mod(angles - start + 1e-9, 2 * np.pi) - 1e-9
     arc = 2 * np.pi - gap
@@ -170,10 +170,10 @@ def cone_weights(angles: np.ndarray, gamma: np.ndarray, needed: float) -> np.nda
     steps = np.empty(len(angles))
     steps[order] = np.gradient(beta[order])
     steps[order[[0, -1]]] /= 2
-    return steps[:, None] * half_scan_shares(beta, gamma, excess)
+    return steps[:, None] * parker_weights(beta, gamma, excess)
 
 
-def _on_both_sides(y: np.ndarray, matrices: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pad_detector(y: np.ndarray, matrices: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Projections with columns of 0 added, and their matrices, until the detector reaches as far on either side of the axis.
 
     The filter spreads a row beyond its ends. Voxels whose shadow misses the shorter side of a displaced detector read there.
@@ -185,7 +185,7 @@ def _on_both_sides(y: np.ndarray, matrices: np.ndarray, u: np.ndarray) -> tuple[
     return np.pad(y, ((0, 0), (0, 0), (on_the_left, missing - on_the_left))), moved
 
 
-def _needed_fan(projector: Projector, gamma: np.ndarray) -> float:
+def _object_fan(projector: Projector, gamma: np.ndarray) -> float:
     """Largest angle [rad] to the axis at which the detector sees the cylinder inside the grid."""
     grid, beam = projector.grid, projector.geometry
     radius = min(grid.extent[:2]) / 2 + np.hypot(*grid.centre[:2])
@@ -216,7 +216,7 @@ def pixel_matrices(beam: FlatDetector, grid: VoxelGrid, views: Sequence[int] | n
     return matrices @ index_to_world
 
 
-def smear(matrices: np.ndarray, images: np.ndarray, grid: VoxelGrid, weighted: bool) -> np.ndarray:
+def backproject_voxels(matrices: np.ndarray, images: np.ndarray, grid: VoxelGrid, weighted: bool) -> np.ndarray:
     """Sum over views of what each voxel reads, bilinear between pixel centres, 0 beyond the detector's edge.
 
     Args:
@@ -239,12 +239,12 @@ def smear(matrices: np.ndarray, images: np.ndarray, grid: VoxelGrid, weighted: b
         for matrix, image in zip(matrices[some], images[some], strict=True):
             entries = [dr.opaque(mi.Float, float(value)) for value in matrix.ravel()]
             pixels = mi.Float(np.ascontiguousarray(image, np.float32).ravel())
-            total += _read(entries, pixels, grid.size, shape, size, weighted)
+            total += _read_view(entries, pixels, grid.size, shape, size, weighted)
         dr.eval(total)
     return np.array(total).reshape(grid.shape)
 
 
-def _read(
+def _read_view(
     entries: list[mi.Float],
     image: mi.Float,
     n: int,

@@ -78,13 +78,13 @@ class VoxelGrid:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        shape = _counts(self.shape)
+        shape = _to_counts(self.shape)
         if len(shape) != 3:
             raise MivolError(f"Found a grid shape {self.shape}, expected three counts (Z, Y, X), each at least 1.")
-        size = _lengths(self.voxel_size, 3)
+        size = _to_lengths(self.voxel_size, 3)
         if len(size) != 3 or not (size > 0).all():
             raise MivolError(f"Found a voxel size {self.voxel_size}, expected positive lengths: one, or (x, y, z).")
-        centre = _finite(self.centre)
+        centre = _to_finite(self.centre)
         if centre.shape != (3,):
             raise MivolError(f"Found a grid centre {self.centre}, expected a finite position (x, y, z).")
         object.__setattr__(self, "shape", shape)
@@ -144,8 +144,8 @@ class PencilRays:
             raise MivolError(
                 f"Found an unusable ray at index {bad[0]}, expected finite origins and directions that are not zero."
             )
-        object.__setattr__(self, "o", _frozen(o))
-        object.__setattr__(self, "d", _frozen(d / norm[:, None]))
+        object.__setattr__(self, "o", _make_read_only(o))
+        object.__setattr__(self, "d", _make_read_only(d / norm[:, None]))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -181,7 +181,7 @@ class ParallelBeam:
     whole_lines: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
-        _freeze_detector(self)
+        _check_detector(self)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -190,7 +190,7 @@ class ParallelBeam:
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Points of the lines nearest the rotation axis, and unit directions, each (views, rows, cols, 3) float64."""
-        u, w = _frame(self.angles[view_index(views, len(self.angles))])
+        u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
         v_of_row, u_of_col = self.v, self.u
         o = np.zeros((len(u), *self.detector, 3))
         o += u_of_col[:, None] * u[:, None, None, :]
@@ -209,7 +209,7 @@ class ParallelBeam:
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
         """The detector's plane through the axis; ``source`` is the direction of the light."""
-        u, w = _frame(self.angles[view_index(views, len(self.angles))])
+        u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
         return Panels(w, self.u[0] * u + self.v[0] * _Z, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
 
 
@@ -239,13 +239,13 @@ class ConeBeam:
     whole_lines: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        lengths = _finite([self.source_to_axis, self.source_to_detector])
+        lengths = _to_finite([self.source_to_axis, self.source_to_detector])
         if lengths.shape != (2,) or not (lengths > 0).all():
             raise MivolError(
                 f"Found {self.source_to_axis} from source to axis and {self.source_to_detector} from source to "
                 "detector, expected positive lengths."
             )
-        _freeze_detector(self)
+        _check_detector(self)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -254,7 +254,7 @@ class ConeBeam:
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The source, and unit directions towards the pixel centres, each (views, rows, cols, 3) float64."""
-        u, w = _frame(self.angles[view_index(views, len(self.angles))])
+        u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
         v_of_row, u_of_col = self.v, self.u
         source = self._sources(u, w)
         d = np.zeros((len(u), *self.detector, 3))
@@ -275,7 +275,7 @@ class ConeBeam:
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
         """Source and detector of each view."""
-        u, w = _frame(self.angles[view_index(views, len(self.angles))])
+        u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
         source = self._sources(u, w)
         corner = source + (self.u[0] + self.axis_offset) * u + self.v[0] * _Z + self.source_to_detector * w
         return Panels(source, corner, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
@@ -284,7 +284,7 @@ class ConeBeam:
         return -self.axis_offset * u - self.source_to_axis * w
 
 
-def cone_beam_of_tigre(n: int = 256, n_views: int = 100) -> tuple[ConeBeam, VoxelGrid]:
+def tigre_cone_beam(n: int = 256, n_views: int = 100) -> tuple[ConeBeam, VoxelGrid]:
     """The cone beam of TIGRE's own algorithm tests ("configuration 1"), at any resolution.
 
     A cube of 256 mm, source to axis 1000 mm, source to detector 1536 mm, a square detector of 409.6 mm, full circle
@@ -301,20 +301,20 @@ def cone_beam_of_tigre(n: int = 256, n_views: int = 100) -> tuple[ConeBeam, Voxe
     return beam, VoxelGrid((n, n, n), voxel_size=256.0 / n)
 
 
-def _freeze_detector(beam: ParallelBeam | ConeBeam) -> None:
-    angles = _finite(beam.angles).reshape(-1)
+def _check_detector(beam: ParallelBeam | ConeBeam) -> None:
+    angles = _to_finite(beam.angles).reshape(-1)
     if len(angles) == 0:
         raise MivolError(f"Found the view angles {beam.angles!r:.60}, expected at least one, all finite, in radians.")
-    detector = _counts(beam.detector)
+    detector = _to_counts(beam.detector)
     if len(detector) != 2:
         raise MivolError(f"Found a detector of {beam.detector} pixels, expected (rows, columns), each at least 1.")
-    pitch = _lengths(beam.pitch, 2)
+    pitch = _to_lengths(beam.pitch, 2)
     if len(pitch) != 2 or not (pitch > 0).all():
         raise MivolError(f"Found a pixel pitch {beam.pitch}, expected positive lengths: one, or (along v, along u).")
     offsets = [beam.axis_offset, *np.atleast_1d(beam.detector_offset).tolist()]
-    if _finite(offsets).shape != (3,):
+    if _to_finite(offsets).shape != (3,):
         raise MivolError(f"Found offsets {offsets} of axis and detector (v, u), expected three finite lengths.")
-    object.__setattr__(beam, "angles", _frozen(angles))
+    object.__setattr__(beam, "angles", _make_read_only(angles))
     object.__setattr__(beam, "detector", detector)
     object.__setattr__(beam, "pitch", tuple(map(float, pitch)))
 
@@ -327,7 +327,7 @@ def view_index(views: Sequence[int] | np.ndarray | None, n_views: int) -> np.nda
     """
     if views is None:
         return np.arange(n_views)
-    found = np.atleast_1d(_finite(views))
+    found = np.atleast_1d(_to_finite(views))
     index = found.astype(int)
     is_empty = hasattr(views, "__len__") and len(views) == 0
     if found.ndim != 1 or (index != found).any() or (found.size == 0 and not is_empty):
@@ -338,7 +338,7 @@ def view_index(views: Sequence[int] | np.ndarray | None, n_views: int) -> np.nda
     return index
 
 
-def _finite(given: object) -> np.ndarray:
+def _to_finite(given: object) -> np.ndarray:
     """Numbers in float64; none where it is no numbers, or some are not finite."""
     try:
         found = np.array(given, float)
@@ -347,19 +347,19 @@ def _finite(given: object) -> np.ndarray:
     return found if np.isfinite(found).all() else np.empty(0)
 
 
-def _lengths(given: object, count: int) -> np.ndarray:
+def _to_lengths(given: object, count: int) -> np.ndarray:
     """One number for all, or as many as there are; none where it is something else."""
-    found = _finite(given)
+    found = _to_finite(given)
     return np.broadcast_to(found, (count,)) if found.shape in ((), (1,), (count,)) else np.empty(0)
 
 
-def _counts(given: object) -> tuple[int, ...]:
+def _to_counts(given: object) -> tuple[int, ...]:
     """Whole numbers of at least 1; none where some are not."""
-    found = np.atleast_1d(_finite(given))
+    found = np.atleast_1d(_to_finite(given))
     return tuple(found.astype(int).tolist()) if found.ndim == 1 and (found % 1 == 0).all() and (found >= 1).all() else ()
 
 
-def _frame(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _beam_axes(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     c, s, zero = np.cos(angles), np.sin(angles), np.zeros_like(angles)
     return np.stack([c, s, zero], -1), np.stack([-s, c, zero], -1)
 
@@ -372,12 +372,12 @@ def _pixel_centres(beam: ParallelBeam | ConeBeam) -> tuple[np.ndarray, np.ndarra
     return v, u
 
 
-def _frozen(a: np.ndarray) -> np.ndarray:
+def _make_read_only(a: np.ndarray) -> np.ndarray:
     a.setflags(write=False)
     return a
 
 
-def subdivide(grid: VoxelGrid, parts: int, geometry: Geometry) -> VoxelGrid:
+def subdivide_grid(grid: VoxelGrid, parts: int, geometry: Geometry) -> VoxelGrid:
     """The same box in ``parts`` times as many voxels along each axis, and along x and y only for a parallel beam.
 
     Each row of a parallel beam sees one height: there is nothing to tell finer layers apart.

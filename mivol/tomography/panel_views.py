@@ -43,17 +43,21 @@ class PanelViews:
                 "detector's middle, of the step to the next column and of the step to the next row."
             )
         if not np.isfinite(table).all():
-            raise MivolError(f"found a number that is not finite in view {_first(~np.isfinite(table).all(1))} of the geometry.")
+            raise MivolError(
+                f"found a number that is not finite in view {_first_index(~np.isfinite(table).all(1))} of the geometry."
+            )
         source, middle, u, v = np.split(table, 4, axis=1)
         normal = np.cross(u, v)
         size = np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
         flat = ~(np.linalg.norm(normal, axis=1) > 1e-6 * size)
         if flat.any():
-            raise MivolError(f"found a detector without area in view {_first(flat)}, expected steps along two directions.")
+            raise MivolError(
+                f"found a detector without area in view {_first_index(flat)}, expected steps along two directions."
+            )
         depth = np.abs(np.einsum("ni,ni->n", normal, middle - source))
         beside = depth <= 1e-9 * np.linalg.norm(normal, axis=1) * np.linalg.norm(middle - source, axis=1)
         if beside.any():
-            raise MivolError(f"found the source in the detector's plane in view {_first(beside)}, expected it outside.")
+            raise MivolError(f"found the source in the detector's plane in view {_first_index(beside)}, expected it outside.")
         table.setflags(write=False)
         object.__setattr__(self, "table", table)
         object.__setattr__(self, "detector", tuple(int(n) for n in self.detector))
@@ -79,15 +83,15 @@ class PanelViews:
         return np.broadcast_to(panels.source[:, None, None, :], d.shape), d
 
 
-def _first(wrong: np.ndarray) -> int:
+def _first_index(wrong: np.ndarray) -> int:
     return int(np.flatnonzero(wrong)[0])
 
 
-SMALLEST = 1e-12
+MIN_SINGULAR_VALUE = 1e-12
 """A matrix whose smallest singular value is below this share of its largest has no source that float64 could place."""
 
 
-def panels_of_matrices(
+def panels_from_matrices(
     matrices: np.ndarray,
     detector: tuple[int, int],
     seen: Sequence[float] = (0.0, 0.0, 0.0),
@@ -111,17 +115,23 @@ def panels_of_matrices(
     p = np.asarray(matrices, np.float64)
     if p.ndim != 3 or p.shape[1:] != (3, 4) or len(p) == 0:
         raise MivolError(f"found projection matrices of shape {p.shape}, expected (views, 3, 4), one for each view.")
-    _refuse(~np.isfinite(p).all((1, 2)), "numbers that are not finite", "finite ones: complete the matrix")
+    _check_views(~np.isfinite(p).all((1, 2)), "numbers that are not finite", "finite ones: complete the matrix")
     m = p[:, :, :3]
     # Rows have units of their own (pixels, pixels, 1), and whole matrices any factor: neither says how near to singular one is.
     lengths = np.linalg.norm(m, axis=2, keepdims=True)
     values = np.linalg.svd(m / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
-    _refuse(values[:, -1] <= SMALLEST * values[:, 0], "a singular left half", "three independent rows: a point source has them")
+    _check_views(
+        values[:, -1] <= MIN_SINGULAR_VALUE * values[:, 0],
+        "a singular left half",
+        "three independent rows: a point source has them",
+    )
     inverse = np.linalg.inv(m)
     source = -(inverse @ p[:, :, 3:])[..., 0]
     depth = m[:, 2] @ np.asarray(seen, float) + p[:, 2, 3]
-    beside = np.abs(depth) <= SMALLEST * lengths[:, 2, 0] * np.linalg.norm(source - seen, axis=1)
-    _refuse(beside, f"{tuple(map(float, seen))} beside the source", "the grid's centre before it: check the unit of lengths")
+    beside = np.abs(depth) <= MIN_SINGULAR_VALUE * lengths[:, 2, 0] * np.linalg.norm(source - seen, axis=1)
+    _check_views(
+        beside, f"{tuple(map(float, seen))} beside the source", "the grid's centre before it: check the unit of lengths"
+    )
     step_u, step_v, corner = (inverse * depth[:, None, None]).transpose(2, 0, 1)
     corner = source + corner + first_pixel[0] * step_u + first_pixel[1] * step_v
     rows, columns = detector
@@ -129,12 +139,12 @@ def panels_of_matrices(
     return PanelViews(np.hstack([source, middle, step_u, step_v]), detector)
 
 
-def _refuse(wrong: np.ndarray, found: str, expected: str) -> None:
+def _check_views(wrong: np.ndarray, found: str, expected: str) -> None:
     if wrong.any():
         raise MivolError(f"found {found} in the projection matrix of view {int(np.argmax(wrong))}, expected {expected}.")
 
 
-def nikon_geometry(scan: NikonScan, angles: np.ndarray) -> ConeBeam | PanelViews:
+def geometry_from_nikon(scan: NikonScan, angles: np.ndarray) -> ConeBeam | PanelViews:
     """A cone beam on a circle; where the rotation axis is tilted or rolled, a table of views whose z is along the axis.
 
     Args:
@@ -146,25 +156,25 @@ def nikon_geometry(scan: NikonScan, angles: np.ndarray) -> ConeBeam | PanelViews
     if not scan.tilt and not scan.roll:
         return circle
     at_rest = ConeBeam(np.zeros(1), (1, 1), scan.source_to_axis, scan.source_to_detector, scan.pitch, scan.axis_offset).panels()
-    upright = _to_z(_axis(scan.tilt, scan.roll))
+    upright = _rotate_to_z(_axis_at_rest(scan.tilt, scan.roll))
     parts = [(upright @ part[0]) for part in (at_rest.source, at_rest.corner, at_rest.along_u, at_rest.along_v)]
-    turns = np.stack([_turn_about_z(angle) for angle in theta])
+    turns = np.stack([_rotate_about_z(angle) for angle in theta])
     return PanelViews(np.hstack([turns @ part for part in parts]), scan.detector)
 
 
-def _axis(tilt: float, roll: float) -> np.ndarray:
+def _axis_at_rest(tilt: float, roll: float) -> np.ndarray:
     """Direction of the rotation axis at rest: z rolled about the light's direction, then tilted about the columns'."""
     t, r = np.radians([-tilt, roll])
     return np.array([np.sin(r), -np.sin(t) * np.cos(r), np.cos(t) * np.cos(r)])
 
 
-def _to_z(axis: np.ndarray) -> np.ndarray:
+def _rotate_to_z(axis: np.ndarray) -> np.ndarray:
     """The least rotation that brings a direction on to z (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + z)
 
 
-def _turn_about_z(angle: float) -> np.ndarray:
+def _rotate_about_z(angle: float) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

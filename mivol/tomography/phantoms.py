@@ -96,7 +96,7 @@ class EllipsoidPhantom:
         for plane, height in zip(volume, z, strict=True):
             centres[..., 2] = height
             for to_body, centre, value in zip(self.to_body, self.centres, self.values, strict=True):
-                plane += value * _covered(centres, offsets, to_body, centre)
+                plane += value * _covered_share(centres, offsets, to_body, centre)
         return volume.astype(np.float32)
 
     def integrate_lines(self, o: np.ndarray, d: np.ndarray, whole_lines: bool = False) -> np.ndarray:
@@ -196,7 +196,7 @@ def _euler(phi: float, theta: float, psi: float) -> np.ndarray:
     return about_z(psi) @ about_x @ about_z(phi)
 
 
-def _covered(points: np.ndarray, offsets: np.ndarray, to_body: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def _covered_share(points: np.ndarray, offsets: np.ndarray, to_body: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Share of ``points + offsets`` that lies in an ellipsoid, for each of ``points`` (..., 3)."""
     q = (points - centre) @ to_body.T
     moved = offsets @ to_body.T

@@ -29,7 +29,7 @@ UNKNOWN_NOISE = 1e-4
 """Variance of a transmission of 1 where the noise was not measured: that of 1e4 quanta."""
 
 
-def of_unknown_noise(transmission: np.ndarray) -> Transmission:
+def assume_quantum_noise(transmission: np.ndarray) -> Transmission:
     """A transmission of whose noise only the form is known: that of quanta, ``var T ~ T``.
 
     Its size, ``UNKNOWN_NOISE``, matters to a solver with a prior only.
@@ -180,11 +180,11 @@ def normalise_air(transmission: Transmission, n_columns: int) -> Transmission:
     value, columns = transmission.value, transmission.value.shape[2]
     if not 2 <= n_columns <= columns // 2:
         raise MivolError(f"Found {n_columns} air columns, expected 2 to {columns // 2} of {columns}.")
-    air = find_air(value, n_columns)
+    air = fit_air(value, n_columns)
     return replace(transmission, value=value / air, variance=transmission.variance / air**2)
 
 
-def find_air(transmission: np.ndarray, n_columns: int) -> np.ndarray:
+def fit_air(transmission: np.ndarray, n_columns: int) -> np.ndarray:
     """(views, rows, cols): the straight line of each row through the mean of its ``n_columns`` at both edges that are finite.
 
     Raises:
@@ -205,7 +205,7 @@ def find_air(transmission: np.ndarray, n_columns: int) -> np.ndarray:
     return left[..., None] * (1 - f) + right[..., None] * f
 
 
-def line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+def to_line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
     """``y = -log T`` and the weights ``1 / var y = T^2 / var T`` (delta method).
 
     A pixel whose transmission is below ``n_sigma`` standard deviations (no light came through), or is not finite, gets
@@ -226,7 +226,7 @@ def line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np
     return np.where(seen, -np.log(safe), 0.0), np.where(seen, safe**2 / np.where(seen, variance, 1.0), 0.0)
 
 
-def bridge_gaps(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def interpolate_gaps(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Line integrals with unused pixels (weight 0: dead, saturated, no light) on the line between their neighbours.
 
     For methods without weights, as filtered back-projection, in which a pixel of 0 would leave a streak through the object.

@@ -38,15 +38,15 @@ PASS_SUM = 1 << 13
 """Most rays of one kernel through a voxel, on average: 1e6 equal float32 terms added in turn err by 8e-4, 8192 by 1e-5.
 Kernels are added up in float64."""
 
-PREPARE_CELLS = 16
+MIN_CELLS_PER_VOXEL = 16
 """Empty blocks are looked for, and values copied with a margin, where the rays cross this many times as many cells as the grid
 has: either reads each voxel a few times."""
 
-MOST_ALONG = 0.2
+MAX_ALONG = 0.2
 """Largest part of its cells that rays enter along one axis, on average, for the walk between columns along that axis: each of
 these is a fresh start. Rays of any direction gain 1.2 at 0.2, those of scanners 1.8 to 2.3 at 0 to 0.06."""
 
-MOST_EMPTY = 0.6
+MAX_EMPTY = 0.6
 """Part of the blocks that may be empty for the walk between columns, which skips none (measured on balls and on a head)."""
 
 RAY_BYTES = 28
@@ -75,7 +75,7 @@ class RayPass(NamedTuple):
         return dr.width(self.o) == count and not self.is_ordered
 
 
-def check_kinds(geometry: object, grid: object) -> None:
+def check_geometry(geometry: object, grid: object) -> None:
     """Refuse what is no scanner, and what is no place for voxels.
 
     Raises:
@@ -128,7 +128,7 @@ class Projector:
                 "'cuda_ad_rgb' first."
             )
         check_one_thread()
-        check_kinds(geometry, grid)
+        check_geometry(geometry, grid)
         self.geometry, self.grid = geometry, grid
         self.views = view_index(views, geometry.shape[0])
         if len(self.views) == 0:
@@ -144,7 +144,7 @@ class Projector:
 
     def __matmul__(self, x: np.ndarray) -> np.ndarray:
         """Line integrals of ``x``: (Z, Y, X) gives (views, rows, cols), (voxels,) gives (rays,)."""
-        x, flat = _as_array(x, self.grid.shape, "voxels")
+        x, flat = _to_flat(x, self.grid.shape, "voxels")
         y = self._project_array(x)
         return y if flat else y.reshape(self.projection_shape)
 
@@ -233,7 +233,7 @@ class Projector:
         empty = padded = None
         if self._pays_to_prepare:
             empty = find_empty_distances(mi.TensorXf(values, (*self.grid.shape, 1)))
-            if self._along is not None and dr.mean(dr.select(empty > 0, 1.0, 0.0))[0] < MOST_EMPTY:
+            if self._along is not None and dr.mean(dr.select(empty > 0, 1.0, 0.0))[0] < MAX_EMPTY:
                 padded = self._kernels.pad(values)
         y = None
         for rays in self._passes():
@@ -271,7 +271,7 @@ class Projector:
     @property
     def _pays_to_prepare(self) -> bool:
         """Whether rays cross so many cells that the voxels may be read a few times before."""
-        return self.shape[0] * sum(self.grid.shape) > PREPARE_CELLS * self.grid.size
+        return self.shape[0] * sum(self.grid.shape) > MIN_CELLS_PER_VOXEL * self.grid.size
 
     @cached_property
     def _along(self) -> int | None:
@@ -281,7 +281,7 @@ class Projector:
         some = self.views[np.unique(np.linspace(0, self.n_views - 1, 8).astype(int))]
         crossed = np.abs(self._rays(some)[1] / np.asarray(self.grid.voxel_size, np.float32)).mean(0)
         axis = int(crossed.argmin())
-        return axis if crossed[axis] <= MOST_ALONG * crossed.sum() else None
+        return axis if crossed[axis] <= MAX_ALONG * crossed.sum() else None
 
     def _passes(self) -> Iterable[RayPass]:
         """The rays, pass by pass."""
@@ -330,7 +330,7 @@ class Transpose:
 
     def __matmul__(self, y: np.ndarray) -> np.ndarray:
         """Back-projection of ``y``: (views, rows, cols) gives (Z, Y, X), (rays,) gives (voxels,)."""
-        y, flat = _as_array(y, self.T.projection_shape, "rays")
+        y, flat = _to_flat(y, self.T.projection_shape, "rays")
         x = self.T._backproject_array(y)
         return x if flat else x.reshape(self.T.grid.shape)
 
@@ -366,7 +366,7 @@ class _ProjectionOfTorch(_Projection):
             super().backward()
 
 
-def _as_array(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarray, bool]:
+def _to_flat(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarray, bool]:
     """(flat float32 array, whether it was flat)."""
     try:
         a = np.asarray(a)

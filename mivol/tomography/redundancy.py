@@ -15,7 +15,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-WIDEST_GAP = 4.0
+MAX_GAP = 4.0
 """Steps (the whole range over the number of views) that may lie between two neighbours. Golden-angle views are at most 1.9
 steps apart; where it is more than 4, directions are missing."""
 
@@ -45,12 +45,12 @@ def widest_gap(angles: np.ndarray, period: float) -> tuple[float, float]:
     return float(gaps[widest]), float(found[(widest + 1) % len(found)])
 
 
-def covers(angles: np.ndarray, period: float) -> bool:
+def covers_circle(angles: np.ndarray, period: float) -> bool:
     """Whether views lie all around a circle of ``period``."""
-    return widest_gap(angles, period)[0] <= WIDEST_GAP * period / len(angles) + 1e-9
+    return widest_gap(angles, period)[0] <= MAX_GAP * period / len(angles) + 1e-9
 
 
-def full_turn_shares(gamma: np.ndarray) -> np.ndarray:
+def full_turn_weights(gamma: np.ndarray) -> np.ndarray:
     """Shares (cols,) of the rays of a whole turn, where each line of a centred detector is seen twice.
 
     A half each, where the detector reaches as far on either side of the axis. Beyond its shorter side a line is seen once,
@@ -72,7 +72,7 @@ def full_turn_shares(gamma: np.ndarray) -> np.ndarray:
     return 0.5 * (1 + longer * np.sign(gamma) * np.sin(np.pi / 2 * along) ** 2)
 
 
-def half_scan_shares(beta: np.ndarray, gamma: np.ndarray, excess: float) -> np.ndarray:
+def parker_weights(beta: np.ndarray, gamma: np.ndarray, excess: float) -> np.ndarray:
     """Parker's shares (views, cols) of a scan over ``pi + 2 excess``.
 
     Args:

@@ -61,10 +61,10 @@ def axis_from_mirrors(y: np.ndarray, angles: np.ndarray, n_pairs: int = 12) -> A
     flat = used[np.ptp(y[used], axis=-1).max(axis=-1) <= 0]
     if len(flat):
         raise MivolError(f"Found view {flat[0]} without contrast, expected an object in every view.")
-    columns = np.array([_mirror_column(y[i], y[j]) for i, j in zip(first, second, strict=True)])
+    columns = np.array([_find_mirror_column(y[i], y[j]) for i, j in zip(first, second, strict=True)])
     uneven = np.ptp(miss) > 1e-9
     design = np.stack([np.ones_like(miss), miss], 1) if uneven else np.ones((len(miss), 1))
-    column, sigma = _fit_constant(design, columns)
+    column, sigma = _fit_first_coefficient(design, columns)
     return Axis(column, sigma, f"mirror images, {len(miss)} pairs of views")
 
 
@@ -84,7 +84,7 @@ def axis_from_moments(y: np.ndarray, angles: np.ndarray) -> Axis:
         raise MivolError("Found a row of a view with no absorption in it, expected an object in every row and view.")
     centres = (y @ np.arange(y.shape[-1])) / mass
     design = np.stack([np.ones_like(angles), np.cos(angles), np.sin(angles)], 1)
-    columns, sigmas = np.transpose([_fit_constant(design, centres[:, row]) for row in range(y.shape[1])])
+    columns, sigmas = np.transpose([_fit_first_coefficient(design, centres[:, row]) for row in range(y.shape[1])])
     variance = max(np.mean(sigmas**2), np.var(columns, ddof=1) if len(columns) > 1 else 0.0) / len(columns)
     return Axis(float(columns.mean()), float(np.sqrt(variance)), "moments of the shadows")
 
@@ -154,7 +154,7 @@ def _opposite_pairs(angles: np.ndarray, n_pairs: int) -> tuple[np.ndarray, np.nd
     return i[best], j[best], miss[best]
 
 
-def _mirror_column(a: np.ndarray, b: np.ndarray) -> float:
+def _find_mirror_column(a: np.ndarray, b: np.ndarray) -> float:
     """Column c for which ``a(s) = b(2 c - s)`` at best; ``a`` and ``b`` are (rows, cols)."""
     n = a.shape[-1]
     # sum_s a(s) b(k - s), k = 2 c, is a convolution: its peak is the best whole k.
@@ -170,7 +170,7 @@ def _mirror_column(a: np.ndarray, b: np.ndarray) -> float:
     return float(optimize.minimize_scalar(misfit, bounds=(k0 / 2 - 1, k0 / 2 + 1), method="bounded").x)
 
 
-def _fit_constant(design: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+def _fit_first_coefficient(design: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """(first coefficient, its standard deviation) of a least-squares fit."""
     coefficients, *_ = np.linalg.lstsq(design, values, rcond=None)
     freedom = max(len(values) - design.shape[1], 1)
@@ -182,7 +182,7 @@ def _held_out_misfit(
     y: np.ndarray, weights: np.ndarray, angles: np.ndarray, column: float, known: slice, asked: slice
 ) -> float:
     rows, cols = y.shape[1:]
-    n = 2 * _reach(y, column) + 1
+    n = 2 * _object_radius(y, column) + 1
     grid, offset = VoxelGrid((rows, n, n)), Axis(column, 0.0, "trial").offset(cols)
     seen, hidden = (Projector(ParallelBeam(angles[part], (rows, cols), axis_offset=offset), grid) for part in (known, asked))
     predicted = hidden @ filtered_backprojection(seen, y[known])
@@ -192,7 +192,7 @@ def _held_out_misfit(
     return float(np.sum(w * (target - scale * predicted) ** 2) / np.sum(w > 0))
 
 
-def _reach(y: np.ndarray, column: float) -> int:
+def _object_radius(y: np.ndarray, column: float) -> int:
     """Pixels from the axis to the outermost one that ever sees a tenth of the densest ray, and a tenth more."""
     seen = np.flatnonzero((y > 0.1 * y.max()).any(axis=(0, 1)))
     return int(np.ceil(1.1 * np.abs(seen - column).max()))

@@ -20,9 +20,9 @@ from mivol.tomography.projector import Projector
 
 __all__ = [
     "StoredProjector",
-    "bytes_to_store",
+    "matrix_bytes",
     "is_worth_storing",
-    "store",
+    "store_matrix",
     "Lines",
     "build_rows",
     "count_bytes",
@@ -32,7 +32,7 @@ __all__ = [
 LAYERS_AT_ONCE = 32
 """Columns of one product: 32 floats are two cache lines, and a layer of 256^2 of them fits into a second-level cache."""
 
-PRODUCTS_TO_PAY = 9
+MIN_PRODUCTS = 9
 """Products with A and its transpose, counted a layer, after which storing is paid for: an entry takes the processor about 23 ns
 to store, and each pair of products reads it 2.6 ns sooner than a walk finds it (2.2 and 4.8 ns, one layer)."""
 
@@ -40,7 +40,7 @@ Blocks = list[scipy.sparse.csr_array]
 
 
 class StoredProjector(Projector):
-    """The operators of a :class:`~mivol.tomography.projector.Projector`, from stored rows; made by :func:`store`.
+    """The operators of a :class:`~mivol.tomography.projector.Projector`, from stored rows; made by :func:`store_matrix`.
 
     ``A = H S``: H interpolates between the layers of the grid at the heights of the detector's rows, S is the stored matrix of
     a layer. Products agree with the walk's to its rounding, and ``A.T`` is the transpose of the same numbers.
@@ -62,7 +62,9 @@ class StoredProjector(Projector):
     def subset(self, views: Sequence[int] | np.ndarray) -> StoredProjector:
         """The rows of some views, counted among this projector's own: the same memory, read in part."""
         walk = super().subset(views)
-        return StoredProjector(walk, _views_of(self._blocks, np.asarray(views, int), self.projection_shape[2]), self._to_rows)
+        return StoredProjector(
+            walk, _select_views(self._blocks, np.asarray(views, int), self.projection_shape[2]), self._to_rows
+        )
 
     def _project_array(self, x: np.ndarray) -> np.ndarray:
         layers = x.reshape(self.grid.shape[0], -1)
@@ -72,7 +74,7 @@ class StoredProjector(Projector):
         if rows == 1:
             return np.concatenate([block @ layers[0] for block in self._blocks])
         y = np.empty((views * columns, rows), np.float32)
-        for part in _parts(rows):
+        for part in _layer_slices(rows):
             operand = np.ascontiguousarray(layers[part].T)
             np.concatenate([block @ operand for block in self._blocks], out=y[:, part])
         return y.reshape(views, columns, rows).transpose(0, 2, 1).reshape(-1)
@@ -81,7 +83,7 @@ class StoredProjector(Projector):
         views, rows, columns = self.projection_shape
         y = y.reshape(views, rows, columns)
         layers = np.empty((rows, self._blocks[0].shape[1]), np.float32)
-        for part in _parts(rows):
+        for part in _layer_slices(rows):
             operand = np.ascontiguousarray(y[:, part].transpose(0, 2, 1)).reshape(views * columns, -1)
             layers[part] = self._back(operand[:, 0] if rows == 1 else operand).T
         return (layers if self._to_rows is None else self._to_rows.T @ layers).reshape(-1)
@@ -103,8 +105,8 @@ class StoredProjector(Projector):
         return mi.Float(self._backproject_array(np.array(y)))
 
 
-def bytes_to_store(projector: Projector) -> int | None:
-    """Bytes that :func:`store` would take, counted without storing; None where the rays do not lie in layers."""
+def matrix_bytes(projector: Projector) -> int | None:
+    """Bytes that :func:`store_matrix` would take, counted without storing; None where the rays do not lie in layers."""
     lines = find_lines(projector.geometry, projector.grid, projector.views)
     return None if lines is None else count_bytes(lines)
 
@@ -117,10 +119,10 @@ def is_worth_storing(rows: int, iterations: int, is_by_subsets: bool) -> bool:
         iterations: of a solver, each with about one product with A and one with its transpose.
         is_by_subsets: whether an iteration takes many small products; a walk of a few hundred rays costs mostly its start.
     """
-    return is_by_subsets or rows * iterations >= PRODUCTS_TO_PAY
+    return is_by_subsets or rows * iterations >= MIN_PRODUCTS
 
 
-def store(projector: Projector) -> StoredProjector:
+def store_matrix(projector: Projector) -> StoredProjector:
     """The same projector with its rows stored.
 
     Raises:
@@ -132,10 +134,10 @@ def store(projector: Projector) -> StoredProjector:
             "found rays that do not lie in layers of constant z, expected those of a parallel beam or of a fan of one row, "
             "whose layers share one matrix: walk them (solve.storage = walk)."
         )
-    return StoredProjector(projector, list(build_rows(lines)), _interpolation(projector, lines.heights))
+    return StoredProjector(projector, list(build_rows(lines)), _row_interpolation(projector, lines.heights))
 
 
-def _interpolation(projector: Projector, heights: np.ndarray) -> scipy.sparse.csr_array | None:
+def _row_interpolation(projector: Projector, heights: np.ndarray) -> scipy.sparse.csr_array | None:
     """(rows, Z) linear interpolation at the heights, clamped and 0 outside the box; None where rows are layers."""
     grid = projector.grid
     n, where = grid.shape[0], (heights - grid.centre[2]) / grid.voxel_size[2] + (grid.shape[0] - 1) / 2
@@ -146,11 +148,11 @@ def _interpolation(projector: Projector, heights: np.ndarray) -> scipy.sparse.cs
     return None if is_each_a_layer else scipy.sparse.csr_array(hats.astype(np.float32))
 
 
-def _parts(rows: int) -> list[slice]:
+def _layer_slices(rows: int) -> list[slice]:
     return [slice(first, min(first + LAYERS_AT_ONCE, rows)) for first in range(0, rows, LAYERS_AT_ONCE)]
 
 
-def _views_of(blocks: Blocks, views: np.ndarray, columns: int) -> Blocks:
+def _select_views(blocks: Blocks, views: np.ndarray, columns: int) -> Blocks:
     """The rows of views, in their order; runs of neighbours stay together."""
     begins = np.cumsum([0, *(block.shape[0] // columns for block in blocks)])
     home = np.searchsorted(begins, views, "right") - 1
@@ -165,13 +167,13 @@ def _views_of(blocks: Blocks, views: np.ndarray, columns: int) -> Blocks:
     return found
 
 
-PLACES = 4
+VOXELS_PER_ROW = 4
 """Most voxels of a row that a line meets: hats are 2 wide, and a line crosses at most 2 voxels while it crosses a row's hat."""
 
-NEGLIGIBLE = 1e-9
+MIN_ENTRY = 1e-9
 """Integrals [voxels] below this are rounding, of kinks that fall on a centre: left out, which is 1e-7 of a voxel in 100."""
 
-BLOCK = 1 << 21
+PAIRS_PER_BLOCK = 1 << 21
 """Pairs of a line and a row that are computed at once: 64 MiB of places and entries."""
 
 
@@ -214,10 +216,10 @@ def find_lines(geometry: Geometry, grid: VoxelGrid, views: np.ndarray) -> Lines 
         directions.append(d[0, :, :2])
     size, n = np.array(grid.voxel_size[:2]), np.array(grid.shape[:0:-1])
     q = (np.array(starts) - np.array(grid.centre[:2])) / size + (n - 1) / 2
-    return _lines(heights, q, np.array(directions) / size, grid.shape[1:], geometry.whole_lines)
+    return _clip_lines(heights, q, np.array(directions) / size, grid.shape[1:], geometry.whole_lines)
 
 
-def _lines(heights: np.ndarray, q: np.ndarray, e: np.ndarray, shape: tuple[int, int], whole: bool) -> Lines:
+def _clip_lines(heights: np.ndarray, q: np.ndarray, e: np.ndarray, shape: tuple[int, int], whole: bool) -> Lines:
     """Of points ``q`` and directions ``e`` (views, cols, 2) in voxels, of which a step of 1 is a unit of length."""
     along_x = np.abs(e[..., 0]) >= np.abs(e[..., 1])
     swap = np.where(along_x, 0, 1)[..., None]
@@ -251,18 +253,18 @@ def build_rows(lines: Lines) -> Iterator[scipy.sparse.csr_array]:
     """The matrix (lines, voxels of a layer) in blocks of whole views: CSR, float32 entries and int32 places."""
     n_views, columns = lines.slope.shape
     steps = max(lines.shape)
-    views_at_once = max(1, BLOCK // (columns * steps))
+    views_at_once = max(1, PAIRS_PER_BLOCK // (columns * steps))
     for first in range(0, n_views, views_at_once):
         part = slice(first, first + views_at_once)
-        yield _block(lines, part, steps)
+        yield _build_block(lines, part, steps)
 
 
-def _block(lines: Lines, part: slice, steps: int) -> scipy.sparse.csr_array:
+def _build_block(lines: Lines, part: slice, steps: int) -> scipy.sparse.csr_array:
     names = ("slope", "offset", "length", "low", "high")
     line = {name: mi.Float64(np.ascontiguousarray(getattr(lines, name)[part]).ravel()) for name in names}
     along_x = mi.Bool(np.ascontiguousarray(lines.along_x[part]).ravel())
     count = dr.width(along_x)
-    at, entries = _entries(line, along_x, lines.shape, steps)
+    at, entries = _integrate_entries(line, along_x, lines.shape, steps)
     at, entries = (a.numpy().reshape(count, -1) for a in (at, entries))
     kept = entries > 0
     ends = np.zeros(count + 1, np.int32)
@@ -271,7 +273,9 @@ def _block(lines: Lines, part: slice, steps: int) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array((entries.take(found), at.take(found), ends), shape=(count, lines.shape[0] * lines.shape[1]))
 
 
-def _entries(line: dict[str, mi.Float64], along_x: mi.Bool, shape: tuple[int, int], steps: int) -> tuple[mi.Int32, mi.Float]:
+def _integrate_entries(
+    line: dict[str, mi.Float64], along_x: mi.Bool, shape: tuple[int, int], steps: int
+) -> tuple[mi.Int32, mi.Float]:
     """Places and integrals, ``PLACES`` for each line and row of voxels; 0 where a line meets fewer."""
     n_y, n_x = (dr.opaque(mi.UInt32, n) for n in shape)
     pair = dr.arange(mi.UInt32, dr.width(along_x) * steps)
@@ -304,7 +308,7 @@ def _entries(line: dict[str, mi.Float64], along_x: mi.Bool, shape: tuple[int, in
     def place(x: mi.Float) -> mi.Float:
         return dr.clip(across(x), nearest, last) - first
 
-    total = [mi.Float(0.0) for _ in range(PLACES)]
+    total = [mi.Float(0.0) for _ in range(VOXELS_PER_ROW)]
     inverse = 1 / dr.select(slope == 0, 1, slope)
     for a, b in ((begin, dr.minimum(end, 0)), (dr.maximum(begin, 0), end)):
         b = dr.maximum(a, b)
@@ -319,16 +323,16 @@ def _entries(line: dict[str, mi.Float64], along_x: mi.Bool, shape: tuple[int, in
             sixth = (d - c) / 6
             upper_part = sixth * sum(w * (place(x) - lower) for x, w in zip((c, middle, d), weights, strict=True))
             lower_part = sixth * sum(weights) - upper_part
-            for j in range(PLACES):
+            for j in range(VOXELS_PER_ROW):
                 total[j] += dr.select(lower == j, lower_part, 0) + dr.select(lower == j - 1, upper_part, 0)
 
     step0, step1 = dr.select(major_x, 1, n_x), dr.select(major_x, n_x, 1)
     base = row * step0 + mi.UInt32(mi.Int32(origin) + mi.Int32(first)) * step1
     active = (row < n0) & (end > begin)
-    at, entries = dr.empty(mi.Int32, PLACES * dr.width(pair)), dr.empty(mi.Float, PLACES * dr.width(pair))
+    at, entries = dr.empty(mi.Int32, VOXELS_PER_ROW * dr.width(pair)), dr.empty(mi.Float, VOXELS_PER_ROW * dr.width(pair))
     # Four neighbours at once: single numbers would take thrice the time of all that goes before.
-    kept = [dr.select(active & (t > NEGLIGIBLE), t * mi.Float(length), 0) for t in total]
-    dr.scatter(at, mi.Vector4i([mi.Int32(base + j * step1) for j in range(PLACES)]), pair)
+    kept = [dr.select(active & (t > MIN_ENTRY), t * mi.Float(length), 0) for t in total]
+    dr.scatter(at, mi.Vector4i([mi.Int32(base + j * step1) for j in range(VOXELS_PER_ROW)]), pair)
     dr.scatter(entries, mi.Vector4f(kept), pair)
     dr.eval(at, entries)
     return at, entries

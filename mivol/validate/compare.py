@@ -15,7 +15,7 @@ from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.validate.metrics import nrmse, psnr
 from mivol.validate.reference_file import ReferenceResult
-from mivol.validate.statistics import Bias, Estimate, Significance, bias, smallest_detectable_bias, z_bound, z_image
+from mivol.validate.statistics import Bias, Estimate, Significance, estimate_bias, smallest_detectable_bias, z_bound, z_image
 
 __all__ = ["Comparison", "compare"]
 
@@ -85,7 +85,7 @@ def compare(
         samples_seen: largest value of one sample [radiance], for instance the background's: what the samples of a pixel may
             have missed is then allowed for, see :meth:`ReferenceResult.variance_with_unseen`. 0: as estimated.
         rounding: see :func:`mivol.validate.statistics.z_image`.
-        correlated: see :func:`mivol.validate.statistics.bias`; 3: the channels share their paths, the filter is a box.
+        correlated: see :func:`mivol.validate.statistics.estimate_bias`; 3: the channels share their paths, the filter is a box.
 
     Raises:
         MivolError: another size, or values that are not finite.
@@ -95,7 +95,7 @@ def compare(
         raise MivolError(f"an image of shape {mean.shape} cannot be compared with a reference of {reference.mean.shape}.")
     var = reference.variance_with_unseen(samples_seen) if samples_seen else reference.variance
     truth, dof = Estimate(reference.mean, var, reference.batches - 1), reference.batches - 1
-    difference = bias(image, truth, alpha=alpha / 2, correlated=correlated)
+    difference = estimate_bias(image, truth, alpha=alpha / 2, correlated=correlated)
     dark = not reference.mean.any()
     z, level = z_image(image, truth, rounding), Significance(alpha / 2, mean.size)
     bound = float(z_bound(level, dof))

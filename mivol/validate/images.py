@@ -21,11 +21,21 @@ from mivol.errors import MivolError
 from mivol.photos.photo_file import CONVERSIONS
 from mivol.validate.metrics import check_window, psnr, ssim
 
-__all__ = ["METRICS", "Quality", "Score", "check_metrics", "colour_fitted", "flip", "judge", "quantised", "score"]
+__all__ = [
+    "METRICS",
+    "ImageScore",
+    "MeanScore",
+    "check_metrics",
+    "fit_colours",
+    "flip",
+    "score_image",
+    "quantise",
+    "average_scores",
+]
 
 
 @dataclass(frozen=True)
-class Quality:
+class ImageScore:
     """What the metrics say of one image, by their names in ``METRICS``."""
 
     name: str
@@ -33,10 +43,10 @@ class Quality:
 
 
 @dataclass(frozen=True)
-class Score:
+class MeanScore:
     """What they say of a set of images: means over images, and each image."""
 
-    images: tuple[Quality, ...]
+    images: tuple[ImageScore, ...]
 
     @property
     def values(self) -> dict[str, float]:
@@ -64,14 +74,14 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
     """Mean FLIP of two sRGB images in 0..1 (H, W, 3), at 67 pixels per degree; 0 for equal images.
 
     Raises:
-        MivolError: as :func:`find_flip`.
+        MivolError: as :func:`load_flip`.
     """
-    evaluate = find_flip()
+    evaluate = load_flip()
     pair = [np.ascontiguousarray(values, np.float32) for values in (truth, image)]
     return float(evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
 
 
-def find_flip() -> Callable:
+def load_flip() -> Callable:
     """FLIP's own implementation.
 
     Raises:
@@ -105,10 +115,10 @@ def check_metrics(names: Sequence[str], width: int, height: int) -> None:
     if "ssim" in names:
         check_window(width, height)
     if "flip" in names:
-        find_flip()
+        load_flip()
 
 
-def quantised(image: np.ndarray, space: str = "srgb") -> np.ndarray:
+def quantise(image: np.ndarray, space: str = "srgb") -> np.ndarray:
     """An image as a screen of 8 bits shows it, in sRGB values: multiples of 1/255, float64.
 
     Args:
@@ -129,7 +139,7 @@ def quantised(image: np.ndarray, space: str = "srgb") -> np.ndarray:
     return np.round(np.clip(CONVERSIONS[space, "srgb"](values), 0, 1) * 255) / 255
 
 
-def judge(
+def score_image(
     image: np.ndarray,
     truth: np.ndarray,
     *,
@@ -137,7 +147,7 @@ def judge(
     mask: np.ndarray | None = None,
     metrics: Sequence[str] = ("psnr",),
     name: str = "image",
-) -> Quality:
+) -> ImageScore:
     """Compare a render with its photograph by the protocol of this module.
 
     Args:
@@ -156,18 +166,18 @@ def judge(
         raise MivolError(f'there is no metric "{unknown}"; choose among {", ".join(METRICS)}.')
     if np.shape(image) != np.shape(truth):
         raise MivolError(f"{name} has shape {np.shape(image)} and its photograph {np.shape(truth)}; render it at that size.")
-    shown, wanted = quantised(image, space), quantised(truth, space)
+    shown, wanted = quantise(image, space), quantise(truth, space)
     if mask is None:
-        return Quality(name, {metric: METRICS[metric].measure(shown, wanted) for metric in metrics})
+        return ImageScore(name, {metric: METRICS[metric].measure(shown, wanted) for metric in metrics})
     if np.shape(mask) != shown.shape[:2] or not np.any(mask):
         raise MivolError(f"the mask of {name} has shape {np.shape(mask)} or leaves no pixel; give one of {shown.shape[:2]}.")
     filled = np.where(np.asarray(mask, bool)[..., None], shown, wanted)
     # The error of the pixels that are left out is 0; PSNR is that of the others.
     counted = -10 * np.log10(np.size(mask) / np.count_nonzero(mask))
-    return Quality(name, {m: METRICS[m].measure(filled, wanted) + counted * (m == "psnr") for m in metrics})
+    return ImageScore(name, {m: METRICS[m].measure(filled, wanted) + counted * (m == "psnr") for m in metrics})
 
 
-def colour_fitted(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+def fit_colours(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """An image whose channels are each a x + b, as near to its photograph as they can be (least squares over what counts).
 
     A camera that chose another exposure or white balance for a view that was not fitted says nothing of the field; this is what
@@ -187,7 +197,7 @@ def colour_fitted(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None 
     return fitted
 
 
-def score(images: Iterable[Quality]) -> Score:
+def average_scores(images: Iterable[ImageScore]) -> MeanScore:
     """The score of a set of images.
 
     Raises:
@@ -196,4 +206,4 @@ def score(images: Iterable[Quality]) -> Score:
     found = tuple(images)
     if not found:
         raise MivolError("there is no image to judge; hold some out.")
-    return Score(found)
+    return MeanScore(found)

@@ -9,7 +9,7 @@ from mivol.errors import MivolError
 __all__ = ["nrmse", "psnr", "ssim"]
 
 
-def _rms(a: np.ndarray, b: np.ndarray) -> float:
+def _rmse(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(np.mean((np.asarray(a, dtype=np.float64) - b) ** 2)))
 
 
@@ -25,7 +25,7 @@ def psnr(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> flo
     peak = float(np.max(truth)) if peak is None else peak
     if not peak > 0:
         raise MivolError(f"a peak of {peak} leaves no signal to compare the noise with; give the largest value expected.")
-    error = _rms(image, truth)
+    error = _rmse(image, truth)
     return float("inf") if error == 0 else float(20 * np.log10(peak / error))
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from mivol.errors import MivolError
 
-__all__ = ["BATCHES", "Moments", "pool", "tiles_of"]
+__all__ = ["BATCHES", "Moments", "average_tiles", "split_tiles"]
 
 BATCHES = 16
 """Independent renders behind a mean: its standard error is known to 1 / sqrt(2 * 15) = 18 %."""
@@ -98,7 +98,7 @@ class Moments:
         return self.variance / self.n
 
 
-def pool(mean: np.ndarray, var: np.ndarray, tile: int) -> tuple[np.ndarray, np.ndarray]:
+def average_tiles(mean: np.ndarray, var: np.ndarray, tile: int) -> tuple[np.ndarray, np.ndarray]:
     """Average tiles of pixels, for estimators with heavy tails.
 
     A batch mean with rare bright samples is far from normal: seen rarely, both its mean and its variance are too small.
@@ -113,10 +113,10 @@ def pool(mean: np.ndarray, var: np.ndarray, tile: int) -> tuple[np.ndarray, np.n
     Returns:
         mean and variance of the mean, (H // tile, W // tile, C).
     """
-    return tiles_of(mean, tile).mean(axis=(1, 3)), tiles_of(var, tile).sum(axis=(1, 3)) / tile**4
+    return split_tiles(mean, tile).mean(axis=(1, 3)), split_tiles(var, tile).sum(axis=(1, 3)) / tile**4
 
 
-def tiles_of(image: np.ndarray, tile: int) -> np.ndarray:
+def split_tiles(image: np.ndarray, tile: int) -> np.ndarray:
     """An image (H, W, C) as (rows of tiles, tile, columns of tiles, tile, C), without what fills no tile."""
     h, w, c = image.shape
     if tile < 1 or h < tile or w < tile:

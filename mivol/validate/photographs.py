@@ -16,14 +16,14 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.photos.transforms import write_transforms
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
-from mivol.scene.sensors import camera_of, find_sensor
+from mivol.scene.sensors import find_sensor, to_camera
 from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult
 
-__all__ = ["photograph"]
+__all__ = ["render_photographs"]
 
 
-def photograph(
+def render_photographs(
     scene: SceneSource | mi.Scene | LoadedScene,
     folder: str | Path,
     *,
@@ -50,7 +50,7 @@ def photograph(
     if not looks:
         raise MivolError("the scene has no sensor to photograph it with; add one, or give sensors.")
     names = [f"view_{number:03d}.exr" for number in range(len(looks))]
-    cameras = {name: camera_of(_sensor(loaded.scene, look), name) for name, look in zip(names, looks, strict=True)}
+    cameras = {name: to_camera(_sensor(loaded.scene, look), name) for name, look in zip(names, looks, strict=True)}
     folder = Path(folder)
     if folder.suffix == ".exr":
         raise MivolError(f"{folder} names one image for {len(looks)} views; name a folder.")

@@ -30,29 +30,29 @@ from mivol.validate.moments import Moments
 from mivol.validate.reference_file import (
     ReferenceResult,
     check_identity,
-    destination_of,
+    checkpoint_path,
+    read_checkpoint,
     read_reference,
-    read_state,
+    reference_path,
     relative_error,
-    save_state,
-    state_path,
+    write_checkpoint,
     write_reference,
 )
-from mivol.validate.trust import Doubt, trust
+from mivol.validate.trust import Doubt, find_doubts
 
-__all__ = ["INTEGRATORS", "render_reference", "RgbExtinction", "find_rgb_extinctions", "with_channel"]
+__all__ = ["INTEGRATORS", "render_reference", "RgbExtinction", "find_rgb_extinctions", "use_channel"]
 
 # Who may judge: Mitsuba's forward integrators for media.
 INTEGRATORS = ("volpath", "volpathmis")
 
 # Fewer batches say too little of their variance: with 32 a standard error is known to 1/sqrt(2 * 31) = 13 %.
-FEWEST_BATCHES = 32
+MIN_BATCHES = 32
 
 # Paths in one render, by backend: below a second or so on two cores, so that Ctrl-C acts soon, and enough to fill a GPU.
 PATHS_PER_PASS = {"llvm": 2**18, "cuda": 2**22}
 
 # Bytes a pixel that are kept beside a batch: mean and squares of three channels in float64, and what a batch makes of them.
-KEPT = (2 + 3) * 3 * 8
+BATCH_BYTES = (2 + 3) * 3 * 8
 
 SECONDS_BETWEEN_CHECKPOINTS = 20.0
 
@@ -116,15 +116,15 @@ def render_reference(
         )
     loaded = scene if isinstance(scene, LoadedScene) else load_scene(scene, overrides)
     method = {"integrator": integrator, "max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
-    setup = _Setup.of(loaded, sensor, method, seed)
-    check_film(setup.sensor, KEPT)
-    path = destination_of(Path(out), loaded.name, setup.identity)
-    doubts = _judge(loaded.scene, setup.sensor, accept_doubts)
+    setup = _RenderSetup.of(loaded, sensor, method, seed)
+    check_film(setup.sensor, BATCH_BYTES)
+    path = reference_path(Path(out), loaded.name, setup.identity)
+    doubts = _check_trust(loaded.scene, setup.sensor, accept_doubts)
     goal = _Goal(target_se, relative, max_spp)
 
     if path != Path(out):
         _drop_damaged(path)
-    result = _finished(path, setup.identity, goal)
+    result = _read_finished(path, setup.identity, goal)
     if result is None:
         setup = setup.with_passes(pass_spp or _stored_pass_spp(path), max_spp)
         progress_bar = _progress(path.stem, goal) if progress else nullcontext(lambda run: None)
@@ -137,7 +137,7 @@ def render_reference(
 
 
 @dataclass(frozen=True)
-class _Setup:
+class _RenderSetup:
     """Everything that one batch needs, and the identity that makes batches comparable."""
 
     scene: mi.Scene
@@ -149,7 +149,9 @@ class _Setup:
     pass_spp: int = 0
 
     @staticmethod
-    def of(loaded: LoadedScene, sensor: int | Mapping[str, object] | mi.Sensor, method: dict[str, Any], seed: int) -> _Setup:
+    def of(
+        loaded: LoadedScene, sensor: int | Mapping[str, object] | mi.Sensor, method: dict[str, Any], seed: int
+    ) -> _RenderSetup:
         """The setup, but for the samples of a pass."""
         look = _sensor(loaded.scene, sensor)
         columns, rows = (int(n) for n in look.film().crop_size())
@@ -167,18 +169,18 @@ class _Setup:
             "mitsuba": mi.__version__,
             "drjit": dr.__version__,
         }
-        return _Setup(loaded.scene, look, made, identity, extinction, (rows, columns, channels))
+        return _RenderSetup(loaded.scene, look, made, identity, extinction, (rows, columns, channels))
 
-    def with_passes(self, wanted: int | None, max_spp: int) -> _Setup:
+    def with_passes(self, wanted: int | None, max_spp: int) -> _RenderSetup:
         """With ``wanted`` samples a pass, or as many as suit.
 
         Raises:
             MivolError: ``max_spp`` does not suffice for enough batches of so many.
         """
-        spp = _real_spp(self.sensor, wanted or _pass_spp(self.shape[0] * self.shape[1], max_spp))
-        if spp * FEWEST_BATCHES > max_spp:
+        spp = _effective_spp(self.sensor, wanted or _choose_pass_spp(self.shape[0] * self.shape[1], max_spp))
+        if spp * MIN_BATCHES > max_spp:
             raise MivolError(
-                f"{max_spp} samples are too few for {FEWEST_BATCHES} batches of {spp}; allow {spp * FEWEST_BATCHES} or more."
+                f"{max_spp} samples are too few for {MIN_BATCHES} batches of {spp}; allow {spp * MIN_BATCHES} or more."
             )
         return replace(self, pass_spp=spp, identity={**self.identity, "pass_spp": spp})
 
@@ -193,7 +195,7 @@ class _Setup:
         else:
             image = np.empty(self.shape)
             for channel in range(3):
-                with with_channel(self.extinction, channel):
+                with use_channel(self.extinction, channel):
                     image[..., channel] = self._render(3 * index + channel)[..., channel]
         if not np.isfinite(image).all():
             row, column, channel = (int(i) for i in np.argwhere(~np.isfinite(image))[0])
@@ -227,16 +229,16 @@ def _channels(film: mi.Film) -> int:
     return 3 if found.startswith("rgb") else 1
 
 
-def _real_spp(sensor: mi.Sensor, spp: int) -> int:
+def _effective_spp(sensor: mi.Sensor, spp: int) -> int:
     """Samples that the sensor's sampler makes of so many: a stratified one rounds up."""
     sampler = sensor.sampler().clone()
     sampler.set_sample_count(spp)
     return int(sampler.sample_count())
 
 
-def _pass_spp(pixels: int, max_spp: int) -> int:
+def _choose_pass_spp(pixels: int, max_spp: int) -> int:
     paths = PATHS_PER_PASS["cuda" if mi.variant().startswith("cuda") else "llvm"]
-    return max(1, min(paths // pixels, max_spp // FEWEST_BATCHES))
+    return max(1, min(paths // pixels, max_spp // MIN_BATCHES))
 
 
 def _base_seed(seed: int) -> int:
@@ -253,7 +255,7 @@ class _Goal:
     max_spp: int
 
     def reached(self, batches: int, spp: int, mean: np.ndarray, variance: np.ndarray) -> bool:
-        return batches >= FEWEST_BATCHES and (spp >= self.max_spp or self.accurate(mean, variance))
+        return batches >= MIN_BATCHES and (spp >= self.max_spp or self.accurate(mean, variance))
 
     def accurate(self, mean: np.ndarray, variance: np.ndarray) -> bool:
         error = float(np.sqrt(variance.mean()))
@@ -261,7 +263,7 @@ class _Goal:
 
 
 @dataclass
-class _Run:
+class _BatchRun:
     """Batches so far; ``moments`` is replaced whole, so that an interrupt finds it valid."""
 
     moments: Moments
@@ -275,7 +277,7 @@ class _Run:
 
 
 def _render_until(
-    goal: _Goal, setup: _Setup, run: _Run, path: Path, doubts: tuple[Doubt, ...], show: Callable[[_Run], None]
+    goal: _Goal, setup: _RenderSetup, run: _BatchRun, path: Path, doubts: tuple[Doubt, ...], show: Callable[[_BatchRun], None]
 ) -> ReferenceResult:
     rendered = False
     try:
@@ -297,13 +299,13 @@ def _render_until(
     return result
 
 
-def _result(setup: _Setup, run: _Run, path: Path, doubts: tuple[Doubt, ...]) -> ReferenceResult:
+def _result(setup: _RenderSetup, run: _BatchRun, path: Path, doubts: tuple[Doubt, ...]) -> ReferenceResult:
     m = run.moments
     return ReferenceResult(m.mean, m.variance_of_mean, m.n, m.n * run.pass_spp, setup.identity, path, doubts, run.seconds)
 
 
 @contextmanager
-def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
+def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_BatchRun], None]]:
     """A bar on the error output; where that is no terminal, in notebooks too, a line at the end.
 
     Bars of rich in a notebook need ipywidgets, and rich complains where they are missing.
@@ -314,9 +316,9 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
     console = Console(stderr=True)
     columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[error]}"), TimeRemainingColumn()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"reference {name}", total=FEWEST_BATCHES, error="")
+        task = bar.add_task(f"reference {name}", total=MIN_BATCHES, error="")
 
-        def show(run: _Run) -> None:
+        def show(run: _BatchRun) -> None:
             if run.moments.n < 2:
                 return
             error = float(np.sqrt(run.moments.variance_of_mean.mean()))
@@ -324,7 +326,7 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
             # The error falls as 1/sqrt(n): batches still to come follow from the error now.
             most = goal.max_spp / run.pass_spp
             needed = run.moments.n * (reached / goal.target_se) ** 2 if goal.target_se else most
-            total = int(np.ceil(max(FEWEST_BATCHES, min(most, needed))))
+            total = int(np.ceil(max(MIN_BATCHES, min(most, needed))))
             bar.update(task, completed=run.moments.n, total=total, error=f"error {reached:.2g}")
 
         yield show
@@ -338,7 +340,7 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
 
 def _drop_damaged(path: Path) -> None:
     """Remove what cannot be read from a folder whose files mivol names, so that it is made anew; a warning says so."""
-    for file, read in ((path, read_reference), (state_path(path), read_state)):
+    for file, read in ((path, read_reference), (checkpoint_path(path), read_checkpoint)):
         try:
             if file.exists():
                 read(file)
@@ -347,7 +349,7 @@ def _drop_damaged(path: Path) -> None:
             file.unlink()
 
 
-def _finished(path: Path, identity: dict[str, Any], goal: _Goal) -> ReferenceResult | None:
+def _read_finished(path: Path, identity: dict[str, Any], goal: _Goal) -> ReferenceResult | None:
     """What is on disk, if it is good enough."""
     if not path.exists():
         return None
@@ -358,31 +360,31 @@ def _finished(path: Path, identity: dict[str, Any], goal: _Goal) -> ReferenceRes
 
 def _stored_pass_spp(path: Path) -> int | None:
     """Samples of a pass of what is on disk, so that a reference can be continued to a higher accuracy."""
-    state = state_path(path)
+    state = checkpoint_path(path)
     if state.exists():
-        return int(read_state(state)[0]["identity"]["pass_spp"])
+        return int(read_checkpoint(state)[0]["identity"]["pass_spp"])
     return int(read_reference(path).identity["pass_spp"]) if path.exists() else None
 
 
-def _load_state(path: Path, setup: _Setup) -> _Run:
-    state = state_path(path)
+def _load_state(path: Path, setup: _RenderSetup) -> _BatchRun:
+    state = checkpoint_path(path)
     if not state.exists():
-        return _Run(Moments.empty(setup.shape), setup.pass_spp, 0.0)
-    made, moments = read_state(state)
+        return _BatchRun(Moments.empty(setup.shape), setup.pass_spp, 0.0)
+    made, moments = read_checkpoint(state)
     check_identity(state, made["identity"], setup.identity)
-    return _Run(moments, setup.pass_spp, made["seconds"])
+    return _BatchRun(moments, setup.pass_spp, made["seconds"])
 
 
-def _save_state(path: Path, setup: _Setup, run: _Run) -> None:
-    save_state(path, setup.identity, run.moments, run.seconds)
+def _save_state(path: Path, setup: _RenderSetup, run: _BatchRun) -> None:
+    write_checkpoint(path, setup.identity, run.moments, run.seconds)
     run.saved = time.monotonic()
 
 
 # -- Doubts ---------------------------------------------------------------------------------------
 
 
-def _judge(scene: mi.Scene, sensor: mi.Sensor, accept: bool) -> tuple[Doubt, ...]:
-    doubts: Sequence[Doubt] = trust(scene, [sensor])
+def _check_trust(scene: mi.Scene, sensor: mi.Sensor, accept: bool) -> tuple[Doubt, ...]:
+    doubts: Sequence[Doubt] = find_doubts(scene, [sensor])
     fatal = [d for d in doubts if d.fatal]
     if fatal and not accept:
         raise MivolError(f"Mitsuba {mi.__version__} is no reference here: {fatal[0].sentence}")
@@ -416,21 +418,21 @@ def find_rgb_extinctions(scene: mi.Scene) -> list[RgbExtinction]:
             continue
         params = traverse_medium(medium)
         keys = [k for k in params.keys() if k.partition(".")[0] in ("sigma_t", "sigma_a", "sigma_s")]  # noqa: SIM118
-        values = {key: _array(params[key]) for key in keys}
+        values = {key: _copy_values(params[key]) for key in keys}
         values = {k: v for k, v in values.items() if v.ndim and v.shape[-1] == 3 and np.any(v != v[..., :1])}
         if values:
             found.append(RgbExtinction(params, values))
     return found
 
 
-def _array(value: Any) -> np.ndarray:
+def _copy_values(value: Any) -> np.ndarray:
     """A copy of the values, channels last."""
     array = np.array(value)
     return array.reshape(-1) if isinstance(value, mi.Color3f) else array
 
 
 @contextmanager
-def with_channel(media: list[RgbExtinction], channel: int) -> Iterator[None]:
+def use_channel(media: list[RgbExtinction], channel: int) -> Iterator[None]:
     """Give all channels the extinction of one, inside of a ``with`` block."""
     try:
         for medium in media:

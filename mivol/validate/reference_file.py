@@ -29,12 +29,12 @@ from mivol.validate.trust import Doubt
 __all__ = [
     "ReferenceResult",
     "check_identity",
-    "destination_of",
+    "reference_path",
     "read_reference",
-    "read_state",
+    "read_checkpoint",
     "relative_error",
-    "save_state",
-    "state_path",
+    "write_checkpoint",
+    "checkpoint_path",
     "write_reference",
 ]
 
@@ -127,21 +127,21 @@ def read_reference(path: str | Path, content_hash: str | None = None) -> Referen
     if "mivol_reference" not in header:
         raise MivolError(f"{path} is an image but not a reference of mivol's; make one with mivol reference.")
     try:
-        found = _stored(Path(path), channels, json.loads(header["mivol_reference"]))
+        found = _from_channels(Path(path), channels, json.loads(header["mivol_reference"]))
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise MivolError(f"{path} is a damaged reference; delete it, and make it with mivol reference.") from error
     if content_hash is not None and found.identity["scene"] != content_hash:
-        raise MivolError(_other(Path(path), "scene", found.identity["scene"], content_hash))
+        raise MivolError(_describe_difference(Path(path), "scene", found.identity["scene"], content_hash))
     return found
 
 
-def _identity(made: dict[str, Any]) -> dict[str, Any]:
+def _parse_identity(made: dict[str, Any]) -> dict[str, Any]:
     """What an image is of and how it was made; KeyError where the scene or the samples of a pass are missing."""
     identity = dict(made["identity"])
     return identity | {"scene": str(identity["scene"]), "pass_spp": int(identity["pass_spp"])}
 
 
-def _stored(path: Path, channels: dict[str, np.ndarray], made: dict[str, Any]) -> ReferenceResult:
+def _from_channels(path: Path, channels: dict[str, np.ndarray], made: dict[str, Any]) -> ReferenceResult:
     """A reference of the channels of its file and of what its header says."""
     names = [name for name in ("R", "G", "B", "Y") if name in channels]
     return ReferenceResult(
@@ -149,14 +149,14 @@ def _stored(path: Path, channels: dict[str, np.ndarray], made: dict[str, Any]) -
         variance=np.stack([channels[f"variance.{n}"] for n in names], axis=-1).astype(np.float64),
         batches=int(made["batches"]),
         spp=int(made["spp"]),
-        identity=_identity(made),
+        identity=_parse_identity(made),
         path=path,
         doubts=tuple(Doubt(**d) for d in made["doubts"]),
         seconds=float(made["seconds"]),
     )
 
 
-def destination_of(out: Path, name: str, identity: dict[str, Any]) -> Path:
+def reference_path(out: Path, name: str, identity: dict[str, Any]) -> Path:
     """The file of a reference: ``out`` itself, or a file in the folder ``out`` named after the scene and the identity.
 
     Raises:
@@ -171,7 +171,7 @@ def destination_of(out: Path, name: str, identity: dict[str, Any]) -> Path:
     return out / f"{name}-{identity['scene'][:12]}-{how[:8]}.exr"
 
 
-def state_path(path: Path) -> Path:
+def checkpoint_path(path: Path) -> Path:
     """Where the batches so far are kept."""
     return path.with_suffix(".state.npz")
 
@@ -184,10 +184,10 @@ def check_identity(path: Path, found: dict[str, Any], wanted: dict[str, Any]) ->
     """
     for key, value in wanted.items():
         if found.get(key) != value:
-            raise MivolError(_other(path, key, found.get(key), value))
+            raise MivolError(_describe_difference(path, key, found.get(key), value))
 
 
-def _other(path: Path, key: str, found: Any, wanted: Any) -> str:
+def _describe_difference(path: Path, key: str, found: Any, wanted: Any) -> str:
     if key == "scene":
         return (
             f"{path} is the reference of another scene (content {str(found)[:12]}, not {str(wanted)[:12]}); choose another "
@@ -196,14 +196,14 @@ def _other(path: Path, key: str, found: Any, wanted: Any) -> str:
     return f"{path} was made with {key} = {found}, not {wanted}; choose another file, or delete it."
 
 
-def save_state(path: Path, identity: dict[str, Any], moments: Moments, seconds: float) -> None:
+def write_checkpoint(path: Path, identity: dict[str, Any], moments: Moments, seconds: float) -> None:
     """Write the batches so far beside a reference."""
     text = json.dumps({"identity": identity, "seconds": seconds})
     m = moments
-    write_whole(state_path(path), lambda file: np.savez(file, n=m.n, mean=m.mean, m2=m.m2, made=np.array(text)))
+    write_whole(checkpoint_path(path), lambda file: np.savez(file, n=m.n, mean=m.mean, m2=m.m2, made=np.array(text)))
 
 
-def read_state(state: Path) -> tuple[dict[str, Any], Moments]:
+def read_checkpoint(state: Path) -> tuple[dict[str, Any], Moments]:
     """The batches of a checkpoint, with ``identity`` and ``seconds``.
 
     Raises:
@@ -212,7 +212,7 @@ def read_state(state: Path) -> tuple[dict[str, Any], Moments]:
     try:
         stored = read_archive(state)
         made = json.loads(str(stored["made"]))
-        found = {"identity": _identity(made), "seconds": float(made["seconds"])}
+        found = {"identity": _parse_identity(made), "seconds": float(made["seconds"])}
         return found, Moments(int(stored["n"]), stored["mean"], stored["m2"])
     except (MivolError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise MivolError(f"{state} is not a whole checkpoint of a reference; delete it to start over.") from error

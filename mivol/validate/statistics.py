@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.validate.moments import Moments, pool, tiles_of
+from mivol.validate.moments import Moments, average_tiles, split_tiles
 
 __all__ = [
     "FAMILIES",
@@ -26,8 +26,8 @@ __all__ = [
     "Estimate",
     "Significance",
     "assert_same_mean",
-    "batches_for",
-    "bias",
+    "required_batches",
+    "estimate_bias",
     "effective_dof",
     "p_value",
     "pooled_dof",
@@ -96,14 +96,14 @@ def effective_dof(variances: np.ndarray, dof: np.ndarray | float, axis: int | tu
 
 
 def pooled_dof(var: np.ndarray, dof: float, tile: int) -> np.ndarray:
-    """Degrees of freedom of the variances that :func:`mivol.validate.moments.pool` gives, (H // tile, W // tile, C).
+    """Degrees of freedom of the variances that :func:`mivol.validate.moments.average_tiles` gives, (H // tile, W // tile, C).
 
     Args:
         var: (H, W, C), of independent pixels.
         dof: of the variance of one pixel.
         tile: side of a tile [pixel].
     """
-    return effective_dof(tiles_of(var, tile), dof, axis=(1, 3))
+    return effective_dof(split_tiles(var, tile), dof, axis=(1, 3))
 
 
 # -- Tests ----------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ def z_bound(level: Significance, dof: np.ndarray | float = np.inf) -> np.ndarray
     return np.where(np.isinf(dof), normal, -stdtrit(np.where(np.isinf(dof), 1.0, dof), tail))
 
 
-def _welch(a: Estimate, b: Estimate) -> np.ndarray:
+def _difference_dof(a: Estimate, b: Estimate) -> np.ndarray:
     """Degrees of freedom of the variance of a difference."""
     dof = np.stack(np.broadcast_arrays(a.dof, b.dof, a.var)[:2]).astype(np.float64)
     return effective_dof(np.stack([a.var, b.var]), dof, axis=0)
@@ -219,8 +219,8 @@ def assert_same_mean(
         a, b: means of any shape, (H, W, C) where ``tile`` is above 1. Student's t with Welch's degrees of freedom takes the
             place of the normal law where variances are estimated; ``dof`` is one number where ``tile`` is above 1.
         level: chance that this call raises although the means agree. Name the comparisons where several images share it.
-        tile: average tiles of so many pixels first; for heavy tails, see :func:`mivol.validate.moments.pool`. The variance of a
-            tile has the degrees of freedom of all its pixels, :func:`pooled_dof`.
+        tile: average tiles of so many pixels first; for heavy tails, see :func:`mivol.validate.moments.average_tiles`. The
+            variance of a tile has the degrees of freedom of all its pixels, :func:`pooled_dof`.
         rounding: see :func:`z_image`.
         what: subject of the sentence.
 
@@ -229,7 +229,7 @@ def assert_same_mean(
             that this test would find nine times in ten.
         MivolError: a value that is not finite, or a negative variance: nothing can be said then.
     """
-    a, b, dof = _prepared(a, b, tile)
+    a, b, dof = _prepare_tiles(a, b, tile)
     level = level.over(a.mean.size)
     z = z_image(a, b, rounding)
     bound = z_bound(level, dof)
@@ -252,22 +252,22 @@ def p_value(a: Estimate, b: Estimate, *, comparisons: int | None = None, tile: i
     """
     from scipy.special import ndtr, stdtr
 
-    a, b, dof = _prepared(a, b, tile)
+    a, b, dof = _prepare_tiles(a, b, tile)
     z = np.abs(z_image(a, b, rounding))
     tail = 2 * np.where(np.isinf(dof), ndtr(-z), stdtr(np.where(np.isinf(dof), 1.0, dof), -z))
     m = comparisons or max(a.mean.size, 1)
     return float(-np.expm1(m * np.log1p(-np.min(tail, initial=1.0).clip(max=1 - 1e-16))))
 
 
-def _prepared(a: Estimate, b: Estimate, tile: int) -> tuple[Estimate, Estimate, np.ndarray]:
+def _prepare_tiles(a: Estimate, b: Estimate, tile: int) -> tuple[Estimate, Estimate, np.ndarray]:
     """Estimates of pixels or tiles, and the degrees of freedom of the variance of their difference."""
-    a, b = _checked(a, b)
+    a, b = _check_estimates(a, b)
     if tile > 1:
-        a, b = (Estimate(*pool(e.mean, e.var, tile), pooled_dof(e.var, e.dof, tile)) for e in (a, b))
-    return a, b, _welch(a, b)
+        a, b = (Estimate(*average_tiles(e.mean, e.var, tile), pooled_dof(e.var, e.dof, tile)) for e in (a, b))
+    return a, b, _difference_dof(a, b)
 
 
-def _checked(a: Estimate, b: Estimate) -> tuple[Estimate, Estimate]:
+def _check_estimates(a: Estimate, b: Estimate) -> tuple[Estimate, Estimate]:
     """Two estimates as float64 arrays of one shape.
 
     Raises:
@@ -309,7 +309,7 @@ def smallest_detectable_bias(
     return (z_bound(level, dof) + NormalDist().inv_cdf(power)) * s
 
 
-def batches_for(wanted_bias: float, variance: float, *, level: Significance = STRICT, power: float = 0.9) -> int:
+def required_batches(wanted_bias: float, variance: float, *, level: Significance = STRICT, power: float = 0.9) -> int:
     """Batches (or samples) so that a bias worth catching is caught: variance ((z_alpha + z_power)/bias)^2, rounded up.
 
     Args:
@@ -340,7 +340,7 @@ class Bias:
     alpha: float
 
 
-def bias(a: Estimate, b: Estimate, *, alpha: float = 1e-3, correlated: int = 1) -> Bias:
+def estimate_bias(a: Estimate, b: Estimate, *, alpha: float = 1e-3, correlated: int = 1) -> Bias:
     """Mean difference of two images: finds a bias too small for any one pixel to show.
 
     Args:
@@ -351,7 +351,7 @@ def bias(a: Estimate, b: Estimate, *, alpha: float = 1e-3, correlated: int = 1) 
             radius r pixels: at most (2 floor(2 r) + 1)^2 pixels; times 3 where the channels share paths). The variance of
             the sum is at most ``correlated`` times the sum of variances, since Cov(i, j) <= (v_i + v_j)/2.
     """
-    a, b = _checked(a, b)
+    a, b = _check_estimates(a, b)
     value = float((a.mean - b.mean).mean())
     error = float(np.sqrt(correlated * (a.var + b.var).sum()) / a.mean.size)
     spread = effective_dof(np.stack([a.var, b.var]), np.reshape([a.dof, b.dof], (2,) + (1,) * a.mean.ndim))

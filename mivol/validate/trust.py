@@ -16,26 +16,35 @@ from itertools import combinations
 import mitsuba as mi
 import numpy as np
 
-from mivol.scene.nesting import bounds, nesting_fault
+from mivol.scene.nesting import find_nesting_fault, shape_bounds
 from mivol.transport.media.medium_view import find_children, medium_kind, traverse_medium
 
-__all__ = ["CHECKS", "Doubt", "trust", "ON_FACE", "RESTART", "MediumShape", "number", "read_medium_shape"]
+__all__ = [
+    "DOUBT_CHECKS",
+    "FACE_TOLERANCE",
+    "RESTART_DISTANCE",
+    "Doubt",
+    "MediumShape",
+    "find_doubts",
+    "first_number",
+    "read_medium_shape",
+]
 
 # exp(-x) is 0 in float32 (denormals flushed) from 87.3: the density of passing untouched, by which Mitsuba divides.
-DEEPEST = 87.0
+MAX_OPTICAL_DEPTH = 87.0
 
 # Mean cosine of `hg` samples, measured: -0.41 at g = 1e-7, -0.029 at 1e-6; the error falls as 1/g.
-SMALLEST_G = 1e-3
+MIN_G = 1e-3
 
 # Mitsuba's shadow rays end math::ShadowEpsilon, 10 RayEpsilon, of their length before an emitter: nearer to it than this, times
 # (1 + max|p|), one that starts anew at a boundary reaches behind its surface, and is dark.
 NEAR_EMITTER = 0.1
 
-TOUCHES = 512
+TOUCH_POINTS = 512
 """Those of them that are looked at for another boundary."""
 
 # The smallest share of the light that is worth a word: below the noise of most references.
-SMALLEST_SKIN = 2e-3
+MIN_SKIN_LOSS = 2e-3
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,7 @@ class Doubt:
     fatal: bool = True
 
 
-def trust(scene: mi.Scene, sensors: Sequence[mi.Sensor] | None = None) -> list[Doubt]:
+def find_doubts(scene: mi.Scene, sensors: Sequence[mi.Sensor] | None = None) -> list[Doubt]:
     """Every reason not to believe what Mitsuba 3.9.1 renders of a scene.
 
     Args:
@@ -61,9 +70,9 @@ def trust(scene: mi.Scene, sensors: Sequence[mi.Sensor] | None = None) -> list[D
         sensors: the cameras that will look at it; by default its own.
     """
     boundaries = [read_medium_shape(s) for s in scene.shapes() if s.interior_medium() is not None]
-    doubts = [Doubt(kind, *found) for kind, check in CHECKS.items() for b in boundaries for found in check(b)]
+    doubts = [Doubt(kind, *found) for kind, check in DOUBT_CHECKS.items() for b in boundaries for found in check(b)]
     doubts += [Doubt("touching", _touching(a, b)) for a, b in combinations(boundaries, 2) if _touch(a, b)]
-    fault = nesting_fault(scene)
+    fault = find_nesting_fault(scene)
     doubts += [Doubt("overlap", fault)] if fault is not None else []
     emitting = [s for s in scene.shapes() if s.is_emitter()]
     doubts += [Doubt("near emitter", *found) for shape in emitting for b in boundaries for found in _near_emitter(shape, b)]
@@ -96,10 +105,11 @@ def _rotated(b: MediumShape) -> Found:
 
 def _too_deep(b: MediumShape) -> Found:
     depth = b.majorant * b.diagonal
-    if b.overhangs and depth > DEEPEST:
+    if b.overhangs and depth > MAX_OPTICAL_DEPTH:
         yield (
             f"{b.name} is larger than the box of its grid, and the largest extinction times its diagonal is {depth:.3g}, above "
-            f"{DEEPEST:g}: Mitsuba shows 0 where a ray misses the grid (issue 336); make the boundary the grid's own box."
+            f"{MAX_OPTICAL_DEPTH:g}: Mitsuba shows 0 where a ray misses the grid (issue 336); make the boundary the grid's own "
+            "box."
         ), True
 
 
@@ -136,8 +146,8 @@ def _wrong_inverse(b: MediumShape) -> Found:
 
 
 def _small_g(b: MediumShape) -> Found:
-    g = number(b.params.get("phase_function.g", 0.0))
-    if 0 < abs(g) < SMALLEST_G and not _is_black(b):
+    g = first_number(b.params.get("phase_function.g", 0.0))
+    if 0 < abs(g) < MIN_G and not _is_black(b):
         yield (
             f"the phase function inside {b.name} is hg with g = {g:.2g}: the mean cosine of Mitsuba's samples is off by about "
             "3e-8/g; use the isotropic phase function."
@@ -164,7 +174,7 @@ def _emission(b: MediumShape) -> Found:
 
 
 def _thick_skin(b: MediumShape) -> Found:
-    if b.skin > SMALLEST_SKIN and not _is_black(b):
+    if b.skin > MIN_SKIN_LOSS and not _is_black(b):
         yield (
             f"the medium inside {b.name} is dense where it touches it: Mitsuba starts rays a little behind the surface where "
             f"they enter, and loses about {b.skin:.1%} of the light that comes back head-on, more aslant; leave the outermost "
@@ -172,7 +182,7 @@ def _thick_skin(b: MediumShape) -> Found:
         ), False
 
 
-CHECKS: dict[str, Callable[[MediumShape], Found]] = {
+DOUBT_CHECKS: dict[str, Callable[[MediumShape], Found]] = {
     "not finite": _not_finite,
     "rotated grid": _rotated,
     "too deep": _too_deep,
@@ -192,9 +202,9 @@ def _touch(a: MediumShape, b: MediumShape) -> bool:
 
 
 def _lies_on(a: MediumShape, b: MediumShape) -> bool:
-    p = a.surface[:TOUCHES]
+    p = a.surface[:TOUCH_POINTS]
     out = p - a.points.mean(axis=0)
-    step = RESTART * (1 + np.abs(p).max(axis=1, keepdims=True)) * out / np.linalg.norm(out, axis=1, keepdims=True)
+    step = RESTART_DISTANCE * (1 + np.abs(p).max(axis=1, keepdims=True)) * out / np.linalg.norm(out, axis=1, keepdims=True)
     near = np.all((p >= b.points.min(axis=0) - np.abs(step)) & (p <= b.points.max(axis=0) + np.abs(step)), axis=1)
     changes = sum(b.holds(q + s) != b.holds(q - s) for q, s in zip(p[near], step[near], strict=True))
     return changes >= 0.01 * len(p)
@@ -215,7 +225,7 @@ SAMPLER = (
 
 
 def _near_emitter(shape: mi.Shape, b: MediumShape) -> Found:
-    near, far = (np.array(v, np.float64) for v in bounds(shape))
+    near, far = (np.array(v, np.float64) for v in shape_bounds(shape))
     low, high = b.points.min(axis=0), b.points.max(axis=0)
     reach = NEAR_EMITTER * (1 + np.abs([near, far, low, high]).max())
     gap = np.linalg.norm(np.maximum(0, np.maximum(near - high, low - far)))
@@ -241,11 +251,11 @@ def _camera_inside(sensor: mi.Sensor, boundaries: list[MediumShape]) -> Iterator
             )
 
 
-ON_FACE = 1e-4
+FACE_TOLERANCE = 1e-4
 """Mitsuba prints transforms to 6 digits, and float32 vertices carry 1e-7 of their size: what lies this little outside the unit
 cube lies on its face."""
 
-RESTART = 1500 * 2.0**-24
+RESTART_DISTANCE = 1500 * 2.0**-24
 """math::RayEpsilon of float32: Mitsuba restarts a ray at p on a surface (1 + max|p|) times this behind it, along the normal."""
 
 POINTS = 4096
@@ -292,7 +302,7 @@ class MediumShape:
     def overhang(self, to_local: np.ndarray) -> bool:
         """Whether the shape reaches outside a box that is mapped to the unit cube."""
         q = self.points @ to_local[:3, :3].T + to_local[:3, 3]
-        return bool(np.any(q < -ON_FACE) or np.any(q > 1 + ON_FACE))
+        return bool(np.any(q < -FACE_TOLERANCE) or np.any(q > 1 + FACE_TOLERANCE))
 
     @property
     def diagonal(self) -> float:
@@ -323,7 +333,7 @@ def read_medium_shape(shape: mi.Shape) -> MediumShape:
     points = np.array(geometry["vertex_positions"], np.float64).reshape(-1, 3) if mesh else _corners(shape.bbox())
     faces = np.array(geometry["faces"]).reshape(-1, 3) if mesh else None
     to_world = _matrix(geometry["to_world"]) if shape.shape_type() == mi.ShapeType.Sphere.value else None
-    to_local, scale = _reach(kind, volumes), number(params.get("scale", 1.0))
+    to_local, scale = _stock_box(kind, volumes), first_number(params.get("scale", 1.0))
     surface = _surface(points, faces, to_world)
     return MediumShape(
         name=shape.id() or f"the {shape.class_name()}",
@@ -336,7 +346,7 @@ def read_medium_shape(shape: mi.Shape) -> MediumShape:
         grids=tuple(_printed(v, "matrix") for v in volumes if v.class_name() == "GridVolume"),
         surface=surface,
         majorant=scale * sum(float(np.max(v.max())) for v in volumes),
-        skin=scale * _skin(surface + ON_FACE * (points.mean(axis=0) - surface), volumes, to_local),
+        skin=scale * _skin(surface + FACE_TOLERANCE * (points.mean(axis=0) - surface), volumes, to_local),
         params={key: params[key] for key in params.keys()},  # noqa: SIM118  (iteration gives pairs)
     )
 
@@ -363,8 +373,8 @@ def _skin(points: np.ndarray, volumes: list[mi.Volume], to_local: np.ndarray | N
         sigma = sigma + np.array(value).reshape(len(value), -1).max(axis=0)
     if to_local is not None:
         q = points @ to_local[:3, :3].T + to_local[:3, 3]
-        sigma = sigma * np.all((q > -ON_FACE) & (q < 1 + ON_FACE), axis=1)
-    return float((sigma * RESTART * (1 + np.abs(points).max(axis=1))).max(initial=0))
+        sigma = sigma * np.all((q > -FACE_TOLERANCE) & (q < 1 + FACE_TOLERANCE), axis=1)
+    return float((sigma * RESTART_DISTANCE * (1 + np.abs(points).max(axis=1))).max(initial=0))
 
 
 def _extinction_volumes(medium: mi.Medium) -> list[mi.Volume]:
@@ -372,7 +382,7 @@ def _extinction_volumes(medium: mi.Medium) -> list[mi.Volume]:
     return [v for name, v in find_children(medium).items() if name in ("sigma_t", "sigma_a", "sigma_s")]
 
 
-def _reach(kind: str, volumes: list[mi.Volume]) -> np.ndarray | None:
+def _stock_box(kind: str, volumes: list[mi.Volume]) -> np.ndarray | None:
     """World to the unit cube of the volume under a stock ``heterogeneous``; None for media that have no such box.
 
     A ``mivol_medium`` in a boundary larger than its grids is right under stock integrators (seen at depths of 1800), and a
@@ -388,7 +398,7 @@ def _reach(kind: str, volumes: list[mi.Volume]) -> np.ndarray | None:
     return np.linalg.inv(box)
 
 
-def number(value: object) -> float:
+def first_number(value: object) -> float:
     """The first number of whatever ``mi.traverse`` hands out."""
     return float(np.ravel(np.array(value))[0])
 

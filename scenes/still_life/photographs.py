@@ -23,7 +23,7 @@ from mivol.photos import Camera, intrinsics
 from mivol.photos.camera_path import aim_camera
 from mivol.photos.transforms import write_transforms
 from mivol.scene.description import content_hash
-from mivol.scene.sensors import sensor_of
+from mivol.scene.sensors import to_sensor
 
 import mitsuba as mi
 import numpy as np
@@ -199,7 +199,7 @@ def make(folder: Path, views: int = 75, size: int = 128, spp: int = 64, scene: s
     (folder / "shows.txt").unlink(missing_ok=True)
     loaded = mi.load_dict(things)
     for number, (name, look) in enumerate(looks.items()):
-        sensor = mi.load_dict(sensor_of(look, pixel_format="rgba") | {"sampler": {"type": "multijitter"}})
+        sensor = mi.load_dict(to_sensor(look, pixel_format="rgba") | {"sampler": {"type": "multijitter"}})
         shown = np.array(mi.render(loaded, sensor=sensor, spp=spp, seed=SEED + number))
         colour, alpha = shown[..., :3], shown[..., 3:]
         write_png(folder / name, np.concatenate([colour / np.where(alpha > 0, alpha, 1), alpha], axis=2))

@@ -10,7 +10,7 @@ import pytest
 from mivol.errors import MivolError
 from mivol.validate.compare import Comparison, compare
 from mivol.validate.reference_file import ReferenceResult
-from mivol.validate.statistics import Estimate, Significance, bias, smallest_detectable_bias, z_bound
+from mivol.validate.statistics import Estimate, Significance, estimate_bias, smallest_detectable_bias, z_bound
 
 SHAPE = (4, 6, 3)
 MEAN, ERROR = 0.5, 1e-3
@@ -57,7 +57,7 @@ def test_the_image_has_errors_of_its_own():
     np.testing.assert_allclose(exact.z, 2.5)
     np.testing.assert_allclose(noisy.z, 2.5 / np.sqrt(2))
     assert not exact.agrees and exact.beyond == 0 and exact.bias.low > 0
-    own = bias(even(0.5, ERROR**2), even(0.5, ERROR**2))
+    own = estimate_bias(even(0.5, ERROR**2), even(0.5, ERROR**2))
     assert noisy.bias.standard_error == pytest.approx(np.sqrt(3) * own.standard_error)
 
 

@@ -14,7 +14,7 @@ from scipy import stats
 
 from mivol.experiments.script import explain
 from mivol.scene import depth_two
-from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, scattering_depth
+from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, sample_lines, scattering_depth
 from mivol.scene.needs import mean_cosine
 from mivol.transport.media.medium_view import view_medium
 from mivol.transport.traversal.box import Box
@@ -102,7 +102,7 @@ SIX = 2 * stats.norm.sf(6)
 @pytest.fixture
 def fresh_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     """Depths are means over lines of this round of seeds."""
-    monkeypatch.setattr(depth_two, "draw_lines", lambda box, n: draw_lines(box, n, fresh(0)))
+    monkeypatch.setattr(depth_two, "sample_lines", lambda box, n: sample_lines(box, n, fresh(0)))
 
 
 @pytest.mark.statistical
@@ -111,7 +111,7 @@ def test_lines_are_even(name: str) -> None:
     """Cauchy: their mean length is 4 V / A in any convex body. Each begins and ends on the boundary (float64: 1e-12), and
     stays inside between."""
     box, n = Box(FRAMES[name]), 20_000
-    o, d, length = draw_lines(box, n, fresh(0))
+    o, d, length = sample_lines(box, n, fresh(0))
     edges = box.to_world[:3, :3].T
     area = 2 * sum(np.linalg.norm(np.cross(edges[i], edges[j])) for i, j in ((0, 1), (1, 2), (2, 0)))
     wanted = 4 * abs(np.linalg.det(edges)) / area

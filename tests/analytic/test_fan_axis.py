@@ -76,8 +76,8 @@ def test_the_axis_is_where_it_was_put(case: str) -> None:
     light = light_of(beam)
     axis = fan_axis.axis_from_fans(-np.log(light), light, replace(beam, axis_offset=9.0))
     assert abs(axis.column - column_of(beam)) < 2 * axis.uncertainty
-    assert fan_axis.SAMPLED <= axis.uncertainty < 5 * fan_axis.SAMPLED
-    assert fan_axis.offset_of_cone(axis, beam) == pytest.approx(beam.axis_offset, abs=2 * axis.uncertainty * beam.pitch[1])
+    assert fan_axis.SAMPLING_ERROR <= axis.uncertainty < 5 * fan_axis.SAMPLING_ERROR
+    assert fan_axis.cone_axis_offset(axis, beam) == pytest.approx(beam.axis_offset, abs=2 * axis.uncertainty * beam.pitch[1])
     rows = "2 rows" if case == "rows beside the plane" else "1 row"
     assert axis.method == f"rays measured from both ends, {rows}"
 
@@ -96,11 +96,11 @@ def test_the_uncertainty_is_that_of_repeated_noise() -> None:
         counts = np.random.default_rng(fresh(seed)).poisson(300.0 * light).astype(float)
         y = -np.log(np.maximum(counts, 1.0) / 300.0)
         axis = fan_axis.axis_from_fans(y, counts, beam)
-        found.append((axis.column, axis.uncertainty**2 - fan_axis.SAMPLED**2))
+        found.append((axis.column, axis.uncertainty**2 - fan_axis.SAMPLING_ERROR**2))
     columns, claimed = np.transpose(found)
     assert_same_variance(columns, claimed.mean(), what="axes of cone beams")
     mean = Estimate(columns.mean(), columns.var(ddof=1) / 64, 63)
-    assert_same_mean(mean, column_of(beam), rounding=fan_axis.SAMPLED, what="axes of cone beams")
+    assert_same_mean(mean, column_of(beam), rounding=fan_axis.SAMPLING_ERROR, what="axes of cone beams")
 
 
 def test_pixels_that_are_not_used_tell_nothing() -> None:
@@ -110,7 +110,7 @@ def test_pixels_that_are_not_used_tell_nothing() -> None:
     y, weights = -np.log(light), light.copy()
     weights[..., 9] = weights[20:22] = 0.0
     y[weights == 0] = 50.0
-    assert abs(fan_axis.axis_from_fans(y, weights, beam).column - column_of(beam)) < 2 * fan_axis.SAMPLED
+    assert abs(fan_axis.axis_from_fans(y, weights, beam).column - column_of(beam)) < 2 * fan_axis.SAMPLING_ERROR
 
 
 REFUSED = {
@@ -137,8 +137,8 @@ def test_air_and_noise_have_no_axis(y: np.ndarray) -> None:
 
 def test_the_least_of_sectors() -> None:
     """Two sectors of 3 (x - 7 -+ 0.2)^2: least at 7, and their slopes of -+1.2 there make 0.2; a ridge is refused."""
-    found = fan_axis._least_of_parts(lambda x: np.array([3 * (x - 7.2) ** 2, 3 * (x - 6.8) ** 2]), 6.5, 1.0)
+    found = fan_axis._sector_minimum(lambda x: np.array([3 * (x - 7.2) ** 2, 3 * (x - 6.8) ** 2]), 6.5, 1.0)
     assert found == pytest.approx((7.0, np.sqrt(2 * 2 * 1.2**2) / 12))
     for ridge in (lambda x: np.array([-(x**2), 0.0]), lambda x: np.array([x, (x - 9) ** 2])):
         with pytest.raises(MivolError, match="no column near 0"):
-            fan_axis._least_of_parts(ridge, 0.0, 1.0)
+            fan_axis._sector_minimum(ridge, 0.0, 1.0)

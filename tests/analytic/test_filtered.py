@@ -9,10 +9,10 @@ from mivol.errors import MivolError
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, PencilRays, VoxelGrid
 from mivol.tomography.phantoms import EllipsoidPhantom
-from mivol.tomography.preprocess import bridge_gaps
+from mivol.tomography.preprocess import interpolate_gaps
 from mivol.tomography.projector import Projector
 from mivol.tomography.ramp import WINDOWS, filter_ramp
-from mivol.tomography.redundancy import angle_steps, full_turn_shares, half_scan_shares
+from mivol.tomography.redundancy import angle_steps, full_turn_weights, parker_weights
 
 GRID = VoxelGrid((1, 48, 48))
 RADIUS, CENTRE, VALUE = 14.0, (4.0, -2.5), 2.0
@@ -114,16 +114,16 @@ def test_shares_of_a_line_add_up_to_one() -> None:
     rng = np.random.default_rng(1)
     excess, gamma = 0.5, np.linspace(-0.4, 0.4, 41)
     for beta in rng.uniform(0, np.pi + 2 * excess, 50):
-        first = half_scan_shares(np.array([beta]), gamma, excess)[0]
+        first = parker_weights(np.array([beta]), gamma, excess)[0]
         for k, g in enumerate(gamma):
             other = np.mod(beta + np.pi - 2 * g, 2 * np.pi)
             seen = other <= np.pi + 2 * excess
-            second = half_scan_shares(np.array([other]), -gamma[k : k + 1], excess)[0, 0] if seen else 0.0
+            second = parker_weights(np.array([other]), -gamma[k : k + 1], excess)[0, 0] if seen else 0.0
             assert first[k] + second == pytest.approx(1.0, abs=1e-12)
-    shares = full_turn_shares(np.linspace(-0.1, 0.4, 501))
+    shares = full_turn_weights(np.linspace(-0.1, 0.4, 501))
     assert np.abs(shares[:201] + shares[200::-1] - 1).max() < 1e-12
     assert (shares[201:] == 1).all()
-    assert (full_turn_shares(np.linspace(-0.4, 0.4, 9)) == 0.5).all()
+    assert (full_turn_weights(np.linspace(-0.4, 0.4, 9)) == 0.5).all()
 
 
 def test_steps_share_the_circle() -> None:
@@ -136,8 +136,8 @@ def test_steps_share_the_circle() -> None:
 
 def test_unused_pixels_are_bridged() -> None:
     y, weights = np.array([[[7.0, 1.0, 9.0, 3.0, 8.0]], [[5.0] * 5]]), np.array([[[0.0, 1, 0, 2, 0]], [[0.0] * 5]])
-    assert bridge_gaps(y, weights).tolist() == [[[1.0, 1.0, 2.0, 3.0, 3.0]], [[0.0] * 5]]
-    assert bridge_gaps(y, weights + 1) is y
+    assert interpolate_gaps(y, weights).tolist() == [[[1.0, 1.0, 2.0, 3.0, 3.0]], [[0.0] * 5]]
+    assert interpolate_gaps(y, weights + 1) is y
 
 
 def test_scans_that_miss_directions_are_refused(variant_rgb: str) -> None:

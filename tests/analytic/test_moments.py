@@ -7,7 +7,7 @@ import pytest
 from false_alarms import assert_same_variance
 
 from mivol.errors import MivolError
-from mivol.validate.moments import Moments, pool
+from mivol.validate.moments import Moments, average_tiles
 
 
 def test_moments_keep_their_digits(seed):
@@ -38,9 +38,9 @@ def test_pooled_tiles(seed):
     """Means of 2x2 tiles, their variance by measurement over 4000 images, and what does not fill a tile left out."""
     rng = np.random.default_rng(seed)
     sigma = np.arange(1, 31, dtype=float).reshape(5, 6, 1)
-    means = np.array([pool(rng.normal(size=sigma.shape) * sigma, sigma**2, 2)[0] for _ in range(4000)])
-    _, var = pool(sigma, sigma**2, 2)
+    means = np.array([average_tiles(rng.normal(size=sigma.shape) * sigma, sigma**2, 2)[0] for _ in range(4000)])
+    _, var = average_tiles(sigma, sigma**2, 2)
     assert means.shape[1:] == (2, 3, 1)
     assert_same_variance(means, var, what="tiles")
     with pytest.raises(MivolError, match="tiles of 9 pixels"):
-        pool(sigma, sigma, 9)
+        average_tiles(sigma, sigma, 9)

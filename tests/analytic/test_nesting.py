@@ -6,7 +6,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.scene.nesting import MOST_PAIRS, ON_FACE, OrientedBox, _is_closed, _number, _pairs, bounds, box_around, extent
+from mivol.scene.nesting import (
+    FACE_TOLERANCE,
+    MAX_PAIRS,
+    OrientedBox,
+    _is_closed,
+    _pairs,
+    _registry_id,
+    oriented_box,
+    scene_diagonal,
+    shape_bounds,
+)
 from scenes import rotation
 
 UPRIGHT = np.eye(3)
@@ -25,7 +35,7 @@ def test_a_gap_counts_in_sizes_of_the_larger_box(turn: np.ndarray, size: float, 
     """The size is the largest coordinate of both boxes, whichever is asked; a margin of either sign is met to a part in 1e9."""
     one = box(np.full(3, -size), np.full(3, size), turn)
     largest = np.abs(one.corners).max()
-    for margin in (ON_FACE, -ON_FACE, 0.01):
+    for margin in (FACE_TOLERANCE, -FACE_TOLERANCE, 0.01):
         for off, shared in ((-1e-3, True), (1e-3, False)):
             low, high = np.full(3, -0.1 * size), np.full(3, 0.1 * size)
             low[axis], high[axis] = size + margin * largest * (1 + off * np.sign(margin)), 1.2 * size
@@ -72,19 +82,19 @@ def cube(x: float, half: float = 0.5) -> dict:
 def test_boxes_around_shapes(variant_rgb: str) -> None:
     turn = mi.ScalarTransform4f().rotate([0, 0, 1], 30).scale([1, 2, 3])
     made = scene(a={"type": "cube", "to_world": turn}, b={"type": "sphere", "center": [9, 0, 0], "radius": 2})
-    turned, ball = (box_around(s) for s in made.shapes())
+    turned, ball = (oriented_box(s) for s in made.shapes())
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
     np.testing.assert_allclose(turned.edges, [[c, s, 0], [-s, c, 0], [0, 0, 1]], atol=1e-6)
     np.testing.assert_allclose(np.ptp(turned.corners @ turned.edges.T, axis=0), [2, 4, 6], rtol=1e-6)
     np.testing.assert_allclose([ball.corners.min(axis=0), ball.corners.max(axis=0)], [[7, -2, -2], [11, 2, 2]], rtol=1e-6)
     assert len(np.unique(ball.corners, axis=0)) == len(np.unique(turned.corners, axis=0)) == 8
     np.testing.assert_array_equal(ball.edges, np.eye(3))
-    low, high = bounds(made.shapes()[1])
+    low, high = shape_bounds(made.shapes()[1])
     np.testing.assert_allclose([low, high], [[7, -2, -2], [11, 2, 2]], rtol=1e-6)
     left = -(c + 2 * s)
     whole = [11 - left, 2 * (2 * c + s), 6]
-    assert extent(made) == pytest.approx(np.linalg.norm(whole), rel=1e-6)
-    assert extent(scene()) == 0.0
+    assert scene_diagonal(made) == pytest.approx(np.linalg.norm(whole), rel=1e-6)
+    assert scene_diagonal(scene()) == 0.0
 
 
 def test_pairs_are_those_that_share_space(variant_rgb: str) -> None:
@@ -94,9 +104,9 @@ def test_pairs_are_those_that_share_space(variant_rgb: str) -> None:
     names = lambda pairs: {(a.id(), b.id()) for a, b in pairs}  # noqa: E731
     assert names(_pairs(shapes, set())) == {("b", "c")}
     for traced in (0, 1):
-        assert names(_pairs(shapes, {_number(mi.ShapePtr(shapes[traced]))})) == {("a", "b"), ("b", "c")}
+        assert names(_pairs(shapes, {_registry_id(mi.ShapePtr(shapes[traced]))})) == {("a", "b"), ("b", "c")}
     crowd = scene(**{f"c{i}": cube(0.01 * i) for i in range(13)})
-    assert len(_pairs(crowd.shapes(), set())) == MOST_PAIRS
+    assert len(_pairs(crowd.shapes(), set())) == MAX_PAIRS
 
 
 def test_what_is_closed(variant_rgb: str) -> None:

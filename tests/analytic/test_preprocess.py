@@ -12,7 +12,7 @@ from mivol.tomography.preprocess import LightDrift, Transmission
 
 def test_noise_of_which_the_form_is_known() -> None:
     """As of 10,000 quanta; what is darker than nothing has none."""
-    found = preprocess.of_unknown_noise(np.array([[[0.5, -0.1, 2.0]]]))
+    found = preprocess.assume_quantum_noise(np.array([[[0.5, -0.1, 2.0]]]))
     assert found.value.tolist() == [[[0.5, -0.1, 2.0]]] and found.variance.tolist() == [[[0.5e-4, 0.0, 2e-4]]]
 
 
@@ -90,7 +90,7 @@ def test_quanta_of_a_pixel() -> None:
 def test_air_is_a_straight_line_through_both_edges() -> None:
     """Means of 2 and of 4 of the finite pixels in two columns at either edge, between their middles and beyond."""
     value = np.array([[[1.0, 3, 9, 9, np.nan, 4]]])
-    air = preprocess.find_air(value, 2)
+    air = preprocess.fit_air(value, 2)
     np.testing.assert_allclose(air, [[[1.75, 2.25, 2.75, 3.25, 3.75, 4.25]]], rtol=1e-14)
     found = preprocess.normalise_air(Transmission(value, np.ones_like(value)), 2)
     np.testing.assert_allclose(found.value, value / air, rtol=1e-14)
@@ -102,18 +102,18 @@ def test_air_is_a_straight_line_through_both_edges() -> None:
     dark = np.ones((2, 3, 6))
     dark[1, 2, :2] = np.nan
     with pytest.raises(MivolError, match="at an edge of row 2 of view 1"):
-        preprocess.find_air(dark, 2)
+        preprocess.fit_air(dark, 2)
 
 
 def test_light_that_is_noise_counts_nothing() -> None:
     """Three standard deviations are noise, a little more is light; without variance, or not finite, nothing is known."""
     value = np.array([0.75, 0.7501, 2.0, np.nan, 0.5, 0.5, 0.5])
     variance = np.array([0.0625, 0.0625, 0.04, 0.01, np.nan, 0.0, np.inf])
-    y, weights = preprocess.line_integrals(Transmission(value, variance))
+    y, weights = preprocess.to_line_integrals(Transmission(value, variance))
     t = np.array([0.7501, 2.0])
     np.testing.assert_allclose(y, [0, *-np.log(t), 0, 0, 0, 0], rtol=1e-14)
     np.testing.assert_allclose(weights, [0, *(t**2 / [0.0625, 0.04]), 0, 0, 0, 0], rtol=1e-14)
-    y, _ = preprocess.line_integrals(Transmission(value, variance), 2.0)
+    y, _ = preprocess.to_line_integrals(Transmission(value, variance), 2.0)
     assert y[0] == pytest.approx(-np.log(0.75))
 
 

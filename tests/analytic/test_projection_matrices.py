@@ -11,7 +11,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments import projections
 from mivol.tomography.geometry import ConeBeam
-from mivol.tomography.panel_views import PanelViews, panels_of_matrices
+from mivol.tomography.panel_views import PanelViews, panels_from_matrices
 
 BEAM = ConeBeam(np.array([0.2, 1.9, 4.0]), (5, 4), 7.0, 11.0, (0.3, 0.4), axis_offset=0.6, detector_offset=(-0.2, 0.7))
 
@@ -42,7 +42,7 @@ def table_of(beam: ConeBeam) -> PanelViews:
 @pytest.mark.parametrize("factor", [1.0, -3e4])
 def test_rays_are_those_of_the_equal_table(factor: float) -> None:
     """Inverting a matrix whose condition is about 100 leaves 1e-14 of the lengths of 10 or so."""
-    found = panels_of_matrices(factor * matrices_of(BEAM), BEAM.detector)
+    found = panels_from_matrices(factor * matrices_of(BEAM), BEAM.detector)
     for ours, theirs in zip(found.rays([2, 0]), table_of(BEAM).rays([2, 0]), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
 
@@ -50,14 +50,14 @@ def test_rays_are_those_of_the_equal_table(factor: float) -> None:
 def test_pixels_may_be_counted_from_elsewhere() -> None:
     """From the first pixel's corner, and from 1 on."""
     moved = np.array([[1.0, 0.0, 1.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]) @ matrices_of(BEAM)
-    found = panels_of_matrices(moved, BEAM.detector, first_pixel=(1.5, 0.5))
+    found = panels_from_matrices(moved, BEAM.detector, first_pixel=(1.5, 0.5))
     np.testing.assert_allclose(found.rays()[1], table_of(BEAM).rays()[1], atol=1e-12)
 
 
 def test_the_half_of_a_line_that_is_meant_is_told_by_what_is_seen() -> None:
     """A source between the origin and the object: rays run to the object, and the origin is behind them."""
     beyond = 2 * table_of(BEAM).table[0, :3]
-    found = panels_of_matrices(matrices_of(BEAM)[:1], BEAM.detector, seen=beyond)
+    found = panels_from_matrices(matrices_of(BEAM)[:1], BEAM.detector, seen=beyond)
     np.testing.assert_allclose(found.rays()[1], -table_of(BEAM).rays([0])[1], atol=1e-12)
 
 
@@ -74,12 +74,12 @@ def test_matrices_without_a_source_are_refused(at: tuple, value: float, sentence
     matrices = matrices_of(BEAM)
     matrices[at] = value
     with pytest.raises(MivolError, match=sentence):
-        panels_of_matrices(matrices, BEAM.detector)
+        panels_from_matrices(matrices, BEAM.detector)
 
 
 def test_matrices_of_another_shape_are_refused() -> None:
     with pytest.raises(MivolError, match=r"shape \(3, 12\), expected \(views, 3, 4\)"):
-        panels_of_matrices(np.ones((3, 12)), (2, 2))
+        panels_from_matrices(np.ones((3, 12)), (2, 2))
 
 
 def test_a_file_of_matrices_is_the_beam_of_a_scan(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.tomography.preprocess import correct_transmission, count_quanta, find_air, line_integrals
+from mivol.tomography.preprocess import correct_transmission, count_quanta, fit_air, to_line_integrals
 
 GAIN, READ_NOISE = 2.5, 4.0
 
@@ -56,7 +56,7 @@ def test_dead_and_saturated_pixels_are_not_used() -> None:
     assert (quanta.counts[lost] == 0).all()
     assert (quanta.blank > 0).all()
     assert quanta.counts[0, 0, 0] == 0
-    y, weights = line_integrals(correct_transmission(readings, flats, darks, saturation=5000.0))
+    y, weights = to_line_integrals(correct_transmission(readings, flats, darks, saturation=5000.0))
     assert (y[lost] == 0).all()
     assert (weights[lost] == 0).all()
     assert (weights[~lost][1:] > 0).all()
@@ -80,7 +80,7 @@ def test_air_leaves_out_dead_pixels() -> None:
     """The same line through the others; without any of them there is no air."""
     t = np.full((1, 2, 8), 0.9)
     t[0, 1, 0] = np.nan
-    np.testing.assert_allclose(find_air(t, 2), 0.9, rtol=1e-15)
+    np.testing.assert_allclose(fit_air(t, 2), 0.9, rtol=1e-15)
     t[0, 1, 1] = np.inf
     with pytest.raises(MivolError, match="at an edge of row 1 of view 0"):
-        find_air(t, 2)
+        fit_air(t, 2)

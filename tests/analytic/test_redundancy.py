@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.tomography.redundancy import BLEND_COLUMNS, angle_steps, covers, full_turn_shares, half_scan_shares, widest_gap
+from mivol.tomography.redundancy import BLEND_COLUMNS, angle_steps, covers_circle, full_turn_weights, parker_weights, widest_gap
 
 
 def test_the_widest_gap_and_where_it_ends() -> None:
@@ -22,7 +22,7 @@ def test_the_widest_gap_and_where_it_ends() -> None:
 def test_four_steps_may_lie_between_two_views(missing: int, covered: bool) -> None:
     """Of 16 views on a circle of 16 so many lie elsewhere: a gap of one more; exactly four steps are enough."""
     angles = np.concatenate([np.arange(16.0 - missing), np.full(missing, 0.5)])
-    assert covers(angles, 16.0) == covered
+    assert covers_circle(angles, 16.0) == covered
 
 
 def test_steps_of_one_view_and_of_equal_ones() -> None:
@@ -38,9 +38,9 @@ def test_shares_of_a_displaced_detector(turned: bool) -> None:
     for short, column in ((100, 0.01), (200, 0.01), (10, 0.01)):
         gamma = np.arange(-short, 2 * short + 1) * column
         width = min(short, max(short / 5, BLEND_COLUMNS)) * column
-        shares = full_turn_shares(gamma)
+        shares = full_turn_weights(gamma)
         if turned:
-            shares = full_turn_shares(-gamma[::-1])[::-1]
+            shares = full_turn_weights(-gamma[::-1])[::-1]
         begin = short * column - width
         wanted = np.sin(np.pi / 2 * np.clip((np.abs(gamma) - begin) / width, 0, 1)) ** 2
         np.testing.assert_allclose(shares, 0.5 * (1 + np.where(gamma < 0, -1, 1) * wanted), atol=1e-9)
@@ -49,18 +49,18 @@ def test_shares_of_a_displaced_detector(turned: bool) -> None:
 
 def test_detectors_that_are_centred_or_miss_the_axis() -> None:
     """Within a column of the middle all count a half; the axis must be seen."""
-    assert full_turn_shares(np.array([-2.0, -1, 0, 1, 2.9])).tolist() == [0.5] * 5
-    assert full_turn_shares(np.arange(-2.0, 4.0))[-1] == 1
+    assert full_turn_weights(np.array([-2.0, -1, 0, 1, 2.9])).tolist() == [0.5] * 5
+    assert full_turn_weights(np.arange(-2.0, 4.0))[-1] == 1
     for gamma in (np.array([0.0, 0.1, 0.2]), np.array([0.1, 0.2]), np.array([-0.3, -0.2, -0.1]), np.array([0.3])):
         with pytest.raises(MivolError, match="wholly on one side of the rotation axis"):
-            full_turn_shares(gamma)
+            full_turn_weights(gamma)
 
 
 def test_parkers_shares() -> None:
     """His formula with gamma the other way round (Parker 1982, equation 12): rise, 1, and fall, for each ray."""
     excess, gamma = 0.4, np.array([-0.6, -0.4, -0.1, 0.0, 0.3, 0.4, 0.5])
     beta = np.linspace(0, np.pi + 2 * excess, 23)
-    found = half_scan_shares(beta, gamma, excess)
+    found = parker_weights(beta, gamma, excess)
     for i, b in enumerate(beta):
         for j, g in enumerate(-np.clip(gamma, -excess, excess)):
             if b < 2 * (excess - g):

@@ -34,18 +34,18 @@ def bump(centre: float, n: int = 40) -> np.ndarray:
 @pytest.mark.parametrize("column", [18.3, 21.0, 23.75])
 def test_mirrors_have_their_column_in_the_middle(column: float) -> None:
     """a(s) = b(2 c - s): cubic interpolation of a bump of 3 and 2 pixels is good to a few thousandths."""
-    assert axes._mirror_column(bump(column - 3), bump(column + 3)) == pytest.approx(column, abs=5e-3)
+    assert axes._find_mirror_column(bump(column - 3), bump(column + 3)) == pytest.approx(column, abs=5e-3)
 
 
 def test_a_constant_and_its_deviation() -> None:
     """The mean of four numbers and its standard error; as a line through five, that of least squares."""
     values = np.array([1.0, 2, 4, 5])
-    assert axes._fit_constant(np.ones((4, 1)), values) == pytest.approx((3, np.sqrt(10 / 3 / 4)))
+    assert axes._fit_first_coefficient(np.ones((4, 1)), values) == pytest.approx((3, np.sqrt(10 / 3 / 4)))
     x, y = np.array([0.0, 1, 2, 3, 5]), np.array([1.0, 2, 2, 4, 4])
     (slope, offset), covariance = np.polyfit(x, y, 1, cov=True)
     assert slope > 0
-    assert axes._fit_constant(np.stack([np.ones(5), x], 1), y) == pytest.approx((offset, np.sqrt(covariance[1, 1])))
-    assert axes._fit_constant(np.ones((1, 1)), np.array([7.0])) == pytest.approx((7, 0))
+    assert axes._fit_first_coefficient(np.stack([np.ones(5), x], 1), y) == pytest.approx((offset, np.sqrt(covariance[1, 1])))
+    assert axes._fit_first_coefficient(np.ones((1, 1)), np.array([7.0])) == pytest.approx((7, 0))
 
 
 def test_moments_follow_a_circle() -> None:
@@ -68,7 +68,7 @@ def test_moments_follow_a_circle() -> None:
     found = axes.axis_from_moments(rough, angles)
     design = np.stack([np.ones(7), np.cos(angles), np.sin(angles)], 1)
     centres = rough @ np.arange(11)
-    each = [axes._fit_constant(design, centres[:, row]) for row in range(2)]
+    each = [axes._fit_first_coefficient(design, centres[:, row]) for row in range(2)]
     assert found.column == pytest.approx((each[0][0] + each[1][0]) / 2)
     scatter = abs(each[0][0] - each[1][0]) / np.sqrt(2)
     assert scatter < np.hypot(each[0][1], each[1][1]) / np.sqrt(2)
@@ -82,8 +82,8 @@ def test_how_far_the_object_reaches() -> None:
     """From column 4.5 to that of the ninth of the densest ray; a tenth is not seen, and a tenth more is added."""
     y = np.zeros((2, 1, 20))
     y[0, 0, 5], y[1, 0, 15], y[1, 0, 18], y[0, 0, 1] = 10.0, 1.1, 1.0, 1.0
-    assert axes._reach(y, 4.5) == int(np.ceil(1.1 * 10.5))
-    assert axes._reach(y, 14.0) == int(np.ceil(1.1 * 9))
+    assert axes._object_radius(y, 4.5) == int(np.ceil(1.1 * 10.5))
+    assert axes._object_radius(y, 14.0) == int(np.ceil(1.1 * 9))
 
 
 def test_the_least_of_a_parabola() -> None:
@@ -143,12 +143,12 @@ def test_pairs_that_miss_half_a_turn_are_read_where_they_do_not(monkeypatch: pyt
     angles = np.array([0.0, 0.1, 0.2, np.pi - 0.02, np.pi + 0.11, np.pi + 0.23])
     y = np.arange(6.0)[:, None, None] + np.arange(4.0)
     columns = lambda a, b: 10 + 3 * (angles[int(b[0, 0])] - angles[int(a[0, 0])] - np.pi)  # noqa: E731
-    monkeypatch.setattr(axes, "_mirror_column", columns)
+    monkeypatch.setattr(axes, "_find_mirror_column", columns)
     found = axes.axis_from_mirrors(y, angles, 3)
     assert (found.column, found.uncertainty) == pytest.approx((10, 0), abs=1e-9)
     assert found.method == "mirror images, 3 pairs of views"
     exact = np.array([0.0, 0.1, np.pi, np.pi + 0.1])
-    monkeypatch.setattr(axes, "_mirror_column", lambda a, b: 4.0 + a[0, 0])
+    monkeypatch.setattr(axes, "_find_mirror_column", lambda a, b: 4.0 + a[0, 0])
     found = axes.axis_from_mirrors(y, exact, 2)
     assert (found.column, found.uncertainty) == pytest.approx((4.5, 0.5))
     flat = y.copy()

@@ -15,11 +15,11 @@ from mivol.validate.statistics import (
     Estimate,
     Significance,
     assert_same_mean,
-    batches_for,
-    bias,
     effective_dof,
+    estimate_bias,
     p_value,
     pooled_dof,
+    required_batches,
     smallest_detectable_bias,
     z_bound,
     z_image,
@@ -115,9 +115,9 @@ def test_power_is_as_promised(seed):
         except AssertionError:
             hits += 1
     assert_rate(hits, runs, 0.9)
-    n = batches_for(size / 10, 9.0, level=level)
+    n = required_batches(size / 10, 9.0, level=level)
     assert n == 100
-    assert batches_for(1e9, 1.0) == 1
+    assert required_batches(1e9, 1.0) == 1
 
 
 def test_message_names_pixel_and_power():
@@ -185,12 +185,12 @@ def test_bias_covers_and_finds(seed):
     runs = 1000
     missed = 0
     for _ in range(runs):
-        found = bias(Estimate(rng.normal(0.3, 1, 50), 1.0), Estimate(np.zeros(50)), alpha=0.05)
+        found = estimate_bias(Estimate(rng.normal(0.3, 1, 50), 1.0), Estimate(np.zeros(50)), alpha=0.05)
         missed += not found.low <= 0.3 <= found.high
     assert_rate(missed, runs, 0.05)
     # 6.3 standard errors, of which the interval takes 3.3.
     note(norm.sf(100_000**0.5 * 0.03 - 3.3), "bias")
-    found = bias(Estimate(rng.normal(0.03, 1, 100_000), 1.0), Estimate(np.zeros(100_000)))
+    found = estimate_bias(Estimate(rng.normal(0.03, 1, 100_000), 1.0), Estimate(np.zeros(100_000)))
     assert found.low > 0
 
 
@@ -201,7 +201,7 @@ def test_bias_of_estimated_variances(seed):
     runs, missed = 2000, 0
     for _ in range(runs):
         m = Moments.of(rng.normal(0.3, 1, (3, 2)))
-        found = bias(Estimate.of(m), Estimate(np.zeros(2)), alpha=0.05)
+        found = estimate_bias(Estimate.of(m), Estimate(np.zeros(2)), alpha=0.05)
         missed += not found.low <= 0.3 <= found.high
     assert_rate(missed, runs, 0.05, at_least=0.02)
 
@@ -213,8 +213,8 @@ def test_bias_of_correlated_pixels(seed):
     noise = rng.normal(size=(2000, 304))
     smooth = np.stack([noise[:, i : i + 300] for i in range(5)]).mean(axis=0)
     image, zero = Estimate(smooth[0], 1 / 5), Estimate(np.zeros(300))
-    naive = bias(image, zero).standard_error
-    safe = bias(image, zero, correlated=9).standard_error
+    naive = estimate_bias(image, zero).standard_error
+    safe = estimate_bias(image, zero, correlated=9).standard_error
     # The sum counts each sample five times, those near the ends one to four times.
     counts = np.convolve(np.ones(300), np.ones(5))
     real = np.sqrt(np.sum(counts**2)) / 5 / 300
@@ -236,7 +236,7 @@ def test_refusals():
         (lambda: Significance(0, 3), "alpha = 0"),
         (lambda: Significance(0.1, 0), "over 0 comparisons"),
         (lambda: Significance(0.1, 3, "sidek"), "sidak"),
-        (lambda: batches_for(0, 1), "a bias of 0"),
+        (lambda: required_batches(0, 1), "a bias of 0"),
         (lambda: smallest_detectable_bias(1.0, power=1), "power = 1"),
     ]
     for call, words in cases:

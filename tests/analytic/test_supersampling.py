@@ -10,7 +10,7 @@ import pytest
 from mivol.optim.projections.iterative import projected_cg
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.tomography.filtered import feldkamp
-from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid, subdivide, voxel_means
+from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
@@ -26,7 +26,7 @@ PARALLEL = ParallelBeam(np.arange(4.0), (2, 2))
 )
 def test_a_subdivided_grid_is_the_same_box(geometry: ConeBeam | ParallelBeam, shape: tuple, edges: tuple) -> None:
     """Three parts an edge; rows of a parallel beam see one height each, and z stays as it is."""
-    fine = subdivide(GRID, 3, geometry)
+    fine = subdivide_grid(GRID, 3, geometry)
     assert fine.shape == shape
     assert fine.voxel_size == pytest.approx(edges)
     assert fine.extent == pytest.approx(GRID.extent) and fine.centre == GRID.centre
@@ -35,7 +35,7 @@ def test_a_subdivided_grid_is_the_same_box(geometry: ConeBeam | ParallelBeam, sh
 @pytest.mark.parametrize("geometry", [CONE, PARALLEL])
 def test_means_are_those_of_blocks(geometry: ConeBeam | ParallelBeam) -> None:
     """A field that is linear in world coordinates has the mean of its value at the middle of a voxel."""
-    fine = subdivide(GRID, 2, geometry)
+    fine = subdivide_grid(GRID, 2, geometry)
     z, y, x = (3.0 * fine.axis("z")[:, None, None], 5.0 * fine.axis("y")[:, None], 7.0 * fine.axis("x"))
     expected = 3.0 * GRID.axis("z")[:, None, None] + 5.0 * GRID.axis("y")[:, None] + 7.0 * GRID.axis("x")
     found = voxel_means(z + y + x, GRID.shape)
@@ -53,7 +53,7 @@ def test_edges_do_not_ripple_in_finer_unknowns(variant_rgb: str) -> None:
     y, truth = head.project(beam), head.voxelise(grid, 4)
     errors = {}
     for parts in (1, 2):
-        a = Projector(beam, subdivide(grid, parts, beam))
+        a = Projector(beam, subdivide_grid(grid, parts, beam))
         start = np.maximum(feldkamp(a, y), 0)
         states = itertools.islice(projected_cg(LeastSquares(a, y, x0=start, nonnegative=True)), 16)
         errors[parts] = [nrmse(voxel_means(state.x.reshape(a.grid.shape), grid.shape), truth) for state in states]

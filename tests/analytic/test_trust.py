@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mivol.validate import trust
-from mivol.validate.trust import ON_FACE, MediumShape
+from mivol.validate.trust import FACE_TOLERANCE, MediumShape
 from scenes import affine, rotation
 
 CORNERS = np.array(list(product((0.0, 1.0), repeat=3)))
@@ -22,11 +22,11 @@ PLAIN = MediumShape("box", CORNERS, None, None, None, None, "", (), CORNERS, 1.0
 
 
 def found(kind: str, **facts: object) -> list[tuple[str, bool]]:
-    return list(trust.CHECKS[kind](replace(PLAIN, **facts)))
+    return list(trust.DOUBT_CHECKS[kind](replace(PLAIN, **facts)))
 
 
 def test_a_plain_medium_raises_no_doubt() -> None:
-    assert all(list(check(PLAIN)) == [] for check in trust.CHECKS.values())
+    assert all(list(check(PLAIN)) == [] for check in trust.DOUBT_CHECKS.values())
 
 
 def overhanging(by: float) -> np.ndarray:
@@ -34,8 +34,8 @@ def overhanging(by: float) -> np.ndarray:
     return affine(np.eye(3) * (1 + by))
 
 
-GRID = overhanging(2 * ON_FACE)
-INSIDE = overhanging(0.5 * ON_FACE)
+GRID = overhanging(2 * FACE_TOLERANCE)
+INSIDE = overhanging(0.5 * FACE_TOLERANCE)
 
 THRESHOLDS: dict[str, list[tuple[dict, bool | None]]] = {
     "not finite": [
@@ -108,7 +108,7 @@ THRESHOLDS: dict[str, list[tuple[dict, bool | None]]] = {
 
 
 def test_every_check_has_its_threshold() -> None:
-    assert THRESHOLDS.keys() == trust.CHECKS.keys()
+    assert THRESHOLDS.keys() == trust.DOUBT_CHECKS.keys()
 
 
 @pytest.mark.parametrize(("kind", "number"), [(kind, k) for kind, cases in THRESHOLDS.items() for k in range(len(cases))])
@@ -150,4 +150,4 @@ def test_a_point_is_inside() -> None:
         assert shape.holds(np.array(inside)) and not shape.holds(np.array(outside))
     assert PLAIN.diagonal == pytest.approx(np.sqrt(3)) and not PLAIN.overhangs
     assert replace(PLAIN, to_local=GRID).overhangs and not replace(PLAIN, to_local=INSIDE).overhangs
-    assert replace(PLAIN, to_local=affine(np.eye(3), [-2 * ON_FACE, 0, 0])).overhangs
+    assert replace(PLAIN, to_local=affine(np.eye(3), [-2 * FACE_TOLERANCE, 0, 0])).overhangs

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.scene.camera_rigs import RIGS, Hemisphere, LookAts, Ring, SceneSensors, find_box, look_at, rig_from
+from mivol.scene.camera_rigs import RIGS, Hemisphere, LookAts, Ring, SceneSensors, find_media_box, look_at, parse_rig
 
 BOX = np.array([[-1.0, 0.0, 2.0], [3.0, 1.0, 4.0]])
 CENTER = BOX.mean(axis=0)
@@ -86,11 +86,11 @@ def test_look_at_is_mitsubas(variant_rgb):
 
 def test_box_is_that_of_the_media(variant_rgb):
     """A floor does not count where a medium is; without media all shapes do."""
-    np.testing.assert_allclose(find_box(_scene()), BOX, atol=1e-6)
+    np.testing.assert_allclose(find_media_box(_scene()), BOX, atol=1e-6)
     only_floor = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}})
-    np.testing.assert_allclose(find_box(only_floor), [[-1, -1, 0], [1, 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(find_media_box(only_floor), [[-1, -1, 0], [1, 1, 0]], atol=1e-6)
     with pytest.raises(MivolError, match="no shape"):
-        find_box(mi.load_dict({"type": "scene", "light": {"type": "constant"}}))
+        find_media_box(mi.load_dict({"type": "scene", "light": {"type": "constant"}}))
 
 
 def test_scene_sensors(variant_rgb):
@@ -120,14 +120,14 @@ BAD = {
 def test_bad_tables_are_refused(table, words):
     """One sentence that names the setting."""
     with pytest.raises(MivolError, match=words):
-        rig_from(table)
+        parse_rig(table)
 
 
 @pytest.mark.parametrize("name", RIGS)
 def test_tables_name_every_rig(name):
     """Each rig is reached by its tag."""
     needed = {"look_at": {"origins": [[0, 0, 1]], "targets": [[0, 0, 0]]}}
-    assert type(rig_from({"rig": name, **needed.get(name, {})})) is RIGS[name]
+    assert type(parse_rig({"rig": name, **needed.get(name, {})})) is RIGS[name]
 
 
 def test_bad_boxes_and_poses(variant_rgb):

@@ -14,7 +14,7 @@ from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos import Camera, intrinsics, load_photos, survey_photos
 from mivol.photos.region import MIDDLE, count_levels, middle_box, nested_boxes, points_in_box
-from mivol.validate.images import colour_fitted, judge
+from mivol.validate.images import fit_colours, score_image
 
 
 def test_the_middle_box_is_a_cube_around_the_focus() -> None:
@@ -85,13 +85,13 @@ def test_the_colours_of_a_view_are_fitted_a_channel_at_a_time() -> None:
     """A render of another exposure and tint is the photograph once its colours are fitted; a mask takes pixels out."""
     photo = capture(1)[0].image.astype(np.float64)
     other = np.clip((photo - [0.05, 0.0, 0.1]) / [0.9, 1.3, 1.2], 0, 1)
-    assert judge(other, photo).values["psnr"] < 25
+    assert score_image(other, photo).values["psnr"] < 25
     # Where nothing was clipped the channels are linear in each other; 8 bits are left of the error.
     fine = ((other > 0) & (other < 1)).all(axis=-1)
-    fitted = colour_fitted(other, photo, fine)
+    fitted = fit_colours(other, photo, fine)
     np.testing.assert_allclose(fitted[fine], photo[fine], atol=1e-9)
     spoilt = np.where(fine[..., None], photo, 0.0)
-    np.testing.assert_allclose(colour_fitted(other, spoilt, fine), fitted, atol=1e-12)
+    np.testing.assert_allclose(fit_colours(other, spoilt, fine), fitted, atol=1e-12)
 
 
 def test_a_preset_brings_what_captures_need_and_the_file_overrides_it() -> None:

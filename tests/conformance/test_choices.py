@@ -62,8 +62,8 @@ def test_transport(media: tuple, settings: Settings, what: str, why: str) -> Non
 @pytest.mark.parametrize(("depth", "lit"), [(0, False), (1, False), (2, True), (3, True), (-1, True)])
 def test_light_is_scattered_from_depth_2_on(depth: int, lit: bool) -> None:
     settings = Settings(max_depth=depth)
-    assert choices.is_lit(needs(fog("a", is_scattering=False), fog()), settings) == lit
-    assert not choices.is_lit(needs(fog(is_scattering=False)), settings)
+    assert choices.is_scattering_visible(needs(fog("a", is_scattering=False), fog()), settings) == lit
+    assert not choices.is_scattering_visible(needs(fog(is_scattering=False)), settings)
 
 
 @pytest.mark.parametrize(
@@ -137,16 +137,16 @@ def test_shadows_are_no_question_without_a_grid_or_light():
 )
 def test_points_that_scatter(occupied: float, emitters: tuple, count: int) -> None:
     medium = fog(occupied=occupied)
-    found, (choice,) = choices.choose_events(needs(medium, emitters=emitters), LIT, ONCE)
+    found, (choice,) = choices.choose_scattering_points(needs(medium, emitters=emitters), LIT, ONCE)
     assert found == count and choice.choice == f"{count} of a camera ray" and f"{occupied:.0%} of the blocks" in choice.reason
 
 
 def test_one_point_scatters_where_there_is_more_than_one_grid():
     for media in ((fog(), fog("b")), (fog(resolutions=(*GRID, *GRID)),), (fog(resolutions=()),)):
-        found, (choice,) = choices.choose_events(needs(*media), LIT, ONCE)
+        found, (choice,) = choices.choose_scattering_points(needs(*media), LIT, ONCE)
         assert found == 1 and choice.reason == "there is more than one grid or none"
     for segment in ("scattering_quadrature", "absorption", FLIGHTS):
-        assert choices.choose_events(needs(fog()), LIT, segment) == (1, [])
+        assert choices.choose_scattering_points(needs(fog()), LIT, segment) == (1, [])
 
 
 def test_channels_emission_skipping_and_tracing():
@@ -208,8 +208,8 @@ def test_how_flights_are_drawn(medium: MediumFacts, choice: str) -> None:
     [
         ((0.8, None), True, 3, FLIGHTS, 0.8),
         ((0.3, 0.99), True, -1, FLIGHTS, 0.95),
-        ((choices.PEAKED,), True, 3, FLIGHTS, choices.PEAKED),
-        ((choices.PEAKED - 0.01,), True, 3, FLIGHTS, None),
+        ((choices.MIN_SIDE_FLIGHT_COSINE,), True, 3, FLIGHTS, choices.MIN_SIDE_FLIGHT_COSINE),
+        ((choices.MIN_SIDE_FLIGHT_COSINE - 0.01,), True, 3, FLIGHTS, None),
         ((None,), True, 3, FLIGHTS, None),
         ((0.8,), False, 3, FLIGHTS, None),
         ((0.8,), True, 2, FLIGHTS, None),

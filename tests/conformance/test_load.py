@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.scene.description import NO_TEXT, content_hash, reason_of
+from mivol.scene.description import NOT_UTF8, content_hash, describe_error
 from mivol.scene.load import load_scene
 from mivol.threads import run_child
 
@@ -127,9 +127,9 @@ def test_a_plugin_says_what_it_refuses(variant_rgb, tmp_path):
 
 def test_a_refusal_that_is_no_text_says_so() -> None:
     """Python 3.11.2 drops a message of Mitsuba's that quotes bytes that are not UTF-8."""
-    assert reason_of(RuntimeError("")) == NO_TEXT
-    assert reason_of(RuntimeError("  [a.cpp:1] ")) == NO_TEXT
-    assert reason_of(RuntimeError("[a.cpp:1] no such plugin")) == "no such plugin"
+    assert describe_error(RuntimeError("")) == NOT_UTF8
+    assert describe_error(RuntimeError("  [a.cpp:1] ")) == NOT_UTF8
+    assert describe_error(RuntimeError("[a.cpp:1] no such plugin")) == "no such plugin"
 
 
 def test_variants_are_checked():

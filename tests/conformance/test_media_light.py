@@ -11,10 +11,10 @@ from media_light_scenes import PLACE, SCENES, burning, drawn, floor, met, seen, 
 from scattering_scenes import assert_same_whole, close_up, moments, pencils, volpath
 
 from mivol.experiments.script import explain
-from mivol.scene.media_light import COST
+from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
-from mivol.scene.previews import gain_of_draws, measure_draws
+from mivol.scene.previews import measure_media_light, sampling_gain
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
 from scenes import ball_of, box_of, centred, medium, refused, render, skip_recorded_grids_on_a_gpu, sky, tensor
@@ -144,7 +144,7 @@ def test_what_draws_gain() -> None:
     small = clear_ball() | {"radius": 0.1}
     scene = close_up({"fire": small, "floor": floor()}, res=4, origin=(0.1, -0.1, 0.9), fov=20)
     share = 0.1**2 / 0.6**2
-    assert find_needs(scene, scene.sensors()[0]).media_light.gain * COST > 20 * (1 / share - 1)
+    assert find_needs(scene, scene.sensors()[0]).media_light.gain * SAMPLING_COST > 20 * (1 / share - 1)
     assert 0.1 < find_needs(room(), room().sensors()[0]).media_light.gain < 0.9
 
 
@@ -152,11 +152,11 @@ def test_the_gain_is_of_variances_or_of_what_chance_has_missed() -> None:
     """Cells of variances 4 and 1, and a cell in which chance finds nothing of a light of 1: 16 samples of it weigh 16."""
     swing = np.tile([-1.0, 1.0], 8) * np.sqrt(15 / 16)
     drawn_cells = np.stack([5 + swing, 5 + swing, 1 + 0.5 * swing])
-    assert gain_of_draws(5 + 2 * swing[None], drawn_cells[:1]) == pytest.approx(4 / COST)
-    assert gain_of_draws(0 * swing[None], drawn_cells[2:]) == pytest.approx(16 / 0.25 / COST)
-    median = gain_of_draws(np.stack([5 + 2 * swing, 5 + 3 * swing, 0 * swing]), drawn_cells)
-    assert median == pytest.approx(9 / COST)
-    assert gain_of_draws(np.zeros((2, 4)), np.zeros((2, 4))) == 0.0
+    assert sampling_gain(5 + 2 * swing[None], drawn_cells[:1]) == pytest.approx(4 / SAMPLING_COST)
+    assert sampling_gain(0 * swing[None], drawn_cells[2:]) == pytest.approx(16 / 0.25 / SAMPLING_COST)
+    median = sampling_gain(np.stack([5 + 2 * swing, 5 + 3 * swing, 0 * swing]), drawn_cells)
+    assert median == pytest.approx(9 / SAMPLING_COST)
+    assert sampling_gain(np.zeros((2, 4)), np.zeros((2, 4))) == 0.0
 
 
 @pytest.mark.slow
@@ -168,11 +168,11 @@ def test_draws_do_not_pay_where_other_light_has_the_noise() -> None:
         survey, sensor, settings = survey_scene(scene), scene.sensors()[0], Settings(max_depth=3)
         needs = find_needs(scene, sensor, survey)
         assert needs.media_light.gain > 1
-        assert measure_draws(scene, sensor, needs, survey, Settings(max_depth=3, media_light="drawn")) is needs
-        measured = measure_draws(scene, sensor, needs, survey, settings)
+        assert measure_media_light(scene, sensor, needs, survey, Settings(max_depth=3, media_light="drawn")) is needs
+        measured = measure_media_light(scene, sensor, needs, survey, settings)
         assert (measured.media_light.gain > 1) == make_plan(measured, settings).draws_emission == pays
         survey.gain_of_draws = 7.0
-        assert measure_draws(scene, sensor, needs, survey, settings).media_light.gain == 7.0
+        assert measure_media_light(scene, sensor, needs, survey, settings).media_light.gain == 7.0
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import scenes
 from mivol.experiments.script import explain
 from mivol.scene import plan
 from mivol.scene.needs import find_needs
-from mivol.scene.nesting import nesting_fault
+from mivol.scene.nesting import find_nesting_fault
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
@@ -287,7 +287,7 @@ def test_the_crossings_of_a_row_of_boxes_share_their_kernels():
         scene = mi.load_dict({"type": "scene", **row})
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            assert nesting_fault(scene) is None
+            assert find_nesting_fault(scene) is None
             return {k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])}
 
     assert 0 < len(launched(6)) == len(launched(2))

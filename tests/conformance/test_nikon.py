@@ -15,7 +15,7 @@ from mivol.experiments import projections
 from mivol.files import read_volume
 from mivol.files.nikon import read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.tomography.geometry import ConeBeam, VoxelGrid
-from mivol.tomography.panel_views import nikon_geometry
+from mivol.tomography.panel_views import geometry_from_nikon
 from mivol.tomography.projector import Projector
 
 VIEWS, ROWS, COLUMNS, WHITE = 16, 10, 12, 60000.0
@@ -70,7 +70,7 @@ def test_a_bead_is_projected_as_in_the_laboratory(tmp_path: Path, tilt: float, r
     through the pixel where the bead is seen must go through the bead in the frame of the volume; only float64 rounds.
     """
     scan = read_nikon(write_scan(tmp_path, blank(), ObjectOffsetX=0.3, ObjectTilt=tilt, ObjectRoll=roll))
-    geometry = nikon_geometry(scan, scan.angles)
+    geometry = geometry_from_nikon(scan, scan.angles)
     bead = np.array([0.7, -0.4, 0.5])
     t, r = np.radians([-tilt, roll])
     axis = np.array([np.sin(r), -np.sin(t) * np.cos(r), np.cos(t) * np.cos(r)])

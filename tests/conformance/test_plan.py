@@ -32,11 +32,11 @@ def needs(*media: MediumFacts, variant: str = "llvm_ad_rgb", **more: object) -> 
 def test_a_pass_ends_within_seconds(backend: str, rays: int, steps: int) -> None:
     """Rays times the cells that one of them may cross, the sum of edges of all grids, stay below a bound."""
     variant = f"{backend}_ad_rgb"
-    assert plan._pass_rays(needs(variant=variant)) == plan._pass_rays(needs(fog(), variant=variant)) == rays
-    assert plan._pass_rays(needs(fog((10, 20, 30)), variant=variant)) == rays
+    assert plan._rays_per_pass(needs(variant=variant)) == plan._rays_per_pass(needs(fog(), variant=variant)) == rays
+    assert plan._rays_per_pass(needs(fog((10, 20, 30)), variant=variant)) == rays
     large = fog((500, 1500, 3000), (100, 200, 300)), fog((400, 100, 100))
-    assert plan._pass_rays(needs(*large, variant=variant)) == min(rays, steps // 6200)
-    assert plan._pass_rays(needs(fog((10**5, 10**5, 10**5)), variant=variant)) == steps // 300_000
+    assert plan._rays_per_pass(needs(*large, variant=variant)) == min(rays, steps // 6200)
+    assert plan._rays_per_pass(needs(fog((10**5, 10**5, 10**5)), variant=variant)) == steps // 300_000
 
 
 @pytest.mark.parametrize("extinction", ["grey", "rgb"])
@@ -47,16 +47,16 @@ def test_memory_of_a_gradient_is_counted(monkeypatch: pytest.MonkeyPatch, extinc
     packed, nodes = gradient_bytes(small, channels), 8 * 9 * 10
     assert packed <= PACKED_LIMIT < gradient_bytes(large, channels)
     monkeypatch.setattr(plan, "available_memory", lambda: None)
-    memory, choice = plan._gradient(needs(fog(small, extinction=extinction)))
+    memory, choice = plan._plan_gradient_memory(needs(fog(small, extinction=extinction)))
     assert memory == packed + 8 * nodes * channels
     assert choice.choice == f"{memory / 2**20:.1f} MiB beyond the rays (packed corners, one copy a thread)"
     assert (choice.about, choice.reason) == ("gradient step", "parameters: none asked for yet")
-    elsewhere, _ = plan._gradient(needs(fog(small, extinction=extinction), variant="cuda_ad_rgb"))
+    elsewhere, _ = plan._plan_gradient_memory(needs(fog(small, extinction=extinction), variant="cuda_ad_rgb"))
     assert elsewhere == 8 * nodes * channels
-    both, choice = plan._gradient(needs(fog(small, large, extinction=extinction), fog(), parameters=("a", "b")))
+    both, choice = plan._plan_gradient_memory(needs(fog(small, large, extinction=extinction), fog(), parameters=("a", "b")))
     assert both == memory + 8 * 2000**3 * channels
     assert "(added to the nodes; packed corners, one copy a thread)" in choice.choice and choice.reason == "parameters: a, b"
-    nothing, choice = plan._gradient(needs(fog()))
+    nothing, choice = plan._plan_gradient_memory(needs(fog()))
     assert nothing == 0 and choice.choice == "0.0 MiB beyond the rays (no grid)"
 
 
@@ -65,15 +65,15 @@ def test_a_gradient_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch
     asked, medium = {"parameters": ("sigma_t",)}, fog((2000, 2000, 2000))
     memory = 8 * 2000**3
     monkeypatch.setattr(plan, "available_memory", lambda: memory)
-    assert plan._gradient(needs(medium, **asked))[0] == memory
+    assert plan._plan_gradient_memory(needs(medium, **asked))[0] == memory
     monkeypatch.setattr(plan, "available_memory", lambda: memory - 1)
     wanted = f"a gradient step would take {memory / GIB:.1f} GiB and {memory / GIB:.1f} GiB are free; lower the resolution"
     with pytest.raises(MivolError, match=wanted):
-        plan._gradient(needs(medium, **asked))
-    assert plan._gradient(needs(medium))[0] == memory
-    assert plan._gradient(needs(medium, variant="cuda_ad_rgb", **asked))[0] == memory
+        plan._plan_gradient_memory(needs(medium, **asked))
+    assert plan._plan_gradient_memory(needs(medium))[0] == memory
+    assert plan._plan_gradient_memory(needs(medium, variant="cuda_ad_rgb", **asked))[0] == memory
     monkeypatch.setattr(plan, "available_memory", lambda: None)
-    assert plan._gradient(needs(medium, **asked))[0] == memory
+    assert plan._plan_gradient_memory(needs(medium, **asked))[0] == memory
 
 
 @pytest.mark.parametrize(
@@ -94,15 +94,18 @@ def test_a_gradient_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_one_estimator_answers(media: tuple, settings: Settings, more: dict, segment: str) -> None:
-    assert plan._segment(needs(*media, **more), settings) == segment
+    assert plan._choose_segment(needs(*media, **more), settings) == segment
 
 
 def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Grids of few occupied blocks are skipped, shadows of many cells estimated, passes counted upwards."""
-    for name in ("refuse_scattering", "refuse_emission", "refuse_quadrature", "refuse_places", "refuse_bounded"):
+    for name in ("check_scattering", "check_emission_cells", "check_quadrature", "check_placements", "check_bounded"):
         monkeypatch.setattr(plan, name, lambda *_: None)
     monkeypatch.setattr(plan, "available_memory", lambda: None)
-    thin, thick = fog((200, 200, 200), occupied=plan.SKIP_BELOW - 1e-9), fog((300, 300, 300), occupied=plan.SKIP_BELOW)
+    thin, thick = (
+        fog((200, 200, 200), occupied=plan.MAX_SKIPPED_SHARE - 1e-9),
+        fog((300, 300, 300), occupied=plan.MAX_SKIPPED_SHARE),
+    )
     homogeneous = fog(occupied=0.0)
     asked = needs(thin, thick, homogeneous, film_samples=2**24 + 1, emitter_kinds=("extended",), surfaces=("Rectangle",),
                   boundaries=[SimpleNamespace(box="a box", hole=None)] * 3, are_emitters_far=False)  # fmt: skip
@@ -116,4 +119,4 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert said["passes"] == f"{passes} of at most {made.pass_rays} rays"
     assert [c.choice for c in made.choices if c.about == "empty space in fog"] == ["skipped", "walked"]
     assert [c.choice for c in made.choices if c.about == "shadows of fog"] == ["exact", "estimated"]
-    assert made.gradient_bytes == plan._gradient(asked)[0]
+    assert made.gradient_bytes == plan._plan_gradient_memory(asked)[0]

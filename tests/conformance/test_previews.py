@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.experiments.script import explain
-from mivol.scene.previews import DEPTHS, DepthAnswer, LeftOut, leaves_out, measure_depths
+from mivol.scene.previews import DEPTHS, DepthError, SufficientDepth, find_sufficient_depth, measure_depth_error
 from mivol.transport.path.estimators import Settings
 from scenes import box_of, camera, centred, medium, sky
 
@@ -23,7 +23,7 @@ def fog(sigma: float, albedo: float) -> mi.Scene:
 def test_a_square_is_the_mean_product_of_two_batches() -> None:
     """Cells lose 0.5, 0.2 and 0.2 of a mean of 1 in three batches: the products are 0.1, 0.1 and 0.04; no squares."""
     full = np.array([[1.3, 1.3], [0.7, 0.7], [1.0, 1.0]])
-    found = leaves_out(2, full - np.array([[0.5], [0.2], [0.2]]), full)
+    found = measure_depth_error(2, full - np.array([[0.5], [0.2], [0.2]]), full)
     assert found.share == pytest.approx(0.3)
     assert found.rms == pytest.approx(np.sqrt(0.08))
 
@@ -36,12 +36,12 @@ def test_an_error_is_the_jackknife_of_the_square() -> None:
     square = np.mean([a * b for i, a in enumerate(lost) for b in lost[:i]])
     error = np.sqrt(3 / 4 * np.sum((pairs - pairs.mean()) ** 2))
     full = np.ones((4, 5))
-    assert leaves_out(3, full - lost[:, None], full).at_most == pytest.approx(np.sqrt(square + 2 * error))
+    assert measure_depth_error(3, full - lost[:, None], full).at_most == pytest.approx(np.sqrt(square + 2 * error))
 
 
 def test_the_smallest_depth_below_the_noise_is_enough() -> None:
-    found = tuple(LeftOut(d, 0.0, 0.0, most) for d, most in zip(DEPTHS, (0.5, 0.1, 0.01), strict=False))
-    assert [DepthAnswer(found, noise).depth for noise in (0.6, 0.1, 0.05, 0.001)] == [2, 3, 6, -1]
+    found = tuple(DepthError(d, 0.0, 0.0, most) for d, most in zip(DEPTHS, (0.5, 0.1, 0.01), strict=False))
+    assert [SufficientDepth(found, noise).depth for noise in (0.6, 0.1, 0.05, 0.001)] == [2, 3, 6, -1]
 
 
 FOGS = [(1.0, 0.0, 1e-6, 2), (0.02, 0.5, 0.01, 2), (5.0, 0.95, 0.02, -1)]
@@ -52,7 +52,7 @@ FOGS = [(1.0, 0.0, 1e-6, 2), (0.02, 0.5, 0.01, 2), (5.0, 0.95, 0.02, -1)]
 def test_fog_needs_the_depth_it_is_known_to_need(variant_rgb, sigma: float, albedo: float, noise: float, depth: int) -> None:
     """Fog that does not scatter, thin fog (what scatters twice is below albedo^2 tau^2 = 4e-4), and fog as dense as a cloud."""
     scene = fog(sigma, albedo)
-    found = measure_depths(scene, scene.sensors()[0], Settings(), noise)
+    found = find_sufficient_depth(scene, scene.sensors()[0], Settings(), noise)
     assert found.depth == depth
     if albedo == 0:
         assert all(abs(left.share) < 1e-6 for left in found.left_out)
@@ -61,7 +61,7 @@ def test_fog_needs_the_depth_it_is_known_to_need(variant_rgb, sigma: float, albe
 def test_what_is_left_out_is_what_renders_differ_by(variant_rgb: str) -> None:
     """Against pictures of 147,456 paths: over 8 seeds the shares deviate by 0.2 % and 0.1 %, so 2 % are nine deviations."""
     scene = fog(SIGMA, ALBEDO)
-    found = measure_depths(scene, scene.sensors()[0], Settings()).left_out[0]
+    found = find_sufficient_depth(scene, scene.sensors()[0], Settings()).left_out[0]
     two, all_of_it = (
         np.array(mi.render(scene, integrator=mi.load_dict({"type": "mivol", "max_depth": d}), spp=1024, seed=1)).mean()
         for d in (2, -1)

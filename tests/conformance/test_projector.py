@@ -61,7 +61,7 @@ def test_walk_between_columns_is_the_float64_twin(monkeypatch, shape, along):
     place[20:60] *= 6
     direction[40:60] = -place[40:60] + 0.3 * direction[40:60]
     rays = PencilRays(place, direction)
-    monkeypatch.setattr(projector_module, "PREPARE_CELLS", 0)
+    monkeypatch.setattr(projector_module, "MIN_CELLS_PER_VOXEL", 0)
     monkeypatch.setattr(Projector, "_along", along)
     a, twin = Projector(rays, grid), oracle_projector.system_matrix(rays, grid)
     x, y = numbers(*shape), numbers(*a.projection_shape, seed=2)

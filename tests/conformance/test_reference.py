@@ -33,7 +33,7 @@ from mivol.validate.compare import compare
 from mivol.validate.moments import Moments
 from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult, read_reference
-from mivol.validate.trust import trust
+from mivol.validate.trust import find_doubts
 
 SIZE = 8
 RGB = np.array([2.0, 6.0, 9.0])
@@ -201,7 +201,7 @@ def test_seeds_are_independent(variant_rgb, tmp_path):
 
 def _counted(monkeypatch, stop_at: int | None = None, how=None) -> list[int]:
     """The numbers of the batches that are rendered from now on; ``how()`` is called during batch ``stop_at``."""
-    rendered, original = [], reference._Setup.batch
+    rendered, original = [], reference._RenderSetup.batch
 
     def batch(self, index):
         rendered.append(index)
@@ -209,7 +209,7 @@ def _counted(monkeypatch, stop_at: int | None = None, how=None) -> list[int]:
             how()
         return original(self, index)
 
-    monkeypatch.setattr(reference._Setup, "batch", batch)
+    monkeypatch.setattr(reference._RenderSetup, "batch", batch)
     return rendered
 
 
@@ -425,11 +425,11 @@ def test_doubts_of_all_kinds(variant_rgb):
     """Each alone; whether Mitsuba is wrong there, the tests below say."""
     assert tuple(_wrong_scenes()) == WRONG
     for kind, (scene, *_) in _wrong_scenes().items():
-        assert [d.kind for d in trust(mi.load_dict(scene))] == [kind.removesuffix(" of ours")]
+        assert [d.kind for d in find_doubts(mi.load_dict(scene))] == [kind.removesuffix(" of ours")]
     for sampler, doubts in (("ldsampler", ["sampler"]), ("independent", [])):
-        assert [d.kind for d in trust(mi.load_dict(_sampled_by(sampler))) if d.fatal] == doubts
+        assert [d.kind for d in find_doubts(mi.load_dict(_sampled_by(sampler))) if d.fatal] == doubts
     for unit, doubts in ((1.0, []), (0.01, ["near emitter"])):
-        assert [d.kind for d in trust(mi.load_dict(_emitter_near_haze(unit))) if d.fatal] == doubts
+        assert [d.kind for d in find_doubts(mi.load_dict(_emitter_near_haze(unit))) if d.fatal] == doubts
 
 
 @pytest.mark.statistical
@@ -440,7 +440,7 @@ def test_doubt_where_mitsuba_is_wrong(variant_rgb, tmp_path, kind):
     Hard cases 3 and 4.
     """
     scene, right, shown = _wrong_scenes()[kind]
-    doubts = trust(mi.load_dict(scene))
+    doubts = find_doubts(mi.load_dict(scene))
     assert [d.kind for d in doubts] == [kind.removesuffix(" of ours")]
     found = _rendered(scene)
     # 512 samples of each pixel, of 0 or 1: the mean is known to 0.017, and what is right is farther off than 0.14.
@@ -481,7 +481,7 @@ def _sampled_by(sampler: str) -> dict:
 def test_doubt_a_sampler_whose_dimensions_depend_on_each_other(variant_rgb):
     """Mitsuba's ldsampler: volpath's mean depends on the sampler, mivol's does not."""
     scenes = {sampler: _sampled_by(sampler) for sampler in ("independent", "ldsampler")}
-    assert [d.kind for d in trust(mi.load_dict(scenes["ldsampler"])) if d.fatal] == ["sampler"]
+    assert [d.kind for d in find_doubts(mi.load_dict(scenes["ldsampler"])) if d.fatal] == ["sampler"]
     # 0.0294 by independent numbers and 0.0279 by ldsampler's, measured once with errors of 1e-4.
     assert_apart(*(Moments.of(_lit(s, "volpath")) for s in scenes.values()), expected=1.5e-3, what="volpath by two samplers")
     assert_same_mean(*(Moments.of(_lit(s, "mivol")) for s in scenes.values()), what="mivol by two samplers")
@@ -507,7 +507,7 @@ def test_doubt_an_emitter_near_a_boundary(variant_rgb):
     for unit in (1.0, 0.01):
         scene = _emitter_near_haze(unit)
         found[unit] = [Moments.of(_lit(scene, kind)) for kind in ("volpath", "mivol")]
-        assert [d.kind for d in trust(mi.load_dict(scene)) if d.fatal] == ([] if unit == 1 else ["near emitter"])
+        assert [d.kind for d in find_doubts(mi.load_dict(scene)) if d.fatal] == ([] if unit == 1 else ["near emitter"])
     (stock, ours), (lost, same) = found[1.0], found[0.01]
     # Stock rays start 1e-4 of a length behind a surface, in an extinction of 1.
     assert_same_mean(stock, ours, rounding=2e-4 * ours.mean)
@@ -527,7 +527,7 @@ def test_our_own_plugins(variant_rgb):
     stock = {"type": "heterogeneous", "sigma_t": _voxels(30.0), "albedo": 0.0}
     ours = {"type": "mivol_medium", "sigma_t": _voxels(30.0)}
     scenes = [_upright_column(_scene(medium, big), 3, 3) for medium in (stock, ours)]
-    assert [[d.kind for d in trust(mi.load_dict(s))] for s in scenes] == [["too deep"], []]
+    assert [[d.kind for d in find_doubts(mi.load_dict(s))] for s in scenes] == [["too deep"], []]
     assert [_rendered(s, spp=4).mean() for s in scenes] == [0, 1]
 
 
@@ -553,7 +553,7 @@ def test_doubts_that_need_no_render(variant_rgb):
         "wrong inverse": _scene(_grid(1.0, to_world=crooked), small),
     }
     for kind, scene in cases.items():
-        assert [d.kind for d in trust(mi.load_dict(scene))] == [kind]
+        assert [d.kind for d in find_doubts(mi.load_dict(scene))] == [kind]
 
 
 def _microflakes() -> dict:
@@ -568,9 +568,9 @@ def test_microflakes_are_drawn_from_another_density_than_is_told(variant_rgb, in
     """Means of the directions of 2^18 samples and of their density: a release that mends it turns this red."""
     blend = {"type": "blendphase", "weight": 0.5, "a": {"type": "rayleigh"}, "b": _microflakes()}
     scene = mi.load_dict(_scene(_homogeneous(0.5, albedo=0.5, phase=_microflakes() if inside == "alone" else blend)))
-    (doubt,) = trust(scene)
+    (doubt,) = find_doubts(scene)
     assert doubt.kind == "microflakes" and doubt.fatal
-    assert trust(mi.load_dict(_scene(_homogeneous(0.5, phase=_microflakes())))) == []
+    assert find_doubts(mi.load_dict(_scene(_homogeneous(0.5, phase=_microflakes())))) == []
     n = 1 << 18
     rng, ctx, mei = mi.PCG32(n, fresh(0)), mi.PhaseFunctionContext(None), dr.zeros(mi.MediumInteraction3f, n)
     mei.wi = mi.Vector3f(0.6, 0, 0.8)
@@ -597,7 +597,7 @@ def test_a_dense_medium_loses_its_skin(variant_rgb):
     """Light that turns once in a deep fog comes back as 1/(4 pi) int s exp(-2 s z) dz = 1/(8 pi). A ray that starts a skin of
     the optical depth x inside keeps exp(-x) of it; both are seen, so a release that mends it turns this red."""
     scene = _fog(np.full((2, 2, 2), 200.0))
-    (doubt,) = trust(mi.load_dict(scene))
+    (doubt,) = find_doubts(mi.load_dict(scene))
     assert doubt.kind == "thick skin" and not doubt.fatal
     # the skin is (1 + max(x, y)) RESTART deep: 1.1 to 1.9 over the film, 2 at a corner of the cube
     x = 0.1 + 0.8 * (np.arange(400) + 0.5) / 400
@@ -617,12 +617,12 @@ def test_no_skin_where_it_is_empty_thin_or_black(variant_rgb):
     inside[2:4, 2:4, 2:4], face[:, :, -1] = 200.0, 200.0
     wide = _t().translate([0.5, 0.5, 0.5]).scale(0.25).translate([-0.5, -0.5, -0.5])
     for scene in (_fog(inside), _fog(np.full((2, 2, 2), 5.0)), _fog(np.full((2, 2, 2), 40.0), to_world=wide)):
-        assert trust(mi.load_dict(scene)) == []
-    assert trust(mi.load_dict(_scene(_homogeneous(200.0)))) == []
+        assert find_doubts(mi.load_dict(scene)) == []
+    assert find_doubts(mi.load_dict(_scene(_homogeneous(200.0)))) == []
     for scene in (_fog(face), _scene(_homogeneous(200.0, albedo=0.5))):
-        assert [d.kind for d in trust(mi.load_dict(scene))] == ["thick skin"]
+        assert [d.kind for d in find_doubts(mi.load_dict(scene))] == ["thick skin"]
     ball = {"type": "sphere", "center": [3, 0, 0], "bsdf": {"type": "null"}, "interior": _homogeneous(50.0, albedo=0.5)}
-    assert [d.kind for d in trust(mi.load_dict(_scene(_homogeneous(1.0), box=ball)))] == ["thick skin"]
+    assert [d.kind for d in find_doubts(mi.load_dict(_scene(_homogeneous(1.0), box=ball)))] == ["thick skin"]
 
 
 def test_no_doubt_about_good_scenes(variant_rgb):
@@ -645,7 +645,7 @@ def test_no_doubt_about_good_scenes(variant_rgb):
         _scene(_grid(1.0), sensor={**corner, "to_world": _t().translate([-1.9, -0.3, -1.1])}),
     ]
     for scene in good:
-        assert trust(mi.load_dict(scene)) == []
+        assert find_doubts(mi.load_dict(scene)) == []
 
 
 # -- Comparing ------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography import stored
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
-from mivol.tomography.stored import bytes_to_store, is_worth_storing, store
+from mivol.tomography.stored import is_worth_storing, matrix_bytes, store_matrix
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -38,7 +38,7 @@ def numbers(*shape: int, seed: int = 1) -> np.ndarray:
 def test_stored_pair_is_the_float64_twin(name: str, grid: str) -> None:
     """2e-6 of sum |A| |x| and |A|^T |y|, as the walk: float32 rounding of entries and of sums of about 20 terms."""
     beam, grid = BEAMS[name], GRIDS[grid]
-    a, twin = store(Projector(beam, grid)), oracle_projector.system_matrix(beam, grid)
+    a, twin = store_matrix(Projector(beam, grid)), oracle_projector.system_matrix(beam, grid)
     x, y = numbers(*grid.shape), numbers(*a.projection_shape, seed=2)
     forward, backward = a @ x, a.T @ y
     assert forward.shape == a.projection_shape
@@ -53,7 +53,7 @@ def test_every_view_of_a_finer_grid_is_the_twin() -> None:
     """Lines along centres and diagonals, and 12 directions between them, through 17^2 voxels; tolerance as above."""
     grid = VoxelGrid((1, 17, 17))
     beam = ParallelBeam(np.arange(16) * np.pi / 8, (1, 25))
-    a, twin = store(Projector(beam, grid)), oracle_projector.system_matrix(beam, grid)
+    a, twin = store_matrix(Projector(beam, grid)), oracle_projector.system_matrix(beam, grid)
     x, y = np.abs(numbers(*grid.shape)), np.abs(numbers(*a.projection_shape, seed=2))
     assert np.abs((a @ x).ravel() - twin @ x.ravel().astype(float)).max() < 2e-6 * (twin @ x.ravel()).max()
     assert np.abs((a.T @ y).ravel() - twin.T @ y.ravel().astype(float)).max() < 2e-6 * (twin.T @ y.ravel()).max()
@@ -63,7 +63,7 @@ def test_many_layers_are_multiplied_in_parts(seed: int) -> None:
     """40 layers, of which 32 go at once, in blocks of one view: each layer is what it is alone."""
     grid = VoxelGrid((40, 4, 3))
     aside = {"detector_offset": (0.0, 0.1)}  # no line in the plane of a face
-    a = store(Projector(ParallelBeam(ANGLES, (40, 5), **aside), grid))
+    a = store_matrix(Projector(ParallelBeam(ANGLES, (40, 5), **aside), grid))
     one = oracle_projector.system_matrix(ParallelBeam(ANGLES, (1, 5), **aside), VoxelGrid((1, 4, 3)))
     x, y = numbers(40, 12, seed=seed), numbers(5, 40, 5, seed=seed + 1)
     expected = (one @ x.T.astype(float)).reshape(5, 5, 40).transpose(0, 2, 1)
@@ -75,8 +75,8 @@ def test_many_layers_are_multiplied_in_parts(seed: int) -> None:
 @pytest.mark.parametrize("block", [1, 1 << 19])
 def test_a_subset_is_the_rows_of_its_views(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
     """In any order, over the borders of blocks (a view each, or all in one), and a subset of a subset."""
-    monkeypatch.setattr(stored, "BLOCK", block)
-    a = store(Projector(BEAMS["parallel, rows between layers"], GRID))
+    monkeypatch.setattr(stored, "PAIRS_PER_BLOCK", block)
+    a = store_matrix(Projector(BEAMS["parallel, rows between layers"], GRID))
     x, y = numbers(*GRID.shape), numbers(3, 7, 9)
     part = a.subset([4, 0, 1])
     np.testing.assert_array_equal(part @ x, (a @ x)[[4, 0, 1]])
@@ -89,14 +89,14 @@ def test_a_subset_is_the_rows_of_its_views(monkeypatch: pytest.MonkeyPatch, bloc
 
 def test_adjoint_identity(seed: int) -> None:
     """|<A x, y> - <x, A^T y>| <= 1e-6 |A x| |y|, as the walk's."""
-    a = store(Projector(BEAMS["parallel, rows between layers"], GRID))
+    a = store_matrix(Projector(BEAMS["parallel, rows between layers"], GRID))
     x, y = numbers(GRID.size, seed=seed), numbers(a.shape[0], seed=seed + 100)
     ax, aty = (a @ x).astype(float), (a.T @ y).astype(float)
     assert abs(ax @ y - x @ aty) <= 1e-6 * np.linalg.norm(ax) * np.linalg.norm(y)
 
 
 def test_tensors_go_through_the_stored_rows() -> None:
-    a = store(Projector(BEAMS["fan"], GRID))
+    a = store_matrix(Projector(BEAMS["fan"], GRID))
     x, y = numbers(*GRID.shape), numbers(*a.projection_shape)
     tensor = mi.TensorXf(x)
     dr.enable_grad(tensor)
@@ -114,7 +114,7 @@ def test_a_solver_finds_what_it_finds_by_walking(name: str) -> None:
     walk = Projector(beam, grid)
     b = walk @ np.abs(numbers(*grid.shape))
     found = []
-    for a in (walk, store(walk)):
+    for a in (walk, store_matrix(walk)):
         states = SOLVERS[name].run(LeastSquares(a, b, nonnegative=True))
         found.append([next(states).x for _ in range(3)][-1])
     assert np.abs(found[1] - found[0]).max() < 3 * 10 * 2e-6 * found[0].max()
@@ -124,18 +124,18 @@ def test_a_solver_finds_what_it_finds_by_walking(name: str) -> None:
 def test_what_storing_takes_is_counted_beforehand() -> None:
     """An entry more or less where a line begins, ends, or meets the outermost rows: 8 a line of about 150 entries, 5 %."""
     walk = Projector(ParallelBeam(0.03 + np.arange(20) * np.pi / 20, (3, 65)), VoxelGrid((3, 65, 65)))
-    stored = store(walk)
-    assert bytes_to_store(walk) == pytest.approx(stored.nbytes, rel=0.05)
+    stored = store_matrix(walk)
+    assert matrix_bytes(walk) == pytest.approx(stored.nbytes, rel=0.05)
     nothing = Projector(BEAMS["parallel, rows are layers"], VoxelGrid((1, 1, 1), centre=(99.0, 99.0, 0.0)))
-    assert bytes_to_store(nothing) == 4 * 45
+    assert matrix_bytes(nothing) == 4 * 45
 
 
 def test_only_rays_in_layers_are_stored() -> None:
     for beam in (ConeBeam(ANGLES, (2, 9), 8.0, 13.0), ConeBeam(ANGLES, (1, 9), 8.0, 13.0, detector_offset=(0.1, 0.0))):
         walk = Projector(beam, GRID)
-        assert bytes_to_store(walk) is None
+        assert matrix_bytes(walk) is None
         with pytest.raises(MivolError, match="rays that do not lie in layers"):
-            store(walk)
+            store_matrix(walk)
 
 
 def test_storing_pays_with_layers_iterations_and_subsets() -> None:

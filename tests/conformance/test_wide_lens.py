@@ -26,7 +26,7 @@ from mivol.photos.lens import Fisheye, Panorama
 from mivol.photos.region import count_views, find_focus, silhouette_box
 from mivol.photos.transforms import write_transforms as write_cameras
 from mivol.report.cameras import outline
-from mivol.scene.sensors import sensor_of
+from mivol.scene.sensors import to_sensor
 from mivol.splatting.projection import pack_view
 
 LENS = Fisheye(-0.01, 0.0005, 0.00002, 0.000001)
@@ -253,7 +253,7 @@ def test_functions_of_an_image_plane_refuse_wide_lenses(variant_rgb: str) -> Non
     with pytest.raises(MivolError, match="fish: found a fisheye, expected a lens with an image plane"):
         to_pinhole(camera)
     with pytest.raises(MivolError, match="fish: .*cut pinholes out of it"):
-        sensor_of(camera)
+        to_sensor(camera)
     with pytest.raises(MivolError, match="fish: .*cut pinholes out of it"):
         pack_view(camera, camera.size)
     shown = photo(camera)

@@ -25,14 +25,14 @@ from mivol.phase.measured import NAMES, named_medium
 from mivol.phase.table import Table
 from mivol.photos import Camera
 from mivol.photos.camera import PIXELS_LOST
-from mivol.scene.camera_rigs import Ring, rig_from
+from mivol.scene.camera_rigs import Ring, parse_rig
 from mivol.scene.description import parse_dict, parse_file
-from mivol.scene.refusals import refuse_quadrature
-from mivol.scene.sensors import sensor_of
+from mivol.scene.refusals import check_quadrature
+from mivol.scene.sensors import to_sensor
 from mivol.transport.path.estimators import Settings
-from mivol.validate.images import judge
+from mivol.validate.images import score_image
 from mivol.validate.reference_file import check_identity
-from mivol.validate.statistics import Estimate, batches_for, p_value
+from mivol.validate.statistics import Estimate, p_value, required_batches
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -147,21 +147,21 @@ def test_harmonics_of_a_file_belong_to_its_nodes(sh: tuple[int, ...]) -> None:
 
 def test_shadows_that_contradict_each_other() -> None:
     needs = SimpleNamespace(media=(), emitters=(), emitter_kinds=())
-    says = lambda **given: refusal_of(refuse_quadrature, needs, Settings(max_depth=2, **given))  # noqa: E731
+    says = lambda **given: refusal_of(check_quadrature, needs, Settings(max_depth=2, **given))  # noqa: E731
     assert says(shadows="exat").startswith("shadows is 'exat'; ") and says(shadows="exat").endswith(" is expected.")
     assert says(shadows="estimated", deterministic=True).startswith("shadows is 'estimated' and deterministic is set")
     assert says(shadows="grid").startswith("shadows is 'grid' without deterministic")
     for given in ({"shadows": "grid", "deterministic": True}, {"shadows": "estimated"}, {"shadows": "exact"}, {}):
-        refuse_quadrature(needs, Settings(max_depth=2, **given))
+        check_quadrature(needs, Settings(max_depth=2, **given))
 
 
 def test_rigs() -> None:
-    assert refusal_of(rig_from, {"rig": "rings"}) == 'unknown rig "rings": did you mean "ring"?'
-    assert refusal_of(rig_from, {"heigth": 3}) == 'rig "ring" has no setting "heigth": did you mean "height"?'
-    near = refusal_of(rig_from, {"rig": "ring", "near": 2.0, "far": 2.0})
+    assert refusal_of(parse_rig, {"rig": "rings"}) == 'unknown rig "rings": did you mean "ring"?'
+    assert refusal_of(parse_rig, {"heigth": 3}) == 'rig "ring" has no setting "heigth": did you mean "height"?'
+    near = refusal_of(parse_rig, {"rig": "ring", "near": 2.0, "far": 2.0})
     assert near.startswith('rig "ring": near = 2.0 is not below far = 2.0')
-    assert refusal_of(rig_from, {"width": 0}).startswith('rig "ring": ')
-    assert rig_from({"near": 1.0, "far": 1.1}) == Ring(near=1.0, far=1.1)
+    assert refusal_of(parse_rig, {"width": 0}).startswith('rig "ring": ')
+    assert parse_rig({"near": 1.0, "far": 1.1}) == Ring(near=1.0, far=1.1)
 
 
 def test_a_sensor_has_square_pixels() -> None:
@@ -171,10 +171,10 @@ def test_a_sensor_has_square_pixels() -> None:
         return Camera(np.array([[50.0 * ratio, 0, 20], [0, 50, 10], [0, 0, 1]]), (40, 20), np.eye(4), name="eye")
 
     off = PIXELS_LOST / 20
-    assert sensor_of(camera(1 + 0.99 * off))["film"]["width"] == 40
-    assert sensor_of(camera(1 - 0.99 * off))["film"]["height"] == 20
+    assert to_sensor(camera(1 + 0.99 * off))["film"]["width"] == 40
+    assert to_sensor(camera(1 - 0.99 * off))["film"]["height"] == 20
     for ratio in (1 + 1.01 * off, 1 - 1.01 * off):
-        assert "focal lengths" in refusal_of(sensor_of, camera(ratio))
+        assert "focal lengths" in refusal_of(to_sensor, camera(ratio))
 
 
 def test_files_that_are_no_scenes(tmp_path: Path) -> None:
@@ -190,13 +190,13 @@ def test_files_that_are_no_scenes(tmp_path: Path) -> None:
 
 def test_images_that_cannot_be_judged() -> None:
     image = np.full((4, 5, 3), 0.5)
-    assert refusal_of(judge, image, image, metrics=("psnr", "psn")).startswith('there is no metric "psn"; choose among ')
-    says = refusal_of(judge, image, image[:3], name="a")
+    assert refusal_of(score_image, image, image, metrics=("psnr", "psn")).startswith('there is no metric "psn"; choose among ')
+    says = refusal_of(score_image, image, image[:3], name="a")
     assert says == "a has shape (4, 5, 3) and its photograph (3, 5, 3); render it at that size."
     for mask in (np.zeros((4, 5), bool), np.ones((5, 4), bool)):
-        says = refusal_of(judge, image, image, mask=mask, name="a")
+        says = refusal_of(score_image, image, image, mask=mask, name="a")
         assert says == f"the mask of a has shape {mask.shape} or leaves no pixel; give one of (4, 5)."
-    assert judge(image, image, mask=np.eye(4, 5, dtype=bool)).name == "image"
+    assert score_image(image, image, mask=np.eye(4, 5, dtype=bool)).name == "image"
 
 
 def test_means_that_cannot_be_compared() -> None:
@@ -204,8 +204,8 @@ def test_means_that_cannot_be_compared() -> None:
     says = refusal_of(p_value, one, Estimate(np.zeros((2, 3)), np.ones((2, 3)), 5))
     assert says == "images of shape (2, 2) and (2, 3) cannot be compared; render both at one size."
     for wanted in (0.0, -1.0, np.nan):
-        assert refusal_of(batches_for, wanted, 1.0) == f"a bias of {wanted} cannot be looked for; give one above 0."
-    assert batches_for(1e9, 1.0) == 1
+        assert refusal_of(required_batches, wanted, 1.0) == f"a bias of {wanted} cannot be looked for; give one above 0."
+    assert required_batches(1e9, 1.0) == 1
 
 
 def test_the_first_key_that_differs_is_named(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from tiny_experiment import SCENE, write_experiment
 
 from mivol.experiments import camera_pictures
 from mivol.photos import PhotoSurvey, survey_photos
-from mivol.scene.camera_rigs import find_box
+from mivol.scene.camera_rigs import find_media_box
 
 
 @pytest.fixture
@@ -50,5 +50,5 @@ def test_pinholes_of_a_scene_are_drawn_about_its_media(variant_rgb, tmp_path: Pa
     assert [(f.camera.name, f.split) for f in survey.frames] == [("a", "train"), ("a", "held_out")] and len(images) == 2
     np.testing.assert_allclose(survey.frames[0].camera.origin, [0, 1, 4], atol=1e-6)
     assert 'origin="0, 1, 4"' in SCENE
-    np.testing.assert_array_equal(survey.box, find_box(scene))
+    np.testing.assert_array_equal(survey.box, find_media_box(scene))
     assert camera_pictures.pictures_of_views(tmp_path, scene, {"train": views[1:]}) == []

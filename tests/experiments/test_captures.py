@@ -18,7 +18,7 @@ from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, Radianc
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos.region import middle_box
-from mivol.validate.images import judge
+from mivol.validate.images import score_image
 
 PLAN = replace(
     PRESETS["capture"], stages=(RadianceStage(12, 60, 1, 6, 24), RadianceStage(24, 140, 1, 6, 24)), degree=0, sky=16, levels=4
@@ -32,7 +32,7 @@ def held_out_psnr(plan: RadiancePlan) -> list[float]:
     box = middle_box([photo.camera for photo in train])
     fit = begin_fit(RadianceProblem(RayBatches.from_photos(train), box, plan), plan.optimizer, plan.course()).complete()
     seen = [render_view(fit.problem.field, photo.camera, fit.problem.sky).image for photo in aside]
-    return [judge(image, photo.image).values["psnr"] for image, photo in zip(seen, aside, strict=True)]
+    return [score_image(image, photo.image).values["psnr"] for image, photo in zip(seen, aside, strict=True)]
 
 
 @pytest.mark.slow

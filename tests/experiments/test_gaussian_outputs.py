@@ -13,7 +13,7 @@ from mivol.experiments import judged_views, photo_fit
 from mivol.experiments.film import Film
 from mivol.experiments.fit_kind import NullProgress
 from mivol.points import Gaussians
-from mivol.validate.images import Quality
+from mivol.validate.images import ImageScore
 
 
 def cloud(n: int = 3) -> Gaussians:
@@ -84,7 +84,7 @@ def finished_fit(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, show
     monkeypatch.setattr(
         outputs,
         "compare",
-        lambda problem, judged, photo, metrics: (np.array(int(photo.name)), Quality(photo.name, {metrics[0]: 20.0})),
+        lambda problem, judged, photo, metrics: (np.array(int(photo.name)), ImageScore(photo.name, {metrics[0]: 20.0})),
     )
     return fit, run, lambda: fit.write_outputs(SimpleNamespace(next_iteration=77), run, None)
 
@@ -130,7 +130,7 @@ def test_a_view_is_judged_as_a_pinhole_sees_it(monkeypatch: pytest.MonkeyPatch) 
     flat = SimpleNamespace(camera="flat", background="behind", image="image", mask="mask", name="name")
     monkeypatch.setattr(outputs, "rectify", lambda given: flat if given is photo else None)
     monkeypatch.setattr(outputs, "picture_of", lambda *asked: asked)
-    monkeypatch.setattr(outputs, "judge", lambda *given, **named: (given, named))
+    monkeypatch.setattr(outputs, "score_image", lambda *given, **named: (given, named))
     problem = SimpleNamespace(plan=SimpleNamespace(low_pass=0.3))
     seen, (given, named) = outputs.compare(problem, SimpleNamespace(space="srgb"), photo, ("psnr",))
     assert seen == (problem, "flat", "behind", 0.3)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from mivol.experiments.judged_views import EDGES, MANY, JudgedViews, caption_of, said_of, spread_over, write_view
 from mivol.photos import Camera, Photo, intrinsics
-from mivol.validate.images import Quality
+from mivol.validate.images import ImageScore
 
 
 def photo(name: str, width: int = 4, height: int = 2, value: float = 0.6) -> Photo:
@@ -77,7 +77,7 @@ def test_many_views_are_smaller_and_none_are_written_where_none_are_asked_for(tm
 
 
 def test_what_is_said_of_views() -> None:
-    quality = Quality("a", {"psnr": 24.126, "ssim": 0.7781})
+    quality = ImageScore("a", {"psnr": 24.126, "ssim": 0.7781})
     assert caption_of(quality, 25.3) == "PSNR 24.13 dB, SSIM 0.7781, 25.30 dB with its colours fitted"
     assert caption_of(quality) == "PSNR 24.13 dB, SSIM 0.7781"
     assert said_of([photo("a")] * 3) == "3 views at 4 x 2 pixels"

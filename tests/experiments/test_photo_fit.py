@@ -33,7 +33,7 @@ from mivol.photos import Camera, Photos, intrinsics
 from mivol.photos.camera_path import aim_camera
 from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
-from mivol.validate.images import judge
+from mivol.validate.images import score_image
 
 SIZE, VIEWS = 48, 20
 
@@ -463,7 +463,9 @@ def test_each_look_is_at_the_same_views(photographs: Path, tmp_path: Path, monke
     kept = replace(judged, views=tuple(replace(view, mask=mask) for view in judged.views))
     nothing = SphericalGrid.from_dense(np.zeros((2, 2, 2)), np.zeros((2, 2, 2, 1, 3)), np.eye(4))
     problem = SimpleNamespace(field=nothing, sky=None)
-    monkeypatch.setattr(field_fit, "judge", lambda *images, **asked: names.append(asked["name"]) or judge(*images, **asked))
+    monkeypatch.setattr(
+        field_fit, "score_image", lambda *images, **asked: names.append(asked["name"]) or score_image(*images, **asked)
+    )
 
     def judge_few(judged: Photos | None, *changes: str) -> dict[str, float]:
         fit = FieldFit(RunContext(config.load(toml(tmp_path, photographs), changes), tmp_path, tmp_path))

@@ -14,7 +14,7 @@ from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
 from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, intrinsics
-from mivol.validate.images import Quality
+from mivol.validate.images import ImageScore
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -75,7 +75,7 @@ def test_distance_and_normals_are_pictures(tmp_path):
 
 
 def test_judged_views_are_told_apart_the_worst_first():
-    found = [Quality("a.jpg", {"psnr": 23.456, "ssim": 0.71234}), Quality("b.jpg", {"psnr": 9.0, "ssim": 0.5})]
+    found = [ImageScore("a.jpg", {"psnr": 23.456, "ssim": 0.71234}), ImageScore("b.jpg", {"psnr": 9.0, "ssim": 0.5})]
     table = judged_views.table_of_views(camera(135, 240), found, [24.0, 12.345])
     assert table.title == "Judged views, at 135 x 240 pixels, the worst first"
     assert table.rows == (("b.jpg", "9.00", "0.5000", "12.35"), ("a.jpg", "23.46", "0.7123", "24.00"))

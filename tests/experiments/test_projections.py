@@ -165,7 +165,7 @@ def test_quanta_are_those_of_the_readings(measured: ScanReadings, monkeypatch: p
     blank = np.full((2, 2, 3), 8.0)
     made = Quanta(np.ones((2, 2, 3)), blank, 0.5, np.ones((2, 2, 3), bool))
     monkeypatch.setattr(projections, "count_quanta", lambda *asked: made if asked == ("r", "f", "d", 99.0) else None)
-    monkeypatch.setattr(projections, "find_air", lambda value, n: np.full((2, 2, 3), n / 4))
+    monkeypatch.setattr(projections, "fit_air", lambda value, n: np.full((2, 2, 3), n / 4))
     assert projections.quanta_of(scan(), measured) is made
     assert (projections.quanta_of(scan(air=2), measured).blank == 4).all()
     for chosen, found in ((scan(drift=1), measured), (scan(), ScanReadings(measured.transmission))):

@@ -26,7 +26,7 @@ from mivol.files import encode_srgb, read_exr, write_exr, write_png
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos.transforms import write_transforms
-from mivol.validate.images import judge
+from mivol.validate.images import score_image
 
 UNIT = 3000.0
 """Radiance of the files: nothing is near 1."""
@@ -122,7 +122,7 @@ def test_what_is_found_is_kept_in_the_unit_of_the_files(photographs: Path, tmp_p
     view = replace(judged.views[0], image=np.minimum(judged.views[0].image, 1))
     assert (
         judge_colour_fitted(view.image / 2, view, "linear")
-        > judge(view.image / 2, view.image, space="linear").values["psnr"] + 6
+        > score_image(view.image / 2, view.image, space="linear").values["psnr"] + 6
     )
 
 

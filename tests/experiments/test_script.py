@@ -21,7 +21,7 @@ from mivol.files import encode_srgb, read_exr, write_exr
 from mivol.optim.losses import L2
 from mivol.photos.camera import Camera
 from mivol.photos.transforms import write_transforms
-from mivol.scene.sensors import sensor_of
+from mivol.scene.sensors import to_sensor
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "docs" / "scripts"
 
@@ -214,5 +214,5 @@ def seen_by(camera: Camera, space: str) -> np.ndarray:
     volume = {"type": "mivol_sh", "filename": "field/field.npz", "space": space}
     box = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "mivol_medium", "emission": volume}}
     box["to_world"] = T(field.to_world).translate(0.5).scale(0.5)
-    parts = {"box": box, "sky": {"type": "constant"}, "camera": sensor_of(camera), "integrator": {"type": "mivol"}}
+    parts = {"box": box, "sky": {"type": "constant"}, "camera": to_sensor(camera), "integrator": {"type": "mivol"}}
     return np.array(mi.render(mi.load_dict({"type": "scene", **parts}), spp=16))[..., :3]

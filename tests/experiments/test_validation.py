@@ -90,7 +90,7 @@ def test_a_wrong_renderer_is_found(variant_rgb, scene: Path, monkeypatch: pytest
 
 
 def test_a_reference_that_cannot_be_trusted_decides_nothing(variant_rgb, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(validation, "trust", lambda scene, sensors: [Doubt("rotated", "the grid is turned.")])
+    monkeypatch.setattr(validation, "find_doubts", lambda scene, sensors: [Doubt("rotated", "the grid is turned.")])
     verdict = validate_scene(load_scene(scene), scene.parent / "a", Validation(spp=16, reference_spp=32))
     assert verdict.code == UNTRUSTED
     assert "is no reference here, so nothing is decided" in verdict.text

@@ -17,7 +17,7 @@ from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 from mivol.transport.line_integrals.radiance_field import make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
-from mivol.validate.images import judge
+from mivol.validate.images import score_image
 
 GREY = np.full(3, 0.5, np.float32)
 
@@ -80,7 +80,7 @@ def test_a_fit_begins_with_a_fog_that_is_not_brighter_than_what_is_seen(variant_
         photos.append(replace(one, image=image, alpha=None, background=around))
     fit = fitted(RayBatches.from_photos(photos[1:], (1, 2), False, "linear"), PLAN)
     seen = render_view(fit.problem.field, photos[0].camera, around).image
-    assert judge(seen, photos[0].image, space="linear").values["psnr"] > 25
+    assert score_image(seen, photos[0].image, space="linear").values["psnr"] > 25
 
 
 def test_an_error_weighs_the_slope_of_the_tone_curve(variant_rgb: str) -> None:
@@ -169,7 +169,7 @@ def test_radiance_is_found_over_a_range_of_800(variant_rgb: str) -> None:
     quality, ratios = [], []
     for photo in held:
         seen = render_view(found, photo.camera, GREY).image
-        quality.append(judge(seen, photo.image, space="linear").values["psnr"])
+        quality.append(score_image(seen, photo.image, space="linear").values["psnr"])
         bright = (photo.alpha > 0.99) & (photo.image.min(axis=2) > 2)
         ratios.append(np.median(seen[bright] / photo.image[bright]))
     # 39.8 dB and 1.00 were measured; as codes 25.6 and 0.17, with the learning rates of codes 32.6 and 0.31.

@@ -22,7 +22,7 @@ from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import random_ellipsoids
-from mivol.tomography.preprocess import Transmission, correct_transmission, fit_light_drift, line_integrals, normalise_air
+from mivol.tomography.preprocess import Transmission, correct_transmission, fit_light_drift, normalise_air, to_line_integrals
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import axis_from_mirrors, axis_from_moments, axis_from_reconstructions, find_axis
 from mivol.validate.moments import Moments
@@ -89,7 +89,7 @@ def test_weights_make_residuals_of_unit_size(simulated):
     """sqrt(w) (y - truth) has variance 1: 7744 values know it to sqrt(2 / 7744) = 1.6 %, the flats' gain to 4 %, and
     errors of the flats that all views share to 6 %: 7.3 % together, of which 6 are allowed (4.3 % were measured)."""
     _, truth, transmission = simulated
-    y, weights = line_integrals(transmission)
+    y, weights = to_line_integrals(transmission)
     z = np.sqrt(weights) * (y - truth)
     assert_within(np.mean(z**2) - 1, 6 * 0.073, chance=2 * stats.norm.sf(6), what="squared residuals")
 
@@ -97,7 +97,7 @@ def test_weights_make_residuals_of_unit_size(simulated):
 def test_no_light_has_weight_0():
     """Hard case 39."""
     t = Transmission(np.array([[[0.5, 1e-4, -0.02, 0.0, np.nan, np.inf]]]), np.full((1, 1, 6), 1e-4))
-    y, weights = line_integrals(t)
+    y, weights = to_line_integrals(t)
     assert np.isfinite(y).all()
     assert np.isfinite(weights).all()
     assert y[0, 0, 0] == pytest.approx(np.log(2))
@@ -107,7 +107,7 @@ def test_no_light_has_weight_0():
 
 def test_brighter_than_the_light_stays_negative():
     """Hard case 40."""
-    y, weights = line_integrals(Transmission(np.full((1, 1, 1), 1.1), np.full((1, 1, 1), 1e-4)))
+    y, weights = to_line_integrals(Transmission(np.full((1, 1, 1), 1.1), np.full((1, 1, 1), 1e-4)))
     assert y == pytest.approx(-np.log(1.1))
     assert weights == pytest.approx(1.21 / 1e-4)
 
@@ -168,7 +168,7 @@ def test_axis_is_found_three_ways(simulated):
     The misfit of reconstructions is bumpy on 64 pixels: -0.09 +- 0.04 over 8 seeds, so 0.35 is 7 of these away.
     """
     angles, _, transmission = simulated
-    y, weights = line_integrals(transmission)
+    y, weights = to_line_integrals(transmission)
     mirrors, moments = axis_from_mirrors(y, angles), axis_from_moments(y, angles)
     flats = np.sqrt(np.sum((np.arange(64) - 31.5) ** 2) / 2000 / 20) / y.sum(axis=-1).mean()
     assert_same_mean(Estimate(mirrors.column, mirrors.uncertainty**2, 10), 35.3, rounding=0.04, what="mirrors")

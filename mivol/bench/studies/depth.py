@@ -32,7 +32,7 @@ from mivol.bench.extinctions import smoke
 from mivol.bench.harness.bars import AT_MOST, Bar, judge, say_row
 from mivol.bench.harness.figures import new_figure
 from mivol.bench.harness.study import Size, Study, amount
-from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, draw_lines, scattering_depth
+from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, sample_lines, scattering_depth
 from mivol.transport.media.medium_view import view_medium
 from mivol.transport.traversal.box import Box
 
@@ -135,7 +135,7 @@ def set_medium(scene: mi.Scene, albedo: float, scale: float) -> None:
 def trace_lines(scene: mi.Scene, max_depth: int, n: int, seed: int) -> np.ndarray:
     """Scattered radiance along n lines (n,). Russian roulette starts late, because the added noise outweighs the saved time."""
     tracer = mi.load_dict({"type": "volpath", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True})
-    o, d, _ = draw_lines(UNIT_BOX, n, seed)
+    o, d, _ = sample_lines(UNIT_BOX, n, seed)
     ray = mi.Ray3f(mi.Point3f(np.ascontiguousarray((o - d).T, np.float32)), mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n)

@@ -92,8 +92,8 @@ def fit_views(
         reconstruct(problem, plan.optimizer, plan.course())
     renders = [render_view(problem.field, photo.camera, photo.background).image for photo in held_out]
     pairs = zip(renders, held_out, strict=True)
-    judged = [images.judge(image, photo.image, space="srgb", metrics=("psnr",)) for image, photo in pairs]
-    psnr = images.score(judged).values["psnr"]
+    judged = [images.score_image(image, photo.image, space="srgb", metrics=("psnr",)) for image, photo in pairs]
+    psnr = images.average_scores(judged).values["psnr"]
     say_row(f"degree {degree}, {len(photos)} views, {priors or 'with TV'}", psnr=psnr, processor_seconds=watch.processor)
     middle = len(renders) // 2
     return {

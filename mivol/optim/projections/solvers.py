@@ -31,7 +31,7 @@ from mivol.optim.projections.linear_problems import (
     flatten,
 )
 from mivol.tomography.filtered import check_circle, check_parallel, feldkamp, filtered_backprojection
-from mivol.tomography.preprocess import bridge_gaps
+from mivol.tomography.preprocess import interpolate_gaps
 from mivol.tomography.projector import Projector
 
 FilteredBackprojection = Callable[[Projector, np.ndarray, str, float], np.ndarray]
@@ -90,7 +90,7 @@ def _once(
         return
     y = np.asarray(problem.b, float).reshape(a.projection_shape)
     if problem.weights is not None:
-        y = bridge_gaps(y, np.reshape(problem.weights, a.projection_shape))
+        y = interpolate_gaps(y, np.reshape(problem.weights, a.projection_shape))
     x = method(a, y, window, cutoff).reshape(-1)
     r = flatten(problem.b, a.dtype) - a @ x
     norm2 = dot(r, apply_weights(flat_weights(problem), r))

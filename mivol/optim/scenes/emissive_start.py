@@ -37,7 +37,7 @@ from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 from mivol.photos import Photo
-from mivol.scene.sensors import camera_of
+from mivol.scene.sensors import to_camera
 
 __all__ = ["FACTORS", "EmissiveStart", "average_density", "find_emissive_start", "fit_emission", "to_photographs"]
 
@@ -146,7 +146,7 @@ def to_photographs(views: Sequence[View]) -> list[Photo]:
     white = float(np.percentile(np.concatenate([image.ravel() for image in images]), BRIGHTEST))
     black = np.zeros(3, np.float32)
     codes = [encode_srgb(image / max(white, 1e-30)).astype(np.float32) for image in images]
-    cameras = [camera_of(view.sensor, view.name) for view in views]
+    cameras = [to_camera(view.sensor, view.name) for view in views]
     return [Photo(view.name, code, None, None, camera, black) for view, code, camera in zip(views, codes, cameras, strict=True)]
 
 

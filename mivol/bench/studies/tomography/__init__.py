@@ -44,7 +44,7 @@ from mivol.files import read_volume
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.smoothed_tv import SmoothedTV
 from mivol.optim.projections.solvers import SOLVERS
-from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid, cone_beam_of_tigre
+from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid, tigre_cone_beam
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
@@ -91,7 +91,7 @@ class Scan(NamedTuple):
 
 def make_head_scan(phantom: str, size: int, n_views: int) -> Scan:
     """Scan of Shepp and Logan's head, with projections in closed form."""
-    beam, grid = cone_beam_of_tigre(size, n_views)
+    beam, grid = tigre_cone_beam(size, n_views)
     head = shepp_logan(phantom, 128.0)
     return Scan(f"Shepp-Logan ({phantom})", Projector(beam, grid), head.project(beam), head.voxelise(grid, 4))
 

@@ -30,9 +30,9 @@ from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.filtered import filtered_backprojection
-from mivol.tomography.geometry import subdivide, voxel_means
+from mivol.tomography.geometry import subdivide_grid, voxel_means
 from mivol.tomography.projector import Projector
-from mivol.tomography.stored import store
+from mivol.tomography.stored import store_matrix
 
 __all__ = ["error_rows", "measure_parts", "measure_peers", "measure_tooth", "part_rows", "ratio_rows"]
 
@@ -82,7 +82,7 @@ def run_solvers(scan: Slice) -> dict[str, Curve]:
 
     def states(name: str, x0: np.ndarray | None = None) -> Iterator[np.ndarray]:
         wanted = config.SolveSettings(name, iterations=STEPS.get(name, 1))
-        a = store(walk) if choose_storage(wanted, walk).is_stored else walk
+        a = store_matrix(walk) if choose_storage(wanted, walk).is_stored else walk
         problem = LeastSquares(a, scan.y, scan.weights, x0, nonnegative=name not in ("cgls", "fbp"))
         yield from (state.x for state in ALL_SOLVERS[name].run(problem))
 
@@ -98,7 +98,7 @@ def run_solvers(scan: Slice) -> dict[str, Curve]:
 def default_states(scan: Slice, solve: config.SolveSettings | None = None) -> Iterator[np.ndarray]:
     """States of the solver that mivol chooses (``solve.name = "auto"``), or of given settings."""
     wanted, _ = settle_solver(solve or config.SolveSettings(), Projector(scan.beam, scan.grid))
-    walk = Projector(scan.beam, subdivide(scan.grid, wanted.supersampling, scan.beam))
+    walk = Projector(scan.beam, subdivide_grid(scan.grid, wanted.supersampling, scan.beam))
     data, all_views = Projections(scan.beam, scan.y, scan.weights, is_noise_known=scan.photons > 0), np.arange(len(scan.y))
     start, prior = start_volume(wanted, walk, data, all_views), make_prior(wanted, walk, data, all_views)
     problem = ProjectionProblem(LeastSquares(walk, scan.y, scan.weights, start, wanted.nonnegative, prior))
@@ -110,7 +110,7 @@ def default_states(scan: Slice, solve: config.SolveSettings | None = None) -> It
 
 def likelihood_states(scan: Slice) -> Iterator[np.ndarray]:
     """States of ML-TR of the counts, from filtered back-projection."""
-    a = store(Projector(scan.beam, scan.grid))
+    a = store_matrix(Projector(scan.beam, scan.grid))
     start = np.maximum(filtered_backprojection(a, scan.y), 0)
     yield from (state.x for state in ALL_SOLVERS["ml-tr"].run(PoissonCounts(a, scan.weights, scan.photons, x0=start)))
 
