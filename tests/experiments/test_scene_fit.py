@@ -298,7 +298,7 @@ def test_the_first_view_is_measured_with_the_truth_in_the_scene(monkeypatch: pyt
         return SimpleNamespace(depth=5, reason="so")
 
     monkeypatch.setattr(scene_fit, "holding", holding)
-    monkeypatch.setattr(scene_fit, "to_camera", lambda sensor: f"camera {sensor}")
+    monkeypatch.setattr(scene_fit, "camera_of", lambda sensor: f"camera {sensor}")
     monkeypatch.setattr(scene_fit, "find_sufficient_depth", measured)
     monkeypatch.setattr(scene_fit.msgspec.structs, "replace", lambda given, **change: SimpleNamespace(**change))
     settled, (line,) = scene_fit.resolve_depth(chosen, SimpleNamespace(scene="scene"), truth)
