@@ -1,6 +1,6 @@
 """Radiance fields as files: the table :data:`FIELD_FORMATS` lists the formats by suffix.
 
-A new format is one writer (and a parser, where it can be read) and one line in the table.
+A new format is one writer (and a parser, if mivol reads the format) and one line in the table.
 
 Conventions of volumes (``.vol``, ``.nrrd``). A file holds the extinction [1/length] at the nodes; a second file
 (``NAME-colour``) holds the colour of degree 0 with its offset, the mean over all directions. Colours keep the space of the
@@ -66,7 +66,7 @@ class FieldFormat:
     Attributes:
         name: name in messages.
         write: writer; takes path, field and options, and returns the files written.
-        recognizes: test of an archive's arrays; None for formats that cannot be read.
+        recognizes: test of an archive's arrays; None: the format cannot be read.
         parse: reader of such an archive; takes the file name and the arrays.
     """
 
@@ -230,7 +230,7 @@ def write_scene(path: Path, field: SphericalGrid, sky: Sky | None = None) -> lis
     Args:
         path: ends in .xml.
         field: content of the cube, with all its levels.
-        sky: background, in the space of the field's colours; None for black.
+        sky: background, in the space of the field's colours; None: black.
 
     Returns:
         Paths of the files written, the scene first.

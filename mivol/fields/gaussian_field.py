@@ -2,7 +2,7 @@
 
 Conventions. Parameters are the pre-images of the activations, with the names of :mod:`mivol.points.gaussians`: "means" (N, 3),
 "log_scales" (N, 3), "quaternions" (N, 4), "opacity_logits" (N,), and optionally "harmonics" (N, K, 3), the colours
-(:mod:`mivol.fields.harmonics`). :mod:`mivol.fields.gaussian_line` has the extinction of one Gaussian along a line; extinctions
+(:mod:`mivol.fields.harmonics`). :mod:`mivol.fields.gaussian_line` has the extinction of a Gaussian along a line; extinctions
 add. A Gaussian ends ``REACH`` standard deviations from its mean.
 
 Low-pass. Splatting widens each Gaussian in the image, by 0.3 pixel^2 in published files, and keeps its opacity. Fitted
@@ -62,7 +62,7 @@ class GaussianField:
     Attributes:
         lists: Gaussians of each cell.
         starts, entries: the lists as device arrays.
-        flat: rows of all Gaussians, detached, for a scale of 1.
+        flat: rows of the Gaussians, detached, for a scale of 1.
     """
 
     line = EXACT_LINE
@@ -139,7 +139,7 @@ class GaussianField:
         return self.lists.to_world
 
     def rows(self, scale: mi.Float) -> mi.Float:
-        """Rows of all Gaussians (:mod:`mivol.fields.gaussian_line`), attached to the parameters and the scale of a medium."""
+        """Rows of the Gaussians (:mod:`mivol.fields.gaussian_line`), attached to the parameters and the scale of a medium."""
         means, log_scales, quaternions = (
             _unpack_columns(self.tensors[name], n) for name, n in zip(EXTINCTION_PARAMETERS, (3, 3, 4), strict=False)
         )
@@ -168,7 +168,7 @@ class GaussianField:
         return harmonic_degree(self.tensors[HARMONICS].shape[1])
 
     def pack_colours(self) -> mi.Float:
-        """Harmonics of all Gaussians in blocks (:mod:`mivol.fields.harmonics`), attached to the parameter."""
+        """Harmonics of the Gaussians in blocks (:mod:`mivol.fields.harmonics`), attached to the parameter."""
         return pack_harmonics(self.tensors[HARMONICS], self.degree)
 
     def eval_basis(self, d: mi.Vector3f) -> list[mi.Float]:

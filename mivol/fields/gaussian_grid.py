@@ -70,7 +70,7 @@ def gaussian_masses(gaussians: Gaussians) -> np.ndarray:
 
 
 def gaussian_box(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,) of the box around three standard deviations of all Gaussians [length], float64.
+    """Corners (3,) of the box around three standard deviations of the Gaussians [length], float64.
 
     Raises:
         MivolError: no Gaussians.
@@ -117,7 +117,7 @@ def gaussians_to_grid(gaussians: Gaussians, low: np.ndarray, high: np.ndarray, r
 
 
 def _deposit(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Masses (nodes,) and harmonics times mass (nodes, 3 K) of all Gaussians, whose centres are in lattice coordinates."""
+    """Masses (nodes,) and harmonics times mass (nodes, 3 K) of the Gaussians, whose centres are in lattice coordinates."""
     covariances = gaussians.covariances().astype(np.float64) / np.outer(voxel, voxel) + 0.25 * np.eye(3)
     reach = DEPOSIT_REACH * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     first, last = np.ceil(centres - reach).astype(np.int64), np.floor(centres + reach).astype(np.int64)
@@ -171,7 +171,7 @@ def grid_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Ga
     """Make Gaussians of the mass, colours and shape of a field's matter, one a block of voxels.
 
     Args:
-        field: of one level.
+        field: of a single level.
         resolution: largest number of blocks along the longest edge; None: blocks with an edge of 2 voxels.
 
     Returns:

@@ -45,7 +45,7 @@ INVERSE_ROOT_2, INVERSE_ROOT_2_PI = 1 / math.sqrt(2), 1 / math.sqrt(2 * math.pi)
 
 @dataclass
 class LineSlopes:
-    """Derivatives of a number with respect to q, v and the opacity of one Gaussian."""
+    """Derivatives of a number with respect to q, v and the opacity of a Gaussian."""
 
     q: mi.Vector3f
     v: mi.Vector3f
@@ -61,7 +61,7 @@ class LineSlopes:
 
 @dataclass
 class WhitenedLine:
-    """A line through a point ``o`` in the direction of the unit vector ``d``, in the whitened frame of one Gaussian.
+    """A line through a point ``o`` in the direction of the unit vector ``d``, in the whitened frame of a Gaussian.
 
     Attributes:
         rows: rows of W [1/length].

@@ -100,7 +100,7 @@ def rotate_direction(frame: np.ndarray, d: mi.Vector3f) -> mi.Vector3f:
 
 
 def blocks_per_gaussian(degree: int) -> int:
-    """Blocks of ``ROW_SIZE`` numbers for the harmonics of one Gaussian."""
+    """Blocks of ``ROW_SIZE`` numbers for the harmonics of a Gaussian."""
     return -(-3 * basis_size(degree) // ROW_SIZE)
 
 
@@ -115,7 +115,7 @@ def pack_harmonics(harmonics: mi.TensorXf, degree: int) -> mi.Float:
 
 
 def read_harmonics(rows: mi.Float, first: mi.UInt32, degree: int) -> list[mi.Float]:
-    """The harmonics of one Gaussian, whose first block has the number ``first``."""
+    """The harmonics of a Gaussian, whose first block has the number ``first``."""
     return [value for block in range(blocks_per_gaussian(degree)) for value in read_row(rows, first + block)]
 
 
@@ -125,7 +125,7 @@ def sum_harmonics(row: list[mi.Float], basis: list[mi.Float]) -> list[mi.Float]:
 
 
 def eval_colour(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
-    """The radiance of one Gaussian: red, green and blue."""
+    """The radiance of a Gaussian: red, green and blue."""
     codes = [dr.maximum(total + 0.5, 0) for total in sum_harmonics(row, basis)]
     return codes if space == "linear" else [decode_srgb_code(code) for code in codes]
 

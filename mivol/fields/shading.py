@@ -8,7 +8,7 @@ fading with distance). Both sides of a surface are lit. The light is white and s
 shadow on matter. In constant regions of a scan the normal is undefined and the result is k_a c.
 
 Conventions. Gradients are central differences at the voxels (one-sided in the outermost layers), linear between voxels, per
-length of the world; they are exact for a quadratic field. The default coefficients are those of VTK's ``vtkVolumeProperty``.
+length of the world; they are exact for a quadratic field. The default coefficients are VTK's (``vtkVolumeProperty``).
 """
 
 from __future__ import annotations

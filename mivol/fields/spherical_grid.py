@@ -5,7 +5,7 @@ r"""A radiance field on a grid: density, and colour in spherical harmonics of th
 The coefficients k and the density rho are trilinear between nodes; o is the offset (0.5), a the activation.
 
 Conventions. Nodes are voxel centres. Values are constant in the outer half voxel, and outside the box is vacuum. Directions
-are those of camera rays, not of the light. They are taken in the grid's own frame: the rotation (and mirror image) of
+are directions of camera rays, not of light. They are taken in the grid's own frame: the rotation (and mirror image) of
 ``to_world`` is removed, scale and shear have no effect, so a rotated field keeps its look. The basis is real, in the order and
 with the signs of ``dr.sh_eval``, as in PlenOctrees, Plenoxels and 3D Gaussian splatting.
 
@@ -89,7 +89,7 @@ class SphericalGrid:
         degree: degree of the harmonics, 0 to 4.
         density: Float, one raw density a row.
         harmonics: Float, ``row_width`` numbers a row.
-        nodes: UInt32, ascending numbers of the stored nodes; None for a dense grid.
+        nodes: UInt32, ascending numbers of the stored nodes; None: a dense grid.
         activation: name in ``ACTIVATIONS``.
         offset: constant added to the sum of the harmonics.
         clamp: whether colours below 0 count as 0.
@@ -147,7 +147,7 @@ class SphericalGrid:
 
     @property
     def node_count(self) -> int:
-        """Number of nodes of all levels, stored or not."""
+        """Number of nodes on all levels, stored or not."""
         return self.levels * math.prod(self.res)
 
     @property
@@ -179,13 +179,13 @@ class SphericalGrid:
         clamp: bool = True,
         space: str = "srgb",
     ) -> SphericalGrid:
-        """Make a field of one level from arrays.
+        """Make a field of a single level from arrays.
 
         Args:
             density: (Z, Y, X) or (Z, Y, X, 1), raw.
             sh: (Z, Y, X, basis, 3).
             to_world: (4, 4) affine map of the unit cube.
-            keep: (Z, Y, X) bool, nodes to store; None for a dense grid.
+            keep: (Z, Y, X) bool, nodes to store; None: a dense grid.
             activation, offset, clamp, space: see the attributes.
 
         Raises:
@@ -236,7 +236,7 @@ class SphericalGrid:
 
     @classmethod
     def from_levels(cls, grids: Sequence[SphericalGrid]) -> SphericalGrid:
-        """Make a nested field from grids of one level, the innermost first, each of twice the extent of the one before.
+        """Make a nested field from grids of a single level, the innermost first, each of twice the extent of the one before.
 
         Raises:
             MivolError: grids that differ in more than their place and values, or do not nest.
@@ -266,7 +266,7 @@ class SphericalGrid:
         return self.from_rows(self.res, density=density, sh=sh, nodes=nodes, **settings)
 
     def extract_level(self, number: int) -> SphericalGrid:
-        """A level as a field of one level that fills its whole box; the box of the level before is not cut out.
+        """A level as a field of a single level that fills its whole box; the box of the level before is not cut out.
 
         Raises:
             MivolError: no such level.

@@ -1,4 +1,4 @@
-r"""Surfaces as triangle meshes by marching cubes: of a radiance field at one extinction, and of depth images of all views.
+r"""Surfaces as triangle meshes by marching cubes: of a radiance field at one extinction, and of depth images.
 
 Of a field. The surface of the extinction sigma is
 
@@ -97,7 +97,7 @@ def _extract_grid_surface(
     """The surface of one grid; an empty list if the grid does not reach the level or all triangles are left out.
 
     Args:
-        grid: grid of one level.
+        grid: grid of a single level.
         density: raw densities at the nodes, (X, Y, Z).
         raw: raw density of the surface.
         inner: box without triangles; None: no box.

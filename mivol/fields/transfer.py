@@ -230,7 +230,7 @@ class Transfer:
     def from_props(cls, props: mi.Properties) -> Transfer:
         """Make a grid from plugin parameters.
 
-        The parameters are ``filename`` or ``data``, ``table``, ``domain``, ``refine``, ``to_world``, and those of
+        The parameters are ``filename`` or ``data``, ``table``, ``domain``, ``refine``, ``to_world``, and those read by
         :class:`GradientEffects`.
 
         Raises:
