@@ -165,12 +165,12 @@ def named_medium(name: str) -> MeasuredMedium:
         MivolError: an unknown name; the message suggests the nearest known names.
     """
     known = {_plain(n): n for n in (*NAMES, *ALIASES)}
-    found = known.get(_plain(name))
-    if found is None:
+    match = known.get(_plain(name))
+    if match is None:
         near = difflib.get_close_matches(_plain(name), known, n=3, cutoff=0.5)
         near = ", ".join(known[n] for n in near) or "milk, skim milk, red wine, ..."
         raise MivolError(f"no measured medium is called {name!r}; near it are {near}: see mivol.phase.measured.NAMES.")
-    reduced, sigma_a, g = _TABLE[ALIASES.get(found, found)]
+    reduced, sigma_a, g = _TABLE[ALIASES.get(match, match)]
     sigma_s = tuple(float(np.round(s / (1 - k), 9)) for s, k in zip(reduced, g, strict=True))
     return MeasuredMedium(sigma_a, sigma_s, g)
 

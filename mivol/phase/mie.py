@@ -146,15 +146,15 @@ def _average(
 def _angular(cosines: np.ndarray, terms: int) -> tuple[np.ndarray, np.ndarray]:
     """The angular functions pi_n and tau_n (terms, n), Bohren & Huffman, section 4.3."""
     pi, tau = np.empty((2, terms, len(cosines)))
-    before, here = np.zeros(len(cosines)), np.ones(len(cosines))
+    previous, current = np.zeros(len(cosines)), np.ones(len(cosines))
     for n in range(1, terms + 1):
-        pi[n - 1], tau[n - 1] = here, n * cosines * here - (n + 1) * before
-        before, here = here, ((2 * n + 1) * cosines * here - (n + 1) * before) / n
+        pi[n - 1], tau[n - 1] = current, n * cosines * current - (n + 1) * previous
+        previous, current = current, ((2 * n + 1) * cosines * current - (n + 1) * previous) / n
     return pi, tau
 
 
-def _check_positive(**given: float) -> None:
-    for name, value in given.items():
+def _check_positive(**values: float) -> None:
+    for name, value in values.items():
         if not (np.isfinite(value) and value > 0):
             raise MivolError(f"{name} is {value}; a finite number above 0 is expected.")
 

@@ -34,9 +34,9 @@ def choose_lobe(shares: Sequence[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.
     start = mi.Float(0)
     for k, share in enumerate(shares):
         # A component of weight 0 is never chosen, not even where rounding leaves u above the sum of all weights.
-        here = (u >= start) & (share > 0)
+        is_chosen = (u >= start) & (share > 0)
         end = start + share
-        chosen, low, high = dr.select(here, k, chosen), dr.select(here, start, low), dr.select(here, end, high)
+        chosen, low, high = dr.select(is_chosen, k, chosen), dr.select(is_chosen, start, low), dr.select(is_chosen, end, high)
         start = end
     inside = (u - low) * dr.rcp(dr.select(high > low, high - low, 1))
     return chosen, dr.clip(inside, 0, 1 - 2.0**-24)

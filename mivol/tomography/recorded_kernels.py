@@ -7,8 +7,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
-from mivol.tomography.geometry import VoxelGrid
-from mivol.transport.media.column_integral import (
+from mivol.tomography.column_integral import (
     ColumnGrid,
     Line,
     backproject_columns,
@@ -17,6 +16,7 @@ from mivol.transport.media.column_integral import (
     pad_nodes,
     zero_nodes,
 )
+from mivol.tomography.geometry import VoxelGrid
 from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_segment
 from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.lattice import Lattice, clip_to_grid

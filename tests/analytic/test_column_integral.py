@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.media.column_integral import (
+from mivol.tomography.column_integral import (
     PIECE,
     ColumnCell,
     ColumnGrid,

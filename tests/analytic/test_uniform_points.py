@@ -53,7 +53,7 @@ def test_lanes_that_are_off_have_no_length():
 
 def test_a_segment_needs_a_random_number_where_something_is_bounded():
     assert start_reservoirs(0, None, 1) == []
-    with pytest.raises(MivolError, match="which is estimated only"):
+    with pytest.raises(MivolError, match="give RaySegment.u"):
         start_reservoirs(1, None, 1)
 
 

@@ -395,7 +395,7 @@ def test_mean_is_the_sum() -> None:
         kept = kept.offer(term, chance)
     term = ShadowTerm(media, kept)
     assert np.all(np.array(term.value) == 0)
-    media.bodies[0].tangents = [mi.Float(1)]
+    media.bodies[0].tangents, media.bodies[0].has_tangent = [mi.Float(1)], [True]
     media.bodies[0].has_tangent = [True]
     found = np.array(term.jvp().x, dtype=np.float64) * np.ones(n)
     truth = -sum(a * b for a, b in zip(LIGHTS, LENGTHS, strict=True))

@@ -124,7 +124,10 @@ class Body:
             MivolError: the default parts include a bounded part.
         """
         if parts is None and self.is_bounded:
-            raise MivolError("the optical depth of a bounded field was asked for; only its transmittance can be estimated.")
+            raise MivolError(
+                "a medium with a bounded field has no exact optical depth; grids, constants or Gaussians are expected: "
+                "estimate its transmittance instead."
+            )
         parts = self.view.parts if parts is None else parts
         scale = dr.detach(self.view.scale) * self.area(interval.ray.d)
         bound = None if enough is None else enough / scale

@@ -157,9 +157,9 @@ class GaussianExtinction:
                 start, end = line.chord
                 ends = fast_max(start, 0), fast_min(end, length)
                 # Cells follow each other without a gap, so the place of entry lies in one of them.
-                here = line.hits & (ends[1] > ends[0]) & (ends[0] >= cell.s) & (ends[0] < cell.s + cell.dt)
+                enters = line.hits & (ends[1] > ends[0]) & (ends[0] >= cell.s) & (ends[0] < cell.s + cell.dt)
                 # Most are not met: a branch costs two thirds of what adding 0 for them did.
-                return dr.if_stmt((state,), here, lambda state: add(state, line, index, ends), lambda state: state)
+                return dr.if_stmt((state,), enters, lambda state: add(state, line, index, ends), lambda state: state)
 
             state = field.visit_cell(cell.lower + 1, through, on, state, meet)
             return state if leave is None else leave(state, cell)

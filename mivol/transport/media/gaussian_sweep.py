@@ -206,9 +206,9 @@ def visit_far_to_near(part: GaussianExtinction, interval: RayInterval, state: An
             def meet(slots: list, line: WhitenedLine, index: mi.UInt32) -> list:
                 ends = ends_of(line)
                 place = fast_min(fast_max(segment.length - line.peak, 0), segment.length * LAST_PLACE)
-                here = line.hits & (ends[1] > ends[0]) & (place >= cell.s) & (place < cell.s + cell.dt)
-                here &= _is_farther(last, (line.peak, index))
-                return dr.if_stmt((slots,), here, lambda slots: _insert(slots, (line.peak, index)), lambda slots: slots)
+                holds_peak = line.hits & (ends[1] > ends[0]) & (place >= cell.s) & (place < cell.s + cell.dt)
+                holds_peak &= _is_farther(last, (line.peak, index))
+                return dr.if_stmt((slots,), holds_peak, lambda slots: _insert(slots, (line.peak, index)), lambda slots: slots)
 
             empty = (dr.full(mi.Float, -dr.inf, dr.width(start)), dr.zeros(mi.UInt32, dr.width(start)))
             slots = field.visit_cell(cell.lower + 1, through, more, [empty] * SLOTS, meet)
@@ -237,9 +237,9 @@ def _is_farther(a: tuple[mi.Float, mi.UInt32], b: tuple[mi.Float, mi.UInt32]) ->
 
 def _insert(slots: list, peak: tuple[mi.Float, mi.UInt32]) -> list:
     """Insert a peak into the sorted slots, the farthest first; the nearest peak falls out."""
-    kept = []
+    result = []
     for own in slots:
         ahead = _is_farther(peak, own)
-        kept.append(tuple(dr.select(ahead, new, old) for new, old in zip(peak, own, strict=True)))
+        result.append(tuple(dr.select(ahead, new, old) for new, old in zip(peak, own, strict=True)))
         peak = tuple(dr.select(ahead, old, new) for new, old in zip(peak, own, strict=True))
-    return kept
+    return result

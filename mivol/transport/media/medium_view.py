@@ -236,15 +236,15 @@ def medium_kind(medium: mi.Medium) -> str:
 
 def find_children(medium: mi.Medium) -> dict[str, mi.Object]:
     """The volumes and the phase function of a medium, by name; an object may occur under several names."""
-    found = {}
+    children = {}
 
     class Children(mi.TraversalCallback):  # in here, since Mitsuba has no such class before a variant is set
         def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
             if isinstance(value, mi.Object):
-                found[name] = value
+                children[name] = value
 
     medium.traverse(Children())
-    return found
+    return children
 
 
 def nested_field(medium: mi.Medium) -> SphericalGrid | None:

@@ -174,7 +174,7 @@ def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: m
         An interval for each of ``media.boxed``, in their order; two intervals for a medium with a hole, before and behind the
         hole.
     """
-    found = []
+    intervals = []
     for body in media.boxed:
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.cuts_grids:
@@ -184,8 +184,8 @@ def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: m
             _, _, enter, leave = clip_to_box(body.hole_rows, *UNIT, ray.o, ray.d, t0, t1)
             misses = leave <= enter
             ends = [(t0, dr.select(misses, t1, enter)), (dr.select(misses, t1, leave), t1)]
-        found += [MediumInterval(ray, a, b, active & (b > a), body) for a, b in ends]
-    return found
+        intervals += [MediumInterval(ray, a, b, active & (b > a), body) for a, b in ends]
+    return intervals
 
 
 @dr.syntax
@@ -218,20 +218,20 @@ def trace_boundaries(
 
     while dr.hint(going, label="to the next opaque surface"):
         hit = media.scene.ray_intersect(onward, mi.RayFlags.All, False, going)
-        found = going & hit.is_valid()
-        t_hit = dr.select(found, dr.maximum(t, hit_distance(ray, hit)), ray.maxt)
+        is_hit = going & hit.is_valid()
+        t_hit = dr.select(is_hit, dr.maximum(t, hit_distance(ray, hit)), ray.maxt)
 
         # -- The medium on this side of the surface fills the interval --------------------------------------------------------
-        transition = found & hit.is_medium_transition()
+        transition = is_hit & hit.is_medium_transition()
         medium = dr.select(transition, hit.target_medium(-ray.d), medium)
         for body in media.traced:
             on = going & (medium == mi.MediumPtr(body.view.medium))
             state = visit(state, MediumInterval(ray, t, t_hit, on, body))
 
         # -- Go on through what is transparent ------------------------------------------------------------------------------
-        clear = found & is_transparent(hit)
+        clear = is_hit & is_transparent(hit)
         if passes_null:
-            thin = found & ~clear & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) & (t_hit < ray.maxt * OWN_SURFACE)
+            thin = is_hit & ~clear & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) & (t_hit < ray.maxt * OWN_SURFACE)
             null_transmission = dr.select(
                 thin, null_transmission * hit.bsdf().eval_null_transmission(hit, thin), null_transmission
             )

@@ -67,8 +67,8 @@ class SceneMedia:
     def medium_of(self, index: mi.UInt32, on: mi.Bool) -> mi.MediumPtr:
         """Mitsuba's medium by its index among ``bodies``; null in lanes that are not ``on``."""
         medium = dr.zeros(mi.MediumPtr, dr.width(on))
-        for body, here in self.bodies_at(index, on):
-            medium = dr.select(here, mi.MediumPtr(body.view.medium), medium)
+        for body, own in self.bodies_at(index, on):
+            medium = dr.select(own, mi.MediumPtr(body.view.medium), medium)
         return medium
 
     @property
@@ -142,10 +142,10 @@ class SceneMedia:
         """Begin a forward pass: take the tangent of each part from the parameters."""
         for body in self.bodies:
             products = [p.scaled(body.view.scale) for p in body.view.parts]
-            asked = [p for p in products if dr.grad_enabled(p)]
-            if asked:
+            followed = [p for p in products if dr.grad_enabled(p)]
+            if followed:
                 # The tangents of the parameters are kept: what else was made of them, such as an albedo, is followed later.
-                dr.forward_to(*asked, flags=dr.ADFlag.ClearEdges)
+                dr.forward_to(*followed, flags=dr.ADFlag.ClearEdges)
             body.has_tangent = [dr.grad_enabled(p) for p in products]
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
             if is_followed(body.view.microflakes):
@@ -163,9 +163,9 @@ def _locate(scene: mi.Scene, ray: mi.Ray3f, size: mi.Float) -> mi.MediumPtr:
     going = dr.full(mi.Bool, True, dr.width(ray))
     while dr.hint(going, label="the medium around the camera"):
         si = scene.ray_intersect(probe, mi.RayFlags.All, False, going)
-        found = going & si.is_valid()
-        boundary = found & si.is_medium_transition()
+        is_hit = going & si.is_valid()
+        boundary = is_hit & si.is_medium_transition()
         medium = dr.select(boundary, si.target_medium(-ray.d), medium)
         probe = spawn_ray(si, ray.d, size)
-        going = found & ~boundary
+        going = is_hit & ~boundary
     return medium

@@ -67,7 +67,10 @@ def start_reservoirs(count: int, u: mi.Float | None, width: int) -> list[PointRe
         MivolError: ``count`` is not 0, and the segment has no random number.
     """
     if count and u is None:
-        raise MivolError("the derivative of an optical depth through a bounded field was asked for, which is estimated only.")
+        raise MivolError(
+            "a segment through a bounded field has no random number; a drawn point estimates the derivative of its optical "
+            "depth: give RaySegment.u."
+        )
     zero = dr.zeros(mi.Float, width)
     return [PointReservoir(zero, zero, zero, mi.Float(u)) for _ in range(count)]
 

@@ -159,13 +159,13 @@ def _nearest(far: mi.UInt8, stride: int, n: int) -> mi.UInt8:
     The new distance of a block is a minimum over its neighbours along the axis. The term of a neighbour is the larger of two
     numbers: its distance along the axis, and its own distance ``far`` across the previous axes.
     """
-    here = dr.arange(mi.Int32, dr.width(far))
-    place = here // stride % n
+    index = dr.arange(mi.Int32, dr.width(far))
+    place = index // stride % n
     best = mi.UInt8(far)
     k = mi.Int32(1)
     while k < mi.Int32(best):
-        low = dr.gather(mi.UInt8, far, mi.UInt32(here - k * stride), place >= k)
-        high = dr.gather(mi.UInt8, far, mi.UInt32(here + k * stride), place + k < n)
+        low = dr.gather(mi.UInt8, far, mi.UInt32(index - k * stride), place >= k)
+        high = dr.gather(mi.UInt8, far, mi.UInt32(index + k * stride), place + k < n)
         low = dr.select(place >= k, low, mi.UInt8(REACH))
         high = dr.select(place + k < n, high, mi.UInt8(REACH))
         best = dr.minimum(best, dr.maximum(dr.minimum(low, high), mi.UInt8(k)))
