@@ -361,7 +361,7 @@ def test_the_showcase_shows_four_things_and_how_the_smoke_changes_the_image(tmp_
     """
     write_gaussians(tmp_path / "needles.ply", runpy.run_path(str(SCENES / "knot" / "render.py"))["knot"](300))
     rng = np.random.default_rng(0)
-    box = np.diag([2.0, 2, 0.8, 1]) + np.array([[0, 0, 0, -0.9], [0, 0, 0, -0.75], [0, 0, 0, -0.2], [0, 0, 0, 0]])
+    box = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 0.8, -0.2], [0, 0, 0, 1]])
     field = SphericalGrid.from_dense(rng.uniform(0, 9, (4, 6, 6)), rng.normal(0.5, 0.2, (4, 6, 6, 1, 3)), box)
     write_field(tmp_path / "field.npz", field)
     files = ("--field", tmp_path / "field.npz", "--needles", tmp_path / "needles.ply")
