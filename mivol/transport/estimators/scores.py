@@ -1,6 +1,6 @@
 r"""Scores: how a walked path accumulates its radiance, the gradients of its parameters, or the tangent of its radiance.
 
-The radiance of a path is a sum of terms, each multiplied by all factors in front of it:
+The radiance of a path is a sum of terms, each multiplied by the factors in front:
 
 .. math:: L = t_1 + f_1 (t_2 + f_2 (t_3 + \dots))
 
@@ -10,7 +10,7 @@ The walk reports terms and factors to its score in the order of the path. There 
 * ``Replay`` (path replay backpropagation) follows a path whose radiance is known. It subtracts each term from ``L``, so ``L``
   is the radiance from further along the path when the walk reports a factor. A term receives d loss / d t = dL, and a factor
   receives d loss / d log f = dL L. After the walk ``L`` is 0, up to rounding.
-* ``Tangent`` adds the tangents of terms, and carries the tangent of the logarithm of the product of all factors, f'/f.
+* ``Tangent`` adds the tangents of terms, and carries the tangent of the logarithm of the product of the factors, f'/f.
 
 Terms and factors compute their own derivatives in reverse mode (vjp) and forward mode (jvp), so a score depends on no
 estimator. A factor differentiates its logarithm, so nothing is divided by a factor without a derivative, and never by a
@@ -159,8 +159,8 @@ class Replay:
     """Follow a path again, and add its derivatives to the gradients of media, surfaces and emitters.
 
     Attributes:
-        L: radiance from further along the path. A path of one segment does not need it (None): the only light behind its factor
-            is the emission at its end, so the factor waits for this term.
+        L: radiance from further along the path. A path with a single segment does not need it (None): the only light behind its
+            factor is the emission at its end, so the factor waits for this term.
         dL: d loss / d L.
         pending: the waiting factor.
     """
@@ -191,7 +191,7 @@ class Tangent:
 
     Attributes:
         dL: tangent of the radiance so far.
-        dlog: tangent of the logarithm of the product of all factors so far.
+        dlog: tangent of the logarithm of the product of the factors so far.
     """
 
     dL: mi.Spectrum

@@ -64,7 +64,7 @@ class PathSegment:
         depth: number of scattering events so far.
         is_side_flight: a flight beside the path (:mod:`mivol.transport.path.side_flight`).
         emission_weight: weight of the emission of media along the segment, if the origin has sampled their emission too [1];
-            None for a weight of 1.
+            None means a weight of 1.
     """
 
     ray: Ray
@@ -146,7 +146,7 @@ class SegmentEstimator(Protocol):
     ends_in_media: bool
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
-        """Draw the random numbers of one segment, for ``PathSegment.samples``."""
+        """Draw the random numbers of a segment, for ``PathSegment.samples``."""
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         """Follow a segment to its end, for the purpose IMAGE, REVERSE or FORWARD."""

@@ -240,7 +240,7 @@ def _find_first_collisions(estimators: Estimators, sampler: mi.Sampler, ray: mi.
 
 
 def _tile_means(values: mi.Float, weights: mi.Float, tile: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """The weighted mean of one channel, and the mean of each tile, shrunk towards it; 0 without weights."""
+    """The weighted mean of a channel, and the mean of each tile, shrunk towards it; 0 without weights."""
     total, collisions = dr.sum(weights), dr.count(weights > 0)
     mean = dr.select(total > 0, dr.sum(values * weights) / dr.select(total > 0, total, 1), 0)
     tile_sums, tile_weights = (dr.zeros(mi.Float, TILES_PER_AXIS * TILES_PER_AXIS) for _ in range(2))

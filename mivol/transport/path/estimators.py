@@ -1,4 +1,4 @@
-"""The table of segment estimators from which a plan chooses, and the estimators and settings of one render.
+"""The table of segment estimators from which a plan chooses, and the estimators and settings of a render.
 
 Each entry states the scenes that the estimator can render, its bias and variance, and the papers it follows. The plan chooses
 one entry for the segments of a path, ``mivol explain`` prints it, and tests measure its promises."""
@@ -86,8 +86,8 @@ class SegmentInputs:
     Attributes:
         direct: estimator of direct lighting, at surfaces and in media.
         count: number of scattering points on a segment in images; derivatives use one.
-        visibility_cache: rough visibility of the emitters, guiding distance sampling; None for no guidance.
-        transmittance_grid: lattice replacing shadow rays; None for exact shadow rays.
+        visibility_cache: rough visibility of the emitters, guiding distance sampling; None without guidance.
+        transmittance_grid: lattice replacing shadow rays; None means exact shadow rays.
     """
 
     direct: DirectLighting
@@ -201,7 +201,7 @@ SEGMENT_ESTIMATORS = {
         _make_quadrature,
         lambda needs: needs.scatters and needs.is_single and needs.deterministic,
         1,
-        "light scatters once in one medium, whose grids share their cells, and every emitter has one position or direction",
+        "light scatters once in one medium, whose grids share cells, and every emitter has a single position or direction",
         "error of the fourth order in the size of a cell for smooth light, no variance; derivatives are Monte Carlo estimates",
         ("hairer_1996", "kulla_2012", "amanatides_1987", "vicini_2021"),
     ),
@@ -219,7 +219,7 @@ def choose_segment_estimator(needs: SegmentNeeds) -> str | None:
 
 @dataclass
 class Estimators:
-    """The estimators and the settings of one render.
+    """The estimators and the settings of a render.
 
     Attributes:
         direct: estimator of direct lighting, at surfaces and in media.
@@ -228,7 +228,7 @@ class Estimators:
         lights_surfaces: a surface scatters light; multiple importance sampling combines emitter samples with BSDF samples.
         lights_media: emitter samples light the collisions in media too. Not used if a constant environment is the only emitter,
             since escaping paths find its light without noise.
-        lobe: mean cosine of the lobe of side flights (:mod:`.side_flight`); None for no side flights.
+        lobe: mean cosine of the lobe of side flights (:mod:`.side_flight`); None without side flights.
         emission: sampler of the emission of media at scattering events; None to leave the emission to paths passing through.
         long_paths_count: long paths carry as much light as short ones (an even environment) or more (emitting media); roulette
             then spares them.

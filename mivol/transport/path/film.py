@@ -4,7 +4,7 @@ r"""The rays of a sensor, the film averaging their radiance, and the transpose f
 
 Conventions. The samples of a render are split into passes of at most ``pass_rays`` rays. The film sums all passes before
 dividing by the filter weights, so the image depends on the split only through the order of sums, and a render may have more
-than the 2^32 samples of one launch. The samples of a stratifying sampler stay stratified over all passes.
+than the 2^32 samples of a launch. The samples of a stratifying sampler stay stratified over all passes.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class RenderSamples:
 
 @dataclass
 class CameraRays:
-    """The camera rays of one pass.
+    """The camera rays of a pass.
 
     Attributes:
         sampler: source of the random numbers of the pass.
@@ -177,7 +177,7 @@ def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pa
 
 
 def render_on_film(samples: RenderSamples, names: list[str], sample: RadianceFunction) -> mi.TensorXf:
-    """Render an image: sample the rays of all passes, and average them on the sensor's film.
+    """Render an image: sample the rays pass by pass, and average them on the sensor's film.
 
     Args:
         samples: samples of the render.
@@ -222,8 +222,8 @@ def adjoint_rays(
             dr.enable_grad(L, aovs)
             film.prepare(names)
             block = _new_block(film, rays)
-            # The film divides a pixel by the filter weights of all passes. With several passes, a block of its own holds their
-            # sum.
+            # The film divides a pixel by the filter weights over the passes. With several passes, a block of its own holds
+            # their sum.
             weight = mi.Float(0 if several else 1)
             _add_samples(block, film, rays, _FilmSample(L * rays.weight, weight, mi.Float(0), aovs))
             film.put_block(block)
@@ -240,7 +240,7 @@ def adjoint_rays(
 
 
 def _sum_filter_weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlock:
-    """An image block with the filter weights of all passes, without light."""
+    """An image block with the filter weights over the passes, without light."""
     film = samples.sensor.film()
     film.prepare(names)
     block = None

@@ -184,7 +184,7 @@ def has_one_segment(estimators: Estimators) -> bool:
 
 
 def film_alpha(path: Path) -> mi.Float:
-    """Alpha of a path for the film [1]: 1 if a surface has stopped the path, else the opacity of the media.
+    """Alpha of a path for the film [1]: 1 if a surface has stopped the path, otherwise the opacity of the media.
 
     From ``max_depth`` 2 on, ``volpath`` draws alpha (1 if a path finds a point in a medium or on a surface); film_alpha is the
     mean of these draws, without noise. At depth 1 ``volpath`` finds no points in media and its smoke has alpha 0; mivol's alpha
@@ -392,7 +392,7 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
 
 
 def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
-    """Next-event estimation: add the light of one emitter sample, attenuated by the media along its shadow ray."""
+    """Next-event estimation: add the light of an emitter sample, attenuated by the media along its shadow ray."""
     if not (estimators.lights_surfaces or estimators.lights_media):
         return path
     media, sampler, attached = estimators.media, path.sampler, path.score.purpose != IMAGE
@@ -425,7 +425,7 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
 
 
 def _add_media_emission(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
-    """Add the light of one sampled point of the emitting media."""
+    """Add the light of a sampled point of the emitting media."""
     media, sampler, attached = estimators.media, path.sampler, path.score.purpose != IMAGE
     lit, albedo = may_scatter & event.in_medium, mi.Spectrum(1)
     if media.has_surfaces:

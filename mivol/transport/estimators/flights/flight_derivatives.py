@@ -97,7 +97,7 @@ class FlightSegment:
         passed: ray up to the end of the flight.
         collision: collision at the end of the flight.
         weight: weight of each channel at the end of the flight [1].
-        baseline: baseline b; None for 0.
+        baseline: baseline b; None means 0.
         emission: sampled point of the emission; None without emission by position.
         gaussian_light: light of Gaussians; None without emitting Gaussians.
         active: lanes that fly.
@@ -239,7 +239,7 @@ class Probe:
         gain: throughput up to the point, times the sampled length [length].
         depth: number of scattering events before the point.
         weight: reservoir weight of the point.
-        total: sum of the weights of all flights.
+        total: total weight of the flights so far.
     """
 
     ray: FineRay
@@ -259,7 +259,7 @@ class Probe:
         return cls(FineRay.from_ray(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
 
     def offer(self, segment: PathSegment, found: FlightPoint, on: mi.Bool) -> Probe:
-        """Offer the point of one more flight to the reservoir."""
+        """Offer the point of another flight to the reservoir."""
         point, gain = found.point, found.gain
         weight = dr.select(point.on & segment.may_scatter & on, dr.max(gain), 0)
         total = self.total + weight
@@ -279,7 +279,7 @@ class Probe:
 class Probes:
     """The probes of a path: one of its flights before the first scattering event, one of its later flights.
 
-    Later flights are few beside the first flights of all paths passing the media, and cause more than half of the noise. (With
+    Later flights are few beside the first flights of the paths passing the media, and cause more than half of the noise. (With
     one probe for both, variance x time over all voxels was 1.2 to 1.4 times as large under a sun or a lamp, and the same in
     even light.)
 
@@ -291,7 +291,7 @@ class Probes:
     later: Probe | None
 
     def offer(self, segment: PathSegment, found: FlightPoint) -> Probes:
-        """Offer the point of one more flight to the reservoir of its kind."""
+        """Offer the point of another flight to the reservoir of its kind."""
         on = segment.depth == 0
         first = None if self.first is None else self.first.offer(segment, found, on)
         return Probes(first, None if self.later is None else self.later.offer(segment, found, ~on))
@@ -306,7 +306,7 @@ class ProbeTerm:
         probe: the probe.
         mei: position of the probe.
         source: estimate of the in-scattered radiance at the probe.
-        baseline: baseline b; None for 0.
+        baseline: baseline b; None means 0.
         on: lanes with a probe.
     """
 
@@ -380,7 +380,7 @@ class ShadowReservoir:
         ray_segment: the ray.
         value: its light at the camera [radiance].
         weight: its reservoir weight.
-        total: sum of the weights of all shadow rays.
+        total: total weight of the shadow rays so far.
     """
 
     ray_segment: RaySegment
@@ -399,11 +399,11 @@ class ShadowReservoir:
         )
 
     def offer(self, light: DirectLight, chance: mi.Float) -> ShadowReservoir:
-        """Offer one more shadow ray to the reservoir.
+        """Offer another shadow ray to the reservoir.
 
         Args:
             light: light of the shadow ray; the weight is its largest channel.
-            chance: uniform random number in [0, 1); the new ray is kept if chance is below weight / (sum of all weights).
+            chance: uniform random number in [0, 1); the new ray is kept if chance is below weight / (total weight).
         """
         weight = dr.select(light.active, dr.max(dr.abs(light.value)), 0)
         total = self.total + weight

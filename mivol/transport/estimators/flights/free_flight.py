@@ -74,7 +74,7 @@ class FreeFlight:
         media: media of the scene.
 
     Attributes:
-        baseline: baseline of the derivatives (:mod:`.flight_derivatives`); None for 0.
+        baseline: baseline of the derivatives (:mod:`.flight_derivatives`); None means 0.
 
     Bias: none. Variance: one flight a segment. Cost: a walk of each medium to the first collision; one more walk for an rgb
     extinction or an emitting medium.
@@ -88,7 +88,7 @@ class FreeFlight:
         self.baseline: Baseline | None = None
 
     def draw(self, sampler: mi.Sampler | LaneSampler, active: mi.Bool, strata: Strata | None) -> tuple[mi.Float, mi.UInt32]:
-        """Draw the number of the flight and the generator of all other numbers, in every lane, since all lanes fly."""
+        """Draw the number of the flight and the generator of the other numbers, in every lane, since all lanes fly."""
         return sampler.next_1d(), draw_state(sampler)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
@@ -130,13 +130,13 @@ class FreeFlight:
     def _channel_weight(
         self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None
     ) -> mi.Spectrum:
-        """The weight of each channel: its value over the mean density of all channels, in proportion to their throughputs.
+        """The weight of each channel: its value over the mean density over the channels, in proportion to their throughputs.
 
         Args:
             segment: segment of the path, with its throughput.
             passed: ray up to the end of the flight.
             active: lanes that fly.
-            collision: collision at the end; None for the probability of flying this far.
+            collision: collision at the end; None means the probability of flying this far.
         """
         if self.media.channels == 1:
             return mi.Spectrum(1)
@@ -196,7 +196,7 @@ def _eval_extinction(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on:
 def _find_first_collision(
     media: SceneMedia, ray: Ray, medium: mi.MediumPtr, u: mi.Float, channel: mi.UInt32, rng: mi.UInt32, active: mi.Bool
 ) -> tuple[SegmentEnd, _Flight]:
-    """Follow a ray to the first opaque surface, and find the first collision in front of it."""
+    """Follow a ray to the first opaque surface, and find the first collision in front of the surface."""
     bodies = media.bodies
     # A ray may enter a traced boundary several times; each entry needs its own random number.
     first = next((p for b in media.boxed for p in b.view.parts if not _draws_many_numbers(p)), None)

@@ -3,7 +3,7 @@ r"""The light of Gaussians along a flight, with its derivatives.
 .. math:: \int_0^D T(t)\,j\,dt = \sum_k T(t_k)\,N_k, \qquad E\big[\,[t > t_k]\,\big] = T(t_k)
 
 At t_k the ray enters Gaussians, whose light between entry and exit is N_k (:mod:`mivol.transport.media.gaussian_sweep`). A
-flight reaching t_k adds all of N_k instead of the light of one sampled point: N_k is a sum in the order of the Gaussians, which
+flight reaching t_k adds all of N_k instead of the light of a sampled point: N_k is a sum in the order of the Gaussians, which
 no single point has, and is free of noise. The derivative by the media in front of t_k is the derivative of the probability of
 reaching t_k: -N_k times the derivative of their optical depth.
 
@@ -50,7 +50,7 @@ class _Entry:
 
 
 class GaussianLight:
-    """The light of all Gaussians along a flight, at the camera.
+    """The light of the Gaussians along a flight, at the camera.
 
     Args:
         media: media of the scene.

@@ -109,7 +109,7 @@ def _collide_in_grid(
 
 
 def _select_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
-    """Select the value of one channel; a grey part has one channel, and a mono variant uses the luminance of three."""
+    """Select the value of a channel; a grey part has one channel, and a mono variant uses the luminance of three."""
     rows = to_scene_channels(rows, 1) if mi.is_monochromatic else rows
     value = rows[0]
     for k, row in enumerate(rows[1:], 1):

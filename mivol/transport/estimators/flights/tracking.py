@@ -2,7 +2,7 @@ r"""Tracking through fields with a majorant: ratio tracking estimates transmitta
 
 .. math:: \hat T = e^{-\int m\,dt} \prod_j \left(1 - \frac{\sigma(x_j) - m}{\kappa\,(M - m)}\right)
 
-*Residual ratio tracking* serves grids, and is cheaper than a walk of all cells of a fine grid. Each block of cells has a
+*Residual ratio tracking* serves grids, and is cheaper than a walk of the cells of a fine grid. Each block of cells has a
 smallest value m (the minorant, a control extinction) and a largest value M (the majorant). The optical depth of m is exact. A
 Poisson process of the rate kappa (M - m) draws the points x_j, which estimate the residual above m. At each point, one of the
 eight corners of the cell is read, drawn with its trilinear weight as probability: the estimate is linear in each factor, so its

@@ -49,7 +49,7 @@ def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
 
 @dataclass
 class DirectSample:
-    """The contribution of one shadow ray to the radiance scattered by a vertex towards the camera.
+    """The contribution of a shadow ray to the radiance scattered by a vertex towards the camera.
 
     Attributes:
         ray_segment: the shadow ray.
@@ -178,7 +178,7 @@ class DirectLighting:
             sample: the emitter sample.
             attached: keep the derivatives of the emitter and of the BSDF or phase function.
             active: lanes to estimate.
-            rng: state of the random number generator for an estimated shadow; None for an exact shadow.
+            rng: state of the random number generator for an estimated shadow; None means an exact shadow.
 
         Bias: none. Variance: one emitter sample. Cost: one shadow ray.
         """

@@ -133,7 +133,7 @@ class RayPoint:
 
 @dataclass
 class EmissionTable:
-    """The density of points in each cell of all boxes.
+    """The density of points in each cell of the boxes.
 
     Attributes:
         boxes: boxes of the emitting media.
@@ -193,7 +193,7 @@ class EmissionTable:
         return RayPoint(pdf, dr.fma(u, length, begin), density, box)
 
     def _walk(self, ray: mi.Ray3f, visit: Callable, state: Any, active: mi.Bool) -> Any:
-        """Visit the cells of all boxes along a ray, by their numbers."""
+        """Visit the cells of the boxes along a ray, by their numbers."""
         for number, box in enumerate(self.boxes):
 
             def visit_cell(state: Any, cell: mi.Vector3i, t0: mi.Float, t1: mi.Float, on: mi.Bool, first: int = number) -> Any:
@@ -297,7 +297,7 @@ class EmissionSampling:
         Args:
             vertex: vertex of the path.
             carried: throughput up to the vertex, times the albedo in a medium [1].
-            samples: uniform random number for the cell, and the generator of all other numbers.
+            samples: uniform random number for the cell, and the generator of the other numbers.
             attached: keep the derivatives of the emission and of the BSDF or phase function.
             active: lanes to estimate.
             estimates: estimate the shadow.

@@ -58,11 +58,11 @@ class SceneEmitters:
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
 
     def bounding_ball(self, number: int) -> list[mi.Float] | None:
-        """Centre and radius of a ``sampled`` emitter [length]; None for an emitter at infinity."""
+        """Centre and radius of a ``sampled`` emitter [length]; None if the emitter is at infinity."""
         return self._balls[number]
 
     def draw_event_samples(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> EventSamples:
-        """Draw the random numbers of one scattering event."""
+        """Draw the random numbers of a scattering event."""
         return EventSamples(
             sampler.next_1d(active),
             sampler.next_2d(active),
@@ -131,7 +131,7 @@ class ChosenEmitter:
 
 @dataclass
 class EventSamples:
-    """The random numbers of one scattering event, uniform in [0, 1).
+    """The random numbers of a scattering event, uniform in [0, 1).
 
     Attributes:
         piece: seed of the reservoir choosing a piece of the ray.
@@ -141,7 +141,7 @@ class EventSamples:
         component: number for the component of the phase function.
         direction: numbers for the direction of the phase sample.
         which_shadow_ray: number for the differentiated shadow ray.
-        strata: strata of directions; None for the whole square.
+        strata: strata of directions; None means the whole square.
     """
 
     piece: mi.Float
@@ -194,7 +194,8 @@ def _fractional_part(x: mi.Float) -> mi.Float:
 
 
 def make_ball_sampler(ray: Ray, ball: list[mi.Float] | None) -> EquiangularSampler | None:
-    """Make the sampler towards an emitter by its bounding ball (x, y, z, radius) [length]; None for an emitter at infinity."""
+    """Make the sampler towards an emitter by its bounding ball (x, y, z, radius) [length]; None if the emitter is at
+    infinity."""
     if ball is None:
         return None
     x, y, z, r = ball

@@ -110,7 +110,7 @@ def _boundary_gradient(media: SceneMedia, ray_segment: RaySegment, active: mi.Bo
 def _add_boundary(
     total: list[mi.Vector3f], media: SceneMedia, ray: Ray, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
 ) -> list[mi.Vector3f]:
-    """Add the term of one boundary, from the extinctions slightly in front of it and behind it."""
+    """Add the term of a boundary, from the extinctions slightly in front of the boundary and behind."""
     slope = dr.dot(hit.n, ray.d)
     face = mi.Vector3f(hit.n) * dr.rcp(dr.select(slope != 0, slope, 1))
     for side, to, sign in ((-ray.d, 1 - SIDE_STEP, -1.0), (ray.d, 1 + SIDE_STEP, 1.0)):

@@ -51,7 +51,7 @@ def find_transmittance(
         medium: medium around the origin of the ray.
         active: lanes to follow.
         rng: state of the random number generator for an unbiased estimate: by tracking with block ranges or a bounded medium in
-            the scene, by roulette otherwise; None for the exact transmittance.
+            the scene, by roulette otherwise; None means the exact transmittance.
 
     Returns:
         The end of the ray; its optical depth for each channel [1], or None if tracking has estimated the transmittance; and the
@@ -88,7 +88,7 @@ def _multiply_transmittance(state: tuple, interval: MediumInterval) -> tuple:
 
 
 def _estimate_medium_transmittance(interval: MediumInterval, channels: int, rng: mi.UInt32) -> tuple[list[mi.Float], mi.UInt32]:
-    """Transmittance of one medium for each channel [1], and the next state of the generator.
+    """Transmittance of a medium for each channel [1], and the next state of the generator.
 
     Ratio tracking estimates bounded parts, residual ratio tracking grids with block ranges. All other parts are exact, and
     walked up to the optical depth ``NEGLIGIBLE_TAU``.

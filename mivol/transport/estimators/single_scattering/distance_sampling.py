@@ -106,7 +106,7 @@ class Reservoir:
 
     Attributes:
         tau, T: optical depth and transmittance of the walked part of the ray, for each channel [1].
-        total: sum of the weights of all offered pieces.
+        total: total weight of the offered pieces.
         candidates: the kept pieces.
     """
 
@@ -181,7 +181,7 @@ class _Filling:
     proposal: DistanceProposal
 
     def visit(self, reservoir: Reservoir, interval: MediumInterval) -> Reservoir:
-        """Offer the pieces of one medium, and sum the optical depth of its parts with other cells."""
+        """Offer the pieces of a medium, and sum the optical depth of its parts with other cells."""
         body = interval.body
         reservoir = self._offer_body(reservoir, interval)
         media = self.proposal.media
@@ -197,7 +197,7 @@ class _Filling:
         return reservoir
 
     def _offer_body(self, reservoir: Reservoir, interval: MediumInterval) -> Reservoir:
-        """Offer the pieces of one medium, in their order.
+        """Offer the pieces of a medium, in their order.
 
         The ends of a box come in float64: seen from 30 box sizes away, a float32 entry has an error of 1e-6 of a box.
         """
@@ -245,7 +245,7 @@ class _Filling:
         return _set_probe_sigma(reservoir, probe_sigma)
 
     def _probe_sigma(self, length: mi.Float) -> mi.Float | None:
-        """Extinction added by a probe over a length [1/length]; None for an image."""
+        """Extinction added by a probe over a length [1/length]; None in images."""
         if not self.proposal.probe_depth:
             return None
         return dr.select(dr.isfinite(length) & (length > 0), self.proposal.probe_depth * bounded_inverse(length), 0)
@@ -273,7 +273,8 @@ class _Filling:
 
 
 def _replace_candidate(old: Candidate, piece: _Piece, weight: mi.Float, total: mi.Float, front: list[mi.Float]) -> Candidate:
-    """Keep the new piece with the probability weight / total, else the old one: a step of weighted reservoir sampling."""
+    """Keep the new piece with the probability weight / total, otherwise the old piece: a step of weighted reservoir
+    sampling."""
     rng, (u,) = draw_pcg32(old.rng, 1)
     keep = u * total < weight
     return Candidate(
@@ -361,7 +362,7 @@ def sample_distance(
     Args:
         proposal: proposal of the reservoir's weights.
         candidate: the piece.
-        total: sum of the weights of all pieces.
+        total: total weight of the pieces.
         u: two uniform random numbers in [0, 1).
         active: lanes that may scatter.
     """

@@ -1,4 +1,4 @@
-r"""Single scattering by quadrature along the camera's ray, without noise, for emitters of one position or direction.
+r"""Single scattering by quadrature along the camera's ray, without noise, for emitters with a single position or direction.
 
 .. math:: \int_a^b T \sigma c\,dt \approx \frac{\Delta}{2}\,\kappa\,(w_1 c_1 + w_2 c_2), \qquad
           w_q = \sigma_q e^{-\tau_q}, \quad \kappa = \frac{\varphi_1(\tau)(\sigma_1 + \sigma_2)}{w_1 + w_2}
@@ -80,7 +80,7 @@ class ScatteringQuadrature:
 
     Args:
         drawn: estimator of derivatives, with the media (a single one) and the emitters.
-        transmittance_grid: optical depths replacing shadow rays; None for exact shadow rays.
+        transmittance_grid: optical depths replacing shadow rays; None means exact shadow rays.
 
     Bias: of fourth order in the size of a cell for smooth light; of first order across the edge of a shadow.
     Variance: none in images.
@@ -147,7 +147,7 @@ class _Span:
         start, length: near end, in float64, and length [length].
         sigma: extinction along the span.
         source: source function along the ray.
-        equiangular: sampler towards the emitter; None for an emitter at infinity.
+        equiangular: sampler towards the emitter; None if the emitter is at infinity.
         on: lanes with the span.
     """
 
@@ -172,7 +172,7 @@ class _LitRay:
         quadrature: media, emitters and shadows.
         ray: ray in world space, with a unit direction.
         number: index of the emitter.
-        equiangular: sampler towards the emitter; None for an emitter at infinity.
+        equiangular: sampler towards the emitter; None if the emitter is at infinity.
     """
 
     quadrature: ScatteringQuadrature
@@ -290,7 +290,8 @@ def _sort_rows(shares: list[mi.Float]) -> list[mi.Float]:
 
 @dr.syntax
 def _add_pieces(state: _LightSum, span: _Span, is_deep: mi.Bool, edges: list[mi.Float], count: mi.UInt32) -> _LightSum:
-    """Add ``count`` pieces, equal in the angle seen from a near emitter, else in length; in a deep cell between ``edges``."""
+    """Add ``count`` pieces, equal in the angle seen from a near emitter, otherwise in length; in a deep cell between
+    ``edges``."""
     start, dt, equiangular = span.start, span.length, span.equiangular
     index = dr.zeros(mi.UInt32, dr.width(dt))
     near = dr.zeros(mi.Float, dr.width(dt))

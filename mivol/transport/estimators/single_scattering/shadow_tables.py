@@ -2,10 +2,10 @@ r"""Optical depth towards the emitters, tabulated over a grid: to guide distance
 
 .. math:: w_b = e^{-\overline{\tau}_l(x_b)} + w_0
 
-A *visibility cache* guides distance sampling. Light of an emitter with one position or direction reaches only parts of a dense
-medium, and the extinction along a camera ray does not tell which. The optical depth from the centre of each block of cells to
-the emitter does, so distances are drawn in proportion to w_b. It is integrated over a grid as coarse as the blocks. Shadow rays
-stay exact, so nothing is biased. The floor ``w_0`` bounds the sample weights in blocks across the edge of a shadow.
+A *visibility cache* guides distance sampling. Light of an emitter with a single position or direction reaches only parts of a
+dense medium, and the extinction along a camera ray does not tell which. The optical depth from the centre of each block of
+cells to the emitter does, so distances are drawn in proportion to w_b. It is integrated over a grid as coarse as the blocks.
+Shadow rays stay exact, so nothing is biased. The floor ``w_0`` bounds the sample weights in blocks across the edge of a shadow.
 
 A *transmittance grid* holds the optical depth at the nodes of a lattice, and replaces shadow rays; it is biased. Its optical
 depth is
@@ -41,7 +41,7 @@ __all__ = [
 
 
 def optical_depth_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitter) -> list[mi.Float]:
-    """Optical depth from points in a medium to an emitter of one position or direction, for each channel [1].
+    """Optical depth from points in a medium to an emitter with a single position or direction, for each channel [1].
 
     It is at most ``NEGLIGIBLE_TAU``, its value behind an opaque surface.
     """
@@ -107,12 +107,12 @@ def build_visibility_cache(
         media: surfaces and media.
         emitters: emitters of the scene.
         rays: number of shadow rays of the image, limiting the resolution of the cache.
-        occupied: fraction of the grid's blocks that are not empty, to build only these; None for all blocks.
+        occupied: fraction of the grid's blocks that are not empty, to build only these; None builds all blocks.
         take: :func:`coarsen_grid`, or a function remembering its results.
 
     Returns:
-        The cache; None if no emitter has one position or direction, with several media or grids or more than ``MAX_EMITTERS``
-        emitters, or for an image too small for a cache to pay.
+        The cache; None if no emitter has a single position or direction, with several media or grids or more than
+        ``MAX_EMITTERS`` emitters, or for an image too small for a cache to pay.
 
     Cost: one shadow ray through the coarse grid for each block and emitter.
     """
@@ -218,7 +218,7 @@ def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: 
 
     Args:
         media: surfaces, and a single medium with one grid.
-        emitters: emitters of the scene, each with one position or direction.
+        emitters: emitters of the scene, each with a single position or direction.
         cells: number of cells of the grid between two nodes.
 
     Bias: O(h^2) of tau in the distance h of nodes; a cell across the edge of an opaque shadow leaks light.

@@ -6,7 +6,7 @@ Conventions. One walk of the segment finds its optical depth and its scattering 
 radiance at the camera for a scattering coefficient of 1. The light is ``sigma_s * weight``, and its derivative with respect to
 sigma_s is the weight itself, so nothing is divided by an extinction or an albedo of possibly 0.
 
-References: the equation of transfer with in-scattered radiance of one order (Chandrasekhar 1960).
+References: the equation of transfer with in-scattered radiance of a single order (Chandrasekhar 1960).
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class SingleScattering:
     Args:
         direct: estimator of direct lighting.
         count: number of scattering points on a segment in images; derivatives use one.
-        visibility_cache: rough visibility of the emitters, for drawing distances in images; None for no cache.
+        visibility_cache: rough visibility of the emitters, for drawing distances in images; None without a cache.
 
     Bias: none.
     Variance: the distance, one direction towards an emitter and one of the phase function; the points of a segment share the
