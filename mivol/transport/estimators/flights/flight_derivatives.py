@@ -145,21 +145,21 @@ class FlightSegment:
             self.gaussian_light.vjp(dL)
         if self.emission is None:
             return
-        media, ray, found = self.media, self.segment.ray, self.emission
+        media, ray, sampled = self.media, self.segment.ray, self.emission
         value = mi.Spectrum(0)
-        for body, on in media.bodies_at(found.point.body, found.point.on):
+        for body, on in media.bodies_at(sampled.point.body, sampled.point.on):
             if not _emits_at_points(body):
                 continue
             with dr.resume_grad():
-                emitted = eval_emission(body, ray, found.point.t, media.channels, on)
+                emitted = eval_emission(body, ray, sampled.point.t, media.channels, on)
                 if dr.grad_enabled(emitted):
-                    dr.backward_from(dr.select(on, dL * found.gain * emitted, 0))
+                    dr.backward_from(dr.select(on, dL * sampled.gain * emitted, 0))
             value = dr.select(on, dr.detach(emitted), value)
-            for name, slope in _emission_slopes(body, ray, found.point.t, on):
+            for name, slope in _emission_slopes(body, ray, sampled.point.t, on):
                 body.vjp_extinction_at(
-                    ray, found.point.t, colours_to_channels(dL * found.gain * slope, media.channels), on, name
+                    ray, sampled.point.t, colours_to_channels(dL * sampled.gain * slope, media.channels), on, name
                 )
-        vjp_optical_depth(media, self._to_emission, -dL * found.gain * value, found.point.on)
+        vjp_optical_depth(media, self._to_emission, -dL * sampled.gain * value, sampled.point.on)
 
     def jvp_light(self) -> mi.Spectrum:
         total = -self._baseline_light * self._jvp_extinction
@@ -167,19 +167,19 @@ class FlightSegment:
             total += self.gaussian_light.jvp()
         if self.emission is None:
             return total
-        media, ray, found = self.media, self.segment.ray, self.emission
+        media, ray, sampled = self.media, self.segment.ray, self.emission
         value, change = mi.Spectrum(0), mi.Spectrum(0)
-        for body, on in media.bodies_at(found.point.body, found.point.on):
+        for body, on in media.bodies_at(sampled.point.body, sampled.point.on):
             if not _emits_at_points(body):
                 continue
             with dr.resume_grad():
-                emitted = eval_emission(body, ray, found.point.t, media.channels, on)
-                own = take_tangent(emitted)
-            for name, slope in _emission_slopes(body, ray, found.point.t, on):
-                own += slope * to_spectrum(body.jvp_extinction_at(ray, found.point.t, media.channels, on, name))
-            value, change = dr.select(on, dr.detach(emitted), value), dr.select(on, own, change)
-        change -= value * jvp_optical_depth(media, self._to_emission, found.point.on)
-        return total + dr.select(found.point.on, found.gain * change, 0)
+                emitted = eval_emission(body, ray, sampled.point.t, media.channels, on)
+                tangent = take_tangent(emitted)
+            for name, slope in _emission_slopes(body, ray, sampled.point.t, on):
+                tangent += slope * to_spectrum(body.jvp_extinction_at(ray, sampled.point.t, media.channels, on, name))
+            value, change = dr.select(on, dr.detach(emitted), value), dr.select(on, tangent, change)
+        change -= value * jvp_optical_depth(media, self._to_emission, sampled.point.on)
+        return total + dr.select(sampled.point.on, sampled.gain * change, 0)
 
     @property
     def _to_emission(self) -> RaySegment:
@@ -209,8 +209,8 @@ class FlightSegment:
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
-                own = take_tangent(_albedo_ratio(eval_albedo(body, hit.mei, on)))
-            change += dr.select(on, own, 0)
+                tangent = take_tangent(_albedo_ratio(eval_albedo(body, hit.mei, on)))
+            change += dr.select(on, tangent, 0)
         return change
 
     @cached_property
@@ -220,8 +220,8 @@ class FlightSegment:
         change = -jvp_optical_depth(media, self.passed, self.active)
         for body, on in media.bodies_at(hit.body, hit.on & self.segment.may_scatter):
             name, weight = _collision_weight(media, body, ray, hit.t, on)
-            own = to_spectrum(body.jvp_extinction_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
-            change += dr.select(on, own * weight, 0)
+            tangent = to_spectrum(body.jvp_extinction_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
+            change += dr.select(on, tangent * weight, 0)
         return change
 
 
@@ -258,12 +258,12 @@ class Probe:
         nothing = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
         return cls(FineRay.from_ray(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
 
-    def offer(self, segment: PathSegment, found: FlightPoint, on: mi.Bool) -> Probe:
+    def offer(self, segment: PathSegment, flight_point: FlightPoint, on: mi.Bool) -> Probe:
         """Offer the point of another flight to the reservoir."""
-        point, gain = found.point, found.gain
+        point, gain = flight_point.point, flight_point.gain
         weight = dr.select(point.on & segment.may_scatter & on, dr.max(gain), 0)
         total = self.total + weight
-        keep = found.chance * total < weight
+        keep = flight_point.chance * total < weight
         return Probe(
             dr.select(keep, segment.ray, self.ray),
             dr.select(keep, point.t, self.t),
@@ -290,11 +290,11 @@ class Probes:
     first: Probe | None
     later: Probe | None
 
-    def offer(self, segment: PathSegment, found: FlightPoint) -> Probes:
+    def offer(self, segment: PathSegment, flight_point: FlightPoint) -> Probes:
         """Offer the point of another flight to the reservoir of its kind."""
         on = segment.depth == 0
-        first = None if self.first is None else self.first.offer(segment, found, on)
-        return Probes(first, None if self.later is None else self.later.offer(segment, found, ~on))
+        first = None if self.first is None else self.first.offer(segment, flight_point, on)
+        return Probes(first, None if self.later is None else self.later.offer(segment, flight_point, ~on))
 
 
 @dataclass
@@ -355,12 +355,12 @@ class ProbeTerm:
         media, probe, total = self.media, self.probe, mi.Spectrum(0)
         for body, on in media.bodies_at(probe.body, self.on):
             name, weight = self._weight(body, on)
-            own = weight * to_spectrum(body.jvp_extinction_at(probe.ray, probe.t, media.channels, on, name))
+            tangent = weight * to_spectrum(body.jvp_extinction_at(probe.ray, probe.t, media.channels, on, name))
             if body.view.albedo is not None:
                 with dr.resume_grad():
                     albedo = eval_albedo(body, self.mei, on)
-                    own += take_tangent(self._by_albedo(body, albedo, on) * albedo)
-            total += dr.select(on, own, 0)
+                    tangent += take_tangent(self._by_albedo(body, albedo, on) * albedo)
+            total += dr.select(on, tangent, 0)
         return total
 
     def _by_albedo(self, body: Body, albedo: mi.Spectrum, on: mi.Bool) -> mi.Spectrum:

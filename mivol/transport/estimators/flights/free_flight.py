@@ -174,8 +174,8 @@ def make_collision(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, 
     at, albedo = dr.select(on, t, 0), mi.Spectrum(0)
     mei = medium_interaction(ray, at)
     mei.medium = media.medium_of(body, on)
-    for other, here in media.bodies_at(body, on):
-        albedo = dr.select(here, _scattering_albedo(media, other, ray, t, mei, here), albedo)
+    for medium, inside in media.bodies_at(body, on):
+        albedo = dr.select(inside, _scattering_albedo(media, medium, ray, t, mei, inside), albedo)
     return Collision(mei, point_along(ray, at), albedo, on, t, body)
 
 

@@ -89,9 +89,9 @@ class GaussianLight:
 
         def add(state: tuple, entry: _Entry) -> tuple:
             sweep, weight = GaussianSweep(entry.interval, self.rows), dr.select(entry.on, dL * entry.gain, 0)
-            own = sweep.integrate(False)
-            sweep.vjp(to_components(weight), own.tau, zeros(mi.Float, self.rows))
-            vjp_optical_depth(self.media, entry.front, -weight * mi.Spectrum(*own.N), entry.on)
+            light = sweep.integrate(False)
+            sweep.vjp(to_components(weight), light.tau, zeros(mi.Float, self.rows))
+            vjp_optical_depth(self.media, entry.front, -weight * mi.Spectrum(*light.N), entry.on)
             return state
 
         self._visit(add, ())
@@ -100,8 +100,8 @@ class GaussianLight:
         """Tangent of the light."""
 
         def add(total: mi.Spectrum, entry: _Entry) -> mi.Spectrum:
-            own = GaussianSweep(entry.interval, self.rows, tangent=True).integrate(False)
-            N, change = (mi.Spectrum(*rows) for rows in (own.N[: self.rows], own.N[self.rows :]))
+            light = GaussianSweep(entry.interval, self.rows, tangent=True).integrate(False)
+            N, change = (mi.Spectrum(*rows) for rows in (light.N[: self.rows], light.N[self.rows :]))
             change -= N * jvp_optical_depth(self.media, entry.front, entry.on)
             return total + dr.select(entry.on, entry.gain * change, 0)
 

@@ -85,27 +85,29 @@ def _collide_in_grid(
     reads = [NodeArray(dr.detach(part.values), part.channels)]
 
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple:
-        left, s, dt, found = state
+        remaining, s, dt, collides = state
         corners = [_select_channel([row[q] for row in cell.corners[0]], channel) for q in range(8)]
         a, b = (activate(part.activation, interpolate(corners, p)) for p in gauss_points(cell))
         tau = 0.5 * cell.dt * scale * (a + b)
-        here = on & (tau >= left)
-        s, dt = dr.select(here, cell.s, s), dr.select(here, cell.dt, dt)
-        return dr.select(on & ~here, left - tau, left), s, dt, found | here
+        ends = on & (tau >= remaining)
+        s, dt = dr.select(ends, cell.s, s), dr.select(ends, cell.dt, dt)
+        return dr.select(on & ~ends, remaining - tau, remaining), s, dt, collides | ends
 
     zero = dr.zeros(mi.Float, width)
     start = (mi.Float(goal), zero, zero, dr.full(mi.Bool, False, width))
-    left, s, dt, found = walk_cells(lattice, segment, visit, start, reads, interval.active, until=lambda state: state[3])
+    remaining, s, dt, collides = walk_cells(
+        lattice, segment, visit, start, reads, interval.active, until=lambda state: state[3]
+    )
 
     # -- The position of the collision inside its cell ---------------------------------------------------------------------
     begin = segment.start + mi.Float64(s)
-    cell, points, inside = points_of_piece(lattice, ray, begin, dt, found)
+    cell, points, inside = points_of_piece(lattice, ray, begin, dt, collides)
     nodes = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     rows = read_nodes(reads, nodes, inside)[0]
     corners = [_select_channel([row[q] for row in rows], channel) for q in range(8)]
     curve = fit_cubic(*(scale * activate(part.activation, interpolate(corners, p)) for p in points))
-    x = invert_cubic_integral(curve, dt, left, integrate_cubic(curve, dt, mi.Float(1)))
-    return dr.select(found, begin + mi.Float64(x) * mi.Float64(dt), dr.inf)
+    x = invert_cubic_integral(curve, dt, remaining, integrate_cubic(curve, dt, mi.Float(1)))
+    return dr.select(collides, begin + mi.Float64(x) * mi.Float64(dt), dr.inf)
 
 
 def _select_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
@@ -141,10 +143,10 @@ def sample_gaussian_flight(
         before = line.share_up_to(ends[0])
         goal = before - dr.log(1 - u) / (scale * line.depth)
         hits = goal < before + line.share(*ends)
-        own = line.peak + math.sqrt(2) * dr.erfinv(dr.select(hits, 2 * goal - 1, 0)) / line.speed
+        t = line.peak + math.sqrt(2) * dr.erfinv(dr.select(hits, 2 * goal - 1, 0)) / line.speed
         # Clamp to the ends: in the tails, a share of 1e-7 is a long way.
-        own = fast_min(fast_max(own, ends[0]), ends[1])
-        return dr.select(hits & (own < nearest), own, nearest), reached, rng
+        t = fast_min(fast_max(t, ends[0]), ends[1])
+        return dr.select(hits & (t < nearest), t, nearest), reached, rng
 
     def leave(state: tuple, cell: Cell) -> tuple:
         return state[0], cell.s + cell.dt, state[2]

@@ -99,7 +99,7 @@ def residual_ratio_tracking(
     roulette; T (max(exp(-int m dt), ``ROULETTE_BELOW``) - T) at most.
     Cost: one step a block, and kappa int (M - m) dt look-ups of one value each.
     """
-    ahead = segment.d > 0
+    is_ascending = segment.d > 0
     blocks, res, channels, values = lattice.block_ranges, lattice.res, lattice.channels, dr.detach(lattice.values.array)
     shift = blocks.shift
     speed = dr.abs(segment.d) * 2.0**-shift
@@ -115,7 +115,7 @@ def residual_ratio_tracking(
         tau = [t + dr.select(on, scale * m * dt, 0) for t, m in zip(state.tau, least, strict=True)]
         # -- The factor, from one corner of the cell -------------------------------------------------------------------
         near = dr.fma(speed, dt, cell.frac)
-        inside = dr.select(ahead, near, 1 - near) * (1 << shift)
+        inside = dr.select(is_ascending, near, 1 - near) * (1 << shift)
         rng, u = draw_pcg32(state.rng, 5)
         node = mi.Vector3i(dr.floor(inside + mi.Vector3f(*u[:3])))
         node = (cell.lower + 1) * (1 << shift) - 1 + node
@@ -127,13 +127,13 @@ def residual_ratio_tracking(
             factor = 1 - (value - m) / (LOOKUP_RATE * above)
             weight.append(dr.select(meets, w * factor, w))
         fresh = -dr.log(u[3])
-        left = dr.select(meets, fresh, dr.maximum(state.ahead - dr.select(on, density * dt, 0), 0))
+        ahead = dr.select(meets, fresh, dr.maximum(state.ahead - dr.select(on, density * dt, 0), 0))
         # -- Roulette ---------------------------------------------------------------------------------------------------
         largest = maximum([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
         survives = u[4] * ROULETTE_BELOW < largest
         lift = dr.select(survives, dr.maximum(1, ROULETTE_BELOW / largest), 0)
         weight = [dr.select(on, w * lift, w) for w in weight]
-        return _TrackedRay(tau, weight, left, rng), dt
+        return _TrackedRay(tau, weight, ahead, rng), dt
 
     def is_dark(state: _TrackedRay) -> mi.Bool:
         return maximum(state.weight) == 0
@@ -223,36 +223,36 @@ def delta_tracking_in_blocks(
     lattice = part.lattice
     segment = clip_interval(lattice, interval)
     blocks, res, values = lattice.block_ranges, lattice.res, dr.detach(part.values)
-    shift, ahead = blocks.shift, segment.d > 0
+    shift, is_ascending = blocks.shift, segment.d > 0
     speed = dr.abs(segment.d) * 2.0**-shift
 
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple[tuple, mi.Float]:
-        left, s, found, rng = state
+        ahead, s, collides, rng = state
         (least,), above = blocks.at(cell.lower + 1, on)
         majorant = least + above
         rate = scale * majorant
         # -- To the end of the block, or to the next tentative collision --------------------------------------------------
-        meets = on & (left < rate * cell.dt)
-        dt = dr.select(meets, dr.minimum(left / rate, cell.dt), cell.dt)
+        meets = on & (ahead < rate * cell.dt)
+        dt = dr.select(meets, dr.minimum(ahead / rate, cell.dt), cell.dt)
         # -- Real or not, from one corner of the cell ------------------------------------------------------------------
         near = dr.fma(speed, dt, cell.frac)
-        inside = dr.select(ahead, near, 1 - near) * (1 << shift)
+        inside = dr.select(is_ascending, near, 1 - near) * (1 << shift)
         rng, u = draw_pcg32(rng, 5)
         node = (cell.lower + 1) * (1 << shift) - 1 + mi.Vector3i(dr.floor(inside + mi.Vector3f(*u[:3])))
         node = dr.clip(node, 0, mi.Vector3i(res[2] - 1, res[1] - 1, res[0] - 1))
         value = dr.gather(mi.Float, values, mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x), meets)
         real = meets & (u[3] * majorant <= value)
-        left = dr.select(meets, -dr.log(u[4]), dr.maximum(left - dr.select(on, rate * dt, 0), 0))
-        return (left, dr.select(real, cell.s + dt, s), found | real, rng), dt
+        ahead = dr.select(meets, -dr.log(u[4]), dr.maximum(ahead - dr.select(on, rate * dt, 0), 0))
+        return (ahead, dr.select(real, cell.s + dt, s), collides | real, rng), dt
 
     width = dr.width(interval.ray)
     rng, (u,) = draw_pcg32(rng, 1)
     start = (-dr.log(u), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width), rng)
     coarse = BlockLattice(tuple(n - 1 for n in blocks.res))
-    _, s, found, rng = walk_cells(
+    _, s, collides, rng = walk_cells(
         coarse, block_segment(segment, shift), visit, start, (), interval.active, until=lambda state: state[2], halts=True
     )
-    return dr.select(found, segment.start + mi.Float64(s), dr.inf), rng
+    return dr.select(collides, segment.start + mi.Float64(s), dr.inf), rng
 
 
 def delta_tracking(
@@ -269,16 +269,16 @@ def delta_tracking(
     begin, end = part.clip(interval)
     rate = scale * part.majorant
 
-    def step(t: mi.Float, found: mi.Bool, rng: mi.UInt32, on: mi.Bool) -> tuple:
+    def step(t: mi.Float, collides: mi.Bool, rng: mi.UInt32, on: mi.Bool) -> tuple:
         rng, (u, chance) = draw_pcg32(rng, 2)
         # The next point is at infinity if the majorant is 0.
         t = t - dr.log(u) / rate
         on &= t < end
         (value,) = part.eval_at(scale, ray, t, on)
         real = on & (chance * rate <= value)
-        return t, found | real, rng, on & ~real
+        return t, collides | real, rng, on & ~real
 
     none = dr.full(mi.Bool, False, dr.width(ray))
     start = (mi.Float(begin), none, mi.UInt32(rng), interval.active & (end > begin))
-    t, found, rng, _ = dr.while_loop(start, lambda t, found, rng, on: on, step, label="collisions with a bounded medium")
-    return dr.select(found, mi.Float64(t), dr.inf), rng
+    t, collides, rng, _ = dr.while_loop(start, lambda t, collides, rng, on: on, step, label="collisions with a bounded medium")
+    return dr.select(collides, mi.Float64(t), dr.inf), rng

@@ -235,19 +235,19 @@ class DirectLighting:
 
         Bias: none. Variance: one emitter sample and one phase sample. Cost: a shadow ray for each.
         """
-        found = []
+        directs = []
         # Only images estimate shadows, and images choose no shadow ray to differentiate: the random number of this choice seeds
         # the generators of the trackers.
-        one, two = (seed_pcg32(samples.which_shadow_ray, dr.width(active), k) if estimates else None for k in range(2))
+        rngs = [seed_pcg32(samples.which_shadow_ray, dr.width(active), k) if estimates else None for k in range(2)]
         if self.emitters.sampled:
             mei = vertex.interaction
             direct, weight = chosen.emitter.sample_direction(mei, samples.emitter, active)
             weighed = ~is_among(self.emitters.transmissive, chosen.emitter) if self.emitters.samples_phase else False
             sample = EmitterSample(direct, weight, chosen.emitter, samples.emitter, len(self.emitters.sampled), weighed)
-            found.append(self.estimate_at_vertex(vertex, sample, attached, active, one))
+            directs.append(self.estimate_at_vertex(vertex, sample, attached, active, rngs[0]))
         if self.emitters.samples_phase:
-            found.append(self._phase_sample(vertex, samples, attached, active, two))
-        return found
+            directs.append(self._phase_sample(vertex, samples, attached, active, rngs[1]))
+        return directs
 
     def _phase_sample(
         self, vertex: MediumVertex, samples: EventSamples, attached: bool, active: mi.Bool, rng: mi.UInt32 | None

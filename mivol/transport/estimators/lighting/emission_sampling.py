@@ -163,8 +163,8 @@ class EmissionTable:
 
         def visit(state: tuple, k: mi.UInt32, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> tuple:
             pdf, light = state
-            own = dr.select(on, dr.gather(mi.Float, self.density, k, on), 0)
-            return pdf + own * _integrate_square(t0, t1), light + own * (t1 - t0)
+            density = dr.select(on, dr.gather(mi.Float, self.density, k, on), 0)
+            return pdf + density * _integrate_square(t0, t1), light + density * (t1 - t0)
 
         return RayDensity(*self._walk(mi.Ray3f(o, d), visit, (mi.Float(0), mi.Float(0)), active))
 
@@ -175,16 +175,16 @@ class EmissionTable:
 
         def visit(state: tuple, k: mi.UInt32, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> tuple:
             pdf, total, begin, length, density, box, u = state
-            own = dr.select(on, dr.gather(mi.Float, self.density, k, on), 0)
-            weight = own * (t1 - t0)
+            cell_density = dr.select(on, dr.gather(mi.Float, self.density, k, on), 0)
+            weight = cell_density * (t1 - t0)
             total += weight
             share = weight / dr.select(total > 0, total, 1)
             keep = u < share
             # The number is now uniform in [0, share) or in [share, 1), and is stretched to [0, 1) again.
             u = dr.select(keep, u / dr.select(share > 0, share, 1), (u - share) / dr.select(share < 1, 1 - share, 1))
             begin, length = dr.select(keep, t0, begin), dr.select(keep, t1 - t0, length)
-            density, box = dr.select(keep, own, density), dr.select(keep, k // CELLS_PER_AXIS**3, box)
-            return pdf + own * _integrate_square(t0, t1), total, begin, length, density, box, u
+            density, box = dr.select(keep, cell_density, density), dr.select(keep, k // CELLS_PER_AXIS**3, box)
+            return pdf + cell_density * _integrate_square(t0, t1), total, begin, length, density, box, u
 
         zero = mi.Float(0)
         start = (zero, zero, zero, zero, zero, mi.UInt32(0), u + zero)
@@ -323,8 +323,8 @@ class EmissionSampling:
         point = EmittingPoint(RaySegment(ray, medium, ray.maxt, True), inside, on, chance)
         front, emitted = carried * light * weight, mi.Spectrum(0)
         with dr.resume_grad(when=attached):
-            for body, here in inside:
-                emitted = dr.select(here, eval_emission(body, ray, point.t, media.channels, here), emitted)
+            for body, lanes in inside:
+                emitted = dr.select(lanes, eval_emission(body, ray, point.t, media.channels, lanes), emitted)
             value = dr.select(on, front * vertex.eval(d, on) * emitted, 0)
         return EmissionLight(media, point, value, front * f)
 
@@ -388,15 +388,15 @@ class EmissionLight(TrackedTerm):
         """Tangent of the light."""
         change, ray, t = super().jvp(), self.point.ray_segment.ray, self.point.t
         for body, on, name, slope in self._slopes():
-            own = to_spectrum(body.jvp_extinction_at(ray, t, self.media.channels, on, name))
-            change += dr.select(on, self.front * slope * own, 0)
+            tangent = to_spectrum(body.jvp_extinction_at(ray, t, self.media.channels, on, name))
+            change += dr.select(on, self.front * slope * tangent, 0)
         return change
 
     def _slopes(self) -> list[tuple[Body, mi.Bool, str, mi.Spectrum]]:
         """The coefficient multiplying the emission of each medium, and the derivative by this coefficient."""
-        ray, found = self.point.ray_segment.ray, []
+        ray, slopes = self.point.ray_segment.ray, []
         for body, on in self.point.bodies:
             if body.view.emission is not None:
                 name, slope = emission_slope(body, ray, self.point.t, on)
-                found.append((body, on, name, dr.detach(slope)))
-        return found
+                slopes.append((body, on, name, dr.detach(slope)))
+        return slopes

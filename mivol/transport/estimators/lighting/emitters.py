@@ -81,12 +81,12 @@ class SceneEmitters:
         emitter = dr.zeros(mi.EmitterPtr, width)
         centre, radius2, finite = mi.Point3f(0), mi.Float(0), mi.Bool(False)
         for k, (candidate, ball) in enumerate(zip(self.sampled, self._balls, strict=True)):
-            here = index == k
-            emitter = dr.select(here, mi.EmitterPtr(candidate), emitter)
+            is_chosen = index == k
+            emitter = dr.select(is_chosen, mi.EmitterPtr(candidate), emitter)
             if ball is not None:
                 x, y, z, r = ball
-                centre = dr.select(here, mi.Point3f(x, y, z), centre)
-                radius2, finite = dr.select(here, dr.square(r), radius2), here | finite
+                centre = dr.select(is_chosen, mi.Point3f(x, y, z), centre)
+                radius2, finite = dr.select(is_chosen, dr.square(r), radius2), is_chosen | finite
         return ChosenEmitter(index, emitter, make_equiangular_sampler(ray, centre, radius2, finite) if self.is_near else None)
 
 
@@ -108,10 +108,10 @@ def _find_bounding_ball(emitter: mi.Emitter) -> list[float] | None:
 
 def is_among(emitters: list[mi.Emitter], emitter: mi.EmitterPtr) -> mi.Bool:
     """Whether the emitter of each lane is in a list."""
-    found = mi.Bool(False)
+    is_listed = mi.Bool(False)
     for candidate in emitters:
-        found |= emitter == mi.EmitterPtr(candidate)
-    return found
+        is_listed |= emitter == mi.EmitterPtr(candidate)
+    return is_listed
 
 
 @dataclass

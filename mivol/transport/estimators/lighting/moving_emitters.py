@@ -65,8 +65,8 @@ def optical_depth_gradient(
             return total
         # The direction of the ray changes perpendicular to itself, and with it the projected area of microflakes.
         turn = body.apply_microflakes(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
-        own = body.optical_depth(interval, media.channels)
-        return [a + t * turn for a, t in zip(total, own, strict=True)]
+        depths = body.optical_depth(interval, media.channels)
+        return [a + t * turn for a, t in zip(total, depths, strict=True)]
 
     zero = [mi.Vector3f(0) for _ in range(media.channels)]
     turned = revisit_media(media, ray_segment, visit, zero, active)
@@ -146,14 +146,14 @@ def _part_gradient(
         # A traced boundary cutting the grid has its own terms; only faces of the grid inside the boundary count.
         leaves, enters = leaves & (b < t1 * (1 - 2 * SIDE_STEP)), enters & (a > t0 * (1 + 2 * SIDE_STEP))
     for t, sign, moves in ((b, -1.0, leaves), (a, 1.0, enters)):
-        here = inside & moves
+        lanes = inside & moves
         face = _face_direction(lattice.from_world, (-0.5,) * 3, high, ray, t)
         if body.cuts_grids:
             # A boundary cutting the grid: the ray leaves (or enters) the medium through a face of the boundary.
             cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
             face = dr.select(cut, _face_direction(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
-        values = part.eval_at(1.0, ray, mi.Float(t), here)
-        vectors = [v + dr.select(here, sign * mi.Float(t) * s * face, 0) for v, s in zip(vectors, values, strict=True)]
+        values = part.eval_at(1.0, ray, mi.Float(t), lanes)
+        vectors = [v + dr.select(lanes, sign * mi.Float(t) * s * face, 0) for v, s in zip(vectors, values, strict=True)]
     return vectors
 
 
@@ -170,9 +170,9 @@ def _rotation_gradient(lattice: Lattice, part: ExactExtinction, segment: Segment
         return total
 
     zero = [dr.zeros(mi.Vector3f, dr.width(segment.length)) for _ in range(part.channels)]
-    found = walk_cells(lattice, segment, visit, zero, [NodeArray(values, part.channels)], active)
+    gradients = walk_cells(lattice, segment, visit, zero, [NodeArray(values, part.channels)], active)
     rows = [[mi.Float(v) for v in row[:3]] for row in lattice.from_world]
-    return [mi.Vector3f(*(sum(rows[a][k] * g[a] for a in range(3)) for k in range(3))) for g in found]
+    return [mi.Vector3f(*(sum(rows[a][k] * g[a] for a in range(3)) for k in range(3))) for g in gradients]
 
 
 def _trilinear_gradient(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:

@@ -83,8 +83,8 @@ def estimate_transmittance(
 def _multiply_transmittance(state: tuple, interval: MediumInterval) -> tuple:
     """Visitor multiplying the transmittances of media along a ray."""
     T, rng = state
-    own, rng = _estimate_medium_transmittance(interval, len(T), rng)
-    return [a * b for a, b in zip(T, own, strict=True)], rng
+    medium_T, rng = _estimate_medium_transmittance(interval, len(T), rng)
+    return [a * b for a, b in zip(T, medium_T, strict=True)], rng
 
 
 def _estimate_medium_transmittance(interval: MediumInterval, channels: int, rng: mi.UInt32) -> tuple[list[mi.Float], mi.UInt32]:
@@ -101,11 +101,11 @@ def _estimate_medium_transmittance(interval: MediumInterval, channels: int, rng:
     scale = dr.detach(body.view.scale) * body.area(interval.ray.d)
     for part in tracked:
         segment = clip_interval(part.lattice, interval)
-        own, rng = residual_ratio_tracking(part.lattice, segment, scale, rng, interval.active)
-        T = [a * b for a, b in zip(T, to_scene_channels(own, channels), strict=True)]
+        part_T, rng = residual_ratio_tracking(part.lattice, segment, scale, rng, interval.active)
+        T = [a * b for a, b in zip(T, to_scene_channels(part_T, channels), strict=True)]
     for part in (p for p in body.view.parts if not p.exact_line):
-        own, rng = ratio_tracking(part, scale, interval, rng)
-        T = [a * b for a, b in zip(T, to_scene_channels(own, channels), strict=True)]
+        part_T, rng = ratio_tracking(part, scale, interval, rng)
+        T = [a * b for a, b in zip(T, to_scene_channels(part_T, channels), strict=True)]
     return T, rng
 
 

@@ -202,9 +202,9 @@ def _estimate_node_light(
     ray = mi.Ray3f(p, -mei.wi, dr.inf, mi.Float(0), mi.Color0f())
     chosen = direct.emitters.choose_emitter(ray, samples.which_emitter)
     everywhere = dr.full(mi.Bool, True, dr.width(lane))
-    found = direct.estimate_in_medium(MediumVertex(direct.media, mei, mi.Point3d(mei.p)), chosen, samples, False, everywhere)
+    directs = direct.estimate_in_medium(MediumVertex(direct.media, mei, mi.Point3d(mei.p)), chosen, samples, False, everywhere)
     apart = max(float(np.linalg.norm(lattice.to_world[:3, a])) / (k - 1) for a, k in enumerate((x, y, z)))
-    light = sum((_limit_near_light(a, apart) for a in found), mi.Spectrum(0))
+    light = sum((_limit_near_light(a, apart) for a in directs), mi.Spectrum(0))
     dr.eval(light)
     rows = []
     for c in range(dr.size_v(light)):
@@ -282,14 +282,14 @@ class ProbeDifference:
         begin: distance of the start of the piece holding the probe, in float64 [length].
         t: distance of the probe, in float64 [length].
         source: derivative of each sum by the extinction at the probe.
-        dims: minus the derivative of each sum by the optical depth in front of the probe.
+        attenuation: minus the derivative of each sum by the optical depth in front of the probe.
         on: lanes with a probe.
     """
 
     begin: mi.Float64
     t: mi.Float64
     source: list[mi.Float]
-    dims: list[mi.Float]
+    attenuation: list[mi.Float]
     on: mi.Bool
 
 
@@ -369,19 +369,19 @@ class ControlSweep:
         def visit(state: _Sweep, cell: Cell, on: mi.Bool) -> _Sweep:
             points = list(gauss_points(cell))
             half = dr.select(on, 0.5 * cell.dt, 0)
-            own = media.to_channels([half * (a + b) for a, b in extinction.along(cell.corners[:1], points)])
-            near = [dr.maximum(a - o, 0) for a, o in zip(state.ahead, own, strict=True)]
+            depths = media.to_channels([half * (a + b) for a, b in extinction.along(cell.corners[:1], points)])
+            near = [dr.maximum(a - o, 0) for a, o in zip(state.ahead, depths, strict=True)]
             T_out, T_in = state.T, [dr.exp(-n) for n in near]
-            taken = [extinguished_light(o, i, t) for o, i, t in zip(own, T_in, T_out, strict=True)]
+            extinguished = [extinguished_light(o, i, t) for o, i, t in zip(depths, T_in, T_out, strict=True)]
             S = self.control.at(cell.lower, on)
             in_front = cell.s + 0.5 * cell.dt > begin
             slopes, behind = [], []
             for j, shares in enumerate(tracks.shares):
-                c = j % len(own)
+                c = j % len(depths)
                 source = sum((factor * S[k] for k, factor in shares), mi.Float(0))
-                dims = state.behind[j] + tracks.rest[j] + dr.select(in_front, probe.dims[j], 0)
-                slopes.append(dr.fma(T_out[c], source, -dims))
-                behind.append(dr.fma(taken[c], source, state.behind[j]))
+                attenuated = state.behind[j] + tracks.rest[j] + dr.select(in_front, probe.attenuation[j], 0)
+                slopes.append(dr.fma(T_out[c], source, -attenuated))
+                behind.append(dr.fma(extinguished[c], source, state.behind[j]))
             change = state.change
             if tracks.tangent:
                 rows = media.to_channels(
@@ -416,9 +416,9 @@ class ControlSweep:
             )
             at = media.to_channels([interpolate(v, frac) for v in corners])
             front = media.to_channels([0.5 * length * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in corners])
-            pairs = zip(probe.source, probe.dims, strict=True)
+            pairs = zip(probe.source, probe.attenuation, strict=True)
             return [dr.select(on, s * at[j % len(at)] - d * front[j % len(at)], 0) for j, (s, d) in enumerate(pairs)]
         at, a, b = (trilinear_weights(fraction_from_lower(p, cell, part.lattice.res)) for p in (frac, *points))
         front = [-0.5 * length * (x + y) for x, y in zip(a, b, strict=True)]
-        body.add_to_grid(part, cell, [(probe.source, at), (probe.dims, front)], on)
+        body.add_to_grid(part, cell, [(probe.source, at), (probe.attenuation, front)], on)
         return [mi.Float(0) for _ in probe.source]

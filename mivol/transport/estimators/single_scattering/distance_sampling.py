@@ -117,10 +117,10 @@ class Reservoir:
 
     def candidate(self, number: mi.UInt32) -> Candidate:
         """The candidate with an index, which may differ from lane to lane."""
-        found = self.candidates[0]
+        candidate = self.candidates[0]
         for k, other in enumerate(self.candidates[1:], 1):
-            found = dr.select(number == k, other, found)
-        return found
+            candidate = dr.select(number == k, other, candidate)
+        return candidate
 
 
 def start_reservoir(media: SceneMedia, u: mi.Float, width: int, count: int = 1) -> Reservoir:
@@ -256,8 +256,8 @@ class _Filling:
         ahead = [a + b for a, b in zip(reservoir.tau, piece.tau, strict=True)]
         beyond = [dr.exp(-t) for t in ahead]
         weight = mi.Float(0)
-        for own, T, T_out in zip(piece.tau, reservoir.T, beyond, strict=True):
-            weight += extinguished_light(own, T, T_out)
+        for tau, T, T_out in zip(piece.tau, reservoir.T, beyond, strict=True):
+            weight += extinguished_light(tau, T, T_out)
             if probe_sigma is not None:
                 weight += 0.5 * probe_sigma * dt * (T + T_out)
         if equiangular is not None:
@@ -388,9 +388,9 @@ def sample_distance(
     # -- The density of their mixture ------------------------------------------------------------------------------------
     sigma = [dr.maximum(eval_cubic(c, x), 0) for c in curve]
     tau = [integrate_cubic(c, dt, x) for c in curve]
-    taken = sum((f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)), mi.Float(0))
+    extinguished = sum((f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)), mi.Float(0))
     hits = sum((f * s * dr.exp(-t) for f, s, t in zip(front, sigma, tau, strict=True)), mi.Float(0))
-    pdf = by_collision * dr.select(taken > 0, hits / dr.select(taken > 0, taken, 1), 0)
+    pdf = by_collision * dr.select(extinguished > 0, hits / dr.select(extinguished > 0, extinguished, 1), 0)
     evenly = dr.rcp(dt)
     if equiangular is not None:
         evenly = dr.select(equiangular.finite, equiangular.density(begin, dt, x * dt), evenly)
@@ -407,9 +407,11 @@ def _extinction_curves(media: SceneMedia, ray: Ray, candidate: Candidate, on: mi
     """The extinction along a piece for each channel: the coefficients of a cubic on [0, 1]."""
     values = [[mi.Float(0) for _ in range(4)] for _ in range(media.channels)]
     for index, body in enumerate(media.bodies):
-        here = on & (candidate.body == index)
-        own = _extinction_along(media, body, ray, candidate, here)
-        values = [[dr.select(here, n, v) for n, v in zip(new, old, strict=True)] for new, old in zip(own, values, strict=True)]
+        lanes = on & (candidate.body == index)
+        along = _extinction_along(media, body, ray, candidate, lanes)
+        values = [
+            [dr.select(lanes, n, v) for n, v in zip(new, old, strict=True)] for new, old in zip(along, values, strict=True)
+        ]
     return [fit_cubic(*v) for v in values]
 
 
@@ -424,8 +426,8 @@ def _extinction_along(media: SceneMedia, body: Body, ray: Ray, candidate: Candid
     cell, points, inside = points_of_piece(lattice, ray, start, candidate.dt, on)
     nodes = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     grid = extinction.along(read_nodes(extinction.reads, nodes, inside), points)
-    own = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
-    return _to_scene_channels(media, own)
+    values = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
+    return _to_scene_channels(media, values)
 
 
 def _to_scene_channels(media: SceneMedia, values: list[list[mi.Float]]) -> list[list[mi.Float]]:

@@ -134,14 +134,14 @@ class ScatteredSegment:
                     dr.backward_from(dr.select(sample.on, carried * sample.value, 0))
         shadow, value, on = _choose_shadow_ray(probe)
         vjp_optical_depth(self.media, shadow, -carried * value, on)
-        for body, here in self.media.bodies_at(probe.event.body, probe.event.on):
+        for body, lanes in self.media.bodies_at(probe.event.body, probe.event.on):
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
-                albedo = eval_albedo(body, probe.mei, here)
+                albedo = eval_albedo(body, probe.mei, lanes)
                 if dr.grad_enabled(albedo):
-                    sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, here)
-                    dr.backward_from(dr.select(here, dL * probe.weight * sigma_t * albedo, 0))
+                    sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, lanes)
+                    dr.backward_from(dr.select(lanes, dL * probe.weight * sigma_t * albedo, 0))
 
     def jvp_light(self) -> mi.Spectrum:
         dL = self._jvp_direct()
@@ -226,8 +226,8 @@ class ScatteredSegment:
         asked = (dL * left, dL * left * sigma_t, rest)
         rows = [to_components(x) if tangent else colours_to_channels(x, media.channels) for x in asked]
         tracks = SweepSums(shares, rows[2], tangent)
-        found = ProbeDifference(point.begin, point.t, rows[0], rows[1], point.on)
-        return ControlSweep(media, self.grid_control, self._passed, self.tau, tracks, found).differentiate(self.active)
+        difference = ProbeDifference(point.begin, point.t, rows[0], rows[1], point.on)
+        return ControlSweep(media, self.grid_control, self._passed, self.tau, tracks, difference).differentiate(self.active)
 
     # -- Control variate: one source function for the whole ray --------------------------------------------------------
 

@@ -111,8 +111,8 @@ class ScatteringQuadrature:
             equiangular = make_ball_sampler(ray, self.emitters.bounding_ball(number))
             zero = _empty_sum(self.media, dr.width(ray))
             visit = _LitRay(self, ray, number, equiangular).visit
-            end, found = visit_media(self.media, ray, segment.medium, visit, zero, active)
-            tau, L = found.tau, L + found.light
+            end, sums = visit_media(self.media, ray, segment.medium, visit, zero, active)
+            tau, L = sums.tau, L + sums.light
         term = TrackedTerm(dr.select(segment.may_scatter, segment.beta * L, 0), active)
         passed = RaySegment(ray, segment.medium, end.t)
         return SegmentEstimate(end, transmittance(tau), term, Transmittance(self.media, passed, active))
@@ -331,16 +331,16 @@ def _add_piece(state: _LightSum, span: _Span, near: mi.Float, far: mi.Float, on:
     ahead, beyond, gain = [], [], []
     for k, (tau, T) in enumerate(zip(state.tau, state.T, strict=True)):
         s1, s2 = values[0][k], values[1][k]
-        own = 0.5 * step * (s1 + s2)
+        piece_tau = 0.5 * step * (s1 + s2)
         first = dr.maximum(step * (0.25 * s1 + (0.25 - SKEW) * s2), 0)
         second = step * ((0.25 + SKEW) * s1 + 0.25 * s2)
         least = dr.minimum(first, second)
         w1, w2 = s1 * dr.exp(least - first), s2 * dr.exp(least - second)
         total = w1 + w2
-        whole = T * 0.5 * step * phi1(own) * (s1 + s2) * dr.select(total > 0, dr.rcp(dr.select(total > 0, total, 1)), 0)
+        whole = T * 0.5 * step * phi1(piece_tau) * (s1 + s2) * dr.select(total > 0, dr.rcp(dr.select(total > 0, total, 1)), 0)
         gain.append((whole * w1, whole * w2))
-        ahead.append(tau + own)
-        beyond.append(T * dr.exp(-own))
+        ahead.append(tau + piece_tau)
+        beyond.append(T * dr.exp(-piece_tau))
     added = dr.select(on, to_spectrum([g[0] for g in gain]) * c[0] + to_spectrum([g[1] for g in gain]) * c[1], 0)
     return _LightSum(ahead, beyond, state.light + added)
 

@@ -120,24 +120,26 @@ class SingleScattering:
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         if purpose == IMAGE:
-            return self._picture(segment, active)
+            return self._estimate_image(segment, active)
         flight = self._walk(segment, 1, PROBE_DEPTH, active)
         samples = segment.samples.for_event(mi.UInt32(0), 1)
-        found = self._scatter(segment, flight, flight.reservoir.candidates[0], samples, active)
+        scattering = self._scatter(segment, flight, flight.reservoir.candidates[0], samples, active)
         tau, controls = flight.reservoir.tau, (self.grid_control, self.constant_control)
-        shared = ScatteredSegment(self.media, segment, flight.end, tau, found, *controls, active)
-        light = SegmentLight(shared, dr.select(found.event.on, found.sigma_s * found.weight, 0), is_replayed=False)
+        shared = ScatteredSegment(self.media, segment, flight.end, tau, scattering, *controls, active)
+        light = SegmentLight(
+            shared, dr.select(scattering.event.on, scattering.sigma_s * scattering.weight, 0), is_replayed=False
+        )
         return SegmentEstimate(flight.end, transmittance(tau), light, SegmentTransmittance(shared))
 
-    def _picture(self, segment: PathSegment, active: mi.Bool) -> SegmentEstimate:
+    def _estimate_image(self, segment: PathSegment, active: mi.Bool) -> SegmentEstimate:
         """The mean of ``count`` points, without derivatives."""
         count, width = self.count, dr.width(segment.ray)
         flight = self._walk(segment, count, 0.0, active)
 
         def light_of(number: mi.UInt32) -> mi.Spectrum:
             candidate, samples = flight.reservoir.candidate(number), segment.samples.for_event(number, count)
-            found = self._scatter(segment, flight, candidate, samples, active)
-            return dr.select(found.event.on, found.sigma_s * found.weight, 0)
+            scattering = self._scatter(segment, flight, candidate, samples, active)
+            return dr.select(scattering.event.on, scattering.sigma_s * scattering.weight, 0)
 
         if count == 1:
             light = light_of(mi.UInt32(0))
