@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -31,6 +31,7 @@ class PathEvent:
         at_surface: lanes hitting a surface.
         collision: collision with a medium before the surface; None if segments never end in media.
         chance: uniform random number in [0, 1), by which a shadow ray of the path is kept for derivatives; None in images.
+        in_medium: lanes colliding with a medium.
     """
 
     si: mi.SurfaceInteraction3f
@@ -39,6 +40,10 @@ class PathEvent:
     at_surface: mi.Bool
     collision: Collision | None
     chance: mi.Float | None = None
+    in_medium: mi.Bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.in_medium = mi.Bool(False) if self.collision is None else self.collision.on
 
     @classmethod
     def from_estimate(cls, estimate: SegmentEstimate, active: mi.Bool) -> PathEvent:
@@ -54,11 +59,6 @@ class PathEvent:
         n = dr.width(collision.on)
         si, t, nowhere = dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), dr.full(mi.Bool, False, n)
         return cls(si, t, collision.mei.medium, nowhere, collision, chance)
-
-    @property
-    def in_medium(self) -> mi.Bool:
-        """Lanes colliding with a medium."""
-        return mi.Bool(False) if self.collision is None else self.collision.on
 
     def vertex(self, media: SceneMedia) -> Vertex:
         """The point at which light is scattered."""
