@@ -26,7 +26,7 @@ KEY = "fog.interior_medium.sigma_t.value.value"
 
 
 def scene(**emitters: dict) -> mi.Scene:
-    """A wall at z = 0, whose other side is lit as well, and fog of an optical depth of DEPTH between z = 1 and 2."""
+    """A wall at z = 0, lit on both sides, and fog of an optical depth of DEPTH between z = 1 and 2."""
     wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
     fog = box_of(medium("mivol_medium", DEPTH), centred(np.diag([20.0, 20, 1]), (0, 0, 1.5)))
     return mi.load_dict({"type": "scene", "wall": wall, "fog": fog, "sensor": camera([0, -1, 9], [0, 0, 0]), **emitters})
@@ -52,7 +52,7 @@ def at_wall(found: mi.Scene) -> tuple[DirectLighting, SurfaceVertex]:
 
 
 def test_a_wall_under_a_emitter():
-    """reflectance / pi I / r^2 exp(-tau); nothing in a lane that is off."""
+    """reflectance / pi I / r^2 exp(-tau); 0 in an inactive lane."""
     direct, vertex = at_wall(scene(emitter=emitter()))
     with dr.suspend_grad():
         aim = direct.sample_emitter(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
@@ -63,7 +63,7 @@ def test_a_wall_under_a_emitter():
 
 
 def test_a_shadow_ray_has_the_derivative_of_its_optical_depth():
-    """-1 for each unit of extinction in a slab of thickness 1, times the light, beside the derivatives that Dr.Jit tracks."""
+    """-1 for each unit of extinction in a slab of thickness 1, times the light, besides the derivatives tracked by Dr.Jit."""
     found = scene(emitter=emitter())
     params = mi.traverse(found)
     dr.enable_grad(params[KEY])
@@ -97,7 +97,7 @@ def test_a_shadow_ray_has_the_derivative_of_its_optical_depth():
 
 
 def at_smoke(found: mi.Scene) -> tuple[DirectLighting, MediumVertex]:
-    """A point at z = 3, of the fog's isotropic phase function, and above it."""
+    """A point at z = 3, with the fog's isotropic phase function, above the fog."""
     media = media_of(found)
     fog = media.bodies[0].view.medium
     mei = medium_interaction(mi.Ray3f(mi.Point3f(0, 0, 9), mi.Vector3f(0, 0, -1)), mi.Float(6), fog)
@@ -110,7 +110,7 @@ def samples() -> EventSamples:
 
 
 def test_a_point_of_smoke_under_two_emitters():
-    """I / (4 pi r^2) of the emitter that was chosen, twice since one of two was; the fog lies below."""
+    """I / (4 pi r^2) of the chosen emitter, doubled since one of two was chosen; the fog lies below."""
     found = scene(one=emitter(4.0, 3.0), two=emitter(5.0, 7.0))
     direct, vertex = at_smoke(found)
     assert len(direct.emitters.sampled) == 2 and not direct.emitters.samples_phase
@@ -124,7 +124,7 @@ def test_a_point_of_smoke_under_two_emitters():
 
 
 def test_a_point_of_smoke_under_a_sky():
-    """Directions are drawn from the phase function alone: the radiance itself, where the direction meets no wall."""
+    """Directions come from the phase function alone: the radiance of the sky, for directions not hitting the wall."""
     direct, vertex = at_smoke(scene(sky=sky(0.7)))
     assert direct.emitters.samples_phase and not direct.emitters.sampled
     chosen = direct.emitters.choose_emitter(mi.Ray3f(vertex.interaction.p, mi.Vector3f(0, 0, 1)), mi.Float(0.5))
@@ -137,7 +137,9 @@ def test_a_point_of_smoke_under_a_sky():
 
 @pytest.mark.parametrize("kind", ["envmap", "directional"])
 def test_a_sample_at_infinity_is_the_same_from_everywhere(kind):
-    """Direction, density and light of a sample drawn far outside are those that a point inside draws; it ends outside."""
+    """Direction, density and light of a sample drawn far outside equal the values drawn at a point inside; the sample ends
+    outside.
+    """
     media = media_of(scene(emitter=sun_of(kind)))
     far, near = dr.zeros(mi.Interaction3f, 64), dr.zeros(mi.Interaction3f, 64)
     far.p, near.p = mi.Point3f(300, -200, 100), mi.Point3f(0.1, 0.2, 0.3)
@@ -157,13 +159,13 @@ def test_a_sample_at_infinity_is_the_same_from_everywhere(kind):
 
 
 def test_weights_of_two_techniques_sum_to_1():
-    """Densities of 1e-30 to 1e30, whose squares are no float32 numbers; each weight is rounded four times."""
+    """Densities of 1e-30 to 1e30, with squares beyond float32; each weight has four roundings."""
     a, b = 10 ** np.random.default_rng(1).uniform(-30, 30, (2, 1000)).astype(np.float32)
     total = np.array(power_heuristic(mi.Float(a), mi.Float(b))) + np.array(power_heuristic(mi.Float(b), mi.Float(a)))
     np.testing.assert_allclose(total, 1, atol=8 * 2.0**-24)
 
 
 def test_values():
-    """(a / b)^2 / (1 + (a / b)^2); a sample that cannot be drawn has no weight, one that only it can draw has all."""
+    """(a / b)^2 / (1 + (a / b)^2); 0 for a density of 0, and 1 if the other density is 0."""
     found = np.array(power_heuristic(mi.Float(3, 0, 0, 2), mi.Float(1, 1, 0, 0)))
     np.testing.assert_allclose(found, [0.9, 0, 0, 1], rtol=4 * 2.0**-24)

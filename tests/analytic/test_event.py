@@ -26,7 +26,7 @@ WALL = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
 
 
 def segments(**shapes: dict) -> tuple[SceneMedia, mi.Ray3f, SegmentEnd]:
-    """Segments at the wall, beside it, and at it in a lane that has ended before."""
+    """Three segments: towards the wall, beside the wall, and towards the wall in an inactive lane."""
     media = media_of(mi.load_dict({"type": "scene", "sensor": camera([0, -1, 4], [0, 0, 0]), **shapes}))
     ray = mi.Ray3f(mi.Point3f(mi.Float(0, 5, 0), 0, 2), mi.Vector3f(0, 0, -1), dr.inf, mi.Float(0, 0, 0), mi.Color0f())
     si, fog = media.scene.ray_intersect(ray), mi.MediumPtr(mi.load_dict({"type": "homogeneous"}))
@@ -45,7 +45,7 @@ def test_a_surface_is_met_where_there_is_one_and_the_lane_goes_on():
 
 
 def test_a_collision_comes_before_the_surface():
-    """The first lane collides at 0.5; the others go on as before. The vertex is of the medium in that lane alone."""
+    """The first lane collides at 0.5; the others continue. The vertex belongs to the medium in the first lane only."""
     media, ray, end = segments(wall=WALL)
     t, on = mi.Float(0.5), mi.Bool(True, False, False)
     mei, place = medium_interaction(ray, t, end.medium), point_along(ray, t)
@@ -76,7 +76,7 @@ ENDLESS = 1e30
 
 
 class FallingRays:
-    """Rays that fall from z = 2 on a rectangle in the plane z = 0, and end 5 farther on."""
+    """Rays falling from z = 2 on a rectangle in the plane z = 0, with ends 5 behind the rectangle."""
 
     def __init__(self, bsdf: dict, lights_media: bool = True) -> None:
         self.fog = mi.load_dict(medium("homogeneous", 0.5, phase={"type": "hg", "g": G}))
@@ -87,7 +87,7 @@ class FallingRays:
         self.ray = mi.Ray3f(mi.Point3f(zero, 0, 2), mi.Vector3f(0, 0, -1), mi.Float(7), zero, mi.Color0f())
 
     def turn(self, in_medium: list[bool] | None, may_scatter: list[bool], component: list[float]) -> NextDirection:
-        """Of four lanes; those in the medium have collided 0.5 from the origin."""
+        """Directions of four lanes; lanes ``in_medium`` have collided at the distance 0.5."""
         ray, si = self.ray, self.estimators.media.scene.ray_intersect(self.ray)
         on = mi.Bool([False] * 4 if in_medium is None else in_medium)
         mei, t = medium_interaction(ray, mi.Float(0.5), self.fog), mi.Float64(0.5)
@@ -101,7 +101,9 @@ class FallingRays:
 
 
 def test_a_diffuse_wall_turns_paths_that_may_scatter():
-    """The weight is the reflectance, the density the cosine over pi; the new ray leaves the wall, in the medium before it."""
+    """The weight is the reflectance, and the density the cosine over pi; the new ray leaves the wall into the medium in front
+    of it.
+    """
     bench = FallingRays(DIFFUSE)
     turn = bench.turn(None, [True, True, False, True], [0.5] * 4)
     assert np.array(turn.on).tolist() == [True, True, False, True] and not np.array(turn.through).any()
@@ -114,7 +116,9 @@ def test_a_diffuse_wall_turns_paths_that_may_scatter():
 
 
 def test_what_a_mask_transmits_goes_straight_on_however_deep_the_path_is():
-    """Numbers above the opacity pass; the ray keeps its direction and the rest of its length, whether or not it may scatter."""
+    """Random numbers above the opacity pass; the ray keeps its direction and the rest of its length, also if it may not
+    scatter.
+    """
     turn = FallingRays(MASK).turn(None, [True, True, False, False], [0.9, 0.1, 0.9, 0.1])
     assert np.array(turn.through).tolist() == [True, False, True, False]
     assert np.array(turn.on).tolist() == [True, True, True, False]
@@ -125,7 +129,7 @@ def test_what_a_mask_transmits_goes_straight_on_however_deep_the_path_is():
 
 @pytest.mark.parametrize("lights_media", [True, False])
 def test_a_medium_turns_paths_by_its_phase_function(lights_media):
-    """The weight is the albedo; light along the direction is found by emitter samples too, unless all emitters are uniform."""
+    """The weight is the albedo; emitter samples find light from this direction too, unless all emitters are uniform."""
     bench = FallingRays(DIFFUSE, lights_media)
     turn = bench.turn([True] * 4, [True, True, False, True], [0.5] * 4)
     assert np.array(turn.on).tolist() == [True, True, False, True] and not np.array(turn.through).any()
@@ -140,7 +144,7 @@ def test_a_medium_turns_paths_by_its_phase_function(lights_media):
 
 
 def test_lanes_in_media_and_at_surfaces_turn_together():
-    """Each as it would alone; the factors of both are told."""
+    """Each lane continues as it would alone, and the factors of both kinds are reported."""
     bench, numbers, may = FallingRays(DIFFUSE), [0.5] * 4, [True] * 4
     both = bench.turn([True, False, True, False], may, numbers)
     inside, outside = bench.turn([True] * 4, may, numbers), bench.turn(None, may, numbers)

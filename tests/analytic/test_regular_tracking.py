@@ -54,7 +54,9 @@ def fly(
 
 @pytest.mark.parametrize("case", ["all of the ray", "part of the ray", "rgb", "empty blocks skipped"])
 def test_the_depth_to_a_collision_is_the_goal(case):
-    """Where the interval has more than the goal; where it has less there is none. ``rgb`` follows one channel a lane."""
+    """The optical depth up to the collision is the goal; an interval with less has no collision. ``rgb`` follows one channel in
+    each lane.
+    """
     (o, d), goal = aimed(3, N), goals()
     t0, t1, channel = np.zeros(N), np.full(N, np.inf), np.zeros(N, int)
     values = rough_grid(1)
@@ -81,7 +83,7 @@ def test_the_depth_to_a_collision_is_the_goal(case):
 
 
 def test_constants_are_left_after_the_goal_over_the_extinction():
-    """t0 + goal / (scale sigma), up to the end of the interval; vacuum and lanes that are off have no collision."""
+    """t0 + goal / (scale sigma), up to the end of the interval; no collision in vacuum and in inactive lanes."""
     ray, goal = rays(np.zeros((1, 3)), np.float64([[0, 0, 1]])), np.array([0.25, 1.0, 4.0])
     grey = ConstantExtinction("sigma_t", mi.Float(0.5))
     expected = 2 + goal / (SCALE * 0.5)
@@ -95,7 +97,7 @@ def test_constants_are_left_after_the_goal_over_the_extinction():
 
 
 def test_an_activation_makes_the_extinction():
-    """exp of the logarithm of 2: an extinction of 2 between 1 and 2, and none outside, where exp of 0 would be 1."""
+    """The extinction is exp(log 2) = 2 between 1 and 2, and 0 outside (not exp(0) = 1)."""
     values = np.full((2, 3, 2, 1), np.log(2))
     part = ActivatedGridExtinction("sigma_t", make_lattice(values, np.eye(4)), select_activation("exp"))
     goal = np.array([0.3, 1.5, 2.9, 3.1])
@@ -110,7 +112,7 @@ def test_lanes_that_are_off_do_not_collide_with_a_grid():
 
 
 def test_a_mono_variant_flies_through_the_luminance():
-    """Of extinctions of 0.2, 1 and 3 in the channels: 0.9742, as Mitsuba weighs them (ITU-R BT.709)."""
+    """The luminance of extinctions 0.2, 1 and 3 in the channels is 0.9742, with Mitsuba's weights (ITU-R BT.709)."""
     try:
         mi.set_variant("llvm_ad_mono")
         values = np.broadcast_to([0.2, 1.0, 3.0], (2, 2, 2, 3))
@@ -128,7 +130,7 @@ FLIGHTS, GAUSSIAN_SCALE = 1 << 16, 0.6
 @pytest.mark.statistical
 @pytest.mark.parametrize("cells", [0.5, 50.0])
 def test_flights_end_where_the_depth_of_the_twin_says(cells: float, variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The share of flights that end before t is 1 - exp(-tau(t)), in few cells and in many; the others are infinite."""
+    """The share of flights ending before t is 1 - exp(-tau(t)), with few and many cells; the other flights are infinite."""
     monkeypatch.setattr(gaussian_cells, "CELLS_PER_GAUSSIAN", cells)
     rng = np.random.default_rng(0)
     means, scales = np.linspace([-1, 0, 0], [1, 0, 0], 20) + rng.uniform(-0.3, 0.3, (20, 3)), rng.uniform(0.1, 0.4, (20, 3))

@@ -17,7 +17,7 @@ KEY = "box.interior_medium.sigma_t.value.value"
 
 
 class Recorder:
-    """A shared segment that remembers what it is told, and an estimator that remembers what it draws."""
+    """A shared segment and an estimator, recording the calls they receive."""
 
     def __init__(self) -> None:
         self.said, self.dL = [], None
@@ -40,7 +40,7 @@ class Recorder:
 
 
 def test_light_and_transmittance_tell_the_segment_that_they_share():
-    """The light first: its weight is known when the transmittance starts the walk."""
+    """The light is reported first, so its weight is known when the transmittance starts the walk."""
     shared = Recorder()
     light, T = SegmentLight(shared, mi.Spectrum(1), True), SegmentTransmittance(shared)
     light.vjp("dL")
@@ -50,7 +50,7 @@ def test_light_and_transmittance_tell_the_segment_that_they_share():
 
 
 def test_absorption_draws_for_the_estimator_whose_path_it_follows():
-    """And hands its numbers on to nobody."""
+    """Absorption draws the numbers of the other estimator, and returns none."""
     other = Recorder()
     absorption = Absorption(None, other)
     assert absorption.draw("sampler", "active", "strata") is None and other.said == [("sampler", "active", "strata")]

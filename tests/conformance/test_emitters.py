@@ -39,7 +39,7 @@ def test_emitters(name):
 
 
 def test_no_emitter_at_all():
-    """Nothing shines, nothing is seen: exactly. Nor does anything change it."""
+    """Without emitters the image is exactly black, and its gradient is 0."""
     box, _ = smoke(rough_grid(1))
     scene = close_up({"smoke": box})
     assert not moments(scene, mivol(), 4, 2).mean.any()
@@ -51,7 +51,7 @@ def test_no_emitter_at_all():
 
 
 def test_what_is_sampled_and_what_is_seen_through() -> None:
-    """A constant sky is hit by chance; a masked panel transmits, an opaque one is hit by directions of the phase function."""
+    """Phase samples find a constant sky; a masked panel transmits; directions of the phase function hit an opaque panel."""
     panel = {"type": "rectangle", "emitter": {"type": "area", "radiance": 1.0}}
     masked = {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}
     sun = {"type": "directional", "direction": [0, 0, -1]}
@@ -75,7 +75,7 @@ def samples(strata: Strata | None = None) -> EventSamples:
 
 
 def test_each_event_draws_directions_from_its_part_of_the_square():
-    """Four events: one in each quarter, for emitters and for the phase function alike."""
+    """Four events: one in each quarter, for emitters and for the phase function."""
     parts = [samples().for_event(mi.UInt32(k), 4) for k in range(4)]
     for name in ("emitter", "direction"):
         cells = [tuple(np.floor(2 * np.array(getattr(p, name)).ravel()).astype(int)) for p in parts]

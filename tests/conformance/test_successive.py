@@ -27,7 +27,7 @@ ENDLESS = mivol(max_depth=-1)
 
 
 def radiance(scene: mi.Scene, count: int) -> np.ndarray:
-    """Radiance and alpha (4, 3 * 8 * 8) of three samples a pixel."""
+    """Radiance and alpha (4, 3 * 8 * 8) of three samples per pixel."""
     session, sensor = Session(Settings(max_depth=-1)), scene.sensors()[0]
     with dr.suspend_grad():
         estimators, _ = session._open(scene, sensor, 3, pictures=True)
@@ -37,16 +37,15 @@ def radiance(scene: mi.Scene, count: int) -> np.ndarray:
 
 
 def peaked(even: bool = False) -> mi.Scene:
-    """Under the sun, with side flights, in smoke or in even fog."""
+    """Smoke or even fog under the sun, with side flights."""
     fog = box_of(medium("mivol_medium", 3.0, 0.99, phase={"type": "hg", "g": 0.8}), PLACE)
     matter = fog if even else smoke(rough_grid(7, 6.0), 0.99, name="hg", g=0.8)[0]
     return close_up({"matter": matter, "sun": sun([0.3, 0.2, -1.0])[0]}, res=8)
 
 
 def test_a_path_does_not_depend_on_the_others_of_its_lane(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Alone, or with others, of which the last lane has fewer: to the last bit.
-
-    Walks in grids and the roulette of shadow rays draw numbers by their lane: the fog is even, and no shadow ray ends early.
+    """A path alone equals, to the last bit, the same path after others in its lane; the last lane has fewer paths. Walks in
+    grids and the roulette of shadow rays draw numbers by their lane, so the fog is even and no shadow ray ends early.
     """
     monkeypatch.setattr("mivol.transport.estimators.lighting.shadow_rays.ROULETTE_TAU", 1e9)
     scene = peaked(even=True)
@@ -57,7 +56,7 @@ def test_a_path_does_not_depend_on_the_others_of_its_lane(monkeypatch: pytest.Mo
 
 
 def test_in_a_white_furnace_every_path_ends_with_the_light_of_the_sky() -> None:
-    """A path that was left out would be black. The camera stands in the smoke."""
+    """An omitted path would be black. The camera stands in the smoke."""
     fog = box_of(medium("mivol_medium", 3.0, 1.0), PLACE)
     scene = close_up({"fog": fog, "sky": sky(1.0)}, res=8, origin=(0.1, 0.2, 0.3), target=(1, 1, 1))
     np.testing.assert_allclose(radiance(scene, 7), 1.0, rtol=1e-5)
@@ -70,7 +69,9 @@ def test_lanes_of_all_threads_have_work(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_plan_takes_them_where_lengths_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scatterings without end, and a sampler without strata, which has numbers for one path a lane only."""
+    """Successive paths need unlimited scattering and a sampler without strata, which has numbers for one path in each lane
+    only.
+    """
     scene, counts = peaked(), []
     monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 64)
     walk = walk_successively
@@ -89,7 +90,7 @@ def test_a_plan_takes_them_where_lengths_differ(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.slow
 def test_a_recording_repeats_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many paths a lane when it is replayed, of another seed."""
+    """A recording with another seed walks as many paths in each lane."""
     monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 64)
     scene, integrator = peaked(), mi.load_dict(ENDLESS)
     mi.render(scene, integrator=integrator, spp=1)  # a recording knows what was read before
@@ -108,7 +109,7 @@ def test_a_recording_repeats_them(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_they_keep_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of paths that begin together."""
+    """The mean equals the mean of simultaneous paths."""
     scene = peaked()
     together = over_pixels(moments(scene, ENDLESS, 256))
     monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 64)

@@ -41,7 +41,7 @@ KEYS = {
 
 
 def smoky(density: np.ndarray | None = None, **parts: dict) -> mi.Scene:
-    """Peaked smoke under the sun that many camera rays miss or pass."""
+    """Peaked smoke under the sun; many camera rays miss it or pass it."""
     density = rough_grid(4, 3.0) * (np.arange(6) < 3)[None, None, :, None] if density is None else density
     albedo = grid_volume("mivol_voxels", 0.9 * rough_grid(5, 1.0, (3, 3, 3)), PLACE)
     interior = medium("mivol_medium", grid_volume("mivol_voxels", density, PLACE), albedo, phase={"type": "mivol_hg", "g": 0.8})
@@ -54,13 +54,13 @@ def floor() -> dict:
 
 
 def coloured() -> mi.Scene:
-    """Each flight draws a channel."""
+    """An rgb extinction: each flight draws a channel."""
     density = rough_grid(4, 3.0)
     return smoky(np.concatenate([density, 0.2 * density, 2 * density], axis=-1), lit=sky(0.3))
 
 
 def burning() -> mi.Scene:
-    """A medium emits beside a floor, and its light is drawn where paths scatter."""
+    """A medium emits beside a floor; scattering events sample its light."""
     interior = medium(
         "mivol_medium",
         grid_volume("mivol_voxels", rough_grid(4, 3.0), PLACE),
@@ -71,7 +71,7 @@ def burning() -> mi.Scene:
 
 
 def glassy() -> mi.Scene:
-    """Behind a boundary that refracts, beside a box: a path may collide on its first segment, or after it was bent."""
+    """A refracting ball beside a box: a path may collide on its first segment, or after a refraction."""
     ball = ball_of(medium("mivol_medium", 1.5, 0.8), (0.3, 1.7, 0.4), 0.5) | {"bsdf": {"type": "dielectric", "int_ior": 1.3}}
     return smoky(ball=ball, lit=sky(0.3))
 
@@ -91,7 +91,7 @@ def back(scene: mi.Scene, key: str, spp: int, seed: int, depth: int = 5) -> np.n
 
 @pytest.fixture
 def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each replay its name, the light that it began with and what it left of it, and d loss by that, a row a channel."""
+    """For each replay its name, the light before and after the replay, and d loss / d light, with one row for each channel."""
     seen: list[tuple] = []
     monkeypatch.setattr(derivatives, "BALANCE", 4.0)  # most camera rays of these scenes collide: two branches and more
 
@@ -114,7 +114,7 @@ def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.n
 
 @pytest.mark.parametrize("name", cases(SCENES, slow=("rgb", "fire", "glass")))
 def test_a_replay_finds_the_light_that_was_found(name: str, replays: list) -> None:
-    """Branches in another order, which leave nothing of it but rounding; stems leave the mean light of their branches."""
+    """Replayed branches, in another order, leave only rounding; replayed stems leave the mean light of their branches."""
     back(SCENES[name](), KEYS["density"], 16, fresh(3), depth=7)
     (first, whole, left, _), (second, light, rest, _) = replays
     assert (first, second) == ("walk_stem", "walk_branch")
@@ -129,7 +129,7 @@ def test_a_replay_finds_the_light_that_was_found(name: str, replays: list) -> No
 
 @pytest.mark.parametrize("depth", [3, 6])
 def test_light_is_linear_in_the_sun(depth: int, replays: list) -> None:
-    """The derivative by the sun, times the sun, is the light of all stems: to float32 sums in another order."""
+    """The derivative by the sun, times the sun, is the light of all stems, up to float32 sums in another order."""
     scene = smoky()
     bright = float(np.mean(mi.traverse(scene)[KEYS["sun"]]))
     found = bright * np.sum(back(scene, KEYS["sun"], 16, fresh(3), depth))
@@ -138,7 +138,7 @@ def test_light_is_linear_in_the_sun(depth: int, replays: list) -> None:
 
 
 def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their random numbers do, and those of any two stems."""
+    """The random numbers of any two branches differ, and of any two stems."""
     made = []
     real = derivatives._Branches.split.__func__
     monkeypatch.setattr(
@@ -152,7 +152,7 @@ def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_branches_walk_side_by_side_by_their_length() -> None:
-    """The longest first; those of one length, or longer than 16 bits can say, in the order that they had, and each once."""
+    """The longest first; branches of equal length, or of more than 16 bits, keep their order; each appears once."""
     depth = np.array([3, 1, 200, 3, 0, 12, 70_000, 11, 65_536, 5000])
     order = np.array(derivatives._order_by_length(mi.UInt32(depth)))
     assert order.tolist() == [6, 8, 9, 2, 5, 7, 0, 3, 1, 4]
@@ -160,20 +160,20 @@ def test_branches_walk_side_by_side_by_their_length() -> None:
 
 @pytest.mark.parametrize(("collided", "count"), [(1000, 1), (260, 2), (100, 2), (90, 3), (20, 4), (1, 4)])
 def test_the_fewer_paths_collide_the_more_branches_they_have(collided: int, count: int) -> None:
-    """sqrt(0.6 / share), to the nearest, at most four: never more branches than stems."""
+    """sqrt(0.6 / share), rounded, at most four; never more branches than stems."""
     assert count_branches(1000, collided) == count
     assert count * collided <= 1000
 
 
 def test_where_no_path_collides_probes_are_alone(replays: list) -> None:
-    """A density of 0 has no branches, and derivatives all the same."""
+    """A density of 0 has no branches, and derivatives from probes."""
     found = back(smoky(np.zeros((4, 5, 6, 1))), KEYS["density"], 64, fresh(3))
     assert [name for name, *_ in replays] == ["walk_stem"]
     assert np.abs(found).max() > 0
 
 
 def test_a_plan_takes_them_where_paths_fly_freely(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And where a sampler has numbers without strata; pictures and recordings have none."""
+    """Branches need free flights and a sampler without strata; images and recordings have none."""
     scene = smoky()
     facts = find_needs(scene, scene.sensors()[0])
     choose = lambda facts, depth, segment="free_flight": plan.choose_branches(facts, Settings(max_depth=depth), segment)[0]  # noqa: E731
@@ -191,7 +191,7 @@ def test_a_plan_takes_them_where_paths_fly_freely(monkeypatch: pytest.MonkeyPatc
      ("rgb", "density", 4), ("fire", "density", 4), ("glass", "density", -1)],
 )  # fmt: skip
 def test_they_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of derivatives by whole paths, along a random direction in the upper half."""
+    """The mean derivative equals the mean of whole paths, along a random direction in the upper half."""
     scene = SCENES[name]()
     shape = np.shape(mi.traverse(scene)[KEYS[key]])
     v = np.random.default_rng(2).uniform(0.5, 1.5, shape) if len(shape) == 4 else np.ones(shape)
@@ -212,7 +212,7 @@ def test_they_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest
 
 @pytest.mark.slow
 def test_a_recording_walks_whole_paths(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a camera that moves its seed: what an ordinary step finds without branches."""
+    """A recorded step with changing seeds gives the gradient of an ordinary step without branches."""
     skip_recorded_grids_on_a_gpu()
     values = rough_grid(4, 3.0).astype(np.float32)
     interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8)
@@ -248,9 +248,8 @@ MISSED = 40.0
 def levels_of(
     emitter: dict, *interiors: dict, depth: int = 3, at: tuple = (0, MISSED, 0.5, MISSED), seen: tuple = (0.5,) * 4
 ) -> Baseline | None:
-    """For boxes with these media, 5 beside each other, the first one [-1, 1]^3, and rays that pass x = ``at``.
-
-    They lie at (``seen``, 0.5) on the film.
+    """The baseline for boxes with these media, 5 apart, the first at [-1, 1]^3, and for rays passing x = ``at``, seen at
+    (``seen``, 0.5) on the film.
     """
     boxes = {f"box{k}": box_of(interior, PLACE + 5 * k * np.eye(4, k=3)) for k, interior in enumerate(interiors)}
     scene = mi.load_dict({"type": "scene", **boxes, "emitter": emitter, "sensor": camera([0, -1, 6], [0, 0, 0])})
@@ -267,19 +266,21 @@ def levels_of(
 
 
 def level_of(*args: dict, **options: object) -> np.ndarray:
-    """The one of later flights, which is the same for all of the film."""
+    """The baseline of later flights, the same for all of the film."""
     return np.array(levels_of(*args, **options).later).ravel()
 
 
 def test_in_a_white_furnace_it_is_the_light_of_the_sky():
-    """Of every path, to the rounding of a sum of 4096."""
+    """Every path finds the light of the sky, up to the rounding of a sum of 4096."""
     found = level_of(sky(0.5), medium("homogeneous", SIGMA, 1.0), depth=-1)
     np.testing.assert_allclose(found, 0.5, rtol=12 * 2.0**-23)
 
 
 def test_collisions_count_as_their_derivatives_weigh():
-    """A white box of sigma 3 and a black one of 0.5, kappa = 0.6 / 2: half of the paths fly to each, and collide there with
-    probabilities of 1 - exp(-2 sigma). 2048 paths tell the second one to 1.7 %, and are always the same."""
+    """A white box of sigma 3 and a black box of 0.5, kappa = 0.6 / 2. Half of the paths fly to each box, and collide with
+    probabilities of 1 - exp(-2 sigma). 2048 paths determine the second probability to 1.7 %; the paths are the same in each
+    run.
+    """
     sigma, light = np.array([3.0, 0.5]), np.array([0.5, 0.0])
     weight = (1 - np.exp(-2 * sigma)) / (sigma + 0.3) ** 2
     boxes = [medium("homogeneous", s, albedo) for s, albedo in zip(sigma, (1.0, 0.0), strict=True)]
@@ -304,7 +305,7 @@ def test_under_an_emitter_it_is_the_mean_of_paths_that_collide():
 
 
 def test_there_is_none_beside_a_sigma_s():
-    """Absorption that has no share of collisions has no such balance."""
+    """With ``sigma_s`` the terms of absorption do not have the mean 0."""
     parts = {"type": "mivol_medium", "sigma_a": 0.1, "sigma_s": 0.2}
     assert levels_of(sky(0.5), parts) is None
 

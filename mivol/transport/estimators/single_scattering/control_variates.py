@@ -152,7 +152,7 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     z, y, x = (r + 1 for r in lattice.res)
     index = dr.arange(mi.UInt32, z * y * x)
     cell = [index // (y * x), (index // x) % y, index % x]
-    # The middle of each cell, as a fraction of the grid's box, in steps of the coarse lattice.
+    # The centre of each cell, in steps of the coarse lattice.
     q = [mi.Float(c) / m * (k - 1) for c, m, k in zip(cell, lattice.res, nodes, strict=True)]
     low = [dr.minimum(mi.UInt32(v), k - 2) for v, k in zip(q, nodes, strict=True)]
     frac = mi.Vector3f(*(v - mi.Float(a) for v, a in zip(q[::-1], low[::-1], strict=True)))
@@ -192,8 +192,7 @@ def _estimate_node_light(
     p = lattice.place(u)
     mei = _interaction_at(p, origins.towards(p))
     mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(lane)), mi.MediumPtr(body.view.medium), None)
-    # A rank-1 lattice over the directions of a node, with a shift (Cranley-Patterson rotation) that depends on the node's
-    # number.
+    # A rank-1 lattice over the directions of a node, shifted by the node's number (Cranley-Patterson rotation).
     shift = [_fractional_part(mi.Float(node) * k) for k in (0.7548776, 0.5698403, 0.3819660)]
     first, second = (turn + 0.5) / DIRECTIONS, _fractional_part(turn * 0.6180340)
     flat = mi.Point2f(_fractional_part(first + shift[0]), _fractional_part(second + shift[1]))
@@ -362,7 +361,7 @@ class ControlSweep:
         extinction = body.extinction(ray)
         lattice = replace(part.lattice, empty_distances=None)
         segment = clip_to_grid(lattice, ray.o, -ray.d, -interval.t1, -interval.t0)
-        # Distances from the far end, where the walk begins: those from the camera would have to be compared in float64.
+        # Distances count from the far end, where the walk begins; distances from the camera would need float64.
         begin = mi.Float(-segment.start - probe.begin)
         reads = [*extinction.reads, NodeArray(body.tangents[0], part.channels)] if tracks.tangent else extinction.reads
 

@@ -216,7 +216,7 @@ class _Filling:
             tau = [s * dt for s in sigma]
             begin, rest = split_float64(a)
             reservoir = self._offer(reservoir, _Piece(begin, rest, dt, tau, on & (dt > 0)), None, probe_sigma)
-            # The length may be infinite: 0 * inf would be NaN.
+            # The length may be infinite, and 0 * inf is NaN.
             tau = [f + dr.select(s > 0, s * length, 0) for f, s in zip(front, sigma, strict=True)]
             return replace(reservoir, tau=tau, T=[dr.exp(-t) for t in tau])
 
@@ -236,8 +236,8 @@ class _Filling:
 
         if extinction.has_constants:
             reservoir = add_constant(reservoir, t0, dr.select(hit, segment.start, t1))
-        # Light from beyond the optical depth DARK is negligible in an image. Derivatives need the whole optical depth, since
-        # they are swept from the far end.
+        # Light from beyond NEGLIGIBLE_TAU does not matter in an image. Derivatives need the whole optical depth, since their
+        # sweep starts at the far end.
         until = None if self.proposal.probe_depth else lambda p: minimum(p.tau) > NEGLIGIBLE_TAU
         reservoir = walk_cells(lattice, segment, visit, reservoir, extinction.reads, on, until)
         if extinction.has_constants:
@@ -264,8 +264,7 @@ class _Filling:
             weight *= equiangular.mean(piece.begin + piece.s, dt)
         if lit is not None:
             weight *= lit
-        # The mean angle of a piece of length 0 is NaN. An infinite weight would make the total infinite, and no later piece
-        # could replace it.
+        # The mean angle of a piece of length 0 is NaN. An infinite weight would make the total infinite, and the piece final.
         weight = dr.select(piece.on & (dt > 0) & (weight < 1e30), weight, 0)
         total = reservoir.total + weight
         kept = [_replace_candidate(old, piece, weight, total, reservoir.tau) for old in reservoir.candidates]
@@ -443,7 +442,7 @@ def _invert_collision_cdf(curve: list, whole: list[mi.Float], front: list[mi.Flo
     c, tau = curve[0], whole[0]
     if len(curve) > 1:
         shares = [f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)]
-        # u.x has chosen the technique already and u.y is needed below, so the channel is drawn with a third number.
+        # u.x has chosen the technique and u.y is needed below, so a third number draws the channel.
         left = dr.select(sum(shares) > 0, _hash_numbers(u), 0) * sum(shares)
         for k in range(1, len(curve)):
             later = left >= sum(shares[:k])

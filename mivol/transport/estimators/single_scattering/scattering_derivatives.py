@@ -155,7 +155,7 @@ class ScatteredSegment:
         probe = self.probe
         carried = probe.sigma_s * probe.gain
         with dr.resume_grad():
-            # The terms are differentiated as one sum: they share edges of the graph, and each traversal clears those behind it.
+            # The terms are differentiated as one sum: they share edges of the graph, and each traversal clears its edges.
             value = sum((dr.select(s.on, carried * s.value, 0) for s in probe.direct), mi.Spectrum(0))
             for body, on in self.media.bodies_at(probe.event.body, probe.event.on):
                 if body.view.albedo is not None:

@@ -212,7 +212,7 @@ class _LitRay:
         if not extinction.has_constants:
             return walk_cells(grid, segment, visit, state, extinction.reads, on)
         state = add_constant(state, t0, dr.select(hit, segment.start, t1))
-        # No block may be skipped: where the grid is empty the constants are not.
+        # No block may be skipped: the constants scatter light in empty blocks of the grid too.
         state = walk_cells(replace(grid, empty_distances=None), segment, visit, state, extinction.reads, on)
         return add_constant(state, dr.select(hit, segment.end, t1), t1)
 

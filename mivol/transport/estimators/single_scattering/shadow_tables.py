@@ -121,7 +121,7 @@ def build_visibility_cache(
     if not media.is_single or len(grids) != 1 or not delta or len(emitters.sampled) > MAX_EMITTERS:
         return None
     (lattice,), (body,) = grids, media.bodies
-    # A medium that has a constant beside its grid has no empty blocks.
+    # A medium with a constant beside its grid has no empty blocks.
     lists = occupied is not None and len(body.view.parts) == 1
     rays_of_block = (occupied if lists else 1) * len(delta)
     fits = [shift for shift in range(MAX_SHIFT + 1) if _count_blocks(lattice, shift) * rays_of_block <= RAY_FRACTION * rays]
@@ -162,8 +162,8 @@ def _block_centres(lattice: Lattice, blocks: tuple[int, int, int], shift: int, i
     """The centres of blocks in the world."""
     _, y, x = blocks
     at = (index % x, (index // x) % y, index // (x * y))
-    # Block b holds the cells from b 2^shift - 1 on, of which the outermost are half as wide. As a fraction of the box, the
-    # middle of the last block may lie outside; it is clamped.
+    # Block b holds the cells from b 2^shift - 1 on; the outermost cells are half as wide. The centre of the last block may lie
+    # outside the box, and is clamped.
     half = 0.5 * (1 << shift) - 0.5
     u = [
         dr.clip((mi.Float(a) * (1 << shift) + half) / n, 0.25 / n, 1 - 0.25 / n)
@@ -230,7 +230,7 @@ def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: 
     z, y, x = nodes
     index = dr.arange(mi.UInt32, z * y * x)
     at = (index % x, (index // x) % y, index // (x * y))
-    # A little inside, since a shadow ray in the plane of a face counts as outside the box.
+    # Slightly inside, since a shadow ray in the plane of a face counts as outside the box.
     u = [dr.clip(mi.Float(a) / (m - 1), INSET, 1 - INSET) for a, m in zip(at, (x, y, z), strict=True)]
     p = lattice.place(mi.Vector3f(*u))
     count, k = len(emitters.sampled), media.channels

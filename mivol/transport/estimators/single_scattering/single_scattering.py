@@ -180,6 +180,6 @@ class SingleScattering:
             tau = segment_optical_depth(media, front, event.on)
         gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
-        # Roulette is for paths: the noise of one scattering is small, and that of roulette would show.
+        # No roulette: single scattering has little noise, and the noise of roulette would show.
         direct = self.direct.estimate_in_medium(vertex, chosen, samples, probes, event.on, not probes and media.tracks_shadows)
         return Scattering(event, mei, gain, direct, event_sigma_s(media, ray, event, mei), samples.which_shadow_ray)
