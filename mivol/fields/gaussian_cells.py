@@ -70,7 +70,7 @@ def list_gaussians(means: np.ndarray, whitening: np.ndarray, reach: float) -> Ce
         MivolError: no Gaussians, or lists larger than the free memory.
     """
     if not len(means):
-        raise MivolError("no Gaussians were given; at least one is expected: there is nothing for rays to meet.")
+        raise MivolError("no Gaussians were given; at least one is expected: without Gaussians rays have nothing to cross.")
     spread = reach * np.sqrt((np.linalg.inv(whitening) ** 2).sum(axis=2))
     low, high = (means - spread).min(axis=0), (means + spread).max(axis=0)
     slack = SLACK * (high - low).max()
@@ -79,11 +79,11 @@ def list_gaussians(means: np.ndarray, whitening: np.ndarray, reach: float) -> Ce
     first, last = (np.clip(_locate_cells(p, low, edge, size), 0, size) for p in (means - spread, means + spread))
     counts = (last - first + 1).prod(axis=1)
     _check_memory(counts)
-    found = [
+    touched = [
         _find_touched_cells(index, first[index], last[index], (means - low) / edge * size, whitening * (edge / size), reach)
         for index in np.split(np.arange(len(means)), find_chunk_starts(counts))
     ]
-    cells, entries = (np.concatenate(rows) for rows in zip(*found, strict=True))
+    cells, entries = (np.concatenate(rows) for rows in zip(*touched, strict=True))
     cells = cells @ np.cumprod([1, *(size[:2] + 1)])
     order = np.argsort(cells, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=int((size + 1).prod())))])

@@ -94,15 +94,15 @@ class GaussianField:
         """
         place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
         tensors = [name for name in (*EXTINCTION_PARAMETERS, HARMONICS) if name in props]
-        shown = props.get("space", "srgb"), float(props.get("blur", 0.0))
+        settings = props.get("space", "srgb"), float(props.get("blur", 0.0))
         if ("filename" in props) == bool(tensors) or (tensors and not set(EXTINCTION_PARAMETERS) <= set(tensors)):
             found = " and ".join([*(["filename"] if "filename" in props else []), *tensors]) or "none of them"
             raise MivolError(
                 f"mivol_gaussians was given {found}; give filename, or {', '.join(EXTINCTION_PARAMETERS)} (and {HARMONICS})."
             )
         if tensors:
-            return cls({name: mi.TensorXf(props[name]) for name in tensors}, place, *shown)
-        return cls.from_gaussians(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place, *shown)
+            return cls({name: mi.TensorXf(props[name]) for name in tensors}, place, *settings)
+        return cls.from_gaussians(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place, *settings)
 
     def refresh(self) -> None:
         """List the Gaussians again after changes of parameters. Reads values, which ``dr.freeze`` cannot record."""

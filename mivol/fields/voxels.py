@@ -61,8 +61,9 @@ class Voxels:
         if len(sources) != 1:
             found = " and ".join(sources) or "none of them"
             raise MivolError(f"{name} was given {found}; give exactly one of filename, grid or data.")
-        given = props.get("to_world", mi.ScalarTransform4f())
-        to_world, to_local = np.array(given.matrix, dtype=np.float64), np.array(given.inverse_transpose, dtype=np.float64).T
+        transform = props.get("to_world", mi.ScalarTransform4f())
+        to_world = np.array(transform.matrix, dtype=np.float64)
+        to_local = np.array(transform.inverse_transpose, dtype=np.float64).T
         own_box = props.get("use_grid_bbox", False)
         values, place = cls._values(props, sources[0], own_box)
         if "filename" in props:
@@ -78,13 +79,13 @@ class Voxels:
             return volume.values, volume.to_world
         if own_box and source == "data":
             raise MivolError("mivol_voxels was given data and use_grid_bbox; a bare tensor has no box: give to_world.")
-        given = props[source]
+        grid = props[source]
         if source == "data":
-            return given, np.eye(4)
-        values = np.array(given)
+            return grid, np.eye(4)
+        values = np.array(grid)
         place = np.eye(4)
         if own_box:
-            low, high = np.array(given.bbox().min), np.array(given.bbox().max)
+            low, high = np.array(grid.bbox().min), np.array(grid.bbox().max)
             place[:3, :3], place[:3, 3] = np.diag(high - low), low
         return values.reshape((*values.shape[:3], -1)), place
 

@@ -52,8 +52,8 @@ def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaus
         MivolError: a missing property, or harmonics of no degree.
     """
     vertex = tables.get("vertex")
-    held = () if vertex is None else vertex.dtype.names
-    missing = [name for name in (*MEANS, *COLOURS, "opacity", *SCALES, *ROTATION) if name not in held]
+    names = () if vertex is None else vertex.dtype.names
+    missing = [name for name in (*MEANS, *COLOURS, "opacity", *SCALES, *ROTATION) if name not in names]
     if missing:
         raise refusal(
             Path(path),
@@ -161,8 +161,8 @@ def _check_compressed_tables(tables: dict[str, np.ndarray], path: Path) -> None:
         ends += [f"{end}_{colour}" for end in ("min", "max") for colour in CHANNELS]
     wanted = {**{("vertex", name): "u4" for name in PACKED_PROPERTIES}, **{("chunk", name): "f4" for name in ends}}
     for (element, name), kind in wanted.items():
-        held = tables[element].dtype
-        if name not in held.names or held[name].str[1:] != kind:
+        record = tables[element].dtype
+        if name not in record.names or record[name].str[1:] != kind:
             found = f"no property {name!r} of type {np.dtype(kind).name} in {element!r}"
             raise refusal(path, found, "those of a compressed PLY of PlayCanvas", "compress it again")
     chunks = -(-len(vertex) // CHUNK_SIZE)

@@ -87,9 +87,9 @@ def read_ksplat(path: Path) -> Gaussians:
         table = np.frombuffer(data, record, section.count, at + section.storage())
         parts.append(_decode_records(table, _parse_buckets(data, at, section, path) if level else None, ends))
         at = end
-    held = sum(part.count for part in parts)
-    if held != count or not parts:
-        raise refusal(path, f"{held} Gaussians in {len(parts)} sections", f"{count}, from the header", "write the file again")
+    total = sum(part.count for part in parts)
+    if total != count or not parts:
+        raise refusal(path, f"{total} Gaussians in {len(parts)} sections", f"{count}, from the header", "write the file again")
     return concatenate(parts)
 
 
@@ -116,12 +116,12 @@ def _parse_buckets(data: bytes, at: int, section: Section, path: Path) -> tuple[
     """The centre of each Gaussian's bucket (N, 3), the length of a step, and the number of steps of half a bucket."""
     partial = np.frombuffer(data, "<u4", section.partial, at)
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + 4 * section.partial).reshape(-1, 3)
-    held = np.concatenate([np.full(section.full, section.bucket_capacity, np.uint64), partial.astype(np.uint64)])
-    if held.sum(dtype=object) != section.count:
-        found = f"{held.sum(dtype=object)} Gaussians in buckets"
+    bucket_counts = np.concatenate([np.full(section.full, section.bucket_capacity, np.uint64), partial.astype(np.uint64)])
+    if bucket_counts.sum(dtype=object) != section.count:
+        found = f"{bucket_counts.sum(dtype=object)} Gaussians in buckets"
         raise refusal(path, found, f"{section.count}, from the section", "write the file again")
     return (
-        centres[np.repeat(np.arange(len(held)), held.astype(np.int64))],
+        centres[np.repeat(np.arange(len(bucket_counts)), bucket_counts.astype(np.int64))],
         section.bucket_size / 2 / section.steps,
         section.steps,
     )

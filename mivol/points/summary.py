@@ -51,15 +51,15 @@ def summarize_file(path: Path) -> FileSummary:
     """
     path = check_file(path)
     if is_gaussian_file(path):
-        held, lines = select_by_suffix(path, GAUSSIAN_READERS)(path), _describe_gaussians
+        contents, lines = select_by_suffix(path, GAUSSIAN_READERS)(path), _describe_gaussians
     else:
-        held, lines = select_by_suffix(path, CLOUD_READERS)(path), _describe_points
+        contents, lines = select_by_suffix(path, CLOUD_READERS)(path), _describe_points
     try:
-        held.check(path)
+        contents.check(path)
         refused = ""
     except MivolError as error:
         refused = str(error)
-    return FileSummary("\n".join([*lines(path, held), *([f"refused\n{refused}"] if refused else [])]), refused)
+    return FileSummary("\n".join([*lines(path, contents), *([f"refused\n{refused}"] if refused else [])]), refused)
 
 
 def convert_file(source: Path, target: Path, kind: str | None = None) -> str:
@@ -82,31 +82,31 @@ def convert_file(source: Path, target: Path, kind: str | None = None) -> str:
     has_gaussians = is_gaussian_file(source)
     select_by_suffix(target, {**CLOUD_WRITERS, **GAUSSIAN_WRITERS})
     kind = kind or ("gaussians" if has_gaussians and target.suffix.lower() in GAUSSIAN_WRITERS else "points")
-    held = read_gaussians(source) if has_gaussians else read_points(source)
+    contents = read_gaussians(source) if has_gaussians else read_points(source)
     if kind == "gaussians":
-        made = points_to_gaussians(held) if isinstance(held, PointCloud) else held
-        write_gaussians(target, made)
-        return f"{target}: {made.count} Gaussians of degree {made.degree}"
-    cloud = held if isinstance(held, PointCloud) else gaussians_to_points(held)
+        gaussians = points_to_gaussians(contents) if isinstance(contents, PointCloud) else contents
+        write_gaussians(target, gaussians)
+        return f"{target}: {gaussians.count} Gaussians of degree {gaussians.degree}"
+    cloud = contents if isinstance(contents, PointCloud) else gaussians_to_points(contents)
     write_points(target, cloud)
     return f"{target}: {cloud.count} points"
 
 
-def _describe_gaussians(path: Path, held: Gaussians) -> list[str]:
-    scales, opacities = held.scales(), held.opacities()
-    faint = np.mean(opacities[np.isfinite(opacities)] < FAINT_OPACITY) if held.count else 0
+def _describe_gaussians(path: Path, contents: Gaussians) -> list[str]:
+    scales, opacities = contents.scales(), contents.opacities()
+    faint = np.mean(opacities[np.isfinite(opacities)] < FAINT_OPACITY) if contents.count else 0
     return [
-        f"{path}: {held.count} Gaussians, harmonics of degree {held.degree}",
-        *_describe_extent(held.means),
+        f"{path}: {contents.count} Gaussians, harmonics of degree {contents.degree}",
+        *_describe_extent(contents.means),
         f"scales {_describe_spread(scales)}",
         f"opacities {_describe_spread(opacities)}, {100 * faint:.3g} % below {FAINT_OPACITY}",
     ]
 
 
-def _describe_points(path: Path, held: PointCloud) -> list[str]:
+def _describe_points(path: Path, contents: PointCloud) -> list[str]:
     return [
-        f"{path}: {held.count} points, {'without' if held.colours is None else 'with'} colours",
-        *_describe_extent(held.positions),
+        f"{path}: {contents.count} points, {'without' if contents.colours is None else 'with'} colours",
+        *_describe_extent(contents.positions),
     ]
 
 

@@ -184,7 +184,7 @@ def test_gradient_step_of_scattered_light(emitter):
 
 def test_grids_that_cannot_be_followed_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU Dr.Jit would abort the process."""
-    monkeypatch.setattr(Voxels, "recorded", None)
+    monkeypatch.setattr(Voxels, "freezable_texture", None)
     scene, _ = build("mivol_medium", False)
     integrator = mi.load_dict({"type": "mivol"})
     frozen = dr.freeze(lambda scene, integrator, seed: mi.render(scene, integrator=integrator, spp=4, seed=seed))

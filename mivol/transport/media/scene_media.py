@@ -146,7 +146,9 @@ class SceneMedia:
             if followed:
                 # The tangents of the parameters are kept: what else was made of them, such as an albedo, is followed later.
                 dr.forward_to(*followed, flags=dr.ADFlag.ClearEdges)
-            body.has_tangent = [dr.grad_enabled(p) for p in products]
+            # A bounded part differentiates its field at points; its product does not tell whether it has a tangent.
+            pairs = zip(products, body.view.parts, strict=True)
+            body.has_tangent = [dr.grad_enabled(p) or not part.exact_line for p, part in pairs]
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
             if is_followed(body.view.microflakes):
                 dr.forward_to(body.view.microflakes, flags=dr.ADFlag.ClearEdges)
