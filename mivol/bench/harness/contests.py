@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mivol.bench.harness.study import Size, amount
 from mivol.bench.harness.timing import Contestant, Timing, race, ratio_of, time_call
 from mivol.validate.moments import Moments
 
-__all__ = ["SEED_STRIDE", "Contest", "Method", "compete", "find_samples"]
+__all__ = ["SEED_STRIDE", "BudgetSize", "Contest", "Method", "compete", "find_samples"]
 
 MIN_SAMPLES, MAX_SAMPLES = 4, 4096
 """Samples per pixel of one call."""
@@ -45,6 +46,17 @@ def find_samples(method: Method, seconds: float) -> int:
         if duration > seconds / 2 or spp >= MAX_SAMPLES:
             return spp
         spp = min(spp * (8 if duration < seconds / 32 else 2), MAX_SAMPLES)
+
+
+@dataclass(frozen=True)
+class BudgetSize(Size):
+    """Amount of work of a contest of images or gradients."""
+
+    rounds: int = amount(8, doc="images or gradients of each method")
+    budget: float = amount(0.8, 0.02, "processor time of one render [s]")
+    spp: int = amount(0, doc="samples per pixel of one render; 0: decided by the budget")
+    levels: tuple[int, ...] = amount((1, 4, 16), (1, 4), "divisors of the samples, for error against time")
+    seed: int = amount(0, doc="seed of all renders")
 
 
 @dataclass(frozen=True)

@@ -25,25 +25,24 @@ from matplotlib.axes import Axes
 from mivol.bench.extinctions import smoke
 from mivol.bench.harness.agreement import compare_means, mean_of_rounds
 from mivol.bench.harness.bars import Bar, judge_agreement, say_row
-from mivol.bench.harness.contests import Contest, Method, compete
+from mivol.bench.harness.contests import BudgetSize, Contest, Method, compete
 from mivol.bench.harness.figures import new_figure, plot_errors, use_plain_ticks
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import Study, amount
 from mivol.bench.scenes import box_scene, constant_light, make_integrator, sun_and_sky
 from mivol.bench.studies.gradients.density_gradient import DensityGradient
+from mivol.bench.studies.single_scattering import contest_images
 from mivol.validate.moments import Moments
 
 __all__ = ["MODELS", "STUDY", "LadderSize", "Model", "measure"]
 
 
 @dataclass(frozen=True)
-class LadderSize(Size):
+class LadderSize(BudgetSize):
     """Amount of work."""
 
     rounds: int = amount(8, 4, "images and gradients of each method")
     side: int = amount(64, 12, "edge of the image [pixels]")
     budget: float = amount(0.8, 0.05, "processor time of one render [s]")
-    spp: int = amount(0, doc="samples per pixel of one render; 0: decided by the budget")
-    levels: tuple[int, ...] = amount((1, 4, 16), (1, 4), "divisors of the samples")
 
 
 @dataclass(frozen=True)
@@ -90,19 +89,13 @@ def measure(size: LadderSize) -> dict:
     answer: dict = {"grid": str(grid)}
     for name, model in MODELS.items():
         answer[name] = {kind: run(model, grid.values, size) for kind, run in measures.items()}
-        say_row(name, **{kind: figures["variance_x_time"] for kind, figures in answer[name].items() if not model.emits})
+        say_row(name, **{kind: figures.get("variance_x_time") for kind, figures in answer[name].items()})
     return answer
 
 
 def measure_image(model: Model, values: np.ndarray, size: LadderSize) -> dict:
     """Errors of pixels against time, and the image."""
-    scene = model.scene(values, size.side)
-
-    def rendering(integrator: mi.Integrator) -> Method:
-        return lambda seed, spp: mi.render(scene, integrator=integrator, spp=spp, seed=seed)
-
-    methods = {name: rendering(integrator) for name, integrator in model.integrators("volpath").items()}
-    contest = compete(methods, size.rounds, size.budget, size.spp, levels=size.levels)
+    contest = contest_images(model.scene(values, size.side), model.integrators("volpath"), size, size.levels)
     figures, mean = error_figures(contest, np.ones(size.side**2 * 3, bool), np.mean)
     return figures | {"picture": mean.reshape(size.side, size.side, 3)}  # for the figure only
 
@@ -113,7 +106,7 @@ def measure_gradient(model: Model, values: np.ndarray, size: LadderSize) -> dict
         name: DensityGradient(model.scene(values, size.side), integrator).of_mean
         for name, integrator in model.integrators("prbvolpath").items()
     }
-    contest = compete(methods, size.rounds, size.budget, size.spp, levels=size.levels)
+    contest = compete(methods, size.rounds, size.budget, size.spp, levels=size.levels, seed=size.seed)
     return error_figures(contest, (values >= 1).ravel(), root_mean_square)[0]
 
 

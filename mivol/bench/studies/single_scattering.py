@@ -53,9 +53,9 @@ from matplotlib.axes import Axes
 from mivol.bench.extinctions import Extinction, as_dense_as_smoke, ct_scan, fine_smoke, les_cloud, smoke, threads_in_space
 from mivol.bench.harness.agreement import compare_means, mean_of_pixels
 from mivol.bench.harness.bars import AT_LEAST, Bar, judge, judge_agreement, say_row
-from mivol.bench.harness.contests import Contest, Method, compete
+from mivol.bench.harness.contests import BudgetSize, Contest, Method, compete
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios, use_plain_ticks
-from mivol.bench.harness.study import Size, Study, amount, ask
+from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.scenes import box_scene, constant_light, make_integrator, point_light, sun_and_sky
 from mivol.validate.moments import Moments
 
@@ -77,17 +77,12 @@ EMITTER_PIXELS, EMITTER_SHARE = 1.5, 0.25
 
 
 @dataclass(frozen=True)
-class ContestSize(Size):
+class ContestSize(BudgetSize):
     """Amount of work of the contests of images."""
 
-    rounds: int = amount(8, doc="images of each integrator")
     max_pixels: int = amount(64, 16, "largest edge of an image [pixels]")
-    budget: float = amount(0.8, 0.02, "processor time of one render [s]")
-    spp: int = amount(0, doc="samples per pixel of one render; 0: decided by the budget")
-    levels: tuple[int, ...] = amount((1, 4, 16), (1, 4), "divisors of the samples, for error against time")
     fine_res: int = amount(256, 48, "voxels along an edge of the fine volumes")
     sparse_res: int = amount(512, 64, "voxels along an edge of the threads")
-    seed: int = amount(0, doc="seed of all renders")
 
 
 class Light(NamedTuple):
@@ -190,7 +185,7 @@ def contend(values: np.ndarray, light: Light, size: ContestSize, levels: tuple[i
 
 
 def contest_images(
-    scene: mi.Scene, integrators: dict[str, mi.Integrator], size: ContestSize, levels: tuple[int, ...] = (1,)
+    scene: mi.Scene, integrators: dict[str, mi.Integrator], size: BudgetSize, levels: tuple[int, ...] = (1,)
 ) -> Contest:
     """Render images by all integrators in turns."""
 
