@@ -1,4 +1,6 @@
-"""One medium in its boundary: which parts are walked together, and its extinction with derivatives, on paper."""
+"""One medium in its boundary: parts of a walk, extinction with derivatives, and coefficients at points, with answers on
+paper.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,7 @@ def body_of(*parts: object, box: Box | None = UNIT, **more: object) -> Body:
 
 
 def across() -> mi.Ray3f:
-    """Through the middle of the unit cube, which lies from 1 to 2."""
+    """A ray through the middle of the unit cube, inside from 1 to 2."""
     return mi.Ray3f(mi.Point3f(-1, 0.5, 0.5), mi.Vector3f(1, 0, 0))
 
 
@@ -147,7 +149,7 @@ def flakes() -> list[mi.Float]:
 
 @pytest.mark.parametrize("where", ["at a point", "along an interval"])
 def test_flakes_multiply_the_extinction_by_their_projected_area(where: str) -> None:
-    """sigma = sqrt(w S w), whose derivatives by S are w w / (2 sqrt(w S w)); an entry off the diagonal occurs twice."""
+    """sigma = sqrt(w S w), with derivatives w w / (2 sqrt(w S w)) by S; an off-diagonal entry occurs twice."""
     d = np.array([0.48, 0.6, 0.64])
     area = np.sqrt(d @ FLAKES @ d)
     slopes = np.array([(1 if a == b else 2) * d[a] * d[b] / (2 * area) for a, b in ENTRIES])
@@ -178,7 +180,7 @@ def test_derivatives_of_flakes_are_followed_where_they_are_asked_for():
 
 
 def test_a_far_point_is_rounded_once():
-    """The sum is made in float64, where that in float32 would be 16 ulps off: 1e4 in front of a camera that is 1e4 away."""
+    """The sum is made in float64; in float32 it would be 16 ulps off, 1e4 in front of a camera 1e4 away."""
     rng = np.random.default_rng(2)
     d = as_float32(rng.normal(size=(3, 64)))
     d = as_float32(d / np.linalg.norm(d, axis=0))

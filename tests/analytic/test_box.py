@@ -1,4 +1,4 @@
-"""Boxes that bound media: corners, which box lies in which, and boxes of cubes."""
+"""Boxes: corners, containment, and boxes of cubes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_box_contains_what_lies_in_it_to_a_tolerance():
 
 
 def test_matching_boxes_have_the_same_corners():
-    """Whatever their axes are called: a quarter turn about z maps the cube to itself."""
+    """Independent of the order of the axes: a quarter turn about z maps the cube to itself."""
     turned = placed(-1, 2) @ np.array([[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     assert Box(placed(-1, 2)).matches(turned, 1e-12)
     assert not Box(placed(-1, 2)).matches(placed(-1, 2.1), 1e-2)

@@ -19,7 +19,7 @@ MOMENTS = 2e-5
 
 @pytest.mark.parametrize("ratio", [0.0, 0.5, 1.0, 7.0])
 def test_a_constant_source_function_shows_the_opacity(ratio):
-    """At any optical depth, and for any two extinctions; the opacity errs by 4e-7 of itself."""
+    """At every optical depth, and for every two extinctions; the relative error of the opacity is 4e-7."""
     shares = share_opacity(mi.Float64(DT), mi.Float64(SIGMAS), mi.Float64(ratio * SIGMAS))
     exact = -np.expm1(-0.5 * DT * (1 + ratio) * SIGMAS)
     np.testing.assert_allclose(np.array(shares.sent(mi.Float64(3), mi.Float64(3))), 3 * exact, rtol=5e-7)
@@ -37,7 +37,7 @@ def test_the_first_point_counts_more_in_a_deep_cell():
 
 
 def test_linear_emission_in_constant_extinction():
-    r"""The two points stand for the mean position of the light that leaves the cell, so a linear density is exact.
+    r"""The two points represent the mean position of the light leaving the cell, so a linear density is exact.
 
     \int_0^D (1 + b t) exp(-s t) dt = (1 - exp(-s D)) / s + b (1 - (1 + s D) exp(-s D)) / s^2, as long as the mean position lies
     between the points: 1 / s > 0.21 D.
@@ -52,7 +52,7 @@ def test_linear_emission_in_constant_extinction():
 
 
 def test_slopes_of_the_weights():
-    """Against central differences, to their error h^2 and to the error of the moments over h."""
+    """Compared with central differences, to their error h^2 and to the error of the moments over h."""
     rng, h = np.random.default_rng(2), 1e-2
     sigma = rng.uniform(0.5, 2, (2, 100))
     exact = weigh_emission_density(mi.Float64(DT), *map(mi.Float64, sigma))

@@ -1,4 +1,4 @@
-"""Channels of extinction: what reads them and what takes derivatives back are transposes of each other."""
+"""Channels of extinction: conversions of values and of derivatives are transposes of each other."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 @pytest.mark.parametrize(("part", "scene"), [(1, 1), (1, 3), (3, 3), (3, 1)])
 def test_rows_and_derivatives_are_transposes(part, scene):
-    """<rows of v, w> = <v, derivatives of w>; the sums are of six products at most, each below 1."""
+    """<rows of v, w> = <v, derivatives of w>; the sums have at most six products, each below 1."""
     rng = np.random.default_rng(part * 10 + scene)
     v, w = rng.uniform(0, 1, (part, 20)), rng.uniform(0, 1, (scene, 20))
     rows = to_scene_channels([mi.Float(x) for x in v], scene)

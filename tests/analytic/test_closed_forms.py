@@ -1,4 +1,4 @@
-"""The Henyey-Greenstein phase function: values, moments and inversion in float64."""
+"""Henyey-Greenstein, Rayleigh and Draine phase functions: values, moments and inversion in float64."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_legendre_moments_and_backscatter_of_hg():
 
 @pytest.mark.parametrize("g", ALL_G)
 def test_inversion_of_hg(g):
-    """The chance of a smaller cosine than the sample's is u, and that of a larger one 1 - u, both to some roundings."""
+    """The probability of a smaller cosine than the sample is u, and of a larger cosine 1 - u, both to a few roundings."""
     turn = sample_hg(*lanes(U), mi.Float(g))
     m, p = as64(turn.below_one), as64(turn.above_minus_one)
     assert np.all(np.isfinite(m) & np.isfinite(p) & (m >= 0) & (p >= 0))
@@ -121,7 +121,7 @@ def test_inversion_of_draine(g, alpha):
 
 
 def test_droplets_of_jendersie_and_deon():
-    """The fit's mean cosine lies by Mie's for clouds, 0.85 to 0.88; outside its range it is refused."""
+    """The mean cosine of the fit agrees with Mie's for clouds, 0.85 to 0.88; diameters outside the range are refused."""
     fit = droplets(20.0)
     share = fit["weight_draine"]
     g = (1 - share) * fit["g_hg"] + share * mean_cosine(fit["g_draine"], fit["alpha"])

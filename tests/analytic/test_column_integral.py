@@ -1,4 +1,4 @@
-"""Line integrals between columns where they are known in closed form, and the margin of nodes and its transpose."""
+"""Line integrals between columns with known closed forms, and the margin of nodes with its transpose."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_margin_holds_the_outermost_values(variant_rgb: str) -> None:
 
 
 def test_sums_of_the_margin_are_those_of_the_outermost_nodes(variant_rgb: str) -> None:
-    """The transpose of the margin: <pad(x), g> = <x, fold(g)>, where g is what feet and heads of columns have got.
+    """The transpose of the margin: <pad(x), g> = <x, fold(g)>, where g are the sums of feet and heads of columns.
 
     1e-6: float32 sums of at most 16 numbers between 0 and 1.
     """
@@ -46,7 +46,7 @@ def test_sums_of_the_margin_are_those_of_the_outermost_nodes(variant_rgb: str) -
 
 
 def test_a_slope_is_integrated_exactly(variant_rgb: str) -> None:
-    """Trilinear interpolation holds a linear function as it is: its integral is the length times its value in the middle."""
+    """Trilinear interpolation reproduces a linear function: its integral is the length times its value in the middle."""
     z, y, x = np.ogrid[:3, :4, :5]
     values = (1 + 2 * x - 0.5 * y + 3 * z).astype(np.float32)
     q, v, length = np.array([0.2, 0.3, 0.1]), np.array([0.9, 0.5, 0.4]), 4.0
@@ -63,10 +63,10 @@ def test_strides_are_those_of_a_grid_with_a_margin() -> None:
 
 
 def test_a_walk_has_the_length_of_its_line_and_starts_afresh_at_each_layer(variant_rgb: str) -> None:
-    """Lengths of cells add up to 1e-6 of the line's (a rounding of 3e-8 a cell, 32 in turn); a fresh start a layer and PIECE.
+    """Lengths of cells add up to 1e-6 of the length of the line (32 roundings of 3e-8); a fresh start at each layer and PIECE.
 
-    The first line runs along x through 99 voxels without leaving its layer of z: ceil(99 / 32) = 4 starts. The second climbs a
-    voxel in ten over 90, from the middle of a layer: it begins, and crosses 9 planes, less than 32 from one another.
+    The first line runs along x through 99 voxels in a single layer of z: ceil(99 / 32) = 4 starts. The second line climbs a
+    voxel in ten over 90, from the middle of a layer: a start, and 9 crossed planes less than 32 voxels apart.
     """
     n = 100
     slope = np.array([0.0, 0.1])

@@ -1,4 +1,4 @@
-"""A piece of a ray over what lies behind it: by hand, and its derivatives by differences."""
+"""A piece of a ray over the pieces behind it: values by hand, derivatives by differences."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PIECES = [(0.5, 2.0), (1.5, 0.25), (0.1, 4.0)]
 
 
 def light(pieces: list[tuple[float, float]], behind: float) -> float:
-    """What the camera sees of them over a light."""
+    """Radiance of the pieces in front of a light, as seen by the camera."""
     front, total = 0.0, 0.0
     for tau, colour in pieces:
         total += np.exp(-front) * -np.expm1(-tau) * colour
@@ -36,7 +36,7 @@ def integral_of(tau: float, colour: float) -> CellIntegral:
 
 
 def test_pieces_are_put_in_front_of_each_other_with_their_tangents() -> None:
-    """From the far end; one tangent of each optical depth, and one of N by itself."""
+    """From the far end, with a tangent of each optical depth and a tangent of N."""
     change, h = [(0.3, 0.2), (-0.7, 0.1), (1.1, -0.5)], 1e-5
     swept = BodyIntegral([mi.Float64(0)] * 2, [mi.Float(0)] * 2)
     for (tau, colour), (dtau, dcolour) in list(zip(PIECES, change, strict=True))[::-1]:

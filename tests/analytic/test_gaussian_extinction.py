@@ -1,4 +1,4 @@
-"""Gaussians along rays against their float64 twin, and the twin against quadrature of what it says of points."""
+"""Gaussians along rays, compared with their float64 twin; the twin is compared with quadrature of its values at points."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ exp(-m^2 / 2) changes by m of it, and m is at most REACH: 1.6e-5."""
 
 
 def cloud(count: int, seed: int = 0) -> Gaussians:
-    """Flat and long ones too, faint and nearly opaque ones, with quaternions of any length."""
+    """Flat and long, faint and nearly opaque Gaussians, with quaternions of any length."""
     rng = np.random.default_rng(seed)
     return Gaussians(
         means=rng.uniform(-0.6, 0.6, (count, 3)),
@@ -39,7 +39,7 @@ def cloud(count: int, seed: int = 0) -> Gaussians:
 
 
 def rays(seed: int = 1, away: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
-    """Rays through the cloud, from a sphere around it: origins and unit directions (RAYS, 3), as float32 has them."""
+    """Rays through the cloud, from a sphere around it: origins and unit directions (RAYS, 3), in float32 precision."""
     rng = np.random.default_rng(seed)
     o = rng.normal(size=(RAYS, 3))
     o *= away / np.linalg.norm(o, axis=1, keepdims=True)
@@ -77,7 +77,9 @@ def test_depths_along_rays_are_those_of_the_twin(count: int, span: str) -> None:
 
 
 def test_the_depth_of_the_twin_is_the_integral_of_its_extinction() -> None:
-    """Adaptive quadrature between the ends of each Gaussian; and nothing that splatting shows is lost but what is cut."""
+    """By adaptive quadrature between the ends of each Gaussian. The twin loses nothing of splatting's Gaussians but the cut
+    tails.
+    """
     gaussians, (o, d) = oracle.Cloud.of(cloud(3)), rays()
     for ray in range(6):
         origin, direction = o[ray : ray + 1], d[ray : ray + 1]
@@ -93,7 +95,7 @@ def test_the_depth_of_the_twin_is_the_integral_of_its_extinction() -> None:
 
 
 def test_a_ray_may_begin_inside_and_far_away() -> None:
-    """Seen from 1000 box sizes away, a ray's direction in float32 would miss by 1e-4; its own point near the box does not."""
+    """From 1000 box sizes away, a float32 direction misses by 1e-4; the entry point near the box does not."""
     gaussians = cloud(8)
     _, d = rays()
     o = np.zeros_like(d)
@@ -134,7 +136,7 @@ def test_extinctions_at_points_are_those_of_the_twin() -> None:
 
 
 def differences(value: object, gaussians: oracle.Cloud) -> dict[str, np.ndarray]:
-    """Central differences (parameter..., rays) of ``value(cloud)`` by each parameter; steps of 1e-5 err by 1e-9."""
+    """Central differences (parameter..., rays) of ``value(cloud)`` by each parameter; the error of steps of 1e-5 is 1e-9."""
     found = {}
     for name in EXTINCTION_PARAMETERS:
         shape, step = getattr(gaussians, name).shape, 1e-5
@@ -148,9 +150,10 @@ def differences(value: object, gaussians: oracle.Cloud) -> dict[str, np.ndarray]
 
 
 def follow(part: GaussianExtinction, there: RayInterval, t: mi.Float | None, weight: np.ndarray) -> tuple[dict, np.ndarray]:
-    """The gradient of a sum of depths (at a distance t: of extinctions) with weights, and two numbers that must agree.
+    """The gradient of a weighted sum of depths (at a distance t: of extinctions), and two numbers that must agree.
 
-    They are its change along random changes of all parameters and of the scale: by the tangent, and by the gradient.
+    The numbers are the change of the sum along random changes of all parameters and of the scale: by the tangent, and by the
+    gradient.
     """
     rng, tensors, scale = np.random.default_rng(5), part.field.tensors, mi.Float(SCALE)
     dr.enable_grad(scale, *tensors.values())
@@ -176,7 +179,7 @@ def follow(part: GaussianExtinction, there: RayInterval, t: mi.Float | None, wei
 @pytest.mark.parametrize("at", ["along a ray", "at a point"])
 @pytest.mark.parametrize("count", [1, 8, pytest.param(50, marks=pytest.mark.slow)])
 def test_derivatives_by_every_parameter_are_finite_differences_of_the_twin(count: int, at: str) -> None:
-    """Of a weighted sum over rays, with the cut frozen; and the tangent is the transpose of the gradient."""
+    """Derivatives of a weighted sum over rays, at a fixed cut; the tangent is the transpose of the gradient."""
     gaussians, (o, d) = cloud(count, seed=3), rays()
     twin = oracle.Cloud.of(gaussians)
     weight = np.random.default_rng(4).normal(size=RAYS)

@@ -1,4 +1,6 @@
-"""The light and the optical depth of Gaussians over intervals of rays, against the float64 twin that sorts them all."""
+"""Light and optical depth of Gaussians over intervals of rays, and their order, compared with the sorted list of the float64
+twin.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ def cloud() -> Gaussians:
 
 
 def sweep(gaussians: Gaussians, ends: tuple[np.ndarray, np.ndarray], scale: float, shows: bool, rows: int = 3) -> tuple:
-    """Rays (o, d), and what is summed along them: N (rows, RAYS) and tau (RAYS,)."""
+    """Rays (o, d), and the sums along them: N (rows, RAYS) and tau (RAYS,)."""
     rng = np.random.default_rng(1)
     o = rng.normal(size=(RAYS, 3))
     o *= 3 / np.linalg.norm(o, axis=1, keepdims=True)
@@ -80,7 +82,7 @@ SORTED_RAYS = 32
 
 
 def rays(away: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions (SORTED_RAYS, 3) through the middle, as float32 has them."""
+    """Origins and unit directions (SORTED_RAYS, 3) through the middle, in float32 precision."""
     rng = np.random.default_rng(1)
     o = rng.normal(size=(SORTED_RAYS, 3))
     o *= away / np.linalg.norm(o, axis=1, keepdims=True)
@@ -90,7 +92,7 @@ def rays(away: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def visited(gaussians: Gaussians, o: np.ndarray, d: np.ndarray, span: tuple[float, float]) -> list[list[int]]:
-    """The numbers of the Gaussians that each ray visits, in the order of the visits."""
+    """The numbers of the Gaussians visited by each ray, in the order of the visits."""
     part = GaussianExtinction("sigma_t", GaussianField.from_gaussians(gaussians, np.eye(4)), mi.Float(1))
     ray = mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
     interval = RayInterval(ray, mi.Float64(span[0]), mi.Float64(span[1]), dr.full(mi.Bool, True, len(o)))
@@ -109,7 +111,7 @@ def visited(gaussians: Gaussians, o: np.ndarray, d: np.ndarray, span: tuple[floa
 
 @pytest.mark.parametrize("span", [(0.0, np.inf), (2.6, 3.2), (3.0, np.inf)])
 def test_each_is_visited_once_from_the_farthest_peak_on(span: tuple[float, float]) -> None:
-    """Wide ones, so that cells hold more than are sorted at once; of an interval those that reach into it."""
+    """Wide Gaussians, so cells hold more than are sorted at once; an interval visits the Gaussians reaching into it."""
     gaussians, (o, d) = random_gaussians(300, 0), rays()
     gaussians.log_scales[:] += 1.5
     cloud, ends = oracle.Cloud.of(gaussians), tuple(np.full(SORTED_RAYS, t) for t in span)
@@ -128,7 +130,7 @@ def test_each_is_visited_once_from_the_farthest_peak_on(span: tuple[float, float
 
 
 def _ends_near(line: oracle.Lines, ray: int, number: int, span: tuple[float, float]) -> bool:
-    """Whether the chord of a Gaussian ends where the interval does."""
+    """Whether the chord of a Gaussian ends at the end of the interval."""
     half = np.sqrt(max(oracle.REACH**2 - line.m2[ray, number], 0)) / line.speed[ray, number]
     ends = line.peak[ray, number] + half * np.array([-1, 1])
     return bool(min(abs(ends[1] - span[0]), abs(ends[0] - span[1])) < 1e-4)

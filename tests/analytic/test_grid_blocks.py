@@ -1,4 +1,4 @@
-"""Empty blocks: what skips them is what does not, and knows how far the next voxel is."""
+"""Blocks of a grid: skipping empty blocks changes no integral, and distances, ranges and means are right."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def shell(n):
-    """One voxel thick, of radius 0.35, in an otherwise empty grid."""
+    """A shell of radius 0.35, a voxel thick, in an otherwise empty grid."""
     c = (np.arange(n) + 0.5) / n - 0.5
     r = np.sqrt(c[:, None, None] ** 2 + c[None, :, None] ** 2 + c[None, None, :] ** 2)
     return (np.abs(r - 0.35) < 0.5 / n).astype(float)
@@ -110,7 +110,7 @@ TWO = centred(2 * np.eye(3))
 
 
 def sparse(channels: int) -> np.ndarray:
-    """A grid with few voxels that are not 0, one of them in a corner."""
+    """A grid with few non-zero voxels, including a corner."""
     rng = np.random.default_rng(3)
     values = np.where(rng.uniform(size=(*SIZE, channels)) < 4e-3, rng.uniform(0.1, 1, (*SIZE, channels)), 0)
     values[-1, -1, -1] = 0.5
@@ -142,7 +142,7 @@ def test_coarse_grids_skip_what_is_empty_where_the_fine_one_does(skip):
 
 @pytest.mark.parametrize("shift", [0, 1, 2, 3])
 def test_blocks_that_hold_anything_are_listed(shift):
-    """Every block with a node that is not 0; none that is further than a block from one."""
+    """The list holds every block with a non-zero node, and no block further than a block from such a node."""
     values, edge = sparse(1)[..., 0], 1 << shift
     held = np.array(coarsen_grid(make_lattice(mi.TensorXf(values[..., None]), TWO), shift, True).occupied_blocks)
     blocks = [(n >> shift) + 1 for n in SIZE]

@@ -1,4 +1,4 @@
-"""An extinction on a grid: trilinear between voxel centres, constant beyond them, and nothing outside of the box."""
+"""An extinction on a grid: values, optical depths and derivatives, with and without an activation, and sums of parts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_values_at_points():
 
 
 def test_optical_depth_across_the_box():
-    """0 up to the first centre, then linear, then 1: 1/4 + 1/4; and half of the way, 1/16 of it linear."""
+    """0 up to the first centre, then linear, then 1: 1/4 + 1/4; over half of the way, 1/16 in the linear part."""
     ray = across([0, 0], [0.25] * 2, [0.25] * 2)
     found = grid(1).integrate(RayInterval(ray, mi.Float(0, 0), mi.Float(1, 0.5), mi.Bool(True)))
     # A cell is integrated with two Gauss points, whose places are rounded: a few roundings of numbers of size 1.
@@ -90,7 +90,7 @@ def ray() -> mi.Ray3f:
 
 
 def test_nothing_lies_outside_of_the_box():
-    """exp of the 0 that is read there would be 1."""
+    """Without the box test, the activation exp would give 1 for the 0 read outside."""
     found = two().eval_at(mi.Float(1), ray(), mi.Float(0.5, 1.5, 2.5), mi.Bool(True))
     np.testing.assert_allclose(np.array(found), [[0, 2, 0]], rtol=ROUNDING)
 
@@ -123,7 +123,7 @@ def lattice(channels: int = 1, res: tuple[int, ...] = (2, 2, 2), shift: float = 
 
 
 def corners(*values: float) -> list[list[mi.Float]]:
-    """[channel][corner] of a read whose channels are the same everywhere in the cell."""
+    """[channel][corner] values of an array with channels constant in the cell."""
     return [[mi.Float(v)] * 8 for v in values]
 
 
@@ -145,7 +145,7 @@ def test_parts_are_summed_for_each_channel():
 
 
 def test_points_of_a_cell_are_interpolated():
-    """A cell that is x + 2 y + 4 z at its corners."""
+    """A cell of values x + 2 y + 4 z at its corners."""
     part = GridExtinction("sigma_t", lattice())
     found = SummedExtinction([part], [part.values], mi.Float(1))
     assert not found.has_constants

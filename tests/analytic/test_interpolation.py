@@ -1,4 +1,4 @@
-"""Trilinear interpolation, its weights, and the outer half voxel."""
+"""Trilinear interpolation, its weights, the outer half voxel, and the cubic along a ray."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def points(n: int = 200) -> np.ndarray:
 
 
 def test_a_trilinear_function_is_its_interpolant():
-    """1 + 2 x + 3 y + 5 z + 7 x y z of the corners' bits; each of seven steps rounds by at most half an ulp of 18."""
+    """1 + 2 x + 3 y + 5 z + 7 x y z of the bits of the corners; each of seven steps rounds by at most half an ulp of 18."""
     p = points()
     x, y, z = BITS.T
     corners = 1.0 + 2 * x + 3 * y + 5 * z + 7 * x * y * z
@@ -46,7 +46,9 @@ def test_weights_are_the_transpose():
 
 
 def test_the_outer_half_voxel_has_one_node():
-    """A grid of (Z, Y, X) = (4, 3, 2): all weight is on the upper node before the first, on the lower from the last on."""
+    """A grid of (Z, Y, X) = (4, 3, 2): all weight is on the upper node before the first node, and on the lower node from the
+    last on.
+    """
     lower = mi.Vector3i(mi.Int32(-1, 0, 1), mi.Int32(-1, 1, 2), mi.Int32(-1, 2, 3))
     found = np.array(fraction_from_lower(mi.Vector3f(0.25), lower, (4, 3, 2)))
     np.testing.assert_array_equal(found, [[1, 0.25, 0]] * 3)
@@ -65,7 +67,7 @@ def curves(least: float = 0.0) -> np.ndarray:
 
 
 def exact(values: np.ndarray) -> np.ndarray:
-    """Coefficients (4, N) of the cubics through values, from the constant on."""
+    """Coefficients (4, N) of the cubics through values, constant term first."""
     return np.linalg.solve(THIRDS[:, None] ** np.arange(4), values)
 
 
@@ -79,7 +81,7 @@ def lanes(values: np.ndarray) -> list[mi.Float]:
 
 
 def inverted(values: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Where the integral is ``u`` of the whole."""
+    """The x at which the integral is the fraction ``u`` of the whole."""
     curve = lanes(values)
     whole = integrate_cubic(curve, mi.Float(DT), mi.Float(1))
     return np.array(invert_cubic_integral(curve, mi.Float(DT), mi.Float(u) * whole, whole), np.float64)
@@ -95,13 +97,13 @@ def test_values_and_integrals_are_those_of_the_cubic():
 
 
 def test_no_integral_is_negative():
-    """Of F x^3 from 0 to 1e-4 little is left but the rounding of its coefficients, which are 0 on paper."""
+    """The integral of F x^3 from 0 to 1e-4 is little more than the rounding of the coefficients, which are 0 on paper."""
     values = as_float32(np.random.default_rng(4).uniform(1, 2, N) * THIRDS[:, None] ** 3)
     assert np.array(integrate_cubic(lanes(values), mi.Float(1), mi.Float(1e-4))).min() == 0
 
 
 def test_the_inverse_reaches_its_goal():
-    """Where the extinction is at least 0.001 of its largest, Newton's steps end at the rounding of the integral and of x."""
+    """If the extinction is at least 0.001 of its largest value, Newton steps end at the rounding of the integral and of x."""
     values, u = curves(least=0.1), as_float32(np.random.default_rng(5).uniform(0, 1, N))
     off, top = np.abs(depth(values, inverted(values, u)) - u * depth(values, 1)), values.max(axis=0)
     np.testing.assert_array_less(off, (2 * OF_INTEGRAL + 2.0**-24) * DT * top)
@@ -111,8 +113,8 @@ def test_the_inverse_reaches_its_goal():
 def test_an_extinction_that_vanishes_at_an_end(at):
     """F x^3, whose integral is the fourth power.
 
-    Newton's steps from above make the error v of x^4 at most (3/4)^4 v. The first step is a bisection, to x^4 <= 1/16 at small
-    u; of the seven others at most one ends below the root: 0.316^6 / 16 = 6.3e-5 of the whole.
+    Newton steps from above reduce an error v of x^4 to at most (3/4)^4 v. The first step is a bisection, to x^4 <= 1/16 at
+    small u; at most one of the seven others ends below the root: 0.316^6 / 16 = 6.3e-5 of the whole.
     """
     u = as_float32((np.arange(N) + 0.5) / N)
     values = as_float32(3 * np.broadcast_to(THIRDS[:, None] if at == "start" else 1 - THIRDS[:, None], (4, N)) ** 3)
@@ -121,7 +123,7 @@ def test_an_extinction_that_vanishes_at_an_end(at):
 
 
 def test_goals_at_the_ends_and_a_flat_extinction():
-    """Nothing is reached at 0, everything at 1; x is the share of the whole where the extinction is the same everywhere."""
+    """Goal 0 gives x = 0, the whole goal x = 1; in a constant extinction x is the goal over the whole."""
     flat, u = np.full((4, 3), 2.0), np.array([0.0, 0.25, 1.0])
     # Coefficients of a constant cancel to 2^-24 of 111 F, and so do those of the integral.
     np.testing.assert_allclose(inverted(flat, u), u, atol=OF_INTEGRAL)

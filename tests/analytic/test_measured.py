@@ -15,7 +15,9 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def test_named_media_are_the_published_ones():
-    """A few numbers of each table; the scattering coefficients of the second one as printed, from the reduced ones."""
+    """A few numbers of each table; the scattering coefficients of the second table as printed, computed from the reduced
+    ones.
+    """
     sigma_a, sigma_s, g = named_medium("Skim milk")
     assert (sigma_a, sigma_s, g) == ((0.0014, 0.0025, 0.0142), (0.70, 1.22, 1.90), (0.0, 0.0, 0.0))
     sigma_a, sigma_s, g = named_medium("lowfat_milk")
@@ -29,7 +31,7 @@ def test_named_media_are_the_published_ones():
 
 
 def test_no_number_of_the_tables_was_changed():
-    """Sums of what was typed from the papers, by columns: one wrong digit changes one of them."""
+    """Sums by columns of the numbers typed from the papers: a single wrong digit changes a sum."""
     sums = [sum(sum(row[k]) for row in measured._JENSEN_2001.values()) for k in range(2)]
     assert sums == pytest.approx([101.52, 4.231], rel=1e-12)
     sums = [sum(sum(row[k]) for row in measured._NARASIMHAN_2006.values()) for k in range(3)]

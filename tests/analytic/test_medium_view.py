@@ -1,4 +1,4 @@
-"""What transport sees of a medium: its channels, whether it emits, whose cells are walked, and where stock grids end."""
+"""Mitsuba's media as sums of fields: channels, emission, walked cells, and the place of stock grids."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_cells_are_those_of_the_extinction_and_else_of_the_light():
 
 
 def test_a_stock_grid_holds_the_points_of_its_box():
-    """[-1, 3] x [-2, 2] x [-3, 1]; a volume that asks this itself holds every point."""
+    """[-1, 3] x [-2, 2] x [-3, 1]; a volume that tests its own box holds every point."""
     box, ours = SimpleNamespace(ptr=7), SimpleNamespace(ptr=8)
     found = view(stock_boxes={7: Box(centred(4 * np.eye(3), (1, 0, -1)))})
     inside = np.array([[1, 0, -1], [-0.5, 1.5, -2.5], [2.5, -1.5, 0.5]])
@@ -69,7 +69,7 @@ VALUES = np.ones((3, 4, 5, 1), np.float32)
 
 @pytest.mark.parametrize("draw", range(6))
 def test_a_stock_grid_that_fills_its_boundary_is_placed_exactly(draw):
-    """The six digits that a gridvolume prints are replaced by the boundary's vertices (float32)."""
+    """The float32 vertices of the boundary replace the six printed digits of a gridvolume."""
     rng = np.random.default_rng(draw)
     turned = scenes.rotation(rng.normal(size=3), rng.uniform(0.3, 3)) @ np.diag(rng.uniform(1, 3, 3))
     place = scenes.centred(turned, rng.uniform(1, 3, 3))
@@ -106,7 +106,7 @@ def test_a_medium_that_scatters_says_so():
 
 
 def test_a_volume_of_another_kind_is_refused():
-    """A medium over something that is neither a number nor a grid."""
+    """A medium over a volume that is neither a number nor a grid."""
 
     class Odd(mi.Volume):
         def max(self):
@@ -125,7 +125,7 @@ def test_a_volume_of_another_kind_is_refused():
 
 
 def test_a_grid_is_placed_once_for_each_boundary(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same grid in two boundaries has two places, and each is found once."""
+    """A grid in two boundaries has two places, and each place is found once."""
     asked = []
 
     def place(volume: object, boundary: Box | None) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Mie phase functions, against small particles, one size, and a float64 twin."""
+"""Mie phase functions, compared with small particles, a single size, and a float64 twin."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_mie_of_small_particles_is_rayleigh(twin, monkeypatch):
 
 
 def test_mie_of_one_size_is_the_theory(twin, monkeypatch):
-    """A distribution so narrow that one size remains: values and mean cosine of that sphere."""
+    """A very narrow distribution is a single size: values and mean cosine of this sphere."""
     monkeypatch.setattr(mie, "RADII", 8)
     table = mie.aerosol(0.5, 1 + 1e-6, 1.5 - 0.01j, tolerance=1e-3)
     x = 2 * np.pi * 0.5 / 0.55
@@ -41,7 +41,7 @@ def test_mie_of_one_size_is_the_theory(twin, monkeypatch):
 
 
 def test_droplets_of_a_cloud(twin, monkeypatch):
-    """A forward peak, and the mean cosine of the sizes, weighted by what they scatter."""
+    """A forward peak, and the mean cosine of the sizes, weighted by their scattered light."""
     monkeypatch.setattr(mie, "RADII", 200)
     table = mie.water_droplets(2.0)
     r = np.linspace(0.05, 8, 200)
@@ -54,7 +54,9 @@ def test_droplets_of_a_cloud(twin, monkeypatch):
 
 
 def test_ends_of_a_lognormal_distribution():
-    """Each leaves out the share CUT: of the area r^2 n(r) below, of r^6 n(r), what small particles scatter, above."""
+    """Each end leaves out the fraction CUT: of the area r^2 n(r) below, and of the light of small particles, r^6 n(r),
+    above.
+    """
     median, s = 0.3, np.log(1.8)
     low, high = np.log(mie._ends_of_lognormal(median, s))
 
@@ -70,7 +72,7 @@ def test_ends_of_a_lognormal_distribution():
 
 
 def test_the_twin_is_miepython():
-    """Where miepython is installed, its coefficients are the twin's."""
+    """If miepython is installed, its coefficients equal those of the twin."""
     real = pytest.importorskip("miepython", reason='miepython is not installed: pip install "mivol[mie]"')
     for index, x in ((1.333 + 0j, 0.1), (1.5 - 0.01j, 10.0), (1.333 + 0j, 114.0)):
         ours, theirs = oracle.Mie.coefficients(index, x), np.atleast_2d(real.coefficients(index, x))

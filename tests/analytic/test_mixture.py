@@ -24,14 +24,14 @@ def test_shares_and_choice():
 
 
 def test_a_lobe_without_a_share_is_never_chosen():
-    """Not at the ends either: u = 0 before a first one, u = 1 (shares may sum to less, by rounding) after a last one."""
+    """Neither at the ends: u = 0 before a first such lobe, u = 1 (rounded shares may sum to less) after a last such lobe."""
     for weights, want in (([0, 1, 0], [1, 1, 1]), ([2, 0, 0], [0, 0, 0]), ([0, 0, 3], [2, 2, 2])):
         chosen, _ = choose_lobe(normalise_weights([mi.Float(w) for w in weights]), mi.Float(0, 0.5, 1))
         assert list(chosen) == want
 
 
 def test_shares_without_any_weight_are_equal():
-    """And have a derivative of 0 by weights that sum to 0, where w / 0 would have none."""
+    """With a derivative of 0 by weights summing to 0, where the derivative of w / 0 does not exist."""
     weights = [mi.Float(0, 1), mi.Float(0, 3)]
     dr.enable_grad(weights)
     shares = normalise_weights(weights)

@@ -1,4 +1,4 @@
-"""Rays of any place and direction that are sorted: nothing but the order of sums is another."""
+"""Sorting rays changes nothing but the order of sums."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ HALF = np.array([[0.5, 0, 0, 0.25], [0, 0.5, 0, 0.25], [0, 0, 0.5, 0.25], [0, 0,
 
 @pytest.fixture
 def sorts() -> None:
-    """Rays are sorted on processors only."""
+    """Rays are sorted on CPUs only."""
     if dr.backend_v(mi.Float) != dr.JitBackend.LLVM:
         pytest.skip("rays are not sorted here")
 
 
 def field_of(levels: int = 1, to_world: np.ndarray = TO_WORLD) -> SphericalGrid:
-    """Rough fields; of nested boxes this is the place of the innermost."""
+    """Rough fields; for nested boxes the place of the innermost box."""
     inner = SphericalGrid.from_dense(*make((9, 11, 10), basis=4, scale=1.0), to_world)
     if levels == 1:
         return inner
@@ -54,7 +54,7 @@ def numbers(seen: RenderedRays) -> list[np.ndarray]:
 
 
 def stepped(field: SphericalGrid, rays: RayBundle, few: int, monkeypatch: pytest.MonkeyPatch):
-    """What is seen, derivatives of a sum in which each ray has weights of its own, and whether rays were sorted."""
+    """Rendered values, derivatives of a sum with a weight for each ray, and whether rays were sorted."""
     monkeypatch.setattr(neighbour_rays, "FEWEST", few)
     rng = np.random.default_rng(3)
     active = mi.Bool(rng.uniform(size=COUNT) < 0.8)
@@ -68,7 +68,7 @@ def stepped(field: SphericalGrid, rays: RayBundle, few: int, monkeypatch: pytest
 
 @pytest.mark.parametrize("levels", [1, 2])
 def test_sorted_rays_see_and_derive_the_same(levels: int, sorts: None, monkeypatch: pytest.MonkeyPatch):
-    """Rays that end in the box, that miss it, and that are not followed are among them."""
+    """Some rays end in the box, some miss the box, and some are inactive."""
     field = field_of(levels)
     o, d = aim(COUNT)
     d[::9] *= -1
@@ -88,7 +88,7 @@ def test_sorted_rays_see_and_derive_the_same(levels: int, sorts: None, monkeypat
 
 
 def test_numbers_for_all_rays_stay_numbers_for_all(sorts: None, monkeypatch: pytest.MonkeyPatch):
-    """An end and weights that all rays share."""
+    """An end and weights shared by all rays."""
     field, rays = field_of(), rays_of(*aim(COUNT))
     found = []
     for few in (1, 1 << 30):
@@ -105,7 +105,7 @@ def test_numbers_for_all_rays_stay_numbers_for_all(sorts: None, monkeypatch: pyt
 
 @pytest.mark.parametrize("levels", [1, 2])
 def test_neighbours_enter_and_leave_side_by_side(levels: int, sorts: None):
-    """By NumPy, in the outermost box, here [-1, 1]^3."""
+    """Compared with NumPy, in the outermost box, here [-1, 1]^3."""
     cells = find_occupied_cells(field_of(levels, CUBE if levels == 1 else CUBE @ HALF))
     rng = np.random.default_rng(5)
     o = rng.normal(size=(FEWEST, 3))
@@ -140,7 +140,7 @@ def test_few_rays_and_rays_from_pinholes_stay_as_they_are(sorts: None):
 
 
 def test_sorted_rays_keep_their_pinholes(sorts: None, monkeypatch: pytest.MonkeyPatch):
-    """A source of pinholes gains nothing by an order, and yet can be read in one."""
+    """A source of pinholes gains nothing from an order, and still renders correctly in any order."""
     field, rays = field_of(), rays_of(*aim(COUNT))
     view = mi.UInt32(np.random.default_rng(6).integers(2, size=COUNT).astype(np.uint32))
     source = bake(field, find_occupied_cells(field), np.float64([[0, 0, 5], [5, 0, 0]]), view)

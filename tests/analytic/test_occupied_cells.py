@@ -1,4 +1,4 @@
-"""The walk through occupied cells: where it says that a ray is in a cell."""
+"""The list of occupied cells: numbers, ways through empty cells, and positions of a ray in a cell."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def test_fractions_across_a_ray_along_an_axis_are_those_of_its_start():
-    """To the bit: none is turned round to be counted along the ray, as 1 - (1 - frac) would round it."""
+    """Equal to the bit: fractions are not reversed along the ray, since 1 - (1 - frac) would round them."""
     field = SphericalGrid.from_dense(np.ones((5, 5, 5), np.float32), np.zeros((5, 5, 5, 1, 3)), np.eye(4))
     n = 64
     o = np.stack([np.full(n, -1.0), *np.random.default_rng(1).uniform(0.1, 0.9, (2, n))], axis=-1)
@@ -43,7 +43,7 @@ DIRECTIONS = list(product((False, True), repeat=3))
 
 
 def chosen(levels: int, share: float = 0.01) -> np.ndarray:
-    """Some cells (levels, Z, Y, X) of the first slices, in clusters as surfaces have them."""
+    """Some cells (levels, Z, Y, X) of the first slices, in clusters like those of surfaces."""
     is_listed = np.random.default_rng(levels).random((levels, *(n + 1 for n in RES))) < share
     is_listed[:, 9:] = False
     is_listed[0, 4:6, 5:9, 6:13] = True
@@ -53,8 +53,9 @@ def chosen(levels: int, share: float = 0.01) -> np.ndarray:
 @pytest.mark.parametrize("levels", [1, 2])
 @pytest.mark.parametrize("ahead", DIRECTIONS)
 def test_ways_lead_through_empty_cells_only(ahead: tuple[bool, ...], levels: int) -> None:
-    """Of an empty brick they end with the last of those nearer than the nearest that is not, in all directions; within a brick
-    that is not empty they end with it where nothing lies ahead, and else with the next cell. Listed cells have none."""
+    """From an empty brick a way ends before the nearest non-empty brick, in all directions. Within a non-empty brick a way
+    ends with the brick if no listed cell lies ahead, and otherwise with the next cell. Listed cells have no way.
+    """
     is_listed = chosen(levels)
     index, _ = CellIndex.find(RES, levels, lambda cell: dr.gather(mi.Bool, mi.Bool(is_listed.ravel()), cell))
     free, _ = looked(index, is_listed.shape, ahead)
@@ -91,7 +92,7 @@ def test_numbers_of_listed_cells(levels: int) -> None:
 
 @pytest.mark.parametrize("nodes", [[], [0], [70 * 21 * 25 - 1, 70 * 21 * 25 + 3 + 25 * (7 + 21 * 2)]])
 def test_only_cells_of_bricks_at_stored_nodes_are_asked_about(nodes: list[int]) -> None:
-    """The cells at a node are the two along each axis that it ends; what is listed is found, and takes 12 bytes a brick."""
+    """A node touches two cells along each axis. All listed cells are found, and the index takes 12 bytes a brick."""
     shape, asked = (2, *(n + 1 for n in RES)), []
     is_listed = np.zeros(shape, bool)
     for node in nodes:

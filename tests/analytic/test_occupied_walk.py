@@ -1,4 +1,4 @@
-"""The pieces of a ray through nested boxes: where each begins and ends, in its level's own lengths."""
+"""The pieces of a ray through nested boxes: begin and end of each piece, in the lengths of its level."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def test_pieces_of_a_ray_through_the_middle_and_of_one_that_misses() -> None:
-    """Boxes of half-extent 1, 2, 4: a ray along x from -5 meets their faces there, one at y = 1.5 misses the innermost."""
+    """Boxes of half-extent 1, 2, 4. A ray along x from -5 meets their faces at these distances; a ray at y = 1.5 misses the
+    innermost.
+    """
     grids = []
     for level in range(3):
         place = CUBE * 2.0**level

@@ -1,4 +1,4 @@
-"""Random numbers of lanes: means, squares and correlations."""
+"""Random numbers of lanes: means, squares and correlations; strata."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def start(number: float) -> mi.Float:
-    """What generators are seeded with, of this round of seeds: a number in [0, 1)."""
+    """A seed in [0, 1) for generators, different in each round of seeds."""
     return mi.Float((number + fresh(0) * 0.6180339887498949) % 1)
 
 
 @pytest.mark.statistical
 def test_numbers_are_uniform():
-    """2^16 lanes, 4 numbers each: means of 1/2, squares of 1/3, no correlation of numbers in a lane, nor of neighbours."""
+    """2^16 lanes, 4 numbers each: means of 1/2, squares of 1/3, no correlation within a lane or between neighbours."""
     _, numbers = draw_pcg32(seed_pcg32(start(0.25), 1 << 16), 4)
     u = np.array([np.array(x, dtype=np.float64) for x in numbers])
     assert u.min() > 0 and u.max() < 1
@@ -34,7 +34,7 @@ def test_numbers_are_uniform():
 
 @pytest.mark.statistical
 def test_numbers_of_paths_are_uniform() -> None:
-    """2^16 paths of the same two seeds, 4 numbers each, as above."""
+    """2^16 paths of equal seeds, 4 numbers each, as above."""
     sampler = LaneSampler.seeded(mi.UInt32(7 + fresh(0)), mi.UInt32(11), dr.arange(mi.UInt32, 1 << 16))
     u = np.array([np.array(x, dtype=np.float64) for x in (sampler.next_1d(), *sampler.next_2d(), sampler.next_1d())])
     rows = np.vstack([u, np.roll(u[0], 1)]) - 0.5

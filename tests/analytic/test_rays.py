@@ -1,4 +1,4 @@
-"""Rays with an origin in float64, beside Mitsuba's own."""
+"""Rays with an origin in float64, and camera rays clipped at both planes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_an_origin_keeps_its_digits():
 
 
 def test_points_are_found_in_float64_and_rounded_once():
-    """Origin and step are each less than half a step of float32 at 100, and their sum is more."""
+    """Origin and step are each less than half a float32 step at 100; their sum is more."""
     t, d, place = 5e-6, np.float32([0, 0.6, 0.8]).astype(np.float64), np.array([1.0, 100 + 3e-6, 100 + 3e-6])
     there = place + t * d
     # A fused product and sum is rounded once, numpy's twice: one step of float64 apart at most.
@@ -70,7 +70,7 @@ RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2
 
 
 def look_down(parts: dict, near: float, far: float) -> mi.Scene:
-    """A camera of parallel rays, 0.002 wide, 4 above the origin."""
+    """An orthographic camera, 0.002 wide, 4 above the origin."""
     turn = mi.ScalarTransform4f()
     place = turn.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]) @ turn.scale([1e-3, 1e-3, 1])
     sensor = camera((0, 0, 4), (0, 0, 0), res=4) | {"type": "orthographic", "to_world": place}
@@ -81,7 +81,7 @@ def look_down(parts: dict, near: float, far: float) -> mi.Scene:
 @pytest.mark.slow_for("grid", "traced")
 @pytest.mark.parametrize("kind", FOG)
 def test_fog_is_cut_at_both_planes(kind):
-    """It lies from 3 to 5 in front of the camera."""
+    """The planes lie 3 and 5 in front of the camera."""
     for near, far, seen in ((0.01, 1e4, 2.0), (3.5, 1e4, 1.5), (0.01, 4.5, 1.5), (3.5, 4.75, 1.25), (0.01, 2.0, 0.0)):
         scene = look_down({"fog": FOG[kind]()}, near, far)
         image = np.array(mi.render(scene, integrator=mi.load_dict(mivol(max_depth=1, aovs="tau")), spp=4))
@@ -91,7 +91,7 @@ def test_fog_is_cut_at_both_planes(kind):
 
 
 def test_what_a_mask_transmits_ends_at_the_same_plane():
-    """A black mask at 2, an emitter at 4.5: in front of it there is the sky of 1, whatever straight rays pass."""
+    """A black mask at 2, an emitter at 4.5: the sky of 1 fills the image in front of the emitter, even through the mask."""
     turn = mi.ScalarTransform4f()
     mask = {"type": "mask", "opacity": 0.6, "nested": {"type": "diffuse", "reflectance": 0.0}}
     masked = {"type": "rectangle", "to_world": turn.translate([0, 0, 2]), "bsdf": mask}
@@ -106,10 +106,10 @@ def test_what_a_mask_transmits_ends_at_the_same_plane():
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_the_same_picture_as_volpath():
-    """Fog around the camera that scatters, a ball in front of the far plane and one behind it; light comes from beyond.
+    """Scattering fog around the camera, a ball in front of the far plane and a ball behind it; light comes from beyond.
 
-    (Behind a boundary volpath forgets the plane: a ray that it starts anew there has no end. In a medium with
-    has_spectral_extinction it loses the rays that meet the plane.)
+    (Behind a boundary volpath forgets the plane: a ray spawned there has no end. In a medium with has_spectral_extinction
+    volpath loses the rays meeting the plane.)
     """
     ref = {"type": "ref", "id": "haze"}
     balls = {"near": (0.1, 0.1, 2.3), "far": (-0.3, 0.1, 0.5)}

@@ -29,7 +29,7 @@ def test_turn_between_directions_keeps_small_angles():
 
 
 def test_direction_after_turns_by_the_angle():
-    """Straight on is -wi, straight back wi, and the sine is right down to 1e-6."""
+    """Straight on is -wi, straight back is wi, and the sine is right down to 1e-6."""
     turn, m, p = turns()
     wi = mi.Vector3f(0.6, 0.0, 0.8)
     wo = as64(scattered_direction(wi, turn, mi.Float(0.3))).T

@@ -1,4 +1,4 @@
-"""Tables of phase functions: from moments and files, and those that are refused."""
+"""Tables of phase functions: moments, files, values and sampling, and refusals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mivol.phase.table import Lookup, Table
 
 
 def test_table_from_legendre_moments():
-    """g^n gives Henyey-Greenstein back, and the table's own moments are those that were put in, to its tolerance."""
+    """Moments g^n give Henyey-Greenstein, and the moments of the table equal the given moments, to its tolerance."""
     given = 0.6 ** np.arange(40)
     table = Table.from_moments(given, tolerance=1e-4)
     c = np.linspace(-1, 1, 301)
@@ -125,7 +125,7 @@ def test_samples_of_a_table_invert_its_distribution():
 
 @pytest.mark.usefixtures("variant_rgb")
 def test_table_of_a_stock_size():
-    """Equally spaced values are those of tabphase: (0.5, 1, 1.5) is (2 + c) / (8 pi)."""
+    """Equally spaced values as for tabphase: (0.5, 1, 1.5) is (2 + c) / (8 pi)."""
     nodes, values, integral, _ = lookup(Table.regular([0.5, 1.0, 1.5]))
     turn, m, p = turns()
     assert np.max(np.abs(as64(nodes.eval(turn, values, integral)) * 8 * np.pi - (2 + (p - m) / 2))) <= 8 * EPS

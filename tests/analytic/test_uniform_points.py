@@ -1,4 +1,4 @@
-"""A point of a bounded extinction, drawn along several intervals: evenly over their lengths in the field's box."""
+"""Points drawn uniformly over several intervals, in the box of a bounded field or in some media."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ N = 1024
 
 
 def bounded_points(*intervals: tuple[float, float], on: bool = True) -> tuple[np.ndarray, float]:
-    """Points for N even numbers, and the length, of a ray that is in the field's box from 1 to 3."""
+    """Points for N evenly spaced numbers, and the length, of a ray inside the box of the field from 1 to 3."""
     part = BoundedExtinction("sigma_t", Ball(mi.Float(1), 1.0, (0, 0, 2)), mi.Float(1), mi.Float(1))
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))
     (point,) = start_reservoirs(1, (dr.arange(mi.Float, N) + 0.5) / N, N)
@@ -38,7 +38,9 @@ def test_one_interval_is_shared_out_evenly():
 
 
 def test_three_intervals_are_shared_out_by_their_lengths():
-    """1, 0 (outside) and 0.5: two thirds of the numbers keep the first, and each of the N points has its own 1/N of 1.5."""
+    """1, 0 (outside) and 0.5: two thirds of the numbers keep the first interval, and each of the N points has 1/N of the
+    length 1.5.
+    """
     t, total = bounded_points((1, 2), (4, 5), (2.5, 7))
     assert total == 1.5
     along = np.sort(np.where(t < 2.25, t - 1, t - 1.5))
@@ -62,7 +64,7 @@ LOW, HIGH = (2.0, 3.0), (4.5, 4.75)
 
 
 def two_boxes(same: bool = False) -> SceneMedia:
-    """Of a grid, whose box need not cut its intervals, and a constant; or of one medium, whose two boundaries are traced."""
+    """A grid, whose box need not clip its intervals, and a constant; or one medium behind two traced boundaries."""
     low, high = (centred(np.diag([2, 2, z]), (0, 0, m)) for z, m in ((1, -0.5), (0.25, 1.625)))
     constant = medium("homogeneous", 0.5)
     grid = medium("mivol_medium", grid_volume("mivol_voxels", np.full((3, 2, 4), 0.5), low))
@@ -73,7 +75,7 @@ def two_boxes(same: bool = False) -> SceneMedia:
 def even_points(
     media: SceneMedia, length: float = 9.0, x: float = 0.0, among: list[Body] | None = None, on: bool = True
 ) -> UniformPoint:
-    """Points for N even numbers, of a ray of some length, in all media unless told which."""
+    """Points for N evenly spaced numbers, on a ray of some length, by default in all media."""
     ray = mi.Ray3f(mi.Point3f(x, 0, -3), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     u = (dr.arange(mi.Float, N) + 0.5) / N
     passed = RaySegment.upto(ray, dr.zeros(mi.MediumPtr), mi.Float64(length))
@@ -107,7 +109,7 @@ def test_points_know_their_medium():
 
 
 def test_only_what_the_segment_has_passed_of_the_media_asked_about():
-    """It ends in the first box; one of the two is asked about; the ray misses both; lanes are off."""
+    """The segment ends in the first box; only one of the media counts; the ray misses both; lanes are inactive."""
     media = two_boxes()
     low, high = sorted(media.bodies, key=lambda body: body.box.to_world[2, 3])
     cases = (
@@ -124,9 +126,9 @@ def test_only_what_the_segment_has_passed_of_the_media_asked_about():
 
 
 def test_intervals_without_end_count_as_empty():
-    """Fog that fills no shape of its own, around a ball: rays that escape have no even point in it.
+    """Fog without a shape of its own, around a ball: escaping rays have no point in the fog.
 
-    Those that start at a surface are as long as the largest float32, the others infinite.
+    Rays from a surface are as long as the largest float32, the others infinite.
     """
     fog = mi.load_dict(medium("homogeneous", 0.5))
     wall = ball_of(medium("homogeneous", 0.7), (0, 0, 0), 1.0) | {"bsdf": {"type": "diffuse"}, "exterior": fog}

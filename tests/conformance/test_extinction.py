@@ -1,4 +1,4 @@
-"""Every kind of extinction answers the same questions along a ray, and its derivatives are transposes of each other."""
+"""Every kind of extinction along a ray: integrals, values at points, and derivatives that are transposes of each other."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BOX = np.diag([2.0, 2.0, 2.0, 1.0]) + np.pad(np.full((3, 1), -1.0), ((0, 1), (3,
 
 
 def noise(channels: int, low: float) -> Lattice:
-    """A grid of noise that is empty in one half; blocks without values are skipped."""
+    """A grid of noise with an empty half; empty blocks are skipped."""
     values = np.random.default_rng(3).uniform(low, 2, (*RES, channels)).astype(np.float32)
     values[:, :, 5:] = min(low, 0)
     values, occupied = mi.TensorXf(values), mi.TensorXf(np.maximum(values, 0))
@@ -42,7 +42,7 @@ KINDS: dict[str, Callable[[], ExactExtinction]] = {
 
 
 def rays() -> tuple[mi.Ray3f, mi.Float, mi.Float]:
-    """Rays around and through the box, and an interval of each that begins inside for some."""
+    """Rays around and through the box, with an interval each; some begin inside."""
     rng = np.random.default_rng(5)
     d = rng.normal(size=(3, RAYS))
     o = rng.uniform(-0.9, 0.9, (3, RAYS)) - 1.5 * (d := d / np.linalg.norm(d, axis=0))
@@ -79,7 +79,7 @@ def test_an_optical_depth_is_the_sum_of_the_values_on_its_way(name: str) -> None
 @pytest.mark.parametrize("where", ["along an interval", "at a point"])
 @pytest.mark.parametrize("name", KINDS)
 def test_derivatives_are_transposes(name: str, where: str) -> None:
-    """<J v, w> = <v, J^T w>, for a tangent that is not 0 where the values are; and J v is not 0."""
+    """<J v, w> = <v, J^T w>, for a tangent that is not 0 where the values are 0; and J v is not 0."""
     part, (ray, t0, t1), on = KINDS[name](), rays(), mi.Bool(True)
     rng = np.random.default_rng(8)
     dr.enable_grad(part.values)
@@ -108,7 +108,7 @@ def coloured() -> ConstantExtinction:
 
 
 def intervals() -> RayInterval:
-    """Four of a ray: one of length 3, one that is not active, one that ends before it begins, one without end."""
+    """Four intervals of a ray: of length 3, inactive, ending before the beginning, and without end."""
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))
     return RayInterval(ray, mi.Float(1, 1, 3, 1), mi.Float(4, 4, 2, dr.inf), mi.Bool(True, False, True, True))
 
@@ -145,7 +145,7 @@ def test_a_gradient_is_delivered_to_the_value_and_to_the_scale():
 
 
 def ball(*sigma: float, scale: float = 2.0) -> BoundedExtinction:
-    """Of radius 1, about (0, 0, 2)."""
+    """A ball of radius 1 about (0, 0, 2)."""
     value = mi.Color3f(*sigma) if len(sigma) == 3 else mi.Float(*sigma)
     return BoundedExtinction("sigma_t", Ball(value, 1.0, (0, 0, 2)), mi.Float(scale), mi.Float(max(sigma)))
 
@@ -155,7 +155,7 @@ def upward(x: float = 0.0) -> mi.Ray3f:
 
 
 def test_the_interval_is_that_of_the_box():
-    """A ray at x = 0.9 crosses the box where it hardly meets the ball; one at 1.1 misses both."""
+    """A ray at x = 0.9 crosses the box and grazes the ball; a ray at 1.1 misses both."""
     part = ball(1.5)
     on = mi.Bool(True)
     begin, end = part.clip(RayInterval(upward(0.9), mi.Float(0, 2, 0), mi.Float(dr.inf, dr.inf, 2.5), on))

@@ -1,4 +1,4 @@
-"""Media along a ray: boundaries of all shapes, moved, in instances and without an end."""
+"""Media along a ray: boundaries of all shapes, moved boundaries, instances, and media without an end."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def walls(**more: object) -> dict:
-    """Six walls that face the inside of a room, from -2 to 2."""
+    """Six walls facing the inside of a room, from -2 to 2."""
     tilts = [([1, 0, 0], 0), ([1, 0, 0], 180), ([1, 0, 0], 90), ([1, 0, 0], -90), ([0, 1, 0], 90), ([0, 1, 0], -90)]
     place = [turn().rotate(*tilt).translate([0, 0, -2]).scale(2) for tilt in tilts]
     return {f"wall{k}": {"type": "rectangle", "to_world": p, "bsdf": {"type": "diffuse"}, **more} for k, p in enumerate(place)}
 
 
 def instances(interior: dict) -> dict:
-    """Two balls of one kind."""
+    """Two balls of the same kind."""
     places = [turn().translate([0.4, 0, 0]), turn().translate([-0.7, 0.1, 0])]
     balls = {f"ball{k}": {"type": "instance", "to_world": p, "of": {"type": "ref", "id": "kind"}} for k, p in enumerate(places)}
     return {"kind": {"type": "shapegroup", "ball": ball_of(interior, (0, 0, 0), 0.5)}, **balls}
@@ -58,7 +58,7 @@ INSIDE = {
 @pytest.mark.statistical
 @pytest.mark.parametrize("where", small.cases(INSIDE, [name for name in INSIDE if name != "a room"]))
 def test_media_that_fill_no_shape_of_their_own(where):
-    """Around the camera, around shapes, and between walls: where no boundary ends a homogeneous medium it has no end."""
+    """Around the camera, around shapes, and between walls: a homogeneous medium without a boundary has no end."""
     ref = {"type": "ref", "id": "fog"}
     parts = {"fog": FOG, **INSIDE[where](ref), "bulb": point([0.3, 0.2, 1.5], 4.0)[0]}
     sensor = scenes.camera((1.5, -1.2, 1.0), (0, 0, 0), res=16, fov=40.0)
@@ -72,7 +72,9 @@ def test_media_that_fill_no_shape_of_their_own(where):
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_fog_in_a_room_that_is_open_on_one_side():
-    """Rectangles bound it, one of them a null one; each wall has a BSDF of its own, so that Mitsuba merges none into a mesh."""
+    """Rectangles bound the fog, a null rectangle among them; each wall has its own BSDF, so Mitsuba does not merge walls into
+    a mesh.
+    """
     ref, placed = {"type": "ref", "id": "fog"}, walls(exterior={"type": "ref", "id": "fog"})
     for k, name in enumerate(placed):
         placed[name]["bsdf"] = {"type": "diffuse", "reflectance": 0.2 + 0.1 * k}
@@ -96,7 +98,7 @@ def test_media_in_instances(kind):
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_boundaries_that_are_moved():
-    """An integrator that has rendered a scene sees that its box was moved, turned and taken back; volpath judges."""
+    """An integrator that has rendered a scene notices that its box was moved, turned and moved back; volpath is the judge."""
     fog = box_of(medium("homogeneous", 1.0, 0.8), centred(0.5 * np.eye(3), (0, 0, 1.6)))
     scene = close_up(lit({"smoke": grid_in(cube(PLACE)), "fog": fog}))
     ours, params = mi.load_dict(mivol()), mi.traverse(scene)

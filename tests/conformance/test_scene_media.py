@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize("shape", small.cases(["box", "ball"], ["box"]))
 def test_camera_inside(shape):
-    """The sensor names its medium, as volpath needs it to."""
+    """The sensor names its medium, as volpath requires."""
     interior = grid_in({}, seed=4)["interior"] | {"id": "fog"}
     ref = {"type": "ref", "id": "fog"}
     parts = lit({"fog": interior, "box": box_of(ref, PLACE) if shape == "box" else ball_of(ref, (0, 0, 0), 1.0)})
@@ -39,7 +39,7 @@ def test_camera_inside(shape):
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_camera_inside_that_names_no_medium():
-    """Volpath starts in vacuum then; we find the medium: the picture is that of a sensor that names it."""
+    """Volpath then starts in vacuum; mivol finds the medium. The image equals that of a sensor naming the medium."""
     interior = grid_in({}, seed=4)["interior"] | {"id": "fog"}
     parts = lit({"fog": interior, "box": box_of({"type": "ref", "id": "fog"}, PLACE)})
     sensor = scenes.camera((0.4, -0.3, 0.2), (-0.5, 0.4, 0), res=8, fov=60.0)

@@ -1,7 +1,7 @@
-"""The derivatives of the optical depth: the transpose, the tangent, and that they are one matrix.
+"""Derivatives of the optical depth: the transpose and the tangent are those of the same matrix.
 
-tau is linear in the voxels, so there is no step size to choose: finite differences are exact but for rounding, and the
-transpose can be held against the twin's dense row.
+tau is linear in the voxels, so finite differences need no step size and are exact but for rounding. The transpose is compared
+with the dense row of the twin.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BOUND = 2e-6
 
 
 def integrate(values, to_world, o, d, t_max=math.inf, skip=False):
-    """The optical depth of tensors, derivatives attached."""
+    """The optical depth of tensors, with derivatives."""
     from mivol.transport.media.grid_integral import integrate_tau
 
     ends = mi.Float(np.broadcast_to(np.float32(t_max), len(o)).copy())
@@ -220,7 +220,7 @@ def test_other_channel_counts_are_refused(channels):
 
 @pytest.mark.parametrize("spare", [-1, 0])
 def test_gradients_are_packed_up_to_a_size(variant_rgb, monkeypatch, spare):
-    """Packed gradients hold a cell's 8 corners side by side; larger ones hold a number a node, whatever the back end."""
+    """Packed gradients hold the 8 corners of a cell side by side; larger gradients hold a number a node, on every back end."""
     from mivol.transport.media import grid_integral
 
     lattice = make_lattice(np.ones((3, 4, 5, 2), np.float32), FRAMES["unit"], False)

@@ -1,4 +1,4 @@
-"""Pictures of Gaussians and their derivatives, against a picture in float64 that has no tiles and never stops."""
+"""Images of Gaussians and their derivatives, compared with an image in float64 without tiles and without an end of lanes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def splatter(variant_rgb: str) -> Splatter:
 
 
 def slopes(arrays: dict[str, np.ndarray], weights: np.ndarray, frozen: oracle_splats.Drawn, **options: object) -> dict:
-    """Derivatives of the sum of weights times the picture by six numbers of each kind: (index, central difference)."""
+    """Derivatives of the weighted sum of the image by six numbers of each kind: (index, central difference)."""
     rng, camera = np.random.default_rng(2), looking(WIDTH, HEIGHT)
     arrays = {name: value.astype(float) for name, value in arrays.items()}
 
@@ -56,7 +56,7 @@ def slopes(arrays: dict[str, np.ndarray], weights: np.ndarray, frozen: oracle_sp
 
 
 def compare(splatter: Splatter, n: int, degree: int, **options: object) -> None:
-    """Picture and derivatives of a cloud are those of the oracle."""
+    """Image and derivatives of a cloud equal those of the oracle."""
     arrays, camera = cloud(n, degree, SIZES[n], seed=n), looking(WIDTH, HEIGHT)
     picture, kept = splatter.forward(tensors(arrays), camera)
     truth, frozen = oracle_splats.draw(arrays, camera, **options)
@@ -71,14 +71,15 @@ def compare(splatter: Splatter, n: int, degree: int, **options: object) -> None:
 
 
 def test_pictures_and_derivatives(splatter: Splatter) -> None:
-    """One splatter for all clouds: nothing of the first may be left in its recordings."""
+    """A single splatter draws all clouds: its recordings keep nothing of the first cloud."""
     for n in SIZES:
         compare(splatter, n, 2)
 
 
 def test_the_derivatives_are_those_of_one_function(splatter: Splatter) -> None:
-    """Reverse against forward: along a direction of all parameters at once, the oracle changes by the dot product of that
-    direction with the gradient. The bound of rounding is shared by all numbers, and grows as the root of how many they are."""
+    """Reverse against forward: along a direction of all parameters at once, the oracle changes by the dot product of the
+    direction with the gradient. The bound of rounding is shared by all numbers, and grows as the root of their count.
+    """
     arrays, camera = cloud(8, 2, SIZES[8], seed=8), looking(WIDTH, HEIGHT)
     picture, kept = splatter.forward(tensors(arrays), camera)
     _, frozen = oracle_splats.draw(arrays, camera)
@@ -97,8 +98,9 @@ def test_the_derivatives_are_those_of_one_function(splatter: Splatter) -> None:
 
 
 def test_small_gaussians_are_splatted_as_they_are_ray_traced(variant_rgb: str) -> None:
-    """The perspective is linearised over a Gaussian, which errs in proportion to its size over its distance: halved with the
-    size, to a tenth (the next term of the expansion), in a picture that is magnified as much as the Gaussian shrinks."""
+    """The perspective is linearised over a Gaussian, with an error proportional to its size over its distance. The error
+    halves with the size, to a tenth (the next term of the expansion), in an image magnified as much as the Gaussian shrinks.
+    """
     splatter = Splatter(32, 32, 0, low_pass=1e-6)
     arrays = {
         "means": np.array([[0.3, -0.2, 0.1]]),
@@ -129,7 +131,7 @@ def test_pictures_and_derivatives_with_compensated_opacity(variant_rgb: str, deg
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_factor_on_higher_harmonics(variant_rgb: str, degree: int) -> None:
-    """A cloud drawn with the factor is the one whose higher harmonics are smaller by it, and so are their derivatives larger.
+    """The image equals that of higher harmonics times the factor; derivatives by these harmonics are times the factor, too.
 
     Tables of 3, 12, 27 and 48 numbers a Gaussian are read one, four, one and sixteen at a time. A product is rounded once more.
     """
@@ -149,7 +151,7 @@ def test_a_factor_on_higher_harmonics(variant_rgb: str, degree: int) -> None:
 
 
 def test_kernels_are_recorded_once(splatter: Splatter) -> None:
-    """Neither another number of Gaussians, nor another pose, nor other lists compile or record anything."""
+    """Another number of Gaussians, another pose and other lists compile and record nothing."""
     recorded = (splatter._project, splatter._write, splatter._composite, splatter._project_adjoint)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for n, distance in ((60, 1.8), (50, 1.6), (200, 1.7), (333, 2.0)):
@@ -162,12 +164,12 @@ def test_kernels_are_recorded_once(splatter: Splatter) -> None:
 
 
 def test_room_for_gaussians_is_a_power_of_two() -> None:
-    """So that kernels are compiled anew a few times in a fit, and not with every clone."""
+    """Kernels are then compiled a few times in a fit, instead of with every clone."""
     assert [_capacity(n) for n in (1, 4096, 4097, 8192, 8193)] == [4096, 4096, 8192, 8192, 16384]
 
 
 def test_what_light_is_left_is_kept_for_derivatives_alone(splatter: Splatter) -> None:
-    """A number a pixel and chunk of a list; a picture alone keeps those of one chunk."""
+    """A number a pixel and chunk of a list; an image without derivatives keeps the numbers of a single chunk."""
     chunks = mi.UInt32([*range(splatter.n_tiles), 37])
     widths = [dr.width(splatter._frame(SimpleNamespace(chunks=chunks), asked).transmittance) for asked in (False, True)]
     assert widths[1] == 37 * widths[0]

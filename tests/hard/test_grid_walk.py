@@ -1,4 +1,6 @@
-"""Walks of cells where they are hard: rays along planes, through edges and corners, along the edge of what is there."""
+"""Walks of cells in hard cases: rays along planes, through edges and corners, along the border of the support, and in plain
+boxes.
+"""
 
 from __future__ import annotations
 
@@ -188,15 +190,15 @@ def test_planes_that_coincide():
 
 
 def lattice_step(n):
-    """Half a float32 spacing at n: how well a position among n voxels is known, in voxels."""
+    """Half a float32 spacing at n [voxels]: the accuracy of a position among n voxels."""
     return n * EPS / 2
 
 
 @pytest.mark.slow_for("filled0")
 @pytest.mark.parametrize("filled", [slice(250, 256), slice(255, 256)])
 def test_the_end_is_where_it_is_after_256_cells(filled):
-    """Rationale: a wall, or the box, ends a ray in the only filled cells, after 250 empty ones.
-    Expected: the end is as good as a float32 position on that lattice, not as a running difference of 600 steps.
+    """Rationale: a wall, or the box, ends a ray in the only filled cells, after 250 empty cells.
+    Expected: the end is as accurate as a float32 position on this lattice, better than a running difference of 600 steps.
 
     Hard case 14.
     """
@@ -238,7 +240,7 @@ COUNT = 4
 
 
 def lengths(place: np.ndarray, o: np.ndarray, d: np.ndarray, on: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What rays pass of each cell (n, z, y, x), where the last cell of each ends, and gaps between cells."""
+    """Length of rays in each cell (n, z, y, x), the end of the last cell of each ray, and gaps between cells."""
     rows = [[COUNT * v for v in row] for row in Box(place).rows()]
     p, w = to_lanes(o, d)
     n = dr.width(p)
@@ -257,7 +259,7 @@ def lengths(place: np.ndarray, o: np.ndarray, d: np.ndarray, on: bool = True) ->
 
 
 def truth(place: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """The same in float64, by sorting all crossings of planes of each ray."""
+    """The same in float64, by sorting all plane crossings of each ray."""
     inverse = np.linalg.inv(place)
     found = np.zeros((len(o), COUNT, COUNT, COUNT))
     for i, (p, w) in enumerate(zip(o, d, strict=True)):
@@ -289,7 +291,7 @@ def test_cells_and_what_rays_pass_of_them(frame: str, inside: bool) -> None:
 
 
 def test_no_cell_outside_is_visited() -> None:
-    """Where rounding lets a ray leave its last cell before it leaves the box."""
+    """For rays that rounding lets leave their last cell before they leave the box."""
     place, n = FRAMES["sheared"], 100_000
     p, w = to_lanes(*random_rays(np.random.default_rng(5), place, n))
 
@@ -301,7 +303,7 @@ def test_no_cell_outside_is_visited() -> None:
 
 
 def test_rays_along_axes_and_rays_that_miss() -> None:
-    """Parallel to two faces, in a row of cells; beside the box; in lanes that are off."""
+    """Parallel to two faces, in a row of cells; beside the box; inactive lanes."""
     place = np.eye(4)
     o, d = np.float32([[0.4, 0.9, -1], [2, 0.6, 0.1], [0.4, 1.1, -1]]), np.float32([[0, 0, 1], [-1, 0, 0], [0, 0, 1]])
     found, last, _ = lengths(place, o, d)

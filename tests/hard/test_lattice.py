@@ -1,4 +1,4 @@
-"""Grids in the world where that is hard: far away, in other scales and frames, and places that are refused."""
+"""Grids in the world in hard cases: far away, in other scales and frames, and refused frames."""
 
 from __future__ import annotations
 

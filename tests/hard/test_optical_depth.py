@@ -1,8 +1,8 @@
-"""Line integrals of grids where they are hard; docstrings tell the number of a case in the list of hard cases.
+"""Line integrals of grids in hard cases; docstrings give the number in the list of hard cases.
 
-The judge is the float64 twin, fed with the very float32 rays and voxels of the code under test. What is asked is
+The judge is the float64 twin with the same float32 rays and voxels. The bound is
 |error| <= 2e-6 * integral of (sigma + h |grad sigma|), h a voxel: about 16 float32 roundings of the value and of the
-position inside a cell; where a sum of a few terms is known, a few roundings of it.
+position inside a cell; for a known sum of a few terms, a few roundings of the sum.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Clouds that splatting has to survive: opaque and clear, tiny and huge, behind the camera, none at all, too many."""
+"""Hard clouds for splatting: opaque and clear, tiny and huge, behind the camera, empty, too many."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def camera() -> Camera:
 
 
 def straight(side: int = SIDE) -> Camera:
-    """A camera one unit of length from the origin, whose axis goes through the centre of a pixel."""
+    """A camera a unit of length from the origin, whose axis goes through the centre of a pixel."""
     pose = np.eye(4)
     pose[2, 3] = 1.0
     return Camera(intrinsics(side, side, side / 2 + 0.5, side / 2 + 0.5), (side, side), pose)
@@ -50,10 +50,10 @@ def stack(opacity_logits: list[float], depths: list[float], scale: float = 0.2) 
 
 
 def test_the_median_depth_is_that_of_the_splat_at_which_half_of_the_light_is_lost(variant_rgb: str) -> None:
-    """Three of opacity 0.4 on the axis: 0.6, 0.36 and 0.216 is left behind them, so half of it is lost at the second.
+    """Three splats of opacity 0.4 on the axis leave 0.6, 0.36 and 0.216 of the light, so half of it is lost at the second.
 
-    Beside the axis, where alpha is below 1 - 0.5^(1/3) = 0.206 of each, more than half gets through all three: 0, as where
-    nothing is.
+    Beside the axis, where each alpha is below 1 - 0.5^(1/3) = 0.206, more than half passes all three: the median depth is 0,
+    as in an empty pixel.
     """
     splatter = Splatter(SIDE, SIDE, 2, median=True)
     reals = tensors(stack([np.log(0.4 / 0.6)] * 3, [0.0, 0.3, 0.6], scale=0.05))
@@ -66,7 +66,9 @@ def test_the_median_depth_is_that_of_the_splat_at_which_half_of_the_light_is_los
 
 
 def disc_picture(radius: float, depth: float = 0.0, beside: float = 0.0, opacity: float = 20.0) -> np.ndarray:
-    """Alpha of one disc of a radius [pixel at the origin] so far behind the origin and so many pixels beside the axis."""
+    """Alpha of a disc of a radius [pixel at the origin], at a distance behind the origin and an offset of pixels from the
+    axis.
+    """
     arrays = stack([opacity], [depth], scale=radius / SIDE)
     arrays["means"][0, 0] = beside / SIDE * (1 + depth)
     splatter = Splatter(SIDE, SIDE, 2, compensated=True, discs=True)
@@ -76,8 +78,8 @@ def disc_picture(radius: float, depth: float = 0.0, beside: float = 0.0, opacity
 def test_a_disc_covers_its_area_and_nothing_else(variant_rgb: str) -> None:
     """Radius 6 pixels, widened to sqrt(36.3) with an opacity of 36 / 36.3: pi 36 pixels in all.
 
-    The share of a pixel is linear in the distance of its centre from the border, and exact only where the border is parallel
-    to an edge: 6 % of a pixel at most, of either sign, in the 2 pi 6 pixels of the border; less than 1 % of the area.
+    The share of a pixel is linear in the distance of its centre from the border, and exact only for a border parallel to an
+    edge. The error is at most 6 % of a pixel, of either sign, in the 2 pi 6 pixels of the border: less than 1 % of the area.
     """
     for beside in (0.0, 0.3, 0.5):
         alpha = disc_picture(6, beside=beside)
@@ -89,8 +91,10 @@ def test_a_disc_covers_its_area_and_nothing_else(variant_rgb: str) -> None:
 
 
 def test_the_light_of_a_small_disc_falls_with_the_square_of_its_distance(variant_rgb: str) -> None:
-    """Radii of 2 to 0.25 pixels. The smallest is drawn with a radius of 0.6, whose border no pixel sees as straight: a
-    quarter of its area, wherever it lies in a pixel; without the widened radius one pixel or none would show it."""
+    """Radii of 2 to 0.25 pixels. The smallest disc is drawn with a radius of 0.6, whose border is not straight in any pixel:
+    an error of a quarter of its area, at every place in a pixel. Without the widened radius one pixel or none would show the
+    disc.
+    """
     for depth in (0.0, 1.0, 3.0, 7.0):
         for beside in (0.0, 0.25, 0.5):
             area = np.pi * (2 / (1 + depth)) ** 2
@@ -107,20 +111,22 @@ def test_nearer_discs_hide_those_behind_and_have_no_derivatives(variant_rgb: str
 
 
 def test_derivatives_at_an_opacity_of_one(splatter: Splatter) -> None:
-    """In the pixel where alpha is 1 nothing behind is seen, and yet the derivative by the place of what hides it knows its
-    colour. A logit of 20 is an opacity of 1 in float32; that of 30 behind it is hidden, and hides the third."""
+    """In the pixel of alpha 1 everything behind is hidden, and yet the derivative by the place of the front splat depends on
+    the hidden colour. A logit of 20 is an opacity of 1 in float32; the splat of logit 30 behind it is hidden, and hides the
+    third.
+    """
     compare_derivatives(splatter, stack([20.0, 30.0, 0.0], [0.0, 0.3, 0.6]))
 
 
 def test_derivatives_behind_a_wall(splatter: Splatter) -> None:
-    """A wall hides 1 - 1e-5 of nine others in all pixels: what it would uncover by another size is nonetheless all nine."""
+    """A wall hides 1 - 1e-5 of nine other splats in all pixels. The derivative by its size still includes all nine."""
     arrays = stack([20.0] + [-0.5] * 9, [0.1 * k for k in range(10)], scale=0.5)
     arrays["log_scales"][0] = np.log(20)
     compare_derivatives(splatter, arrays)
 
 
 def compare_derivatives(splatter: Splatter, arrays: dict[str, np.ndarray]) -> None:
-    """Picture and derivatives of a cloud on the axis are those of the oracle."""
+    """Image and derivatives of a cloud on the axis equal those of the oracle."""
     picture, kept = splatter.forward(tensors(arrays), straight())
     truth, frozen = oracle_splats.draw(arrays, straight())
     truth = truth[..., [0, 1, 2, 4]]
@@ -144,7 +150,7 @@ def compare_derivatives(splatter: Splatter, arrays: dict[str, np.ndarray]) -> No
 
 
 def test_opacities_of_zero_and_one_by_infinite_logits(splatter: Splatter) -> None:
-    """What is clear leaves no trace; what is opaque is finite in its derivatives."""
+    """A clear Gaussian leaves no trace; an opaque Gaussian has finite derivatives."""
     arrays = stack([-np.inf, np.inf, 0.0], [0.0, 0.3, 0.6])
     picture, kept = splatter.forward(tensors(arrays), straight())
     alone, _ = splatter.forward(tensors({name: value[1:] for name, value in arrays.items()}), straight())
@@ -158,9 +164,10 @@ def test_opacities_of_zero_and_one_by_infinite_logits(splatter: Splatter) -> Non
 
 @pytest.mark.parametrize("scale", [1e-6, 1e3])
 def test_tiny_and_huge_scales(splatter: Splatter, camera: Camera, scale: float) -> None:
-    """A tiny Gaussian is as wide as the low-pass filter, a huge one has the alpha of its opacity in every pixel. Centres are
-    rounded as ever; a huge covariance is the sum of squares up to (1e3 * 22 pixels)^2, of which the low-pass loses nothing that
-    is seen: alpha changes by 1e-9 across the picture."""
+    """A tiny Gaussian is as wide as the low-pass filter, a huge one has the alpha of its opacity in every pixel. A huge
+    covariance is a sum of squares up to (1e3 * 22 pixels)^2, in which the low-pass filter disappears without effect: alpha
+    changes by 1e-9 across the image.
+    """
     arrays = cloud(20, 2, scale, seed=4)
     picture, kept = splatter.forward(tensors(arrays), camera)
     truth, _ = oracle_splats.draw(arrays, camera)
@@ -170,8 +177,9 @@ def test_tiny_and_huge_scales(splatter: Splatter, camera: Camera, scale: float) 
 
 
 def test_needles(splatter: Splatter, camera: Camera) -> None:
-    """A million times as long as thick. Products of their covariance cancel to 1e-7 of themselves, and are not formed. The
-    exponent is a sum of up to 24^2 / 0.6 = 1000 that cancels, of terms that are each rounded by a few 2^-24: 3e-4."""
+    """A million times as long as thick. Products of their covariance would cancel to 1e-7 and are not formed. The exponent is
+    a sum of terms up to 24^2 / 0.6 = 1000, each rounded by a few 2^-24, that cancel: 3e-4.
+    """
     arrays = cloud(20, 2, 1.0, seed=6)
     arrays["log_scales"] = np.log(np.full((20, 3), [300.0, 3e-4, 3e-4], np.float32))
     picture, kept = splatter.forward(tensors(arrays), camera)
@@ -181,7 +189,7 @@ def test_needles(splatter: Splatter, camera: Camera) -> None:
 
 
 def test_nothing_behind_the_camera_is_drawn(splatter: Splatter, camera: Camera) -> None:
-    """Nor what its mean is in front of the near plane of; what only reaches across the camera is drawn."""
+    """A Gaussian is drawn only if its mean is in front of the near plane, even if it reaches across the camera."""
     arrays = cloud(3, 2, 0.1)
     forward = camera.forward
     arrays["means"] = np.float32(camera.origin + np.array([[-0.5], [0.005], [0.05]]) * forward)
@@ -195,8 +203,9 @@ def test_nothing_behind_the_camera_is_drawn(splatter: Splatter, camera: Camera) 
 
 
 def test_layers_without_end(splatter: Splatter) -> None:
-    """Of 200 veils the last is seen, and learns: Mitsuba's ``volprim_rf_basic`` ends a ray after 64 and at a hundredth of its
-    light. The derivative by its colour is Y_0 times its weights, which leave a fiftieth of the light to it."""
+    """The last of 200 veils is visible, and learns. Mitsuba's ``volprim_rf_basic`` ends a ray after 64 Gaussians and at a
+    hundredth of its light. The derivative by the colour of the last veil is Y_0 times its weight, a fiftieth of the light.
+    """
     n = 200
     arrays = stack([-3.9] * n, [0.002 * k for k in range(n)], scale=0.5)
     picture, kept = splatter.forward(tensors(arrays), straight())
@@ -212,8 +221,9 @@ def test_layers_without_end(splatter: Splatter) -> None:
 
 @pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
 def test_the_unit_of_length_is_free(variant_rgb: str, unit: float) -> None:
-    """Everything times a length, near plane included, is the same picture, and the derivative by places is divided by it.
-    Logarithms of scales up to 12 are rounded by 12 * 2^-24 = 7e-7, and alpha by at most 11 times that (q <= 2 ln 255)."""
+    """Scaling everything by a length, near plane included, gives the same image and divides the derivative by places.
+    Logarithms of scales up to 12 are rounded by 12 * 2^-24 = 7e-7, and alpha by at most 11 times this error (q <= 2 ln 255).
+    """
     arrays, camera = cloud(50, 2, 0.15, seed=4), looking(SIDE, SIDE)
     truth, _ = oracle_splats.draw(arrays, camera)
     pose = camera.to_world.copy()
@@ -233,10 +243,11 @@ def test_the_unit_of_length_is_free(variant_rgb: str, unit: float) -> None:
 
 
 def test_the_camera_inside_gaussians(splatter: Splatter, camera: Camera) -> None:
-    """Means close in front of the camera and beside it, with scales that reach across its plane: drawn, by the linearisation at
-    the border of the picture where they are beyond (its float64 twin has no other). Mitsuba's ``volprim_rf_basic`` drops every
-    Gaussian that a ray begins in. Centres are up to 130 pixels away and rounded three times (2e-5 pixels), and an ellipse is 7
-    pixels wide at least: alpha errs by 3.3 / 7 of that, 1e-5."""
+    """Means close in front of the camera and beside it, with scales reaching across its plane, are drawn with the perspective
+    linearised at the border of the image (as in the float64 twin). Mitsuba's ``volprim_rf_basic`` drops every Gaussian around
+    the origin of a ray. Centres are up to 130 pixels away and rounded three times (2e-5 pixels), and an ellipse is at least 7
+    pixels wide: the error of alpha is 3.3 / 7 of 2e-5, 1e-5.
+    """
     rng = np.random.default_rng(7)
     arrays = cloud(20, 2, 0.2, seed=4)
     right, down = camera.to_world[:3, 0], -camera.to_world[:3, 1]
@@ -250,8 +261,9 @@ def test_the_camera_inside_gaussians(splatter: Splatter, camera: Camera) -> None
 
 
 def test_a_black_channel_has_no_derivative_and_the_rest_has(splatter: Splatter) -> None:
-    """Below 0 a colour is 0, and so is its derivative: in the red of a Gaussian and nowhere else. In front of a grey one,
-    opacity and size of what is black in all channels are learnt by what they hide."""
+    """A colour below 0 is 0, with a derivative of 0: in the red of a Gaussian only. In front of a grey Gaussian, opacity and
+    size of a black Gaussian are learnt from the hidden light.
+    """
     arrays = stack([0.0, 1.0], [0.0, 0.3])
     arrays["harmonics"][0, 0] = [-1.8, -1.7, 0.4]
     picture, kept = splatter.forward(tensors(arrays), straight())
@@ -270,7 +282,7 @@ def test_a_black_channel_has_no_derivative_and_the_rest_has(splatter: Splatter) 
 
 
 def d_red(shape: tuple[int, ...]) -> np.ndarray:
-    """The derivative of the sum of the red of a picture."""
+    """The derivative of the sum of the red of an image."""
     d_picture = np.zeros(shape, np.float32)
     d_picture[..., 0] = 1
     return d_picture
@@ -308,8 +320,9 @@ def test_a_quaternion_of_no_direction_is_refused(splatter: Splatter, camera: Cam
 
 @pytest.mark.parametrize("length", [1e-29, 1e-20, 1e20, 1e30])
 def test_quaternions_of_any_length(splatter: Splatter, camera: Camera, length: float) -> None:
-    """A rotation is that of the direction: squares of these lengths are 0 or infinite in float32. Components are rounded by
-    2^-24 of themselves when they are scaled, as all else is. The derivative shrinks as the quaternion grows."""
+    """A rotation depends on the direction of its quaternion; squares of these lengths are 0 or infinite in float32. Scaling
+    rounds components by 2^-24, relative. The derivative shrinks as the quaternion grows.
+    """
     arrays = cloud(20, 2, 0.1, seed=4)
     arrays["quaternions"] /= np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True)
     scaled = arrays | {"quaternions": arrays["quaternions"] * np.float32(length)}
@@ -323,7 +336,9 @@ def test_quaternions_of_any_length(splatter: Splatter, camera: Camera, length: f
 
 
 def test_lists_that_do_not_fit_are_refused_with_their_size(splatter: Splatter, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before they are made. Gaussians in one tile take 80 bytes each: an entry, what sorting takes, and T of 64 pixels / 4."""
+    """The refusal comes before the lists are made. A Gaussian in a tile takes 80 bytes: an entry, its sorting, and T of 64
+    pixels / 4.
+    """
     monkeypatch.setattr(module, "available_memory", lambda: 15 << 20)
     made = []
     monkeypatch.setattr(splatter, "_write", lambda *args: made.append(args))
@@ -334,14 +349,14 @@ def test_lists_that_do_not_fit_are_refused_with_their_size(splatter: Splatter, m
 
 
 def test_entries_that_32_bits_do_not_count_are_refused() -> None:
-    """Wherever there is memory enough; the last number of entries that fits is not."""
+    """Even with enough memory; the last fitting number of entries is accepted."""
     check_memory(0, None, 1 << 28, "many")
     with pytest.raises(MivolError, match="Found 268,435,457 entries"):
         check_memory(0, None, (1 << 28) + 1, "many")
 
 
 def test_splats_are_in_order_of_depth_and_of_their_number_at_a_tie() -> None:
-    """Depths of many orders of magnitude, each three times, of which every other row is asked for."""
+    """Depths of many orders of magnitude, each three times; every other row is requested."""
     depth = np.tile(10.0 ** np.random.default_rng(0).uniform(-2, 20, 500), 3).astype(np.float32)
     rows = np.arange(0, len(depth), 2)
     expected = rows[np.lexsort((rows, depth[rows]))]
@@ -349,7 +364,7 @@ def test_splats_are_in_order_of_depth_and_of_their_number_at_a_tie() -> None:
 
 
 def test_the_jump_of_a_swap_is_bounded(splatter: Splatter) -> None:
-    """Two Gaussians whose depths are swapped exchange their order: in a pixel that jumps by T a_1 a_2 (c_1 - c_2), no more."""
+    """Two Gaussians whose depths are swapped exchange their order: a pixel jumps by T a_1 a_2 (c_1 - c_2), and no more."""
     arrays = stack([0.0, 1.0], [0.0, 1e-4])
     pictures = []
     for z in (1e-4, -1e-4):
