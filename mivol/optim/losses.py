@@ -46,7 +46,7 @@ class Loss(Strategy, tag="loss"):
         """
         raise MivolError(
             f'gauss_newton needs a loss that is quadratic in the image, found "{self.label()}": '
-            'choose "l2" or "relative_l2", or another optimiser.'
+            'choose "l2" or "relative_l2", or another optimizer.'
         )
 
     def __call__(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.Float:

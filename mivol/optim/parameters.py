@@ -137,7 +137,7 @@ class Parameter:
             raise MivolError(f'{self.name}: unknown map "{self.map}": {suggest_name(self.map, list(MAPS))}')
         if not MAPS[self.map].supports(low, high):
             raise MivolError(
-                f'{self.name}: map "{self.map}" serves {MAPS[self.map].domains}, found [{low}, {high}]: '
+                f'{self.name}: map "{self.map}" supports {MAPS[self.map].domains}, found [{low}, {high}]: '
                 "change the domain or the map."
             )
         if not self.lr > 0.0:

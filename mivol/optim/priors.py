@@ -212,11 +212,11 @@ class Neighbours:
         own = dr.arange(mi.UInt32, dr.width(node))
         neighbours = cls([], [])
         for stride, n in ((1, x), (x, y), (x * y, z)):
-            place = node // stride % n
-            following = dr.select(place < n - 1, node + stride, node)
+            index = node // stride % n
+            following = dr.select(index < n - 1, node + stride, node)
             following = dr.select(is_covered_by_inner(following, field.res), node, following)
             neighbours.after.append(field.look_up_rows(following))
-            before = field.look_up_rows(dr.select(place > 0, node - stride, node))
+            before = field.look_up_rows(dr.select(index > 0, node - stride, node))
             neighbours.before.append(dr.select(before < dr.width(node), before, own))
         dr.eval(neighbours)
         return neighbours

@@ -120,7 +120,7 @@ def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu
     assert held < estimate_bytes(plan, plan.stages[0], BOX, rows)
 
 
-def test_unvisible_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> None:
+def test_invisible_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> None:
     """What is left are the nodes of seen cells and their neighbours, with the values and the squares that they had; Dr.Jit
     holds nothing back of what was there before."""
     fit = fitted(RayBatches.from_photos(photos, (1, 2)), replace(PLAN, drop=1 / 9), 70)

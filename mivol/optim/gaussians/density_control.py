@@ -57,10 +57,10 @@ class CloudChange:
 
     def carry(self, learnt: CloudArrays) -> CloudArrays:
         """Moments of the old rows, for the new rows; 0 for invalid moments."""
-        found = {name: array[self.parent] for name, array in learnt.items()}
-        for array in found.values():
+        moments = {name: array[self.parent] for name, array in learnt.items()}
+        for array in moments.values():
             array[self.forgets] = 0
-        return found
+        return moments
 
     def then(self, later: CloudChange) -> CloudChange:
         """This change, followed by another change of the cloud, as a single change."""
@@ -99,13 +99,13 @@ def clone_and_split(cloud: CloudArrays, rows: NDArray[np.int64], largest_clone: 
     stays = np.ones(n, bool)
     stays[split] = False
     parent = np.concatenate([np.flatnonzero(stays), clones, split, split])
-    made = {name: array[parent] for name, array in cloud.items()}
+    arrays = {name: array[parent] for name, array in cloud.items()}
     halves = slice(len(parent) - 2 * len(split), len(parent))
-    drawn = rng.standard_normal((2 * len(split), 3)) * np.exp(made["log_scales"][halves])
-    turned = np.einsum("nij,nj->ni", rotations(made["quaternions"][halves]), drawn)
-    made["means"][halves] += turned.astype(np.float32)
-    made["log_scales"][halves] -= np.float32(math.log(SHRINK))
-    return CloudChange(made, parent, np.arange(len(parent)) >= n - len(split))
+    drawn = rng.standard_normal((2 * len(split), 3)) * np.exp(arrays["log_scales"][halves])
+    turned = np.einsum("nij,nj->ni", rotations(arrays["quaternions"][halves]), drawn)
+    arrays["means"][halves] += turned.astype(np.float32)
+    arrays["log_scales"][halves] -= np.float32(math.log(SHRINK))
+    return CloudChange(arrays, parent, np.arange(len(parent)) >= n - len(split))
 
 
 def prune(cloud: CloudArrays, keep: NDArray[np.bool_]) -> CloudChange:
@@ -152,14 +152,14 @@ def grow(cloud: CloudArrays, count: int, least_opacity: float, rng: np.random.Ge
 def _shared(cloud: CloudArrays, parent: NDArray[np.int64], least_opacity: float) -> CloudChange:
     """Copies of rows, which share the opacity and scale of each position."""
     copies = np.minimum(np.bincount(parent, minlength=len(cloud["means"]))[parent], MOST_COPIES)
-    made = {name: array[parent] for name, array in cloud.items()}
+    arrays = {name: array[parent] for name, array in cloud.items()}
     shares = copies > 1
-    opacity = expit(made["opacity_logits"][shares].astype(np.float64))
+    opacity = expit(arrays["opacity_logits"][shares].astype(np.float64))
     each, factor = split_opacity_and_scale(opacity, copies[shares])
     each = np.clip(each, least_opacity, 1 - 2**-23)
-    made["opacity_logits"][shares] = logit(each).astype(np.float32)
-    made["log_scales"][shares] += np.log(factor)[:, None].astype(np.float32)
-    return CloudChange(made, parent, shares)
+    arrays["opacity_logits"][shares] = logit(each).astype(np.float32)
+    arrays["log_scales"][shares] += np.log(factor)[:, None].astype(np.float32)
+    return CloudChange(arrays, parent, shares)
 
 
 def split_opacity_and_scale(opacity: NDArray, copies: NDArray) -> tuple[NDArray, NDArray]:

@@ -163,7 +163,7 @@ class GaussianPlan:
     def for_edge(self, edge: int) -> GaussianPlan:
         """The plan for photographs with this longer edge [pixel]."""
         shrinks = [2 ** max(0, round(math.log2(edge / stage.edge))) for stage in self.stages]
-        return replace(self, stages=tuple(replace(one, shrink=n) for one, n in zip(self.stages, shrinks, strict=True)))
+        return replace(self, stages=tuple(replace(stage, shrink=n) for stage, n in zip(self.stages, shrinks, strict=True)))
 
     def minutes(self, pixels: int) -> float:
         """Estimated time of the fit on two cores that walk 25 million rays a second (``STEP``).
@@ -184,7 +184,7 @@ class GaussianPlan:
 
     def scaled(self, effort: float) -> GaussianPlan:
         """The plan with ``effort`` times the steps."""
-        return replace(self, stages=tuple(replace(one, steps=max(1, round(one.steps * effort))) for one in self.stages))
+        return replace(self, stages=tuple(replace(stage, steps=max(1, round(stage.steps * effort))) for stage in self.stages))
 
 
 PUBLISHED = {

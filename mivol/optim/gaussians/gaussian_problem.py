@@ -143,8 +143,8 @@ class GaussianProblem:
             raise MivolError(f"found views = {views}, expected at most 1 view per step of a fit of Gaussians: leave views out.")
         epoch, index = divmod(iteration, len(self.cameras))
         view = int(np.random.default_rng((self.seed, 2, epoch)).permutation(len(self.cameras))[index])
-        loss, gradient, seen = self.view_loss_and_gradient(reals, view, self._background(iteration))
-        self._add_statistics(seen)
+        loss, gradient, statistics = self.view_loss_and_gradient(reals, view, self._background(iteration))
+        self._add_statistics(statistics)
         if self.plan.control == "relocation":
             loss, gradient = self._add_priors(reals, loss, gradient)
         return loss, gradient
@@ -157,7 +157,7 @@ class GaussianProblem:
         Args:
             reals: of the cloud.
             view: number of the view.
-            background: put behind the photograph and the cloud (3,); None keeps the photograph's own background.
+            background: put backdrop the photograph and the cloud (3,); None keeps the photograph's own background.
         """
         shrink = self.plan.stages[self.stage].shrink
         camera = self._camera(view, shrink)
@@ -165,12 +165,12 @@ class GaussianProblem:
         image, saved = splatter.forward(reals, camera)
         self.safe_point()
         gains = self._gains_of(reals, view)
-        seen, target, behind, counted = self._compare_with_photograph(image, view, shrink, background, gains)
-        loss, slope = self._image_loss(seen, target, self._shape(camera.size), self.plan.ssim)
-        gradient, statistics = splatter.backward(saved, _gradient_of_image(slope, behind, counted, gains, image.shape))
+        colour, target, backdrop, counted = self._compare_with_photograph(image, view, shrink, background, gains)
+        loss, slope = self._image_loss(colour, target, self._shape(camera.size), self.plan.ssim)
+        gradient, statistics = splatter.backward(saved, _gradient_of_image(slope, backdrop, counted, gains, image.shape))
         gradient.pop("pose")
         if self.exposure is not None:
-            pixel, by_log = dr.arange(mi.UInt32, dr.width(seen) // 3), seen * slope
+            pixel, by_log = dr.arange(mi.UInt32, dr.width(colour) // 3), colour * slope
             by_log = mi.Color3f(*(dr.sum(dr.gather(mi.Float, by_log, 3 * pixel + c)) for c in range(3)))
             slopes = self.exposure.gradient(dr.opaque(mi.UInt32, view), by_log)
             gradient["exposure"] = mi.TensorXf(slopes, reals["exposure"].shape)
@@ -224,22 +224,22 @@ class GaussianProblem:
         pixels.
         """
         codes, counted = self.batches.image(shrink, view)
-        before = self.batches.backgrounds[view]
-        behind = before if background is None else background
-        colours = [dr.opaque(mi.Float, float(c)) for c in behind]
+        own = self.batches.backgrounds[view]
+        backdrop = own if background is None else background
+        colours = [dr.opaque(mi.Float, float(c)) for c in backdrop]
         pixels = image.shape[0] * image.shape[1]
         pixel = dr.arange(mi.UInt32, pixels)
-        through = 1 - dr.gather(mi.Float, image.array, 4 * pixel + 3)
-        seen, target = dr.empty(mi.Float, 3 * pixels), dr.empty(mi.Float, 3 * pixels)
+        T = 1 - dr.gather(mi.Float, image.array, 4 * pixel + 3)
+        rendered, target = dr.empty(mi.Float, 3 * pixels), dr.empty(mi.Float, 3 * pixels)
         for c, colour in enumerate(colours):
             value = codes[c]
             if len(codes) == 4:
-                value = value + (1 - codes[3]) * (colour - dr.opaque(mi.Float, float(before[c])))
-            shown = dr.gather(mi.Float, image.array, 4 * pixel + c) + through * colour
-            dr.scatter(seen, shown * dr.gather(mi.Float, gains, mi.UInt32(c)) * counted, 3 * pixel + c)
+                value = value + (1 - codes[3]) * (colour - dr.opaque(mi.Float, float(own[c])))
+            composite = dr.gather(mi.Float, image.array, 4 * pixel + c) + T * colour
+            dr.scatter(rendered, composite * dr.gather(mi.Float, gains, mi.UInt32(c)) * counted, 3 * pixel + c)
             dr.scatter(target, value * counted, 3 * pixel + c)
-        dr.eval(seen, target)
-        return seen, target, mi.Float(np.asarray(behind, np.float32)), counted
+        dr.eval(rendered, target)
+        return rendered, target, mi.Float(np.asarray(backdrop, np.float32)), counted
 
     def _add_priors(self, reals: Reals, loss: mi.Float, gradient: Reals) -> tuple[mi.Float, Reals]:
         """Loss and gradient with the priors of relocation: the mean opacity and the mean scale [extent]."""
@@ -257,10 +257,10 @@ class GaussianProblem:
 
         With n photographs, a gain has a gradient every n steps, and Adam moves the gain by up to sqrt(n) rates.
         """
-        found = self.plan.learning_rates(iteration, self.extent)
+        rates = self.plan.learning_rates(iteration, self.extent)
         if self.exposure is not None:
-            found["exposure"] = self._gain_step(iteration) / len(self.cameras) ** 0.5
-        return found
+            rates["exposure"] = self._gain_step(iteration) / len(self.cameras) ** 0.5
+        return rates
 
     def _gain_step(self, iteration: int) -> float:
         """Maximum change of a gain's logarithm per visit of the photograph."""
@@ -321,9 +321,9 @@ class GaussianProblem:
         more = min(max(room, 0), max(1, len(self.cloud["means"]) // 20))
         return moved.then(grow(moved.cloud, more, self.plan.least_opacity, rng)) if more else moved
 
-    def _add_statistics(self, seen: ScreenStatistics) -> None:
-        self._slopes += np.where(seen.visible, seen.d_mean2d, 0)
-        self._times += seen.visible
+    def _add_statistics(self, statistics: ScreenStatistics) -> None:
+        self._slopes += np.where(statistics.visible, statistics.d_mean2d, 0)
+        self._times += statistics.visible
 
     def _reset_statistics(self) -> None:
         """Restart the sums of screen gradients and the counts of views of each Gaussian."""
@@ -363,27 +363,27 @@ class GaussianProblem:
 
 def _with_degree(arrays: CloudArrays, degree: int) -> CloudArrays:
     """The arrays with harmonics up to a degree: higher harmonics are dropped, new harmonics are 0."""
-    harmonics, wanted = arrays["harmonics"], (degree + 1) ** 2
-    made = np.zeros((len(harmonics), wanted, 3), np.float32)
-    shared = min(wanted, harmonics.shape[1])
-    made[:, :shared] = harmonics[:, :shared]
-    return {**arrays, "harmonics": made}
+    harmonics, count = arrays["harmonics"], (degree + 1) ** 2
+    padded = np.zeros((len(harmonics), count, 3), np.float32)
+    shared = min(count, harmonics.shape[1])
+    padded[:, :shared] = harmonics[:, :shared]
+    return {**arrays, "harmonics": padded}
 
 
 def _gradient_of_image(
-    slope: mi.Float, behind: mi.Float, counted: mi.Float, gains: mi.Float, shape: tuple[int, ...]
+    slope: mi.Float, backdrop: mi.Float, counted: mi.Float, gains: mi.Float, shape: tuple[int, ...]
 ) -> mi.TensorXf:
     """Derivatives by premultiplied colour and alpha, from derivatives by the composite over a background, times gains."""
     pixel = dr.arange(mi.UInt32, shape[0] * shape[1])
     dr.eval(slope)
-    made, through = dr.empty(mi.Float, 4 * dr.width(pixel)), mi.Float(0)
+    gradient, by_T = dr.empty(mi.Float, 4 * dr.width(pixel)), mi.Float(0)
     for c in range(3):
-        one = dr.gather(mi.Float, slope, 3 * pixel + c) * counted * dr.gather(mi.Float, gains, mi.UInt32(c))
-        through += one * dr.gather(mi.Float, behind, mi.UInt32(c))
-        dr.scatter(made, one, 4 * pixel + c)
-    dr.scatter(made, -through, 4 * pixel + 3)
-    dr.eval(made)
-    return mi.TensorXf(made, shape)
+        component = dr.gather(mi.Float, slope, 3 * pixel + c) * counted * dr.gather(mi.Float, gains, mi.UInt32(c))
+        by_T += component * dr.gather(mi.Float, backdrop, mi.UInt32(c))
+        dr.scatter(gradient, component, 4 * pixel + c)
+    dr.scatter(gradient, -by_T, 4 * pixel + 3)
+    dr.eval(gradient)
+    return mi.TensorXf(gradient, shape)
 
 
 STEEPNESS, MIDDLE_OPACITY = 100.0, 0.005

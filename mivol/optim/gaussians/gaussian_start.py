@@ -46,13 +46,13 @@ def find_start_points(photos: Photos, count: int, seed: int) -> tuple[np.ndarray
     rng = np.random.default_rng((seed, 1))
     if any(view.alpha is None for view in photos.views):
         return rng.uniform(*photos.box, (count, 3)), f"{count} random points in the box"
-    kept = [np.zeros((0, 3))]
+    accepted = [np.zeros((0, 3))]
     for _ in range(ROUNDS):
         drawn = rng.uniform(*photos.box, (count, 3))
-        kept.append(drawn[_may_be_matter(photos.views, drawn)])
-        if sum(map(len, kept)) >= count:
+        accepted.append(drawn[_may_be_matter(photos.views, drawn)])
+        if sum(map(len, accepted)) >= count:
             break
-    points = np.concatenate(kept)[:count]
+    points = np.concatenate(accepted)[:count]
     if len(points) < 4:
         raise MivolError("alpha leaves no part of the box that all views show as matter: check the box and the cameras.")
     return points, f"{len(points)} random points that no view shows as transparent"
@@ -89,11 +89,11 @@ def make_start_cloud(places: np.ndarray, views: Sequence[Photo], degree: int) ->
 
 def _may_be_matter(views: Sequence[Photo], points: np.ndarray) -> np.ndarray:
     """Whether enough views contain each point (N, 3), and no view shows the point as transparent."""
-    kept = count_views([view.camera for view in views], points) >= SHARE * len(views)
+    accepted = count_views([view.camera for view in views], points) >= SHARE * len(views)
     for view in views:
         visible, row, column = _look_up(view, points)
-        kept &= ~visible | (view.alpha[row, column] > 0)
-    return kept
+        accepted &= ~visible | (view.alpha[row, column] > 0)
+    return accepted
 
 
 def _mean_colour(views: Sequence[Photo], points: np.ndarray) -> np.ndarray:

@@ -96,7 +96,7 @@ class _Axis:
     array.
     """
 
-    place: mi.Int32
+    position: mi.Int32
     count: mi.Int32
     step: mi.Int32
 
@@ -119,8 +119,8 @@ class _Axis:
         """
         index, sums = dr.arange(mi.Int32, dr.width(arrays[0])), None
         for offset, weight in zip(range(-REACH, REACH + 1), WEIGHTS, strict=True):
-            position = self.place + offset
-            inside = (position >= 0) & (position < self.count)
+            shifted = self.position + offset
+            inside = (shifted >= 0) & (shifted < self.count)
             at = index + offset * self.step
             values = function(*(dr.gather(mi.Float, array, at, inside) if offset else array for array in arrays))
             sums = [0] * len(values) if sums is None else sums

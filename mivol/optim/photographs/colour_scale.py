@@ -50,7 +50,7 @@ class SrgbScale:
         """Derivatives by reals, from derivatives by colours."""
         return slopes
 
-    def weight(self, shown: mi.Color3f) -> mi.Color3f:
+    def weight(self, colour: mi.Color3f) -> mi.Color3f:
         """Factor on an error at a rendered colour."""
         return mi.Color3f(1)
 
@@ -84,12 +84,12 @@ class LinearScale:
         A fog brighter than all pixels would vanish before it learns a colour, and never return: densities below 0 have no
         derivative.
         """
-        found = pixels()
-        return np.minimum(np.quantile(found, 0.99, axis=0) / 2, 0.5) if len(found) else np.full(3, 0.5)
+        colours = pixels()
+        return np.minimum(np.quantile(colours, 0.99, axis=0) / 2, 0.5) if len(colours) else np.full(3, 0.5)
 
-    def weight(self, shown: mi.Color3f) -> mi.Color3f:
+    def weight(self, colour: mi.Color3f) -> mi.Color3f:
         """The slope of the tone curve."""
-        return dr.rcp(dr.maximum(dr.detach(shown), 0) + EPSILON)
+        return dr.rcp(dr.maximum(dr.detach(colour), 0) + EPSILON)
 
 
 SCALES: dict[str, SrgbScale | LinearScale] = {"srgb": SrgbScale(), "linear": LinearScale()}

@@ -71,17 +71,17 @@ def sample_depth_rays(
     slot = np.repeat(np.arange(len(drawn)), [len(own) for own in drawn])
     positions = np.concatenate(drawn)
     extent = np.abs((positions - box.mean(axis=0)) / (box[1] - box[0])).max(axis=1) * 2
-    away = positions - origins[slot]
-    d = np.linalg.norm(away, axis=1)
+    offset = positions - origins[slot]
+    d = np.linalg.norm(offset, axis=1)
     # A point at the camera has no direction.
-    kept = (extent <= 2 ** (levels - 1)) & (d > 0)
-    if not kept.any():
+    inside = (extent <= 2 ** (levels - 1)) & (d > 0)
+    if not inside.any():
         return None
-    away, d, o = away[kept], d[kept], origins[slot[kept]]
-    off = voxel * 2 ** np.ceil(np.log2(np.maximum(extent[kept], 1))) + UNCERTAINTY * d
+    offset, d, o = offset[inside], d[inside], origins[slot[inside]]
+    margin = voxel * 2 ** np.ceil(np.log2(np.maximum(extent[inside], 1))) + UNCERTAINTY * d
     twice = np.tile(np.arange(len(d)), 2)
-    o, towards = mi.Point3f(*_columns(o[twice])), mi.Vector3f(*_columns((away / d[:, None])[twice]))
-    ends = _real(np.concatenate([np.maximum(d - off, 0), d + off]))
+    o, towards = mi.Point3f(*_columns(o[twice])), mi.Vector3f(*_columns((offset / d[:, None])[twice]))
+    ends = _real(np.concatenate([np.maximum(d - margin, 0), d + margin]))
     return DepthRays(RayBundle(o, towards, ends), len(d))
 
 

@@ -103,8 +103,8 @@ class RadianceProblem:
         self.scale = SCALES[self.batches.space]
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
         self.near = self.plan.near_distance(self.batches.origins, self.box)
-        place, degree = place_grid(self.box, self.plan.stages[0].longest), self.plan.degree_at(0)
-        fog = _fog(*place, degree, self.plan.start / self.unit, self.plan.levels, self.batches.space)
+        grid, degree = place_grid(self.box, self.plan.stages[0].longest), self.plan.degree_at(0)
+        fog = _fog(*grid, degree, self.plan.start / self.unit, self.plan.levels, self.batches.space)
         self.field = _coloured(fog, self.scale.fog_colour(self.batches.pixels))
         self._first_row = 0
         self._update_neighbours()
@@ -117,11 +117,11 @@ class RadianceProblem:
 
     def values(self) -> Reals:
         """Field and sky as tensors of reals."""
-        found = _tensors(self.field)
+        reals = _tensors(self.field)
         if self.sky is not None:
-            found["sky"] = mi.TensorXf(self.sky.texels, (dr.width(self.sky.texels) // TEXEL, TEXEL))
-        found |= {name: mi.TensorXf(self.scale.to_reals(found[name].array), found[name].shape) for name in self._colours(found)}
-        return found if self.exposure is None else found | {"exposure": self.exposure.tensor}
+            reals["sky"] = mi.TensorXf(self.sky.texels, (dr.width(self.sky.texels) // TEXEL, TEXEL))
+        reals |= {name: mi.TensorXf(self.scale.to_reals(reals[name].array), reals[name].shape) for name in self._colours(reals)}
+        return reals if self.exposure is None else reals | {"exposure": self.exposure.tensor}
 
     @staticmethod
     def _colours(reals: Reals) -> list[str]:
@@ -280,10 +280,10 @@ class RadianceProblem:
         if not begins:
             # Visible matter may move by a voxel. A finer stage stores all cells around a kept node anyway.
             keep = maximum_filter(keep, (1, 3, 3, 3))
-        place, degree = place_grid(self.box, self.plan.stages[stage].longest), self.plan.degree_at(stage)
+        grid, degree = place_grid(self.box, self.plan.stages[stage].longest), self.plan.degree_at(stage)
 
-        def resampled(grid: SphericalGrid) -> SphericalGrid:
-            return resample_field(grid, *place, keep).with_degree(degree)
+        def resampled(field: SphericalGrid) -> SphericalGrid:
+            return resample_field(field, *grid, keep).with_degree(degree)
 
         self.field, self.stage = resampled(old), stage
         # Only the node positions of the old field are used from here on; zeros that are not evaluated take no memory.
@@ -293,8 +293,8 @@ class RadianceProblem:
         shrink = max(old.res) / max(self.field.res)
         counts = self.field.res if old.levels == 1 else (old.levels, *self.field.res)
         nodes = " x ".join(str(n) for n in counts)
-        kept = f"{nodes} nodes, {self.field.rows - 1} of them stored"
-        message = f"refined to {kept}{self._compare_exposures(stage)}" if begins else f"unseen nodes removed: {kept}"
+        size = f"{nodes} nodes, {self.field.rows - 1} of them stored"
+        message = f"refined to {size}{self._compare_exposures(stage)}" if begins else f"unseen nodes removed: {size}"
         return Refinement(
             self.values(),
             lambda tensors: tensors | _tensors(resampled(_with_tensors(old, tensors))),
@@ -345,10 +345,10 @@ class RadianceProblem:
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
         """Continue from the arrays of :meth:`pack`, with the same plan, photographs and box."""
         self.stage, self.has_gains = int(arrays["stage"]), bool(arrays["has_gains"])
-        place, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
+        grid, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
         nodes = mi.UInt32(arrays["nodes"]) if "nodes" in arrays else None
         values = reals["density"].array, reals["harmonics"].array
-        self.field = SphericalGrid(*place, degree, *values, nodes, levels=self.plan.levels, space=self.batches.space)
+        self.field = SphericalGrid(*grid, degree, *values, nodes, levels=self.plan.levels, space=self.batches.space)
         self.set_reals(reals)
         self._update_neighbours()
 

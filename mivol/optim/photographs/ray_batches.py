@@ -211,8 +211,8 @@ class RayBatches:
         corner = np.take_along_axis(corner, order[..., None], axis=1)
         lane = dr.arange(mi.UInt32, len(views) * tiles * TILE * TILE)
         tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
-        place = [dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(corner[..., a]).reshape(-1)), tile) for a in range(2)]
-        return self.make_batch(shrink, views, tile // tiles, place[0] + within % TILE, place[1] + within // TILE)
+        first = [dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(corner[..., a]).reshape(-1)), tile) for a in range(2)]
+        return self.make_batch(shrink, views, tile // tiles, first[0] + within % TILE, first[1] + within // TILE)
 
     def all_pixels(self, shrink: int, view: int) -> RayBatch:
         """All pixels of a view, tile by tile; tiles that cross the border repeat border pixels."""

@@ -115,8 +115,8 @@ def scale_tv_to_noise(a: Projector, y: np.ndarray, weights: np.ndarray, tv: floa
     """
     edge = float(np.prod(a.grid.voxel_size) ** (1 / 3))
     w = np.asarray(weights, np.float64)
-    seen = np.asarray(a.T @ flatten(w, a.dtype), np.float64)
-    pull = np.sqrt(CHORD * edge * np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
+    sensitivity = np.asarray(a.T @ flatten(w, a.dtype), np.float64)
+    pull = np.sqrt(CHORD * edge * np.median(sensitivity[sensitivity > 0])) if (sensitivity > 0).any() else 0.0
     chord = np.asarray(a @ np.ones(a.shape[1], a.dtype), np.float64).reshape(w.shape)
     mean = abs(float(np.sum(w * y * chord))) / max(float(np.sum(w * chord**2)), np.finfo(float).tiny)
     slope = delta * mean / edge
