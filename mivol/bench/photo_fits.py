@@ -24,9 +24,9 @@ from mivol.bench.harness.timing import Stopwatch
 from mivol.bench.reference_walk import measure_walk_rate, reference_seconds
 from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit
-from mivol.experiments.field_plan import batches_of, make_plan, suited
-from mivol.experiments.gaussian_fit import begin, make_gaussian_plan
-from mivol.experiments.photo_data import boxed, read_photos
+from mivol.experiments.field_plan import adapt_plan, make_batches, make_plan
+from mivol.experiments.gaussian_fit import make_gaussian_plan, start_gaussians
+from mivol.experiments.photo_data import add_box, read_photos
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
@@ -125,7 +125,7 @@ class PhotoProblem:
         """Render the view of a pinhole photograph (H, W, 3) over its background."""
         if isinstance(self.problem, RadianceProblem):
             return render_view(self.problem.field, photo.camera, photo.background).image
-        return gaussian_fit.picture_of(self.problem, photo.camera, photo.background, self.problem.plan.low_pass)
+        return gaussian_fit.render_gaussians(self.problem, photo.camera, photo.background, self.problem.plan.low_pass)
 
     def score(self, views: Iterable[Photo], metrics: tuple[str, ...] = ("psnr",)) -> dict[str, float]:
         """Mean metrics of views."""
@@ -151,12 +151,12 @@ def prepare_fit(
     tables = {"title": folder.name, "seed": seed, "photos": {"path": str(folder), **photos}, **settings}
     chosen = config.from_dict(tables)
     train, judged = read_photos(chosen, Path())
-    train = boxed(chosen, train)
+    train = add_box(chosen, train)
     if isinstance(chosen, config.FieldExperiment):
-        plan = suited(adapt(make_plan(chosen)), train)
-        problem = RadianceProblem(batches_of(plan, train), train.box, plan)
+        plan = adapt_plan(adapt(make_plan(chosen)), train)
+        problem = RadianceProblem(make_batches(plan, train), train.box, plan)
         return PhotoProblem(problem, train, judged, sum(stage.steps for stage in plan.stages))
-    begun = begin(chosen, train, make_gaussian_plan(chosen))
+    begun = start_gaussians(chosen, train, make_gaussian_plan(chosen))
     return PhotoProblem(begun.problem(seed), train, judged, begun.plan.steps)
 
 

@@ -338,7 +338,7 @@ def render(arguments: argparse.Namespace) -> None:
     For a scene, the flags are the flags of the command mitsuba.
     """
     from mivol.cli.loading import load
-    from mivol.experiments.render import check_output, choose_integrator, name_of, render_image, write_image
+    from mivol.experiments.render import check_output, choose_integrator, integrator_name, render_image, write_image
 
     path = arguments.output or arguments.scene.with_suffix(".exr")
     check_output(path)
@@ -348,8 +348,8 @@ def render(arguments: argparse.Namespace) -> None:
         return
     scene = load(arguments).scene
     integrator = choose_integrator(scene, arguments.integrator)
-    if name_of(integrator) != "mivol":
-        print(f"rendered by {name_of(integrator)}; --integrator mivol renders with mivol", file=sys.stderr)
+    if integrator_name(integrator) != "mivol":
+        print(f"rendered by {integrator_name(integrator)}; --integrator mivol renders with mivol", file=sys.stderr)
     write_image(path, *render_image(scene, arguments.sensor, integrator, arguments.spp, arguments.seed))
     print(path)
 
@@ -361,7 +361,7 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
         MivolError: a camera for a scene, or no camera for a field.
     """
     from mivol.experiments.back_end import set_variant
-    from mivol.experiments.render import PointLook, view_field, view_points
+    from mivol.experiments.render import PointLook, render_field, render_points
     from mivol.points.summary import SUFFIXES
 
     suffix = arguments.scene.suffix.lower()
@@ -376,7 +376,9 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
         return None
     set_variant(arguments.mode)
     camera = arguments.look_at, arguments.up, arguments.fov, tuple(arguments.size)
-    return (lambda: view_points(arguments.scene, *camera, look)) if is_cloud else (lambda: view_field(arguments.scene, *camera))
+    if is_cloud:
+        return lambda: render_points(arguments.scene, *camera, look)
+    return lambda: render_field(arguments.scene, *camera)
 
 
 def reference(arguments: argparse.Namespace) -> None:

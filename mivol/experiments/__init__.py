@@ -1,1 +1,1 @@
-"""A run as a function: an image, a fit of a scene, of photographs or of a scan, from its settings to its folder."""
+"""Experiments: an image, a fit of a scene, of photographs or of projections, from the settings to the run folder."""

@@ -1,4 +1,4 @@
-"""The Mitsuba variant and the threads that a run works with."""
+"""The Mitsuba variant and the number of threads of a run."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from mivol.threads import check_one_thread, set_thread_count
 
 
 def choose_back_end(variant: str, threads: int = 0) -> None:
-    """Activate a variant, with so many threads of the CPU back end; 0 leaves Dr.Jit's choice.
+    """Activate a variant, and set the threads of the CPU back end; 0 threads keep Dr.Jit's choice.
 
     Raises:
-        MivolError: this Mitsuba has no such variant, there is no GPU for it, mivol does not work in it; a negative number of
-            threads; or another thread of this process uses Dr.Jit.
+        MivolError: an unknown or unsupported variant, a variant without its GPU, a negative number of threads, or Dr.Jit in use
+            by another thread of this process.
     """
     check_one_thread()
     set_variant(variant)
@@ -26,7 +26,7 @@ def set_variant(name: str) -> None:
     """Activate a variant.
 
     Raises:
-        MivolError: this Mitsuba has none of that name, there is no GPU for it, or mivol does not work in it.
+        MivolError: an unknown or unsupported variant, or a variant without its GPU.
     """
     if name not in mi.variants():
         raise MivolError(f'Mitsuba has no variant "{name}": choose among {", ".join(mi.variants())}.')
@@ -37,7 +37,7 @@ def set_variant(name: str) -> None:
 
 
 def set_threads(count: int) -> None:
-    """Threads of the CPU back end; 0 leaves Dr.Jit's choice.
+    """Set the threads of the CPU back end; 0 keeps Dr.Jit's choice.
 
     Raises:
         MivolError: a negative number.

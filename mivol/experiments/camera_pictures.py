@@ -1,4 +1,4 @@
-"""Where the cameras or the scanner of a run stand, as two pictures of its page: from the side and from above."""
+"""Images of the cameras or the scanner of a run, from the side and from above."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mivol.scene.camera_rigs import find_media_box
 from mivol.scene.sensors import to_camera
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
-__all__ = ["pictures_of_photos", "pictures_of_scan", "pictures_of_views", "survey_of"]
+__all__ = ["draw_photo_cameras", "draw_scanner", "draw_view_cameras", "survey_all_cameras"]
 
 CAPTIONS = {
     "side": "Where the cameras stand, and the box where matter may be",
@@ -27,31 +27,31 @@ CAPTIONS = {
 }
 
 
-def pictures_of_photos(folder: Path, photos: Photos, judged: Photos | None, levels: int = 1) -> list[Image]:
-    """Cameras of all photographs, those that judge among them, about their boxes.
+def draw_photo_cameras(folder: Path, photos: Photos, judged: Photos | None, levels: int = 1) -> list[Image]:
+    """Draw the cameras of all photographs and their boxes.
 
     Args:
-        folder: of the run, where the pictures are written.
-        photos: what was fitted.
-        judged: what it is judged by; None for nothing.
-        levels: nested boxes that were fitted.
+        folder: run folder.
+        photos: photographs to fit.
+        judged: photographs that judge the fit; None for none.
+        levels: nested boxes of the model.
     """
-    return _pictures(folder, survey_of(photos, judged, levels))
+    return _pictures(folder, survey_all_cameras(photos, judged, levels))
 
 
-def survey_of(photos: Photos, judged: Photos | None, levels: int) -> PhotoSurvey:
-    """What is drawn of a fit: the cameras of all its photographs, and so many nested boxes."""
+def survey_all_cameras(photos: Photos, judged: Photos | None, levels: int) -> PhotoSurvey:
+    """Survey of all photographs and nested boxes of a fit."""
     frames = photos.survey.frames + (() if judged is None else judged.survey.frames)
     return replace(photos.survey, frames=frames, levels=levels)
 
 
-def pictures_of_views(folder: Path, scene: mi.Scene, views: Mapping[str, Sequence[View]]) -> list[Image]:
-    """Cameras of a scene's views about the box of its media; none where no view is of a pinhole.
+def draw_view_cameras(folder: Path, scene: mi.Scene, views: Mapping[str, Sequence[View]]) -> list[Image]:
+    """Draw the cameras of a scene's views around the box of its media; without pinhole cameras nothing is drawn.
 
     Args:
-        folder: of the run, where the pictures are written.
-        scene: what they look at.
-        views: by key of ``mivol.photos.SPLITS``.
+        folder: run folder.
+        scene: the scene.
+        views: views by key of ``mivol.photos.SPLITS``.
     """
     frames = tuple(
         PhotoFrame(Path(view.name), to_camera(view.sensor, view.name), split)
@@ -64,14 +64,14 @@ def pictures_of_views(folder: Path, scene: mi.Scene, views: Mapping[str, Sequenc
     return _pictures(folder, PhotoSurvey(folder, "a scene", frames, (), find_media_box(scene), "about its media", (0.0, 0.0)))
 
 
-def pictures_of_scan(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held_out: NDArray) -> list[Image]:
-    """Sources and detectors of a scanner about the voxels.
+def draw_scanner(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held_out: NDArray) -> list[Image]:
+    """Draw sources and detectors of a scanner around the voxels.
 
     Args:
-        folder: of the run, where the pictures are written.
-        geometry: with all views.
+        folder: run folder.
+        geometry: geometry of all views.
         grid: the voxels.
-        held_out: numbers of the views that were not fitted.
+        held_out: indices of the held-out views.
     """
     for part in PARTS:
         plot_scanner(geometry, grid, held_out, folder / f"scanner_{part}.png", part)

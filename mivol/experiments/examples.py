@@ -58,7 +58,7 @@ class StandIn:
 
     def make(self, folder: Path) -> list[str]:
         """Write the volume to a folder; the settings that name it."""
-        return [f"{self.setting}={quoted(self.write(folder))}"]
+        return [f"{self.setting}={to_toml_string(self.write(folder))}"]
 
     def write(self, folder: Path) -> Path:
         """Write the volume to a folder; the path of its file."""
@@ -176,7 +176,7 @@ def list_examples() -> str:
     return "\n".join(f"{name:<{width}}  {example.says}" for name, example in EXAMPLES.items())
 
 
-def example_named(name: str) -> Example:
+def find_example(name: str) -> Example:
     """The example of that name.
 
     Raises:
@@ -200,7 +200,7 @@ def copy_example(name: str, into: Path) -> Path:
     Raises:
         MivolError: no such example, something lies there already, or what the system refuses (disk full, ...).
     """
-    example = example_named(name)
+    example = find_example(name)
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise MivolError(f'"{into}" is there already: name a folder that is not there yet, or is empty.')
     source = example.source(name)
@@ -254,7 +254,7 @@ def run_example(
     Raises:
         MivolError: no such example, and whatever its fit refuses.
     """
-    example, progress = example_named(name), progress or NullProgress()
+    example, progress = find_example(name), progress or NullProgress()
     source = example.source(name)
     # Before anything is made for it: what the changes ask for may be refused.
     wanted = config.load(source / example.file, (f"output=runs/{name}", *changes)).output
@@ -272,13 +272,13 @@ def prepare(name: str, example: Example, source: Path, folder: Path, progress: P
         if not (photographs / "transforms.json").exists():
             progress.say(["making the photographs"])
             run_script(source / example.photographs, ["-o", str(photographs)])
-        return [f"photos.path={quoted(photographs)}"]
+        return [f"photos.path={to_toml_string(photographs)}"]
     if example.scan:
         readings = folder.resolve() / "scan"
         if not (readings / "truth.npz").exists():
             progress.say(["making the readings"])
             run_script(source / example.scan, ["-o", str(readings)])
-        return [f"{setting}={quoted(readings / file)}" for setting, file in SCAN_FILES.items()]
+        return [f"{setting}={to_toml_string(readings / file)}" for setting, file in SCAN_FILES.items()]
     if example.stand_in is None or find_local_file(example.stand_in.data) is not None:
         return []
     wanted = example.stand_in
@@ -288,7 +288,7 @@ def prepare(name: str, example: Example, source: Path, folder: Path, progress: P
     return wanted.make(folder)
 
 
-def quoted(path: Path) -> str:
+def to_toml_string(path: Path) -> str:
     """A path as a string of TOML; backslashes are letters there."""
     return f"'{path}'"
 

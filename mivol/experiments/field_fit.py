@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mivol import config
 from mivol.config import FieldExperiment
-from mivol.experiments.field_plan import batches_of, choices, make_plan, suited
+from mivol.experiments.field_plan import adapt_plan, explain_plan, make_batches, make_plan
 from mivol.experiments.fit_kind import Say
 from mivol.experiments.photo_fit import PhotoFit
 from mivol.experiments.run_folder import BestFiles, RunFolder
@@ -63,30 +63,30 @@ class FieldFit(PhotoFit):
             self.record.citations.append("mildenhall_2022")
 
     def plan_fit(self) -> list[PlanLine]:
-        self.plan = suited(self.plan, self.photos)
+        self.plan = adapt_plan(self.plan, self.photos)
         self.levels = self.plan.levels
-        self.batches = batches_of(self.plan, self.photos)
-        return choices(self.plan, self.photos, self.batches)
+        self.batches = make_batches(self.plan, self.photos)
+        return explain_plan(self.plan, self.photos, self.batches)
 
     def make_problem(self) -> RadianceProblem:
         return RadianceProblem(self.batches, self.photos.box, self.plan, self.settings.seed)
 
     def best_files(self) -> BestFiles:
         names = ("field_best.npz", *(["sky_best.exr"] if self.problem.sky is not None else []))
-        return BestFiles(names, lambda folder: save_found(folder, self.problem, "_best", self.photos.white))
+        return BestFiles(names, lambda folder: write_result(folder, self.problem, "_best", self.photos.white))
 
     def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, ImageScore]:
-        return compare(self.problem, self.judged, photo, metrics)
+        return judge_view(self.problem, self.judged, photo, metrics)
 
     def film_frame(self, camera: Camera) -> NDArray:
-        view = render_view(self.problem.field, camera, behind(self.problem, self.photos.views[0]))
+        view = render_view(self.problem.field, camera, find_background(self.problem, self.photos.views[0]))
         return CONVERSIONS[self.photos.space, "srgb"](view.image)
 
     def write_model(self, run: RunFolder) -> dict[str, float]:
         run.make("volumes")
         field, record = self.problem.field, self.record
-        save_found(run.path, self.problem, white=self.photos.white)
-        record.tables = [storage(field, run.path / "field.npz")]
+        write_result(run.path, self.problem, white=self.photos.white)
+        record.tables = [tabulate_storage(field, run.path / "field.npz")]
         record.volumes += [write_density(run.path, field.extract_level(number), number) for number in range(field.levels)]
         self.levels = field.levels
         return {"nodes": float(field.rows - (field.nodes is not None)), "bytes": field.bytes / 2**20}
@@ -98,31 +98,33 @@ class FieldFit(PhotoFit):
         return write_geometry(run.path, view, photo.camera, self.judged.near_far)
 
 
-def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0) -> None:
-    """The field that a problem holds, and its sky where there is one, with a word in their names.
+def write_result(folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0) -> None:
+    """Write the field of a problem, and its sky if there is one.
 
     Args:
-        folder, problem, which: where, what, and the word.
-        white: by what colours are multiplied: the radiance for which 1 stood in the fit.
+        folder, problem, which: folder, problem, and a suffix of the file names.
+        white: factor on the colours: the radiance that was 1 in the fit.
     """
     write_field(folder / f"field{which}.npz", problem.field.scale_colours(white))
     if problem.sky is not None:
         write_exr(folder / f"sky{which}.exr", {"": white * problem.sky.image()})
 
 
-def compare(problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, ImageScore]:
-    """A photograph's view of the field, and how alike they are."""
-    seen = render_view(problem.field, photo.camera, behind(problem, photo))
+def judge_view(
+    problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]
+) -> tuple[FieldView, ImageScore]:
+    """Render a photograph's view of the field, and measure it."""
+    seen = render_view(problem.field, photo.camera, find_background(problem, photo))
     return seen, score_image(seen.image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
 
-def behind(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:
-    """What a photograph shows where nothing is."""
+def find_background(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:
+    """Return the background of a photograph: the fitted sky, or the photograph's own."""
     return photo.background if problem.sky is None else problem.sky
 
 
-def storage(field: SphericalGrid, path: Path) -> Table:
-    """What the field takes, beside grids of the same box that keep every node."""
+def tabulate_storage(field: SphericalGrid, path: Path) -> Table:
+    """Table of the field's size, beside grids of the same box with all nodes."""
     nodes, kept = field.node_count, len(field.stored_nodes())
     kinds = {
         "every node: r, g, b and density of 8 bits": 4 * nodes,
@@ -137,7 +139,7 @@ def storage(field: SphericalGrid, path: Path) -> Table:
 
 
 def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
-    """The extinction at the nodes of a level, as a grid that other programs read; the innermost has no number."""
+    """Write the extinction at the nodes of a level, for other programs; only outer levels have a number in their name."""
     raw, _ = field.to_dense()
     name = f"volumes/density{f'-level-{level}' if level else ''}"
     sigma = np.array(field.activation_function.value_and_slope(type(field.density)(raw.ravel()))[0]).reshape(*field.res, 1)
@@ -149,7 +151,7 @@ def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
 
 
 def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
-    """Distance and normals of a view as colours."""
+    """Write distance and normals of a view as colours."""
     near, far = near_far
     normals = normals_from_depth(seen.depth, camera)
     distances = f"from light, {near:.3g} [length], to dark, {far:.3g} [length]"

@@ -1,4 +1,4 @@
-"""How photographs will be fitted: the plan of a preset with what the file says otherwise, and its reasons."""
+"""The plan of a radiance-field fit: a preset, changed by the settings and adapted to the photographs, with its reasons."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ GAINS = PlanLine(
 )
 
 SMALLEST = 16
-"""Shortest edge of a photograph that was made smaller [pixel]."""
+"""Shortest edge of a shrunk photograph [pixel]."""
 
 FEWEST = 16
-"""Nodes along an edge that a preset has in any case, though voxels are smaller than pixels then."""
+"""Smallest number of nodes along an edge in a preset, even if voxels are then smaller than pixels."""
 
 FEWEST_STEPS = 230
-"""Steps of the last stage in any case, if it has as many; stages before it look as often at each pixel. With fewer a field does
-not get to where photographs put it (12 of wires, views held out of them: 25.3 dB in 58 steps, 29.4 in 234, 29.0 in 300, and
-27.6 where each stage has 300)."""
+"""Smallest number of steps of the last stage, if the preset has as many; earlier stages visit each pixel as often. With fewer
+steps the field stays far from its optimum (12 photographs of wires, held-out views: 25.3 dB in 58 steps, 29.4 in 234, 29.0 in
+300, and 27.6 with 300 steps in each stage)."""
 
 LEARNED = {"sky": ("sky", "sky_smooth"), "nested": ("sky", "sky_smooth", "levels", "near")}
-"""What the plan takes from the preset ``capture``, by the word for what is behind."""
+"""Fields of the plan that come from the preset ``capture``, by the word for the background."""
 
 
 def make_plan(chosen: FieldExperiment) -> RadiancePlan:
-    """The preset with what the file says otherwise.
+    """Return the preset of the settings, changed by the other settings.
 
     Raises:
         MivolError: an unknown preset.
@@ -52,7 +52,7 @@ def make_plan(chosen: FieldExperiment) -> RadiancePlan:
     wanted = chosen.field
     if wanted.preset not in PRESETS:
         raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {suggest_name(wanted.preset, list(PRESETS))}')
-    plan = with_background(PRESETS[wanted.preset], chosen.photos.background)
+    plan = set_background(PRESETS[wanted.preset], chosen.photos.background)
     names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure")
     given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
@@ -67,28 +67,28 @@ def make_plan(chosen: FieldExperiment) -> RadiancePlan:
     return plan if wanted.longest is None else replace(plan.with_longest(wanted.longest), cubic=False)
 
 
-def with_background(plan: RadiancePlan, background: str | tuple[float, float, float]) -> RadiancePlan:
-    """The plan that learns what is behind, or does not, as the word for it says; the preset's where there is none."""
+def set_background(plan: RadiancePlan, background: str | tuple[float, float, float]) -> RadiancePlan:
+    """Return the plan with a fitted background or without, by its word; an empty word keeps the preset's."""
     if background == "":
         return plan
     names = LEARNED.get(background, ()) if isinstance(background, str) else ()
     return replace(plan, **{"sky": 0} | {name: getattr(PRESETS["capture"], name) for name in names})
 
 
-def batches_of(plan: RadiancePlan, photos: Photos) -> RayBatches:
-    """The photographs in the sizes of the plan, without the distortion of lenses that have an image plane."""
+def make_batches(plan: RadiancePlan, photos: Photos) -> RayBatches:
+    """Return the photographs in the sizes of the plan, undistorted if their lens has an image plane."""
     return RayBatches.from_photos(
         [rectify(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space
     )
 
 
-def suited(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
-    """The plan for these photographs.
+def adapt_plan(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
+    """Adapt a plan to its photographs.
 
-    Grids of a plan for cubes have as many nodes in a box that is none, though voxels are not smaller than the plan's for that,
-    and never smaller than a pixel. Photographs are as small as the grids can tell, by the plan's pixels along a voxel at the
-    middle of the box, stages take no more steps than their pixels are worth, the degree is lower where photographs are few, and
-    there are no more nested boxes than the points of a reconstruction need.
+    A plan for cubes keeps its number of nodes in a box of other proportions; its voxels become smaller than neither the plan's
+    voxels nor a pixel. Photographs shrink to the plan's number of pixels per voxel at the middle of the box. Stages take no
+    more steps than their pixels justify. Few photographs get a lower degree. Nested boxes end where they hold the reconstructed
+    points.
     """
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
@@ -107,31 +107,31 @@ def suited(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
         return pixels / stage.shrink**2 / (min(stage.views, len(cameras)) * stage.tiles * TILE**2)
 
     if len(photos.views) < FEW_PHOTOGRAPHS:
-        plan = of_few(plan)
-    plan = with_levels_needed(plan, photos)
+        plan = adapt_to_few(plan)
+    plan = reduce_levels(plan, photos)
     stages = [suited_stage(stage) for stage in plan.stages]
     epochs = max(plan.epochs, FEWEST_STEPS / steps_an_epoch(stages[-1]))
     stages = [replace(stage, steps=max(1, int(min(stage.steps, epochs * steps_an_epoch(stage))))) for stage in stages]
     return replace(plan, stages=tuple(stages), cubic=False)
 
 
-def of_few(plan: RadiancePlan) -> RadiancePlan:
-    """The plan for fewer than ``FEW`` photographs."""
+def adapt_to_few(plan: RadiancePlan) -> RadiancePlan:
+    """Return the plan for fewer than ``FEW_PHOTOGRAPHS`` photographs."""
     degree = plan.degree if plan.few_degree is None else plan.few_degree
     matte = plan.matte if plan.few_matte is None else plan.few_matte
     return replace(plan, tv_every=1, degree=degree, matte=matte)
 
 
-def with_levels_needed(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
-    """The plan with no more nested boxes than the points of a reconstruction need, where there are enough of these."""
+def reduce_levels(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
+    """Return the plan with the nested boxes that hold the reconstructed points, if there are enough points."""
     points = photos.survey.points
     if not plan.fewer_levels or points is None or len(points) < FEWEST_POINTS:
         return plan
     return replace(plan, levels=count_levels(photos.box, points, plan.levels))
 
 
-def choices(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
-    """What will be done, and why."""
+def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
+    """Return the choices of a plan with their reasons."""
     box, origins = photos.box, np.array([view.camera.origin for view in photos.views])
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
     width, height = photos.views[0].camera.size
@@ -148,23 +148,23 @@ def choices(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> list[Pla
     return [
         PlanLine(choice=f"{len(photos.views)} photographs, a box of {size} [length]", reason=photos.survey.box_from),
         *outer_boxes[: plan.levels > 1],
-        *left_out(plan, photos),
-        *distances_told(plan, batches),
-        *near_cameras(plan, origins, box),
-        *wide_lenses(photos),
+        *explain_points_outside(plan, photos),
+        *explain_depths(plan, batches),
+        *explain_near_cameras(plan, origins, box),
+        *explain_wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
-        steps_of(plan),
-        sizes_of(plan, (width, height)),
+        explain_steps(plan),
+        explain_sizes(plan, (width, height)),
         PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
-        what_is_behind(plan, photos),
+        explain_background(plan, photos),
         *[GAINS][: plan.exposure],
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
         PlanLine(choice=check_memory(plan, box, batches), reason="counted before it is taken"),
     ]
 
 
-def left_out(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
-    """A line where points of a reconstruction lie beyond the boxes."""
+def explain_points_outside(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
+    """Return a line if reconstructed points lie outside the boxes."""
     points = photos.survey.points
     if points is None or (beyond := len(points) - len(points_in_box(points, nested_boxes(photos.box, plan.levels)[-1]))) == 0:
         return []
@@ -173,22 +173,22 @@ def left_out(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
     return [PlanLine(choice=f"{beyond} of {len(points)} points of the reconstruction left out", reason=reason)]
 
 
-def distances_told(plan: RadiancePlan, batches: RayBatches) -> list[PlanLine]:
-    """A line where points of a reconstruction say how far things are."""
+def explain_depths(plan: RadiancePlan, batches: RayBatches) -> list[PlanLine]:
+    """Return a line if reconstructed points give depths of rays."""
     found = sum(map(len, batches.points))
     choice = f"{found} points that photographs found say where their rays end, with a weight of {plan.depth:g}"
     return [PlanLine(choice=choice, reason="a model of COLMAP names them; field.depth")] if plan.depth and found else []
 
 
-def near_cameras(plan: RadiancePlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:
-    """A line where derivatives fall towards cameras at ``origins``."""
+def explain_near_cameras(plan: RadiancePlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:
+    """Return a line if derivatives decrease towards cameras at ``origins``."""
     reach = plan.near_distance(origins, box)
     choice = f"derivatives nearer to a camera than {reach:.4g} [length] fall with the square of the distance"
     return [PlanLine(choice=choice, reason="else matter grows before the lenses")] if reach else []
 
 
-def steps_of(plan: RadiancePlan) -> PlanLine:
-    """How many steps the stages take, and what bounds them."""
+def explain_steps(plan: RadiancePlan) -> PlanLine:
+    """Return the number of steps of the stages, and its bound."""
     steps = ", ".join(str(stage.steps) for stage in plan.stages)
     reason = "field.effort"
     if plan.epochs < math.inf:
@@ -196,8 +196,8 @@ def steps_of(plan: RadiancePlan) -> PlanLine:
     return PlanLine(choice=f"{steps} steps in these stages", reason=reason)
 
 
-def sizes_of(plan: RadiancePlan, held: tuple[int, int]) -> PlanLine:
-    """How large photographs are in each stage, which are held at so many pixels."""
+def explain_sizes(plan: RadiancePlan, held: tuple[int, int]) -> PlanLine:
+    """Return the sizes of the photographs in the stages; ``held`` is their size in memory."""
     width, height = held
     if all(stage.shrink == 1 for stage in plan.stages):
         reason = "their pixels are not much finer than voxels"
@@ -208,15 +208,15 @@ def sizes_of(plan: RadiancePlan, held: tuple[int, int]) -> PlanLine:
     )
 
 
-def wide_lenses(photos: Photos) -> list[PlanLine]:
-    """A line where photographs were taken through lenses without an image plane."""
+def explain_wide_lenses(photos: Photos) -> list[PlanLine]:
+    """Return a line if the lens of photographs has no image plane."""
     kinds = [type(view.camera.distortion).__name__.lower() for view in photos.views if view.camera.distortion.is_wide]
     reason = "traced exactly once a lens and size, and looked up: nothing is resampled"
     return [PlanLine(choice=f"rays of {len(kinds)} {kinds[0]} photographs", reason=reason)] if kinds else []
 
 
-def what_is_behind(plan: RadiancePlan, photos: Photos) -> PlanLine:
-    """What rays see that pass the box; where a colour is only believed, the one that the photographs' edges show is told."""
+def explain_background(plan: RadiancePlan, photos: Photos) -> PlanLine:
+    """Return the choice of the background; for an assumed colour, the reason has the colour at the photographs' edges."""
     if plan.sky:
         return PlanLine(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; it is learned with the field")
     if photos.views[0].alpha is not None:

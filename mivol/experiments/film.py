@@ -1,4 +1,4 @@
-"""Films of runs: that of a fit of photographs, whose camera's way is settled before the fit, and that of a volume."""
+"""Films of a run: a camera path through a fitted model, planned before the fit, and a rotating volume."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FILM_SIZE = 256
 """Longest edge of a film [pixel]."""
 
 SECONDS = 4
-"""Length of a film."""
+"""Length of a film [s]."""
 
 WAYS = {
     "turntable": "views around the box",
@@ -34,13 +34,13 @@ WAYS = {
 
 @dataclass(frozen=True)
 class Film:
-    """Where the camera of a film goes.
+    """Camera path of a film.
 
     Attributes:
-        cameras: one a picture; none where there is no film.
+        cameras: one camera per frame; empty for no film.
         way: key of WAYS.
-        shrink: how many times smaller than the photographs the pictures are.
-        notes: why there is no film although one was asked for.
+        shrink: size of the photographs over the size of the frames.
+        notes: reason of a missing film.
     """
 
     cameras: tuple[Camera, ...]
@@ -49,12 +49,12 @@ class Film:
     notes: tuple[str, ...] = ()
 
     def write(self, folder: Path, picture: Callable[[Camera], NDArray], progress: Progress) -> Image:
-        """Make the pictures and write them; says how films become mp4 where they do not.
+        """Render the frames and write the film; without ffmpeg, say how to get an mp4.
 
         Args:
-            folder: run folder; the film lies in ``film/``.
-            picture: (H, W, 3) code values that a camera sees.
-            progress: who is told how it goes.
+            folder: run folder; the film is in ``film/``.
+            picture: function that renders the code values (H, W, 3) of a camera.
+            progress: display of the run's progress.
         """
         path = f"film/{self.way}{film_suffix()}"
         if not path.endswith(".mp4"):
@@ -69,11 +69,13 @@ class Film:
 
 
 def plan_film(show: ShowSettings, photos: Photos) -> Film:
-    """Place the cameras of a film, before anything is fitted.
+    """Place the cameras of a film.
+
+    If the photographs have no common upward direction, or if there is only one, a film without keyframes is left out with a
+    note.
 
     Raises:
-        MivolError: keyframes that no camera can take. Where photographs have no common upward direction, or there is one
-            alone, a film that nobody described is left out with a note.
+        MivolError: keyframes without a valid camera.
     """
     if not show.frames:
         return Film(())
@@ -94,16 +96,16 @@ def plan_film(show: ShowSettings, photos: Photos) -> Film:
 
 
 def film_of_volume(run: RunFolder, values: NDArray, size: Sequence[float], upright: str, quantity: str) -> list[Image]:
-    """Write a volume as it turns about its upright axis; no film where :func:`volume_frames` has none.
+    """Write a film of a volume that rotates about its upright axis; empty for volumes that :func:`volume_frames` leaves out.
 
-    It is an animated WebP everywhere, which is small: its pictures are grey.
+    The film is an animated WebP, which is small for grey images.
 
     Args:
-        run: the film lies in its ``film/``.
-        values: (Z, Y, X, C).
-        size: world lengths of the box's edges along x, y, z.
+        run: run folder; the film is in ``film/``.
+        values: values (Z, Y, X, C).
+        size: lengths of the box's edges along x, y, z in the world.
         upright: "y" or "z".
-        quantity: of the values, for the caption.
+        quantity: quantity of the values, for the caption.
     """
     frames, largest = volume_frames(values, size, upright)
     if not frames:
@@ -116,6 +118,6 @@ def film_of_volume(run: RunFolder, values: NDArray, size: Sequence[float], uprig
 
 
 def _small(camera: Camera) -> Camera:
-    """A camera with at most the pixels of a film."""
+    """Return a camera with at most the pixels of a film."""
     scale = min(1.0, FILM_SIZE / max(camera.size))
     return camera.resized(tuple(max(1, round(edge * scale)) for edge in camera.size))

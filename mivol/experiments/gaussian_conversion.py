@@ -31,11 +31,11 @@ __all__ = [
     "cameras_around",
     "convert_to_field",
     "convert_to_gaussians",
-    "loss_of_field",
+    "field_psnr",
     "read_as_gaussians",
     "MeshLoss",
     "convert_to_mesh",
-    "loss_of_mesh",
+    "measure_mesh_error",
     "mesh_of_gaussians",
 ]
 
@@ -79,7 +79,7 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     lines = [
         f"{target}: {' x '.join(map(str, field.res[::-1]))} nodes, {field.rows - 1} of them stored, degree {field.degree}",
         f"{100 * mass / gaussian_masses(cloud).sum():.4g} % of the extinction lies in the box",
-        f"{loss_of_field(cloud, field):.1f} dB between the field and splatted Gaussians: {VIEWED}, over black, peak 1",
+        f"{field_psnr(cloud, field):.1f} dB between the field and splatted Gaussians: {VIEWED}, over black, peak 1",
     ]
     capped = int((cloud.opacities() > MAX_OPACITY).sum())
     if capped:
@@ -112,7 +112,7 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
     lines = [f"{target}: {made.count} Gaussians of degree {made.degree}"]
     if field.space == "linear":
         return "\n".join([*lines, "their colours are code values of the field's radiance, so views of the two do not compare"])
-    loss = f"{loss_of_field(made, field):.1f} dB between splatted Gaussians and the field: {VIEWED}, over black, peak 1"
+    loss = f"{field_psnr(made, field):.1f} dB between splatted Gaussians and the field: {VIEWED}, over black, peak 1"
     return "\n".join([*lines, loss])
 
 
@@ -131,7 +131,7 @@ def read_as_gaussians(source: Path) -> Gaussians:
     return read_gaussians(source) if is_gaussian_file(source) else points_to_gaussians(read_points(source))
 
 
-def loss_of_field(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> float:
+def field_psnr(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> float:
     """PSNR between views of a field and splatted Gaussians [dB]: code values over black, the peak is 1.
 
     Args:
@@ -190,7 +190,7 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
     low, high = corners_of_box(cloud, box)
     mesh = mesh_of_gaussians(cloud, low, high, resolution)
     write_mesh(target, mesh)
-    loss, voxel = loss_of_mesh(cloud, mesh, low, high), float((high - low).max()) / resolution
+    loss, voxel = measure_mesh_error(cloud, mesh, low, high), float((high - low).max()) / resolution
     nine_tenths = f"{loss.most:.3g} for nine tenths of the pixels ({loss.most / voxel:.2g} voxels)"
     lines = [
         f"{target}: {len(mesh.points)} points, {len(mesh.faces)} triangles, fused from {FUSED} views",
@@ -212,7 +212,8 @@ def mesh_of_gaussians(cloud: Gaussians, low: np.ndarray, high: np.ndarray, resol
     Raises:
         MivolError: as :func:`mivol.fields.surfaces.fuse_depths`.
     """
-    return fuse_depths(_seen(cloud, cameras_around(placed(low, high), FINENESS * resolution, FUSED)), low, high, resolution)
+    cameras = cameras_around(box_to_world(low, high), FINENESS * resolution, FUSED)
+    return fuse_depths(_splat_depths(cloud, cameras), low, high, resolution)
 
 
 @dataclass(frozen=True)
@@ -231,7 +232,7 @@ class MeshLoss:
     invented: float
 
 
-def loss_of_mesh(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray, edge: int = EDGE) -> MeshLoss:
+def measure_mesh_error(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray, edge: int = EDGE) -> MeshLoss:
     """Compare a mesh with splatted views, ray by ray.
 
     Args:
@@ -242,7 +243,7 @@ def loss_of_mesh(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray
     """
     scene = mi.load_dict({"type": "scene", "mesh": _shape_of(mesh)})
     apart, missed, invented = [], [], []
-    for view in _seen(cloud, cameras_around(placed(low, high), edge)):
+    for view in _splat_depths(cloud, cameras_around(box_to_world(low, high), edge)):
         met = _depth_in(scene, view.camera)
         is_there = np.isfinite(view.depth)
         both = is_there & np.isfinite(met)
@@ -254,14 +255,14 @@ def loss_of_mesh(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray
     return MeshLoss(float(median), float(most), *(float(np.concatenate(part).mean()) for part in (missed, invented)))
 
 
-def placed(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def box_to_world(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """(4, 4) unit cube to a box."""
     to_world = np.diag([*(high - low), 1.0])
     to_world[:3, 3] = low
     return to_world
 
 
-def _seen(cloud: Gaussians, cameras: Sequence[Camera]) -> Iterator[DepthView]:
+def _splat_depths(cloud: Gaussians, cameras: Sequence[Camera]) -> Iterator[DepthView]:
     """What cameras of one size see of Gaussians."""
     splatter, reals = Splatter(*cameras[0].size, cloud.degree, median=True), to_tensors(cloud)
     for camera in cameras:

@@ -28,7 +28,7 @@ from mivol.points import Gaussians, write_gaussians
 from mivol.report.record import PlanLine, RunRecord, Table
 from mivol.validate.images import ImageScore, score_image
 
-__all__ = ["Begun", "GaussianFit", "begin", "compare", "make_gaussian_plan", "picture_of"]
+__all__ = ["GaussianStart", "GaussianFit", "start_gaussians", "judge_view", "make_gaussian_plan", "render_gaussians"]
 
 FILE = "gaussians.ply"
 
@@ -65,7 +65,7 @@ class GaussianFit(PhotoFit):
         )
 
     def plan_fit(self) -> list[PlanLine]:
-        self.begun = begin(self.settings, self.photos, self.plan)
+        self.begun = start_gaussians(self.settings, self.photos, self.plan)
         self.plan = self.begun.plan
         return self.begun.lines
 
@@ -80,38 +80,38 @@ class GaussianFit(PhotoFit):
         return rectify(photo)
 
     def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, ImageScore]:
-        return compare(self.problem, self.judged, photo, metrics)
+        return judge_view(self.problem, self.judged, photo, metrics)
 
     def film_frame(self, camera: Camera) -> NDArray:
         low_pass = self.plan.low_pass_at(self.film.shrink)
-        return picture_of(self.problem, camera, self.photos.views[0].background, low_pass)
+        return render_gaussians(self.problem, camera, self.photos.views[0].background, low_pass)
 
     def write_model(self, run: RunFolder) -> dict[str, float]:
         gaussians, path = Gaussians(**self.problem.cloud), run.path / FILE
         write_gaussians(path, gaussians)
-        self.record.tables = [storage(gaussians, path.stat().st_size)]
+        self.record.tables = [tabulate_gaussians(gaussians, path.stat().st_size)]
         return {"gaussians": float(gaussians.count)}
 
     def gains(self) -> NDArray | None:
         return None if self.problem.exposure is None else self.problem.exposure.table()
 
 
-def compare(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, ImageScore]:
-    """A photograph's view of the Gaussians (H, W, 3), and how alike they are; what a lens distorts is rectified first."""
+def judge_view(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, ImageScore]:
+    """Render a photograph's view of the Gaussians (H, W, 3), and measure it; distorted photographs are undistorted first."""
     photo = rectify(photo)
-    seen = picture_of(problem, photo.camera, photo.background, problem.plan.low_pass)
+    seen = render_gaussians(problem, photo.camera, photo.background, problem.plan.low_pass)
     return seen, score_image(seen, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
 
-def picture_of(problem: GaussianProblem, camera: Camera, behind: NDArray, low_pass: float) -> NDArray:
-    """What a pinhole sees of the Gaussians, (H, W, 3) over a colour (3,)."""
+def render_gaussians(problem: GaussianProblem, camera: Camera, behind: NDArray, low_pass: float) -> NDArray:
+    """Render the Gaussians through a pinhole, (H, W, 3), over a colour (3,)."""
     splatter = problem.splatter_for(camera.size, low_pass)
     seen = np.array(splatter.forward(problem.values(), camera, derivatives=False)[0])
     return seen[..., :3] + (1 - seen[..., 3:]) * np.asarray(behind, np.float32)
 
 
-def storage(found: Gaussians, bytes_: int) -> Table:
-    """What the Gaussians take, and what they are like."""
+def tabulate_gaussians(found: Gaussians, bytes_: int) -> Table:
+    """Table of the size and the typical shape of the Gaussians."""
     opacity, scale = found.opacities(), found.scales()
     rows = (
         ("Gaussians", f"{found.count}"),
@@ -125,15 +125,15 @@ def storage(found: Gaussians, bytes_: int) -> Table:
 
 
 @dataclass(frozen=True)
-class Begun:
-    """What a fit begins with.
+class GaussianStart:
+    """The start of a fit.
 
     Attributes:
-        views: the photographs, as pinholes saw them.
-        plan: for photographs of their size.
-        batches: the photographs in the sizes of the plan.
-        cloud: the first Gaussians.
-        lines: what will be done, and why.
+        views: photographs, undistorted.
+        plan: plan for photographs of this size.
+        batches: photographs in the sizes of the plan.
+        cloud: first Gaussians.
+        lines: choices with their reasons.
     """
 
     views: tuple[Photo, ...]
@@ -143,15 +143,15 @@ class Begun:
     lines: list[PlanLine]
 
     def problem(self, seed: int) -> GaussianProblem:
-        """What is fitted, before its first step; ``seed``: of the views and the places that are drawn."""
+        """Return the problem before its first step; ``seed`` draws the views and the places."""
         return GaussianProblem(self.batches, [view.camera for view in self.views], self.cloud, self.plan, seed)
 
 
 def make_gaussian_plan(chosen: GaussianExperiment) -> GaussianPlan:
-    """The preset with what the file says otherwise.
+    """Return the preset of the settings, changed by the other settings.
 
     Raises:
-        MivolError: an unknown preset or control of the density.
+        MivolError: an unknown preset or density control.
     """
     wanted = chosen.gaussians
     if wanted.preset not in PRESETS:
@@ -167,11 +167,11 @@ def make_gaussian_plan(chosen: GaussianExperiment) -> GaussianPlan:
     return plan.scaled(wanted.effort)
 
 
-def begin(chosen: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> Begun:
-    """Photographs, plan and first Gaussians of a fit; memory is counted before it is taken.
+def start_gaussians(chosen: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> GaussianStart:
+    """Adapt the plan to the photographs, and place the first Gaussians; memory is checked before it is allocated.
 
     Raises:
-        MivolError: more memory than there is, or no place where Gaussians could begin.
+        MivolError: more memory than there is, or no place for Gaussians.
     """
     views = tuple(rectify(view) for view in photos.views)
     longest = max(max(view.camera.size) for view in views)
@@ -187,14 +187,15 @@ def begin(chosen: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> Beg
     memory = check_memory(replace(plan, start=len(places)), taken, pixels)
     batches = RayBatches.from_photos(views, [stage.shrink for stage in plan.stages])
     cloud = make_start_cloud(places, views, plan.stages[0].degree)
-    return Begun(views, plan, batches, cloud, choices(plan, photos, len(places), whence, memory, plan.minutes(largest)))
+    lines = explain_plan(plan, photos, len(places), whence, memory, plan.minutes(largest))
+    return GaussianStart(views, plan, batches, cloud, lines)
 
 
 GAINS = PlanLine(choice="gains of each photograph", reason="cameras that choose their exposure; pulled towards 1")
 
 
-def choices(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:
-    """What will be done, and why."""
+def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:
+    """Return the choices of the plan with their reasons."""
     stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
     behind = "alpha says what is there" if photos.views[0].alpha is not None else "photos.background"
     control = {

@@ -1,4 +1,4 @@
-"""Judged views as pictures: a few in full, the worst among them, and all others small, to be scrolled through."""
+"""The views that judge a fit of photographs: metrics, tables and images."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from mivol.validate.images import METRICS, ImageScore, fit_colours, score_image
 
 __all__ = [
     "JudgedViews",
-    "caption_of",
+    "describe_quality",
     "judge_colour_fitted",
     "rename_metrics",
-    "said_of",
-    "spread_over",
-    "table_of_views",
+    "describe_views",
+    "select_shown_views",
+    "tabulate_views",
     "write_view",
 ]
 
 MANY = 32
-"""Judged views from which the small ones are smaller: a page stays below some 20 MB."""
+"""Number of judged views above which small images are smaller, so that a page stays below about 20 MB."""
 
 EDGES = 256, 128
-"""Longest edge of a small picture [pixel], of few and of many views."""
+"""Longest edge of a small image [pixel], for few and for many views."""
 
 
-def spread_over(count: int, shown: int) -> frozenset[int]:
-    """Numbers of as many views as are to be shown, from the first to the last of so many."""
+def select_shown_views(count: int, shown: int) -> frozenset[int]:
+    """Indices of the views shown in full, from the first to the last view."""
     return frozenset(np.linspace(0, count - 1, min(shown, count)).astype(int).tolist())
 
 
-def caption_of(quality: ImageScore, fitted: float | None = None) -> str:
-    """What is said beside a view: its metrics, and its PSNR [dB] where its colours are fitted to the photograph's first."""
-    found = [said_as(name, value) for name, value in quality.values.items()]
+def describe_quality(quality: ImageScore, fitted: float | None = None) -> str:
+    """Caption of a view: its metrics, and its PSNR [dB] after colour correction if given."""
+    found = [format_metric(name, value) for name, value in quality.values.items()]
     return ", ".join(found if fitted is None else [*found, f"{fitted:.2f} dB with its colours fitted"])
 
 
-def said_as(metric: str, value: float) -> str:
-    """A metric's name, value and unit."""
+def format_metric(metric: str, value: float) -> str:
+    """Name, value and unit of a metric."""
     label, _, unit = METRICS[metric].label.partition(" [")
     return f"{label} {value:.{METRICS[metric].digits}f} {unit.rstrip(']')}".rstrip()
 
 
 @dataclass
 class JudgedViews:
-    """Pictures of judged views, written one by one as they are judged.
+    """Images of judged views, written one by one.
 
     Attributes:
-        folder: of the run.
-        space: of the photographs.
-        count: of views that will be judged.
-        shown: how many are kept in full beside the worst; 0: no pictures are written at all.
+        folder: run folder.
+        space: colour space of the photographs.
+        count: number of judged views.
+        shown: number of views in full beside the worst; 0 writes no images.
     """
 
     folder: Path
@@ -70,31 +70,31 @@ class JudgedViews:
     _worst: tuple[Photo, int, NDArray, str] | None = field(default=None, init=False)
 
     def add(self, photo: Photo, image: NDArray, psnr: float, caption: str) -> None:
-        """The next view.
+        """Add the next view.
 
         Args:
             photo: the photograph.
-            image: the render (H, W, 3), in the photographs' space.
-            psnr: [dB], by which the worst is known.
-            caption: what is said beside it.
+            image: the render (H, W, 3), in the photographs' colour space.
+            psnr: PSNR [dB], which decides on the worst view.
+            caption: caption of the view.
         """
         number = len(self._psnr)
         if self.shown:
-            edge = None if number in spread_over(self.count, self.shown) else EDGES[self.count > MANY]
+            edge = None if number in select_shown_views(self.count, self.shown) else EDGES[self.count > MANY]
             self._images[number] = write_view(self.folder, photo, number, image, self.space, caption, edge)
             if psnr < min(self._psnr.values(), default=np.inf):
                 self._worst = photo, number, image, caption
         self._psnr[number] = psnr
 
     def images(self) -> list[Image]:
-        """What was written, for the record: the worst view first, in full, then the others in full, then those that are small,
-        from the worst to the best."""
+        """Return the written images for the record: the worst view in full, the other views in full, then the small views, the
+        worst first."""
         if self._worst is None:
             return []
         photo, worst, image, caption = self._worst
         said = f"the worst of {self.count}: {caption}"
         self._images[worst] = write_view(self.folder, photo, worst, image, self.space, said)
-        whole = [n for n in sorted(spread_over(self.count, self.shown)) if n != worst]
+        whole = [n for n in sorted(select_shown_views(self.count, self.shown)) if n != worst]
         small = sorted(self._images.keys() - {worst, *whole}, key=self._psnr.__getitem__)
         return [one for number in (worst, *whole, *small) for one in self._images[number]]
 
@@ -108,14 +108,14 @@ def write_view(
     caption: str = "",
     edge: int | None = None,
 ) -> list[Image]:
-    """A render beside its photograph, both as a screen shows them.
+    """Write a render beside its photograph, both tone-mapped for a screen.
 
     Args:
-        folder, photo, number: where, of what, and the number in the files' names.
-        image: (H, W, 3), in ``space``.
-        space: of both.
-        caption: what is said beside them.
-        edge: longest edge of what is written [pixel]: means of squares of pixels; None: as they are.
+        folder, photo, number: run folder, photograph, and number in the file names.
+        image: render (H, W, 3) in ``space``.
+        space: colour space of both.
+        caption: caption of the view.
+        edge: longest edge of the written images [pixel], by means of squares of pixels; None for the full size.
     """
     written = []
     for role, values in {"render": image, "reference": photo.image}.items():
@@ -129,15 +129,15 @@ def write_view(
 
 
 def _shrunk(image: NDArray, edge: int) -> NDArray:
-    """Means of squares of pixels, as few as make the longest edge at most so long; what is left at the sides is cut."""
+    """Means of squares of pixels, the smallest squares with a longest edge of at most ``edge``; incomplete squares are cut."""
     step = -(-max(image.shape[:2]) // edge)
     rows, columns = (max(n // step, 1) for n in image.shape[:2])
     cut = image[: rows * step, : columns * step]
     return cut.reshape(rows, -1, columns, cut.shape[1] // columns, 3).mean(axis=(1, 3))
 
 
-def said_of(views: Iterable[Photo]) -> str:
-    """How many views are judged, and at which size."""
+def describe_views(views: Iterable[Photo]) -> str:
+    """Number and size of the judged views."""
     sizes = [photo.camera.size for photo in views]
     width, height = sizes[0]
     size = f"{width} x {height} pixels" if set(sizes) == {sizes[0]} else "their own sizes"
@@ -145,18 +145,18 @@ def said_of(views: Iterable[Photo]) -> str:
 
 
 def judge_colour_fitted(image: NDArray, photo: Photo, space: str) -> float:
-    """PSNR [dB] of a view whose colours, as a screen shows them, were fitted to its photograph's."""
+    """PSNR [dB] of a view after a fit of its colours to the photograph, for screen colours."""
     shown, wanted = (CONVERSIONS[space, "srgb"](values) for values in (image, photo.image))
     return score_image(fit_colours(shown, wanted, photo.mask), wanted, mask=photo.mask).values["psnr"]
 
 
-def table_of_views(camera: Camera, found: Sequence[ImageScore], fitted: Sequence[float] = ()) -> Table:
-    """Every judged view with its own figures, the worst one first.
+def tabulate_views(camera: Camera, found: Sequence[ImageScore], fitted: Sequence[float] = ()) -> Table:
+    """Table of all judged views with their metrics, the worst first.
 
     Args:
-        camera: of the first view, whose size is said.
-        found: the metrics of each.
-        fitted: PSNR [dB] of each with its colours fitted to the photograph's; none: it is not said.
+        camera: camera of the first view, for the size in the title.
+        found: metrics of each view.
+        fitted: PSNR [dB] of each view after colour correction; empty for none.
     """
     metrics = list(found[0].values)
     head = ("view", *(METRICS[name].label for name in metrics))

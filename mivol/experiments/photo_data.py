@@ -1,4 +1,4 @@
-"""Photographs that are fitted, those that a fit is judged by, and the box where matter may be."""
+"""Photographs to fit, photographs that judge the fit, and the box of the matter."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from mivol.validate.images import check_metrics
 
 
 def read_photos(chosen: PhotoExperiment, base: Path) -> tuple[Photos, Photos | None]:
-    """Photographs to fit, and those to judge by.
+    """Read the photographs to fit, and the photographs that judge the fit (None for none).
 
     Raises:
-        MivolError: as :func:`mivol.photos.load_photos`, metrics that do not judge them, or neither a box (a background) nor
-            one of the words for it.
+        MivolError: as :func:`mivol.photos.load_photos`, metrics for larger photographs, or an unknown word for the box or the
+            background.
     """
     wanted = chosen.photos
     if isinstance(wanted.box, str) and wanted.box not in BOXES:
@@ -53,20 +53,20 @@ def read_photos(chosen: PhotoExperiment, base: Path) -> tuple[Photos, Photos | N
     check_background(chosen, has_alpha)
     if has_alpha:
         settings["background"] = wanted.background or None
-    photos = _over(load_photos(path, split="train", **settings), wanted.background)
-    white = white_of(photos) if photos.space == "linear" else 1.0
+    photos = _put_over(load_photos(path, split="train", **settings), wanted.background)
+    white = find_white(photos) if photos.space == "linear" else 1.0
     if not is_judged:
-        return exposed(photos, white), None
+        return divide_by_white(photos, white), None
     judged = load_photos(path, split=wanted.judged, **settings | {"space": photos.space})
     check_metrics(chosen.show.metrics, *np.min([view.camera.size for view in judged.views], axis=0))
-    return exposed(photos, white), exposed(_over(judged, wanted.background), white)
+    return divide_by_white(photos, white), divide_by_white(_put_over(judged, wanted.background), white)
 
 
 def check_background(chosen: PhotoExperiment, has_alpha: bool) -> None:
-    """Refuse a word for what is behind that is none, or none for photographs of this kind.
+    """Refuse an unknown word for the background, or a word for photographs of the other kind.
 
     Raises:
-        MivolError: with the words that are.
+        MivolError: with the known words.
     """
     word = chosen.photos.background
     learned = [] if isinstance(chosen, GaussianExperiment) else list(LEARNED)
@@ -82,21 +82,21 @@ def check_background(chosen: PhotoExperiment, has_alpha: bool) -> None:
 
 
 MIDDLE_GREY = 0.18
-"""What the median of photographs of radiance is shown as, over white (the key of Reinhard et al. 2002)."""
+"""Median of shown photographs of radiance, over white (the key of Reinhard et al. 2002)."""
 
 
-def white_of(photos: Photos) -> float:
-    """The radiance that is shown white: a power of 2, by which numbers are divided without a rounding error.
+def find_white(photos: Photos) -> float:
+    """Radiance of white on a screen: a power of 2, so that a division has no rounding error.
 
-    The median of what is lit (mean of rgb above 0) then lies within a factor of sqrt(2) of ``MIDDLE_GREY``.
+    The median of lit pixels (mean of rgb above 0) is then within a factor of sqrt(2) of ``MIDDLE_GREY``.
     """
     levels = np.concatenate([view.image[::2, ::2].mean(axis=2).ravel() for view in photos.views])
     lit = levels[levels > 0]
     return 2.0 ** round(math.log2(np.median(lit) / MIDDLE_GREY)) if len(lit) else 1.0
 
 
-def exposed(photos: Photos, white: float) -> Photos:
-    """Photographs whose values are divided by that of white."""
+def divide_by_white(photos: Photos, white: float) -> Photos:
+    """Divide the photographs by the radiance of white."""
     if white == 1:
         return photos
     by = np.float32(white)
@@ -104,8 +104,8 @@ def exposed(photos: Photos, white: float) -> Photos:
     return replace(photos, views=tuple(views), white=white)
 
 
-def _over(photos: Photos, background: str | tuple[float, float, float]) -> Photos:
-    """Photographs that show a colour where nothing is; those with alpha were put over theirs."""
+def _put_over(photos: Photos, background: str | tuple[float, float, float]) -> Photos:
+    """Set the background colour of photographs without alpha; photographs with alpha have one already."""
     if photos.views[0].alpha is not None:
         return photos
     colour = np.full(3, background == "white", np.float32) if isinstance(background, str) else np.array(background, np.float32)
@@ -113,10 +113,10 @@ def _over(photos: Photos, background: str | tuple[float, float, float]) -> Photo
 
 
 def note_on_alpha(survey: PhotoSurvey) -> str:
-    """What alpha in all photographs means for a fit of them; "" where there is none.
+    """Return a note on the alpha of all photographs; "" without alpha.
 
     Raises:
-        MivolError: some photographs have alpha and some have not.
+        MivolError: alpha in some photographs only.
     """
     if not check_alpha(survey.frames):
         return ""
@@ -126,42 +126,42 @@ def note_on_alpha(survey: PhotoSurvey) -> str:
     return f"alpha in all photographs: photos.background says what they are put over; {box}"
 
 
-def boxed(chosen: PhotoExperiment, photos: Photos) -> Photos:
-    """The photographs with the box where matter may be.
+def add_box(chosen: PhotoExperiment, photos: Photos) -> Photos:
+    """Set the box of the matter.
 
     Raises:
-        MivolError: as :func:`mivol.photos.region.silhouette_box`.
+        MivolError: as :meth:`mivol.photos.Photos.silhouette_box`.
     """
     wanted = chosen.photos.box
     return BOXES[wanted](photos) if isinstance(wanted, str) else photos
 
 
-def _found(photos: Photos) -> Photos:
-    """About what alpha shows, where all photographs have alpha and an image plane; else what the cameras look at."""
+def _find_box(photos: Photos) -> Photos:
+    """Box around the opaque pixels if all photographs have alpha and an image plane; else the box that the cameras look at."""
     has_silhouettes = all(view.alpha is not None and not view.camera.distortion.is_wide for view in photos.views)
-    return _about_silhouettes(photos) if has_silhouettes else photos
+    return _box_silhouettes(photos) if has_silhouettes else photos
 
 
-def _about_silhouettes(photos: Photos) -> Photos:
+def _box_silhouettes(photos: Photos) -> Photos:
     box = photos.silhouette_box()
     near_far = near_and_far([view.camera for view in photos.views], box)
     return replace(photos, survey=replace(photos.survey, box=box, box_from="about what alpha shows", near_far=near_far))
 
 
 BOXES = {
-    "found": _found,
+    "found": _find_box,
     "cameras": lambda photos: photos,
-    "silhouettes": _about_silhouettes,
+    "silhouettes": _box_silhouettes,
     "middle": lambda photos: photos,
 }
-"""What is made of the box that was found with the photographs, by the word for it."""
+"""Functions that set the box, by their word in the settings."""
 
 SEARCHED = {"middle": "middle"}
-"""Words for a box that ``load_photos`` looks for itself."""
+"""Words for a box that ``load_photos`` finds itself."""
 
 
-def notes(photos: Photos, judged: Photos | None = None) -> list[str]:
-    """What a reader must know of the photographs."""
+def describe_photos(photos: Photos, judged: Photos | None = None) -> list[str]:
+    """Return notes on the photographs for the report."""
     if photos.space == "linear":
         found = [
             f"Colours are radiance, as in the photographs' files; an error weighs as the slope of log(y + {EPSILON:g}) says "

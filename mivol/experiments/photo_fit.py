@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.config import PhotoExperiment
-from mivol.experiments.camera_pictures import pictures_of_photos, survey_of
+from mivol.experiments.camera_pictures import draw_photo_cameras, survey_all_cameras
 from mivol.experiments.film import plan_film
 from mivol.experiments.fit_kind import Evaluation, FitKind, RunContext, Say, Stages
 from mivol.experiments.judged_views import (
     JudgedViews,
-    caption_of,
+    describe_quality,
+    describe_views,
     judge_colour_fitted,
     rename_metrics,
-    said_of,
-    table_of_views,
+    tabulate_views,
 )
-from mivol.experiments.photo_data import boxed, notes, read_photos
+from mivol.experiments.photo_data import add_box, describe_photos, read_photos
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Course, Fit
@@ -38,7 +38,7 @@ from mivol.report.record import Image, PlanLine, Table
 from mivol.scene.explain import Explanation
 from mivol.validate.images import ImageScore, average_scores
 
-__all__ = ["PhotoFit", "table_of_gains"]
+__all__ = ["PhotoFit", "tabulate_gains"]
 
 
 class PhotoFit(FitKind):
@@ -77,14 +77,14 @@ class PhotoFit(FitKind):
 
     def load(self, say: Say) -> None:
         photos, self.judged = read_photos(self.settings, self.context.base)
-        self.photos = boxed(self.settings, photos)
+        self.photos = add_box(self.settings, photos)
         say(self.photos.describe())
         say(f"  judged by {0 if self.judged is None else len(self.judged.views)} photographs")
         self.film = plan_film(self.settings.show, self.photos)
         for note in self.film.notes:
             say(f"  {note}")
         self.record.plan = self.plan_fit()
-        self.record.notes = [*notes(self.photos, self.judged), *self.film.notes]
+        self.record.notes = [*describe_photos(self.photos, self.judged), *self.film.notes]
         for line in self.record.plan:
             say(f"  {line.choice}: {line.reason}")
 
@@ -154,13 +154,13 @@ class PhotoFit(FitKind):
         sizes = self.write_model(run)
         gains = self.gains()
         if gains is not None:
-            record.tables.append(table_of_gains([view.name for view in self.photos.views], gains))
+            record.tables.append(tabulate_gains([view.name for view in self.photos.views], gains))
         record.results = {"views": float(len(self.photos.views)), "iterations": float(fit.next_iteration), **sizes}
         if self.judged is not None:
             record.results |= self.write_judged(run)
         if self.film.cameras:
             record.images.append(self.film.write(run.path, self.film_frame, self.context.progress))
-        record.images += pictures_of_photos(run.path, self.photos, self.judged, self.levels)
+        record.images += draw_photo_cameras(run.path, self.photos, self.judged, self.levels)
         run.write_curves()
 
     def write_judged(self, run: RunFolder) -> dict[str, float]:
@@ -176,12 +176,12 @@ class PhotoFit(FitKind):
             if self.fits_colours:
                 fitted.append(judge_colour_fitted(image, photo, space))
             psnr = quality.values.get("psnr", fitted[-1] if fitted else next(iter(quality.values.values())))
-            pictures.add(photo, image, psnr, caption_of(quality, fitted[-1] if fitted else None))
+            pictures.add(photo, image, psnr, describe_quality(quality, fitted[-1] if fitted else None))
             if number == 0:
                 first = self.write_first_view(run, view, photo)
         self.record.images += [*pictures.images(), *first]
-        self.record.judged = said_of(views)
-        self.record.tables.append(table_of_views(views[0].camera, qualities, fitted))
+        self.record.judged = describe_views(views)
+        self.record.tables.append(tabulate_views(views[0].camera, qualities, fitted))
         means = rename_metrics(average_scores(qualities).values)
         return means | ({"psnr_colour_fitted": float(np.mean(fitted))} if fitted else {})
 
@@ -193,10 +193,10 @@ class PhotoFit(FitKind):
 
     def draw_cameras(self, path: Path) -> None:
         """Draw the cameras of all photographs and the boxes of the model into an image."""
-        plot_cameras(survey_of(self.photos, self.judged, self.levels), path)
+        plot_cameras(survey_all_cameras(self.photos, self.judged, self.levels), path)
 
 
-def table_of_gains(names: Sequence[str], gains: NDArray) -> Table:
+def tabulate_gains(names: Sequence[str], gains: NDArray) -> Table:
     """Table of the gains (photographs, 3) of the photographs, with the gains farthest from 1 first."""
     far = np.argsort(-np.abs(np.log(gains)).max(axis=1), kind="stable")
     rows = [(names[k], *(f"{gain:.3f}" for gain in gains[k])) for k in far]

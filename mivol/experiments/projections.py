@@ -1,4 +1,4 @@
-"""Projections of a scan: measured, of a volume that is known, or exact chords through a phantom."""
+"""The projections of a scan: measured, computed from a volume, or exact line integrals of a phantom."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import find_axis
 
 RAY_BYTES = 3 * 8
-"""Of a ray of a computed scan: what is exact, what is seen of it and its weight, in float64."""
+"""Memory per ray of a computed scan [byte]: exact value, noisy value and weight, in float64."""
 
 
 @with_short_repr
 @dataclass(frozen=True)
 class Projections:
-    """Line integrals and what they were taken with.
+    """Line integrals with their geometry.
 
     Attributes:
         geometry: beam and detector.
         y: line integrals (views, rows, cols).
-        weights: their inverse variances.
-        truth: (Z, Y, X), where known.
-        quanta: numbers of quanta, where they are known: simulated, or of readings with flats and darks.
-        notes: what was found out on the way.
-        is_noise_known: whether 1 / weights are variances, and not only in proportion to them.
+        weights: inverse variances of the line integrals.
+        truth: true volume (Z, Y, X), if known.
+        quanta: numbers of quanta, if known: simulated, or from readings with flats and darks.
+        notes: notes for the report.
+        is_noise_known: whether 1 / weights are the variances, and not only proportional to them.
     """
 
     geometry: FlatDetector
@@ -65,27 +65,27 @@ class Projections:
         return hashlib.sha256(self.y.tobytes() + self.weights.tobytes()).hexdigest()
 
 
-def beam_of(chosen: config.ScanExperiment) -> str:
-    """The kind of beam, for people."""
+def describe_beam(chosen: config.ScanExperiment) -> str:
+    """Name of the beam."""
     return f"{type(chosen.data if isinstance(chosen.scan, OfData) else chosen.scan).__name__.lower()} beam"
 
 
 def make_geometry(chosen: config.ScanExperiment, base: Path) -> FlatDetector:
-    """Beam and detector of computed projections."""
+    """Return beam and detector of computed projections."""
     wanted = chosen.scan
-    angles = np.arange(0) if isinstance(wanted, Table | Matrices) else evenly(wanted)
-    return place_beam(chosen, base, angles, wanted.detector)
+    angles = np.arange(0) if isinstance(wanted, Table | Matrices) else even_angles(wanted)
+    return make_beam(chosen, base, angles, wanted.detector)
 
 
-def evenly(wanted: Detector) -> np.ndarray:
-    """Angles [rad] spread over the arc."""
+def even_angles(wanted: Detector) -> np.ndarray:
+    """Angles [rad] spread evenly over the arc."""
     return np.radians(wanted.arc) * np.arange(wanted.views) / wanted.views
 
 
-def place_beam(
+def make_beam(
     chosen: config.ScanExperiment, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
 ) -> FlatDetector:
-    """The beam that was asked for, with these angles [rad] and pixels; a found ``axis_offset`` replaces the file's."""
+    """Return the beam of the settings, with these angles [rad] and pixels; a given ``axis_offset`` replaces the settings'."""
     wanted = chosen.scan
     if isinstance(wanted, Table):
         return PanelViews(read_columns(base / wanted.file, COLUMNS), detector)
@@ -102,20 +102,20 @@ def place_beam(
 
 
 def make_grid(chosen: config.ScanExperiment, base: Path) -> VoxelGrid:
-    """Where the voxels lie.
+    """Return the voxels.
 
     Raises:
-        MivolError: no table ``grid``, and none in the data.
+        MivolError: neither a table ``grid`` nor a grid in the data.
     """
     wanted = chosen.grid
     return nikon_grid(chosen.data, base) if wanted is None else VoxelGrid(wanted.shape, wanted.voxel_size, wanted.centre)
 
 
 def make_data(chosen: config.ScanExperiment, base: Path, grid: VoxelGrid) -> Projections:
-    """Projections, measured or computed.
+    """Read or compute the projections.
 
     Raises:
-        MivolError: files that cannot be read or do not fit, rays that all miss the grid, or more of them than memory.
+        MivolError: files that cannot be read or do not fit, rays that all miss the grid, or more rays than memory.
     """
     is_measured = isinstance(chosen.data, Measured | Stack | Nikon)
     if is_measured:
@@ -132,10 +132,10 @@ def make_data(chosen: config.ScanExperiment, base: Path, grid: VoxelGrid) -> Pro
 
 
 def check_rays(chosen: config.ScanExperiment) -> None:
-    """Refuse a computed scan of more rays than can be kept; of a table of views, one view is counted.
+    """Refuse a computed scan beyond the memory; a table of views counts as one view.
 
     Raises:
-        MivolError: with how many there are.
+        MivolError: with the number of rays.
     """
     rows, columns = chosen.scan.detector
     views = getattr(chosen.scan, "views", 1)
@@ -147,7 +147,7 @@ def check_hits(projector: Projector) -> None:
     """Refuse a scan whose rays all miss the grid, by up to eight of its views.
 
     Raises:
-        MivolError: how far the grid is from the rays' origins.
+        MivolError: with the extent of the grid.
     """
     some = projector.subset(np.unique(np.linspace(0, projector.n_views - 1, 8).astype(int)))
     if (some @ np.ones(projector.grid.shape, np.float32)).any():
@@ -162,17 +162,17 @@ def check_hits(projector: Projector) -> None:
 def project_ellipsoids(
     wanted: Ellipsoids, base: Path, geometry: FlatDetector, grid: VoxelGrid
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Exact chords, and the phantom averaged over voxels."""
+    """Return exact line integrals, and the phantom averaged over voxels."""
     phantom = shepp_logan(wanted.table, wanted.half_width)
     # Two sub-points an edge err by 0.06 of a head of 128^3, four by 0.015: less than what is judged by them.
     return wanted.scale * phantom.project(geometry), wanted.scale * phantom.voxelise(grid, 4)
 
 
 def project_volume(wanted: Known, base: Path, geometry: FlatDetector, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Line integrals of a volume file, and the volume.
+    """Return line integrals of a volume file, and the volume.
 
     Raises:
-        MivolError: it has several channels or another shape than the grid.
+        MivolError: several channels, or another shape than the grid.
     """
     values = read_volume(resolve_path(base, wanted.file)).values
     if values.shape != (*grid.shape, 1):
@@ -185,9 +185,9 @@ SIMULATED = {Ellipsoids: project_ellipsoids, Known: project_volume}
 
 
 def add_noise(geometry: FlatDetector, exact: np.ndarray, truth: np.ndarray, photons: float, seed: int) -> Projections:
-    """Line integrals of Poisson counts, weighted by 1 / var y = counts; without photons the exact ones.
+    """Return line integrals of Poisson counts with weights 1 / var y = counts; exact line integrals without photons.
 
-    A pixel without a single quantum has no logarithm: y = 0 and weight 0.
+    A pixel without any quantum has no logarithm: y = 0 with weight 0.
     """
     if not photons:
         return Projections(geometry, exact, np.ones_like(exact), truth)
@@ -198,7 +198,7 @@ def add_noise(geometry: FlatDetector, exact: np.ndarray, truth: np.ndarray, phot
 
 
 def read_measured(chosen: config.ScanExperiment, base: Path) -> Projections:
-    """Readings from files as line integrals with weights; the axis of a circular scan is found where asked for.
+    """Read measured projections as line integrals with weights; find the rotation axis of a circular scan if requested.
 
     Raises:
         MivolError: a file that cannot be read, or does not fit the others.
@@ -210,49 +210,49 @@ def read_measured(chosen: config.ScanExperiment, base: Path) -> Projections:
     y, weights = to_line_integrals(normalise_air(found.transmission, wanted.air) if wanted.air else found.transmission)
     offset = None
     if isinstance(chosen.scan, Parallel | Cone):
-        offset, said = settle_axis(chosen, base, y, weights, angles)
+        offset, said = resolve_axis(chosen, base, y, weights, angles)
         notes += said
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
     geometry = found.geometry
     if geometry is None:
-        geometry = place_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
+        geometry = make_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
-    quanta = quanta_of(chosen, found) if ALL_SOLVERS[chosen.solve.solver].problem is PoissonCounts else None
+    quanta = count_measured_quanta(chosen, found) if ALL_SOLVERS[chosen.solve.solver].problem is PoissonCounts else None
     return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=found.intensity is not None)
 
 
-def settle_axis(
+def resolve_axis(
     chosen: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
 ) -> tuple[float | None, list[str]]:
-    """The ``axis_offset`` of a circular scan [length] where it is looked for, else None, and what is said about it.
+    """Return the found ``axis_offset`` of a circular scan [length] or None, and notes.
 
-    An offset in a file holds, unless the file says ``data.find_axis = true`` besides.
+    An offset in the settings holds, unless they also have ``data.find_axis = true``.
     """
     wanted, given = chosen.data.find_axis, chosen.scan.axis_offset
     if wanted or (wanted is None and not given):
-        offset, said = look_for_axis(chosen, base, y, weights, angles)
+        offset, said = find_rotation_axis(chosen, base, y, weights, angles)
         return offset, [said]
     if wanted is None:
         return None, [f"the rotation axis is where scan.axis_offset has it, {given:g}: data.find_axis = true looks for it"]
     return None, []
 
 
-def look_for_axis(
+def find_rotation_axis(
     chosen: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
 ) -> tuple[float | None, str]:
-    """The ``axis_offset`` of a circular scan [length], and a sentence about it; None where a cone beam does not tell it.
+    """Return the ``axis_offset`` of a circular scan [length] and a note; None if a cone beam does not determine it.
 
     Raises:
-        MivolError: as :func:`mivol.tomography.rotation_axis.find_axis`, of a parallel beam.
+        MivolError: as :func:`mivol.tomography.rotation_axis.find_axis`, for a parallel beam.
     """
     if isinstance(chosen.scan, Parallel):
         axis = find_axis(y, weights, angles)
         offset = axis.offset(y.shape[2], float(np.broadcast_to(chosen.scan.pitch, (2,))[1]))
     else:
-        beam = place_beam(chosen, base, angles, y.shape[1:])
+        beam = make_beam(chosen, base, angles, y.shape[1:])
         try:
             axis = axis_from_fans(y, weights, beam)
         except MivolError as error:
@@ -261,11 +261,11 @@ def look_for_axis(
     return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
 
 
-def quanta_of(chosen: config.ScanExperiment, found: ScanReadings) -> Quanta:
-    """Numbers of quanta of a measured scan; where air is named, the light without an object is as bright as it is there.
+def count_measured_quanta(chosen: config.ScanExperiment, found: ScanReadings) -> Quanta:
+    """Return the numbers of quanta of a measured scan; named air columns correct the brightness of the light without an object.
 
     Raises:
-        MivolError: data without flats and darks, or with a drift, which only line integrals take.
+        MivolError: data without flats and darks, or with a drift, which only line integrals have.
     """
     if found.intensity is None or chosen.data.drift:
         raise MivolError(
@@ -279,7 +279,7 @@ def quanta_of(chosen: config.ScanExperiment, found: ScanReadings) -> Quanta:
 
 
 def held_out_views(chosen: config.ScanExperiment, count: int) -> np.ndarray:
-    """Numbers of the views that are predicted, not fitted."""
+    """Indices of the held-out views, which are predicted and not fitted."""
     every = chosen.held_out_every
     if every == 1:
         raise MivolError("held_out_every = 1 holds out all views, expected some to fit: choose 2 or more, or 0.")
@@ -287,5 +287,5 @@ def held_out_views(chosen: config.ScanExperiment, count: int) -> np.ndarray:
 
 
 def fitted_views(held_out: np.ndarray, count: int) -> np.ndarray:
-    """Numbers of the views that are not held out."""
+    """Indices of the views that are not held out."""
     return np.setdiff1d(np.arange(count), held_out)

@@ -1,4 +1,4 @@
-"""Measured projections from files: transmission, what it was taken with, and angles or geometry where the files have them."""
+"""Measured projections from files: transmission, and angles or geometry if the files have them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from mivol.tomography.preprocess import Transmission, assume_quantum_noise, corr
 @with_short_repr
 @dataclass(frozen=True, eq=False)
 class ScanReadings:
-    """What the files of a scan hold.
+    """Content of the files of a scan.
 
     Attributes:
-        transmission: (views, rows, cols), rows from the lowest.
-        angles: (views,) [rad]; None where they do not matter, or are the geometry's.
-        geometry: where the files have one.
-        intensity: readings, flats and darks, where the files have them.
-        notes: what is to be said of them.
+        transmission: transmission (views, rows, cols), lowest row first.
+        angles: angles (views,) [rad]; None if the geometry has them.
+        geometry: geometry, if the files have one.
+        intensity: readings, flats and darks, if the files have them.
+        notes: notes for the report.
     """
 
     transmission: Transmission
@@ -80,10 +80,10 @@ def read_stack_scan(chosen: config.ScanExperiment, base: Path) -> ScanReadings:
 
 
 def read_angles(chosen: config.ScanExperiment, base: Path, views: int) -> np.ndarray | None:
-    """Angles [rad] of a stack: listed, or evenly over the arc; None where a table has the geometry.
+    """Return the angles [rad] of a stack: from a file, or evenly over the arc; None if a table has the geometry.
 
     Raises:
-        MivolError: another number of angles than views, or angles of another unit.
+        MivolError: numbers of angles and views that differ, or angles in another unit.
     """
     wanted: Stack = chosen.data
     if isinstance(chosen.scan, Table | Matrices):
@@ -97,7 +97,7 @@ def read_angles(chosen: config.ScanExperiment, base: Path, views: int) -> np.nda
 
 
 def to_radians(angles: np.ndarray, unit: str) -> np.ndarray:
-    """Angles in radians.
+    """Convert angles to radians.
 
     Raises:
         MivolError: as :func:`check_unit`.
@@ -107,10 +107,10 @@ def to_radians(angles: np.ndarray, unit: str) -> np.ndarray:
 
 
 def check_unit(angles: np.ndarray, unit: str, way_out: str) -> None:
-    """Refuse angles (views,) that are not in degrees, or not in radians.
+    """Refuse angles (views,) in another unit.
 
     Raises:
-        MivolError: numbers that are of the other unit: over 8 turns in radians, or 16 views and more within 6.3 degrees.
+        MivolError: more than 8 turns in radians, or at least 16 views within 6.3 degrees.
     """
     span = float(np.ptp(angles))
     if unit == "radian" and span > 16 * np.pi:
@@ -122,7 +122,7 @@ def check_unit(angles: np.ndarray, unit: str, way_out: str) -> None:
 
 
 def note_order(angles: np.ndarray) -> list[str]:
-    """A sentence where angles go back and forth, which a scanner rarely does."""
+    """Return a note if the angles go back and forth, which scanners rarely do."""
     steps = np.diff(angles)
     back = np.flatnonzero(np.sign(steps) * np.sign(np.sum(np.sign(steps))) < 0)
     if not len(back):
@@ -133,7 +133,7 @@ def note_order(angles: np.ndarray) -> list[str]:
 
 
 def read_nikon_scan(wanted: Nikon, base: Path) -> tuple[Transmission, ConeBeam | PanelViews, list[str]]:
-    """Transmission, geometry, and notes.
+    """Read a Nikon scan: transmission, geometry and notes.
 
     Raises:
         MivolError: as :mod:`mivol.files.nikon`.
@@ -141,11 +141,15 @@ def read_nikon_scan(wanted: Nikon, base: Path) -> tuple[Transmission, ConeBeam |
     scan = read_nikon(base / wanted.file)
     angles = read_nikon_angles(base / wanted.angles, len(scan.images)) if wanted.angles else scan.angles
     geometry = geometry_from_nikon(scan, angles)
-    return assume_quantum_noise(read_nikon_transmission(scan, wanted.saturation)), geometry, notes_of(scan, geometry)
+    return (
+        assume_quantum_noise(read_nikon_transmission(scan, wanted.saturation)),
+        geometry,
+        describe_nikon_settings(scan, geometry),
+    )
 
 
-def notes_of(scan: NikonScan, geometry: ConeBeam | PanelViews) -> list[str]:
-    """Sentences about what the settings hold beyond a circle."""
+def describe_nikon_settings(scan: NikonScan, geometry: ConeBeam | PanelViews) -> list[str]:
+    """Return notes on settings beyond a circular scan."""
     notes = []
     if isinstance(geometry, PanelViews):
         notes.append(f"the rotation axis is tilted by {scan.tilt:g} and rolled by {scan.roll:g} degrees: z runs along it")
@@ -155,10 +159,10 @@ def notes_of(scan: NikonScan, geometry: ConeBeam | PanelViews) -> list[str]:
 
 
 def nikon_grid(wanted: Nikon, base: Path) -> VoxelGrid:
-    """The voxels of the settings, about the middle of the axis.
+    """Return the voxels of the settings file, centred on the axis.
 
     Raises:
-        MivolError: there are none.
+        MivolError: a settings file without voxels.
     """
     scan = read_nikon(base / wanted.file)
     if scan.shape is None:

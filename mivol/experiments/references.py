@@ -1,4 +1,4 @@
-"""What was seen from each view of a scene: rendered by Mitsuba's path tracer, or read from files."""
+"""The reference of each view of a scene: rendered from the scene with the true volume, or read from a file."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult, read_reference
 
 SEEN = 2 * 3 * 4
-"""Bytes a pixel of a view that a fit keeps: what was seen, in three channels, and its standard error or its batch."""
+"""Memory per pixel of a view [byte]: the reference in three channels, and its standard error or its batch."""
 
 
 @dataclass
 class References:
-    """What was seen of a scene.
+    """References of all views.
 
     Attributes:
-        held_out_numbers: of the views that the fit does not see.
-        fitted: views that the fit sees.
-        held_out: views that it does not.
-        standard_errors: of the references, by view, where known.
+        held_out_numbers: indices of the held-out views.
+        fitted: views to fit.
+        held_out: held-out views.
+        standard_errors: standard errors of the references by view name, if known.
     """
 
     held_out_numbers: frozenset[int]
@@ -48,9 +48,9 @@ class References:
     standard_errors: dict[str, np.ndarray] = field(default_factory=dict)
 
     def add(self, sensor: dict | mi.Sensor, mean: np.ndarray, error: np.ndarray | None = None) -> None:
-        """Sort the next view in."""
+        """Add the next view."""
         index = len(self.fitted) + len(self.held_out)
-        view = View(f"view {index}", camera_of(sensor), mi.TensorXf(np.ascontiguousarray(mean, dtype=np.float32)))
+        view = View(f"view {index}", to_sensor(sensor), mi.TensorXf(np.ascontiguousarray(mean, dtype=np.float32)))
         (self.held_out if index in self.held_out_numbers else self.fitted).append(view)
         if error is not None:
             self.standard_errors[view.name] = error
@@ -88,32 +88,32 @@ def find_references(
     if truth is None:
         render_views(references, context, settings, loaded, sensors)
     else:
-        with holding(loaded.scene, settings.truth.key, truth):
+        with hold_values(loaded.scene, settings.truth.key, truth):
             render_views(references, context, settings, load_scene(loaded.scene), sensors)
     return references
 
 
 def find_sensors(chosen: SceneExperiment, scene: mi.Scene) -> tuple[list[Any], frozenset[int]]:
-    """All views in their order, and the numbers of those that are held out.
+    """Return the sensors of all views, and the indices of the held-out views.
 
     Raises:
-        MivolError: no views, views of several sizes or more of them than fit into memory, or held-out views that are not there.
+        MivolError: no views, views of different sizes, more views than memory, or unknown held-out views.
     """
     sensors = list(chosen.views.sensors(scene))
     more = list(chosen.held_out.sensors(scene)) if chosen.held_out is not None else []
     check_held_out(chosen.reference.held_out, len(sensors))
     held_out = (*chosen.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
     sensors += more
-    check_film(camera_of(sensors[0]), SEEN * len(sensors))
-    check_sizes({f"view {index}": camera_of(sensor) for index, sensor in enumerate(sensors)})
+    check_film(to_sensor(sensors[0]), SEEN * len(sensors))
+    check_sizes({f"view {index}": to_sensor(sensor) for index, sensor in enumerate(sensors)})
     return sensors, frozenset(held_out)
 
 
 def load_experiment_scene(chosen: SceneExperiment, base: Path) -> LoadedScene:
-    """The scene of an experiment, with its defines; those may name public data (``data:NAME``).
+    """Load the scene of an experiment with its defines; a define may name public data (``data:NAME``).
 
     Raises:
-        MivolError: as :func:`mivol.scene.load.load_scene`, or data that has not been fetched.
+        MivolError: as :func:`mivol.scene.load.load_scene`, or data that are not here.
     """
     given = chosen.scene.define.items()
     is_data = {key: isinstance(value, str) and value.startswith(PREFIX) for key, value in given}
@@ -121,16 +121,16 @@ def load_experiment_scene(chosen: SceneExperiment, base: Path) -> LoadedScene:
     return load_scene(base / chosen.scene.file, defines)
 
 
-def camera_of(sensor: dict | mi.Sensor) -> mi.Sensor:
-    """What a rig gives, as a sensor."""
+def to_sensor(sensor: dict | mi.Sensor) -> mi.Sensor:
+    """Return a sensor of a camera rig as a Mitsuba sensor."""
     return mi.load_dict(dict(sensor)) if isinstance(sensor, dict) else sensor
 
 
 def check_held_out(held_out: Sequence[int], count: int) -> None:
-    """Refuse views to hold out that are not there, and a split that leaves nothing to fit.
+    """Refuse unknown held-out views, and a split without a view to fit.
 
     Raises:
-        MivolError: with the number.
+        MivolError: with the index.
     """
     wrong = next((i for i in held_out if not 0 <= i < count), None)
     if wrong is not None:
@@ -156,17 +156,17 @@ def render_views(
 
 
 def standard_error(made: ReferenceResult) -> np.ndarray:
-    """Of each pixel's mean, with room for what was never sampled."""
+    """Standard error of each pixel's mean, with an allowance for light that no sample has found."""
     return np.sqrt(made.variance_with_unseen(float(made.mean.max())))
 
 
 def read_references(
     chosen: SceneExperiment, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: frozenset[int]
 ) -> References:
-    """References from OpenEXR files; those that mivol wrote must be of the scene that they are said to be of.
+    """Read references from OpenEXR files. A file of mivol must show the named scene.
 
     Raises:
-        MivolError: another number of files than views, or a file of another scene.
+        MivolError: numbers of files and views that differ, or a file of another scene.
     """
     wanted, seen = chosen.reference, References(held_out)
     if len(wanted.paths) != len(sensors):
@@ -178,15 +178,15 @@ def read_references(
             made = read_reference(base / name, of)
             seen.add(sensor, made.mean, standard_error(made))
         else:
-            seen.add(sensor, colours_of(base / name, stack_layers(channels)))
+            seen.add(sensor, select_colours(base / name, stack_layers(channels)))
     return seen
 
 
-def colours_of(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:
-    """What the variant renders, of a picture from a file: colours (height, width, 3), or luminance (height, width, 1).
+def select_colours(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the channels that the variant renders: colours (height, width, 3), or luminance (height, width, 1).
 
     Raises:
-        MivolError: it has channels of other names.
+        MivolError: channels of other names.
     """
     name, wanted = ("Y", "Y (luminance)") if "mono" in mi.variant() else ("", "R, G and B")
     if name not in found:
@@ -196,14 +196,14 @@ def colours_of(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:
 
 
 VOXEL_BYTES = 9 * 8
-"""Of a procedural volume while it is made: its places twice, and three numbers that are made of them, in float64."""
+"""Memory per voxel of a procedural volume while it is made [byte]: the position twice, and three numbers, in float64."""
 
 
 def make_truth(chosen: SceneExperiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
-    """The true volume (Z, Y, X, C), where the experiment knows one.
+    """Return the true volume (Z, Y, X, C) of an experiment; None if unknown.
 
     Raises:
-        MivolError: its key is not in the scene, its file cannot be read, or it does not fit into memory.
+        MivolError: an unknown key, a file that cannot be read, or a volume beyond the memory.
     """
     if chosen.truth is None:
         return None
@@ -217,10 +217,10 @@ def make_truth(chosen: SceneExperiment, base: Path, scene: mi.Scene) -> np.ndarr
 
 
 def check_truth(chosen: SceneExperiment) -> None:
-    """Refuse a truth of a parameter that is not fitted: references would show it, and renders what the scene holds.
+    """Refuse a true volume of a parameter that is not fitted: references and renders would show different volumes.
 
     Raises:
-        MivolError: with its key.
+        MivolError: with the key.
     """
     if chosen.truth is not None and chosen.truth.key not in [sought.key for sought in chosen.parameter]:
         raise MivolError(
@@ -230,11 +230,11 @@ def check_truth(chosen: SceneExperiment) -> None:
 
 
 @contextmanager
-def holding(scene: mi.Scene, key: str, values: np.ndarray) -> Iterator[None]:
-    """The scene with other values of one parameter, for a while."""
+def hold_values(scene: mi.Scene, key: str, values: np.ndarray) -> Iterator[None]:
+    """Put other values of one parameter into the scene for the time of a block."""
     params = mi.traverse(scene)
     before = type(params[key])(params[key])
-    put(params, key, values)
+    set_parameter(params, key, values)
     try:
         yield
     finally:
@@ -242,7 +242,7 @@ def holding(scene: mi.Scene, key: str, values: np.ndarray) -> Iterator[None]:
         params.update()
 
 
-def put(params: mi.SceneParameters, key: str, values: np.ndarray) -> None:
-    """Set a parameter, in the type that the scene gives it."""
+def set_parameter(params: mi.SceneParameters, key: str, values: np.ndarray) -> None:
+    """Set a parameter, in the type of the scene's parameter."""
     params[key] = like(mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32)), params[key])
     params.update()

@@ -52,7 +52,7 @@ def check_output(path: Path) -> None:
     check_destination(path)
 
 
-def name_of(integrator: mi.Integrator) -> str:
+def integrator_name(integrator: mi.Integrator) -> str:
     """The plugin's name of an integrator: ours, or what it prints first."""
     return "mivol" if hasattr(integrator, "session") else str(integrator).partition("[")[0].strip()
 
@@ -124,7 +124,7 @@ SKY_FILE = "sky.exr"
 """What a fit writes beside its field, where it learned what is behind."""
 
 
-def view_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> np.ndarray:
+def render_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> np.ndarray:
     """What a pinhole sees of a field, over the sky beside its file or black: linear light (height, width, 3).
 
     Args:
@@ -137,7 +137,7 @@ def view_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: f
     Raises:
         MivolError: as :func:`mivol.fields.field_files.read_field`, or a camera that cannot be.
     """
-    camera = camera_at(look_at, up, fov, size)
+    camera = make_camera(look_at, up, fov, size)
     field, sky = read_field(path), sky_beside(path)
     seen = render_view(field, camera, np.zeros(3) if sky is None else sky).image
     return np.maximum(seen, 0) if field.space == "linear" else decode_srgb(seen)
@@ -153,8 +153,8 @@ def sky_beside(path: Path) -> Sky | None:
     return read_sky(beside) if beside.is_file() else None
 
 
-def camera_at(look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> Camera:
-    """The camera of :func:`view_field`.
+def make_camera(look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> Camera:
+    """The camera of :func:`render_field`.
 
     Raises:
         MivolError: a view along ``up``, numbers that are not finite, or an angle or a size that no pinhole has.
@@ -202,7 +202,7 @@ class PointLook:
             raise MivolError(f"points of radius {self.radius:g} were asked for; a length above 0 is expected.")
 
 
-def view_points(
+def render_points(
     path: Path, look_at: Sequence[float] | None, up: Sequence[float], fov: float, size: tuple[int, int], look: PointLook
 ) -> np.ndarray:
     """What a pinhole sees of points or Gaussians over black: linear light (height, width, 3).
@@ -225,20 +225,20 @@ def view_points(
     if not is_cloud and look != PointLook():
         raise MivolError(f"{path} holds Gaussians, which have shapes of their own: leave out how points are drawn.")
     held = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)
-    camera = camera_at(look_at or whole_view(held.means, up, fov, size), up, fov, size)
-    return decode_srgb(picture_of(held, camera, is_cloud, is_cloud and look.drawn_as == "discs"))
+    camera = make_camera(look_at or frame_points(held.means, up, fov, size), up, fov, size)
+    return decode_srgb(splat_points(held, camera, is_cloud, is_cloud and look.drawn_as == "discs"))
 
 
 def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
     """Round Gaussians of one radius at the points; those without colours are coloured by how densely they stand."""
     made = points_to_gaussians(cloud, look.opacity)
     if cloud.colours is None:
-        made = points_to_gaussians(replace(cloud, colours=by_density(made.scales()[:, 0])), look.opacity)
+        made = points_to_gaussians(replace(cloud, colours=density_colours(made.scales()[:, 0])), look.opacity)
     radius = 0.5 * float(np.median(made.scales())) if look.radius is None else look.radius
     return replace(made, log_scales=np.full((made.count, 3), math.log(radius)))
 
 
-def by_density(distances: np.ndarray) -> np.ndarray:
+def density_colours(distances: np.ndarray) -> np.ndarray:
     """(N, 3) colours of points by the logarithms of their distances to others: light where they stand densely."""
     height = -np.log(distances.astype(np.float64))
     low, high = np.quantile(height, [SHARE, 1 - SHARE])
@@ -248,7 +248,7 @@ def by_density(distances: np.ndarray) -> np.ndarray:
 COLOUR_MAP = "magma"
 
 
-def whole_view(places: np.ndarray, up: Sequence[float], fov: float, size: tuple[int, int]) -> list[float]:
+def frame_points(places: np.ndarray, up: Sequence[float], fov: float, size: tuple[int, int]) -> list[float]:
     """Where a camera stands that sees a ball about the middle 98 % of places along each axis, and the ball's middle."""
     low, high = np.quantile(places.astype(np.float64), [SHARE, 1 - SHARE], axis=0)
     middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
@@ -257,7 +257,7 @@ def whole_view(places: np.ndarray, up: Sequence[float], fov: float, size: tuple[
     return [*(middle + towards * radius / math.sin(half)), *middle]
 
 
-def picture_of(held: Gaussians, camera: Camera, compensated: bool, discs: bool) -> np.ndarray:
+def splat_points(held: Gaussians, camera: Camera, compensated: bool, discs: bool) -> np.ndarray:
     """(height, width, 3) code values over black."""
     splatter = Splatter(*camera.size, held.degree, compensated=compensated, discs=discs)
     return np.array(splatter.forward(to_tensors(held), camera, derivatives=False)[0])[..., :3]

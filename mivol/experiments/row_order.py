@@ -1,8 +1,8 @@
-"""Whether a detector's rows are upside down: which way round a small reconstruction explains the projections better.
+"""Detection of upside-down detector rows, by coarse reconstructions with both row orders.
 
-Opposite views see an object's heights from either side. Where source and detector lie alike above and below a plane, as on a
-circle with a centred detector, a scan that is read upside down is that of the mirrored object, and nobody can tell; nor can
-parallel light. A detector that is displaced along v, a helix, or any other trajectory tells.
+Views from opposite sides see the heights of an object from either side. If source and detector are symmetric about a plane, as
+on a circle with a centred detector, an upside-down scan equals a scan of the mirrored object, and nothing tells them apart; the
+same holds for parallel light. A detector displaced along v, a helix, or any other trajectory breaks the symmetry.
 """
 
 from __future__ import annotations
@@ -24,20 +24,21 @@ VIEWS, EDGE, ITERATIONS = 32, 24, 10
 """At most so many views of so many rows, columns and voxels along an edge are compared, after so many iterations of CGLS."""
 
 LIMIT = 6.0
-"""Mean difference of the views' misfits over its standard error, from which on they are said to be upside down. Where both ways
-explain a scan alike, Student's t of 31 degrees of freedom is beyond 6 with a chance of 6e-7."""
+"""Mean difference of the views' residuals over its standard error, above which rows count as upside down. If both orders
+explain a
+scan equally well, Student's t of 31 degrees of freedom exceeds 6 with probability 6e-7."""
 
 ROUNDING = 1e-4
-"""Parts of a misfit that are no difference: ten iterations of products in float32, whose sums are good to some 1e-6 each."""
+"""Relative rounding error of a residual after ten iterations of float32 products, whose sums have errors of about 1e-6 each."""
 
 
 @dataclass(frozen=True)
 class RowOrder:
-    """Which way round the rows fit.
+    """Agreement of both row orders with the projections.
 
     Attributes:
-        as_read, upside_down: what a small reconstruction misses of the projections, relative.
-        excess: by how many standard errors the views are missed more as they are read than upside down.
+        as_read, upside_down: relative residual of a small reconstruction.
+        excess: excess of the residual as read over the residual upside down [standard error].
     """
 
     as_read: float
@@ -46,24 +47,24 @@ class RowOrder:
 
 
 def can_tell(geometry: object, grid: VoxelGrid) -> bool:
-    """Whether a scan and its mirror image above and below are two different scans."""
+    """Whether a scan differs from the scan of its mirror image."""
     if isinstance(geometry, ParallelBeam) or geometry.shape[1] < 2:
         return False
     return not isinstance(geometry, ConeBeam) or geometry.detector_offset[0] != 0 or grid.centre[2] != 0
 
 
 def compare_rows(geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights: np.ndarray) -> RowOrder:
-    """Reconstruct coarsely from the rows as they are and from those upside down, and compare what is missed, view by view.
+    """Reconstruct coarsely with both row orders, and compare the residuals view by view.
 
     Args:
-        y: (views, rows, cols) line integrals.
-        weights: 0: not used.
+        y: line integrals (views, rows, cols).
+        weights: weights; 0 for unused pixels.
     """
     small, seen = _coarse(geometry, y, weights)
     shape = tuple(min(n, EDGE) for n in grid.shape)
     edges = tuple(float(e) for e in grid.extent / np.array(shape[::-1]))
     projector = Projector(small.geometry, VoxelGrid(shape, edges, grid.centre))
-    ways = [_missed(projector, small.y[:, way], seen[:, way]) for way in (slice(None), slice(None, None, -1))]
+    ways = [_residuals(projector, small.y[:, way], seen[:, way]) for way in (slice(None), slice(None, None, -1))]
     more, size = ways[0] - ways[1], float(np.sum(seen * small.y**2)) or 1.0
     error = float(np.hypot(np.std(more) / np.sqrt(max(len(more) - 1, 1)), ROUNDING * np.mean(ways))) or 1.0
     as_read, upside_down = (float(np.sqrt(way.sum() / size)) for way in ways)
@@ -73,7 +74,7 @@ def compare_rows(geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights
 def note_rows(
     wanted: config.Readings, geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights: np.ndarray
 ) -> list[str]:
-    """A sentence where the rows of measured projections seem to be upside down, with the way out."""
+    """Return a note with a remedy if the rows of measured projections seem to be upside down."""
     if not can_tell(geometry, grid):
         return []
     found = compare_rows(geometry, grid, y, weights)
@@ -99,7 +100,7 @@ class _Small:
 
 
 def _coarse(geometry: FlatDetector, y: np.ndarray, weights: np.ndarray) -> tuple[_Small, np.ndarray]:
-    """Means over blocks of used pixels of some views, and which blocks have any."""
+    """Means over blocks of used pixels in some views, and the blocks with used pixels."""
     views = np.unique(np.linspace(0, len(y) - 1, VIEWS).astype(int))
     (block_v, rows, first_v), (block_u, cols, first_u) = (_blocks(n) for n in y.shape[1:])
     inner = np.s_[first_v : first_v + rows * block_v, first_u : first_u + cols * block_u]
@@ -118,13 +119,13 @@ def _coarse(geometry: FlatDetector, y: np.ndarray, weights: np.ndarray) -> tuple
 
 
 def _blocks(pixels: int) -> tuple[int, int, int]:
-    """(pixels of a block, blocks, first pixel): at most EDGE blocks in the middle of so many pixels."""
+    """(pixels per block, blocks, first pixel): at most EDGE blocks in the middle of the pixels."""
     size = -(-pixels // EDGE)
     return size, pixels // size, (pixels - pixels // size * size) // 2
 
 
-def _missed(projector: Projector, y: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(views,) squares of what a few iterations leave of the projections."""
+def _residuals(projector: Projector, y: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Squared residuals (views,) after a few iterations."""
     problem = LeastSquares(projector, y, seen, nonnegative=False)
     *_, state = itertools.islice(SOLVERS["cgls"].run(problem), ITERATIONS)
     return np.sum(seen * (y - projector @ state.x.reshape(projector.grid.shape)) ** 2, axis=(1, 2))

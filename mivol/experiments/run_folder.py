@@ -1,9 +1,8 @@
-"""A run's folder while the run is at work: its record is kept true, and no other run writes into it.
+"""The folder of a run: its record, its metrics and its best iterate, protected from other runs.
 
-Conventions. A run folder holds ``run.json``, ``metrics.jsonl``, ``checkpoint.npz``, ``report.html``, and in folders of their
-own what came of the run: ``views/``, ``volumes/``, ``curves/``, and ``references/`` or ``film/``; a scan's
-has a ``preview.png`` while it goes on. Every file is written whole.
-What an earlier run recorded stays as it is until another one takes its first step; then it moves to ``earlier/``.
+Conventions. A run folder holds ``run.json``, ``metrics.jsonl``, ``checkpoint.npz``, ``report.html`` and folders of results:
+``views/``, ``volumes/``, ``curves/``, ``references/``, ``film/``. A running reconstruction also writes ``preview.png``. Every
+file is written whole. The files of an earlier run move to ``earlier/`` when a new run takes its first step.
 """
 
 from __future__ import annotations
@@ -40,16 +39,16 @@ CHECKPOINT = "checkpoint.npz"
 BEST = "best.npz"
 EARLIER = "earlier"
 KEPT = (RECORD, METRICS, CHECKPOINT, BEST, "report.html")
-"""What is kept of an earlier run in the same folder, in ``earlier/``."""
+"""Files that move to ``earlier/``."""
 
 
 class RunFolder:
-    """A folder, made where it is not there, and the record of the run at work in it.
+    """A folder, created if missing, and the record of the run in it.
 
     Attributes:
-        path: of the folder.
-        record: what ``run.json`` will say.
-        is_resumed: whether the run goes on from the folder's checkpoint.
+        path: path of the folder.
+        record: content of ``run.json``.
+        is_resumed: whether the run continues from the folder's checkpoint.
     """
 
     def __init__(self, path: Path, record: RunRecord, is_resumed: bool = False) -> None:
@@ -59,19 +58,19 @@ class RunFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """Where the run's checkpoint lies."""
+        """Path of the checkpoint."""
         return self.path / CHECKPOINT
 
     @property
     def best(self) -> Path:
-        """Where the run's best iterate lies."""
+        """Path of the best iterate."""
         return self.path / BEST
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
-        """Keep ``run.json`` true: "running" at first, "finished" or "stopped" in the end, with what stopped it.
+        """Keep ``run.json`` up to date: "running" first, "finished" or "stopped" in the end, with the reason of the stop.
 
-        The record of an earlier run is left alone by a run that is refused before it begins.
+        A run that is refused before its first step leaves the record of an earlier run unchanged.
 
         Raises:
             MivolError: another run uses the folder.
@@ -93,10 +92,10 @@ class RunFolder:
             self._write()
 
     def begin(self, iteration: int) -> None:
-        """From here on the folder is this run's: before its first step, when nothing can be refused any more.
+        """Take over the folder before the first step, when nothing can be refused any more.
 
         Args:
-            iteration: the last one that a resumed run keeps the metrics of; a new run keeps none.
+            iteration: last iteration whose metrics a resumed run keeps; a new run keeps none.
         """
         if self.is_resumed:
             rewind_metrics(self.path, iteration)
@@ -105,7 +104,7 @@ class RunFolder:
         self._write()
 
     def _holds_a_run(self) -> bool:
-        """Whether an earlier run has taken a step or has finished here, or was being put away when a process was killed."""
+        """Whether an earlier run has taken a step or finished here, or was being moved when its process was killed."""
         there = {name for name in KEPT if (self.path / name).exists()}
         if there != {RECORD}:
             return bool(there)
@@ -114,10 +113,10 @@ class RunFolder:
         return False
 
     def _put_away(self) -> None:
-        """Move what an earlier run recorded to ``earlier/``, so that the two are never mixed and neither is lost.
+        """Move the files of an earlier run to ``earlier/``, so that runs are never mixed and none is lost.
 
-        The run is in the folder or in ``earlier/`` as a whole whenever the process is killed: it is there twice (hard links,
-        where the file system knows them) before it goes here, its record first. Files without a record were put away before.
+        If the process is killed, the earlier run is complete in the folder or in ``earlier/``: the files are copied first (by
+        hard links if the file system has them), then removed, the record first. Files without a record have been moved before.
         """
         if self._has_begun:
             return
@@ -131,7 +130,7 @@ class RunFolder:
             (self.path / name).unlink()
 
     def _copy_to_earlier(self, names: list[str], coming: Path, going: Path) -> None:
-        """Make ``earlier/`` of these files in one rename, by way of two folders that are not there before or afterwards."""
+        """Make ``earlier/`` of these files in one rename, by way of two temporary folders."""
         coming.mkdir()
         for name in names:
             try:
@@ -149,7 +148,7 @@ class RunFolder:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a part of the run."""
+        """Measure the time of a stage."""
         start = time.perf_counter()
         try:
             yield
@@ -157,17 +156,17 @@ class RunFolder:
             self.record.timings[name] = time.perf_counter() - start
 
     def make(self, *names: str) -> None:
-        """Make folders in it.
+        """Create subfolders.
 
         Raises:
-            MivolError: what the system refuses (disk full, quota, permission ...).
+            MivolError: a disk error (disk full, quota, permission ...).
         """
         for name in names:
             with disk_faults(self.path / name, "room for a folder"):
                 (self.path / name).mkdir(exist_ok=True)
 
     def summary(self) -> str:
-        """What was saved, in a line: the results of the record."""
+        """Return the results of the record in one line."""
         words = []
         for name, value in self.record.results.items():
             quantity = find_quantity(name, self.record.units)
@@ -177,7 +176,7 @@ class RunFolder:
         return f"saved: {', '.join(words)}"
 
     def rewind(self, iteration: int) -> None:
-        """Drop the metrics after an iteration, so that a resumed run says nothing twice."""
+        """Remove the metrics after an iteration, so that a resumed run repeats none."""
         rewind_metrics(self.path, iteration)
 
     def append(self, iteration: int, seconds: float, **values: float) -> None:
@@ -185,7 +184,7 @@ class RunFolder:
         append_metrics(self.path, iteration, seconds, **values)
 
     def write_curves(self) -> None:
-        """Draw each number of the metrics against the iteration, as PNG."""
+        """Plot each number of the metrics against the iteration, as PNG."""
         self.make("curves")
         rows = read_metrics(self.path)
         names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
@@ -194,16 +193,16 @@ class RunFolder:
 
 
 JUDGES = {"nrmse": 1.0, "held_out_psnr": -1.0, "few_psnr": -1.0}
-"""What an iterate is judged by: the first of these that is measured. Times the sign, smaller is better."""
+"""Errors that judge an iterate, in order of preference. Smaller is better after multiplication by the sign."""
 
 
 @dataclass(frozen=True)
 class BestFiles:
-    """Files of their own format that hold the best iterate, where parameters alone do not say what it is.
+    """Files of the best iterate, for problems whose parameters do not hold all of the model.
 
     Attributes:
-        names: relative to the run folder.
-        write: writes them to the folder, of the newest iterate.
+        names: paths relative to the run folder.
+        write: function that writes the current model into a folder.
     """
 
     names: tuple[str, ...]
@@ -211,16 +210,15 @@ class BestFiles:
 
 
 class BestIterate:
-    """The iterate that was judged best so far, and the newest one.
+    """The best iterate so far, and the error of the newest iterate.
 
     Attributes:
-        run: the folder; ``best.npz`` in it says which iterate is best and holds its values by parameter, and a resumed run
-            goes on from there.
-        files: that hold the best iterate beside ``best.npz``; None for none.
-        judge: what it is judged by, a key of ``JUDGES``; "" before the first judgement, and where nothing is measured.
-        iteration: of the best one.
-        value: of the best one.
-        newest: value of the newest one.
+        run: run folder; its ``best.npz`` has the best iterate, from which a resumed run continues.
+        files: more files of the best iterate; None for none.
+        judge: name of the judging error, a key of ``JUDGES``; "" before the first judgement, and without any error.
+        iteration: iteration of the best iterate.
+        value: error of the best iterate.
+        newest: error of the newest iterate.
     """
 
     def __init__(self, run: RunFolder, files: BestFiles | None = None) -> None:
@@ -228,7 +226,7 @@ class BestIterate:
         self.run, self.judge, self.iteration, self.value, self.newest = run, "", 0, 0.0, 0.0
 
     def restore(self) -> None:
-        """Go on from what is there, where the run is resumed and something is."""
+        """Continue from the best iterate in the folder, if the run is resumed."""
         if self.run.is_resumed and self.run.best.exists():
             about = checkpoint.read(self.run.best, {})[1]
             self.judge, self.iteration, self.value = about["judge"], about["iteration"], about["value"]
@@ -236,12 +234,12 @@ class BestIterate:
             self.newest = told[-1] if told else self.value
 
     def see(self, iteration: int, errors: Mapping[str, float], values: Mapping[str, Any] | None = None) -> None:
-        """Judge an iterate, and keep it where it is the best so far.
+        """Judge an iterate, and keep the best.
 
         Args:
-            iteration: how many steps have been taken.
-            errors: what was measured of it, by name; without one of ``JUDGES`` it is not judged.
-            values: arrays by parameter; None where ``files`` hold all.
+            iteration: number of steps taken.
+            errors: errors by name; an iterate without an error of ``JUDGES`` is not judged.
+            values: arrays by parameter; None if ``files`` hold the iterate.
         """
         judge = next((name for name in JUDGES if np.isfinite(errors.get(name, np.nan))), "")
         if not judge:
@@ -257,21 +255,21 @@ class BestIterate:
 
     @property
     def is_newest(self) -> bool:
-        """Whether no iterate was better than the newest one."""
+        """Whether the newest iterate is the best."""
         return not self.judge or self.newest == self.value
 
     def read(self) -> dict[str, np.ndarray]:
-        """The best iterate, by parameter."""
+        """Read the best iterate, by parameter."""
         return checkpoint.read(self.run.best, {})[0]
 
     def settle(self) -> None:
-        """Remove the files of an iterate that is the last one as well, or of another run: once a fit is done."""
+        """After the fit, remove the files of the best iterate if the last iterate is the best."""
         if self.files is not None and self.is_newest:
             for name in self.files.names:
                 (self.run.path / name).unlink(missing_ok=True)
 
     def says(self) -> list[str]:
-        """A sentence where the fit has become worse since."""
+        """Return a sentence if an earlier iterate was better than the last."""
         if self.is_newest:
             return []
         quantity = QUANTITIES[self.judge]

@@ -15,18 +15,18 @@ from mivol import config
 from mivol.config import ScanExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Evaluation, FitKind, Say, Stages
-from mivol.experiments.projections import Projections, beam_of, fitted_views, held_out_views, make_data, make_grid
+from mivol.experiments.projections import Projections, describe_beam, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.scan_outputs import write_best, write_outputs
 from mivol.experiments.solver_choice import (
     check_grid,
     check_noise,
     choose_storage,
+    estimate_noise,
+    explain_prior,
     make_prior,
-    plan_of_prior,
-    settle_noise,
-    settle_solver,
-    strength_of,
+    resolve_solver,
+    tv_strength,
 )
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Course, Fit
@@ -71,10 +71,10 @@ class ScanFit(FitKind):
     def new_record(self) -> RunRecord:
         settings = self.settings
         name = settings.solve.solver
-        prior = ["rudin_1992", "huber_1964"] if strength_of(settings.solve) else []
+        prior = ["rudin_1992", "huber_1964"] if tv_strength(settings.solve) else []
         return RunRecord.new(
             settings.title,
-            method=f"{name} on line integrals of a {beam_of(settings)}",
+            method=f"{name} on line integrals of a {describe_beam(settings)}",
             config=config.resolved(settings),
             command=self.context.command,
             seeds={"noise": getattr(settings.data, "seed", 0)},
@@ -93,14 +93,14 @@ class ScanFit(FitKind):
         check_grid(self.settings, grid)
         self.data = make_data(self.settings, base, grid)
         views, rows, columns = self.data.y.shape
-        say(f"  scan      {views} views of {rows} x {columns} pixels, {beam_of(self.settings)}")
+        say(f"  scan      {views} views of {rows} x {columns} pixels, {describe_beam(self.settings)}")
         for note in self.data.notes:
             say(f"  data      {note}")
         self.record.notes += self.data.notes
         self.held_out = held_out_views(self.settings, views)
         self.kept = fitted_views(self.held_out, views)
         say(f"  held out  {len(self.held_out)} views")
-        solve, self.choices = settle_solver(self.settings.solve, Projector(self.data.geometry, grid, self.kept))
+        solve, self.choices = resolve_solver(self.settings.solve, Projector(self.data.geometry, grid, self.kept))
         self.settings = msgspec.structs.replace(self.settings, solve=solve)
         self.record.plan += self.choices
         self.projector = make_projector(self.settings, self.data, grid)
@@ -115,8 +115,8 @@ class ScanFit(FitKind):
         storage = choose_storage(self.settings.solve, self.problem.linear_problem.A)
         self.record.plan.append(storage.line)
         storage.apply(self.problem)
-        self.record.plan += settle_noise(self.problem, self.settings.solve, self.data)
-        self.noise = noise_of(self.settings, self.problem, self.data)
+        self.record.plan += estimate_noise(self.problem, self.settings.solve, self.data)
+        self.noise = expected_noise(self.settings, self.problem, self.data)
 
     def optimizer(self) -> LinearSolve:
         return make_solver(self.settings, self.noise)
@@ -130,7 +130,7 @@ class ScanFit(FitKind):
     def evaluate(self, fit: Fit) -> Evaluation:
         state, problem = fit.run.state, self.problem.linear_problem
         volume = voxel_means(state.x.reshape(problem.A.grid.shape), self.grid.shape)
-        errors = {"residual": state.residual_norm / norm_of(problem)}
+        errors = {"residual": state.residual_norm / data_norm(problem)}
         if self.data.truth is not None:
             errors["nrmse"] = nrmse(volume, self.data.truth)
         if self.noise:
@@ -145,11 +145,11 @@ class ScanFit(FitKind):
         last, state, problem, record = self.settings.solve.iterations, fit.run.state, self.problem.linear_problem, self.record
         if fit.run.stop_reason and fit.next_iteration < last:
             record.notes.append(f"stopped after iteration {fit.next_iteration} of {last}: {fit.run.stop_reason}")
-        record.results = {"iterations": float(state.iteration), "residual": state.residual_norm / norm_of(problem)}
-        record.plan += plan_of_prior(problem.prior, state)
+        record.results = {"iterations": float(state.iteration), "residual": state.residual_norm / data_norm(problem)}
+        record.plan += explain_prior(problem.prior, state)
         if self.data.is_noise_known:
             record.results["discrepancy"] = state.residual_norm / expected_residual_norm(problem, self.settings.solve.name)
-        self.data = without_drift(self.problem, self.data, self.held_out, state)
+        self.data = subtract_drift(self.problem, self.data, self.held_out, state)
 
     def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
         volume = fit.run.state.x.reshape(self.projector.grid.shape)
@@ -164,7 +164,7 @@ class ScanFit(FitKind):
         cheap = msgspec.structs.replace(settings, solve=msgspec.structs.replace(settings.solve, start="empty"))
         problem = make_problem(cheap, self.projector, self.data, self.kept)
         storage = choose_storage(settings.solve, problem.linear_problem.A).line
-        make_solver(settings, noise_of(settings, problem, self.data)).begin(problem)
+        make_solver(settings, expected_noise(settings, problem, self.data)).begin(problem)
         for line in (*self.choices, storage):
             say(f"  {line.choice}, because {line.reason}")
         if settings.solve.tv:
@@ -173,10 +173,10 @@ class ScanFit(FitKind):
 
 
 def make_projector(chosen: config.ScanExperiment, data: Projections, grid: VoxelGrid) -> Projector:
-    """All rays, and the unknowns that they cross.
+    """Return the projector of all rays through the unknowns.
 
     Raises:
-        MivolError: more unknowns than the solver can keep in memory.
+        MivolError: more unknowns than memory.
     """
     unknowns = subdivide_grid(grid, chosen.solve.supersampling, data.geometry)
     check_grid(chosen, unknowns)
@@ -184,7 +184,7 @@ def make_projector(chosen: config.ScanExperiment, data: Projections, grid: Voxel
 
 
 def make_problem(chosen: config.ScanExperiment, projector: Projector, data: Projections, kept: np.ndarray) -> ProjectionProblem:
-    """What the solver minimises, over the views that are fitted.
+    """Return the solver's problem for the fitted views.
 
     Raises:
         MivolError: ML-TR without counts.
@@ -195,31 +195,31 @@ def make_problem(chosen: config.ScanExperiment, projector: Projector, data: Proj
     x0 = start_volume(wanted, a, data, kept)
     if ALL_SOLVERS[wanted.name].problem is LeastSquares:
         least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, wanted.nonnegative, prior)
-        return ProjectionProblem(least_squares, times=times_of(data)[kept] if getattr(chosen.data, "drift", 0) else None)
+        return ProjectionProblem(least_squares, times=view_times(data)[kept] if getattr(chosen.data, "drift", 0) else None)
     if data.quanta is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
     quanta = data.quanta.of_views(kept)
     return ProjectionProblem(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
 
 
-def times_of(data: Projections) -> np.ndarray:
-    """When each view was taken, from -1 to 1: views are taken one after the other."""
+def view_times(data: Projections) -> np.ndarray:
+    """Times of the views from -1 to 1, evenly spaced."""
     return np.linspace(-1.0, 1.0, len(data.y))
 
 
-def without_drift(problem: ProjectionProblem, data: Projections, held_out: np.ndarray, state: SolverState) -> Projections:
-    """Line integrals of the object alone, the drift of the light fitted to the views that are not held out."""
+def subtract_drift(problem: ProjectionProblem, data: Projections, held_out: np.ndarray, state: SolverState) -> Projections:
+    """Subtract the drift of the light, fitted to the views that are not held out, from the line integrals."""
     if problem.times is None:
         return data
     drift = fit_drift(problem.linear_problem, state.x, problem.times)
-    return replace(data, y=data.y - drift.eval(times_of(data)))
+    return replace(data, y=data.y - drift.eval(view_times(data)))
 
 
 def start_volume(wanted: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
-    """Where an iterative solver begins: None for an empty volume, else by fbp or fdk, at or above 0 where that is asked for.
+    """Return the first volume of an iterative solver, nonnegative if requested; None for an empty volume.
 
     Raises:
-        MivolError: what the direct method refuses.
+        MivolError: geometries that filtered back-projection refuses.
     """
     if wanted.start == "empty" or wanted.name in DIRECT:
         return None
@@ -228,11 +228,11 @@ def start_volume(wanted: config.SolveSettings, a: Projector, data: Projections, 
     return np.maximum(x, 0) if wanted.nonnegative else x
 
 
-def noise_of(chosen: config.ScanExperiment, problem: ProjectionProblem, data: Projections) -> float | None:
-    """The norm of the residual that noise alone would leave; None where the noise is not known.
+def expected_noise(chosen: config.ScanExperiment, problem: ProjectionProblem, data: Projections) -> float | None:
+    """Norm of the residual that the noise alone leaves; None if the noise is unknown.
 
     Raises:
-        MivolError: it is not known, and the solver is to stop by it.
+        MivolError: a stop by an unknown noise.
     """
     if chosen.solve.discrepancy:
         check_noise("solve.discrepancy", data)
@@ -240,7 +240,7 @@ def noise_of(chosen: config.ScanExperiment, problem: ProjectionProblem, data: Pr
 
 
 def make_solver(chosen: config.ScanExperiment, noise: float | None) -> LinearSolve:
-    """The solver with its settings, which stops by the noise where that is asked for."""
+    """Return the solver with its settings; it stops at the noise if requested."""
     wanted = chosen.solve
     shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     if wanted.discrepancy:
@@ -248,8 +248,8 @@ def make_solver(chosen: config.ScanExperiment, noise: float | None) -> LinearSol
     return LinearSolve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
 
 
-def norm_of(task: LeastSquares | PoissonCounts) -> float:
-    """|W^(1/2) b|, or the expected norm of Pearson's residuals, sqrt(m)."""
+def data_norm(task: LeastSquares | PoissonCounts) -> float:
+    """|W^(1/2) b|, or sqrt(m), the expected norm of Pearson's residuals."""
     if isinstance(task, PoissonCounts):
         return float(np.sqrt(np.size(task.counts) if task.used is None else np.sum(task.used)))
     return float(np.sqrt(np.sum(task.weights * task.b**2))) or 1.0

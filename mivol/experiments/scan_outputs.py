@@ -1,4 +1,4 @@
-"""What a reconstruction from projections leaves in its folder: volumes, a sinogram, views held out, curves, results."""
+"""The outputs of a reconstruction from projections: volumes, sinogram, held-out views, curves and results."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mivol.experiments.camera_pictures import pictures_of_scan
+from mivol.experiments.camera_pictures import draw_scanner
 from mivol.experiments.film import film_of_volume
 from mivol.experiments.projections import Projections
 from mivol.experiments.run_folder import BestIterate, RunFolder
@@ -24,12 +24,12 @@ def write_outputs(
     """Write volume, sinogram, held-out views and curves, and put them and the results on record.
 
     Args:
-        run: where it is written; its results have the iterations already.
-        projector: of all views.
-        grid: the voxels that were asked for; the projector's may divide them.
-        data: what was measured.
-        held_out: numbers of the views that were not fitted.
-        x: (Z, Y, X) of the projector's grid, what was found.
+        run: run folder; its record has the iterations already.
+        projector: projector of all views.
+        grid: requested voxels; the projector's grid may divide them.
+        data: projections.
+        held_out: indices of the held-out views.
+        x: reconstruction (Z, Y, X) on the projector's grid.
     """
     run.make("views", "volumes")
     predicted, record = projector @ x, run.record
@@ -37,14 +37,14 @@ def write_outputs(
     record.volumes += write_grids(run.path, grid, volume, data.truth)
     record.images += film_of_volume(run, volume[..., None], tuple(float(edge) for edge in grid.extent), "z", "sigma_t")
     middle = data.y.shape[1] // 2
-    noise = noise_of(data)
+    noise = line_noise(data)
     said = f"row {middle + 1} of {data.y.shape[1]}"
     record.images += write_pair(run.path, SINOGRAM, Pair(data.y[:, middle], predicted[:, middle], noise[:, middle]), said)
     if data.y.shape[1] > 1:
         for view in held_out[:4]:
             pair = Pair(*(part[view, ::-1] for part in (data.y, predicted, noise)))
             record.images += write_pair(run.path, f"view {view}", pair, held_out=True)
-    record.images += pictures_of_scan(run.path, data.geometry, grid, held_out)
+    record.images += draw_scanner(run.path, data.geometry, grid, held_out)
     run.write_curves()
     record.results["views"] = float(projector.n_views - len(held_out))
     if data.truth is not None:
@@ -61,15 +61,15 @@ def write_best(run: RunFolder, grid: VoxelGrid, best: BestIterate) -> None:
 
 
 class Pair(NamedTuple):
-    """Line integrals of one shape: measured, of the reconstruction, and their standard deviation; NaN where it is not known."""
+    """Line integrals of one shape: measured, predicted, and their standard deviation; NaN if unknown."""
 
     measured: np.ndarray
     predicted: np.ndarray
     noise: np.ndarray
 
 
-def noise_of(data: Projections) -> np.ndarray:
-    """Standard deviations of line integrals: inf where a pixel is not used, NaN where only their ratios are known."""
+def line_noise(data: Projections) -> np.ndarray:
+    """Standard deviations of the line integrals: inf for unused pixels, NaN if only ratios of weights are known."""
     if not data.is_noise_known:
         return np.full(data.y.shape, np.nan)
     with np.errstate(divide="ignore"):
@@ -77,7 +77,7 @@ def noise_of(data: Projections) -> np.ndarray:
 
 
 def write_pair(folder: Path, name: str, pair: Pair, caption: str = "", held_out: bool = False) -> list[Image]:
-    """Measured line integrals beside those of the reconstruction, and their noise, as layers of one file."""
+    """Write measured and predicted line integrals and their noise as layers of one file."""
     path = f"views/{name.replace(' ', '_')}.exr"
     layers = {"Y": pair.predicted, "reference.Y": pair.measured}
     roles = {"render": "Y", "reference": "reference.Y"}
@@ -89,7 +89,7 @@ def write_pair(folder: Path, name: str, pair: Pair, caption: str = "", held_out:
 
 
 def write_grids(folder: Path, grid: VoxelGrid, x: np.ndarray, truth: np.ndarray | None) -> list[Volume]:
-    """The reconstruction as .vol and .npz; the truth beside it."""
+    """Write the reconstruction as .vol and .npz, and the truth if known."""
     found, size = [], tuple(float(edge) for edge in grid.extent)
     for role, values in {"reconstruction": x, **({"truth": truth} if truth is not None else {})}.items():
         write_volume(folder / f"volumes/{role}.vol", values, grid.to_world)

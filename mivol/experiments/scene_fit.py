@@ -20,19 +20,19 @@ from mivol.errors import MivolError
 from mivol.experiments.fit_kind import FitKind, Say, Stages
 from mivol.experiments.references import (
     References,
-    camera_of,
     check_truth,
     find_references,
     find_sensors,
-    holding,
+    hold_values,
     load_experiment_scene,
     make_truth,
-    put,
     read_references,
+    set_parameter,
+    to_sensor,
 )
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.scene_outputs import SceneOutputs
-from mivol.experiments.start import Start, make_starts, place_of
+from mivol.experiments.start import Start, grid_to_world, make_starts
 from mivol.optim.events import upsample
 from mivol.optim.loop import Course, Fit
 from mivol.optim.optimizer import Optimizer
@@ -94,7 +94,7 @@ class SceneFit(FitKind):
         self.loaded = load_experiment_scene(self.settings, self.context.base)
         scene = self.loaded.scene
         self.sensors, self.held_out = find_sensors(self.settings, scene)
-        width, height = (int(n) for n in camera_of(self.sensors[0]).film().crop_size())
+        width, height = (int(n) for n in to_sensor(self.sensors[0]).film().crop_size())
         held_out = f", {len(self.held_out)} of them held out" if self.held_out else ""
         say(f"  views     {len(self.sensors)} of {width} x {height} pixels{held_out}")
         self.truth = make_truth(self.settings, self.context.base, scene)
@@ -117,7 +117,7 @@ class SceneFit(FitKind):
 
     def prepare(self, run: RunFolder) -> None:
         self.measure = SceneErrors(self.settings, self.references, self.truth)
-        self.record.units = units(self.settings, self.problem)
+        self.record.units = find_units(self.settings, self.problem)
         self.record.notes += self.improve_starts(run)
         plan = plan_renders(self.settings, self.problem)
         self.record.plan = list(self.depth_plan)
@@ -136,9 +136,9 @@ class SceneFit(FitKind):
         notes = []
         for sought in self.settings.parameter:
             if sought.start_fit == "emission":
-                place = place_of(sought.key, self.problem.scene)
+                place = grid_to_world(sought.key, self.problem.scene)
                 start = find_emissive_start(self.problem, sought.key, place, self.settings.optimiser, self.settings.seed)
-                put(self.problem.params, sought.key, start.value)
+                set_parameter(self.problem.params, sought.key, start.value)
                 self.problem.set_reals(self.problem.initial_reals())
                 notes.append(f"{sought.key} {start.description}")
         self.context.progress.say(notes)
@@ -189,11 +189,11 @@ class SceneFit(FitKind):
         problem.rehearse()
         params = mi.traverse(scene)
         for start in self.starts:
-            put(params, start.parameter.name, start.value)
+            set_parameter(params, start.parameter.name, start.value)
         if self.truth is not None:
-            put(params, settings.truth.key, self.truth)
+            set_parameter(params, settings.truth.key, self.truth)
         say(f"  holding   {'the truth' if self.truth is not None else 'the start'}, in what follows")
-        return explain_scene(scene, settings.fit.max_depth, camera_of(self.sensors[0]))
+        return explain_scene(scene, settings.fit.max_depth, to_sensor(self.sensors[0]))
 
 
 def resolve_depth(
@@ -212,8 +212,8 @@ def resolve_depth(
     if truth is None and not isinstance(settings.reference, Rendered):
         depth, reason = -1, "the references are files, and what they show is not known"
     else:
-        with nullcontext() if truth is None else holding(loaded.scene, settings.truth.key, truth):
-            sensor = camera_of(next(iter(settings.views.sensors(loaded.scene))))
+        with nullcontext() if truth is None else hold_values(loaded.scene, settings.truth.key, truth):
+            sensor = to_sensor(next(iter(settings.views.sensors(loaded.scene))))
             answer = find_sufficient_depth(loaded.scene, sensor, Settings(), settings.fit.noise)
         depth, reason = answer.depth, answer.reason
     fit = msgspec.structs.replace(settings.fit, max_depth=depth)
@@ -246,7 +246,7 @@ def make_white_references(sensors: Sequence[Any], held_out: frozenset[int]) -> R
     """White images in place of the references that a fit would render."""
     references = References(held_out)
     for sensor in sensors:
-        width, height = camera_of(sensor).film().crop_size()
+        width, height = to_sensor(sensor).film().crop_size()
         references.add(sensor, np.ones((int(height), int(width), 1 if "mono" in mi.variant() else 3)))
     return references
 
@@ -257,7 +257,7 @@ def make_problem(
     """Make the problem of an experiment, and put the starts into the scene."""
     params = mi.traverse(scene)
     for start in starts:
-        put(params, start.parameter.name, start.value)
+        set_parameter(params, start.parameter.name, start.value)
     options = {"spp": settings.fit.spp, "samples_per_pass": settings.fit.samples_per_pass, "seed": settings.seed}
     parameters = [start.parameter for start in starts]
     problem = SceneProblem(scene, references.fitted, parameters, integrator, settings.loss, **options)
@@ -295,7 +295,7 @@ class SceneErrors:
             if tuple(volume.shape) != self.truth.shape:
                 volume = upsample(volume, self.truth.shape[:3])
             errors["nrmse"] = nrmse(np.asarray(volume), self.truth)
-        return errors | numbers(problem)
+        return errors | scalar_values(problem)
 
     def psnr(self, problem: SceneProblem, batch: RenderBatch) -> list[float]:
         """PSNR [dB] of each view of a batch, rendered from the current scene."""
@@ -304,13 +304,13 @@ class SceneErrors:
         return [psnr(render, reference) for render, reference in pairs]
 
 
-def numbers(problem: SceneProblem) -> dict[str, float]:
+def scalar_values(problem: SceneProblem) -> dict[str, float]:
     """Current numbers of all parameters that are neither grids nor images, by key and index."""
     values = {name: np.asarray(value) for name, value in problem.values().items() if value.ndim == 1}
     return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}
 
 
-def units(settings: SceneExperiment, problem: SceneProblem) -> dict[str, str]:
-    """Units of the loss and of :func:`numbers`."""
+def find_units(settings: SceneExperiment, problem: SceneProblem) -> dict[str, str]:
+    """Units of the loss and of :func:`scalar_values`."""
     known = {parameter.name: parameter.unit for parameter in problem.parameters}
-    return {"loss": settings.loss.unit} | {name: known[name.rpartition("[")[0]] for name in numbers(problem)}
+    return {"loss": settings.loss.unit} | {name: known[name.rpartition("[")[0]] for name in scalar_values(problem)}

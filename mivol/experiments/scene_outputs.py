@@ -1,8 +1,8 @@
-"""What a fit of a scene leaves in its folder: each view beside its reference, volumes, images, curves and results.
+"""The outputs of a scene fit: views beside their references, volumes, images, curves and results.
 
-Conventions. ``views/`` has one OpenEXR file a view, with the layers ``reference`` and ``standard_error`` (of their difference,
-where that of the reference is known) beside the render, and PNGs; ``volumes/`` has ``.vol`` and ``.npz``; ``images/`` has
-textures and skies that were looked for.
+Conventions. ``views/`` has one OpenEXR file per view, with the layers ``reference`` and ``standard_error`` (of the difference,
+if the reference's is known) beside the render, and PNGs. ``volumes/`` has ``.vol`` and ``.npz``. ``images/`` has fitted
+textures and skies.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.config import SceneExperiment, Sought
-from mivol.experiments.camera_pictures import pictures_of_views
+from mivol.experiments.camera_pictures import draw_view_cameras
 from mivol.experiments.film import film_of_volume
 from mivol.experiments.references import References
 from mivol.experiments.run_folder import BestIterate, RunFolder
-from mivol.experiments.start import edges_of, place_of, unit_of
+from mivol.experiments.start import box_edges, find_unit, grid_to_world
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.loop import Fit
 from mivol.optim.parameters import GRID
@@ -29,15 +29,15 @@ from mivol.validate.moments import BATCHES, Moments
 
 @dataclass(frozen=True)
 class SceneOutputs:
-    """What is written of a fit of a scene.
+    """Outputs of a scene fit.
 
     Attributes:
-        chosen: the experiment's settings.
-        run: where it is written, and the record that lists it.
-        fit: the fit, done.
+        chosen: settings of the experiment.
+        run: run folder with the record.
+        fit: the finished fit.
         seen: the references.
-        truth: the true volume, where known.
-        best: the best iterate, where it is not the last.
+        truth: true volume, if known.
+        best: the best iterate.
     """
 
     chosen: SceneExperiment
@@ -57,7 +57,7 @@ class SceneOutputs:
             record.volumes += self.write_grid(sought)
             record.images += self.write_image(sought.key)
         views = {"train": self.seen.fitted, "held_out": self.seen.held_out}
-        record.images += pictures_of_views(self.run.path, fit.problem.scene, views)
+        record.images += draw_view_cameras(self.run.path, fit.problem.scene, views)
         self.run.write_curves()
         record.results = {
             **fit.latest_errors(),
@@ -68,10 +68,11 @@ class SceneOutputs:
         }
 
     def render_last(self, view: View, number: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """The render of a view, and the standard error of its difference from the reference; None where only one is known.
+        """Render a view; return it with the standard error of its difference from the reference, None if the reference's is
+        unknown.
 
-        The render's own noise counts: where no path of the reference saw a light that the render did see, at the edge of
-        what is lit, it is the larger part. It is known from ``BATCHES`` renders of a sample or more.
+        The render's own noise counts. At the edge of a lit region, the render may see light that no path of the reference has
+        found, and its noise is then the larger part. It is estimated from ``BATCHES`` renders of at least one sample.
         """
         render, spp = self.fit.problem.render, self.chosen.fit.spp_shown or self.chosen.fit.spp
         seed, error = (self.chosen.seed, 0, number, FINAL), self.seen.standard_errors.get(view.name)
@@ -82,52 +83,53 @@ class SceneOutputs:
         return batches.mean.astype(np.float32), np.sqrt(np.square(error) + batches.variance_of_mean).astype(np.float32)
 
     def write_view(self, view: View, number: int) -> list[Image]:
-        """One view: the render beside its reference."""
+        """Write a render beside its reference."""
         stem = f"views/{view.name.replace(' ', '_')}"
         image, error = self.render_last(view, number)
         reference = np.asarray(view.reference)
         parts = {"render": ("", image), "reference": ("reference", reference)}
         if error is not None:
             parts["standard error"] = "standard_error", error
-        planes = {key: plane for part in parts.values() for key, plane in named(*part).items()}
+        planes = {key: plane for part in parts.values() for key, plane in to_exr_layer(*part).items()}
         write_exr(self.run.path / f"{stem}.exr", planes)
         write_png(self.run.path / f"{stem}.png", image)
         write_png(self.run.path / f"{stem}_reference.png", reference)
         about = {"view": view.name, "held_out": any(view is other for other in self.seen.held_out)}
-        return [Image(path=f"{stem}.exr", role=role, layer=layer_of(*part), **about) for role, part in parts.items()]
+        return [Image(path=f"{stem}.exr", role=role, layer=layer_name(*part), **about) for role, part in parts.items()]
 
     def write_grid(self, sought: Sought) -> list[Volume]:
-        """A parameter that is a grid, as .npz and .vol where it lies in the scene, and as a film; the truth beside it.
+        """Write a fitted grid as .npz and .vol at its place in the scene, and as a film, and the truth if known.
 
-        A .vol has room for boxes along the axes only: of a turned grid it holds the unit cube, which the scene places.
+        A .vol holds only boxes along the axes. For a rotated grid it has the unit cube, which the scene places.
         """
         value = np.asarray(self.fit.values()[sought.key])
         if value.ndim != GRID:
             return []
-        place = place_of(sought.key, self.fit.problem.scene)
+        place = grid_to_world(sought.key, self.fit.problem.scene)
         is_along_axes = np.array_equal(place[:3, :3], np.diag(np.abs(np.diagonal(place)[:3])))
         quantity = next((word for word in ("sigma_t", "sigma_a", "sigma_s", "albedo") if word in sought.key), "value")
         grids = {"reconstruction": value}
         if self.truth is not None and self.chosen.truth.key == sought.key:
             grids["truth"] = self.truth
         found = []
-        unit = unit_of(sought)
+        unit = find_unit(sought)
         for role, grid in grids.items():
             stem = f"volumes/{sought.key.replace('.', '_')}_{role}"
             write_volume(self.run.path / f"{stem}.vol", grid, place if is_along_axes else np.eye(4))
             write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": unit})
-            about = {"quantity": quantity, "unit": unit, "size": edges_of(place), "caption": sought.key}
+            about = {"quantity": quantity, "unit": unit, "size": box_edges(place), "caption": sought.key}
             found.append(Volume(path=f"{stem}.npz", role=role, **about))
-        self.run.record.images += film_of_volume(self.run, value, edges_of(place), "y", quantity)
+        self.run.record.images += film_of_volume(self.run, value, box_edges(place), "y", quantity)
         if not self.best.is_newest:
             stem = f"volumes/{sought.key.replace('.', '_')}_best"
             write_volume(self.run.path / f"{stem}.npz", self.best.read()[sought.key], place)
         return found
 
     def write_image(self, key: str) -> list[Image]:
-        """A parameter that is an image (texture, sky), as .exr of linear values and .png.
+        """Write a fitted image (texture, sky) as .exr of linear values and as .png.
 
-        Mitsuba's ``envmap`` repeats a column at either side of what it was given, which another ``envmap`` would do again.
+        Mitsuba's ``envmap`` repeats a column at either side of its input. The output has no repeated columns, since another
+        ``envmap`` would repeat them again.
         """
         value = np.asarray(self.fit.values()[key])
         if value.ndim != 3 or value.shape[2] not in (1, 3):
@@ -136,16 +138,16 @@ class SceneOutputs:
         image = value[:, 1:-1] if is_sky else value
         self.run.make("images")
         stem = f"images/{key.replace('.', '_')}"
-        write_exr(self.run.path / f"{stem}.exr", named("", image))
+        write_exr(self.run.path / f"{stem}.exr", to_exr_layer("", image))
         write_png(self.run.path / f"{stem}.png", image)
         return [Image(path=f"{stem}.png", role="picture", caption=f"{key} as found, in {stem}.exr")]
 
 
-def named(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:
-    """Channels of an image (height, width, 1 or 3), as an OpenEXR layer."""
-    return {layer: image} if image.shape[2] == 3 else {layer_of(layer, image): image[..., 0]}
+def to_exr_layer(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:
+    """Channels of an image (height, width, 1 or 3) as an OpenEXR layer."""
+    return {layer: image} if image.shape[2] == 3 else {layer_name(layer, image): image[..., 0]}
 
 
-def layer_of(layer: str, image: np.ndarray) -> str:
-    """What a record calls a layer: single channels have a name of their own."""
+def layer_name(layer: str, image: np.ndarray) -> str:
+    """Name of a layer in the record; single channels have a name of their own."""
     return layer if image.shape[2] == 3 else f"{layer}.Y".lstrip(".")

@@ -1,7 +1,7 @@
-"""What a script needs in a line each: a problem from a scene and pictures, its optimisation, a field from photographs.
+"""Functions for scripts: a problem from a scene and images, its optimization, and fits of photographs.
 
-Conventions. Everything here is made of parts that can be had by themselves (``mivol.optim``, ``mivol.experiments``); nothing is
-printed, and nothing is written but by :func:`fit_photographs` and :func:`fit_gaussians`.
+Conventions. Each function combines parts of ``mivol.optim`` and ``mivol.experiments``. Nothing is printed, and only
+:func:`fit_photographs` and :func:`fit_gaussians` write files.
 """
 
 from __future__ import annotations
@@ -37,27 +37,28 @@ from mivol.scene.load import SceneSource, load_scene
 __all__ = ["Problem", "explain", "fit_gaussians", "fit_photographs", "optimize"]
 
 Reference: TypeAlias = "np.ndarray | mi.TensorXf | str | os.PathLike[str]"
-"""A picture: an array (height, width, channels) of linear radiance, or the OpenEXR file of one."""
+"""An image: an array (height, width, channels) of linear radiance, or an OpenEXR file."""
 
 
 class Problem(SceneProblem):
-    """A scene, pictures of it, and what is looked for.
+    """Scene parameters to fit to images.
 
     Args:
-        scene: a scene, a dict, or the path of its XML.
-        references: one picture a sensor; or a scene, a dict or the path of its XML, which is rendered from the same sensors
-            by its own integrator.
-        parameters: what is looked for: keys of ``mi.traverse(scene)``, or :class:`Parameter` with domain, rate and priors.
+        scene: a scene, a dict, or the path of an XML file.
+        references: one image per sensor; or a scene, a dict or the path of an XML file, rendered from the same sensors by its
+            own integrator.
+        parameters: keys of ``mi.traverse(scene)``, or :class:`Parameter` with domain, rate and priors.
         loss: one of ``mivol.optim.losses``, or any function (image, reference) -> one number, of tensors (height, width,
             channels).
-        integrator: that differentiates; None takes the scene's own where that is mivol's, else mivol's at the same depth.
-        sensors: where the pictures were taken from; None: the scene's own sensors.
+        integrator: an integrator with derivatives; None for the scene's own if it is mivol's, else for mivol's at the same
+            depth.
+        sensors: sensors of the images; None for the scene's own sensors.
         spp: samples per pixel of an image, and of its derivative.
         seed: root of all random numbers.
 
     Raises:
-        MivolError: another number of pictures than sensors, pictures of another size than their sensors or not finite, or a
-            key that is not there.
+        MivolError: numbers of images and sensors that differ, images of another size than their sensors or not finite, or an
+            unknown key.
 
     Example:
         >>> problem = mivol.Problem("scene.xml", ["a.exr", "b.exr"], ["smoke.interior_medium.sigma_t.data"])
@@ -80,13 +81,13 @@ class Problem(SceneProblem):
         looked_from = list(loaded.sensors() if sensors is None else sensors)
         sought = make_parameters(parameters)
         views = make_views(references, looked_from)
-        super().__init__(loaded, views, sought, integrator or ours_for(loaded), loss, spp, seed=seed)
+        super().__init__(loaded, views, sought, integrator or choose_own_integrator(loaded), loss, spp, seed=seed)
 
 
-def ours_for(scene: mi.Scene) -> mi.Integrator:
-    """The scene's own integrator where it is mivol's and shows colours only, else mivol's at the same depth.
+def choose_own_integrator(scene: mi.Scene) -> mi.Integrator:
+    """Return the scene's integrator if it is mivol's and renders colours only, else mivol's at the same depth.
 
-    Pictures have no AOVs to compare with.
+    Images to fit have no AOVs.
     """
     own = scene.integrator()
     if hasattr(own, "session") and not list(own.aov_names()):
@@ -95,10 +96,10 @@ def ours_for(scene: mi.Scene) -> mi.Integrator:
 
 
 def make_parameters(parameters: Sequence[str | Parameter]) -> list[Parameter]:
-    """What is looked for, each with its settings.
+    """Return the parameters with their settings.
 
     Raises:
-        MivolError: one key without a list about it, or what is neither a key nor a :class:`Parameter`.
+        MivolError: one key without a list, or an entry that is neither a key nor a :class:`Parameter`.
     """
     if isinstance(parameters, str | Parameter):
         raise MivolError(f"parameters: found a single {type(parameters).__name__}, expected a list of them; put it in a list.")
@@ -109,11 +110,11 @@ def make_parameters(parameters: Sequence[str | Parameter]) -> list[Parameter]:
     return [Parameter(one) if isinstance(one, str) else one for one in parameters]
 
 
-def scene_of(references: SceneSource | mi.Scene) -> mi.Scene:
-    """The scene that references are rendered of.
+def load_reference_scene(references: SceneSource | mi.Scene) -> mi.Scene:
+    """Load the scene from which references are rendered.
 
     Raises:
-        MivolError: the path of a single picture, which stands in a list, or as :func:`mivol.scene.load.load_scene`.
+        MivolError: the path of a single image outside a list, or as :func:`mivol.scene.load.load_scene`.
     """
     if isinstance(references, str | os.PathLike) and Path(references).suffix.lower() != ".xml":
         raise MivolError(
@@ -124,29 +125,29 @@ def scene_of(references: SceneSource | mi.Scene) -> mi.Scene:
 
 
 def make_views(references: Sequence[Reference] | SceneSource | mi.Scene, sensors: Sequence[mi.Sensor]) -> list[View]:
-    """Sensors with what they saw.
+    """Return the sensors with their images.
 
     Raises:
-        MivolError: another number of pictures than sensors, or as :func:`scene_of`.
+        MivolError: numbers of images and sensors that differ, or as :func:`load_reference_scene`.
     """
     if isinstance(references, str | os.PathLike | Mapping | mi.Scene):
-        scene = scene_of(references)
+        scene = load_reference_scene(references)
         own = scene.integrator()
-        integrator = ours_for(scene) if own is None or list(own.aov_names()) else own
+        integrator = choose_own_integrator(scene) if own is None or list(own.aov_names()) else own
         with dr.suspend_grad():
             seen = [mi.render(scene, sensor=sensor, integrator=integrator, seed=n) for n, sensor in enumerate(sensors)]
     else:
-        seen = [picture(one) for one in references]
+        seen = [to_image_tensor(one) for one in references]
     if len(seen) != len(sensors):
         raise MivolError(f"found {len(seen)} references for {len(sensors)} sensors: give one for each (sensors=...).")
     return [View(f"view {number}", sensor, one) for number, (sensor, one) in enumerate(zip(sensors, seen, strict=True))]
 
 
-def picture(reference: Reference) -> mi.TensorXf:
-    """A reference as a tensor (height, width, channels); of a file its colour.
+def to_image_tensor(reference: Reference) -> mi.TensorXf:
+    """Return a reference as a tensor (height, width, channels); a file gives its colours.
 
     Raises:
-        MivolError: a file that cannot be read, or an array that is no picture.
+        MivolError: a file that cannot be read, or an array of another shape.
     """
     if isinstance(reference, str | os.PathLike):
         values = stack_layers(read_exr(Path(reference))[0])[""][..., :3]
@@ -166,21 +167,21 @@ def optimize(
     measure: Measure | None = None,
     observer: Callable[[Fit], None] = lambda fit: None,
 ) -> Fit:
-    """Minimise; the scene holds the result afterwards.
+    """Minimize the loss of a problem; the scene holds the result afterwards.
 
     Args:
-        problem: what is minimised.
-        optimiser: one of mivol's, one of ``mi.ad``, or your own with a method ``begin(problem)``; None: Adam.
-        iterations: at most so many.
-        measure: errors by name, of what the problem holds at the end.
-        observer: called after each iteration.
+        problem: the problem.
+        optimiser: an optimizer of mivol or of ``mi.ad``, or any object with a method ``begin(problem)``; None for Adam.
+        iterations: largest number of iterations.
+        measure: function of the problem that returns errors by name, called at the end.
+        observer: function of the fit, called after each iteration.
 
     Returns:
-        The fit: ``fit.values()`` are what was found, ``fit.history`` the losses.
+        The fit: ``fit.values()`` has the parameters, ``fit.history`` the losses.
 
     Raises:
-        MivolError: a loss that is not finite, or what cannot be rendered.
-        KeyboardInterrupt: Ctrl-C; the scene holds what was found so far.
+        MivolError: a loss that is not finite, or a scene that cannot be rendered.
+        KeyboardInterrupt: Ctrl-C; the scene holds the newest parameters.
     """
     return reconstruct(problem, to_optimizer(optimiser or Adam()), iterations, measure=measure, observer=observer)
 
@@ -191,17 +192,17 @@ def explain(
     sensor: int | mi.Sensor = 0,
     noise: float | None = None,
 ) -> str:
-    """Say what a scene needs and what will be done about it, before more than a small preview is rendered.
+    """Say what a scene needs and how mivol would render it, before more than a small preview is rendered.
 
     Args:
-        scene: a scene, a dict, or the path of its XML.
-        max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
-        sensor: the sensor asked about, or its number.
-        noise: measure which ``max_depth`` leaves out less than this noise of a pixel, over the mean radiance
-            (:mod:`mivol.scene.previews`); None to measure nothing.
+        scene: a scene, a dict, or the path of an XML file.
+        max_depth: longest path; None for the settings of the scene's own integrator.
+        sensor: a sensor, or its index.
+        noise: noise of a pixel over the mean radiance; the smallest ``max_depth`` that neglects less is measured
+            (:mod:`mivol.scene.depth_preview`); None to measure nothing.
 
     Returns:
-        Facts, choices with their reasons, and at the end what is refused, where something is.
+        Facts, choices with their reasons, and the reason of a refusal.
 
     Raises:
         MivolError: as :func:`mivol.scene.load.load_scene`.
@@ -216,21 +217,21 @@ def fit_photographs(
     settings: Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> SphericalGrid:
-    """Fit a radiance field to posed photographs; ``field.npz`` and its page lie in the run folder.
+    """Fit a radiance field to posed photographs; the run folder has ``field.npz`` and the report page.
 
     Args:
         photographs: a folder, or its file of cameras (Blender, nerfstudio, instant-ngp, COLMAP).
         output: run folder.
-        settings: of the TOML file by dotted key, as ``{"field.preset": "tiny", "photos.background": "white"}``.
-        progress: who is told how it goes; None: nobody.
+        settings: settings of the TOML file by dotted key, as ``{"field.preset": "tiny", "photos.background": "white"}``.
+        progress: display of the run's progress; None for none.
 
     Raises:
-        MivolError: what ``mivol optimize`` refuses, in the same words.
+        MivolError: as ``mivol optimize``.
 
     Example:
         >>> field = mivol.fit_photographs("photographs", "runs/field", {"field.preset": "tiny"})
     """
-    fitted(photographs, output, settings, progress, {})
+    run_photo_experiment(photographs, output, settings, progress, {})
     return read_field(Path(output) / "field.npz")
 
 
@@ -240,30 +241,30 @@ def fit_gaussians(
     settings: Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> Gaussians:
-    """Fit 3D Gaussians to posed photographs; ``gaussians.ply`` and its page lie in the run folder.
+    """Fit 3D Gaussians to posed photographs; the run folder has ``gaussians.ply`` and the report page.
 
     Args:
         photographs, output, progress: as :func:`fit_photographs`.
-        settings: of the TOML file by dotted key, as ``{"gaussians.preset": "tiny", "photos.background": "white"}``.
+        settings: settings of the TOML file by dotted key, as ``{"gaussians.preset": "tiny", "photos.background": "white"}``.
 
     Raises:
-        MivolError: what ``mivol optimize`` refuses, in the same words.
+        MivolError: as ``mivol optimize``.
 
     Example:
-        >>> found = mivol.fit_gaussians("photographs", "runs/gaussians", {"gaussians.preset": "tiny"})
+        >>> gaussians = mivol.fit_gaussians("photographs", "runs/gaussians", {"gaussians.preset": "tiny"})
     """
-    fitted(photographs, output, settings, progress, {"gaussians": {}})
+    run_photo_experiment(photographs, output, settings, progress, {"gaussians": {}})
     return read_gaussians(Path(output) / "gaussians.ply")
 
 
-def fitted(
+def run_photo_experiment(
     photographs: str | os.PathLike,
     output: str | os.PathLike,
     settings: Mapping[str, Any] | None,
     progress: Progress | None,
     tables: dict[str, Any],
 ) -> None:
-    """Do an experiment on photographs that has these tables besides."""
+    """Run an experiment on photographs with these additional tables of settings."""
     path = Path(photographs).resolve()
     raw: dict[str, Any] = {"title": path.stem, "photos": {"path": str(path)}, **tables}
     for key, value in (settings or {}).items():

@@ -1,8 +1,9 @@
-"""What ``solve.name = "auto"`` means for one scan: what a file leaves open, settled by the table of docs/benchmarks.md.
+"""The solver of a scan: the choices behind "auto", their memory, the stored rows and the prior.
 
-That table has slices of few, noisy and many views. In all kinds the least error after 20 iterations has pcg that begins at
-filtered back-projection, on unknowns twice as fine as the voxels, with total variation that balances the noise. What depends on
-the scan is whether it can be begun so, whether the finer unknowns fit, and what is taken for the noise.
+The choices follow the table of docs/benchmarks.md, with slices of few, noisy and many views. In all of them pcg has the
+smallest error after 20 iterations, if it starts from filtered back-projection, has unknowns twice as fine as the voxels, and a
+total variation that balances the noise. The scan decides whether it can start filtered, whether the finer unknowns fit, and
+what counts as noise.
 """
 
 from __future__ import annotations
@@ -31,38 +32,38 @@ from mivol.tomography.projector import Projector
 from mivol.tomography.stored import is_worth_storing, matrix_bytes, store_matrix
 
 MOST_UNKNOWNS = 1 << 24
-"""More unknowns than 256^3 are taken only where they are asked for: with a hundred views an iteration takes ten seconds on two
-cores there, and a solver keeps some ten fields of so many numbers."""
+"""Largest number of unknowns that "auto" chooses: 256^3. With a hundred views an iteration then takes ten seconds on two cores,
+and a solver keeps about ten fields of this size."""
 
 
-def strength_of(wanted: config.SolveSettings) -> float:
-    """``solve.tv`` as it is meant: absent, it is 1 where "auto" chooses and the unit is the noise, else 0."""
+def tv_strength(wanted: config.SolveSettings) -> float:
+    """Value of ``solve.tv``; if absent, 1 for "auto" in units of the noise, else 0."""
     if wanted.tv is not None:
         return wanted.tv
     return 1.0 if wanted.name == AUTO and wanted.tv_unit == "noise" else 0.0
 
 
-def settle_solver(wanted: config.SolveSettings, walk: Projector) -> tuple[config.SolveSettings, list[PlanLine]]:
-    """Put values in the places of all that was left open.
+def resolve_solver(wanted: config.SolveSettings, walk: Projector) -> tuple[config.SolveSettings, list[PlanLine]]:
+    """Put values in place of all open settings.
 
     Args:
         wanted: settings of a file.
-        walk: of the views that are fitted, through the voxels that are asked for.
+        walk: projector of the fitted views, through the requested voxels.
 
     Returns:
-        Settings without a gap, and why they are these.
+        Complete settings, and their reasons.
     """
     name = wanted.solver
-    start, start_line = settle_start(wanted, walk)
-    parts, parts_line = settle_supersampling(wanted, walk)
-    settled = msgspec.structs.replace(wanted, name=name, tv=strength_of(wanted), start=start, supersampling=parts)
+    start, start_line = resolve_start(wanted, walk)
+    parts, parts_line = resolve_supersampling(wanted, walk)
+    settled = msgspec.structs.replace(wanted, name=name, tv=tv_strength(wanted), start=start, supersampling=parts)
     by_table = "the least error of few, noisy and many views in the table of docs/benchmarks.md"
     reason = by_table if wanted.name == AUTO else ALL_SOLVERS[name].promises
     return settled, [PlanLine(choice=f"solver: {name}", reason=reason), *start_line, *parts_line]
 
 
-def settle_start(wanted: config.SolveSettings, walk: Projector) -> tuple[str, list[PlanLine]]:
-    """Where to begin, and why where it was left open to "auto"."""
+def resolve_start(wanted: config.SolveSettings, walk: Projector) -> tuple[str, list[PlanLine]]:
+    """Return the first volume, and the reason of an automatic choice."""
     if wanted.start is not None or wanted.name != AUTO:
         return wanted.start or "empty", []
     try:
@@ -72,8 +73,8 @@ def settle_start(wanted: config.SolveSettings, walk: Projector) -> tuple[str, li
     return "filtered", [PlanLine(choice="start: filtered back-projection", reason="half of the iterations are saved")]
 
 
-def settle_supersampling(wanted: config.SolveSettings, walk: Projector) -> tuple[int, list[PlanLine]]:
-    """Unknowns along an edge of a voxel, and why where it was left open to "auto"."""
+def resolve_supersampling(wanted: config.SolveSettings, walk: Projector) -> tuple[int, list[PlanLine]]:
+    """Return the unknowns along an edge of a voxel, and the reason of an automatic choice."""
     if wanted.supersampling is not None or wanted.name != AUTO:
         return wanted.supersampling or 1, []
     unknowns = subdivide_grid(walk.grid, 2, walk.geometry).size
@@ -84,14 +85,14 @@ def settle_supersampling(wanted: config.SolveSettings, walk: Projector) -> tuple
 
 
 FIELDS, FIELDS_OF_ONE_STEP = 10, 3
-"""Fields of so many numbers as there are unknowns, of four bytes each, that an iterative and a direct solver keep."""
+"""Fields of 4-byte numbers, one per unknown, in an iterative and in a direct solver."""
 
 
 def check_grid(chosen: config.ScanExperiment, grid: VoxelGrid) -> None:
-    """Refuse unknowns that a solver cannot keep.
+    """Refuse unknowns beyond the memory.
 
     Raises:
-        MivolError: with how many there are.
+        MivolError: with their number.
     """
     fields = FIELDS_OF_ONE_STEP if chosen.solve.solver in DIRECT else FIELDS
     what = f"a reconstruction of {' x '.join(str(n) for n in grid.shape)} unknowns"
@@ -99,15 +100,15 @@ def check_grid(chosen: config.ScanExperiment, grid: VoxelGrid) -> None:
 
 
 BY_SUBSETS = ("sart", "os-sart")
-"""Solvers that take many small products an iteration."""
+"""Solvers with many small products per iteration."""
 
 
 @dataclass(frozen=True)
 class Storage:
-    """What was chosen.
+    """Choice of the operator.
 
     Attributes:
-        is_stored: whether the rows of a layer are kept.
+        is_stored: whether the rows of a layer are stored.
         line: the choice and its reason.
     """
 
@@ -115,59 +116,59 @@ class Storage:
     line: PlanLine
 
     def apply(self, problem: ProjectionProblem) -> None:
-        """Give the solver's problem the operator that was chosen."""
+        """Put the chosen operator into the solver's problem."""
         if self.is_stored:
             problem.linear_problem = replace(problem.linear_problem, A=store_matrix(problem.linear_problem.A))
 
 
 def choose_storage(wanted: config.SolveSettings, walk: Projector) -> Storage:
-    """Count, and choose; nothing is stored yet.
+    """Estimate memory and time, and choose; nothing is stored yet.
 
     Args:
-        wanted: its ``storage``, ``memory``, solver and iterations.
-        walk: of the views that are fitted.
+        wanted: settings of the solver.
+        walk: projector of the fitted views.
 
     Raises:
-        MivolError: stored rows were asked for that the solver does not read, do not exist, or need more memory than is allowed.
+        MivolError: requested rows that the solver cannot use, that do not exist, or that need more memory than allowed.
     """
     if wanted.storage == "walk":
-        return walked("as asked for")
+        return plan_walk("as asked for")
     if wanted.name in DIRECT:
-        return refused(wanted, f"{wanted.name} takes one step, without a matrix")
+        return refuse_matrix(wanted, f"{wanted.name} takes one step, without a matrix")
     size = matrix_bytes(walk)
     if size is None:
-        return refused(wanted, "only the rays of a parallel beam, or of a fan of one row, lie in layers that share a matrix")
+        return refuse_matrix(wanted, "only a parallel beam, or a fan of one row, has layers of rays that share a matrix")
     rows, said = walk.projection_shape[1], f"{size / 2**20:.3g} MiB, of at most {wanted.memory:.3g} GiB"
     if size > wanted.memory * 2**30:
-        return refused(wanted, f"the rows of a layer take {said} (solve.memory)")
+        return refuse_matrix(wanted, f"the rows of a layer take {said} (solve.memory)")
     if wanted.storage == "auto" and not is_worth_storing(rows, wanted.iterations, wanted.name in BY_SUBSETS):
-        return walked(f"{wanted.iterations} iterations on {rows} rows of the detector do not pay for storing {said}")
+        return plan_walk(f"{wanted.iterations} iterations on {rows} rows of the detector do not pay for storing {said}")
     shared = "" if rows == 1 else f", shared by the {rows} rows of the detector"
     return Storage(True, PlanLine(choice="storage: the exact integrals of a layer, kept as sparse rows", reason=said + shared))
 
 
-def walked(reason: str) -> Storage:
-    """Nothing is stored."""
+def plan_walk(reason: str) -> Storage:
+    """Choose to store nothing."""
     return Storage(False, PlanLine(choice="storage: none, each product walks through the grid", reason=reason))
 
 
-def refused(wanted: config.SolveSettings, reason: str) -> Storage:
-    """A walk, unless stored rows were asked for by name.
+def refuse_matrix(wanted: config.SolveSettings, reason: str) -> Storage:
+    """Choose to store nothing, unless stored rows were requested.
 
     Raises:
-        MivolError: they were.
+        MivolError: stored rows were requested.
     """
     if wanted.storage == "matrix":
         raise MivolError(f"solve.storage = matrix cannot be had: {reason}: choose auto or walk.")
-    return walked(reason)
+    return plan_walk(reason)
 
 
 PLAIN_ITERATIONS = {"filtered": 5, "empty": 20}
-"""Iterations without a prior after which what is left of noiseless views is the misfit of voxels, by where they began."""
+"""Iterations without a prior after which the residual of noiseless views is the misfit of the voxels, by the first volume."""
 
 
 def make_prior(wanted: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> SmoothedTV | None:
-    """Total variation in the unit that was asked for, as if weights were inverse variances; None where none was."""
+    """Return the total variation in the requested unit, with weights as inverse variances; None without total variation."""
     if not wanted.tv:
         return None
     if wanted.tv_unit == "length":
@@ -175,11 +176,11 @@ def make_prior(wanted: config.SolveSettings, a: Projector, data: Projections, ke
     return scale_tv_to_noise(a, data.y[kept], data.weights[kept], wanted.tv, wanted.delta)
 
 
-def settle_noise(problem: ProjectionProblem, wanted: config.SolveSettings, data: Projections) -> list[PlanLine]:
-    """Where a prior's unit is a noise that is not known: take what a few iterations without a prior leave, and begin there.
+def estimate_noise(problem: ProjectionProblem, wanted: config.SolveSettings, data: Projections) -> list[PlanLine]:
+    """If the prior needs an unknown noise, take the residual of a few iterations without a prior, and continue from there.
 
-    Variances are ``s^2 / w`` then, and s is found. Least squares with weights w need ``s^2`` times the strength that goes with
-    ``w / s^2``, which is 1/s of what balances noise of the variances 1 / w: the prior becomes s times as strong.
+    The variances are then ``s^2 / w``, and s is found. Least squares with weights w need ``s^2`` times the strength for ``w /
+    s^2``, which is 1/s of the strength that balances noise of variance 1 / w: the prior becomes s times as strong.
     """
     task = problem.linear_problem
     if task.prior is None or wanted.tv_unit == "length" or data.is_noise_known:
@@ -195,8 +196,8 @@ def settle_noise(problem: ProjectionProblem, wanted: config.SolveSettings, data:
     return [PlanLine(choice=f"noise: {left:.4g} times what the weights say", reason=reason)]
 
 
-def plan_of_prior(prior: SmoothedTV | None, state: SolverState) -> list[PlanLine]:
-    """How strong the prior was, and what it did."""
+def explain_prior(prior: SmoothedTV | None, state: SolverState) -> list[PlanLine]:
+    """Return the strength of the prior and its effect."""
     if prior is None:
         return []
     share, edges = prior.value(state.x) / abs(state.objective), prior.share_of_edges(state.x)
@@ -209,10 +210,10 @@ def plan_of_prior(prior: SmoothedTV | None, state: SolverState) -> list[PlanLine
 
 
 def check_noise(asked: str, data: Projections) -> None:
-    """Refuse what needs the size of the noise where it is not known.
+    """Refuse a setting that needs the size of an unknown noise.
 
     Raises:
-        MivolError: it is not.
+        MivolError: the noise is unknown.
     """
     if not data.is_noise_known:
         raise MivolError(

@@ -1,6 +1,7 @@
-"""Where a fit of a scene begins: the first value of each parameter, and the place of its grid.
+"""The first values of the parameters of a scene fit, with their units and the places of their grids.
 
-Conventions. Memory is counted before any of it is taken: of the first grids, and of those that events refine them to.
+Conventions. Memory is checked before it is allocated, for the first grids and for the refined grids of later events. ``length``
+and ``radiance`` are the units of the scene; ``1`` is a pure number; "" is an unknown unit.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from mivol.optim.parameters import GRID, Parameter, as_tensor, find
 from mivol.transport.media.medium_view import find_grid_place
 
 NUMBER_BYTES = 6 * 4
-"""Of each number that is looked for: value, the scene's copy, real, derivative and two moments of the optimiser."""
+"""Memory per fitted number [byte]: value, copy in the scene, optimized real, derivative and two moments of the optimizer."""
 
 
 @dataclass(frozen=True)
@@ -36,22 +37,22 @@ class Start:
 
 
 def make_starts(chosen: SceneExperiment, base: Path, scene: mi.Scene) -> list[Start]:
-    """All parameters of a fit and where they start; the scene is not changed.
+    """Return all parameters of a fit with their first values; the scene is not changed.
 
     Raises:
-        MivolError: as :func:`make_start`, grids that will be refined beyond the memory, or none that could be refined.
+        MivolError: as :func:`make_start`, refined grids beyond the memory, or an upsample event without a grid.
     """
     starts = [make_start(sought, base, scene) for sought in chosen.parameter]
     grids = [start for start in starts if start.value.ndim == GRID]
     if any(isinstance(event, Upsample) for event in chosen.event):
         check_for_grids(len(grids))
     for start in grids:
-        check_grid(start.parameter.name, refined(start.value.shape, chosen), "let upsample refine less, or start coarser")
+        check_grid(start.parameter.name, final_shape(start.value.shape, chosen), "let upsample refine less, or start coarser")
     return starts
 
 
-def refined(shape: Sequence[int], chosen: SceneExperiment) -> tuple[int, ...]:
-    """The shape of a grid after all events of a fit."""
+def final_shape(shape: Sequence[int], chosen: SceneExperiment) -> tuple[int, ...]:
+    """Shape of a grid after all events of a fit."""
     factor, last = 1, chosen.fit.iterations
     for event in chosen.event:
         if isinstance(event, Upsample):
@@ -60,20 +61,20 @@ def refined(shape: Sequence[int], chosen: SceneExperiment) -> tuple[int, ...]:
 
 
 def check_grid(key: str, shape: Sequence[int], way_out: str) -> None:
-    """Refuse a grid with which a fit would not fit into memory.
+    """Refuse a grid beyond the memory.
 
     Raises:
-        MivolError: with its shape and what it takes.
+        MivolError: with its shape and size.
     """
     said = " x ".join(str(n) for n in shape)
     check_memory(NUMBER_BYTES * math.prod(shape), f"{key} of {said} numbers, with its derivative and the optimiser,", way_out)
 
 
 def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
-    """A parameter and where it starts; the scene is not changed.
+    """Return a parameter with its first value; the scene is not changed.
 
     Raises:
-        MivolError: no such parameter, a start outside its domain, a file that cannot be read, or a grid beyond the memory.
+        MivolError: an unknown parameter, a value outside its domain, a file that cannot be read, or a grid beyond the memory.
     """
     params = mi.traverse(scene)
     now = as_tensor(params[find(sought.key, params)])
@@ -88,15 +89,15 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
     elif sought.start is not None:
         shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
         check_grid(sought.key, shape, "give parameter.shape fewer voxels")
-        value = np.full(shape, start_of(sought, shape), dtype=np.float32)
-    extent = edges_of(place_of(sought.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
-    parameter = Parameter(sought.key, unit_of(sought), sought.domain, sought.map, sought.lr, extent, sought.prior)
+        value = np.full(shape, check_start(sought, shape), dtype=np.float32)
+    extent = box_edges(grid_to_world(sought.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
+    parameter = Parameter(sought.key, find_unit(sought), sought.domain, sought.map, sought.lr, extent, sought.prior)
     parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
     return Start(parameter, value)
 
 
-def start_of(sought: Sought, shape: Sequence[int]) -> Any:
-    """The start that the experiment gives: one number, or one for each of the last axis.
+def check_start(sought: Sought, shape: Sequence[int]) -> Any:
+    """Return the first value in the settings: one number, or one number per channel.
 
     Raises:
         MivolError: another count of numbers.
@@ -107,12 +108,12 @@ def start_of(sought: Sought, shape: Sequence[int]) -> Any:
     return sought.start
 
 
-def place_of(key: str, scene: mi.Scene) -> np.ndarray:
-    """Where the grid of a parameter lies: the (4, 4) map of the unit cube to the world."""
+def grid_to_world(key: str, scene: mi.Scene) -> np.ndarray:
+    """Transform (4, 4) from the unit cube to the world for the grid of a parameter."""
     return find_grid_place(mi.traverse(scene).properties[key][2])
 
 
-def edges_of(place: np.ndarray) -> tuple[float, float, float]:
+def box_edges(place: np.ndarray) -> tuple[float, float, float]:
     """Lengths (x, y, z) of the edges of a grid's box."""
     return tuple(float(edge) for edge in np.linalg.norm(place[:3, :3], axis=0))
 
@@ -131,10 +132,11 @@ UNITS = {
     "alpha": "1",
     "scale": "1",
 }
-"""By the words of a key of ``mi.traverse(scene)``. Mitsuba's extinction is ``scale`` times ``sigma_t``, its sky ``scale`` times
-``data``: one of the two has the unit."""
+"""Units by a word of the key. Mitsuba's extinction is ``scale`` times ``sigma_t``, its sky ``scale`` times ``data``: only one
+of
+the factors has the unit."""
 
 
-def unit_of(sought: Sought) -> str:
-    """The unit of a parameter: the experiment's, else that of the last word of the key that has one, else ""."""
+def find_unit(sought: Sought) -> str:
+    """Unit of a parameter: the unit in the settings, else the unit of the last word of the key with an entry, else ""."""
     return sought.unit or next((UNITS[word] for word in reversed(sought.key.split(".")) if word in UNITS), "")

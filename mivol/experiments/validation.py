@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.experiments.references import put
+from mivol.experiments.references import set_parameter
 from mivol.files import write_whole_text
 from mivol.optim.parameters import as_tensor, find
 from mivol.optim.scenes.views import derive_seed
@@ -218,7 +218,7 @@ def check_gradient(
         slopes = slopes.add(mean.slope(direction, seeds[0], seeds[1]))
         near = near.add(mean.difference(start, STEP * direction, seeds[2]) / STEP)
         far = far.add(mean.difference(start, 2 * STEP * direction, seeds[3]) / (2 * STEP))
-    put(params, key, start)
+    set_parameter(params, key, start)
     g, d = Estimate.of(slopes), Estimate.of(near)
     error = float(np.sqrt(g.var + d.var))
     left_out = abs(float(far.mean - near.mean)) / 3
@@ -258,11 +258,11 @@ class MeanRadiance:
         """Half the difference of the mean a step on and a step back, with the same random numbers."""
         params, means = mi.traverse(self.scene), []
         for sign in (1.0, -1.0):
-            put(params, self.key, start + sign * step)
+            set_parameter(params, self.key, start + sign * step)
             with dr.suspend_grad():
                 image = self.integrator.render(self.scene, self.camera, seed=seed, spp=self.spp)
             means.append(float(np.mean(np.asarray(image), dtype=np.float64)))
-        put(params, self.key, start)
+        set_parameter(params, self.key, start)
         return (means[0] - means[1]) / 2
 
 

@@ -10,7 +10,7 @@ from gaussian_sets import random_gaussians
 from skimage.io import imread
 
 from mivol.cli import main
-from mivol.experiments.render import whole_view
+from mivol.experiments.render import frame_points
 from mivol.points.cloud import PointCloud, write_points
 from mivol.points.gaussian_files import write_gaussians
 
@@ -51,7 +51,7 @@ def test_colours_of_points_are_shown_and_gaussians_as_they_are(tmp_path: Path) -
 def test_all_places_lie_in_the_cone_of_the_view() -> None:
     """A ball about all of them touches the cone of the smaller angle: directions to the places are within it."""
     places = np.random.default_rng(5).uniform(-1, 3, (500, 3))
-    look = np.array(whole_view(places, (0, 0, 1), 40.0, (64, 32)))
+    look = np.array(frame_points(places, (0, 0, 1), 40.0, (64, 32)))
     towards, axis = places - look[:3], look[3:] - look[:3]
     angle = np.arccos(towards @ axis / np.linalg.norm(towards, axis=1) / np.linalg.norm(axis))
     half = np.arctan(np.tan(np.radians(20)) / 2)

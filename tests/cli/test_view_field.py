@@ -9,7 +9,7 @@ import pytest
 
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.render import camera_at
+from mivol.experiments.render import make_camera
 from mivol.fields.field_files import write_field
 from mivol.fields.sky import read_sky
 from mivol.fields.spherical_grid import SphericalGrid
@@ -51,7 +51,7 @@ def test_a_field_is_seen_from_where_one_likes(field: Path, capsys: pytest.Captur
 
 
 def test_the_camera_stands_where_it_is_told() -> None:
-    camera = camera_at([1.0, 2.0, 3.0, 4.0, 2.0, 3.0], [0.0, 0.0, 1.0], 90.0, (40, 20))
+    camera = make_camera([1.0, 2.0, 3.0, 4.0, 2.0, 3.0], [0.0, 0.0, 1.0], 90.0, (40, 20))
     np.testing.assert_allclose(camera.origin, [1, 2, 3])
     # What it looks at is in the middle, upwards is up, and 45 degrees to the left is the edge.
     at, depth = project(camera, np.array([[4.0, 2, 3], [4.0, 2, 4], [4.0, 5, 3]]))
@@ -71,7 +71,7 @@ def test_the_camera_stands_where_it_is_told() -> None:
 )
 def test_cameras_that_cannot_be_are_refused(up: list[float], fov: float, size: tuple[int, int], says: str) -> None:
     with pytest.raises(MivolError, match=says):
-        camera_at([0.0, 0.0, 0.0, 1.0, 0.0, 0.0], up, fov, size)
+        make_camera([0.0, 0.0, 0.0, 1.0, 0.0, 0.0], up, fov, size)
 
 
 def test_what_is_no_field_has_its_own_cameras(field: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -12,7 +12,7 @@ import pytest
 from photo_sets import COLMAP_CAMERAS, look_at, ring, write_colmap, write_transforms
 
 from mivol.errors import MivolError
-from mivol.experiments.field_plan import wide_lenses
+from mivol.experiments.field_plan import explain_wide_lenses
 from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS, RadianceStage
@@ -263,9 +263,9 @@ def test_functions_of_an_image_plane_refuse_wide_lenses(variant_rgb: str) -> Non
 
 
 def test_the_plan_names_wide_photographs() -> None:
-    (line,) = wide_lenses(type("Photos", (), {"views": [photo(fisheye()), photo(fisheye())]}))
+    (line,) = explain_wide_lenses(type("Photos", (), {"views": [photo(fisheye()), photo(fisheye())]}))
     assert line.choice == "rays of 2 fisheye photographs"
-    assert not wide_lenses(type("Photos", (), {"views": [photo(Camera(intrinsics(40, 40, 4, 4), (8, 8), PLACE))]}))
+    assert not explain_wide_lenses(type("Photos", (), {"views": [photo(Camera(intrinsics(40, 40, 4, 4), (8, 8), PLACE))]}))
 
 
 @pytest.mark.slow

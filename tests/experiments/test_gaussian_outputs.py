@@ -30,7 +30,7 @@ def cloud(n: int = 3) -> Gaussians:
 
 def test_what_the_gaussians_take() -> None:
     """Medians of the opacities, of the longest axes, and of these over the shortest ones."""
-    table = outputs.storage(cloud(), 3 * 2**19)
+    table = outputs.tabulate_gaussians(cloud(), 3 * 2**19)
     assert (table.title, table.head) == ("What was found", ("", ""))
     assert table.rows == (
         ("Gaussians", "3"),
@@ -53,7 +53,7 @@ def test_a_picture_stands_before_a_colour() -> None:
         return SimpleNamespace(forward=lambda values, camera, derivatives: (seen, None) if not derivatives else None)
 
     problem = SimpleNamespace(splatter_for=splatter_for, values=dict)
-    found = outputs.picture_of(problem, SimpleNamespace(size=(3, 2)), np.array([1.0, 0.0, 0.4]), 0.3)
+    found = outputs.render_gaussians(problem, SimpleNamespace(size=(3, 2)), np.array([1.0, 0.0, 0.4]), 0.3)
     np.testing.assert_allclose(found, np.broadcast_to([0.75, 0.5, 0.6], (2, 3, 3)), rtol=1e-6)
     assert asked == [((3, 2), 0.3)]
 
@@ -78,12 +78,12 @@ def finished_fit(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, show
     fit.problem = SimpleNamespace(exposure=None, cloud=arrays)
     monkeypatch.setattr(outputs, "write_gaussians", lambda path, gaussians: path.write_bytes(bytes(100)))
     monkeypatch.setattr(outputs, "rectify", lambda photo: photo)
-    monkeypatch.setattr(photo_fit, "pictures_of_photos", lambda *given: run.written.append(given) or [])
+    monkeypatch.setattr(photo_fit, "draw_photo_cameras", lambda *given: run.written.append(given) or [])
     written = lambda folder, photo, number, seen, space, caption, edge=None: [(photo.name, seen.tolist(), caption, edge)]  # noqa: E731
     monkeypatch.setattr(judged_views, "write_view", written)
     monkeypatch.setattr(
         outputs,
-        "compare",
+        "judge_view",
         lambda problem, judged, photo, metrics: (np.array(int(photo.name)), ImageScore(photo.name, {metrics[0]: 20.0})),
     )
     return fit, run, lambda: fit.write_outputs(SimpleNamespace(next_iteration=77), run, None)
@@ -115,7 +115,7 @@ def test_frames_are_filtered_as_the_smaller_picture_asks(monkeypatch: pytest.Mon
     is judged."""
     fit, _, write = finished_fit(monkeypatch, tmp_path, 2, 0, frames=8)
     asked, given = [], []
-    monkeypatch.setattr(outputs, "picture_of", lambda problem, *how: asked.append(how) or "picture")
+    monkeypatch.setattr(outputs, "render_gaussians", lambda problem, *how: asked.append(how) or "picture")
     monkeypatch.setattr(Film, "write", lambda film, folder, picture, progress: given.append(folder) or picture("camera"))
     write()
     ((camera, behind, low_pass),) = asked
@@ -129,10 +129,10 @@ def test_a_view_is_judged_as_a_pinhole_sees_it(monkeypatch: pytest.MonkeyPatch) 
     photo = SimpleNamespace(camera="bent")
     flat = SimpleNamespace(camera="flat", background="behind", image="image", mask="mask", name="name")
     monkeypatch.setattr(outputs, "rectify", lambda given: flat if given is photo else None)
-    monkeypatch.setattr(outputs, "picture_of", lambda *asked: asked)
+    monkeypatch.setattr(outputs, "render_gaussians", lambda *asked: asked)
     monkeypatch.setattr(outputs, "score_image", lambda *given, **named: (given, named))
     problem = SimpleNamespace(plan=SimpleNamespace(low_pass=0.3))
-    seen, (given, named) = outputs.compare(problem, SimpleNamespace(space="srgb"), photo, ("psnr",))
+    seen, (given, named) = outputs.judge_view(problem, SimpleNamespace(space="srgb"), photo, ("psnr",))
     assert seen == (problem, "flat", "behind", 0.3)
     assert given == (seen, "image")
     assert named == {"space": "srgb", "mask": "mask", "metrics": ("psnr",), "name": "name"}

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mivol.experiments.judged_views import EDGES, MANY, JudgedViews, caption_of, said_of, spread_over, write_view
+from mivol.experiments.judged_views import (
+    EDGES,
+    MANY,
+    JudgedViews,
+    describe_quality,
+    describe_views,
+    select_shown_views,
+    write_view,
+)
 from mivol.photos import Camera, Photo, intrinsics
 from mivol.validate.images import ImageScore
 
@@ -47,7 +55,7 @@ def test_small_views_are_means_of_squares(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("count", "shown", "numbers"), [(7, 3, {0, 3, 6}), (2, 5, {0, 1}), (4, 1, {0}), (3, 0, set())])
 def test_views_in_full_are_spread_over_all(count: int, shown: int, numbers: set[int]) -> None:
-    assert spread_over(count, shown) == numbers
+    assert select_shown_views(count, shown) == numbers
 
 
 def test_the_worst_is_shown_first_and_in_full(tmp_path: Path) -> None:
@@ -78,8 +86,8 @@ def test_many_views_are_smaller_and_none_are_written_where_none_are_asked_for(tm
 
 def test_what_is_said_of_views() -> None:
     quality = ImageScore("a", {"psnr": 24.126, "ssim": 0.7781})
-    assert caption_of(quality, 25.3) == "PSNR 24.13 dB, SSIM 0.7781, 25.30 dB with its colours fitted"
-    assert caption_of(quality) == "PSNR 24.13 dB, SSIM 0.7781"
-    assert said_of([photo("a")] * 3) == "3 views at 4 x 2 pixels"
-    assert said_of([photo("a")]) == "1 view at 4 x 2 pixels"
-    assert said_of([photo("a"), photo("b", 6)]) == "2 views at their own sizes"
+    assert describe_quality(quality, 25.3) == "PSNR 24.13 dB, SSIM 0.7781, 25.30 dB with its colours fitted"
+    assert describe_quality(quality) == "PSNR 24.13 dB, SSIM 0.7781"
+    assert describe_views([photo("a")] * 3) == "3 views at 4 x 2 pixels"
+    assert describe_views([photo("a")]) == "1 view at 4 x 2 pixels"
+    assert describe_views([photo("a"), photo("b", 6)]) == "2 views at their own sizes"

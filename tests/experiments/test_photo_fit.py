@@ -147,7 +147,7 @@ def test_a_film_without_ffmpeg_is_an_animated_image(
 def test_what_a_field_takes_is_told_in_bytes_a_node(tmp_path: Path, variant_rgb: str) -> None:
     """Of 6^3 nodes: 4 numbers of a byte, 4 of four bytes; a density and 3 colours, in rows of 4, of four bytes."""
     (tmp_path / "field.npz").write_bytes(bytes(864))
-    table = field_fit.storage(ball(6), tmp_path / "field.npz")
+    table = field_fit.tabulate_storage(ball(6), tmp_path / "field.npz")
     assert [row[2] for row in table.rows] == ["4", "16", "20", "20", "4"]
     assert [row[1] for row in table.rows][-1] == f"{864 / 2**20:.2f} MiB"
     assert table.head[0] == "216 of 216 nodes are kept (100.0%)"
@@ -243,7 +243,7 @@ def test_what_was_done_to_linear_photographs_is_said(photographs: Path, tmp_path
     said = []
     for folder in (photographs, tmp_path):
         photos, _ = photo_data.read_photos(config.load(toml(tmp_path, folder), ["photos.space=srgb"]), tmp_path)
-        said.append(" ".join(photo_data.notes(photos)))
+        said.append(" ".join(photo_data.describe_photos(photos)))
     assert ["light of photographs of radiance was encoded" in note for note in said] == [False, True]
     assert all("srgb code values" in note for note in said)
 
@@ -253,12 +253,12 @@ def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -
     chosen = config.load(toml(tmp_path, photographs), ["photos.background=[0, 0.5, 0]"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = field_plan.make_plan(chosen)
-    said = field_plan.what_is_behind(plan, photos)
+    said = field_plan.explain_background(plan, photos)
     assert said.choice == "the colour (0, 0.5, 0) behind the box"
     assert "edges of the photographs show (1, 1, 1) mostly" in said.reason
-    assert "sky of 8 rows" in field_plan.what_is_behind(replace(plan, sky=8), photos).choice
+    assert "sky of 8 rows" in field_plan.explain_background(replace(plan, sky=8), photos).choice
     clear = replace(photos, views=tuple(replace(v, alpha=np.ones((SIZE, SIZE))) for v in photos.views))
-    assert "alpha" in field_plan.what_is_behind(plan, clear).reason
+    assert "alpha" in field_plan.explain_background(plan, clear).reason
 
 
 @pytest.mark.parametrize(
@@ -325,7 +325,7 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = RadiancePlan((RadianceStage(4, 1), RadianceStage(8, 1), RadianceStage(11, 1), RadianceStage(13, 1, shrink=4)))
-    assert [stage.shrink for stage in field_plan.suited(plan, photos).stages] == [2, 2, 2, 1]
+    assert [stage.shrink for stage in field_plan.adapt_plan(plan, photos).stages] == [2, 2, 2, 1]
 
 
 def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path: Path) -> None:
@@ -339,15 +339,15 @@ def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path:
     )
     plan = RadiancePlan(stages, epochs=20.0)
     expected = [20 * count * 24**2 // 96, 20 * 48**2 // 16, 5]
-    assert [stage.steps for stage in field_plan.suited(plan, photos).stages] == expected
-    few, least = field_plan.suited(replace(plan, stages=stages[:2], epochs=0.1), photos), field_plan.FEWEST_STEPS
+    assert [stage.steps for stage in field_plan.adapt_plan(plan, photos).stages] == expected
+    few, least = field_plan.adapt_plan(replace(plan, stages=stages[:2], epochs=0.1), photos), field_plan.FEWEST_STEPS
     # So many steps of the last stage look at each pixel least / 144 times.
     assert [stage.steps for stage in few.stages] == [least * count * 24**2 // (96 * 144), least]
-    assert [stage.steps for stage in field_plan.suited(RadiancePlan(stages), photos).stages] == [10_000, 10_000, 5]
+    assert [stage.steps for stage in field_plan.adapt_plan(RadiancePlan(stages), photos).stages] == [10_000, 10_000, 5]
     asked = field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
-    assert "no pixel is looked at over 20 times" in field_plan.steps_of(plan).reason
-    assert field_plan.steps_of(RadiancePlan(stages)).reason == "field.effort"
+    assert "no pixel is looked at over 20 times" in field_plan.explain_steps(plan).reason
+    assert field_plan.explain_steps(RadiancePlan(stages)).reason == "field.effort"
 
 
 def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
@@ -362,14 +362,14 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Pat
     assert scale_longest(8, slab) == 25 and scale_longest(8, photos.box) == 8
     long = replace(photos, survey=replace(photos.survey, box=slab))
     plan = RadiancePlan((RadianceStage(4, 1), RadianceStage(8, 1), RadianceStage(40, 1)))
-    assert [stage.longest for stage in field_plan.suited(plan, long).stages] == [13, 17, 34]
-    assert [stage.longest for stage in field_plan.suited(replace(plan, voxel=1.5), long).stages] == [13, 22, 34]
+    assert [stage.longest for stage in field_plan.adapt_plan(plan, long).stages] == [13, 17, 34]
+    assert [stage.longest for stage in field_plan.adapt_plan(replace(plan, voxel=1.5), long).stages] == [13, 22, 34]
     quarter = np.diag([0.25, 0.25, 1])
     cameras = [replace(view.camera, K=quarter @ view.camera.K) for view in long.views]
     far = replace(long, views=tuple(replace(v, camera=c) for v, c in zip(long.views, cameras, strict=True)))
-    assert [stage.longest for stage in field_plan.suited(plan, far).stages] == [4, 8, 16]
-    assert field_plan.suited(field_plan.suited(plan, long), long) == field_plan.suited(plan, long)
-    assert [stage.longest for stage in field_plan.suited(replace(plan, cubic=False), long).stages] == [4, 8, 40]
+    assert [stage.longest for stage in field_plan.adapt_plan(plan, far).stages] == [4, 8, 16]
+    assert field_plan.adapt_plan(field_plan.adapt_plan(plan, long), long) == field_plan.adapt_plan(plan, long)
+    assert [stage.longest for stage in field_plan.adapt_plan(replace(plan, cubic=False), long).stages] == [4, 8, 40]
     assert not field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
 
 
@@ -379,9 +379,9 @@ def test_few_photographs_are_smoothed_each_step(photographs: Path, tmp_path: Pat
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = field_plan.make_plan(chosen)
     assert plan.tv_every == 4 and len(photos.views) < FEW_PHOTOGRAPHS
-    assert field_plan.suited(plan, photos).tv_every == 1
+    assert field_plan.adapt_plan(plan, photos).tv_every == 1
     many = replace(photos, views=photos.views * (FEW_PHOTOGRAPHS // len(photos.views) + 1))
-    assert field_plan.suited(plan, many).tv_every == 4
+    assert field_plan.adapt_plan(plan, many).tv_every == 4
 
 
 def test_colours_of_few_photographs_do_not_decay(photographs: Path, tmp_path: Path) -> None:
@@ -393,7 +393,7 @@ def test_colours_of_few_photographs_do_not_decay(photographs: Path, tmp_path: Pa
     def found(**field: float) -> list[tuple[float, int]]:
         raw = {"title": "x", "photos": {"path": "p"}, "field": {"preset": "capture", **field}}
         plan = field_plan.make_plan(config.from_dict(raw))
-        return [(one.matte, one.degree) for one in (field_plan.suited(plan, photos), field_plan.suited(plan, many))]
+        return [(one.matte, one.degree) for one in (field_plan.adapt_plan(plan, photos), field_plan.adapt_plan(plan, many))]
 
     assert found() == [(0, 1), (12, 2)]
     assert found(matte=3.0) == [(3, 1), (3, 2)]
@@ -408,12 +408,12 @@ def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Pa
     half = (photos.box[1] - photos.box[0]) / 2
     points = photos.box.mean(axis=0) + half * np.concatenate([np.tile([0, 3, 0], (997, 1)), np.tile([0, 0, 4.5], (3, 1))])
     plan = replace(field_plan.make_plan(chosen), levels=5, near=1.0)
-    assert field_plan.suited(plan, photos).levels == 5
+    assert field_plan.adapt_plan(plan, photos).levels == 5
 
     def said(points: np.ndarray, plan: RadiancePlan) -> str:
         known = replace(photos, survey=replace(photos.survey, points=points))
-        fitting = field_plan.suited(plan, known)
-        lines = field_plan.choices(fitting, known, field_plan.batches_of(fitting, known))
+        fitting = field_plan.adapt_plan(plan, known)
+        lines = field_plan.explain_plan(fitting, known, field_plan.make_batches(fitting, known))
         return "\n".join(f"{line.choice}: {line.reason}" for line in lines)
 
     text = said(points, plan)
@@ -423,10 +423,10 @@ def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Pa
     assert f"nearer to a camera than {np.median(distances):.4g} [length]" in text
     assert "5 nested boxes" in said(points[:99], plan) and "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
     seen = replace(photos, views=tuple(replace(view, points=points[:7]) for view in photos.views))
-    batches = field_plan.batches_of(plan, seen)
-    lines = [line.choice for line in field_plan.choices(replace(plan, depth=0.5), seen, batches)]
+    batches = field_plan.make_batches(plan, seen)
+    lines = [line.choice for line in field_plan.explain_plan(replace(plan, depth=0.5), seen, batches)]
     assert f"{7 * len(photos.views)} points that photographs found say where their rays end, with a weight of 0.5" in lines
-    assert field_plan.distances_told(plan, batches) == []
+    assert field_plan.explain_depths(plan, batches) == []
     one = said(points, replace(plan, levels=1, near=0.0, sky=8))
     assert "1000 of 1000 points" in one and "beyond the box, where the sky is" in one
     assert "nested" not in one and "nearer to a camera" not in one
@@ -478,11 +478,11 @@ def test_each_look_is_at_the_same_views(photographs: Path, tmp_path: Path, monke
     assert names == ["view_3.png", "view_8.png"] * 2
     one = judge_few(judged, "show.judged=1")
     both = judge_few(judged)
-    alone = [field_fit.compare(problem, judged, view, ("psnr",))[1].values["psnr"] for view in judged.views]
+    alone = [field_fit.judge_view(problem, judged, view, ("psnr",))[1].values["psnr"] for view in judged.views]
     assert one == {"few_psnr": alone[0]}
     assert both == {"held_out_psnr": np.mean(alone)}
     assert judge_few(None) == {}
-    assert any("2 views are judged, the first at 48 x 48 pixels" in note for note in photo_data.notes(judged, judged))
+    assert any("2 views are judged, the first at 48 x 48 pixels" in note for note in photo_data.describe_photos(judged, judged))
 
 
 @pytest.mark.parametrize(
@@ -538,18 +538,18 @@ def test_a_box_of_silhouettes_needs_alpha(photographs: Path, tmp_path: Path) -> 
     chosen = config.load(toml(tmp_path, photographs), ["photos.box=silhouettes"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     with pytest.raises(MivolError, match="alpha"):
-        photo_data.boxed(chosen, photos)
+        photo_data.add_box(chosen, photos)
 
 
 def test_the_box_is_about_silhouettes_where_all_photographs_have_alpha(photographs: Path, tmp_path: Path) -> None:
     """Without a word the box is the tight one where it can be, and that of the cameras where one view has no alpha."""
     chosen = config.load(toml(tmp_path, photographs), ["photos.box=found"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    assert photo_data.boxed(chosen, photos) is photos
+    assert photo_data.add_box(chosen, photos) is photos
     cut = [replace(view, alpha=(view.image < 0.99).any(axis=2).astype(np.float32)) for view in photos.views]
-    tight = photo_data.boxed(chosen, replace(photos, views=tuple(cut)))
+    tight = photo_data.add_box(chosen, replace(photos, views=tuple(cut)))
     # The ball's radius is 0.6 and no camera is nearer than 2.9 to it; two cells of the second search are 0.1.
     assert (np.abs(tight.box) > 0.55).all() and (np.abs(tight.box) < 0.75).all() and (np.abs(photos.box) > 0.9).all()
     assert tight.survey.box_from == "about what alpha shows"
     mixed = replace(photos, views=(photos.views[0], *cut[1:]))
-    assert photo_data.boxed(chosen, mixed) is mixed
+    assert photo_data.add_box(chosen, mixed) is mixed

@@ -37,7 +37,7 @@ def test_what_a_field_takes(tmp_path, kept):
     """60 nodes of a box: 4 and 16 bytes each; 4 (1 + 4 x 3) with harmonics of degree 1 in rows of 12."""
     sparse = field(None if kept == 60 else np.arange(60).reshape(RES) < kept)
     write_field(tmp_path / "field.npz", sparse)
-    table = field_fit.storage(sparse, tmp_path / "field.npz")
+    table = field_fit.tabulate_storage(sparse, tmp_path / "field.npz")
     assert table.head[0] == f"{kept} of 60 nodes are kept ({kept / 60:.1%})"
     rows = {name: each for name, _, each in table.rows}
     assert rows["every node: r, g, b and density of 8 bits"] == "4" and rows["every node: four numbers"] == "16"
@@ -46,7 +46,7 @@ def test_what_a_field_takes(tmp_path, kept):
     assert rows["this field, its file"] == f"{(tmp_path / 'field.npz').stat().st_size / 60:.3g}"
     # Two digits of a MiB say nothing of so few bytes; of a thousand times as many they do.
     big = SimpleNamespace(node_count=256**3, stored_nodes=lambda: range(2**20), degree=0, width=4, bytes=3 * 2**20)
-    sizes = {name: size for name, size, _ in field_fit.storage(big, tmp_path / "field.npz").rows}
+    sizes = {name: size for name, size, _ in field_fit.tabulate_storage(big, tmp_path / "field.npz").rows}
     assert sizes["every node: four numbers"] == "256.00 MiB" and sizes["this field, in memory"] == "3.00 MiB"
 
 
@@ -76,11 +76,11 @@ def test_distance_and_normals_are_pictures(tmp_path):
 
 def test_judged_views_are_told_apart_the_worst_first():
     found = [ImageScore("a.jpg", {"psnr": 23.456, "ssim": 0.71234}), ImageScore("b.jpg", {"psnr": 9.0, "ssim": 0.5})]
-    table = judged_views.table_of_views(camera(135, 240), found, [24.0, 12.345])
+    table = judged_views.tabulate_views(camera(135, 240), found, [24.0, 12.345])
     assert table.title == "Judged views, at 135 x 240 pixels, the worst first"
     assert table.rows == (("b.jpg", "9.00", "0.5000", "12.35"), ("a.jpg", "23.46", "0.7123", "24.00"))
     assert table.head[3] == "PSNR [dB], colours fitted to the photograph's"
-    bare = judged_views.table_of_views(camera(135, 240), found)
+    bare = judged_views.tabulate_views(camera(135, 240), found)
     assert bare.head == table.head[:3] and bare.rows == tuple(row[:3] for row in table.rows)
 
 
@@ -90,5 +90,5 @@ def test_metrics_have_the_names_of_the_record():
 
 def test_behind_a_field_is_its_sky_or_the_photographs_own_background():
     photo, sky = SimpleNamespace(background="white"), object()
-    assert field_fit.behind(SimpleNamespace(sky=None), photo) == "white"
-    assert field_fit.behind(SimpleNamespace(sky=sky), photo) is sky
+    assert field_fit.find_background(SimpleNamespace(sky=None), photo) == "white"
+    assert field_fit.find_background(SimpleNamespace(sky=sky), photo) is sky

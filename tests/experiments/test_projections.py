@@ -155,7 +155,7 @@ def test_the_axis_of_a_cone_takes_the_place_of_the_settings(measured: ScanReadin
 
 
 def test_as_many_views_as_the_geometry_has(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(projections, "place_beam", lambda *asked: SimpleNamespace(shape=(3, 2, 3)))
+    monkeypatch.setattr(projections, "make_beam", lambda *asked: SimpleNamespace(shape=(3, 2, 3)))
     with pytest.raises(MivolError, match="found 2 projections and a geometry of 3 views"):
         projections.read_measured(scan(), Path())
 
@@ -166,11 +166,11 @@ def test_quanta_are_those_of_the_readings(measured: ScanReadings, monkeypatch: p
     made = Quanta(np.ones((2, 2, 3)), blank, 0.5, np.ones((2, 2, 3), bool))
     monkeypatch.setattr(projections, "count_quanta", lambda *asked: made if asked == ("r", "f", "d", 99.0) else None)
     monkeypatch.setattr(projections, "fit_air", lambda value, n: np.full((2, 2, 3), n / 4))
-    assert projections.quanta_of(scan(), measured) is made
-    assert (projections.quanta_of(scan(air=2), measured).blank == 4).all()
+    assert projections.count_measured_quanta(scan(), measured) is made
+    assert (projections.count_measured_quanta(scan(air=2), measured).blank == 4).all()
     for chosen, found in ((scan(drift=1), measured), (scan(), ScanReadings(measured.transmission))):
         with pytest.raises(MivolError, match="ml-tr needs counts of quanta"):
-            projections.quanta_of(chosen, found)
+            projections.count_measured_quanta(chosen, found)
     problems = {"pcg": SimpleNamespace(problem=LeastSquares), "ml-tr": SimpleNamespace(problem=PoissonCounts)}
     monkeypatch.setattr(projections, "ALL_SOLVERS", problems)
     chosen = scan()

@@ -15,10 +15,10 @@ from PIL import Image
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.field_fit import save_found
-from mivol.experiments.field_plan import batches_of, make_plan, suited
+from mivol.experiments.field_fit import write_result
+from mivol.experiments.field_plan import adapt_plan, make_batches, make_plan
 from mivol.experiments.judged_views import judge_colour_fitted, write_view
-from mivol.experiments.photo_data import MIDDLE_GREY, exposed, notes, read_photos
+from mivol.experiments.photo_data import MIDDLE_GREY, describe_photos, divide_by_white, read_photos
 from mivol.fields.field_files import read_field
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
@@ -96,18 +96,18 @@ def test_photographs_of_radiance_are_shown_at_one_exposure(photographs: Path, tm
     assert abs(np.log2(np.median(lit) / MIDDLE_GREY)) < 0.6
     channels, _ = read_exr(photographs / "view_3.exr")
     np.testing.assert_array_equal(judged.views[0].image[..., 1] * np.float32(photos.white), channels["G"])
-    assert f"y = 1 is the radiance {photos.white:g}" in notes(photos, judged)[0]
-    assert exposed(photos, 1.0) is photos
+    assert f"y = 1 is the radiance {photos.white:g}" in describe_photos(photos, judged)[0]
+    assert divide_by_white(photos, 1.0) is photos
 
 
 def test_what_is_found_is_kept_in_the_unit_of_the_files(photographs: Path, tmp_path: Path) -> None:
     """The field and its sky are brightened; a view beside its photograph is tone-mapped."""
     path = toml(tmp_path, photographs, field="sky = 8")
     photos, judged = read(path)
-    plan = suited(make_plan(config.load(path)), photos)
-    problem = RadianceProblem(batches_of(plan, photos), photos.box, plan)
+    plan = adapt_plan(make_plan(config.load(path)), photos)
+    problem = RadianceProblem(make_batches(plan, photos), photos.box, plan)
     problem.sky = Sky.uniform(8, 0.75)
-    save_found(tmp_path, problem, "_best", photos.white)
+    write_result(tmp_path, problem, "_best", photos.white)
     found = read_field(tmp_path / "field_best.npz")
     assert (found.space, found.offset) == ("linear", 0.5 * photos.white)
     assert np.all(read_exr(tmp_path / "sky_best.exr")[0]["G"] == 0.75 * photos.white)
@@ -176,11 +176,11 @@ def test_codes_and_radiance_in_one_set_are_refused(photographs: Path, tmp_path: 
     photos, _ = read(toml(tmp_path, tmp_path, 'space = "srgb"'))
     for view in photos.views:
         np.testing.assert_allclose(view.image[7, 7], encode_srgb(np.array([0.5, 0.25, 1])), atol=0.6 / 255)
-    assert any("what is above 1 counts as 1" in note for note in notes(photos))
+    assert any("what is above 1 counts as 1" in note for note in describe_photos(photos))
     photos, judged = read(toml(tmp_path, tmp_path, 'space = "linear"'))
     np.testing.assert_allclose(photos.views[1].image[7, 7] * photos.white, [0.5, 0.25, 1], atol=0.005)
     np.testing.assert_allclose(judged.views[0].image[7, 7] * judged.white, [0.5, 0.25, 2], rtol=1e-6)
-    assert any("Code values were decoded" in note for note in notes(photos))
+    assert any("Code values were decoded" in note for note in describe_photos(photos))
 
 
 def test_gaussians_are_fitted_to_codes(photographs: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from mivol.config import Truth
 from mivol.errors import MivolError
 from mivol.experiments import references
 from mivol.experiments.fit_kind import RunContext
-from mivol.experiments.references import check_truth, holding, make_truth
+from mivol.experiments.references import check_truth, hold_values, make_truth
 from mivol.files import write_exr, write_volume
 from mivol.validate.reference_file import ReferenceResult
 from scenes import box_of, grid_volume, medium
@@ -60,10 +60,10 @@ def test_a_photograph_has_what_the_variant_renders(
     """Colours without their alpha, or a luminance; a scene's fit met a KeyError on the other."""
     monkeypatch.setattr(references.mi, "variant", lambda: variant)
     held = {"": np.zeros((4, 5, 4)), "Y": np.zeros((4, 5))}
-    assert references.colours_of(tmp_path / "a.exr", held).shape == (4, 5, channels)
+    assert references.select_colours(tmp_path / "a.exr", held).shape == (4, 5, channels)
     del held[taken]
     with pytest.raises(MivolError, match=r"a\.exr: found the channels (R, G, B|Y), expected (R, G and B|Y \(luminance\));"):
-        references.colours_of(tmp_path / "a.exr", held)
+        references.select_colours(tmp_path / "a.exr", held)
 
 
 def test_views_that_are_held_out_come_after_the_others(variant_rgb, folder: Path) -> None:
@@ -160,7 +160,7 @@ def test_a_truth_is_of_what_is_looked_for() -> None:
 def test_a_scene_holds_other_values_for_a_while() -> None:
     found = scene()
     params = mi.traverse(found)
-    with holding(found, KEY, np.full((2, 3, 4, 1), 7.0)):
+    with hold_values(found, KEY, np.full((2, 3, 4, 1), 7.0)):
         assert set(np.array(params[KEY]).ravel()) == {7}
         assert set(np.array(mi.traverse(found)[KEY]).ravel()) == {7}
     assert set(np.array(mi.traverse(found)[KEY]).ravel()) == {1}

@@ -297,8 +297,8 @@ def test_the_first_view_is_measured_with_the_truth_in_the_scene(monkeypatch: pyt
         asked.append((scene, sensor, noise, len(held)))
         return SimpleNamespace(depth=5, reason="so")
 
-    monkeypatch.setattr(scene_fit, "holding", holding)
-    monkeypatch.setattr(scene_fit, "camera_of", lambda sensor: f"camera {sensor}")
+    monkeypatch.setattr(scene_fit, "hold_values", holding)
+    monkeypatch.setattr(scene_fit, "to_sensor", lambda sensor: f"camera {sensor}")
     monkeypatch.setattr(scene_fit, "find_sufficient_depth", measured)
     monkeypatch.setattr(scene_fit.msgspec.structs, "replace", lambda given, **change: SimpleNamespace(**change))
     settled, (line,) = scene_fit.resolve_depth(chosen, SimpleNamespace(scene="scene"), truth)

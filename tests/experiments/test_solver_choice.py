@@ -11,7 +11,7 @@ import pytest
 from mivol import config
 from mivol.experiments import solver_choice
 from mivol.experiments.projections import Projections
-from mivol.experiments.solver_choice import PLAIN_ITERATIONS, make_prior, settle_noise, settle_solver, strength_of
+from mivol.experiments.solver_choice import PLAIN_ITERATIONS, estimate_noise, make_prior, resolve_solver, tv_strength
 from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
 from mivol.optim.projections.linear_problems import LeastSquares
@@ -26,7 +26,7 @@ HALF = np.arange(12) * np.pi / 12
 
 
 def settled(wanted: config.SolveSettings, geometry: Geometry) -> tuple[config.SolveSettings, dict[str, str]]:
-    found, lines = settle_solver(wanted, Projector(geometry, GRID))
+    found, lines = resolve_solver(wanted, Projector(geometry, GRID))
     return found, {line.choice: line.reason for line in lines}
 
 
@@ -78,9 +78,9 @@ def test_what_a_file_says_holds(variant_rgb: str) -> None:
 
 def test_the_prior_that_is_meant() -> None:
     """Only in units of the noise is there a strength that needs no choice."""
-    assert strength_of(config.SolveSettings()) == 1
-    assert strength_of(config.SolveSettings(tv_unit="length")) == strength_of(config.SolveSettings("pcg")) == 0
-    assert strength_of(config.SolveSettings(tv=0.25)) == strength_of(config.SolveSettings("pcg", tv=0.25)) == 0.25
+    assert tv_strength(config.SolveSettings()) == 1
+    assert tv_strength(config.SolveSettings(tv_unit="length")) == tv_strength(config.SolveSettings("pcg")) == 0
+    assert tv_strength(config.SolveSettings(tv=0.25)) == tv_strength(config.SolveSettings("pcg", tv=0.25)) == 0.25
     assert (config.SolveSettings().solver, config.SolveSettings("ml-tr").solver) == ("pcg", "ml-tr")
 
 
@@ -105,7 +105,7 @@ def test_the_noise_is_what_plain_iterations_leave(variant_rgb: str) -> None:
     problem, data = problem_of(1.0, WANTED)
     plain = replace(problem.linear_problem, prior=None)
     *_, state = itertools.islice(projected_cg(plain), PLAIN_ITERATIONS["filtered"])
-    (line,) = settle_noise(problem, WANTED, data)
+    (line,) = estimate_noise(problem, WANTED, data)
     left = state.residual_norm / np.sqrt(data.y.size)
     # Threads add up in any order: five iterations end within 1e-4 of each other; the line has four digits.
     assert line.choice.endswith("times what the weights say")
@@ -122,7 +122,7 @@ def test_weights_in_proportion_find_the_same(variant_rgb: str) -> None:
     strengths = []
     for weight in (1.0, 9.0):
         problem, data = problem_of(weight, WANTED)
-        settle_noise(problem, WANTED, data)
+        estimate_noise(problem, WANTED, data)
         strengths.append(problem.linear_problem.prior.strength)
     # Iterates differ by rounding of float32, 1e-6 of a residual that is a hundredth of the projections.
     assert strengths[1] == pytest.approx(9 * strengths[0], rel=1e-4)
@@ -137,11 +137,11 @@ def test_nothing_is_estimated_where_nothing_is_missing(
 ) -> None:
     problem, data = problem_of(1.0, wanted, is_noise_known)
     before = problem.linear_problem
-    assert settle_noise(problem, wanted, data) == []
+    assert estimate_noise(problem, wanted, data) == []
     assert problem.linear_problem is before
 
 
 def test_projections_of_nothing_leave_no_noise(variant_rgb: str) -> None:
     problem, data = problem_of(1.0, WANTED)
     problem.linear_problem = replace(problem.linear_problem, b=0 * data.y)
-    assert settle_noise(problem, WANTED, data) == []
+    assert estimate_noise(problem, WANTED, data) == []

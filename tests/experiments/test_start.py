@@ -10,7 +10,7 @@ import pytest
 from tiny_experiment import FIT, SCENE, TRUTH, files_of, refused, run
 
 from mivol.config import Sought
-from mivol.experiments.start import unit_of
+from mivol.experiments.start import find_unit
 from mivol.files import read_volume
 from mivol.validate.metrics import nrmse
 
@@ -64,8 +64,8 @@ ALBEDO = "cube.interior_medium.albedo.value.value"
 )
 def test_a_key_tells_its_unit(key: str, unit: str) -> None:
     """By its last word that has one; what the experiment says goes before."""
-    assert unit_of(Sought(key=key)) == unit
-    assert unit_of(Sought(key=key, unit="1/m")) == "1/m"
+    assert find_unit(Sought(key=key)) == unit
+    assert find_unit(Sought(key=key, unit="1/m")) == "1/m"
 
 
 def test_numbers_of_a_fit_are_recorded_with_their_units(variant_rgb, folder: Path) -> None:

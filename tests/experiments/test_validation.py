@@ -162,7 +162,7 @@ def test_a_gradient_is_checked_by_differences(variant_rgb: str, monkeypatch: pyt
     swing = iter(0.1 * (-1.0) ** k for k in range(16))
     monkeypatch.setattr(validation.mi, "traverse", lambda scene: {"a.key": values})
     monkeypatch.setattr(validation, "as_tensor", lambda value: value)
-    monkeypatch.setattr(validation, "put", lambda params, key, start: put_back.append((key, start.tolist())))
+    monkeypatch.setattr(validation, "set_parameter", lambda params, key, start: put_back.append((key, start.tolist())))
 
     def slope(self: validation.MeanRadiance, direction: np.ndarray, *seeds: int) -> float:
         assert (self.scene, self.camera, self.integrator) == ("scene", "camera", "ours")
@@ -210,7 +210,7 @@ def test_a_difference_is_half_of_both_sides(variant_rgb: str, monkeypatch: pytes
     """A step on, a step back with the same seed, and the values as they were."""
     placed, asked = [], []
     monkeypatch.setattr(validation.mi, "traverse", lambda scene: "params")
-    monkeypatch.setattr(validation, "put", lambda params, key, values: placed.append((params, key, values.tolist())))
+    monkeypatch.setattr(validation, "set_parameter", lambda params, key, values: placed.append((params, key, values.tolist())))
 
     def render(scene: object, camera: object, seed: int, spp: int) -> np.ndarray:
         asked.append((seed, spp))

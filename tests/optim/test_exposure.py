@@ -14,8 +14,8 @@ from ball_photos import BOX, PLAN
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.experiments.field_plan import GAINS, choices, make_plan
-from mivol.experiments.photo_fit import table_of_gains
+from mivol.experiments.field_plan import GAINS, explain_plan, make_plan
+from mivol.experiments.photo_fit import tabulate_gains
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import begin_fit
 from mivol.optim.photographs import radiance_problem
@@ -148,12 +148,12 @@ def test_a_plan_says_that_there_are_gains(variant_rgb: str) -> None:
     survey = type("Survey", (), {"box_from": "as given", "points": None})
     photos = type("Photos", (), {"views": shown, "box": MIDDLE, "survey": survey})
     batches = RayBatches.from_photos(shown)
-    assert GAINS in choices(SMALL, photos, batches)
-    assert GAINS not in choices(replace(SMALL, exposure=False), photos, batches)
+    assert GAINS in explain_plan(SMALL, photos, batches)
+    assert GAINS not in explain_plan(replace(SMALL, exposure=False), photos, batches)
 
 
 def test_gains_are_shown_those_far_from_1_first() -> None:
-    table = table_of_gains(["a", "b", "c"], np.array([[1.0, 1.05, 1.0], [0.5, 1.0, 1.0], [1.0, 1.0, 1.3]]))
+    table = tabulate_gains(["a", "b", "c"], np.array([[1.0, 1.05, 1.0], [0.5, 1.0, 1.0], [1.0, 1.0, 1.3]]))
     assert table.head == ("photograph", "red", "green", "blue")
     assert table.rows == (("b", "0.500", "1.000", "1.000"), ("c", "1.000", "1.000", "1.300"), ("a", "1.000", "1.050", "1.000"))
 

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mivol.experiments.camera_pictures import pictures_of_scan
+from mivol.experiments.camera_pictures import draw_scanner
 from mivol.report.cameras import EDGE
 from mivol.report.scanner import BEAM_REACH, DETECTORS, MARKER_WIDTH, MOST_VIEWS, plot_scanner, select_views
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
@@ -125,11 +125,11 @@ def test_drawn_views_are_evenly_spread(count: int, every: int) -> None:
 
 def test_captions_state_the_number_of_drawn_views(tmp_path: Path) -> None:
     """A source and parallel light have different captions."""
-    images = pictures_of_scan(tmp_path, CONE, GRID, HELD_OUT)
+    images = draw_scanner(tmp_path, CONE, GRID, HELD_OUT)
     assert [(i.path, i.role) for i in images] == [("scanner_side.png", "picture"), ("scanner_plan.png", "picture")]
     assert images[0].caption == "Where the source stands in 12 views, some detectors, and the box of the voxels"
     many = ParallelBeam(np.arange(100.0), (5, 7))
-    (first, _) = pictures_of_scan(tmp_path, many, GRID, HELD_OUT)
+    (first, _) = draw_scanner(tmp_path, many, GRID, HELD_OUT)
     assert first.caption.startswith(f"Which way the light goes in {MOST_VIEWS + 2} of 100 views")
     assert all((tmp_path / image.path).is_file() for image in images)
 

@@ -95,7 +95,7 @@ def store(problem: object) -> tuple[int, int]:
     """Number of nodes or Gaussians, and the size of their files [bytes]."""
     with TemporaryDirectory() as folder:
         if isinstance(problem, RadianceProblem):
-            field_fit.save_found(Path(folder), problem)
+            field_fit.write_result(Path(folder), problem)
             count = problem.field.rows
         else:
             cloud = Gaussians(**problem.cloud)

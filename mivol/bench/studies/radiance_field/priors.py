@@ -15,7 +15,7 @@ from mivol.bench.harness.study import amount
 from mivol.bench.studies.radiance_field.fields import FieldSize
 from mivol.bench.studies.radiance_field.fits import held_out_psnr
 from mivol.bench.studies.radiance_field.room import write_room
-from mivol.experiments.field_plan import of_few, with_levels_needed
+from mivol.experiments.field_plan import adapt_to_few, reduce_levels
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import begin_radiance_fit, current_field
@@ -51,7 +51,7 @@ class PriorSize(FieldSize):
 
 def small_plan(size: PriorSize) -> RadiancePlan:
     """The preset for captures with few photographs, at a small size."""
-    preset, n = of_few(PRESETS["capture"]), size.prior_resolution
+    preset, n = adapt_to_few(PRESETS["capture"]), size.prior_resolution
     stages = RadianceStage(n // 2, size.prior_steps // 3, 1, 8, 16), RadianceStage(n, size.prior_steps, 1, 8, 48)
     return replace(preset, stages=stages, exposure=False)
 
@@ -88,7 +88,7 @@ def measure_priors(size: PriorSize) -> dict:
     """How much worse is the preset for captures without each of its priors?"""
     answer = {}
     for name, capture in load_captures(size).items():
-        plan = with_levels_needed(small_plan(size), capture)
+        plan = reduce_levels(small_plan(size), capture)
         photos, box = [rectify(photo) for photo in capture.views], capture.box
         folds = range(size.prior_folds)
         whole = [judge_plan(plan, photos, box, fold) for fold in folds]

@@ -25,7 +25,7 @@ from mivol.bench.harness.bars import say
 from mivol.bench.studies.tomography.slices import Slice, load_tooth, make_slice
 from mivol.experiments.projections import Projections
 from mivol.experiments.scan_fit import start_volume
-from mivol.experiments.solver_choice import choose_storage, make_prior, settle_noise, settle_solver
+from mivol.experiments.solver_choice import choose_storage, estimate_noise, make_prior, resolve_solver
 from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
@@ -97,13 +97,13 @@ def run_solvers(scan: Slice) -> dict[str, Curve]:
 
 def default_states(scan: Slice, solve: config.SolveSettings | None = None) -> Iterator[np.ndarray]:
     """States of the solver that mivol chooses (``solve.name = "auto"``), or of given settings."""
-    wanted, _ = settle_solver(solve or config.SolveSettings(), Projector(scan.beam, scan.grid))
+    wanted, _ = resolve_solver(solve or config.SolveSettings(), Projector(scan.beam, scan.grid))
     walk = Projector(scan.beam, subdivide_grid(scan.grid, wanted.supersampling, scan.beam))
     data, all_views = Projections(scan.beam, scan.y, scan.weights, is_noise_known=scan.photons > 0), np.arange(len(scan.y))
     start, prior = start_volume(wanted, walk, data, all_views), make_prior(wanted, walk, data, all_views)
     problem = ProjectionProblem(LeastSquares(walk, scan.y, scan.weights, start, wanted.nonnegative, prior))
     choose_storage(wanted, walk).apply(problem)
-    settle_noise(problem, wanted, data)
+    estimate_noise(problem, wanted, data)
     for state in ALL_SOLVERS[wanted.name].run(problem.linear_problem):
         yield voxel_means(state.x.reshape(walk.grid.shape), scan.grid.shape)
 
