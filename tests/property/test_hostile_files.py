@@ -47,12 +47,12 @@ def raises(error: Exception) -> None:
         (lambda: raises(RecursionError("deep")), "fault"),
     ],
 )
-def test_what_counts_as_a_fault(read, kind: str) -> None:
+def test_faults_are_other_errors_than_refusals(read, kind: str) -> None:
     assert fuzz.outcome(read)[0] == kind
 
 
-def test_files_are_broken_by_their_number() -> None:
-    """The same number gives the same file, another one another; most are not the sound file."""
+def test_a_number_determines_the_damage() -> None:
+    """Equal numbers give equal files, different numbers different files; most differ from the sound file."""
     sound = bytes(range(200)) * 3
     made = [fuzz.mutate(sound, np.random.default_rng((1, number))) for number in (0, 0, *range(1, 40))]
     assert made[0] == made[1]
@@ -61,7 +61,7 @@ def test_files_are_broken_by_their_number() -> None:
 
 
 def test_a_tiff_without_a_width_is_refused(tmp_path: Path) -> None:
-    """Found by the script: Pillow raised a TypeError at a second page. The tag of the width, 256, becomes another."""
+    """Found by fuzzing: Pillow raised a TypeError at a second page. The tag of the width, 256, is replaced."""
     path = tmp_path / "stack.tif"
     page = Image.fromarray(np.eye(8, 9, dtype=np.float32))
     page.save(path, save_all=True, append_images=[page])
@@ -72,8 +72,8 @@ def test_a_tiff_without_a_width_is_refused(tmp_path: Path) -> None:
         read_stack(path)
 
 
-def test_names_and_keys_without_an_end_are_refused(tmp_path: Path) -> None:
-    """A header may name a file as no file can be called, and a key may be as long as its file."""
+def test_endless_names_and_keys_are_refused(tmp_path: Path) -> None:
+    """A header may name an impossible file, and a key may be as long as its file."""
     (tmp_path / "a.mhd").write_text(
         f"ObjectType = Image\nNDims = 3\nDimSize = 1 1 1\nElementType = MET_FLOAT\nElementDataFile = {'A' * 70000}\n"
     )
@@ -86,14 +86,14 @@ def test_names_and_keys_without_an_end_are_refused(tmp_path: Path) -> None:
         assert len(str(refused.value)) <= fuzz.LONGEST
 
 
-def test_deep_cameras_are_refused(tmp_path: Path) -> None:
-    """Python's JSON follows brackets by recursion."""
+def test_deeply_nested_cameras_are_refused(tmp_path: Path) -> None:
+    """Python's JSON parser recurses on brackets."""
     (tmp_path / "transforms.json").write_text('{"frames": ' + "[" * 100_000)
     with pytest.raises(MivolError, match="text that is not JSON"):
         load_photos(tmp_path)
 
 
-def test_photographs_with_names_without_an_end_are_refused(tmp_path: Path) -> None:
+def test_endless_names_of_photographs_are_refused(tmp_path: Path) -> None:
     frame = {"file_path": "A" * 3000 + ".png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 10.0, "w": 12, "h": 8, "frames": [frame]}))
     with pytest.raises(MivolError, match="a name of 3004 characters"):
@@ -101,8 +101,8 @@ def test_photographs_with_names_without_an_end_are_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("coefficient", "sound"), [(1e-320, True), (1e5, True), (1e300, False), (np.nan, False)])
-def test_lenses_that_no_camera_has(coefficient: float, sound: bool) -> None:
-    """A last coefficient of nearly 0 bends nothing, and of a huge one no fold can be found: NumPy raised a LinAlgError."""
+def test_extreme_lenses_are_accepted_or_refused(coefficient: float, sound: bool) -> None:
+    """A last coefficient near 0 bends nothing; a huge coefficient has no fold: NumPy raised a LinAlgError."""
     K = intrinsics(10.0, 10.0, 6.0, 4.0)
     if sound:
         assert Camera(K, (12, 8), np.eye(4), Lens(k1=0.1, k4=coefficient)).distortion.fold == np.inf
@@ -114,23 +114,23 @@ def test_lenses_that_no_camera_has(coefficient: float, sound: bool) -> None:
 @pytest.mark.parametrize(
     "line", ["1", "1 PINHOLE inf 48 9 9 6 4", "1 PINHOLE 64 nan 9 9 6 4", "9" * 5000 + " PINHOLE 64 48 9 9 6 4"]
 )
-def test_cameras_of_colmap_that_are_refused(tmp_path: Path, line: str) -> None:
-    """Short lines, sizes that are none, numbers that Python does not read."""
+def test_invalid_colmap_cameras_are_refused(tmp_path: Path, line: str) -> None:
+    """Short lines, invalid sizes, and numbers beyond Python's limit."""
     write_colmap(tmp_path, encoding="txt")
     (tmp_path / "sparse/0/cameras.txt").write_text(line + "\n")
     with pytest.raises(MivolError):
         load_photos(tmp_path)
 
 
-def test_deep_experiments_are_refused(tmp_path: Path) -> None:
-    """tomllib follows brackets by recursion."""
+def test_deeply_nested_experiments_are_refused(tmp_path: Path) -> None:
+    """tomllib recurses on brackets."""
     (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
     with pytest.raises(MivolError, match="nests its values deeper"):
         config.load(tmp_path / "deep.toml")
 
 
-def test_keys_of_many_parts_are_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """tomllib takes the square of their number as time, so it is not asked; a key of fewer, and a path of dots, are its own."""
+def test_keys_of_many_parts_are_refused_before_parsing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """tomllib takes quadratic time for them. Shorter keys and paths of dots are parsed."""
     for text in ("a." * 50_000 + "b = 1", "[" + '"a" . ' * 200 + "b]"):
         (tmp_path / "deep.toml").write_text(text)
         with monkeypatch.context() as patch, pytest.raises(MivolError, match="nests its values deeper"):
@@ -141,13 +141,13 @@ def test_keys_of_many_parts_are_refused_at_once(tmp_path: Path, monkeypatch: pyt
         config.load(tmp_path / "some.toml")
 
 
-def test_a_byte_order_mark_of_windows_is_no_part_of_an_experiment(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbf" + SHEPP_LOGAN.with_name("cone_128.toml").read_bytes())
     assert config.load(tmp_path / "a.toml") == config.load(SHEPP_LOGAN.with_name("cone_128.toml"))
 
 
-def test_a_name_that_is_no_text_can_be_printed(tmp_path: Path) -> None:
-    """Half of a pair of UTF-16 is a name in JSON, and print() raised a UnicodeEncodeError at the refusal."""
+def test_a_refusal_of_an_invalid_name_can_be_printed(tmp_path: Path) -> None:
+    """Half of a UTF-16 pair is a valid name in JSON; print() raised a UnicodeEncodeError at the refusal."""
     frame = {"file_path": "\ud800.png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 10.0, "w": 12, "h": 8, "frames": [frame]}))
     with pytest.raises(MivolError) as refused:
@@ -155,8 +155,8 @@ def test_a_name_that_is_no_text_can_be_printed(tmp_path: Path) -> None:
     assert rb"\ud800.png" in str(refused.value).encode()
 
 
-def test_records_of_las_without_room_are_refused(tmp_path: Path) -> None:
-    """Found by the script: laspy reads as many empty records as the header says, two thousand million of them."""
+def test_too_many_las_records_are_refused(tmp_path: Path) -> None:
+    """Found by fuzzing: laspy reads as many empty records as the header claims, two billion here."""
     pytest.importorskip("laspy")
     path = tmp_path / "a.las"
     FILES["las"][1](path)
@@ -166,8 +166,8 @@ def test_records_of_las_without_room_are_refused(tmp_path: Path) -> None:
         read_points(path)
 
 
-def test_a_header_of_a_cloud_that_is_no_python_is_refused(tmp_path: Path) -> None:
-    """Found by the script: a bracket that never closes in the header of an array is an error of Python's tokeniser."""
+def test_an_unclosed_array_header_is_refused(tmp_path: Path) -> None:
+    """Found by fuzzing: an unclosed bracket in the header of an array raises an error of Python's tokenizer."""
     path = tmp_path / "a.npy"
     np.save(path, np.zeros((4, 3)))
     path.write_bytes(path.read_bytes().replace(b"}", b"{"))
@@ -176,7 +176,7 @@ def test_a_header_of_a_cloud_that_is_no_python_is_refused(tmp_path: Path) -> Non
 
 
 def test_an_archive_of_a_volume_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A volume goes through the same opener as fields: what it would take is counted before it is taken."""
+    """Volumes use the same reader as fields: sizes are checked before memory is allocated."""
     write_volume(tmp_path / "a.npz", np.zeros((32, 32, 32, 1), np.float32))
     monkeypatch.setattr("mivol.files.npy.available_memory", lambda: 100_000)
     with pytest.raises(MivolError, match="at most the free memory"):
@@ -184,8 +184,8 @@ def test_an_archive_of_a_volume_is_bounded(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("said", ["{", "[]", '{"identity": {}}'])
-def test_a_damaged_reference_is_named(tmp_path: Path, said: str) -> None:
-    """Found by the script: the header is JSON, and may be cut off or tell less than mivol writes."""
+def test_a_damaged_reference_is_refused(tmp_path: Path, said: str) -> None:
+    """Found by fuzzing: the header is JSON and may be truncated or incomplete."""
     write_exr(tmp_path / "a.exr", {"": np.zeros((2, 2, 3), np.float32)}, {"mivol_reference": said})
     with pytest.raises(MivolError, match="a damaged reference"):
         read_reference(tmp_path / "a.exr")
@@ -195,14 +195,14 @@ def test_a_damaged_reference_is_named(tmp_path: Path, said: str) -> None:
     "inside", [b'<inte\xaa\x89r name="a"/>', b'<emitter type="constant"><string name="\xfd" value="1"/></emitter>']
 )
 def test_a_scene_of_foreign_bytes_is_refused(variant_rgb: str, tmp_path: Path, inside: bytes) -> None:
-    """Found by the script: Mitsuba's refusals and settings quote the file, and are no text where the file is none."""
+    """Found by fuzzing: Mitsuba's errors quote the file, which may be invalid text."""
     (tmp_path / "a.xml").write_bytes(b'<scene version="3.0.0">' + inside + b"</scene>")
     with pytest.raises(MivolError, match="bytes that are not UTF-8"):
         load_scene(tmp_path / "a.xml")
 
 
-def test_a_scene_of_a_name_without_an_end_is_refused(variant_rgb: str, tmp_path: Path) -> None:
-    """Found by the script: Mitsuba's refusal quotes all of it."""
+def test_a_scene_with_an_endless_name_is_refused(variant_rgb: str, tmp_path: Path) -> None:
+    """Found by fuzzing: Mitsuba's error quotes the whole name."""
     (tmp_path / "a.xml").write_text(f'<scene version="3.0.0" {"A" * 70000}="1"/>')
     with pytest.raises(MivolError) as refused:
         load_scene(tmp_path / "a.xml")
@@ -211,7 +211,7 @@ def test_a_scene_of_a_name_without_an_end_is_refused(variant_rgb: str, tmp_path:
 
 @pytest.mark.parametrize("name", ["run.json", "metrics.jsonl", "a.png"])
 def test_a_page_of_damaged_files_is_refused(tmp_path: Path, name: str) -> None:
-    """Found by the script: bytes that are no UTF-8, and a picture that is none."""
+    """Found by fuzzing: invalid UTF-8 and a damaged image."""
     SETS["run"][0](tmp_path)
     path = tmp_path / name
     whole = path.read_bytes()
@@ -225,7 +225,7 @@ def test_a_page_of_damaged_files_is_refused(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("listed", ["s%d.raw 0 200000000000 1", "s%099999999d.raw 0 1 1", "s%.0s.raw 0 7 1", "%d%d.raw 0 1 1"])
 def test_patterns_of_files_are_bounded(tmp_path: Path, listed: str) -> None:
-    """A header of 150 bytes named 200 milliards of files, whose names alone fill the memory."""
+    """A header of 150 bytes named 200 billion files, whose names alone would fill the memory."""
     (tmp_path / "s.raw").write_bytes(bytes(4))
     (tmp_path / "a.nhdr").write_text(nrrd_head(numbered(), **{"data file": listed}))
     (tmp_path / "a.mhd").write_bytes(meta_head(numbered(), data=listed))
@@ -245,7 +245,7 @@ def test_numbered_files_are_read_in_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("skip", "sound"), [("2", True), ("99999999999999", False), ("-1", False)])
-def test_lines_that_are_skipped_are_there(tmp_path: Path, skip: str, sound: bool) -> None:
+def test_skipped_lines_must_exist(tmp_path: Path, skip: str, sound: bool) -> None:
     values = numbered()
     (tmp_path / "s.raw").write_bytes(b"one\ntwo\n" + values.astype("<f4").tobytes())
     (tmp_path / "a.nhdr").write_text(nrrd_head(values, **{"data file": "s.raw", "line skip": skip}))
@@ -257,7 +257,7 @@ def test_lines_that_are_skipped_are_there(tmp_path: Path, skip: str, sound: bool
 
 
 def test_numbers_of_thousands_of_digits_are_refused(tmp_path: Path) -> None:
-    """Python refuses to read them, in a ValueError that is none of JSON's or TOML's own."""
+    """Python rejects them with a ValueError outside the classes of JSON and TOML errors."""
     (tmp_path / "transforms.json").write_text(f'{{"w": {"9" * 5000}}}')
     (tmp_path / "a.toml").write_text(f"threads = {'9' * 5000}")
     with pytest.raises(MivolError, match="text that is not JSON"):
@@ -268,7 +268,7 @@ def test_numbers_of_thousands_of_digits_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*FILES, *SETS])
-def test_broken_files_end_in_a_sentence(variant_rgb: str, tmp_path: Path, name: str) -> None:
+def test_damaged_files_are_read_or_refused(variant_rgb: str, tmp_path: Path, name: str) -> None:
     fuzz.write_sound(name, tmp_path)
     found = [fuzz.outcome(fuzz.case(name, number, 2, tmp_path)[0]) for number in range(SAMPLE)]
     assert [said for kind, said in found if kind == "fault"] == []
@@ -276,8 +276,8 @@ def test_broken_files_end_in_a_sentence(variant_rgb: str, tmp_path: Path, name: 
 
 
 @pytest.mark.slow
-def test_the_script_names_what_it_found(variant_rgb: str, capsys: pytest.CaptureFixture) -> None:
-    """In a child process, as it reads 20,000: three files, each counted."""
+def test_the_script_reports_its_files(variant_rgb: str, capsys: pytest.CaptureFixture) -> None:
+    """In a child process, as for 20,000 files: three files, each counted."""
     assert fuzz.main(["--files", "3", "--only", "vol"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("vol: 3 files, ")
