@@ -22,6 +22,7 @@ al. 2011 (blocks); Hofmann et al. 2021 (one corner in place of eight).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -99,12 +100,10 @@ def residual_ratio_tracking(
     roulette; T (max(exp(-int m dt), ``ROULETTE_BELOW``) - T) at most.
     Cost: one step a block, and kappa int (M - m) dt look-ups of one value each.
     """
-    is_ascending = segment.d > 0
-    blocks, res, channels, values = lattice.block_ranges, lattice.res, lattice.channels, dr.detach(lattice.values.array)
-    shift = blocks.shift
-    speed = dr.abs(segment.d) * 2.0**-shift
+    blocks, channels, values = lattice.block_ranges, lattice.channels, dr.detach(lattice.values.array)
+    draw_corner = _make_corner_sampler(lattice, segment)
     rate = LOOKUP_RATE * scale
-    coarse = block_segment(segment, shift)
+    coarse = block_segment(segment, blocks.shift)
 
     def visit(state: _TrackedRay, cell: Cell, on: mi.Bool) -> tuple[_TrackedRay, mi.Float]:
         least, above = blocks.at(cell.lower + 1, on)
@@ -114,13 +113,8 @@ def residual_ratio_tracking(
         dt = dr.select(meets, dr.minimum(state.ahead / density, cell.dt), cell.dt)
         tau = [t + dr.select(on, scale * m * dt, 0) for t, m in zip(state.tau, least, strict=True)]
         # -- The factor, from one corner of the cell -------------------------------------------------------------------
-        near = dr.fma(speed, dt, cell.frac)
-        inside = dr.select(is_ascending, near, 1 - near) * (1 << shift)
         rng, u = draw_pcg32(state.rng, 5)
-        node = mi.Vector3i(dr.floor(inside + mi.Vector3f(*u[:3])))
-        node = (cell.lower + 1) * (1 << shift) - 1 + node
-        node = dr.clip(node, 0, mi.Vector3i(res[2] - 1, res[1] - 1, res[0] - 1))
-        index = mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x) * channels
+        index = draw_corner(cell, dt, u) * channels
         weight = []
         for c, (w, m) in enumerate(zip(state.weight, least, strict=True)):
             value = dr.gather(mi.Float, values, index + c, meets)
@@ -148,6 +142,24 @@ def residual_ratio_tracking(
     )
     end = walk_cells(BlockLattice(tuple(n - 1 for n in blocks.res)), coarse, visit, start, (), active, is_dark, halts=True)
     return [w * dr.exp(-t) for t, w in zip(end.tau, end.weight, strict=True)], end.rng
+
+
+def _make_corner_sampler(lattice: Lattice, segment: Segment) -> Callable[[Cell, mi.Float, list[mi.Float]], mi.UInt32]:
+    """Make ``draw_corner(cell, dt, u)``, drawing a corner of the cell at the distance ``dt`` behind the entry into a block.
+
+    Each corner has its trilinear weight as probability, by three uniform random numbers; the result is the index of its node.
+    """
+    res, shift = lattice.res, lattice.block_ranges.shift
+    is_ascending, speed = segment.d > 0, dr.abs(segment.d) * 2.0**-shift
+
+    def draw_corner(cell: Cell, dt: mi.Float, u: list[mi.Float]) -> mi.UInt32:
+        near = dr.fma(speed, dt, cell.frac)
+        inside = dr.select(is_ascending, near, 1 - near) * (1 << shift)
+        node = (cell.lower + 1) * (1 << shift) - 1 + mi.Vector3i(dr.floor(inside + mi.Vector3f(*u[:3])))
+        node = dr.clip(node, 0, mi.Vector3i(res[2] - 1, res[1] - 1, res[0] - 1))
+        return mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x)
+
+    return draw_corner
 
 
 def block_segment(segment: Segment, shift: int) -> Segment:
@@ -222,9 +234,8 @@ def delta_tracking_in_blocks(
     """
     lattice = part.lattice
     segment = clip_interval(lattice, interval)
-    blocks, res, values = lattice.block_ranges, lattice.res, dr.detach(part.values)
-    shift, is_ascending = blocks.shift, segment.d > 0
-    speed = dr.abs(segment.d) * 2.0**-shift
+    blocks, values = lattice.block_ranges, dr.detach(part.values)
+    draw_corner = _make_corner_sampler(lattice, segment)
 
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple[tuple, mi.Float]:
         ahead, s, collides, rng = state
@@ -235,12 +246,8 @@ def delta_tracking_in_blocks(
         meets = on & (ahead < rate * cell.dt)
         dt = dr.select(meets, dr.minimum(ahead / rate, cell.dt), cell.dt)
         # -- Real or not, from one corner of the cell ------------------------------------------------------------------
-        near = dr.fma(speed, dt, cell.frac)
-        inside = dr.select(is_ascending, near, 1 - near) * (1 << shift)
         rng, u = draw_pcg32(rng, 5)
-        node = (cell.lower + 1) * (1 << shift) - 1 + mi.Vector3i(dr.floor(inside + mi.Vector3f(*u[:3])))
-        node = dr.clip(node, 0, mi.Vector3i(res[2] - 1, res[1] - 1, res[0] - 1))
-        value = dr.gather(mi.Float, values, mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x), meets)
+        value = dr.gather(mi.Float, values, draw_corner(cell, dt, u), meets)
         real = meets & (u[3] * majorant <= value)
         ahead = dr.select(meets, -dr.log(u[4]), dr.maximum(ahead - dr.select(on, rate * dt, 0), 0))
         return (ahead, dr.select(real, cell.s + dt, s), collides | real, rng), dt
@@ -250,7 +257,14 @@ def delta_tracking_in_blocks(
     start = (-dr.log(u), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width), rng)
     coarse = BlockLattice(tuple(n - 1 for n in blocks.res))
     _, s, collides, rng = walk_cells(
-        coarse, block_segment(segment, shift), visit, start, (), interval.active, until=lambda state: state[2], halts=True
+        coarse,
+        block_segment(segment, blocks.shift),
+        visit,
+        start,
+        (),
+        interval.active,
+        until=lambda state: state[2],
+        halts=True,
     )
     return dr.select(collides, segment.start + mi.Float64(s), dr.inf), rng
 

@@ -21,6 +21,7 @@ __all__ = [
     "UNIFORM_EMITTER",
     "ChosenEmitter",
     "SceneEmitters",
+    "fractional_part",
     "is_among",
     "EventSamples",
     "EquiangularSampler",
@@ -165,10 +166,10 @@ class EventSamples:
         part = Strata(number, across, count // across)
 
         def one(u: mi.Float) -> mi.Float:
-            return _fractional_part(dr.fma(k, 0.6180339887, u))
+            return fractional_part(dr.fma(k, 0.6180339887, u))
 
         def two(u: mi.Point2f) -> mi.Point2f:
-            return mi.Point2f(_fractional_part(dr.fma(k, 0.7548776662, u.x)), _fractional_part(dr.fma(k, 0.5698402910, u.y)))
+            return mi.Point2f(fractional_part(dr.fma(k, 0.7548776662, u.x)), fractional_part(dr.fma(k, 0.5698402910, u.y)))
 
         moved = EventSamples(
             self.piece,
@@ -189,7 +190,8 @@ class EventSamples:
         return replace(self, emitter=emitter, direction=direction, strata=None)
 
 
-def _fractional_part(x: mi.Float) -> mi.Float:
+def fractional_part(x: mi.Float) -> mi.Float:
+    """x - floor(x), in [0, 1)."""
     return x - dr.floor(x)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from mivol.kernel_recording import is_recording
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, DirectSample
-from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER, EventSamples
+from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER, EventSamples, fractional_part
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.single_scattering.distance_sampling import extinguished_light
 from mivol.transport.media.body import Body, eval_albedo
@@ -193,10 +193,10 @@ def _estimate_node_light(
     mei = _interaction_at(p, origins.towards(p))
     mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(lane)), mi.MediumPtr(body.view.medium), None)
     # A rank-1 lattice over the directions of a node, shifted by the node's number (Cranley-Patterson rotation).
-    shift = [_fractional_part(mi.Float(node) * k) for k in (0.7548776, 0.5698403, 0.3819660)]
-    first, second = (turn + 0.5) / DIRECTIONS, _fractional_part(turn * 0.6180340)
-    flat = mi.Point2f(_fractional_part(first + shift[0]), _fractional_part(second + shift[1]))
-    which, component = _fractional_part(turn * 0.7548776 + shift[2]), _fractional_part(turn * 0.5698403)
+    shift = [fractional_part(mi.Float(node) * k) for k in (0.7548776, 0.5698403, 0.3819660)]
+    first, second = (turn + 0.5) / DIRECTIONS, fractional_part(turn * 0.6180340)
+    flat = mi.Point2f(fractional_part(first + shift[0]), fractional_part(second + shift[1]))
+    which, component = fractional_part(turn * 0.7548776 + shift[2]), fractional_part(turn * 0.5698403)
     samples = EventSamples(mi.Float(0), mi.Point2f(0), which, flat, component, flat, mi.Float(0))
     ray = mi.Ray3f(p, -mei.wi, dr.inf, mi.Float(0), mi.Color0f())
     chosen = direct.emitters.choose_emitter(ray, samples.which_emitter)
@@ -228,10 +228,6 @@ def _merge_equal(rows: list[mi.Float]) -> list[mi.Float]:
     if is_recording() or any(dr.any(row != rows[0]) for row in rows[1:]):
         return rows
     return rows[:1]
-
-
-def _fractional_part(x: mi.Float) -> mi.Float:
-    return x - dr.floor(x)
 
 
 def _interaction_at(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f:
