@@ -1,4 +1,4 @@
-"""The table of what media emit: densities of points and of directions, against sums over its cells."""
+"""The table of emitted power: densities of points and of directions, against sums over its cells."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def numbers(n: int, count: int, seed: int) -> list[mi.Float]:
 
 
 def two() -> mi.Scene:
-    """A fire, and beside it another of constants in a box of another size, a third as bright in every cell."""
+    """A fire, and a box of constants of another size beside it, a third as bright in every cell."""
     far = affine(np.diag([0.5, 0.5, 0.25]), [1.0, 0.2, 0.1])
     low = medium("mivol_medium", 0.5, 0.0, emission={"type": "rgb", "value": [2.0, 1.0, 0.0]})
     values = np.ones((2, 2, 2, 1), np.float32)
@@ -49,12 +49,12 @@ def two() -> mi.Scene:
 
 
 def order(table: EmissionTable) -> list[int]:
-    """Which of the two fires each box is: Mitsuba keeps shapes in an order of its own."""
+    """The order of the two boxes: Mitsuba orders shapes as it likes."""
     return [0 if box.box.to_world[0, 0] > 0.6 else 1 for box in table.boxes]
 
 
 def test_cells_have_their_share_of_the_power() -> None:
-    """sigma_t (1 - albedo) Le times the volume of a cell, and the even share."""
+    """sigma_t (1 - albedo) Le times the volume of a cell, and the uniform share."""
     table = table_of(two())
     which = order(table)
     power = np.repeat(np.array([1 * 0.75 * 18 * 0.7 * 0.5 * 0.8, 0.5 * 3 * 0.5 * 0.5 * 0.25])[which], CELLS_PER_AXIS**3)
@@ -92,7 +92,7 @@ def test_points_are_drawn_with_their_density() -> None:
 
 @pytest.mark.statistical
 def test_dark_cells_are_seldom_drawn() -> None:
-    """The same of a fire whose cells are unlike each other."""
+    """The same for a fire with different cells."""
     table = table_of(seen("over a floor", res=4))
     u, *inside = numbers(N, 4, 4)
     q = (np.array(table.sample_point(u, inside)).T - PLACE[:3, 3]) / np.diag(PLACE)[:3]
@@ -104,7 +104,7 @@ def test_dark_cells_are_seldom_drawn() -> None:
 @pytest.mark.parametrize("origin", [(0.1, 0.05, -0.1), (-2.0, 0.3, 0.4)], ids=["inside", "outside"])
 @pytest.mark.statistical
 def test_the_density_of_directions_integrates_to_one(origin: tuple) -> None:
-    """Over the sphere; and each direction that is drawn has one."""
+    """The density integrates to 1 over the sphere, and each sampled direction has a density."""
     table = table_of(seen("over a floor", res=4))
     o = mi.Point3f(*origin) + dr.zeros(mi.Point3f, N)
     u, v, w, *rest = numbers(N, 6, 2)
@@ -118,7 +118,9 @@ def test_the_density_of_directions_integrates_to_one(origin: tuple) -> None:
 
 @pytest.mark.statistical
 def test_points_of_a_ray_are_drawn_with_their_density() -> None:
-    """The mean of t^k / density is the integral of t^k over what a ray passes of both boxes; light sums the table along it."""
+    """The mean of t^k / density is the integral of t^k over the ray's intervals in both boxes; ``light`` sums the table along
+    the ray.
+    """
     table = table_of(two())
     o, d = mi.Point3f(-1.0, 0.25, 0.15), mi.Vector3f(1, 0, 0)
     on = dr.full(mi.Bool, True, N)

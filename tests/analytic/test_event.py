@@ -33,7 +33,7 @@ def segments(**shapes: dict) -> tuple[SceneMedia, mi.Ray3f, SegmentEnd]:
     return media, ray, SegmentEnd(si, si.t, fog, 1.0)
 
 
-def test_a_surface_is_met_where_there_is_one_and_the_lane_goes_on():
+def test_active_lanes_hit_the_surface():
     media, _, end = segments(wall=WALL)
     found = PathEvent.from_estimate(SegmentEstimate(end, mi.Spectrum(1), None, None), mi.Bool(True, True, False))
     assert np.array(found.at_surface).tolist() == [True, False, False]
@@ -59,7 +59,7 @@ def test_a_collision_comes_before_the_surface():
     assert np.array(vertex.interaction.p.z).tolist()[::2] == [1.5, 0]
 
 
-def test_where_there_are_no_surfaces_a_collision_has_a_vertex_of_a_medium_alone():
+def test_without_surfaces_a_collision_has_a_medium_vertex():
     media, ray, end = segments(cloud=box_of(medium("homogeneous", 1.0, 0.5), np.eye(4)))
     mei, place = medium_interaction(ray, mi.Float(0.5), end.medium), point_along(ray, 0.5)
     hit = Collision(mei, place, mi.Spectrum(0.5), True, mi.Float64(0.5), mi.UInt32(0))
@@ -100,7 +100,7 @@ class FallingRays:
             )
 
 
-def test_a_diffuse_wall_turns_paths_that_may_scatter():
+def test_a_diffuse_wall_scatters_paths_that_may_scatter():
     """The weight is the reflectance, and the density the cosine over pi; the new ray leaves the wall into the medium in front
     of it.
     """
@@ -115,7 +115,7 @@ def test_a_diffuse_wall_turns_paths_that_may_scatter():
     assert np.all(np.array(turn.origin.p.z) == 0) and len(turn.factors) == 1
 
 
-def test_what_a_mask_transmits_goes_straight_on_however_deep_the_path_is():
+def test_a_mask_transmits_rays_without_deviation_at_any_depth():
     """Random numbers above the opacity pass; the ray keeps its direction and the rest of its length, also if it may not
     scatter.
     """
@@ -128,7 +128,7 @@ def test_what_a_mask_transmits_goes_straight_on_however_deep_the_path_is():
 
 
 @pytest.mark.parametrize("lights_media", [True, False])
-def test_a_medium_turns_paths_by_its_phase_function(lights_media):
+def test_a_medium_scatters_paths_by_its_phase_function(lights_media):
     """The weight is the albedo; emitter samples find light from this direction too, unless all emitters are uniform."""
     bench = FallingRays(DIFFUSE, lights_media)
     turn = bench.turn([True] * 4, [True, True, False, True], [0.5] * 4)
@@ -143,7 +143,7 @@ def test_a_medium_turns_paths_by_its_phase_function(lights_media):
     np.testing.assert_array_equal(np.array(turn.origin.p.z), 1.5)
 
 
-def test_lanes_in_media_and_at_surfaces_turn_together():
+def test_lanes_in_media_and_at_surfaces_scatter_together():
     """Each lane continues as it would alone, and the factors of both kinds are reported."""
     bench, numbers, may = FallingRays(DIFFUSE), [0.5] * 4, [True] * 4
     both = bench.turn([True, False, True, False], may, numbers)

@@ -68,13 +68,13 @@ def follow(found: mi.Scene, keys: tuple[str, ...], depth: int = 1, spp: int = SP
 
 
 def assert_transposed(terms: np.ndarray, gradients: dict) -> None:
-    """Reverse and forward mode see the same random numbers: their sums differ by rounding, 1e-5 of the sum of all sizes."""
+    """Reverse and forward mode use the same numbers: their sums differ by rounding, 1e-5 of the sum of absolute values."""
     assert abs(sum(gradients.values()) - terms.sum()) < 1e-5 * np.abs(terms).sum()
     assert all(value != 0 for value in gradients.values())
 
 
 def of_batches(values: np.ndarray) -> Estimate:
-    """The mean of values that are drawn alike and independently."""
+    """The mean of independent, identically distributed values."""
     return Estimate(values.mean(), values.var(ddof=1) / values.size, values.size - 1)
 
 
@@ -90,8 +90,9 @@ BOUNDARIES = {"a box": "cube", "a traced sphere": "sphere"}
 @pytest.mark.parametrize("slack", [1.0, 3.0])
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
-    """Rationale: exp(-sigma chord) is known, the estimator is not told the chord. Expected: means and derivatives by the
-    extinction agree. A majorant that is too large costs look-ups and changes no mean."""
+    """Rationale: exp(-sigma chord) is known, and the estimator does not know the chord. Expected: means and derivatives by the
+    extinction agree. A loose majorant costs look-ups and changes no mean.
+    """
     chord = 2 * np.sqrt(0.8**2 - 0.5**2)
     found = scene([0, -4, 0.5], [0, 0, 0.5], fog=shape(BOUNDARIES[boundary], fog(radius=0.8, slack=slack)))
     image, tangent, _ = follow(found, ("sigma_t.sigma",))
@@ -102,7 +103,7 @@ def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
 
 @pytest.mark.statistical
 def test_colours_and_the_scale_of_the_medium() -> None:
-    """Each channel by itself, under one majorant for all of them; the scale is followed like the field's own parameters."""
+    """Each channel by itself, under a common majorant; the scale has a derivative like the field's own parameters."""
     sigma, chord = [0.3, 1.0, 2.0], 1.6
     image, tangent, _ = follow(scene([0, -4, 0], [0, 0, 0], fog=shape("cube", fog(sigma, radius=0.8))), ("scale", "sigma"))
     for channel, own in enumerate(sigma):
@@ -113,7 +114,7 @@ def test_colours_and_the_scale_of_the_medium() -> None:
 
 @pytest.mark.statistical
 def test_several_media_along_a_ray() -> None:
-    """Two bounded media, one in a box and one that is traced, beside a grid and a constant, which stay exact."""
+    """Two bounded media, in a box and in a traced boundary, beside a grid and a constant, which stay exact."""
     place = mi.ScalarTransform4f().translate([-0.5, 1.5, -0.5])
     grid = {"type": "mivol_voxels", "data": mi.TensorXf(np.full((4, 4, 4, 1), 0.5, np.float32)), "to_world": place}
     found = scene(
@@ -132,8 +133,9 @@ def test_several_media_along_a_ray() -> None:
 
 @pytest.mark.statistical
 def test_a_boundary_that_is_entered_twice() -> None:
-    """One medium in two spheres on a diagonal of the field's box: the nearer one lies in the box and beyond the ball, and a
-    point of the derivative is drawn in each by its length."""
+    """One medium in two spheres on a diagonal of the field's box. The nearer sphere lies in the box and beyond the ball, and
+    each sphere has points of the derivative in proportion to its length.
+    """
     diagonal = np.ones(3) / np.sqrt(3)
     medium = {**fog(1.1, radius=1.0), "id": "fog"}
     found = scene(
@@ -185,7 +187,7 @@ def test_a_ball_that_scatters_any_number_of_times(whole_paths: None) -> None:
 
 @pytest.mark.statistical
 def test_several_passes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A gradient that Dr.Jit pulls back in one pass is kept in the next."""
+    """A gradient delivered by Dr.Jit in one pass is kept in the next."""
     monkeypatch.setitem(plan.PASS_RAYS, "llvm", SIDE * SIDE * SPP // 4)
     found = scene([0, -4, 0.5], [0, 0, 0.5], fog=shape("sphere", fog(radius=0.8)))
     _, tangent, _ = follow(found, ("sigma_t.sigma",))
@@ -216,7 +218,7 @@ def test_a_majorant_that_is_none_is_refused() -> None:
 
 
 def test_a_plan_is_explained_where_no_optical_depth_is_known() -> None:
-    """What one scattering leaves out is told by the optical depth, of media that have one."""
+    """The plan tells the error of single scattering by the optical depth, for media with a known optical depth."""
     text = explain(scene([0, -4, 0], [0, 0, 0], fog=shape("cube", {**fog(), "albedo": 0.5})), max_depth=2)
     assert "a bounded Ball" in text
     assert "one scattering leaves out" not in text

@@ -1,4 +1,4 @@
-"""Vertices: a diffuse surface with smoke on one side of it, and a point of smoke."""
+"""Vertices: a diffuse surface with smoke on one side, and a point of smoke."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_diffuse_wall_reflects_by_the_cosine(media):
 
 
 def test_a_ray_starts_in_the_medium_of_its_side(media):
-    """Behind the wall there is smoke; the origin lies a little on that side."""
+    """Smoke lies behind the wall; the origin of the ray lies slightly on this side."""
     vertex = on_the_wall(media)
     front, above = vertex.leave(mi.Point3f(1, 0, 3))
     back, below = vertex.leave(mi.Point3f(1, 0, -3))
@@ -56,7 +56,7 @@ def test_a_wall_that_bounds_nothing_keeps_the_medium_of_the_ray():
 
 
 def test_a_point_of_smoke_scatters_by_its_phase_function(media):
-    """Henyey-Greenstein of g = 0.5 where light turns by 0 and by 90 degrees; it stays in its medium, at its place."""
+    """Henyey-Greenstein of g = 0.5 at scattering angles of 0 and 90 degrees; the ray starts in the medium, at the point."""
     smoke = media.scene.shapes()[0].interior_medium()
     mei = medium_interaction(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, -1)), mi.Float(2), smoke)
     vertex = MediumVertex(media, mei, mi.Point3d(mei.p))

@@ -1,4 +1,4 @@
-"""The table of segment estimators: every question has one answer at most, and a plan takes it."""
+"""The table of segment estimators: at most one entry applies to any needs, and the plan takes it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ QUESTIONS = [SegmentNeeds(*flags, *turns) for flags in itertools.product((False,
 
 @pytest.mark.parametrize("asked", QUESTIONS, ids=str)
 def test_a_question_has_one_answer_at_most(asked: SegmentNeeds) -> None:
-    """Quadrature is for one scattering, and bounded media that emit must scatter besides; all else has exactly one."""
+    """Quadrature serves single scattering only, and bounded emitting media must scatter too; exactly one entry applies to all
+    other needs.
+    """
     found = [name for name, entry in SEGMENT_ESTIMATORS.items() if entry.applies(asked)]
     if asked.scatters:
         several = asked.scatterings > 1 or asked.emits or asked.is_bounded or asked.refracts

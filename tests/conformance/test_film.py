@@ -1,4 +1,4 @@
-"""The image does not depend on how its samples are split, and every film, filter, crop and sensor gives Mitsuba's image."""
+"""The image does not depend on the split of its samples, and equals Mitsuba's image for every film, filter, crop and sensor."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PLACE = scenes.centred(2 * np.eye(3))
 
 
 def parts(sensor: dict) -> dict:
-    """A volume before a bright wall that hides half of the sky."""
+    """A volume in front of a bright wall hiding half of the sky."""
     values = np.random.default_rng(5).uniform(0, 2, (4, 5, 6, 1)).astype(np.float32)
     return {
         "type": "scene",
@@ -77,7 +77,7 @@ CAMERAS = {
     "name", cases(CAMERAS, ["perspective", "gaussian filter", "lanczos filter", "orthographic", "rgba", "border"])
 )
 def test_same_image_as_volpath(name):
-    """Batch means of both, 12 batches of 64 samples: the stock integrator is the judge of film and sensor."""
+    """Batch means of both, 12 batches of 64 samples: the stock integrator is the reference for film and sensor."""
     scene = mi.load_dict(parts(CAMERAS[name]()))
     ours = moments(scene, mi.load_dict({"type": "mivol", "max_depth": 1}), 64, 0)
     stock = moments(scene, mi.load_dict({"type": "volpath", "max_depth": 1}), 64, 500)
@@ -92,7 +92,7 @@ def test_same_image_as_volpath(name):
     "kind", cases(["independent", "stratified", "multijitter", "ldsampler"], ["independent", "stratified", "ldsampler"])
 )
 def test_split_into_passes(kind, monkeypatch):
-    """4 passes of one sample have the mean of one pass of 4."""
+    """4 passes of one sample have the mean of one pass of 4 samples."""
     made = sensor_of(rfilter="gaussian")
     made["sampler"] = {"type": kind, "sample_count": 4}
     scene = mi.load_dict(parts(made))
@@ -135,7 +135,7 @@ def test_pixels_are_not_correlated_between_passes(monkeypatch):
 
 @pytest.mark.parametrize("layout", [film.SPREAD, film.TILED])
 def test_samples_of_a_pixel_share_it_out(layout):
-    """Of 12 samples one lies in each cell of 3 x 4, in an order of its own in each tile or pixel."""
+    """Of 12 samples, each cell of 3 x 4 holds one, in an order of its own in each tile or pixel."""
     # A box filter would count all samples of a pixel at its corner.
     samples = film.RenderSamples(mi.load_dict(sensor_of(rfilter="gaussian")), 5, 12, 1 << 20, layout)
     (rays,) = film.film_passes(samples)
@@ -148,7 +148,7 @@ def test_samples_of_a_pixel_share_it_out(layout):
 
 
 def test_a_new_seed_compiles_nothing():
-    """A kernel holds no seed: only the first render of a scene is compiled."""
+    """A kernel contains no seed: only the first render of a scene is compiled."""
     smoke = medium("heterogeneous", grid_volume("gridvolume", np.ones((4, 5, 6, 1), np.float32), PLACE), 0.5)
     scene = mi.load_dict({"type": "scene", "box": box_of(smoke, PLACE), "sky": sky(0.5), "sensor": sensor_of()})
     integrator, compiled = mi.load_dict({"type": "mivol", "max_depth": 2}), []
@@ -197,8 +197,9 @@ def test_many_views_share_their_kernels():
 
 
 def test_a_scene_that_holds_its_integrator_is_freed():
-    """The integrator must not hold the scene in turn: Mitsuba counts references, and each call of a medium, an emitter or a
-    BSDF is traced for every one that is left over (fits were 20 times slower after 80 scenes)."""
+    """The integrator must not hold the scene: Mitsuba counts references, and traces each call of a medium, emitter or BSDF for
+    every object left over (fits were 20 times slower after 80 scenes).
+    """
     scene = mi.load_dict(parts(sensor_of()) | {"integrator": {"type": "mivol", "max_depth": 2}})
     mi.render(scene, spp=1)
     integrator = weakref.ref(scene.integrator())
@@ -208,7 +209,7 @@ def test_a_scene_that_holds_its_integrator_is_freed():
 
 
 def test_one_integrator_on_two_scenes():
-    """The same integrator on one scene after the other keeps nothing of the first (prbvolpath does: 5.4 times too dark)."""
+    """The same integrator, used on two scenes, keeps nothing of the first (prbvolpath does: 5.4 times too dark)."""
     integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
     full = mi.load_dict(parts(sensor_of()))
     bare = parts(sensor_of())

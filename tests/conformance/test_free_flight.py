@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 @pytest.fixture
 def flies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Free flights at depth 2 too, where the plan would take the estimator of one scattering."""
+    """The plan uses free flights at depth 2 too, instead of the estimator of single scattering."""
     choose = plan.choose_segment_estimator
     monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
 
@@ -39,10 +39,10 @@ def unlimited(**more: object) -> dict:
 
 @pytest.mark.parametrize("top", [1.0, 40.0])
 def test_white_furnace(top):
-    """A medium that only scatters cannot be seen in light that is the same from everywhere: each sample is 1, to rounding.
+    """A purely scattering medium is invisible in even light: each sample is 1, up to rounding.
 
-    The throughput is a product of albedos of 1 and of phase weights that are 1 to some ulps; paths through an optical depth
-    of 40 have some hundred factors of 1 +- 1e-7.
+    The throughput is a product of albedos of 1 and of phase weights equal to 1 up to some ulps; paths through an optical depth
+    of 40 have some hundreds of them.
     """
     scene = close_up({"smoke": smoke(rough_grid(2, top), 1.0, name="hg", g=0.6)[0], "sky": scenes.sky(1.0)}, res=8)
     image = scenes.render(scene, unlimited(), 4, seed=fresh(1))
@@ -51,7 +51,7 @@ def test_white_furnace(top):
 
 @pytest.mark.statistical
 def test_absorption_and_scattering_are_a_density_and_an_albedo():
-    """The same smoke by sigma_a and sigma_s, and by sigma_t and an albedo of 0.6."""
+    """The same smoke, given by sigma_a and sigma_s, and by sigma_t and an albedo of 0.6."""
     density = rough_grid(4, 2.0)
     parts = {f"sigma_{k}": grid_volume("mivol_voxels", as_float32(c * density), PLACE) for k, c in (("a", 0.4), ("s", 0.6))}
     found = []
@@ -74,7 +74,7 @@ def test_roulette_spares_paths_that_lose_little():
 
 @pytest.mark.statistical
 def test_isothermal_furnace():
-    """What absorbs and glows like its surroundings cannot be seen either, whatever it scatters."""
+    """A medium glowing like its surroundings is invisible too, for any scattering."""
     interior = medium("mivol_medium", grid_volume("mivol_voxels", rough_grid(3, 3.0), PLACE), 0.6, emission=1.0)
     scene = close_up({"smoke": box_of(interior, PLACE), "sky": scenes.sky(1.0)}, res=8)
     found = over_pixels(small.moments(scene, unlimited(rr_depth=50), 64))
@@ -93,7 +93,7 @@ def h_function(albedo: float, mu: float = 1.0) -> float:
 
 
 def half_space(albedo: float) -> mi.Scene:
-    """Seen from above in a constant sky: 400 free paths deep, and as wide to each side as no path gets."""
+    """A half-space seen from above in a constant sky: 400 mean free paths deep, and wider to each side than any path."""
     place = centred(np.diag([8000.0, 8000.0, 400.0]), (0, 0, -200.0))
     sensor = {"type": "orthographic", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])}
     sensor |= {"film": scenes.film(4, 4), "sampler": {"type": "independent"}}
@@ -230,7 +230,7 @@ def test_roulette_keeps_the_mean():
 
 @pytest.mark.statistical
 def test_alpha_is_the_opacity():
-    """What is drawn has the mean of what is known."""
+    """The drawn alpha has the mean of the exact alpha."""
     rgba = mi.load_dict({"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgba", "rfilter": {"type": "box"}})
     scene = mi.load_dict(
         {"type": "scene", "smoke": smoke(rough_grid(7, 2.0), 0.8)[0], "bulb": point([1.7, -0.6, 1.4])[0]}

@@ -1,4 +1,4 @@
-"""Media behind boundaries that refract: no straight ray finds an emitter, so none is sent; and roulette of long paths."""
+"""Media behind refracting boundaries, which straight shadow rays cannot pass; and the roulette of long paths."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_emitters_are_drawn_where_a_straight_ray_may_find_one(name: str) -> None
 
 
 def test_media_around_shapes_are_not_sealed() -> None:
-    """A ray may begin in them: the medium of the sensor, or of the outside of a shape."""
+    """A ray may begin in the medium of the sensor, or in the medium outside a shape."""
     milk = mi.load_dict({"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.9})
     bubble = ball(0.0, bsdf=GLASS, exterior=milk, interior={"type": "homogeneous", "sigma_t": 1.0})
     assert not survey_scene(mi.load_dict({"type": "scene", "bubble": bubble, "sky": scenes.sky()})).is_sealed
@@ -80,9 +80,8 @@ WAIT = 100
 
 
 def furnace(sky: dict, interior: dict | None = None) -> mi.Scene:
-    """A white ball of a mean free path of a sixteenth of its radius, in light of 1 from everywhere.
-
-    The index of refraction of its boundary is that of air.
+    """A white ball with a mean free path of a sixteenth of its radius, in even light of 1; the index of its boundary equals
+    air.
     """
     milk = {"type": "homogeneous", "sigma_t": 16.0, "albedo": 1.0}
     matched = {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0}
@@ -92,7 +91,7 @@ def furnace(sky: dict, interior: dict | None = None) -> mi.Scene:
 
 
 def panorama() -> dict:
-    """A sky of 1 whose every direction is looked up, so that no plan knows that they are the same."""
+    """A constant sky of 1 as an environment map: the plan does not know that it is constant."""
     return {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
 
 
@@ -100,8 +99,9 @@ UNLIMITED = {"type": "mivol", "max_depth": -1, "rr_depth": WAIT}
 
 
 def test_roulette_spares_long_paths_in_even_light() -> None:
-    """Every path that escapes brings 1; at the surface roulette ends those that have scattered ``rr_depth`` times with a chance
-    of 0.05, and nothing else does."""
+    """Every escaping path finds 1. At the surface, roulette ends paths after ``rr_depth`` scattering events with a probability
+    of 0.05, and no other paths.
+    """
     light = scenes.render(furnace(scenes.sky()), UNLIMITED, 1, seed=3)[..., 0].ravel()
     ends = np.array([0, 1, 1 / 0.95])
     assert np.abs(light[:, None] - ends).min(axis=1).max() < 1e-4  # some thousand factors of 1 +- 6e-8
@@ -109,7 +109,9 @@ def test_roulette_spares_long_paths_in_even_light() -> None:
 
 
 def test_roulette_ends_long_paths_in_light_that_has_a_place() -> None:
-    """A path of n > LONG scatterings brings sqrt(n / LONG): an n that is whole to its rounding, and some are twice LONG."""
+    """A path of n > LONG_PATH scattering events has the throughput sqrt(n / LONG_PATH): n is a whole number up to rounding, and
+    some are twice LONG_PATH.
+    """
     light = scenes.render(furnace(panorama()), UNLIMITED, 1, seed=3)[..., 0].ravel()
     raised = light[light > 1.06] * 0.95
     n = raised**2 * LONG_PATH
@@ -126,7 +128,7 @@ def test_roulette_of_long_paths_keeps_the_mean() -> None:
 
 
 def test_roulette_spares_long_paths_where_media_emit() -> None:
-    """The light of a path grows with its length: none is worth less than what it has cost."""
+    """The light of a path grows with its length, so long paths are worth their cost."""
     glow = {"type": "mivol_medium", "sigma_t": 16.0, "albedo": 1.0, "emission": 1.0}
     scene = furnace(panorama(), glow)
     survey, settings = survey_scene(scene), Settings(max_depth=-1)

@@ -1,4 +1,4 @@
-"""Shadow rays: surfaces and emitters that transmit part of the light undeviated, and rays that end by roulette."""
+"""Shadow rays through surfaces and emitters transmitting part of the light, and the roulette along shadow rays."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize("emitter", small.cases(["bulb", "emitter", "sky"], ["emitter", "sky"]))
 def test_shadow_rays_go_on_through_what_is_partly_clear(emitter):
-    """A mask dims them by its transparency, as volpath does, towards all kinds of emitters."""
+    """A mask attenuates shadow rays by its transparency, as in volpath, towards all kinds of emitters."""
     sky = EMITTERS["envmap"]()["emitter"]
     shine = {"bulb": point([1.6, -1.3, 1.7])[0], "emitter": area(1.6, -1.3, 1.7), "sky": sky}[emitter]
     same(behind_a_mask() | {"shine": shine})
@@ -46,7 +46,7 @@ def test_shadow_rays_go_on_through_what_is_partly_clear(emitter):
 @pytest.mark.parametrize("emitter", small.cases(["bulb", "sky"], ["sky"]))
 @pytest.mark.parametrize("kind", small.cases(["transmissive", "boundary"], ["boundary"]))
 def test_emitters_that_let_light_pass(kind, emitter):
-    """A luminous mask before another emitter, and a boundary that shines itself: what is behind them is seen through them."""
+    """A luminous mask in front of another emitter, and a luminous boundary: light from behind passes them."""
     shine = {"bulb": {"bulb": point([1.6, -1.3, 1.7], 40.0)[0]}, "sky": EMITTERS["envmap"]()}[emitter]
     light = {"emitter": {"type": "area", "radiance": 5.0}}
     if kind == "boundary":
@@ -72,14 +72,14 @@ def through(sigma_t: np.ndarray | float, rng: bool) -> tuple[np.ndarray, np.ndar
 
 
 def test_clear_rays_are_not_played_for():
-    """Up to the depth of SURE_DEPTH the estimate is exact: 0.9 here."""
+    """Up to the optical depth ROULETTE_TAU the estimate is exact, here at 0.9."""
     assert np.array_equal(through(0.45, True)[0], through(0.45, False)[0])
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "rgb grid", "constant"])
 def test_roulette_keeps_the_mean(kind):
-    """A ray that survives brings exp(-1) in its clearest channel, and less in the others; one that does not brings 0."""
+    """A surviving ray transmits exp(-1) in its clearest channel and less in the others; other rays transmit 0."""
     values = {"grid": [1.2], "rgb grid": [1.2, 0.9, 3.0]}.get(kind)
     sigma = 1.2 if values is None else np.tile(np.float32(values), (2, 2, 2, 1))
     exact, found = through(sigma, False)[0][0], through(sigma, True)[0]
@@ -91,7 +91,9 @@ def test_roulette_keeps_the_mean(kind):
 
 
 def test_a_ray_that_ends_is_walked_no_further():
-    """In a grid of 32 cells along the ray, of a depth of 64: those that end have gone a few cells, which their depth tells."""
+    """In a grid of 32 cells along the ray with an optical depth of 64, ended rays have walked a few cells, as their optical
+    depth shows.
+    """
     _, tau = through(np.full((2, 2, 32, 1), 32.0, np.float32), True)
     # A cell has a depth of 2, and a limit of 1 + ln(2^24) = 17.6 at most is passed by one cell.
     assert tau.min() > ROULETTE_TAU and tau.max() < 20 and tau.mean() < 5

@@ -1,4 +1,4 @@
-"""Gradients under a constant sky, of which a constant control variate takes a part over."""
+"""Gradients under a constant sky, with a constant control variate."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ WHITE = {
     small.cases([("stock", "a box"), *(("own", place) for place in WHITE)], [("own", "a box"), ("own", "two boxes")]),
 )
 def test_white_smoke_of_no_density_in_a_constant_sky_has_no_gradient(kind, place):
-    """What turns in is what is turned away: 0 in each sample, to rounding of the two (a few EPS of their size)."""
+    """In-scattering equals out-scattering: 0 in each sample, up to the rounding of the two (a few EPS of their size)."""
     gradients = []
     for albedo in (0.0, 1.0):
         medium_type, volume_type = small.KINDS[kind]
@@ -52,7 +52,7 @@ def test_white_smoke_of_no_density_in_a_constant_sky_has_no_gradient(kind, place
 @pytest.mark.statistical
 @pytest.mark.parametrize("alone", [True, False])
 def test_a_ball_under_a_constant_sky(alone):
-    """Density in a boundary that is traced, by itself and behind a box that shades it: against differences."""
+    """Density in a traced boundary, alone and behind a box shading it, against differences."""
     interior = medium("mivol_medium", grid_volume("mivol_voxels", 0.2 + rough_grid(1), PLACE), 0.8)
     parts = {"smoke": scenes.ball_of(interior, (0, 0, 0), 1.0), "sky": scenes.sky(0.7)}
     if not alone:

@@ -79,7 +79,7 @@ def glassy() -> mi.Scene:
 SCENES = {"sun": smoky, "floor": lambda: smoky(floor=floor()), "rgb": coloured, "fire": burning, "glass": glassy}
 
 
-def back(scene: mi.Scene, key: str, spp: int, seed: int, depth: int = 5) -> np.ndarray:
+def gradient_of_mean_image(scene: mi.Scene, key: str, spp: int, seed: int, depth: int = 5) -> np.ndarray:
     """The derivative of the mean image."""
     params, variable = watched(scene, key)
     w = mi.TensorXf(np.full((8, 8, 3), 1 / 192, dtype=np.float32))
@@ -115,7 +115,7 @@ def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.n
 @pytest.mark.parametrize("name", cases(SCENES, slow=("rgb", "fire", "glass")))
 def test_a_replay_finds_the_light_that_was_found(name: str, replays: list) -> None:
     """Replayed branches, in another order, leave only rounding; replayed stems leave the mean light of their branches."""
-    back(SCENES[name](), KEYS["density"], 16, fresh(3), depth=7)
+    gradient_of_mean_image(SCENES[name](), KEYS["density"], 16, fresh(3), depth=7)
     (first, whole, left, _), (second, light, rest, _) = replays
     assert (first, second) == ("walk_stem", "walk_branch")
     assert len(np.unique(light[0])) > 100
@@ -132,7 +132,7 @@ def test_light_is_linear_in_the_sun(depth: int, replays: list) -> None:
     """The derivative by the sun, times the sun, is the light of all stems, up to float32 sums in another order."""
     scene = smoky()
     bright = float(np.mean(mi.traverse(scene)[KEYS["sun"]]))
-    found = bright * np.sum(back(scene, KEYS["sun"], 16, fresh(3), depth))
+    found = bright * np.sum(gradient_of_mean_image(scene, KEYS["sun"], 16, fresh(3), depth))
     _, light, _, dL = replays[0]
     assert found == pytest.approx(np.sum(light * dL), rel=1e-4)
 
@@ -145,7 +145,7 @@ def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
         derivatives._Branches, "split", classmethod(lambda cls, *args: made.append(real(cls, *args)) or made[0])
     )
     monkeypatch.setattr(derivatives, "BALANCE", 100.0)
-    back(smoky(), KEYS["density"], 64, fresh(3))
+    gradient_of_mean_image(smoky(), KEYS["density"], 64, fresh(3))
     stem, seeds = np.array(made[0].stem), np.array(made[0].seeds[:2])
     assert np.array_equal(np.unique(stem, return_counts=True)[1], np.full(len(stem) // 4, 4))
     assert np.unique(seeds, axis=1).shape[1] == seeds.shape[1]
@@ -165,14 +165,14 @@ def test_the_fewer_paths_collide_the_more_branches_they_have(collided: int, coun
     assert count * collided <= 1000
 
 
-def test_where_no_path_collides_probes_are_alone(replays: list) -> None:
+def test_without_collisions_probes_give_the_derivative(replays: list) -> None:
     """A density of 0 has no branches, and derivatives from probes."""
-    found = back(smoky(np.zeros((4, 5, 6, 1))), KEYS["density"], 64, fresh(3))
+    found = gradient_of_mean_image(smoky(np.zeros((4, 5, 6, 1))), KEYS["density"], 64, fresh(3))
     assert [name for name, *_ in replays] == ["walk_stem"]
     assert np.abs(found).max() > 0
 
 
-def test_a_plan_takes_them_where_paths_fly_freely(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plan_branches_paths_with_free_flights(monkeypatch: pytest.MonkeyPatch) -> None:
     """Branches need free flights and a sampler without strata; images and recordings have none."""
     scene = smoky()
     facts = find_needs(scene, scene.sensors()[0])
@@ -190,7 +190,7 @@ def test_a_plan_takes_them_where_paths_fly_freely(monkeypatch: pytest.MonkeyPatc
     [("sun", "density", 4), ("sun", "albedo", 4), ("sun", "g", 4), ("sun", "density", -1), ("floor", "floor", 4),
      ("rgb", "density", 4), ("fire", "density", 4), ("glass", "density", -1)],
 )  # fmt: skip
-def test_they_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_branches_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean derivative equals the mean of whole paths, along a random direction in the upper half."""
     scene = SCENES[name]()
     shape = np.shape(mi.traverse(scene)[KEYS[key]])
@@ -199,7 +199,7 @@ def test_they_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest
         v[: shape[0] // 2] = 0
 
     def along(spp: int) -> Estimate:
-        found = [np.sum(back(scene, KEYS[key], spp, fresh(k), depth) * v) for k in range(BATCHES)]
+        found = [np.sum(gradient_of_mean_image(scene, KEYS[key], spp, fresh(k), depth) * v) for k in range(BATCHES)]
         return Estimate.of(Moments.of(np.array(found)[:, None]))
 
     monkeypatch.setattr(derivatives, "BALANCE", 2.0)
@@ -245,7 +245,7 @@ MISSED = 40.0
 """Where a ray passes all boxes."""
 
 
-def levels_of(
+def find_baselines(
     emitter: dict, *interiors: dict, depth: int = 3, at: tuple = (0, MISSED, 0.5, MISSED), seen: tuple = (0.5,) * 4
 ) -> Baseline | None:
     """The baseline for boxes with these media, 5 apart, the first at [-1, 1]^3, and for rays passing x = ``at``, seen at
@@ -265,14 +265,14 @@ def levels_of(
     return estimators.segment.baseline
 
 
-def level_of(*args: dict, **options: object) -> np.ndarray:
+def find_later_baseline(*args: dict, **options: object) -> np.ndarray:
     """The baseline of later flights, the same for all of the film."""
-    return np.array(levels_of(*args, **options).later).ravel()
+    return np.array(find_baselines(*args, **options).later).ravel()
 
 
-def test_in_a_white_furnace_it_is_the_light_of_the_sky():
+def test_baseline_in_a_white_furnace_is_the_light_of_the_sky():
     """Every path finds the light of the sky, up to the rounding of a sum of 4096."""
-    found = level_of(sky(0.5), medium("homogeneous", SIGMA, 1.0), depth=-1)
+    found = find_later_baseline(sky(0.5), medium("homogeneous", SIGMA, 1.0), depth=-1)
     np.testing.assert_allclose(found, 0.5, rtol=12 * 2.0**-23)
 
 
@@ -284,15 +284,17 @@ def test_collisions_count_as_their_derivatives_weigh():
     sigma, light = np.array([3.0, 0.5]), np.array([0.5, 0.0])
     weight = (1 - np.exp(-2 * sigma)) / (sigma + 0.3) ** 2
     boxes = [medium("homogeneous", s, albedo) for s, albedo in zip(sigma, (1.0, 0.0), strict=True)]
-    found = level_of(sky(0.5), *boxes, depth=-1, at=(0, 5, 0, 5))
+    found = find_later_baseline(sky(0.5), *boxes, depth=-1, at=(0, 5, 0, 5))
     np.testing.assert_allclose(found, np.sum(weight * light) / weight.sum(), rtol=0.08)
 
 
-def test_where_nothing_collides_it_is_the_mean_of_all_rays():
-    np.testing.assert_allclose(level_of(sky(0.5), medium("homogeneous", SIGMA, 1.0), at=(MISSED, MISSED)), 0.5, rtol=1e-6)
+def test_baseline_without_collisions_is_the_mean_of_all_rays():
+    np.testing.assert_allclose(
+        find_later_baseline(sky(0.5), medium("homogeneous", SIGMA, 1.0), at=(MISSED, MISSED)), 0.5, rtol=1e-6
+    )
 
 
-def test_under_an_emitter_it_is_the_mean_of_paths_that_collide():
+def test_baseline_under_an_emitter_is_the_mean_of_colliding_paths():
     """Albedo times I / (4 pi r^2), of the one path in twenty that collides.
 
     Shadows take 1 - exp(-0.17) of it at most, since no way through the box is longer than 3.5, and a second scattering adds
@@ -300,24 +302,24 @@ def test_under_an_emitter_it_is_the_mean_of_paths_that_collide():
     """
     emitter = {"type": "point", "position": [0.0, 0.0, FAR], "intensity": POWER}
     once = ALBEDO * POWER / (4 * np.pi * FAR**2)
-    found = level_of(emitter, medium("homogeneous", SIGMA, ALBEDO))
+    found = find_later_baseline(emitter, medium("homogeneous", SIGMA, ALBEDO))
     assert np.all((0.82 * once < found) & (found < 1.19 * once))
 
 
-def test_there_is_none_beside_a_sigma_s():
+def test_no_baseline_with_sigma_s():
     """With ``sigma_s`` the terms of absorption do not have the mean 0."""
     parts = {"type": "mivol_medium", "sigma_a": 0.1, "sigma_s": 0.2}
-    assert levels_of(sky(0.5), parts) is None
+    assert find_baselines(sky(0.5), parts) is None
 
 
-def test_first_flights_have_a_level_for_each_tile():
+def test_first_flights_have_a_baseline_for_each_tile():
     """White and black boxes in two tiles: the light of each, drawn to the mean of all by as much as 16 collisions weigh.
 
     Of 4096 paths n = 2048 (1 - exp(-2 sigma)) collide in each, with a standard deviation of 0.9 %; paths are always the same.
     Rays beside the film belong to the tiles at its edge.
     """
     boxes = [medium("homogeneous", 1.0, albedo) for albedo in (1.0, 0.0)]
-    found = levels_of(sky(0.5), *boxes, depth=-1, at=(0, 5, 0, 5), seen=(-0.1, 0.99, 0.0, 1.2))
+    found = find_baselines(sky(0.5), *boxes, depth=-1, at=(0, 5, 0, 5), seen=(-0.1, 0.99, 0.0, 1.2))
     n = 2048 * (1 - np.exp(-2.0))
     first, mean = np.array(found.first)[0], np.array(found.later)[0, 0]
     np.testing.assert_allclose(first[::2] / mean, (2 * n + 16) / (n + 16), rtol=0.06)

@@ -1,4 +1,4 @@
-"""Derivatives of light of media that is drawn where paths scatter."""
+"""Derivatives of sampled light of emitting media, at scattering events."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CASES = [pytest.param(*case, marks=() if case == QUICK else pytest.mark.slow) fo
 
 
 def _step(scene: mi.Scene, key: str) -> np.ndarray | float:
-    """A direction of one sign."""
+    """A direction with entries of one sign."""
     shape = np.shape(mi.traverse(scene)[key])
     return np.random.default_rng(2).uniform(0.5, 1.5, shape) if np.prod(shape) > 3 else 1.0
 
@@ -86,7 +86,7 @@ def _along(scene: mi.Scene, key: str, v: np.ndarray | float, integrator: dict, s
 @pytest.mark.statistical
 @pytest.mark.parametrize(("name", "what"), CASES)
 def test_draws_keep_the_mean_of_derivatives(name: str, what: str) -> None:
-    """With draws and by chance."""
+    """Sampling of the emission keeps the mean derivative of paths meeting the emission by chance."""
     scene, key = seen(name), KEYS[name, what]
     v, (few, many) = _step(scene, key), (16, 64) if (name, what) == QUICK else (64, 256)
     found, truth = _along(scene, key, v, drawn(3), few), _along(scene, key, v, met(3), many)

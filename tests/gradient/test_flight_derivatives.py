@@ -209,7 +209,7 @@ def test_density_by_differences(room, depth):
 
 @dataclass(frozen=True)
 class _Aside(Light):
-    """A camera that looks at the dense half of a box only."""
+    """A camera seeing only the dense half of a box."""
 
     def scene(self, values: np.ndarray, side: int) -> mi.Scene:
         parts = box_scene(values, side, self.albedo, **self.parts())
@@ -219,9 +219,8 @@ class _Aside(Light):
 
 @pytest.mark.statistical
 def test_what_no_camera_ray_meets():
-    """The empty half beside what is seen: light comes through it after a scattering, so that later probes alone find it.
-
-    Beside a path tracer that carries the derivative forward.
+    """The empty half beside the visible half: light passes it after a scattering event, so only later probes find its
+    derivative. The reference is a path tracer with forward derivatives.
     """
     left = np.broadcast_to(np.arange(8) < 4, (8, 8, 8))
     values, direction = np.where(left, 2.0, 0), np.where(left, 0.0, 1.0)
@@ -236,8 +235,9 @@ def test_what_no_camera_ray_meets():
 
 
 def test_probes_are_kept_in_proportion_to_their_gain():
-    """Before a scattering the first flight alone; after it flights of gains 1 and 3, kept in 1/4 and 3/4 of evenly spread
-    lanes, which stand for 4 together. Flights that may not scatter any more, and lanes without a point, are not kept."""
+    """The first probe comes from the first flight. Of later flights with gains 1 and 3, 1/4 and 3/4 of evenly spread lanes keep
+    the probe, with a total of 4. Flights of paths that may not scatter any more, and lanes without a point, keep none.
+    """
     n, never = 64, dr.full(mi.Bool, False, 64)
     ray = FineRay.from_ray(mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0), mi.Vector3f(0, 0, 1)))
     on, zero = ~never, dr.zeros(mi.UInt32, n)
@@ -263,7 +263,7 @@ OF_A_SUN = PARAMETERS | {"emitter": "sun.irradiance.value"}
 
 
 def _in_the_sun() -> mi.Scene:
-    """A peaked phase function under the sun, whose light side flights look for."""
+    """A peaked phase function under the sun, with side flights."""
     smoky = grid_volume("mivol_voxels", rough_grid(4, 4.0), PLACE)
     albedo = grid_volume("mivol_voxels", 0.9 * rough_grid(5, 1.0, (3, 3, 3)), PLACE)
     interior = medium("mivol_medium", smoky, albedo, phase={"type": "mivol_hg", "g": 0.8})
@@ -284,7 +284,7 @@ def test_of_side_flights_forward_is_the_transpose_of_reverse(name, whole_paths):
 
 
 def test_of_side_flights_light_is_linear_in_a_sky(whole_paths):
-    """The derivative along the sky itself is the picture of the same seed, to float32 sums in another order."""
+    """The derivative along the sky itself is the image with the same seed, up to float32 sums in another order."""
     light = np.random.default_rng(3).uniform(0.1, 1, (8, 16, 3)).astype(np.float32)
     light[2, 5] = 200
     interior = medium("mivol_medium", 1.5, 0.8, phase={"type": "mivol_hg", "g": 0.8})
@@ -300,7 +300,7 @@ def test_of_side_flights_light_is_linear_in_a_sky(whole_paths):
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", ["density", "albedo", "g"])
 def test_side_flights_keep_the_mean_of_derivatives(name, monkeypatch):
-    """With them and without, along a random direction in the upper half: what the two halves scatter nearly cancels."""
+    """With and without side flights, along a random direction in the upper half: the light of both halves nearly cancels."""
     scene, key, integrator = _in_the_sun(), OF_A_SUN[name], mi.load_dict(mivol(max_depth=4))
     shape = np.shape(mi.traverse(scene)[key])
     v = np.random.default_rng(2).uniform(0.5, 1.5, shape) if len(shape) == 4 else 1.0
@@ -316,7 +316,7 @@ def test_side_flights_keep_the_mean_of_derivatives(name, monkeypatch):
 @pytest.mark.slow_for("emission-5")
 @pytest.mark.parametrize(("name", "depth"), [("emission", 5), ("emitter", 5)])
 def test_light_is_linear_in_what_emits(name, depth):
-    """The derivative along an emission is the image of that emission alone, sample by sample."""
+    """The derivative along an emission is the image of this emission alone, sample by sample."""
     scene, key = _everything(), PARAMETERS[name]
     integrator, params = mi.load_dict(mivol(max_depth=depth, rr_depth=3)), mi.traverse(scene)
     kind, value = type(params[key]), np.array(params[key], dtype=np.float32)
@@ -335,7 +335,7 @@ def test_light_is_linear_in_what_emits(name, depth):
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_albedo_of_zero(monkeypatch):
-    """Where nothing scatters yet, light that would is found by probes; the estimator of one scattering never divides by it."""
+    """An albedo of 0 has a derivative, from probes; the estimator of single scattering never divides by it."""
     values = 0.9 * rough_grid(5, 1.0, (3, 3, 3)) * (np.arange(3) > 0)[None, None, :, None]
     density, albedo = (grid_volume("mivol_voxels", grid, PLACE) for grid in (rough_grid(4), values))
     interior = medium("mivol_medium", density, albedo)
@@ -370,7 +370,7 @@ LIGHTS, LENGTHS = (0.5, 0.0, 2.0, 0.1), (0.3, 0.9, 0.2, 0.7)
 
 
 def fog() -> object:
-    """Media of one homogeneous box, ready to take derivatives."""
+    """Media of one homogeneous box, prepared for derivatives."""
     scene = mi.load_dict(
         {
             "type": "scene",

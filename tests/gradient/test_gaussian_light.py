@@ -27,7 +27,7 @@ ALMOST_NONE = 1e-7
 
 
 def gaussians(white: bool = False) -> dict:
-    """Ten of them, well inside of a cube of edge 2; ``white`` ones have the radiance 1."""
+    """Ten Gaussians, well inside a cube of edge 2; ``white`` Gaussians have the radiance 1."""
     rng = np.random.default_rng(0)
     tensors = {
         "means": rng.uniform(-0.4, 0.4, (10, 3)),
@@ -42,7 +42,7 @@ def gaussians(white: bool = False) -> dict:
 
 
 def scene(albedo: float, nested: bool, white: bool = False, sigma_t: object = 0.4) -> mi.Scene:
-    """Gaussians over a floor under a sky, with fog in front of them, or all around them in a boundary that is traced."""
+    """Gaussians over a floor under a sky, with fog in front of them, or around them in a traced boundary."""
     cloud, fog = gaussians(white), {"type": "mivol_medium", "id": "fog", "sigma_t": sigma_t, "albedo": albedo}
     place, look = mi.ScalarTransform4f(), mi.ScalarTransform4f().look_at([0.5, 0.4, 6], [0, 0, 0], [0, 1, 0])
     if nested:
@@ -89,7 +89,7 @@ def over_tiles(drawn: np.ndarray) -> Moments:
 @pytest.mark.statistical
 @pytest.mark.parametrize("nested", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_everything_in_a_furnace_has_its_radiance(nested: bool) -> None:
-    """White Gaussians of the radiance of the sky emit what they absorb; fog and floor lose nothing."""
+    """White Gaussians with the radiance of the sky emit as much as they absorb; fog and floor lose nothing."""
     found = pictures(scene(1.0, nested, white=True), -1, 32, 0)
     assert_same_mean(found, 1.0, what="radiance")
     assert_precise(found, 0.05, what="radiance")
@@ -99,7 +99,7 @@ def test_everything_in_a_furnace_has_its_radiance(nested: bool) -> None:
 @pytest.mark.statistical
 @pytest.mark.parametrize("nested", [False, True])
 def test_flights_bring_the_light_that_is_composited(nested: bool) -> None:
-    """The floor is lit by the Gaussians too, so both pictures are drawn."""
+    """The Gaussians light the floor too, so both images are Monte Carlo estimates."""
     flown, exact = (pictures(scene(albedo, nested), 2, 64, 100 * k) for k, albedo in enumerate((ALMOST_NONE, 0.0)))
     assert_same_mean(flown, exact, what="radiance")
     assert_precise(flown, 0.05, what="radiance")
@@ -109,7 +109,7 @@ def test_flights_bring_the_light_that_is_composited(nested: bool) -> None:
 
 
 def followed(found: mi.Scene) -> dict[str, object]:
-    """The parameters of Gaussians and fog, with derivatives asked for."""
+    """The parameters of Gaussians and fog, with derivatives enabled."""
     params = mi.traverse(found)
     keys = [f"cloud.interior_medium.emission.{name}" for name in (*EXTINCTION_PARAMETERS, HARMONICS)]
     keys += [key for key in params.keys() if key.endswith("sigma_t.value.value")]  # noqa: SIM118
@@ -148,7 +148,9 @@ def test_forward_is_the_transpose_of_reverse(nested: bool, whole_paths: None) ->
 @pytest.mark.statistical
 @pytest.mark.parametrize("nested", [False, True])
 def test_derivatives_are_those_of_what_is_composited(nested: bool) -> None:
-    """Of the sum of all pixels along one change of everything; the exact ones of compositing see the same floor."""
+    """Derivative of the sum of all pixels along one change of all parameters; compositing gives the exact one, with the same
+    floor.
+    """
     rng, found = np.random.default_rng(2), []
     weight = np.full((SIDE, SIDE, 3), 1 / 192)
     change: dict[str, np.ndarray] = {}

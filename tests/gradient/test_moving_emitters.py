@@ -1,4 +1,4 @@
-"""Gradients of single scattering by the place and direction of emitters."""
+"""Gradients of single scattering by the position and direction of emitters."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_position_of_a_point_light():
-    """Smooth where the light is outside: distance, direction and shadow all move."""
+    """Smooth for a light outside the medium: distance, direction and shadow all change."""
     values = rough_grid(10)
     box, m = smoke(values, 0.7, "own", PLACE, "hg", 0.4)
     emitter = point([1.5, 1, 2.0])
@@ -57,7 +57,9 @@ TURNED = {
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(TURNED, ["spot"]))
 def test_direction_of_an_emitter(kind):
-    """A sun that turns takes its shadows along; a spot turns its cone only. About an axis across, by an angle [rad]."""
+    """A rotating sun moves its shadows; a rotating spot moves its cone only. Rotation by an angle about a perpendicular axis
+    [rad].
+    """
     box, m = smoke(rough_grid(10), 0.7, "own", PLACE, "hg", 0.4)
     axis, across = np.array([-0.3, 0.6, -0.74]), np.array([0.8, 0.6, 0.0])
     axis = axis / np.linalg.norm(axis)
@@ -92,9 +94,11 @@ def test_direction_of_an_emitter(kind):
 @pytest.mark.statistical
 @pytest.mark.parametrize("depth", [2, 3])
 def test_place_of_an_emitter_over_a_floor(depth):
-    """A floor under haze is lit from elsewhere: its distance, its slope and the haze in between; in each of two bounces.
+    """A floor under haze: the distance of the emitter, the slope of its light and the haze in between change, in each of two
+    bounces.
 
-    No emitter in the plane of a face of the haze: there the light has a kink, for rays close to the face leave by or along it.
+    No emitter lies in the plane of a face of the haze: the light has a kink there, since rays close to the face leave by it or
+    along it.
     """
     haze = medium("homogeneous", 0.7, 0.6 if depth == 2 else 0.0)
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
@@ -125,7 +129,7 @@ def test_place_of_an_emitter_over_a_floor(depth):
 
 
 def traced_media() -> dict[str, dict]:
-    """Black media whose boundaries are traced, over a floor."""
+    """Black media with traced boundaries, over a floor."""
     grid, haze = medium("mivol_medium", grid_volume("mivol_voxels", 0.2 + rough_grid(1), PLACE)), medium("homogeneous", 0.4)
     turned = mi.ScalarTransform4f().rotate([1, 0, 0], 35).scale([0.7, 1.1, 0.8])
     egg = {"type": "sphere", "to_world": turned, "bsdf": {"type": "null"}, "interior": medium("homogeneous", 1.2)}
@@ -153,7 +157,7 @@ TRACED = ("an egg", "a ball in its grid", "a ball around its grid", "a ball in a
 @pytest.mark.parametrize("emitter", [(0.3, -0.2, 3.0), (0.05, 0.1, 0.2)])
 @pytest.mark.parametrize("name", TRACED)
 def test_place_of_an_emitter_behind_boundaries_that_are_traced(name, emitter):
-    """What a floor shows has no noise: differences of the same pencils. One emitter is outside, one in the medium."""
+    """The floor has no noise: differences of the same pencils. One emitter is outside the medium, one inside."""
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2.2]).scale(3)}
     o = np.column_stack([np.random.default_rng(4).uniform(-0.3, 0.3, (6, 2)), np.full(6, -2.0)])
     parts = {**traced_media()[name], "floor": floor, "emitter": point(emitter)[0]}
