@@ -1,4 +1,4 @@
-"""Terms and factors whose derivatives Dr.Jit tracks: those of a square, in both directions."""
+"""Terms and factors differentiated by Dr.Jit: the derivatives of a square, in reverse and forward mode."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_term_is_seen_by_its_lanes_only():
 
 
 def test_a_term_has_the_derivative_of_its_value():
-    """Of x^2, 2 x^2 and x^2: 2 x, 4 x and 2 x."""
+    """The derivatives of x^2, 2 x^2 and x^2 are 2 x, 4 x and 2 x."""
     x = parameter()
     term = TrackedTerm(square(x), mi.Bool(*ON))
     with dr.suspend_grad():
@@ -47,7 +47,7 @@ def test_a_term_has_the_derivative_of_its_value():
 
 
 def test_a_factor_has_the_derivative_of_its_logarithm():
-    """2 / x in each colour; where it is 0 it has none."""
+    """2 / x in each colour; 0 for a factor of 0."""
     x = parameter()
     with dr.suspend_grad():
         TrackedFactor(lambda: square(x), mi.Bool(*ON)).vjp(mi.Spectrum(1, 2, 0.5))

@@ -37,7 +37,7 @@ ALBEDO = 0.7
 
 
 def control_of(emitter: dict) -> GridControl:
-    """S in smoke so thin that it dims nothing: 4 x 3 x 5 voxels, whose coarse lattice has its nodes in the corners."""
+    """S in smoke too thin to attenuate light: 4 x 3 x 5 voxels, with the nodes of the coarse lattice in the corners."""
     values = np.full((4, 3, 5, 1), 1e-7, np.float32)
     scene = close_up({"smoke": smoke(values, ALBEDO)[0], "emitter": emitter})
     survey, settings = survey_scene(scene), Settings(max_depth=2)
@@ -50,7 +50,7 @@ def control_of(emitter: dict) -> GridControl:
 
 
 def test_constant_sky_of_a_colour():
-    """albedo L, in every cell and each channel."""
+    """S is albedo L, in every cell and each channel."""
     colour = [0.2, 1.0, 3.0]
     found = control_of({"type": "constant", "radiance": {"type": "rgb", "value": colour}})
     assert found.channels == 3
@@ -60,7 +60,7 @@ def test_constant_sky_of_a_colour():
 
 
 def test_point_light_from_the_corners_of_the_grid():
-    """albedo I / (4 pi r^2) in the nodes, which lie in the corners of the box, and linear between them."""
+    """S is albedo I / (4 pi r^2) at the nodes in the corners of the box, and linear between them."""
     place, intensity = np.array([4.0, 1.0, 2.5]), 3.0
     found = control_of(point(place, intensity)[0])
     values = np.array(found.values).reshape(5, 4, 6)
@@ -78,7 +78,7 @@ def test_point_light_from_the_corners_of_the_grid():
 
 
 def test_point_light_between_nodes_of_three_edges(monkeypatch):
-    """4 x 3 x 4 nodes, two cells apart: the light of each in its place, and trilinear between them."""
+    """4 x 3 x 4 nodes, two cells apart: each node has the light at its position, trilinear in between."""
     monkeypatch.setattr(control_variates, "CELLS_PER_NODE", 2)
     place, intensity = np.array([4.0, 1.0, 2.5]), 3.0
     values = np.array(control_of(point(place, intensity)[0]).values).reshape(5, 4, 6)
@@ -90,12 +90,12 @@ def test_point_light_between_nodes_of_three_edges(monkeypatch):
 
 
 def test_nodes_stand_eight_cells_apart():
-    """Two where all cells are within one step, and 33 at most: 31 steps of 8 cells and a last one of 7 need all of them."""
+    """Two nodes if all cells lie within one step, and 33 at most: 31 steps of 8 cells and a last one of 7 need all 33."""
     assert [count_nodes(n) for n in (1, 7, 8, 15, 16, 247, 254, 255, 256, 1024)] == [2, 2, 3, 3, 4, 32, 33, 33, 33, 33]
 
 
 def test_a_cell_has_the_light_of_its_place():
-    """Three edges and two channels' worth of numbers: a cell is found in z, y, x, from a lower node of -1 on."""
+    """Three different edges and two channels: cells are numbered in z, y, x, from a lower node of -1 on."""
     res, channels = (2, 4, 3), 3
     values = np.arange(3 * 5 * 4 * channels, dtype=np.float32).reshape(3, 5, 4, channels)
     control = GridControl(mi.Float(values.ravel()), res, channels)
@@ -125,7 +125,7 @@ def depth(sigma: np.ndarray, end: float) -> float:
 
 
 def light(sigma: np.ndarray) -> float:
-    """What the sweep differentiates: S of all cells, the light behind, and the probe by itself."""
+    """The differentiated light: S of all cells, the light behind, and the probe."""
     tau = np.array([depth(sigma, e) for e in EDGES])
     control = np.sum(S * -np.diff(np.exp(-tau)))
     point = SOURCE * np.interp(AT, [0.375, 0.625], sigma[1:3])
@@ -145,7 +145,7 @@ def media(variant_rgb: str) -> SceneMedia:
 
 
 def sweep(media: SceneMedia, tangent: bool) -> ControlSweep:
-    """A ray from x = -1 on."""
+    """The sweep of a ray starting at x = -1."""
     ray = mi.Ray3f(mi.Point3f(-1, 0.5, 0.5), mi.Vector3f(1, 0, 0), dr.inf, mi.Float(0), mi.Color0f())
     values = np.zeros((2, 2, 5))
     values[:] = S

@@ -1,4 +1,4 @@
-"""A distance in the piece of a ray that was kept, against the inverse of its optical depth on paper."""
+"""The distance drawn in the kept piece of a ray, against the inverse of its optical depth on paper."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 @pytest.mark.parametrize("ends", [(0.5, 2.0), (2.0, 0.5), (0.5, 200.0), (1e-3, 0.02)])
 def test_collisions_in_a_cell_of_linear_extinction(ends):
-    r"""tau(x) = d (a x + (b - a) x^2 / 2) for a cell of length d reaches -log(1 - u (1 - exp(-tau(1)))) where x says."""
+    """In a cell of length d, tau(x) = d (a x + (b - a) x^2 / 2) equals -log(1 - u (1 - exp(-tau(1)))) at the drawn x."""
     values = np.repeat(np.float32([ends[0], *ends, ends[1]]), 4).reshape(4, 2, 2, 1)
     scene = close_up({"smoke": smoke(values)[0], "emitter": point([0, 0, 30.0])[0]})
     survey, settings, n = survey_scene(scene), Settings(max_depth=2), 64

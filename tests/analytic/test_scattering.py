@@ -1,4 +1,4 @@
-"""A scattering event in one of two media: which one, and its coefficients."""
+"""A scattering event in one of two media: its medium and its coefficients."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def upwards(media: SceneMedia) -> list[int]:
 
 
 def event(media: SceneMedia) -> MediumEvent:
-    """In the lower medium, in the upper one, and nowhere."""
+    """Events in the lower medium, in the upper medium, and in none."""
     low, top = upwards(media)[0], upwards(media)[-1]
     sigma, t = mi.Float(5, 6, 7), mi.Float64(1, 3, 3)
     return MediumEvent(t, t, mi.Float(1), [sigma] * 3, [sigma] * 3, mi.UInt32(low, top, top), mi.Bool(True, True, False))
@@ -70,7 +70,7 @@ def test_events_know_their_medium():
 
 
 def test_coefficients_are_those_of_the_medium():
-    """The albedo times the extinction, or sigma_s itself; 0 where nothing is scattered."""
+    """The albedo times the extinction, or sigma_s itself; 0 without a scattering event."""
     media = scene_of(medium("mivol_medium", **GREY), COLOURS)
     mei = event_interaction(media, upward(), event(media))
     found = np.array(event_sigma_s(media, upward(), event(media), mei))
@@ -82,7 +82,7 @@ def test_coefficients_are_those_of_the_medium():
 
 
 def test_a_single_walk_knows_the_extinction_already():
-    """The event of a single medium says what it is; nothing is looked up again."""
+    """The event of a single medium carries the extinction; no second look-up."""
     media = scene_of(medium("mivol_medium", **GREY))
     found = event_sigma_t(media, media.bodies[0], upward(), event(media), mi.Bool(True))
     np.testing.assert_array_equal(np.array(found), [[5, 6, 7]] * 3)

@@ -1,4 +1,4 @@
-"""Which of an event's two shadow rays is derived: each in proportion to its light, at its value over that probability."""
+"""The choice of an event's differentiated shadow ray: in proportion to its light, with its value over this probability."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def shadow_ray(x: float, value: list[float], on: list[bool]) -> SimpleNamespace:
-    """Towards +x from (x, 0, 0), of length 10 + x."""
+    """A ray towards +x from (x, 0, 0), of length 10 + x."""
     ray = mi.Ray3f(mi.Point3f(mi.Float([x] * len(on)), 0, 0), mi.Vector3f(1, 0, 0), 0, mi.Color0f())
     segment = RaySegment(ray, dr.zeros(mi.MediumPtr, len(on)), mi.Float([10 + x] * len(on)))
     return SimpleNamespace(ray_segment=segment, value=mi.Spectrum(*value), on=mi.Bool(on))
 
 
 def test_each_has_its_light_as_probability() -> None:
-    """Light of 3 and of 1: the first below a chance of 3/4, each at 4 thirds or 4 times its value. Without light, none."""
+    """Light of 3 and 1: the first ray for a chance below 3/4, with 4/3 of its value; else the second with 4 times its value.
+    Without light, none.
+    """
     probe = SimpleNamespace(
         chance=mi.Float([0.0, 0.74, 0.76, 0.99]),
         direct=[shadow_ray(1.0, [0.5, 1.0, 1.5], [True] * 4), shadow_ray(2.0, [0.25, 0.25, 0.5], [True, True, True, False])],

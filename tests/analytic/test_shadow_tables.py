@@ -41,7 +41,7 @@ TWO = centred(2 * np.eye(3))
 @pytest.mark.parametrize("occupied", [None, 1.0])
 @pytest.mark.parametrize("shift", [0, 1, 2, 3])
 def test_weights_are_those_of_beer(shift, occupied):
-    """In a grid of one value light from above is dimmed by the depth of a block's middle, however coarse the grid."""
+    """In a constant grid, light from above is attenuated by the depth of a block's centre, for any size of blocks."""
     box, _ = smoke(np.full(SIZE, 0.8, np.float32), to_world=TWO)
     emitter, _ = sun([0, 0, -1.0])
     seen = pencils({"smoke": box, "emitter": emitter}, *aimed(3))
@@ -64,7 +64,7 @@ def test_weights_are_those_of_beer(shift, occupied):
 
 @pytest.mark.parametrize("shift", [0, 1, 2])
 def test_a_cell_has_the_weight_of_its_block(shift):
-    """Cells begin at a lower node of -1 and stand in z, y, x; of two emitters each lane has its own."""
+    """Cells begin at a lower node of -1, in the order z, y, x; each lane has its own of two emitters."""
     blocks = tuple((n >> shift) + 1 for n in SIZE)
     weights = np.random.default_rng(shift).random((*blocks, 2), dtype=np.float32)
     cache = VisibilityCache(mi.Float(weights.ravel()), blocks, shift, 2)
@@ -83,7 +83,7 @@ def open_direct(scene: mi.Scene):
 
 @pytest.mark.slow
 def test_light_grid_against_exact_shadows():
-    """tau between nodes is wrong by h^2: two nodes a cell leave a quarter of the error of one node in two cells, or less."""
+    """The error of tau between nodes is h^2: two nodes a cell have at most a quarter of the error of one node in two cells."""
     box, _ = smoke(rough_grid(1, shape=(16, 16, 16)))
     emitter, _ = sun([0.3, 0.2, -1.0])
     scene = close_up({"smoke": box, "emitter": emitter})
@@ -102,7 +102,7 @@ def test_light_grid_against_exact_shadows():
 
 @pytest.mark.parametrize(("cells", "nodes"), [(1, (9, 6, 2)), (4, (3, 3, 2)), (3, (4, 3, 2))])
 def test_nodes_of_a_light_grid_are_so_many_cells_apart(cells, nodes):
-    """At most ``cells`` apart, and in both faces: n cells have ceil(n / cells) steps, and one node more than that."""
+    """At most ``cells`` apart, with nodes in both faces: n cells have ceil(n / cells) steps, and one node more."""
     box, _ = smoke(rough_grid(1, shape=(8, 5, 1)))
     scene = close_up({"smoke": box, "emitter": sun([0.3, 0.2, -1.0])[0]})
     with dr.suspend_grad():
@@ -111,7 +111,7 @@ def test_nodes_of_a_light_grid_are_so_many_cells_apart(cells, nodes):
 
 
 def test_light_grid_keeps_optical_depth_not_transmittance():
-    """Under suns along the axes tau of a constant grid is linear: interpolated exactly, where T would be 8 % too bright."""
+    """Under suns along the axes, tau of a constant grid is linear, and interpolated exactly; T would be 8 % too bright."""
     box, _ = smoke(np.full((4, 3, 5), 2.0, np.float32), to_world=centred(2 * np.eye(3)))
     suns = {f"sun {axis}": sun(-np.eye(3)[axis])[0] for axis in range(3)}
     scene = close_up({"smoke": box, **suns})
@@ -126,7 +126,7 @@ def test_light_grid_keeps_optical_depth_not_transmittance():
 
 
 def test_a_point_has_the_light_of_its_place():
-    """A depth that is linear in x, y and z, for each of two emitters and three channels, at points of a box that leans."""
+    """An optical depth linear in x, y and z, for each of two emitters and three channels, at points of a rotated box."""
     to_world = np.array([[2.0, 0.3, 0, -1], [-0.2, 1.5, 0.1, 0.4], [0, 0.1, 3, 2], [0, 0, 0, 1]])
     lattice = Lattice(mi.TensorXf(np.zeros((5, 4, 2, 1), np.float32)), to_world)
     shape, rng = (3, 5, 4), np.random.default_rng(2)

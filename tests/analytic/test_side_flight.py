@@ -32,7 +32,7 @@ N, G, LOBE, SIGMA, ALBEDO, SUN = 1 << 16, 0.6, 0.8, 0.7, 0.9, 2.0
 
 
 def middle() -> tuple[Estimators, Collision]:
-    """Collisions in the middle of a ball of radius 1, of rays that travel towards the sun."""
+    """Collisions in the middle of a ball of radius 1, of rays travelling towards the sun."""
     fog = medium("homogeneous", SIGMA, ALBEDO, phase={"type": "hg", "g": G})
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": SUN}
     scene = mi.load_dict({"type": "scene", "fog": ball_of(fog, (0, 0, 0), 1.0), "sun": sun,
@@ -75,7 +75,7 @@ def test_light_at_the_end_of_a_side_flight():
 
 
 def test_the_next_vertex_counts_by_the_balance_heuristic():
-    """p / (p + q) where a side flight was made, 1 elsewhere; the emitter sample is handed on."""
+    """The weight is p / (p + q) in lanes with a side flight, 1 in others; the next vertex takes the emitter sample."""
     estimators, hit = middle()
     c = np.linspace(-1, 1, N)
     wo = mi.Vector3f(mi.Float(np.sqrt(1 - c**2)), 0, mi.Float(c))

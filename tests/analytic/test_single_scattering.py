@@ -27,7 +27,7 @@ SPP = 1024
 
 
 def check(parts, media, emitters, o, d, spp=SPP, integrator=None, level=2e-5, **more):
-    """Rounding is `level` times the largest radiance."""
+    """Compare with the exact radiance; rounding is `level` times the largest radiance."""
     seen = pencils(parts | {f"emitter{i}": emitter for i, (emitter, _) in enumerate(emitters)}, o, d)
     known = [twin for _, twin in emitters]
     background = more.get("background", 0.0)
@@ -103,7 +103,7 @@ def test_albedo_grid(kind):
 
 @pytest.mark.statistical
 def test_rgb_albedo_and_rgb_extinction():
-    """Three channels, each with an extinction and an albedo of its own."""
+    """Three channels, each with its own extinction and albedo."""
     values = rough_grid(7, 1.0) * np.array([0.2, 1.0, 4.0])
     albedo = as_float32([0.9, 0.3, 0.6])
     grid = grid_volume("mivol_voxels", as_float32(values), PLACE)
@@ -150,7 +150,7 @@ def test_two_media_shade_each_other():
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_background_shines_through():
-    """A grid in a constant sky: what is turned and what is left of the background."""
+    """A grid in a constant sky: in-scattered light and the transmitted background."""
     box, m = smoke(rough_grid(12), 0.9, name="hg", g=0.7)
     # 12 x 24 directions see kinks of the shadow depth: 5e-4 of the radiance, measured by refining them.
     sky = ({"type": "constant", "radiance": 0.6}, twins.Sky(0.6, 12))
@@ -170,7 +170,7 @@ def test_background_shines_through():
     ],
 )
 def test_point_light_in_fog(sigma_s, sigma_t, intensity, t0, h, D, answer):
-    """A box of length D along the ray, wide across it: light from beside the ray stays inside on its way."""
+    """A box of length D along the ray, wide across it: light from beside the ray stays inside the box."""
     frame = affine(np.diag([D, 400.0, 400.0]), (0, -200, -200))
     fog = box_of(medium("homogeneous", sigma_t, sigma_s / sigma_t), frame)
     emitter = point([t0, h, 0.0] if t0 > 0 else [1e-6, h, 0], intensity)[0]
@@ -184,7 +184,7 @@ def test_point_light_in_fog(sigma_s, sigma_t, intensity, t0, h, D, answer):
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", ["isotropic", "rayleigh"])
 def test_thin_limit(name):
-    """tau of 1e-4: the closed form without extinction, to that."""
+    """tau of 1e-4: the closed form without extinction, up to a relative error of this size."""
     frame = affine(np.diag([4.0, 400.0, 400.0]), (0, -200, -200))
     fog = box_of(medium("homogeneous", 1e-5, 0.5, phase={"type": name}), frame)
     seen = pencils({"fog": fog, "emitter": point([1.2, 0.3, 0.0], 2.0)[0]}, [-1, 0, 0], [1, 0, 0])
@@ -199,7 +199,7 @@ def test_thin_limit(name):
 @pytest.mark.parametrize(("mu", "mu0"), [(0.6, 0.9), (0.9, 0.6), (0.7, 0.7), (1.0, 1.0)])
 @pytest.mark.parametrize("kind", ["homogeneous", "grid"])
 def test_collimated_slab(mu, mu0, kind):
-    """Reflected and transmitted light of a slab 400 wide and 1 high, its edges 200 away; mu = mu0 is no special case."""
+    """Reflected and transmitted light of a slab 400 wide and 1 high, with its edges 200 away; mu = mu0 is no special case."""
     sigma, albedo, g, E0 = 1.7, 0.8, 0.4, 2.0
     frame = as_float32(affine(np.diag([400.0, 400, 1]), (-200, -200, 0)))
     build = fog(sigma, albedo, frame, "hg", g) if kind == "homogeneous" else smoke(
@@ -251,9 +251,9 @@ def test_ball_in_a_constant_sky(sigma):
 @pytest.mark.statistical
 @pytest.mark.slow
 def test_reciprocity():
-    """The light of an emitter at a that passes b, from all sides, is that of an emitter at b that passes a (fluence).
+    """The light of an emitter at a passing b, from all sides, equals the light of an emitter at b passing a (fluence).
 
-    Both cameras see the whole box; a pixel weighs what it sees of the sphere, to second order in its size (1e-4).
+    Both cameras see the whole box; a pixel is weighted by its share of the sphere, to second order in its size (1e-4).
     """
     a, b = np.array([-3.0, 0.3, 0.5]), np.array([1.5, 2.5, 1.0])
     box, _ = smoke(rough_grid(13), 0.9, "own", name="hg", g=0.5)
@@ -280,7 +280,7 @@ def test_reciprocity():
 @pytest.mark.statistical
 @pytest.mark.parametrize("scale", small.cases([1e-3, 1e3], [1e3]))
 def test_the_size_of_the_scene(scale):
-    """k times larger, thinner by k, under a directional emitter: the same radiance."""
+    """A scene k times larger and thinner by k, under a directional emitter, has the same radiance."""
     frame = as_float32(centred(2 * scale * np.eye(3)))
     box, m = smoke(rough_grid(14) / scale, 0.8, "own", frame)
     o, d = aimed(14)
@@ -288,7 +288,7 @@ def test_the_size_of_the_scene(scale):
 
 
 def test_radiance_is_linear_in_the_emitters():
-    """Twice the emitter is twice the picture, to the last bit, with the same samples."""
+    """Twice the emitter gives twice the image, to the last bit, with the same samples."""
     box, _ = smoke(rough_grid(15), 0.8)
     o, d = aimed(15)
     images = [
@@ -300,7 +300,7 @@ def test_radiance_is_linear_in_the_emitters():
 
 
 def test_where_nothing_is_sampled_twice_is_the_same():
-    """The seed decides all: two renders of one seed are equal to the last bit."""
+    """The seed determines the image: two renders with one seed are equal to the last bit."""
     box, _ = smoke(rough_grid(16), 0.8)
     seen = pencils({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, *aimed(16))
     first, second, other = (scenes.render(seen.scene, mivol(), 16, seed=s) for s in (3, 3, 4))

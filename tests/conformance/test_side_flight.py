@@ -1,4 +1,4 @@
-"""Side flights towards the emitter of the next collision: pictures have the mean that they have without them."""
+"""Side flights towards the emitter of the next collision do not change the mean of images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize("lit", small.cases(["sun", "sky"], slow=("sky",)))
 def test_side_flights_keep_the_mean(lit, monkeypatch):
-    """With them and without: the same mean."""
+    """The same mean with and without side flights."""
     image = mi.Bitmap(np.random.default_rng(3).uniform(0, 1, (8, 16, 3)).astype(np.float32) ** 4)
     far = {"sun": small.sun([0.3, 0.2, -1.0])[0], "sky": {"type": "envmap", "bitmap": image}}[lit]
     scene = close_up({"smoke": smoke(rough_grid(7, 6.0), 0.9, name="hg", g=0.8)[0], "far": far}, res=8)
@@ -37,7 +37,7 @@ def test_side_flights_keep_the_mean(lit, monkeypatch):
     [(0.8, "sun", 3, True), (0.8, "sun", 2, False), (0.3, "sun", 3, False), (0.8, "point", 3, False)],
 )
 def test_a_plan_takes_them_where_they_pay(g, emitter, depth, flies):
-    """Peaked phase functions, two scatterings, and emitters at infinity."""
+    """The plan needs peaked phase functions, two scattering events, and emitters at infinity."""
     shine = small.sun([0.3, 0.2, -1.0])[0] if emitter == "sun" else small.point([1.5, 1, 2.0])[0]
     scene = close_up({"smoke": smoke(rough_grid(7), 0.9, name="hg", g=g)[0], "emitter": shine}, res=2)
     made = plan.make_plan(find_needs(scene, scene.sensors()[0], survey_scene(scene)), Settings(max_depth=depth))

@@ -76,7 +76,7 @@ def two_media() -> dict:
 
 
 def crossing_media() -> dict:
-    """Two balls side by side, one of each kind, that the rays and their shadows cross."""
+    """Two balls side by side, one of each kind, crossed by the rays and their shadows."""
     ink = {"type": "homogeneous", "sigma_t": 1.5, "albedo": {"type": "rgb", "value": [0.1, 0.5, 0.9]}}
     right = centred(1.2 * np.eye(3), (0.6, 0, 0))
     return {
@@ -86,7 +86,7 @@ def crossing_media() -> dict:
 
 
 def surfaces() -> dict:
-    """A ball in the volume, a floor under it and a screen above: they are lit through it, and they shade it."""
+    """A ball in the volume, a floor below and a screen above: lit through the volume, and shading it."""
     return {
         "smoke": grid_in(cube(PLACE)),
         "ball": {"type": "sphere", "radius": 0.4, "center": [0.2, -0.1, -0.3], "bsdf": RED},
@@ -96,7 +96,7 @@ def surfaces() -> dict:
 
 
 def mirrors() -> dict:
-    """At depth 2 a mirror shows emitters and the sky through the volume, not the light that the volume turns."""
+    """At depth 2 a mirror shows emitters and the sky through the volume, not light scattered by the volume."""
     mirror = {"type": "rectangle", "to_world": turn().translate([0, 0, -0.7]).scale(0.8), "bsdf": {"type": "conductor"}}
     return {"smoke": grid_in(cube(PLACE)), "mirror": mirror, "emitter": area(-0.5, 2.0, 2.0)}
 
@@ -145,7 +145,9 @@ def test_places(name):
 @pytest.mark.statistical
 @pytest.mark.slow
 def test_fog_without_an_end_by_quadrature_and_its_derivatives():
-    """The same light as drawn; the derivative of its density, forward and by differences of pictures without noise."""
+    """Quadrature gives the mean of Monte Carlo; the derivative by the density, in forward mode and by differences of images
+    without noise.
+    """
     parts = {"fog": FOG, **floor(), "bulb": point([0.3, 0.2, 1.5], 4.0)[0]}
     sensor = scenes.camera((1.5, -1.2, 1.0), (0, 0, 0), res=6, fov=40.0) | {"medium": {"type": "ref", "id": "fog"}}
     scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
@@ -180,7 +182,7 @@ def test_fog_without_an_end_by_quadrature_and_its_derivatives():
 
 
 def _world(unit: float) -> dict:
-    """A ball of fog in one of haze above one of wood, in lengths of ``unit``."""
+    """A ball of fog in a ball of haze above a wooden ball, in lengths of ``unit``."""
     place = turn().scale(unit)
     haze = medium("homogeneous", 0.5 / unit, 0.6)
     fog_in_it = {"type": "sphere", "to_world": place @ turn().scale(0.3), "bsdf": {"type": "null"}, "exterior": haze}
@@ -198,7 +200,7 @@ def _world(unit: float) -> dict:
 @pytest.mark.slow_for("0.0078125")
 @pytest.mark.parametrize("unit", [2.0**-7, 2.0**-14])
 def test_scenes_of_any_size(unit):
-    """Lengths in another unit: the same image. Mitsuba starts rays 1e-4 behind a surface, whatever the scene's size."""
+    """Another unit of length gives the same image. Mitsuba starts rays 1e-4 behind a surface, for any size of the scene."""
     big, small_one = (
         np.array(mi.render(mi.load_dict(_world(u)), integrator=mi.load_dict(mivol()), spp=64)) for u in (1.0, unit)
     )
@@ -209,7 +211,7 @@ def test_scenes_of_any_size(unit):
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_hidden_emitters():
-    """hide_emitters takes the emitters out of the picture, not their light off the smoke."""
+    """hide_emitters removes the emitters from the image, and not their light on the smoke."""
     parts = {"smoke": smoke(rough_grid(5))[0], "emitter": area(0.0, 2.0, 0.0, size=1.0), "sky": scenes.sky(0.5)}
     image, _ = same(parts, ours=mivol(hide_emitters=True), stock=volpath(hide_emitters=True))
     shown = moments(close_up(parts), mivol(), 32, 2)
@@ -219,7 +221,7 @@ def test_hidden_emitters():
 @pytest.mark.statistical
 @pytest.mark.slow
 def test_a_medium_that_asks_for_no_emitter_sampling():
-    """sample_emitters = false changes how the sky's light is found, not how much there is."""
+    """sample_emitters = false changes the sampling of the sky's light, and not its amount."""
     plain = grid_in(cube(PLACE))
     quiet = grid_in(cube(PLACE), sample_emitters=False)
     sky = scenes.sky(0.7)
@@ -232,7 +234,7 @@ def test_a_medium_that_asks_for_no_emitter_sampling():
 
 
 def channel_by_channel(build, spp: int, batches: int = 16) -> Moments:
-    """Volpath's mean of each channel from a scene of its own, grey: `build(c)` makes it."""
+    """Volpath's mean of each channel, from a grey scene of its own made by `build(c)`."""
     alone = [moments(close_up(build(c)), volpath(), spp, batches, first=1000 * (c + 1)) for c in range(3)]
     mean, m2 = (np.stack([getattr(m, k)[..., c] for c, m in enumerate(alone)], axis=-1) for k in ("mean", "m2"))
     return Moments(batches, mean, m2)
@@ -263,9 +265,8 @@ def test_rgb_extinction(kind, ratio):
 @pytest.mark.statistical
 @pytest.mark.slow
 def test_depth_2_is_one_turn():
-    """Depth 1 is the background alone; depth 2 adds what turned once, and no more: dense smoke of albedo 1 stays below 1.
-
-    Hard case 46.
+    """Depth 1 is the background alone; depth 2 adds single scattering only: dense smoke of albedo 1 stays below 1. Hard case
+    46.
     """
     box, _ = smoke(rough_grid(7, 12.0), albedo=1.0)
     scene = close_up({"smoke": box, "sky": scenes.sky(1.0)})
@@ -298,9 +299,10 @@ so few renders."""
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(SAMPLERS, [name for name in SAMPLERS if name != "multijitter"]))
 def test_samplers(kind):
-    """Points that are spread evenly change the noise, not the mean: against independent ones; and there is less noise.
+    """Stratified samples change the noise, not the mean of independent samples, and have less noise.
 
-    A sky that varies over a pixel behind thin smoke: most noise is that of the place in the pixel, which good samplers spread.
+    Thin smoke in front of a sky varying over a pixel: most noise is due to the position in the pixel, which good samplers
+    stratify.
     """
     spp = 49 if kind == "orthogonal" else 64
     sky = np.random.default_rng(3).uniform(0, 1, (8, 16, 1)) ** 4 * np.ones(3)
@@ -322,7 +324,7 @@ def test_samplers(kind):
 @pytest.mark.slow_for("own")
 @pytest.mark.parametrize("kind", small.KINDS)
 def test_recordings(kind):
-    """A function recorded by dr.freeze shows what an ordinary render shows, also after values have changed."""
+    """A function recorded by dr.freeze gives the image of an ordinary render, also after values have changed."""
     if kind == "own":
         scenes.skip_recorded_grids_on_a_gpu()
     parts = {"smoke": smoke(rough_grid(1), kind=kind, name="hg", g=0.4)[0], "bulb": point([1.5, -1.2, 1.6])[0]}
@@ -344,7 +346,7 @@ def test_recordings(kind):
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_a_mono_variant():
-    """One channel: as volpath in the same variant."""
+    """One channel, compared with volpath in the same variant."""
     mi.set_variant("llvm_ad_mono")
     sensor = scenes.camera((1.5, -2.5, 1.2), (0, 0, 0), res=16, fov=40.0)
     sensor["film"]["pixel_format"] = "luminance"
@@ -365,8 +367,9 @@ STRANGERS = (
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STRANGERS)
 def test_scenes_of_a_stranger(two_threads, name, data_dir, tmp_path):
-    """The scenes that Mitsuba tests its own volumetric integrators with, at depth 2, as the reference tool renders them:
-    each channel alone where the extinction is rgb."""
+    """The scenes of Mitsuba's own tests of volumetric integrators, at depth 2, rendered by the reference tool: each channel
+    alone for an rgb extinction.
+    """
     folder = data_dir / "scenes" / "mitsuba-data" / "tests" / "scenes" / "participating_media"
     file, settings = folder / f"{name}_volpath.xml", {"res": "16"}
     how = {"max_depth": 2, "max_spp": 1024, "rr_depth": 100, "accept_doubts": True, "progress": False}

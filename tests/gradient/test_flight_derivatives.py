@@ -36,7 +36,7 @@ MEDIUM = "smoke.interior_medium."
 
 @pytest.fixture
 def flies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Free flights at depth 2 too, where the plan would take the estimator of one scattering."""
+    """The plan uses free flights at depth 2 too, instead of the estimator of single scattering."""
     choose = plan.choose_segment_estimator
     monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
 
@@ -54,7 +54,7 @@ def flies(monkeypatch: pytest.MonkeyPatch) -> None:
     ),
 )
 def test_density(flies, density, emitter):
-    """Empty, half empty and flat (density equal to the majorant) are where other estimators are biased."""
+    """Empty, half empty and flat (density equal to the majorant), where other estimators are biased."""
     shine = point([1.5, 1, 2.0]) if emitter == "point" else sun([0.3, 0.2, -1.0])
     box, m = smoke(as_float32(DENSITIES[density]()), 0.7, "own", PLACE, "hg", 0.4)
     seen = pencils({"smoke": box, "emitter": shine[0]}, *aimed(1, 8))
@@ -88,7 +88,7 @@ def _forward(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, inte
 @pytest.mark.slow_for("0.0")
 @pytest.mark.parametrize("g", [0.0, 0.6])
 def test_a_white_furnace_has_no_derivative(g):
-    """Light at the end of a flight is that of the level, and so is the light that a probe finds, sample by sample."""
+    """The light at the end of a flight and at a probe equals the baseline, sample by sample."""
     scene = close_up({"smoke": smoke(rough_grid(2, 5.0), 1.0, "own", name="hg", g=g)[0], "sky": scenes.sky(1.0)}, res=8)
     integrator = mi.load_dict(mivol(max_depth=-1, rr_depth=100))
     found = _backward(scene, GRID, np.ones((8, 8, 3)), 16, fresh(3), integrator)
@@ -98,7 +98,7 @@ def test_a_white_furnace_has_no_derivative(g):
 
 
 def _everything(colour: bool = False) -> mi.Scene:
-    """One scene with each kind of parameter; a half of the density is empty, and of the albedo a part is 0."""
+    """One scene with each kind of parameter; half of the density is empty, and the albedo is partly 0."""
     density = rough_grid(4, 3.0) * (np.arange(6) < 3)[None, None, :, None]
     albedo = 0.9 * rough_grid(5, 1.0, (3, 3, 3)) * (np.arange(3) > 0)[None, None, :, None]
     if colour:
@@ -154,7 +154,7 @@ def _along(scene: mi.Scene, key: str, v: np.ndarray, integrator: mi.Integrator, 
 
 
 def _difference(scene: mi.Scene, key: str, v: np.ndarray, h: float, integrator: mi.Integrator, spp: int) -> Estimate:
-    """(f(x + h v) - f(x - h v)) / 2 h of the mean image; batches share their random numbers, which takes most of the noise."""
+    """(f(x + h v) - f(x - h v)) / 2 h of the mean image; batches share random numbers, which cancels most of the noise."""
     params = mi.traverse(scene)
     kind, start = type(params[key]), np.array(params[key], dtype=np.float64)
     found = []
@@ -195,8 +195,8 @@ ROOMS = {
 def test_density_by_differences(room, depth):
     """Along the density itself, which keeps empty voxels empty.
 
-    The truncation of a central difference is h^2/6 of the third derivative; along the density that is of the size of the
-    derivative at an optical depth of about 1, so 0.05^2/6 = 4e-4 of it.
+    The truncation error of a central difference is h^2/6 of the third derivative. Along the density, the third derivative is of
+    the size of the derivative at an optical depth of about 1, so the error is 0.05^2/6 = 4e-4 of it.
     """
     density = rough_grid(4, 3.0)
     scene = close_up(ROOMS[room](density), res=8)

@@ -1,4 +1,4 @@
-"""Reservoirs of distances where they are hard: one dense voxel, and channels of very different extinction."""
+"""Hard cases of distance reservoirs: one dense voxel, and channels of very different extinction."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize("peak", [20.0, 2000.0])
 def test_one_dense_voxel(peak):
-    """One voxel 10 or 1000 times denser than the rest, off the rays and between some of them and the emitter: the same law.
-
+    """One voxel 10 or 1000 times denser than the rest, beside the rays and between some rays and the emitter: the same law.
     Hard case 31.
     """
     values = rough_grid(6)
@@ -40,8 +39,7 @@ def test_one_dense_voxel(peak):
 
 
 def test_noise_does_not_follow_the_majorant():
-    """Rays that never come near the dense voxel see what they see without it, to the last digits, with the same noise.
-
+    """Rays far from the dense voxel have the same radiance with and without the voxel, to the last digits, with the same noise.
     Hard case 31.
     """
     values = rough_grid(6)
@@ -59,7 +57,7 @@ def test_noise_does_not_follow_the_majorant():
 @pytest.mark.statistical
 @pytest.mark.parametrize("ratio", [(1e-3, 1.0, 10.0), (0.0, 1.0, 2.0), (8.0, 8.0, 8e-4)])
 def test_channels_of_very_different_extinction(ratio):
-    """Each channel is its own grey picture: at ratios of 1e4, and with a channel that is vacuum. Hard case 32."""
+    """Each channel equals its own grey image, at ratios of 1e4 and with a channel of vacuum. Hard case 32."""
     values = as_float32(rough_grid(7, 1.0) * np.array(ratio))
     interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "hg", "g": 0.4})
     emitter = point([1.5, 1, 2.0])
@@ -89,15 +87,13 @@ def test_channels_of_very_different_extinction(ratio):
     ids=["grey", "rgb", "a channel of 0", "short", "empty"],
 )
 def test_what_is_behind_the_dark_takes_no_candidates(sigma, length, lit):
-    """A region of constant extinction may have no end; its clearest channel tells how much of it is lit. Of a vacuum nothing is
-    needed.
-    """
+    """A region of constant extinction may have no end; its clearest channel determines its lit length. A vacuum needs none."""
     found = lit_length([mi.Float(s) for s in sigma], mi.Float(length))
     assert float(np.array(found).item()) == pytest.approx(lit, rel=1e-6)
 
 
 def test_a_probe_is_spread_over_the_grid_alone():
-    """A grid fills the middle half of a box of vacuum: a probe's optical depth is even over the grid's length."""
+    """A grid fills the middle half of a box of vacuum: the optical depth of a probe is uniform over the length of the grid."""
     grid = np.diag([1.0, 1, 1, 1])
     grid[:3, 3] = -0.5
     place = np.diag([2.0, 2, 2, 1])

@@ -1,4 +1,4 @@
-"""Where single scattering breaks: the numbered hard cases, each against a closed form or the float64 twin."""
+"""Hard cases of single scattering, by number, each against a closed form or the float64 twin."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EPS = 2.0**-23
 
 
 def gradients(seen: Pencils, key: str, spp: int, batches: int = BATCHES) -> Moments:
-    """Of the derivative of the sum of all pixels and channels."""
+    """Gradients of the sum of all pixels and channels."""
     params, integrator = mi.traverse(seen.scene), mi.load_dict(mivol())
     dr.enable_grad(params[key])
     found, ones = [], mi.TensorXf(np.ones((1, len(seen.o), 3), dtype=np.float32))
@@ -69,7 +69,7 @@ def test_derivative_of_no_density(lit, kind):
 
 
 def test_picture_of_no_density():
-    """The background to the last digit, and nothing else; no NaN from 0/0. Hard case 21."""
+    """Exactly the background; no NaN from 0/0. Hard case 21."""
     box, _ = smoke(0 * rough_grid(1), 1.0)
     seen = pencils({"smoke": box, "sky": scenes.sky(0.7), "bulb": point([0.1, 0.2, 0.3])[0]}, *aimed(1, 6))
     assert np.all(np.abs(scenes.render(seen.scene, mivol(), 16) - as_float32(0.7)) <= 4 * EPS)
@@ -100,9 +100,8 @@ def test_albedo_0(kind):
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [-0.1, 1.2, math.nan])
 def test_albedo_outside_its_domain(value, kind):
-    """An optimiser's overshoot is refused with a sentence that names the albedo, not rendered as energy out of nothing.
-
-    Hard case 25.
+    """An optimizer's overshoot is refused with a sentence naming the albedo, and not rendered with a gain of energy. Hard case
+    25.
     """
     box, _ = smoke(rough_grid(3), 0.8, kind)
     seen = pencils({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, *aimed(3, 2))
@@ -132,10 +131,7 @@ def test_albedo_grid_outside_its_domain(value, kind):
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_density_that_is_no_number(value, kind):
-    """One voxel that is not a number, or infinite, is refused and named by its indices; after a step back all is well.
-
-    Hard case 26.
-    """
+    """A voxel of NaN or infinity is refused and named by its indices; rendering works again after a step back. Hard case 26."""
     values = rough_grid(4)
     box, _ = smoke(values, 0.8, kind)
     seen = pencils({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, *aimed(4, 2))
@@ -156,7 +152,7 @@ def test_density_that_is_no_number(value, kind):
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["stock"]))
 def test_density_that_has_grown(kind):
-    """Values that an optimiser has raised tenfold: nothing that was found for the old ones may be used. Hard case 30."""
+    """An optimizer has raised the values tenfold: bounds of the old values must not be used. Hard case 30."""
     values = rough_grid(5, 0.5)
     box, m = smoke(values, 0.8, kind)
     emitter = point([1.5, 1, 2.0])
@@ -179,7 +175,7 @@ def test_density_that_has_grown(kind):
 @pytest.mark.statistical
 @pytest.mark.parametrize("h", [1e-3, 0.03, 0.4])
 def test_point_light_beside_the_ray(h):
-    """Close to the ray the radiance is as 1/h: equal angles keep the noise where it was. Hard case 33."""
+    """Close to the ray the radiance grows as 1/h: equal angles keep the noise constant. Hard case 33."""
     values = rough_grid(8)
     box, m = smoke(values, 0.8, "own")
     emitter = point([0.1, as_float32(0.2 + h), 0.3])
@@ -192,7 +188,7 @@ def test_point_light_beside_the_ray(h):
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 def test_point_light_on_the_ray(kind):
-    """The integral diverges there: what is shown must be finite numbers, and its neighbours right. Hard case 33."""
+    """The integral diverges: the pixel must be finite, and its neighbours right. Hard case 33."""
     values = rough_grid(8)
     box, m = smoke(values, 0.8, "own") if kind == "grid" else fog(0.7, 0.8)
     emitter = point([0.1, 0.2, 0.3])
@@ -208,7 +204,7 @@ def test_point_light_on_the_ray(kind):
 @pytest.mark.statistical
 @pytest.mark.parametrize("where", ["node", "face", "edge", "border"])
 def test_point_light_at_a_special_place(where):
-    """On a voxel's centre, on a face and on an edge between cells, on the border of the grid. Hard case 33."""
+    """A point light at a voxel's centre, on a face and an edge between cells, and on the border of the grid. Hard case 33."""
     values = rough_grid(9, 1.0, (4, 4, 4))
     step = 0.5  # voxel centres of [-1, 1]^3 in 4: -0.75, -0.25, 0.25, 0.75
     place = {
@@ -227,9 +223,8 @@ def test_point_light_at_a_special_place(where):
 @pytest.mark.statistical
 @pytest.mark.parametrize("away", [1e3, 1e5])
 def test_point_light_far_away_is_a_sun(away):
-    """Irradiance I / r^2 from one direction, to the parallax 1/r; the angle that a cell fills is not a difference.
-
-    Hard case 34.
+    """Irradiance I / r^2 from one direction, up to the parallax 1/r; the angle of a cell is not computed as a difference. Hard
+    case 34.
     """
     values = rough_grid(10)
     box, m = smoke(values, 0.8, "own", name="hg", g=0.5)
@@ -245,7 +240,7 @@ def test_point_light_far_away_is_a_sun(away):
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 @pytest.mark.parametrize("tilt", [0.0, 1e-6, 1e-3])
 def test_light_along_the_camera_ray(tilt, kind):
-    """mu -> mu0 in transmission: alpha p E0 (tau/mu) e^{-tau/mu}, no 0/0 anywhere near it. Hard case 35."""
+    """mu -> mu0 in transmission: alpha p E0 (tau/mu) e^{-tau/mu}, without 0/0. Hard case 35."""
     sigma = 1.3
     frame = as_float32(scenes.affine(np.diag([400.0, 400, 1]), (-200, -200, 0)))
     build = fog(sigma, 0.8, frame) if kind == "homogeneous" else smoke(np.full((3, 2, 2, 1), sigma), 0.8, "own", frame)
@@ -264,9 +259,8 @@ def test_light_along_the_camera_ray(tilt, kind):
 @pytest.mark.statistical
 @pytest.mark.parametrize("direction", [[0, 0, -1.0], [0, -1.0, 0], [1.0, 0, 0]])
 def test_shadow_rays_along_the_faces_of_cells(direction):
-    """Camera rays in planes between cells, through voxel centres, the light along other such planes: T is continuous.
-
-    Hard case 36.
+    """Camera rays in planes between cells, through voxel centres, and light along other such planes: T is continuous. Hard case
+    36.
     """
     values = rough_grid(11, 2.0, (4, 4, 4))
     box, m = smoke(values, 0.8, "own")
@@ -279,9 +273,8 @@ def test_shadow_rays_along_the_faces_of_cells(direction):
 
 @pytest.mark.statistical
 def test_no_light_is_lost_where_shadow_rays_start():
-    """Dense smoke of voxels 1e-3 wide: an offset of Mitsuba's 1e-4 at the start of a shadow ray would show as 10 %.
-
-    Hard case 36.
+    """Dense smoke of voxels 1e-3 wide: Mitsuba's offset of 1e-4 at the start of a shadow ray would cause an error of 10 %. Hard
+    case 36.
     """
     scale = 2e-3
     values = as_float32(rough_grid(12, 2.0) / scale)
@@ -300,9 +293,8 @@ def test_no_light_is_lost_where_shadow_rays_start():
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 def test_depth_2_is_one_scattering(kind):
-    """Depth 1: the background through the medium, exactly; depth 2: one scattering more, by its closed form; not two.
-
-    Hard case 46.
+    """Depth 1: exactly the background through the medium; depth 2: single scattering in addition, by its closed form. Hard case
+    46.
     """
     sigma, depth = 2.2, 0.4
     build = fog(sigma, 1.0, np.eye(4)) if kind == "homogeneous" else smoke(np.full((4, 3, 2, 1), sigma), 1.0, "own", np.eye(4))
@@ -318,7 +310,7 @@ def test_depth_2_is_one_scattering(kind):
 
 
 def test_surfaces_shine_on_the_medium_only_directly():
-    """A white floor lit by an emitter lights the smoke above it at depth 3, not at 2; an area light does at 2. Hard case 46."""
+    """A white floor lit by an emitter lights the smoke above at depth 3, not at 2; an area light does at 2. Hard case 46."""
     box, _ = smoke(rough_grid(13), 0.9)
     turn, ray = mi.ScalarTransform4f, ([-5, 0.1, 0.2], [1.0, 0, 0])
     floor = {"type": "rectangle", "to_world": turn().translate([0, 0, -1.2]).scale(3)}
