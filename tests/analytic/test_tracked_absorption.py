@@ -213,7 +213,7 @@ def test_what_needs_an_exact_line_is_refused_by_name(asked: str) -> None:
 
 def test_a_majorant_that_is_none_is_refused() -> None:
     found = scene([0, -4, 0], [0, 0, 0], fog=shape("cube", fog(slack=float("inf"))))
-    with pytest.raises(MivolError, match="the majorant of sigma_t, a Ball, is inf; a finite one is expected"):
+    with pytest.raises(MivolError, match="the majorant of sigma_t, a Ball, is inf; a finite number of at least 0 is expected"):
         mi.render(found, integrator=mi.load_dict({"type": "mivol", "max_depth": 1}), spp=1)
 
 

@@ -66,9 +66,9 @@ def integrate_tau(
         >>> tau = integrate_tau(Lattice(mi.TensorXf(sigma_t), to_world), ray.o, ray.d)
     """
     if lattice.channels not in (1, 3):
-        raise MivolError(f"a grid of {lattice.channels} channels was given; an optical depth has 1 (grey) or 3 (rgb).")
+        raise MivolError(f"a grid of {lattice.channels} channels was given; 1 (grey) or 3 (rgb) are expected: split it.")
     if dr.grad_enabled(o, d, t_max):
-        raise MivolError("rays with gradients were given; optical depth is differentiable in the grid only: detach the rays.")
+        raise MivolError("rays with gradients were given; rays without gradients are expected: detach the rays.")
     segment = clip_to_grid(lattice, o, d, 0, t_max)
     tau = dr.custom(_OpticalDepth, lattice.values.array, lattice, segment, mi.Bool(active))
     return tau[0] if lattice.channels == 1 else mi.Color3f(*tau)

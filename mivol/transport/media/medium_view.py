@@ -123,7 +123,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     kind = medium_kind(medium)
     params = traverse_medium(medium)
     if kind not in (*STOCK, "mivol_medium"):
-        raise MivolError(f"a medium of type {kind} was found; mivol renders mivol_medium, homogeneous and heterogeneous media.")
+        raise MivolError(f"a medium of type {kind} was found; mivol_medium, homogeneous or heterogeneous is expected.")
     children = find_children(medium)
     names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if n in children]
     places = {} if places is None else places
@@ -282,13 +282,14 @@ def _field_part(
             f"{name} is a {type(field).__name__} that declares {field.line!r}; media read {BOUNDED!r} fields and Gaussians."
         )
     if is_recording():
-        what = "whose cells cannot be listed" if has_lists else "whose majorant cannot be read"
-        raise MivolError(f"{name} is a {type(field).__name__}, {what} while dr.freeze records: render without it.")
+        reason = "whose cells cannot be listed" if has_lists else "whose majorant cannot be read"
+        raise MivolError(f"{name} is a {type(field).__name__}, {reason} while dr.freeze records: render without dr.freeze.")
     if has_lists:
         return GaussianExtinction("sigma_t" if shows else name, field, dr.detach(scale), shows)
     majorant = max(field.bound())
     if not 0 <= majorant < np.inf:
-        raise MivolError(f"the majorant of {name}, a {type(field).__name__}, is {majorant:.4g}; a finite one is expected.")
+        kind = type(field).__name__
+        raise MivolError(f"the majorant of {name}, a {kind}, is {majorant:.4g}; a finite number of at least 0 is expected.")
     return BoundedExtinction(name, field, dr.detach(scale), dr.opaque(mi.Float, majorant))
 
 
@@ -301,9 +302,9 @@ def _part(
         lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places))
         return GridExtinction(name, lattice, volume if volume.class_name() == "GridVolume" else None)
     if constant not in params.properties:
-        found = sorted(k for k in params.properties if k.startswith(name + "."))
+        keys = sorted(k for k in params.properties if k.startswith(name + "."))
         raise MivolError(
-            f"{name} of a {kind} has the parameters {found}; a number, an rgb triple, a constvolume, a gridvolume or "
+            f"{name} of a {kind} has the parameters {keys}; a number, an rgb triple, a constvolume, a gridvolume or "
             "mivol_voxels is expected."
         )
     value = params[constant]

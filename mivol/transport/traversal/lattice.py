@@ -50,10 +50,11 @@ class Lattice:
     def __post_init__(self) -> None:
         if self.from_world is not None:
             return
-        if len(self.values.shape) != 4 or 0 in self.values.shape:
-            raise MivolError(f"a grid of shape {tuple(self.values.shape)} was given; (Z, Y, X, channels) is expected.")
-        if np.prod([n + 1 for n in self.values.shape[:3]]) * self.channels >= 2**31:
-            raise MivolError(f"a grid of shape {tuple(self.values.shape)} was given; a walk counts up to 2^31: split it.")
+        shape = tuple(self.values.shape)
+        if len(shape) != 4 or 0 in shape:
+            raise MivolError(f"a grid of shape {shape} was given; (Z, Y, X, channels) is expected: reshape it.")
+        if np.prod([n + 1 for n in shape[:3]]) * self.channels >= 2**31:
+            raise MivolError(f"a grid of shape {shape} was given; at most 2^31 cells and channels are expected: split it.")
         self.to_world = check_affine(self.to_world)
         # Opaque numbers are arguments of a kernel, so grids in different places share one compiled kernel.
         rows = lattice_from_world(self.to_world, self.res)

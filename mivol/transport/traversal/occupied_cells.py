@@ -88,8 +88,8 @@ class OccupiedCells:
         z, y, x = res
         total = levels * (z + 1) * (y + 1) * (x + 1)
         if total >= 2**31:
-            found = f"{levels} x {x} x {y} x {z}" if levels > 1 else f"{x} x {y} x {z}"
-            raise MivolError(f"a grid of {found} nodes was given; its cells are counted up to 2^31: split it.")
+            size = f"{levels} x {x} x {y} x {z}" if levels > 1 else f"{x} x {y} x {z}"
+            raise MivolError(f"a grid of {size} nodes was given; at most 2^31 cells are expected: split it.")
         index, listed = CellIndex.find(res, levels, lambda cell: occupied(_corner_rows(cell, row_of, res)), stored)
         count = dr.width(listed)
         # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive. Where no cell is occupied the arrays
