@@ -1,4 +1,4 @@
-"""The sweep over one medium, of the integrand whose sum is known: opacities add up to 1 - exp(-tau)."""
+"""The sweep over one medium, with an integrand of known sum: opacities add up to 1 - exp(-tau)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ SIGMA = np.array([0.5, 2.0, 0.25, 1.0, 4.0], np.float32)
 
 CONSTANT = 0.5
 ROUNDING = 32 * 2.0**-23
-"""Of sums of 7 pieces, each of some roundings, relative to numbers of size 1."""
+"""Bound of the rounding of sums of 7 pieces, with several roundings each, relative to numbers of size 1."""
 
 
 class Opacity:
-    """N = 1 - exp(-tau) of a cell of mean extinction, or of a constant."""
+    """N = 1 - exp(-tau) of a cell with the mean extinction, or of a constant."""
 
     rows, points = 1, (0.25, 0.75)
 
@@ -42,7 +42,7 @@ class Opacity:
         return [CellIntegral(sigma[0] * piece.dt, T, 1 - T, [piece.dt], [T * piece.dt])]
 
     def vjp(self, piece: object, sigma: list, weight: list) -> None:
-        """No other parameters."""
+        """Do nothing: the integrand has no parameters."""
 
     def jvp(self, piece: object, sigma: list) -> list[mi.Float]:
         return [mi.Float(0)]
@@ -57,7 +57,7 @@ def media(variant_rgb: str) -> SceneMedia:
 
 
 def sweep(media: SceneMedia, tangent: bool = False) -> BodySweep:
-    """Along x through the grid, from -1 + 0.5 to 2."""
+    """A sweep along x through the grid, from -1 + 0.5 to 2."""
     ray = mi.Ray3f(mi.Point3f(-1, 0.5, 0.5), mi.Vector3f(1, 0, 0), dr.inf, mi.Float(0), mi.Color0f())
     on, (body,) = mi.Bool(True), media.bodies
     line = LineIntegral(media, Opacity(), RaySegment(ray, mi.MediumPtr(None), mi.Float(3)), on)
@@ -65,11 +65,11 @@ def sweep(media: SceneMedia, tangent: bool = False) -> BodySweep:
 
 
 TAU = SIGMA.mean() + 2.5 * CONSTANT
-"""The trilinear values, of a constant border, have the mean of the voxels."""
+"""The trilinear values, with a constant border, have the mean of the voxels."""
 
 
 def in_order(body: Body, grid: object, constant: object) -> list:
-    """Of the parts of the medium, in their order."""
+    """One entry for each part of the medium, in order."""
     return [constant if part.lattice is None else grid for part in body.view.parts]
 
 
@@ -81,7 +81,7 @@ def test_opacities_add_up(media):
 
 
 def test_tangents_follow(media):
-    """N' = T tau', for any change of the voxels and of the constant."""
+    """N' = T tau' for any change of the voxels and of the constant."""
     v = np.array([1, -2, 3, -4, 5], np.float32)
     media.bodies[0].tangents = in_order(media.bodies[0], mi.Float(v), mi.Float(0.75))
     with dr.suspend_grad():
@@ -92,7 +92,7 @@ def test_tangents_follow(media):
 
 
 def test_the_transpose_gives_each_voxel_its_share(media):
-    """weight T_front T over the length of each part, less what is dimmed behind the medium."""
+    """weight T_front T over the length of each part, minus the light behind the medium."""
     media.start_gradients()
     front, weight, behind = 0.25, 3.0, 0.125
     with dr.suspend_grad():

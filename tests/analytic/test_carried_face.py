@@ -1,4 +1,4 @@
-"""Corners that a ray carries from cell to cell: where it may, where it may not, and how many are read."""
+"""Corner values carried from cell to cell: same results as without, and the number of reads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def followed(field: SphericalGrid, cells: OccupiedCells, o, d) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """What rays see through these cells, and the derivatives of a sum of it."""
+    """Values of rays through the given cells, and the derivatives of a weighted sum."""
     rays, model = rays_of(o, d), make_model(field)
     source = make_exact(field, rays.d, slope=True)
     seen = render_rays(cells, source, model, rays)
@@ -27,9 +27,9 @@ def followed(field: SphericalGrid, cells: OccupiedCells, o, d) -> tuple[list[np.
 
 
 def test_cells_that_are_left_out_between_others_change_nothing():
-    """Holes break the chain of faces: the same light and derivatives as of a walk through all cells, where it never breaks."""
+    """Holes break the chain of faces: light and derivatives equal a walk through all cells, in which the chain never breaks."""
     density, sh = make((9, 11, 10), basis=9)
-    # A tenth of the nodes hold much, so that the walls of holes, which hold little less than nothing, are felt beside them.
+    # A tenth of the nodes are dense, which makes errors at the slightly negative walls of holes visible.
     field = SphericalGrid.from_dense(np.where(density > 9.5, density, np.float32(-0.1)), sh, TO_WORLD)
     some = find_occupied_cells(field)
     whole = OccupiedCells.find(field.res, TO_WORLD, field.look_up_rows, lambda _: mi.Bool(True), field.rows)
@@ -37,14 +37,14 @@ def test_cells_that_are_left_out_between_others_change_nothing():
     o, d = aim(100)
     for ours, theirs in zip(followed(field, some, o, d), followed(field, whole, o, d), strict=True):
         for a, b in zip(ours, theirs, strict=True):
-            # The same terms; those of a cell and its neighbour are added in another order.
+            # The terms are equal; terms of a cell and its neighbour are added in another order.
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * max(np.abs(b).max(), 1))
             assert np.abs(b).max() > 0.01
 
 
 @pytest.mark.parametrize("along", [(1, 1, 1), (1, -1, 0), (0, -1, -1), (-1, 0, 1)])
 def test_a_ray_through_edges_reads_the_cell_that_it_comes_to(along: tuple[int, int, int]):
-    """A ray that leaves through two faces at once does not come through either; its neighbours do, one after the other."""
+    """A ray that leaves through two faces at once shares no face with the next cell; nearby rays cross both in turn."""
     density, sh = make((8, 8, 8), basis=4)
     field = SphericalGrid.from_dense(np.abs(density), sh, CUBE)
     d = np.array(along) / np.linalg.norm(along)
@@ -57,7 +57,7 @@ def test_a_ray_through_edges_reads_the_cell_that_it_comes_to(along: tuple[int, i
 
 @pytest.mark.parametrize("basis", [1, 4, 9, 16, 25])
 def test_rows_of_all_degrees_are_packed_and_unpacked(basis: int):
-    """The light is linear in density and colour where all is thin: the derivative times the values is the light itself."""
+    """In a thin field light is linear in density and colour: the derivative times the values is the light."""
     density, sh = make((4, 5, 6), basis=basis)
     density = np.float32(1e-6) * (1 + np.abs(density))
     field = SphericalGrid.from_dense(density, sh, CUBE, offset=0.0, clamp=False)
@@ -65,7 +65,7 @@ def test_rows_of_all_degrees_are_packed_and_unpacked(basis: int):
     by_density, by_sh = (np.float64(s) for s in derive(field, o, d, [1.0, 0.5, -0.7]))
     light = np.sum(np.float64(see(field, o, d)[0]) @ [1.0, 0.5, -0.7])
     size = np.sum(np.abs(by_sh * sh.reshape(by_sh.shape)))
-    # An optical depth of 2e-5 is the relative error; sums of terms of both signs.
+    # The optical depth of 2e-5 is the relative error of linearity; the sums have terms of both signs.
     assert np.sum(by_density * density.reshape(-1)) == pytest.approx(light, abs=1e-4 * size)
     assert np.sum(by_sh * sh.reshape(by_sh.shape)) == pytest.approx(light, abs=1e-4 * size)
     assert abs(light) > 1e-3 * size
@@ -99,7 +99,7 @@ def test_a_cell_costs_four_corners_and_the_first_one_eight(monkeypatch: pytest.M
 
 
 def test_rows_of_a_field_are_aligned():
-    """Dr.Jit reads a row as packets only in arrays that are."""
+    """Dr.Jit gathers a row as packets only from aligned arrays."""
     density, sh = make(basis=9)
     field = SphericalGrid.from_dense(density, sh, TO_WORLD)
     if dr.backend_v(mi.Float) == dr.JitBackend.LLVM:

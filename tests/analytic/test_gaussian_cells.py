@@ -1,4 +1,4 @@
-"""Lists of Gaussians by cell: never too short, seldom too long, refused where they do not fit."""
+"""Lists of Gaussians by cell: complete, nearly minimal, and refused beyond the free memory."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def cells_of(lists: CellLists, p: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("parts", [1, 50])
 def test_a_gaussian_is_listed_wherever_it_reaches(parts: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Points on and inside of the ellipsoids lie in cells that list them, however the work is cut."""
+    """Points on and inside the ellipsoids lie in cells that list the Gaussian, for any size of chunks."""
     cloud = oracle.Cloud.of(random_gaussians(300, 0))
     monkeypatch.setattr(gaussian_cells, "MAX_CHUNK_PAIRS", gaussian_cells.MAX_CHUNK_PAIRS if parts == 1 else 1000)
     lists, rng = lists_of(cloud), np.random.default_rng(1)
@@ -40,7 +40,7 @@ def test_a_gaussian_is_listed_wherever_it_reaches(parts: int, monkeypatch: pytes
 
 
 def test_a_thin_gaussian_across_the_box_is_in_few_cells() -> None:
-    """A needle from corner to corner passes about 3 n cells of a cube of n, and has neighbours; its box holds n^3."""
+    """A needle from corner to corner crosses about 3 n cells of a cube of n^3 cells, with neighbours; its box holds n^3."""
     cloud = oracle.Cloud.of(random_gaussians(400, 0))
     cloud.means[0], cloud.log_scales[0] = 0, np.log([0.4, 1e-4, 1e-4])
     axis, along = np.array([1.0, 0, 0]), np.ones(3) / np.sqrt(3)

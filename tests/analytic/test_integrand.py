@@ -1,4 +1,4 @@
-"""Media that cannot be swept cell by cell are refused, each by its own sentence."""
+"""Media that a sweep cannot integrate cell by cell are refused, with a message for each reason."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def grid(*res: int, edge: float = 1.0) -> GridExtinction:
 
 
 def media(*parts: object, **more: object) -> SimpleNamespace:
-    """A medium that can be swept, and one of these parts."""
+    """A valid medium, and a medium of the given parts."""
     views = [MediumView(None, list(p), mi.Float(1), **m) for p, m in (((grid(1, 1, 1),), {}), (parts, more))]
     return SimpleNamespace(bodies=[Body(view, None) for view in views])
 
@@ -38,7 +38,7 @@ def test_grids_that_share_their_cells_and_constants_are_swept():
 
 @pytest.mark.parametrize("other", [(2, 3, 5), (2, 3, 4)])
 def test_grids_in_other_cells_are_refused(other: tuple[int, ...]) -> None:
-    """Of another resolution, or of another place; whichever grid of the medium it is."""
+    """A grid of another resolution or another place is refused, at any position among the grids of the medium."""
     parts = grid(2, 3, 4), grid(2, 3, 4), grid(*other, edge=1.0 if other[2] == 5 else 2.0)
     with pytest.raises(MivolError, match=rf"somebody asks .* \(2, 3, 4\) and \(2, 3, {other[2]}\) voxels .* or do without"):
         check_cells_shared(media(*parts), ASKING)

@@ -1,4 +1,4 @@
-"""Nested boxes: light and derivatives along rays against a float64 twin that cuts rays at all faces, and against one grid."""
+"""Nested boxes: light and derivatives along rays against a float64 twin with rays cut at all faces, and against one grid."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def place(level: int, to_world: np.ndarray = TO_WORLD) -> np.ndarray:
 
 
 def arrays(seed: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Rough densities and harmonics of each level, of the world's units: outer levels are thinner."""
+    """Rough densities and harmonics of each level, in world units: outer levels are thinner."""
     made = []
     for level in range(LEVELS):
         density, sh = make(seed=seed + level)
@@ -47,7 +47,7 @@ def twin_of(values: list[tuple[np.ndarray, np.ndarray]]) -> NestedTwin:
 
 
 def lines(count: int, seed: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Rays that begin in each level, outside of all, and that miss the inner boxes."""
+    """Rays that begin in each level and outside of all levels, and rays past the inner boxes."""
     rng = np.random.default_rng(seed)
     middle = TO_WORLD[:3] @ [0.5, 0.5, 0.5, 1]
     o = np.float32(middle + rng.normal(size=(count, 3)) * rng.choice([0.3, 1.0, 3.0, 9.0], (count, 1)))
@@ -73,7 +73,7 @@ def test_light_of_all_levels_is_that_of_the_twin() -> None:
 
 
 def test_rays_take_their_pieces_from_all_levels() -> None:
-    """The rays of these tests begin and end in every level, or the tests above and below would show less than they say."""
+    """The rays of these tests begin and end in every level; otherwise the other tests would check less than they claim."""
     o, d = lines(60)
     seen = followed(field_of(arrays()), o, d)
     assert set(np.array(seen.first.piece)) >= {-1, 0, 1, 2, 3}
@@ -83,7 +83,7 @@ def test_rays_take_their_pieces_from_all_levels() -> None:
 
 
 def test_a_ray_that_stops_has_the_derivatives_of_what_it_saw() -> None:
-    """Stopped at 1e-3 instead of never: all derivatives move by less than what is left of the light, and those behind are 0."""
+    """With a stop at 1e-3 all derivatives move by less than the remaining light, and derivatives behind the stop are 0."""
     o, d = lines(40, seed=6)
     dense = [(8 * density, sh) for density, sh in arrays()]
     whole, cut = (derive(field_of(dense), o, d, [1.0, 1.0, 1.0], stop=stop) for stop in (0.0, 1e-3))
@@ -117,7 +117,7 @@ def test_derivatives_of_all_levels_are_those_of_the_twin() -> None:
 
 
 def test_one_fine_grid_that_holds_the_same_values_looks_the_same() -> None:
-    """The inner nodes are nodes of a grid of twice as many in the outer box: between them both fields are one."""
+    """The inner nodes are nodes of a grid of twice as many nodes in the outer box, so both fields are equal between them."""
     rng, n = np.random.default_rng(1), 6
     fine = rng.normal(1, 3, (2 * n,) * 3), rng.normal(0, 0.4, (*(2 * n,) * 3, 4, 3))
     inner = tuple(a[n // 2 : n // 2 + n, n // 2 : n // 2 + n, n // 2 : n // 2 + n] for a in fine)
@@ -136,7 +136,7 @@ def test_one_fine_grid_that_holds_the_same_values_looks_the_same() -> None:
 
 
 def test_what_the_inner_box_covers_is_vacuum_in_the_outer_one() -> None:
-    """Covered nodes have no part in any ray: NaN there is not seen. All the others have: a change is seen by some ray."""
+    """Covered nodes have no influence on rays: NaN there is invisible. A change of any other node changes some ray."""
     res, rng = (9, 8, 12), np.random.default_rng(2)
     grids = [
         SphericalGrid.from_dense(rng.uniform(0.1, 0.4, res), np.zeros((*res, 1, 3)), place(i, CUBE), activation="none")
@@ -183,7 +183,7 @@ def test_values_at_points_are_those_that_rays_see() -> None:
 
 
 def test_tables_of_pinholes_hold_what_is_seen_of_all_levels() -> None:
-    """From one pinhole, in the direction of the nodes themselves: what is baked is the sum of harmonics, and folded back."""
+    """For one pinhole, the table has the sum of harmonics in the directions of the nodes, and vjp_bake is the transpose."""
     field = field_of(arrays())
     cells, pinhole = find_occupied_cells(field), np.array([[0.4, -2.0, 7.0]])
     table = np.array(bake(field, cells, pinhole, mi.UInt32(0)).table).reshape(-1, 4)
@@ -213,7 +213,7 @@ def test_tables_of_pinholes_hold_what_is_seen_of_all_levels() -> None:
 
 
 def test_near_derivatives_are_scaled_and_far_ones_are_not() -> None:
-    """A ray through a constant: where all of it is nearer than ``near`` by t^2 / near^2, beyond it not at all."""
+    """Along a ray through a constant, derivatives nearer than ``near`` are scaled by t^2 / near^2, others unchanged."""
     field = SphericalGrid.from_dense(np.full((2, 2, 2), 1e-3), np.zeros((2, 2, 2, 1, 3)), CUBE)
     o, d = [[-1.0, 0.1, 0.2]], [[1.0, 0.0, 0.0]]
     rays, cells = rays_of(o, d), find_occupied_cells(field)

@@ -1,4 +1,4 @@
-"""Radiance fields: light along rays against the float64 twin and closed forms, and its derivatives against differences."""
+"""Radiance fields: light along rays against a float64 twin and closed forms, derivatives against differences."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_derivatives_are_those_of_the_twin(variant_rgb: str) -> None:
 
 
 def ramp(n: int):
-    """A field linear along x, dense or thin, and its colour: grids of any size hold the same one between their outer nodes."""
+    """A field linear along x, dense or thin, with colour: grids of any size are equal between their outer nodes."""
     x = (np.arange(n) + 0.5) / n
     density = np.broadcast_to(30 * x, (n, n, n)).astype(np.float64)
     sh = np.zeros((n, n, n, 1, 3))
@@ -146,7 +146,7 @@ def test_the_background_of_the_same_colour(variant_rgb: str) -> None:
 
 
 def test_the_brightest_weight_of_a_cell(variant_rgb: str) -> None:
-    """T alpha of each cell, behind those that are in front of it; the largest one where rays come from both sides."""
+    """T alpha of each cell behind the cells in front; the largest value for rays from both sides."""
     field = SphericalGrid.from_dense(np.full((4, 3, 5), 3.0), np.zeros((4, 3, 5, 1, 3)), CUBE)
     cells, model = find_occupied_cells(field), make_model(field)
     weight = dr.zeros(mi.Float, cells.count)
@@ -213,7 +213,7 @@ def test_a_ray_that_stops_early_errs_by_what_it_leaves(variant_rgb: str) -> None
 
 
 def numbers_of(cells: OccupiedCells) -> np.ndarray:
-    """Of each cell (Z, Y, X) its place in the list, which only listed ones have."""
+    """The list number of each cell (Z, Y, X); only listed cells have one."""
     return looked(cells.index, (1, *(n + 1 for n in cells.res)), (True, True, True))[1][0]
 
 

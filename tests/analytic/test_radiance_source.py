@@ -1,4 +1,4 @@
-"""Baked harmonics of pinholes: their derivatives, and how fast they converge to exact directions."""
+"""Baked harmonics of pinholes: derivatives, and convergence to exact directions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mivol.transport.line_integrals.radiance_source import bake, vjp_bake
 
 
 def test_pinhole_derivatives_are_those_of_what_a_pinhole_sees(variant_rgb: str) -> None:
-    """The baked table is linear in the field: moving the field along its gradient changes the image by its square."""
+    """The baked table is linear in the field: a step along the gradient changes the image by its squared norm."""
     density, sh = make(basis=9)
     pinholes = np.array([[3.0, 1, 0.5], [-2.0, 2.5, 1]])
     o = np.repeat(pinholes, 10, axis=0)

@@ -1,4 +1,4 @@
-"""A radiance field on other nodes is the same field."""
+"""A resampled radiance field has the same values on other nodes."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def test_a_field_on_finer_nodes_is_the_same_field(variant_rgb: str) -> None:
     inner = np.s_[5:-1, 1:-1, 1:-1]
     np.testing.assert_allclose(density[inner], (1 - x + 3 * y)[inner], atol=1e-5)
     np.testing.assert_allclose(found[..., 0, 0][inner], (x + 2 * y - z)[inner], atol=1e-5)
-    # Nodes 0 and 1 are not kept: fine nodes up to 2.5 lie between those only.
+    # Nodes 0 and 1 are not kept, and fine nodes up to 2.5 have no other neighbours.
     assert (density[:3] == 0).all() and (density[3:] != 0).any(axis=(1, 2)).all()
     with pytest.raises(MivolError, match="other axes"):
         resample_field(field, (12, 12, 12), np.array([[0, -1.0, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), keep)
 
 
 def test_levels_are_resampled_apart(variant_rgb: str) -> None:
-    """Each level keeps its own values on finer nodes, sees none of another, and has no rows where the level before is."""
+    """Each level keeps its own values on finer nodes, reads no other level, and has no rows inside the level before."""
     n, levels = 8, 3
     g = (np.arange(n) + 0.5) / n
     z, y, x = np.meshgrid(g, g, g, indexing="ij")

@@ -1,4 +1,4 @@
-"""Radiance fields on disk: ours, svox2's, and what is refused."""
+"""Radiance fields on disk: archives of mivol and of svox2, and refused files."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_values_that_half_floats_cannot_hold_stay(variant_rgb: str, tmp_path: Pa
 
 
 def test_densities_of_large_scenes_keep_their_digits(variant_rgb: str, tmp_path: Path) -> None:
-    """Extinctions go as 1 / length: in a box of 1e9 units half floats would make 0 of them."""
+    """Extinctions scale as 1 / length: in a box of 1e9 units half floats would round them to 0."""
     density, sh = arrays()
     for small in (1e-4, 1e-9):
         write_field(tmp_path / "f.npz", SphericalGrid.from_dense(density * small, sh, CUBE))
@@ -141,7 +141,7 @@ HOSTILE_FIELDS = {
 
 @pytest.mark.parametrize("case", HOSTILE_FIELDS)
 def test_hostile_fields_are_refused(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
-    """One node of a field of 3 x 4 x 5, spoilt: a sentence each, where one of them ended the process."""
+    """One wrong array in a field of 3 x 4 x 5 nodes ends in a message; some of them once ended the process."""
     change, said = HOSTILE_FIELDS[case]
     keep = np.zeros((3, 4, 5), bool)
     keep[0, 0, 0] = True

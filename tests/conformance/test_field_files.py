@@ -1,4 +1,4 @@
-"""A radiance field as meshes, volumes and checkpoints: where surfaces lie, which way they face, what colour they have."""
+"""A radiance field as meshes, volumes and checkpoints: position, orientation and colour of surfaces."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ PLACE = np.array([[2.0, 0.0, 0.0, -1.0], [0.0, 2.0, 0.0, -1.0], [0.0, 0.0, 2.0, 
 
 
 def nodes(place: np.ndarray, res: tuple[int, int, int] = RES) -> np.ndarray:
-    """(Z, Y, X, 3) world places of the nodes."""
+    """(Z, Y, X, 3) world positions of the nodes."""
     z, y, x = res
     grid = np.meshgrid(*((np.arange(n) + 0.5) / n for n in (z, y, x)), indexing="ij")
     return np.stack(grid[::-1], axis=-1) @ place[:3, :3].T + place[:3, 3]
 
 
 def ball(place: np.ndarray = PLACE, activation: str = "relu", keep: bool = False, space: str = "srgb") -> SphericalGrid:
-    """A ball of RADIUS about the origin: 10 more extinction than the level 4 for each unit of length inside.
+    """A ball of RADIUS about the origin; its extinction is 4 at the surface and grows inwards by 10 for each unit of length.
 
-    Its degree-1 coefficients make what is seen along -z redder than along +z.
+    Coefficients of degree 1 make the colour seen along -z redder than along +z.
     """
     inside = RADIUS - np.linalg.norm(nodes(place), axis=-1)
     sigma = np.maximum(4 + 10 * inside, 1e-3)
@@ -45,17 +45,17 @@ def ball(place: np.ndarray = PLACE, activation: str = "relu", keep: bool = False
 
 
 def volume_of(mesh: Mesh) -> float:
-    """Signed: positive where faces look outwards (divergence theorem)."""
+    """The signed volume of a mesh: positive if faces look outwards (divergence theorem)."""
     a, b, c = (mesh.points[mesh.faces[:, k]] for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_the_surface_of_a_ball(variant_rgb: None, activation: str) -> None:
-    """Corners lie within half a voxel of the ball, normals outwards.
+    """Vertices lie within half a voxel of the ball, and normals point outwards.
 
-    Voxels are up to 0.1 long; the distance that is interpolated is curved by 1 / RADIUS, so that corners are within
-    h^2 / (8 RADIUS) = 0.002 of it, and a little more for logarithms of it.
+    Voxels are up to 0.1 long. The interpolated distance has the curvature 1 / RADIUS, so vertices are within h^2 / (8 RADIUS) =
+    0.002 of the ball, and slightly more for logarithms of the distance.
     """
     mesh = extract_surface(ball(activation=activation), 4.0)
     distance = np.linalg.norm(mesh.points, axis=1)
@@ -79,7 +79,7 @@ def test_a_mesh_stands_where_the_field_does(variant_rgb: None) -> None:
 
 
 def test_colours_are_those_seen_from_outside(variant_rgb: None) -> None:
-    """A ray that comes in against the normal n travels along -n: red is 0.5 - 0.4886 (-0.5) (-n_z) there, to 8 bits."""
+    """A ray against the normal n travels along -n and sees the red 0.5 - 0.4886 (-0.5) (-n_z), to 8 bits."""
     mesh = extract_surface(ball(), 4.0)
     red = 0.5 + 0.48860251 * -0.5 * -mesh.normals[:, 2]
     assert mesh.colours[:, 0] == pytest.approx(red, abs=1e-5)
@@ -94,7 +94,7 @@ def test_a_sparse_field_has_the_surface_of_the_dense_one(variant_rgb: None) -> N
 
 
 def test_hard_a_field_that_reaches_its_sides_is_closed(variant_rgb: None) -> None:
-    """A full box: its surface is closed and at most half a voxel outside (cells of 1/3, 1/4, 1/5)."""
+    """The surface of a full box is closed, and at most half a voxel outside (cells of 1/3, 1/4, 1/5)."""
     sh = np.zeros((3, 4, 5, 1, 3), np.float32)
     mesh = extract_surface(SphericalGrid.from_dense(np.full((3, 4, 5), 9.0), sh, np.eye(4)), 1e-3)
     edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
@@ -106,8 +106,9 @@ def test_hard_a_field_that_reaches_its_sides_is_closed(variant_rgb: None) -> Non
 
 
 def test_the_level_of_a_mesh(variant_rgb: None) -> None:
-    """Longest edge 0.1: half the light passes it at ln 2 / 0.1, unless matter is thinner: of 2 and 6 in equal parts, half of
-    (4 + 36) / 8. A lower level is a larger ball, by 0.1 for each 1."""
+    """With a longest edge of 0.1 a dense field has the level ln 2 / 0.1; a thin field of 2 and 6 in equal parts has half of
+    (4 + 36) / 8. A level lower by 1 makes the ball larger by 0.1.
+    """
     block, sh = np.full((10, 10, 10), -1.0), np.zeros((10, 10, 10, 1, 3))
     block[2:8, 2:8, 2:5], block[2:8, 2:8, 5:8] = 2, 6
     thin, dense = (SphericalGrid.from_dense(k * block, sh, np.eye(4)) for k in (1, 10))
@@ -124,7 +125,7 @@ def test_the_level_of_a_mesh(variant_rgb: None) -> None:
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])
 def test_meshes_on_disk(variant_rgb: None, tmp_path: Path, suffix: str) -> None:
-    """Mitsuba reads what was written: the same box and as many triangles; ours are the same to float32 and 8 bits."""
+    """Mitsuba reads the file: the same box, and as many triangles. mivol reads the same mesh to float32 and 8 bits."""
     mesh = extract_surface(ball(), 4.0)
     path = tmp_path / f"ball{suffix}"
     assert write_field(path, ball(), 4.0) == [path]
@@ -177,7 +178,7 @@ def test_volumes_show_the_nodes(variant_rgb: None, tmp_path: Path, suffix: str) 
 
 
 def test_a_checkpoint_of_svox2(variant_rgb: None, tmp_path: Path) -> None:
-    """What was written is what is read, to half floats: 11 bits."""
+    """The written field is read again to half floats, 11 bits."""
     rng = np.random.default_rng(0)
     keep = rng.random((3, 4, 5)) < 0.5
     field = SphericalGrid.from_dense(rng.normal(size=keep.shape), rng.normal(size=(*keep.shape, 9, 3)), PLACE, keep)
@@ -190,7 +191,7 @@ def test_a_checkpoint_of_svox2(variant_rgb: None, tmp_path: Path) -> None:
 
 
 def test_meshes_hold_codes_whatever_the_field_holds(variant_rgb: None) -> None:
-    """Viewers show the colours of a mesh as they are: radiance is encoded."""
+    """Viewers show the colours of a mesh unchanged, so radiance is encoded."""
     codes, light = (extract_surface(ball(space=space)).colours for space in ("srgb", "linear"))
     np.testing.assert_allclose(light, encode_srgb(codes), atol=1e-6)
     assert np.ptp(codes) > 0.2
@@ -218,7 +219,7 @@ def test_what_cannot_be_exported(variant_rgb, tmp_path, name, change, level, sen
 
 
 def test_meshes_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(MivolError, match="corners 0 to 3, expected numbers of its 3 points"):
+    with pytest.raises(MivolError, match="corners 0 to 3, expected indices of its 3 points"):
         Mesh(np.eye(3), np.array([[0, 1, 3]]))
     with pytest.raises(MivolError, match=r"expected \(V, 3\)"):
         Mesh(np.eye(3), np.array([[0, 1]]))

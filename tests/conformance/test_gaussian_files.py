@@ -1,4 +1,6 @@
-"""Files of Gaussians: read as their authors write them, in any order; written to the bit; hostile ones end in a sentence."""
+"""Files of Gaussians: files of the authors' program are read in any order of properties and written to the bit; damaged files
+end in a message.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +19,12 @@ ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
 
 
 def equal(a: Gaussians, b: Gaussians) -> bool:
-    """The same to the bit."""
+    """Equality to the bit."""
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ARRAYS)
 
 
 def angles(a: Gaussians, b: Gaussians) -> np.ndarray:
-    """The angles by which the rotations of two sets differ, (N,) [rad]."""
+    """The angles between the rotations of two sets, (N,) [rad]."""
     cosine = np.abs(np.sum(unit(a) * unit(b), axis=1))
     return 2 * np.arccos(np.minimum(cosine, 1))
 
@@ -38,7 +40,7 @@ def unit(one: Gaussians) -> np.ndarray:
 
 @pytest.mark.parametrize("degree", range(4))
 def test_what_is_written_is_the_file_of_the_authors(tmp_path: Path, degree: int) -> None:
-    """The body to the bit; read again, every number is the same to the bit."""
+    """The body is equal to the bit, and every number read again is equal to the bit."""
     one = random_gaussians(7, degree)
     write_gaussians(tmp_path / "a.ply", one)
     head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -49,7 +51,9 @@ def test_what_is_written_is_the_file_of_the_authors(tmp_path: Path, degree: int)
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
 def test_any_order_of_properties_is_read(tmp_path: Path, form: str) -> None:
-    """Shuffled, as doubles, with a property of another program and an element of lists behind; text holds 17 digits."""
+    """Properties are shuffled and stored as doubles, beside a property of another program and an element of lists; text has 17
+    digits.
+    """
     one = random_gaussians(5, 2)
     names = [*np.random.default_rng(4).permutation(inria_properties(2)).tolist(), "confidence"]
     rows = [[{**inria_row(one, index), "confidence": 1.0}[name] for name in names] for index in range(5)]
@@ -65,7 +69,7 @@ def test_any_order_of_properties_is_read(tmp_path: Path, form: str) -> None:
 
 
 def change(old: bytes, new: bytes) -> bytes:
-    """A sound file with something else in it."""
+    """A valid file with a replaced part."""
     data = inria_bytes(random_gaussians(3, 1))
     assert data.count(old) == 1
     return data.replace(old, new)

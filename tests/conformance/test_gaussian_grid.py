@@ -1,4 +1,4 @@
-"""Gaussians on a grid: optical depths along lines against the closed form, mass, colours, and what is refused."""
+"""Gaussians to a grid and back: optical depths against the closed form, mass, colours, and refused inputs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def variant() -> None:
 
 
 def one(scales: tuple[float, ...] = (1.0, 1.0, 1.0), opacity: float = 0.7, mean: tuple[float, ...] = (0, 0, 0)) -> Gaussians:
-    """A turned Gaussian of a colour that depends on the direction."""
+    """A turned Gaussian with a directional colour."""
     harmonics = np.linspace(-0.5, 0.8, 12).reshape(1, 4, 3)
     return Gaussians([mean], np.log([scales]), [[0.9, 0.2, -0.3, 0.1]], [logit(opacity)], harmonics)
 
@@ -39,9 +39,10 @@ def total(field: gaussian_grid.SphericalGrid) -> float:
 
 
 def test_a_mass_is_the_mean_over_directions_weighed_by_the_area_seen() -> None:
-    """Against a sum over directions of optical depth times area over the area, with a rule exact to degree 60 and more.
+    """The mass equals a sum over directions of optical depth times area, divided by the sum of areas.
 
-    The integrand is analytic with a ratio of axes of 4: 64 x 128 points leave less than 1e-6 of it.
+    The quadrature is exact to degree 60. The integrand is analytic, and with a ratio of axes of 4 the 64 x 128 points have an
+    error below 1e-6.
     """
     gaussians = one((0.5, 1.0, 2.0))
     cosine, weight = np.polynomial.legendre.leggauss(64)
@@ -58,12 +59,12 @@ def test_a_mass_is_the_mean_over_directions_weighed_by_the_area_seen() -> None:
 
 
 def test_optical_depths_along_lines_are_those_of_the_widened_gaussian() -> None:
-    """Through the centre and beside it, in three directions: m / (2 pi A) exp(-q / 2).
+    """Lines through the centre and beside it, in three directions, have the optical depth m / (2 pi A) exp(-q / 2).
 
-    The low-pass filter adds 1/4 voxel^2; trilinear interpolation adds f (1 - f) where a line lies at the fraction f between two
-    nodes, 1/6 in the mean over the fractions that a slanting line takes (the ripple is 3e-4 of 0.01).
-    What is left: the fourth cumulant of the tent, 1/60 voxel^4, by 1 / (60 8 s^4) = 4e-4 for each axis at s = 1.5 voxels
-    and more, and 2e-4 beyond the reach; 2e-3 in all.
+    The low-pass filter adds a variance of 1/4 voxel^2. Trilinear interpolation adds f (1 - f) on a line at the fraction f
+    between two nodes, in the mean 1/6 over the fractions of a slanting line (the ripple is 3e-4 of 0.01). The remaining error
+    is the fourth cumulant of the tent, 1/60 voxel^4, which gives 1 / (60 8 s^4) = 4e-4 for each axis at s of at least 1.5
+    voxels, and 2e-4 beyond the reach; 2e-3 in total.
     """
     gaussians = one((0.5, 0.6, 0.9))
     field = gaussians_to_grid(gaussians, np.full(3, -5.0), np.full(3, 5.0), 30)
@@ -83,7 +84,9 @@ def test_optical_depths_along_lines_are_those_of_the_widened_gaussian() -> None:
 
 
 def test_mass_is_kept_however_small_gaussians_are() -> None:
-    """A thousandth of a voxel, a flat one, and one of some voxels: float32 densities, 1e-6."""
+    """Gaussians of a thousandth of a voxel, a flat one, and one of some voxels keep their mass to 1e-6, the rounding of
+    float32.
+    """
     for scales in ((1e-4,) * 3, (0.3, 0.3, 1e-6), (0.2, 0.3, 0.4)):
         gaussians = one(scales, mean=(0.013, -0.021, 0.037))
         field = gaussians_to_grid(gaussians, np.full(3, -2.0), np.full(3, 2.0), 32)
@@ -98,7 +101,7 @@ def test_a_gaussian_on_a_face_gives_half_of_its_mass() -> None:
 
 
 def test_parts_of_a_set_and_the_set_are_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Densities add, colours are means weighed by them, and no cut of the work changes a sum by more than rounding."""
+    """Densities add, colours are means weighted by density, and the size of chunks changes sums only by rounding."""
     parts = [one((0.3, 0.2, 0.4), 0.5), one((0.4, 0.2, 0.3), 0.9, (0.5, 0, 0))]
     parts[1] = Gaussians(
         *(getattr(parts[1], n) for n in ("means", "log_scales", "quaternions", "opacity_logits")), -parts[1].harmonics
@@ -136,16 +139,16 @@ def test_what_cannot_be_a_grid_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def field_of(density: np.ndarray, to_world: np.ndarray, seed: int = 1, degree: int = 1, **kind: object) -> SphericalGrid:
-    """A field of these densities, with colours of all directions."""
+    """A field of the given densities, with colours in all directions."""
     sh = np.random.default_rng(seed).uniform(-0.3, 0.3, (*density.shape, (degree + 1) ** 2, 3))
     return SphericalGrid.from_dense(density, sh, to_world, **kind)
 
 
 def test_one_block_of_one_gaussian_is_this_gaussian() -> None:
-    """There and back: mass, mean, colour, and the covariance with that of the two kernels, 1/4 + 1/6 of a voxel^2.
+    """A Gaussian to a grid and back keeps mass, mean and colour; its covariance grows by the two kernels, 1/4 + 1/6 voxel^2.
 
-    Sums over nodes of a Gaussian of 1.5 voxels and more are its integrals to exp(-2 pi^2 1.5^2) of it; at four deviations,
-    where it is cut off, lie 2e-4 of its mass and 16 times as much of its variance: 4e-3.
+    For a Gaussian of at least 1.5 voxels, sums over nodes equal integrals to exp(-2 pi^2 1.5^2). Beyond the cut at four
+    deviations lie 2e-4 of the mass and 16 times this share of the variance: 4e-3.
     """
     harmonics = np.linspace(-0.5, 0.8, 12).reshape(1, 4, 3)
     one = Gaussians([[0.1, -0.2, 0.3]], np.log([[0.5, 0.6, 0.9]]), [[0.9, 0.2, -0.3, 0.1]], [logit(0.7)], harmonics)
@@ -160,7 +163,7 @@ def test_one_block_of_one_gaussian_is_this_gaussian() -> None:
 
 
 def test_masses_are_those_of_the_voxels_in_blocks_that_need_not_divide_the_grid() -> None:
-    """5 x 6 x 7 nodes in blocks of 3; float32 logits: 1e-5."""
+    """5 x 6 x 7 nodes in blocks of 3. Tolerance 1e-5: logits are float32."""
     rng = np.random.default_rng(2)
     to_world = np.diag([0.7, 1.2, 0.5, 1.0])
     density = rng.uniform(0.2, 3, (5, 6, 7))
@@ -171,9 +174,9 @@ def test_masses_are_those_of_the_voxels_in_blocks_that_need_not_divide_the_grid(
 
 
 def test_a_layer_of_voxels_makes_flat_gaussians_in_a_sheared_grid() -> None:
-    """One layer of a block of 4 x 4 x 4: the variance across it is the tent's, along it that of 4 places more.
+    """A layer in a block of 4 x 4 x 4: across the layer the variance is the tent's, along the layer 4 nodes add theirs.
 
-    In a sheared frame a covariance is A (variance) A^T with the edges of a voxel as the columns of A.
+    In a sheared frame the covariance is A (variance) A^T, with the voxel edges as columns of A.
     """
     to_world = np.eye(4)
     to_world[:3, :3] = [[0.4, 0.1, 0.0], [0.0, 0.4, 0.2], [0.0, 0.0, -0.4]]
@@ -188,7 +191,7 @@ def test_a_layer_of_voxels_makes_flat_gaussians_in_a_sheared_grid() -> None:
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_colours_of_a_turned_grid_are_those_of_the_world(degree: int) -> None:
-    """One voxel, seen along four directions: float32 harmonics, 1e-5. The offset of the field is not that of Gaussians."""
+    """One voxel seen along four directions. Tolerance 1e-5: harmonics are float32. Field and Gaussians differ in offset."""
     c, s = np.cos(0.7), np.sin(0.7)
     to_world = np.eye(4)
     to_world[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
@@ -201,7 +204,7 @@ def test_colours_of_a_turned_grid_are_those_of_the_world(degree: int) -> None:
 
 
 def colours_along(made: Gaussians, d: np.ndarray) -> np.ndarray:
-    """(directions, 3) of the first Gaussian, by the model that published files have."""
+    """(directions, 3) colours of the first Gaussian, by the model of published files."""
     import drjit as dr
 
     basis = [np.broadcast_to(np.array(y), len(d)) for y in dr.sh_eval(mi.Vector3f(*d.T), made.degree)]
@@ -209,7 +212,7 @@ def colours_along(made: Gaussians, d: np.ndarray) -> np.ndarray:
 
 
 def test_radiance_becomes_code_values() -> None:
-    """A colour of degree 0 is encoded; harmonics of float32: 1e-5."""
+    """A colour of degree 0 is encoded. Tolerance 1e-5: harmonics are float32."""
     light = np.array([0.02, 0.2, 0.7])
     sh = ((light - 0.5) / CONSTANT_HARMONIC).reshape(1, 1, 1, 1, 3)
     field = SphericalGrid.from_dense(np.full((1, 1, 1), 0.5), sh, np.eye(4), space="linear")

@@ -1,4 +1,4 @@
-"""The model of Gaussians: shapes, activations, rotations, and what is refused by index."""
+"""The model of Gaussians: shapes, activations, rotations, and messages that name the first wrong index."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from mivol.points.gaussians import Gaussians, concatenate, logit
 
 
 def test_a_quarter_turn_about_z_takes_x_to_y() -> None:
-    """(w, x, y, z) = (1, 0, 0, 1), of length sqrt(2): the first axis, of scale 2, points along y.
+    """(w, x, y, z) = (1, 0, 0, 1) has length sqrt(2); the first axis, of scale 2, points along y.
 
-    The quaternion's norm and the products are rounded some ten times in float32: 2^-20 of the largest entry, 4, bounds it.
+    The norm and the products of the quaternion are rounded about ten times in float32; 2^-20 of the largest entry, 4, is a
+    bound.
     """
     one = Gaussians(np.zeros((1, 3)), np.log([[2, 1, 0.5]]), [[1, 0, 0, 1]], [0], np.zeros((1, 1, 3)))
     assert np.abs(one.rotations()[0] - [[0, -1, 0], [1, 0, 0], [0, 0, 1]]).max() <= 2**-20
@@ -68,9 +69,9 @@ def test_numbers_that_cannot_be_drawn_are_named_by_index(name: str, value: float
 
 
 def test_the_basis_is_that_of_published_files(variant_rgb: str) -> None:
-    """Files of 3D Gaussian splatting name their basis by constants; Dr.Jit's is the same, in the same order.
+    """Published files define their basis by constants; Dr.Jit has the same basis in the same order.
 
-    Each function is a polynomial of at most 8 rounded operations on numbers below 4: 8 * 4 * 2^-24 bounds its rounding.
+    Each function is a polynomial of at most 8 rounded operations on numbers below 4; 8 * 4 * 2^-24 is a bound of its rounding.
     """
     d = np.random.default_rng(3).normal(size=(3, 20))
     x, y, z = d = (d / np.linalg.norm(d, axis=0)).astype(np.float32).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Clouds of points: files, a density that keeps their mass, points drawn from a density, Gaussians made of them."""
+"""Clouds of points: files, densities of the same mass, random points of a density, and Gaussians of points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BOX = np.array([[2.0, 0.5, 0, -1], [0, 3, 0, 4], [0, 0, 1.5, 2], [0, 0, 0, 1]])
 
 
 def inside(count: int, seed: int = 5) -> np.ndarray:
-    """Points in the box, some of them on its faces and corners."""
+    """Points in the box, some on its faces and corners."""
     unit = np.random.default_rng(seed).uniform(size=(count, 3))
     unit[:8] = [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]
     unit[8:11] = [[0, 0.3, 0.4], [0.2, 1, 0.7], [0.99, 0.5, 0]]
@@ -30,7 +30,7 @@ def inside(count: int, seed: int = 5) -> np.ndarray:
 
 @pytest.mark.parametrize("suffix", [".ply", ".npy"])
 def test_what_is_written_is_read(tmp_path: Path, suffix: str) -> None:
-    """Positions in float32; colours, where the format has them, in bytes."""
+    """Positions return in float32; colours return in bytes, if the format has colours."""
     cloud = PointCloud(inside(20), np.linspace(0, 1, 60).reshape(20, 3))
     write_points(tmp_path / f"a{suffix}", cloud)
     read = read_points(tmp_path / f"a{suffix}")
@@ -67,7 +67,7 @@ def test_points_of_colmap_keep_their_colours(tmp_path: Path, suffix: str) -> Non
 
 
 def test_las_is_read(tmp_path: Path) -> None:
-    """Positions in steps of the scale that the header says."""
+    """Positions are multiples of the scale in the header."""
     laspy = pytest.importorskip("laspy", reason="LAS needs the optional package laspy")
     header = laspy.LasHeader(point_format=2, version="1.2")
     header.offsets, header.scales = [5e6, 0, 0], [0.001, 0.001, 0.001]
@@ -81,7 +81,7 @@ def test_las_is_read(tmp_path: Path) -> None:
 
 
 def npy(array: np.ndarray, tmp_path: Path) -> bytes:
-    """The bytes of an array's file."""
+    """The bytes of a file of an array."""
     np.save(tmp_path / "other.npy", array)
     return (tmp_path / "other.npy").read_bytes()
 
@@ -114,8 +114,9 @@ def test_a_published_cloud_is_read(data_dir: Path) -> None:
 
 @pytest.mark.parametrize("resolution", [(4, 5, 6), (1, 3, 2), (1, 1, 1)])
 def test_the_mass_is_kept_up_to_the_faces(resolution: tuple[int, int, int]) -> None:
-    """The eight weights of a point sum to 1 to some eight roundings, and the mass of all is a sum of positive numbers: 1000
-    roundings of 2^-53 of it bound its error."""
+    """The eight weights of a point sum to 1 to about eight roundings, and the mass is a sum of positive numbers; 1000 roundings
+    of 2^-53 bound its relative error.
+    """
     points = inside(500)
     masses = np.random.default_rng(6).uniform(0.5, 2, 500)
     density = points_to_density(points, resolution, BOX, masses)
@@ -124,8 +125,9 @@ def test_the_mass_is_kept_up_to_the_faces(resolution: tuple[int, int, int]) -> N
 
 
 def test_the_centre_of_mass_is_kept_inside() -> None:
-    """Of one point at a time, half a voxel and more from the faces: sum of density times voxel centres is the point; to some
-    twenty roundings of numbers below 8."""
+    """For a single point, at least half a voxel from the faces, the sum of density times voxel centres is the point, to about
+    twenty roundings of numbers below 8.
+    """
     resolution = (4, 5, 6)
     index = np.stack(np.meshgrid(*map(np.arange, resolution), indexing="ij"), axis=-1)[..., ::-1]
     centres = (index + 0.5) / resolution[::-1] @ BOX[:3, :3].T + BOX[:3, 3]
@@ -143,7 +145,9 @@ def test_a_point_outside_is_refused_by_index() -> None:
 
 
 def test_each_voxel_holds_its_share_of_the_points() -> None:
-    """To less than one point, since voxels are drawn systematically; those without mass hold none. 1e-9: of rounding."""
+    """Voxels are drawn systematically, so the count of each is its share to less than one point; voxels without mass stay
+    empty. Tolerance 1e-9 for rounding.
+    """
     density = np.random.default_rng(8).uniform(size=(3, 4, 5))
     density[1] = 0
     points = sample_points(density, BOX, 1000, seed=3)
@@ -167,8 +171,9 @@ def test_a_density_that_nothing_can_be_drawn_from_is_refused(density: np.ndarray
 
 
 def test_gaussians_are_as_wide_as_their_neighbours_are_away() -> None:
-    """Corners of a cube of edge 2 have their three neighbours at 2; a point that is there twice more gets the smallest scale.
-    Logarithms below 8 in float32: 1e-6."""
+    """Corners of a cube of edge 2 have three neighbours at distance 2; a point with two copies gets the smallest scale.
+    Tolerance 1e-6: logarithms below 8 in float32.
+    """
     corners = np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (0, 2)], float)
     balls = points_to_gaussians(PointCloud(corners, np.full((8, 3), 0.75)), opacity=0.2).check()
     assert np.abs(balls.log_scales - np.log(2)).max() <= 1e-6

@@ -1,4 +1,4 @@
-"""A map of directions is Mitsuba's, and its derivatives are its own."""
+"""A sky is an environment map of Mitsuba, with derivatives by its texels."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_sky_of_one_row_is_refused(variant_rgb: str) -> None:
 
 
 def test_smoothing_a_sky(variant_rgb: str) -> None:
-    """A share of the way to the mean of four neighbours: across the seam, and at a pole to the row beside it."""
+    """Texels move by a share towards the mean of four neighbours: across the seam, and at a pole to the row beside."""
     image = np.float32(np.random.default_rng(3).random((6, 12, 3)))
     around = np.roll(image, 1, 1) + np.roll(image, -1, 1)
     around += np.concatenate([image[:1], image[:-1]]) + np.concatenate([image[1:], image[-1:]])
@@ -59,7 +59,7 @@ def test_smoothing_a_sky(variant_rgb: str) -> None:
 
 
 def test_corners_of_a_direction_are_texels(variant_rgb: str) -> None:
-    """Four texels that exist, with shares of at least 0 that sum to 1, to two roundings: at the poles and the seam too."""
+    """The four texels exist, with weights of at least 0 and sum 1, to two roundings; also at the poles and the seam."""
     for rows in (2, 5):
         _, d = some(400)
         corners = Sky.from_image(np.zeros((rows, 2 * rows, 3), np.float32))._corners(d)

@@ -1,5 +1,6 @@
-"""Compact files of Gaussians: each number is within its quantisation of what an encoder of its own put in, and scenes that
-are published in several formats agree."""
+"""Compact files of Gaussians: numbers are within the quantisation of a test encoder, and published scenes in several formats
+agree.
+"""
 
 from __future__ import annotations
 
@@ -31,18 +32,18 @@ def unit(one: Gaussians) -> np.ndarray:
 
 
 def close(found: np.ndarray, wanted: np.ndarray, bound: float | np.ndarray) -> bool:
-    """Within a bound and rounding, number by number."""
+    """Equality within a bound and rounding, number by number."""
     return bool(np.all(np.abs(found.astype(np.float64) - wanted) <= np.asarray(bound) + ROUNDING))
 
 
 def colours_are_bytes(read: Gaussians, one: Gaussians) -> bool:
-    """Colour and opacity within half a step of 1 / 255; colours of the test's sets lie in 0..1."""
+    """Colour and opacity are within half a step of 1 / 255; colours of the test sets lie in 0..1."""
     return close(read.base_colours(), one.base_colours(), 0.5 / 255) and close(read.opacities(), one.opacities(), 0.5 / 255)
 
 
 @pytest.fixture
 def read(tmp_path: Path) -> Read:
-    """Bytes as a file of some suffix, read."""
+    """Read bytes as a file with a suffix."""
 
     def read_bytes(data: bytes, suffix: str) -> Gaussians:
         (tmp_path / f"a{suffix}").write_bytes(data)
@@ -89,7 +90,9 @@ def test_bytes_that_gzip_would_pack_are_read_as_they_are(read: Read) -> None:
 
 
 def test_harmonics_turn_with_the_axes(variant_rgb: str) -> None:
-    """The colour along (x, -y, -z) with turned coefficients is that along (x, y, z): each function changes by its sign only."""
+    """The colour along (x, -y, -z) with turned coefficients equals the colour along (x, y, z): each function changes only its
+    sign.
+    """
     d = np.array([[0.3, -0.5, 0.2], [0.6, 0.1, -0.7], [-0.2, 0.4, 0.5]], np.float32).T
     turned = d * np.array([[1], [-1], [-1]], np.float32)
     plain, other = (dr.sh_eval(mi.Vector3f(v), 3) for v in (d, turned))
@@ -98,7 +101,7 @@ def test_harmonics_turn_with_the_axes(variant_rgb: str) -> None:
 
 
 def changed(data: bytes, at: int, new: bytes) -> bytes:
-    """The bytes with some in them replaced."""
+    """The bytes with some bytes replaced."""
     return data[:at] + new + data[at + len(new) :]
 
 
@@ -150,7 +153,7 @@ def test_damaged_zstandard_ends_in_a_sentence(read: Read, at: int, new: bytes, s
 
 
 def test_splat_is_within_its_steps(read: Read) -> None:
-    """Positions and scales in float32; quaternions in steps of 1/128, a whole one where 255 holds 1; w below 0 too."""
+    """Positions and scales are float32; quaternions have steps of 1/128, a full step where 255 means 1; w may be negative."""
     one = random_gaussians(40, 0)
     found = read(splat_bytes(one), ".splat")
     assert np.array_equal(found.means, one.means)

@@ -1,4 +1,4 @@
-"""Pictures of distances become a surface: a ball seen from all around, in closed form."""
+"""Depth images become a surface: a ball seen from all sides, against the closed form."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LOW, HIGH = MIDDLE - 0.8, MIDDLE + np.array([0.8, 0.9, 0.8])
 
 
 def views_of_a_ball(count: int = 24, edge: int = 96) -> list[DepthView]:
-    """Its depths by the roots of a quadratic; the colour is the place."""
+    """Depth images of a ball from the roots of a quadratic; the colour is the position."""
     to_world = np.diag([2.0, 2, 2, 1])
     to_world[:3, 3] = MIDDLE - 1
     views = []
@@ -32,9 +32,11 @@ def views_of_a_ball(count: int = 24, edge: int = 96) -> list[DepthView]:
 
 
 def test_a_ball_comes_back_with_its_normals_and_its_orientation() -> None:
-    """Voxels of 1.7/20. A slanting view takes the depth along its line for the distance, which is 1 / cos of it, and views
-    beside the ball pull it inwards: within a voxel, half a one in the median. Normals feel the steps of the
-    pictures: 60 degrees at most, 11 in the median."""
+    """Points lie within a voxel (1.7/20) of the ball, half a voxel in the median; normals within 60 degrees, 11 in the median.
+
+    A slanting view takes the depth along its line for the distance, which is too long by 1 / cos, and views past the ball pull
+    the surface inwards. Normals follow the steps of the images.
+    """
     mesh = fuse_depths(views_of_a_ball(), LOW, HIGH, 20)
     voxel = 1.7 / 20
     away = mesh.points - MIDDLE
@@ -49,7 +51,7 @@ def test_a_ball_comes_back_with_its_normals_and_its_orientation() -> None:
 
 
 def test_colours_are_means_of_what_views_show_there() -> None:
-    """A view along d shows 0.5 + 0.4 d: over the half sphere of views that see a place the mean of -d . n is 1/2."""
+    """A view along d shows 0.5 + 0.4 d; over the half sphere of views of a point the mean of -d . n is 1/2."""
     mesh = fuse_depths(views_of_a_ball(), LOW, HIGH, 20)
     shown = (mesh.colours - 0.5) / -0.4
     facing = np.sum(shown * mesh.normals, axis=1)
@@ -57,9 +59,9 @@ def test_colours_are_means_of_what_views_show_there() -> None:
 
 
 def test_one_view_through_a_surface_does_not_tear_a_hole() -> None:
-    """Six of 24 views see nothing at all: a place at the surface is told of by ten others or so, at ten times their weight.
+    """Six of 24 views see free space only; about ten views of each surface point have ten times their weight.
 
-    The surface moves inwards by less than a voxel; deep inside, where nothing else is said, they make a hollow.
+    The surface moves inwards by less than a voxel. Deep inside, no other view contributes, and the six views make a hollow.
     """
     views = views_of_a_ball()
     for view in views[::4]:

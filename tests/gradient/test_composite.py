@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def column(sigma: np.ndarray, boundary: dict | None = None) -> mi.Scene:
-    """A ray from z = -1 up the middle of a column of voxels in the unit cube."""
+    """A ray from z = -1 through the middle of a column of voxels in the unit cube."""
     values = np.asarray(sigma, dtype=np.float32).reshape(-1, 1, 1, 1)
     interior = medium("mivol_medium", grid_volume("mivol_voxels", values))
     shape = {**boundary, "bsdf": {"type": "null"}, "interior": interior} if boundary else box_of(interior, np.eye(4))
@@ -103,7 +103,7 @@ def test_media_hidden_behind_another(shape):
 
 
 def hidden_slope(which: int) -> float:
-    """d depth / d sigma of the second or third box of the test above, by a central difference of the closed form / e^-50."""
+    """d depth / d sigma of the second or third box of the test above: a central difference of the closed form, over e^-50."""
 
     def beyond(sigma: list[float]) -> float:
         moment, left, opaque = 0.0, 1.0, 0.0
