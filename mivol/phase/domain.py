@@ -16,7 +16,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["ASYMMETRY", "COSINE_SQUARED", "DOMAINS", "LARGEST", "WEIGHT", "Domain"]
+__all__ = ["ASYMMETRY", "COSINE_SQUARED", "LARGEST", "WEIGHT", "Domain"]
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,3 @@ ASYMMETRY = Domain(
 COSINE_SQUARED = WEIGHT = Domain(
     0.0, LARGEST, "a finite number of at least 0, and at most 1e30,", "choose one, or clip it after each step"
 )
-
-DOMAINS = {"g": ASYMMETRY, "alpha": COSINE_SQUARED, "weight": WEIGHT}
-"""Domain of each parameter."""

@@ -8,7 +8,8 @@ for, nest the phase functions in a ``mivol_mixture``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -17,32 +18,35 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording
 from mivol.phase.closed_forms import eval_draine, eval_hg, eval_rayleigh, sample_draine, sample_hg, sample_rayleigh
-from mivol.phase.domain import DOMAINS
+from mivol.phase.domain import ASYMMETRY, COSINE_SQUARED, WEIGHT, Domain
 from mivol.phase.mixture import choose_lobe, normalise_weights
 from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table, check_values
 
-VALUES_OF_VOLUMES = ("data", "value.value")
+VOLUME_KEYS = ("data", "value.value")
 """Keys under which Mitsuba's grids and constants, and ours, hold their values."""
 
 ALL_COMPONENTS = 2**32 - 1
 
 
-class TurningPhase(mi.PhaseFunction):
+class AnglePhase(mi.PhaseFunction):
     """A phase function of the scattering angle alone.
 
-    Samples and densities carry no derivative; the value of ``eval_pdf`` carries those of the parameters and directions.
+    Samples and densities carry no derivatives. The value of ``eval_pdf`` carries the derivatives with respect to the parameters
+    and the directions.
     """
+
+    domains: ClassVar[dict[str, Domain]] = {}
 
     def __init__(self, props: mi.Properties, parameters: Mapping[str, mi.Float | mi.Volume]) -> None:
         super().__init__(props)
         self.m_flags = int(mi.PhaseFunctionFlags.Anisotropic)
         self.kind = props.plugin_name()
-        self.parameters = dict(parameters)  # dr.freeze finds arrays among a plugin's own attributes only
+        self.parameters = dict(parameters)  # dr.freeze finds arrays only among a plugin's own attributes
         self.refresh()
 
     def refresh(self) -> None:
-        _take_over(self.parameters, self.kind)
+        _check_parameters(self.parameters, self.domains, self.kind)
 
     def component_count(self, active: mi.Bool = True) -> int:
         return 1
@@ -55,9 +59,6 @@ class TurningPhase(mi.PhaseFunction):
 
     def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
         raise NotImplementedError
-
-    def at(self, name: str, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-        return _eval(self.parameters[name], name, mei, active)
 
     def sample(
         self,
@@ -86,40 +87,51 @@ class TurningPhase(mi.PhaseFunction):
         self.refresh()
 
     def to_string(self) -> str:
-        return f"{self.kind}[" + ", ".join(f"{n}={_brief(v)}" for n, v in self.parameters.items()) + "]"
+        return f"{self.kind}[" + ", ".join(f"{n}={_format_value(v)}" for n, v in self.parameters.items()) + "]"
 
 
-class HenyeyGreenstein(TurningPhase):
+class ClosedFormPhase(AnglePhase):
+    """A phase function whose density and inversion are closed forms.
+
+    A subclass names both functions, and the default and the domain of each parameter in the order of the functions' arguments.
+    """
+
+    density: ClassVar[Callable[..., mi.Float]]
+    inversion: ClassVar[Callable[..., ScatteringAngle]]
+    defaults: ClassVar[dict[str, float]] = {}
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props, {name: _read_parameter(props, name, default) for name, default in self.defaults.items()})
+
+    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return self.density(angle, *self._eval_parameters(mei, active))
+
+    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
+        return self.inversion(u, *self._eval_parameters(mei, active))
+
+    def _eval_parameters(self, mei: mi.MediumInteraction3f, active: mi.Bool) -> list[mi.Float]:
+        return [_eval_parameter(value, self.domains[name], mei, active) for name, value in self.parameters.items()]
+
+
+class HenyeyGreenstein(ClosedFormPhase):
     """``<phase type="mivol_hg">``: the Henyey-Greenstein phase function.
 
     Parameters:
         g: mean cosine, -1 < g < 1, a float or a volume. Default 0.8, as stock ``hg`` has it.
     """
 
-    def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props, {"g": _read(props, "g", 0.8)})
-
-    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-        return eval_hg(angle, self.at("g", mei, active))
-
-    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
-        return sample_hg(u, self.at("g", mei, active))
+    density, inversion = staticmethod(eval_hg), staticmethod(sample_hg)
+    defaults: ClassVar = {"g": 0.8}
+    domains: ClassVar = {"g": ASYMMETRY}
 
 
-class Rayleigh(TurningPhase):
+class Rayleigh(ClosedFormPhase):
     """``<phase type="mivol_rayleigh">``: particles much smaller than the wavelength; no parameters."""
 
-    def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props, {})
-
-    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-        return eval_rayleigh(angle)
-
-    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
-        return sample_rayleigh(u)
+    density, inversion = staticmethod(eval_rayleigh), staticmethod(sample_rayleigh)
 
 
-class Draine(TurningPhase):
+class Draine(ClosedFormPhase):
     """``<phase type="mivol_draine">``: Draine's phase function, between Henyey-Greenstein's, Cornette-Shanks' and Rayleigh's.
 
     Parameters:
@@ -127,17 +139,12 @@ class Draine(TurningPhase):
         alpha: weight of cos^2, at least 0, a float or a volume: 0 is Henyey-Greenstein, 1 (the default) Cornette-Shanks.
     """
 
-    def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props, {"g": _read(props, "g", 0.8), "alpha": _read(props, "alpha", 1.0)})
-
-    def eval_angle(self, angle: ScatteringAngle, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-        return eval_draine(angle, self.at("g", mei, active), self.at("alpha", mei, active))
-
-    def sample_angle(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> ScatteringAngle:
-        return sample_draine(u, self.at("g", mei, active), self.at("alpha", mei, active))
+    density, inversion = staticmethod(eval_draine), staticmethod(sample_draine)
+    defaults: ClassVar = {"g": 0.8, "alpha": 1.0}
+    domains: ClassVar = {"g": ASYMMETRY, "alpha": COSINE_SQUARED}
 
 
-class Tabulated(TurningPhase):
+class Tabulated(AnglePhase):
     """``<phase type="mivol_tabulated">``: values at cosines, linear in between, normalised.
 
     Parameters:
@@ -196,7 +203,7 @@ class Mixture(mi.PhaseFunction):
         self.refresh()
 
     def refresh(self) -> None:
-        _take_over(self.weights, "mivol_mixture")
+        _check_parameters(self.weights, dict.fromkeys(self.weights, WEIGHT), "mivol_mixture")
         numbers = [w for w in self.weights.values() if not isinstance(w, mi.Volume)]
         if len(numbers) == len(self.weights) and not is_recording() and not any(w[0] > 0 for w in numbers):
             raise MivolError("the weights of mivol_mixture are all 0; at least one above 0 is expected.")
@@ -212,7 +219,7 @@ class Mixture(mi.PhaseFunction):
         return int(lobe.flags() if inner == ALL_COMPONENTS else lobe.flags(inner))
 
     def shares(self, mei: mi.MediumInteraction3f, active: mi.Bool) -> list[mi.Float]:
-        return normalise_weights([_eval(w, "weight", mei, active) for w in self.weights.values()])
+        return normalise_weights([_eval_parameter(w, WEIGHT, mei, active) for w in self.weights.values()])
 
     def sample(
         self,
@@ -298,10 +305,10 @@ def _count(lobe: mi.PhaseFunction) -> int:
     return max(lobe.component_count(), 1)
 
 
-# -- Parameters that are a number or a volume -------------------------------------------------------------------------
+# -- Parameters: each a number or a volume ----------------------------------------------------------------------------
 
 
-def _read(props: mi.Properties, name: str, default: float) -> mi.Float | mi.Volume:
+def _read_parameter(props: mi.Properties, name: str, default: float) -> mi.Float | mi.Volume:
     value = props.get(name, default)
     if isinstance(value, mi.Volume):
         return value
@@ -310,20 +317,20 @@ def _read(props: mi.Properties, name: str, default: float) -> mi.Float | mi.Volu
     raise MivolError(f"{name} of {props.plugin_name()} is a {type(value).__name__}; a number or a volume is expected.")
 
 
-def _brief(value: mi.Float | mi.Volume) -> str:
-    """A value in words; a recording cannot read numbers."""
+def _format_value(value: mi.Float | mi.Volume) -> str:
+    """Print a value. While ``dr.freeze`` records, numbers cannot be read."""
     if isinstance(value, mi.Volume):
         return value.class_name()
     return "recorded" if is_recording() else str(dr.detach(value))
 
 
-def _take_over(parameters: dict[str, mi.Float | mi.Volume], owner: str) -> None:
-    """Refuse values that can be read, and make arrays of numbers, which recordings and recompilations do not bake in."""
+def _check_parameters(parameters: dict[str, mi.Float | mi.Volume], domains: dict[str, Domain], owner: str) -> None:
+    """Refuse values outside their domains, and make numbers opaque: recordings and compiled kernels do not bake them in."""
     for name, value in parameters.items():
         if not is_recording():
             for known in _known_values(value):
                 _check_channels(known, f"{name} of {owner}")
-                DOMAINS[name.split("_")[0]].check(np.array(dr.detach(known)), f"{name} of {owner}")
+                domains[name].check(np.array(dr.detach(known)), f"{name} of {owner}")
         if not isinstance(value, mi.Volume):
             dr.make_opaque(value)
 
@@ -332,7 +339,7 @@ def _known_values(value: mi.Float | mi.Volume) -> list[object]:
     if not isinstance(value, mi.Volume):
         return [value]
     params = mi.traverse(value)
-    return [params[key] for key in VALUES_OF_VOLUMES if key in params]
+    return [params[key] for key in VOLUME_KEYS if key in params]
 
 
 def _check_channels(known: mi.Float | mi.Color3f | mi.TensorXf, name: str) -> None:
@@ -341,9 +348,8 @@ def _check_channels(known: mi.Float | mi.Color3f | mi.TensorXf, name: str) -> No
         raise MivolError(f"{name} has {channels} channels; a phase function has one value for all colours: give a grey volume.")
 
 
-def _eval(value: mi.Float | mi.Volume, name: str, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
-    x = value.eval_1(mei, active) if isinstance(value, mi.Volume) else value
-    return DOMAINS[name].project(x)
+def _eval_parameter(value: mi.Float | mi.Volume, domain: Domain, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+    return domain.project(value.eval_1(mei, active) if isinstance(value, mi.Volume) else value)
 
 
 def _read_weights(props: mi.Properties, names: list[str]) -> dict[str, mi.Float | mi.Volume]:
@@ -353,7 +359,7 @@ def _read_weights(props: mi.Properties, names: list[str]) -> dict[str, mi.Float 
     missing = [k for k in keys if k not in props]
     if 0 < len(missing) < len(keys):
         raise MivolError(f"mivol_mixture lacks {', '.join(missing)}; give a weight for each phase function, or for none.")
-    return {k: _read(props, k, 1.0) for k in keys}
+    return {k: _read_parameter(props, k, 1.0) for k in keys}
 
 
 def _read_table(props: mi.Properties) -> Table:

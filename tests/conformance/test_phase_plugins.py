@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,6 +16,7 @@ from mivol.phase.table import Table
 from mivol.validate.moments import Moments
 from scenes import box_of, camera, render, sky
 
+ROOT = Path(__file__).parents[2]
 EPS = 2.0**-23
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono")
 
@@ -31,13 +35,17 @@ def grid(values: np.ndarray, kind: str = "gridvolume") -> dict:
     return {"type": kind, "data": mi.TensorXf(values[..., None])}
 
 
+REGISTERED = re.findall(r'register_phase\("(\w+)"', (ROOT / "mivol/plugins/phases.py").read_text())
+CLOSED_FORMS = {kind: {"type": kind} for kind in REGISTERED if kind not in ("mivol_tabulated", "mivol_mixture")}
+"""Every phase function that needs no settings, with its defaults: a new one is tested by everything below."""
+
 PEAK = Table([-1, -0.8, -0.1, 0.3, 0.95, 1.0], [1.0, 0.2, 0.0, 0.5, 2.0, 30.0])
 PHASES = {
+    **CLOSED_FORMS,
     "hg": {"type": "mivol_hg", "g": 0.6},
     "hg backwards": {"type": "mivol_hg", "g": -0.85},
     "hg isotropic": {"type": "mivol_hg", "g": 0.0},
     "hg nearly isotropic": {"type": "mivol_hg", "g": 1e-7},
-    "rayleigh": {"type": "mivol_rayleigh"},
     "cornette-shanks": {"type": "mivol_draine", "g": 0.5},
     "draine": {"type": "mivol_draine", "g": -0.6, "alpha": 27.0},
     "table": {"type": "mivol_tabulated", "values": "0.5, 1.0, 1.5"},
@@ -156,15 +164,38 @@ def test_flags_and_projected_area(variant):
     assert mixed.flags() == int(mi.PhaseFunctionFlags.Isotropic)
 
 
+@pytest.mark.parametrize("name", CLOSED_FORMS)
+def test_derivatives_by_parameters_are_differences_of_values(variant, name):
+    """Each parameter of each closed form, at its default, against central differences of two steps."""
+    phase, mei, wo = mi.load_dict(CLOSED_FORMS[name]), interaction(directions(64, 20)), vector(directions(64, 21))
+    params = mi.traverse(phase)
+    for key, default in ((key, float(value[0])) for key, value in params):
+
+        def values(x: float, key: str = key) -> np.ndarray:
+            params[key] = mi.Float(x)
+            params.update()
+            return value_and_pdf(phase, mei, wo)[0]
+
+        fine, coarse = ((values(default + h) - values(default - h)) / (2 * h) for h in (2.0**-7, 2.0**-6))
+        params[key] = mi.Float(default)
+        dr.enable_grad(params[key])
+        params.update()
+        value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, wo)
+        dr.forward(params[key])
+        slope = np.array(dr.grad(value[0]), dtype=np.float64)
+        # The error of a step h is c h^2 at leading order: the difference of the two steps is 3 times that of the fine one, of
+        # which all is allowed for. Values are rounded by 4 eps each.
+        assert np.all(np.abs(slope - fine) <= np.abs(fine - coarse) + 4 * EPS * np.abs(value_and_pdf(phase, mei, wo)[0]) * 2**7)
+
+
 # -- Loading -----------------------------------------------------------------------------------------------------------------
 
 
 def test_xml(variant, tmp_path):
     (tmp_path / "drops.csv").write_text("angle,value\n0,3\n90,1\n180,2\n")
     scenes = {
-        "mivol_hg": '<float name="g" value="0.3"/>',
-        "mivol_rayleigh": "",
-        "mivol_draine": '<float name="g" value="0.3"/><float name="alpha" value="2"/>',
+        **{kind: "".join(f'<float name="{key}" value="0.3"/>' for key, _ in mi.traverse(mi.load_dict(given)))
+           for kind, given in CLOSED_FORMS.items()},
         "mivol_tabulated": f'<string name="filename" value="{tmp_path / "drops.csv"}"/>',
         "mivol_mixture": '<phase name="a" type="hg"/><phase name="b" type="mivol_rayleigh"/>'
         '<float name="weight_a" value="0.2"/>'
@@ -311,7 +342,7 @@ def test_updates_are_seen(variant):
 
 PAIRS = {
     "hg": (PHASES["hg"], {"type": "hg", "g": 0.6}),
-    "rayleigh": (PHASES["rayleigh"], {"type": "rayleigh"}),
+    "rayleigh": (PHASES["mivol_rayleigh"], {"type": "rayleigh"}),
     "isotropic": (PHASES["hg isotropic"], {"type": "isotropic"}),
     "table": (PHASES["table"], {"type": "tabphase", "values": "0.5, 1.0, 1.5"}),
     "mixture": (
@@ -353,7 +384,7 @@ def test_components_of_a_mixture_are_those_of_a_blend(variant):
         ours.eval_pdf(ctx, mei, wo)
 
 
-@pytest.mark.parametrize(("name", "count"), [("hg", 1), ("rayleigh", 1), ("draine", 1), ("table", 1), ("mixture", 3)])
+@pytest.mark.parametrize(("name", "count"), [("hg", 1), ("mivol_rayleigh", 1), ("draine", 1), ("table", 1), ("mixture", 3)])
 def test_components_are_counted(variant, name, count):
     """One for each lobe, as stock ``hg`` and ``isotropic`` count; each has the flags of its lobe."""
     phase = mi.load_dict(PHASES[name])
