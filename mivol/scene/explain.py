@@ -86,7 +86,8 @@ def explain_scene(
         needs = find_needs(scene, eye, survey, reads_emission=settings.may_draw_emission)
     except MivolError as error:
         return Explanation(("facts", *_describe_unread_scene(scene), *_find_warnings(scene)), str(error))
-    facts = ("facts", *_describe_facts(needs), *_find_warnings(scene))
+    misplaced = [f"  warning   {medium.misplacement}" for medium in needs.media if medium.misplaced]
+    facts = ("facts", *_describe_facts(needs), *_find_warnings(scene), *misplaced)
     try:
         check_film(eye)
         make_plan(needs, settings)

@@ -7,6 +7,7 @@ been replaced, and never while a function is being recorded by ``dr.freeze``.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,13 +18,14 @@ import numpy as np
 from mivol.kernel_recording import is_recording
 from mivol.scene.description import check_variant
 from mivol.scene.media_light import MediaLight, read_media_light
-from mivol.scene.nesting import shape_bounds
+from mivol.scene.nesting import OrientedBox, shape_bounds
 from mivol.scene.readings import GridReading, check_constants, check_emission, is_scattering, read_extinction
 from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, find_outside_media, is_instance, survey_scene
 from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.medium_view import MediumView, medium_kind
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.box import Box
 
 __all__ = ["find_needs", "MediumFacts", "Needs", "mean_cosine"]
 
@@ -51,7 +53,10 @@ def find_needs(
     views = tuple(b.view(survey.places) for b in boundaries)
     params = mi.traverse(scene)
     asked = tuple(k for k, v in params if dr.grad_enabled(v))
-    media = tuple(_read_medium_facts(b, view, survey, recording) for b, view in zip(boundaries, views, strict=True))
+    media = tuple(
+        replace(_read_medium_facts(b, view, survey, recording), misplaced=_find_misplaced(b, view, boundaries, survey))
+        for b, view in zip(boundaries, views, strict=True)
+    )
     needs = Needs(
         variant=mi.variant(),
         boundaries=boundaries,
@@ -79,6 +84,27 @@ def find_needs(
     scattering = [body for body, facts in zip(bodies, media, strict=True) if facts.is_scattering]
     light = read_media_light(needs.media_of(scene, bodies, survey.size), boundaries, scattering, sensor, survey)
     return replace(needs, media_light=light)
+
+
+def _find_misplaced(
+    boundary: Boundary, view: MediumView, boundaries: Sequence[Boundary], survey: SceneSurvey
+) -> tuple[str, ...]:
+    """Find the grids of a medium that lie wholly outside of all shapes filled by the medium, by the names of the parts."""
+    key = (boundary.name, boundary.level)
+    if key not in survey.misplaced:
+        shapes = [b.around for b in boundaries if b.medium.ptr == boundary.medium.ptr]
+        grids = {} if None in shapes else {p.name: p.lattice for p in view.parts if p.lattice is not None}
+        boxes = {name: OrientedBox.from_box(Box(lattice.to_world)) for name, lattice in grids.items()}
+        survey.misplaced[key] = tuple(name for name, box in boxes.items() if not any(box.shares(s) for s in shapes))
+    return survey.misplaced[key]
+
+
+def warn_of_misplaced_grids(needs: Needs, survey: SceneSurvey) -> None:
+    """Warn of each medium whose grids lie outside of the shape filled by the medium, once for each scene."""
+    for facts in needs.media:
+        if facts.misplaced and (facts.name, "misplaced") not in survey.warned:
+            survey.warned.add((facts.name, "misplaced"))
+            warnings.warn(f"{facts.misplacement} (this is said once).", RuntimeWarning, stacklevel=2)
 
 
 def _is_placement(key: str, owner: object) -> bool:
@@ -195,6 +221,17 @@ class MediumFacts:
     bounded: str | None = None
     gaussians: int = 0
     mean_cosine: float | None = None
+    misplaced: tuple[str, ...] = ()
+
+    @property
+    def misplacement(self) -> str:
+        """The sentence about the misplaced grids; empty without one."""
+        if not self.misplaced:
+            return ""
+        return (
+            f"the whole grid {' and '.join(self.misplaced)} of the medium in {self.name} lies outside of {self.name} and adds "
+            "nothing to the medium: correct the to_world of the grid or of the shape"
+        )
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.traversal.box import fit_box
+from mivol.transport.traversal.box import Box, fit_box
 from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["OrientedBox", "shape_bounds", "oriented_box", "scene_diagonal", "find_nesting_fault"]
@@ -66,12 +66,17 @@ class OrientedBox:
         return bool((gap < margin * size).all())
 
 
+    @classmethod
+    def from_box(cls, box: Box) -> OrientedBox:
+        """The same parallelepiped."""
+        edges = box.to_world[:3, :3].T
+        return cls(box.corners(), edges / np.linalg.norm(edges, axis=1, keepdims=True))
+
+
 def oriented_box(shape: mi.Shape) -> OrientedBox:
     """A box around a shape."""
     if shape.class_name() == "Cube":
-        box = fit_box(shape)
-        edges = box.to_world[:3, :3].T
-        return OrientedBox(box.corners(), edges / np.linalg.norm(edges, axis=1, keepdims=True))
+        return OrientedBox.from_box(fit_box(shape))
     low, high = shape_bounds(shape)
     return OrientedBox(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high), np.eye(3))
 

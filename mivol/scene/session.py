@@ -14,7 +14,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording, without_garbage_collection
 from mivol.scene.derived import carry_tangents, recompute_derived
-from mivol.scene.needs import find_needs
+from mivol.scene.needs import find_needs, warn_of_misplaced_grids
 from mivol.scene.plan import Plan, build_estimators, make_plan
 from mivol.scene.previews import measure_media_light
 from mivol.scene.refusals import parse_aovs
@@ -136,6 +136,7 @@ class Session:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
         survey = self._surveyed.survey
         needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
+        warn_of_misplaced_grids(needs, survey)
         needs = measure_media_light(scene, sensor, needs, survey, self.settings)
         plan = make_plan(needs, self.settings, self.aovs)
         return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan

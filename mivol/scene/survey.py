@@ -36,7 +36,8 @@ class SceneSurvey:
         values, numbers: what was read of arrays and of constants (:mod:`mivol.scene.readings`).
         places: where grids lie (:func:`mivol.transport.media.medium_view.view_medium`).
         cosines: mean cosines of phase functions, by the name of the medium.
-        warned: grids whose values below 0 were told of.
+        warned: media and grids that were warned of.
+        misplaced: names of the grids of each medium that lie outside of its shapes.
         media_light: what was read of the light that media emit, with the arrays that it was read of
             (:mod:`mivol.scene.media_light`); None where nothing was.
         gain_of_draws: how much sooner draws of that light reach an error [1] (:mod:`mivol.scene.previews`); None where it
@@ -60,6 +61,7 @@ class SceneSurvey:
     numbers: dict = field(default_factory=dict)
     cosines: dict = field(default_factory=dict)
     warned: set = field(default_factory=set)
+    misplaced: dict = field(default_factory=dict)
     media_light: tuple | None = None
     gain_of_draws: float | None = None
 
@@ -99,6 +101,9 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     if fault is not None:
         raise MivolError(fault)
     around = find_outside_media([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
+    exteriors = {s.exterior_medium().ptr for s in shapes if s.is_medium_transition() and s.exterior_medium() is not None}
+    # A medium that also surrounds a shape has no known end.
+    boundaries = [replace(b, around=None) if b.medium.ptr in exteriors else b for b in boundaries]
     boundaries = [part for boundary in boundaries for part in _split_levels(boundary)] + around
     kinds = tuple(_emitter_kind(e) for e in scene.emitters())
     marks = tuple((s, _read_placement(s)) for s in shapes if s.is_medium_transition())
@@ -174,7 +179,8 @@ def is_instance(shape: mi.Shape) -> bool:
 def _make_boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox]) -> Boundary:
     alone = not any(box.shares(boxes[shape.ptr]) for other, box in boxes.items() if other != shape.ptr)
     is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
-    return Boundary(shape.interior_medium(), name, shape.class_name(), fit_box(shape) if is_box else None)
+    box = fit_box(shape) if is_box else None
+    return Boundary(shape.interior_medium(), name, shape.class_name(), box, around=boxes[shape.ptr])
 
 
 def find_outside_media(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:
@@ -227,7 +233,8 @@ class Boundary:
         shape: class of that shape; ``AROUND`` for a medium that fills none (around other shapes or the camera, in instances).
         box: the shape, where it is a box that no other boundary overlaps; None where it has to be traced.
         level: of a nested radiance field, each level of which is a medium of its own.
-        hole: the box in which that level is not, for the level before is there; None of all other media.
+        hole: box of the inner level, which this level leaves out; None for other media.
+        around: box around the shape; None if the medium fills no shape or also surrounds one.
     """
 
     medium: mi.Medium
@@ -236,6 +243,7 @@ class Boundary:
     box: Box | None
     level: int = 0
     hole: Box | None = None
+    around: OrientedBox | None = None
 
     def view(self, places: dict) -> MediumView:
         """Its medium as a sum of fields; ``places`` as in :func:`mivol.transport.media.medium_view.view_medium`.

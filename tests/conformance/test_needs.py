@@ -425,3 +425,37 @@ def test_a_camera_is_inside_where_its_rays_may_begin_in_a_boundary(name: str) ->
     for shapes, expected in (({"ball": ball}, inside), ({"box": box}, False), ({"ball": ball, "box": apart}, inside)):
         scene = mi.load_dict({"type": "scene", **shapes, "sensor": make()})
         assert find_needs(scene, scene.sensors()[0], survey_scene(scene)).camera_inside == expected
+
+
+# -- Grids outside of their shape ------------------------------------------------------------------------------------------
+
+
+def frame_at(x: float) -> np.ndarray:
+    frame = PLACE.copy()
+    frame[0, 3] += x
+    return frame
+
+
+@pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
+@pytest.mark.parametrize("boundary", [box_of, ball_of])
+def test_a_grid_outside_of_its_shape_is_told(kind: str, boundary) -> None:
+    """By explain, and by the first render, in one sentence."""
+    where = (PLACE,) if boundary is box_of else ((0.0, 0.0, 0.0), 1.0)
+    scene = scene_of(boundary=boundary, where=where, sigma_t=grid_volume(kind, values(), frame_at(10.0)))
+    sentence = "the whole grid sigma_t of the medium in .* lies outside of .* and adds nothing to the medium"
+    assert re.search(f"warning   {sentence}", explain(scene))
+    integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
+    with pytest.warns(RuntimeWarning, match=sentence):
+        mi.render(scene, integrator=integrator, spp=1)
+    mi.render(scene, integrator=integrator, spp=1)  # warnings are errors in tests: said once
+
+
+@pytest.mark.parametrize("x", [0.0, 1.9])
+def test_a_grid_that_meets_its_shape_is_not(x: float) -> None:
+    assert "lies outside" not in explain(scene_of(sigma_t=grid_volume("mivol_voxels", values(), frame_at(x))))
+
+
+def test_a_grid_in_another_shape_of_its_medium_is_not() -> None:
+    fog = {**medium("mivol_medium", grid_volume("mivol_voxels", values(), PLACE), 0.0), "id": "fog"}
+    scene = scene_of(box=box_of(fog, frame_at(10.0)), other=box_of({"type": "ref", "id": "fog"}, PLACE))
+    assert "lies outside" not in explain(scene)
