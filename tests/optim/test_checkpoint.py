@@ -1,4 +1,4 @@
-"""A run that was stopped and resumed is the run that was not."""
+"""Checkpoints: a resumed run equals an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_resumed_run_is_the_same_with_several_threads(two_threads, ctrl_c, tmp
 
 @pytest.mark.slow_for("after an event")
 @pytest.mark.parametrize("iteration", [2, 3], ids=["after an event", "plain"])
-def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, ctrl_c, tmp_path: Path, iteration: int) -> None:
+def test_signal_within_an_iteration_loses_nothing(one_thread, ctrl_c, tmp_path: Path, iteration: int) -> None:
     """The signal comes in the render of an iteration: that iteration is done again from where it began, its events not."""
     path, whole = tmp_path / "checkpoint.npz", fit(Adam())
     problem = small_problem()

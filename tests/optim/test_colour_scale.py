@@ -1,4 +1,4 @@
-"""Photographs of radiance: the reals of a fit, the weight of an error, and a ball of high dynamic range."""
+"""Photographs of radiance: reals, weights of errors, and a fit of a ball of high dynamic range."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def problem_of(photos: list[Photo], sky: int = 0) -> RadianceProblem:
     return RadianceProblem(RayBatches.from_photos(photos, (1, 2), with_alpha, "linear"), BOX, replace(PLAN, start=1.0, sky=sky))
 
 
-def test_reals_of_radiance_are_its_logarithm_far_from_0(variant_rgb: str) -> None:
+def test_linear_reals_are_logarithmic_far_from_0(variant_rgb: str) -> None:
     """In float64 asinh; there and back to a few roundings of float32. Codes are their own reals."""
     colours = np.float32([-30, -0.3, 0, 1e-3, 0.4, 90])
     scale = SCALES["linear"]
@@ -60,7 +60,7 @@ def test_reals_of_radiance_are_its_logarithm_far_from_0(variant_rgb: str) -> Non
         assert np.array_equal(np.array(same), colours)
 
 
-def test_a_fit_begins_with_a_fog_that_is_not_brighter_than_what_is_seen(variant_rgb: str) -> None:
+def test_initial_fog_is_not_brighter_than_the_photographs(variant_rgb: str) -> None:
     """Half of the brightest hundredth of each colour, at most grey.
 
     A dim ball before more light is found (43 dB were seen); a fog of 0.5, brighter than both, goes until no matter is left.
@@ -83,7 +83,7 @@ def test_a_fit_begins_with_a_fog_that_is_not_brighter_than_what_is_seen(variant_
     assert score_image(seen, photos[0].image, space="linear").values["psnr"] > 25
 
 
-def test_an_error_weighs_the_slope_of_the_tone_curve(variant_rgb: str) -> None:
+def test_errors_are_weighted_by_the_slope_of_the_tone_curve(variant_rgb: str) -> None:
     """The loss of a ray, in float64, from what the field shows and the photographs hold; of a photograph beyond 1, too."""
     photos = [shot(k, 16) for k in range(3)]
     problem = problem_of(photos)
@@ -102,7 +102,7 @@ def test_an_error_weighs_the_slope_of_the_tone_curve(variant_rgb: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["harmonics", "sky"])
-def test_derivatives_are_those_of_the_weighted_error_by_reals(variant_rgb: str, name: str) -> None:
+def test_gradient_matches_the_weighted_error(variant_rgb: str, name: str) -> None:
     """A step along a direction: with the weights held at the first point, as the source holds them."""
     photos = [shot(k, 16) for k in range(3)]
     problem = problem_of(photos, sky=4)
@@ -144,7 +144,7 @@ class _Held:
         return getattr(self.scale, name)
 
 
-def test_pixels_of_radiance_are_kept_as_they_are(variant_rgb: str) -> None:
+def test_radiance_pixels_are_stored_unchanged(variant_rgb: str) -> None:
     """Beyond 1, below 1/255 and negative, in both sizes; memory counts four bytes a number."""
     photos = [shot(k, 16) for k in range(2)]
     image = photos[0].image.copy()
@@ -159,7 +159,7 @@ def test_pixels_of_radiance_are_kept_as_they_are(variant_rgb: str) -> None:
 
 
 @pytest.mark.slow
-def test_radiance_is_found_over_a_range_of_800(variant_rgb: str) -> None:
+def test_fit_recovers_a_radiance_range_of_800(variant_rgb: str) -> None:
     """As codes the lamp's side, a quarter of the ball, comes out white: 1 of up to 18."""
     train, held = [shot(k) for k in range(16)], [shot(k + 0.5) for k in range(4)]
     image = np.stack([photo.image for photo in train])
@@ -177,7 +177,7 @@ def test_radiance_is_found_over_a_range_of_800(variant_rgb: str) -> None:
     assert abs(np.log(np.mean(ratios))) < 0.1
 
 
-def test_a_checkpoint_of_radiance_is_one(variant_rgb: str) -> None:
+def test_resumed_radiance_fit_equals_an_uninterrupted_fit(variant_rgb: str) -> None:
     """What is packed and taken up again shows the same, and is radiance."""
     problem = problem_of([shot(k, 16) for k in range(2)], sky=4)
     rng = np.random.default_rng(5)

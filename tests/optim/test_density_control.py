@@ -1,4 +1,4 @@
-"""Density control on arrays: what each change makes of a cloud, and what it carries over of what was learnt."""
+"""Density control of arrays: the new rows of each change, and the moments carried over."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_clone_is_its_parent_and_starts_without_moments() -> None:
     assert not learnt[6:].any()
 
 
-def test_halves_are_drawn_from_the_gaussian_that_they_replace() -> None:
+def test_halves_are_drawn_from_the_split_gaussian() -> None:
     """4000 halves of one Gaussian: mean and covariance of their places, by their standard errors.
 
     With n draws a sample covariance is off by sqrt((s_ii s_jj + s_ij^2) / n) (normal draws); 6 of these for each of 6 entries,
@@ -59,7 +59,7 @@ def test_halves_are_drawn_from_the_gaussian_that_they_replace() -> None:
     np.testing.assert_allclose(np.exp(change.cloud["log_scales"]) * 1.6, scales, rtol=1e-5)
 
 
-def test_large_ones_are_split_and_small_ones_cloned() -> None:
+def test_large_gaussians_are_split_and_small_ones_cloned() -> None:
     old = cloud(3)
     old["log_scales"][:] = np.log([[0.1, 0.1, 0.1], [0.1, 0.1, 0.9], [0.9, 0.9, 0.9]])
     change = density_control.clone_and_split(old, np.array([0, 1]), 0.5, np.random.default_rng(0))
@@ -68,7 +68,7 @@ def test_large_ones_are_split_and_small_ones_cloned() -> None:
     assert change.forgets.tolist() == [False, False, True, True, True]
 
 
-def test_the_steepest_are_chosen_and_no_more_than_there_is_room_for() -> None:
+def test_select_rows_takes_the_highest_scores_up_to_a_limit() -> None:
     slope = np.array([3.0, 1.0, 2.0, 3.0, 0.5])
     assert density_control.select_rows(slope, 1.0, 10).tolist() == [0, 1, 2, 3]
     assert density_control.select_rows(slope, 1.0, 3).tolist() == [0, 2, 3]
@@ -83,7 +83,7 @@ def test_pruning_keeps_moments_and_refuses_to_leave_nothing() -> None:
         density_control.prune(cloud(), np.zeros(6, bool))
 
 
-def test_two_changes_are_one() -> None:
+def test_composed_changes_equal_successive_changes() -> None:
     """Clones, some of which are pruned: rows and what is forgotten are those of the first cloud."""
     first = density_control.clone_and_split(cloud(), np.array([2]), math.inf, np.random.default_rng(0))
     both = first.then(density_control.prune(first.cloud, np.arange(7) % 2 == 0))
@@ -102,7 +102,7 @@ def test_opacities_are_reset_from_above_only() -> None:
 
 @pytest.mark.parametrize("copies", [1, 2, 5, 20])
 @pytest.mark.parametrize("opacity", [0.02, 0.6, 0.99])
-def test_copies_compose_to_what_they_replace(opacity: float, copies: int) -> None:
+def test_copies_compose_to_the_replaced_gaussian(opacity: float, copies: int) -> None:
     """At the middle the composite of N copies is the old opacity; along a line through it, it has the same integral.
 
     quad is asked for 1e-10; the alternating sums lose at most 2^20 ulps of float64 with 20 copies: 1e-9 bounds both.

@@ -1,4 +1,4 @@
-"""A start from an emissive fit: the density of a field in voxels, views as photographs, the factor of the least loss."""
+"""Emissive start: average density in voxels, views as photographs, and the best factor."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def problem_of(value: np.ndarray, truth: np.ndarray, cameras: int) -> SceneProbl
     return SceneProblem(absorbing_scene(value), views, [parameter], spp=4, seed=3)
 
 
-def test_a_voxel_has_the_mean_of_the_field(variant_rgb):
+def test_voxel_density_is_the_mean_of_the_field(variant_rgb):
     """A density that is linear along the axes has at a voxel's middle its mean; the grid's axes are turned by a quarter."""
     z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n for n in (8, 8, 8)), indexing="ij")
     turned = PLACE @ np.array([[0.0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -46,14 +46,14 @@ def test_a_voxel_has_the_mean_of_the_field(variant_rgb):
     assert PARTS == 3
 
 
-def test_nothing_lies_outside_of_the_field(variant_rgb):
+def test_density_is_0_outside_the_field(variant_rgb):
     """A grid that is twice as long as the field's box has matter in one half of it."""
     longer = PLACE @ np.diag([2.0, 1, 1, 1])
     found = average_density(field_of(np.full((2, 2, 2), 3.0), PLACE), longer, (1, 1, 4))
     assert np.allclose(found, [[[3, 3, 0, 0]]], atol=1e-6)
 
 
-def test_views_become_codes_of_one_white(variant_rgb):
+def test_views_share_a_white_level(variant_rgb):
     """The brightest percentile of all views is white; one channel is grey."""
     values = np.linspace(0, 2, 48, dtype=np.float32).reshape(4, 4, 3)
     sensor = camera(0.0, 4)
@@ -66,7 +66,7 @@ def test_views_become_codes_of_one_white(variant_rgb):
 
 
 @pytest.mark.slow
-def test_the_factor_has_the_least_loss(variant_rgb, monkeypatch):
+def test_best_factor_has_the_least_loss(variant_rgb, monkeypatch):
     """The density of the emissive fit, of which only the shape counts, is brought to the scale that the views ask for."""
     truth = np.full((2, 2, 2, 1), 0.05)
     truth[0, 0, 0] = 1.0
@@ -84,7 +84,7 @@ def test_the_factor_has_the_least_loss(variant_rgb, monkeypatch):
 
 
 @pytest.mark.slow
-def test_no_value_is_0(variant_rgb, monkeypatch):
+def test_start_values_are_positive(variant_rgb, monkeypatch):
     """Where the emissive volume is empty the start is a thousandth of the mean: maps to the logarithm have no 0."""
     shape = np.zeros((2, 2, 2))
     shape[0, 0, 0] = 8.0
@@ -113,7 +113,7 @@ def test_other_cameras_are_refused(variant_rgb):
 
 
 @pytest.mark.slow
-def test_an_emissive_fit_finds_where_matter_is(variant_rgb):
+def test_emissive_fit_recovers_the_shape(variant_rgb):
     """One dark corner of a cube under a white sky, from 8 views: most of the found density lies in that octant, which has an
     eighth of the box."""
     truth = np.zeros((4, 4, 4, 1))

@@ -1,4 +1,4 @@
-"""Events: when they are due, and that refining a grid conserves its mass."""
+"""Events: due iterations, and conservation of mass on refining a grid."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_upsampling_conserves_mass(old: tuple[int, ...], new: tuple[int, ...], c
     assert fine.min(initial=0.0) >= 0.0
 
 
-def test_a_channel_that_is_far_smaller_keeps_its_mass_too(variant_rgb) -> None:
+def test_upsampling_conserves_the_mass_of_a_much_smaller_channel(variant_rgb) -> None:
     """Three voxels become one, in which linear interpolation alone leaves more than a third of the last."""
     field = np.zeros((1, 1, 3, 2), np.float32)
     field[0, 0, 2] = 1e-16, 1.0
@@ -75,7 +75,7 @@ def test_upsampling_of_a_field_of_both_signs_without_mass(variant_rgb) -> None:
     assert np.allclose(fine.ravel(), [1, 0.5, -0.5, -1], atol=EPS)
 
 
-def test_events_are_due_when_they_say(variant_rgb) -> None:
+def test_events_are_due_at_their_iterations(variant_rgb) -> None:
     assert [i for i in range(9) if Upsample(at=(3, 5)).due(i)] == [3, 5]
     assert [i for i in range(9) if Checkpoint(every=4).due(i)] == [4, 8]
     assert [i for i in range(9) if Evaluate(every=4).due(i)] == [0, 4, 8]

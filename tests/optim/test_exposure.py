@@ -1,4 +1,4 @@
-"""Gains of photographs: their derivatives by a formula, when they are left out, and what they are worth to a fit."""
+"""Gains of photographs: derivatives, removal of equal exposures, and their effect on a fit."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def problem_of(plan: RadiancePlan = SMALL, count: int = 5, uneven: float = 0.0) 
 # -- Gains --------------------------------------------------------------------------------------------------------
 
 
-def test_gains_are_pulled_towards_1_and_have_a_mean_of_1(variant_rgb: str) -> None:
+def test_regularized_gains_move_towards_1_with_mean_1(variant_rgb: str) -> None:
     logs = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
     found = Exposure(mi.Float(logs.ravel())).regularized(0.3)
     wanted = (logs - logs.mean(axis=0)) * (1 - 0.3 * PULL)
@@ -61,7 +61,7 @@ def test_gains_are_pulled_towards_1_and_have_a_mean_of_1(variant_rgb: str) -> No
     assert np.array_equal(Exposure.neutral(4).table(), np.ones((4, 3)))
 
 
-def test_derivatives_of_gains_are_those_of_the_squared_error(variant_rgb: str) -> None:
+def test_gain_gradient_matches_the_squared_error(variant_rgb: str) -> None:
     """(g s - t)^2, mean over rays and rgb, differentiated by log g in float64 from what the field shows."""
     problem, logs = problem_of(), logs_of(5, 0.2)
     problem.exposure = Exposure(mi.Float(logs.ravel()))
@@ -81,7 +81,7 @@ def test_derivatives_of_gains_are_those_of_the_squared_error(variant_rgb: str) -
     assert not wanted[[1, 4]].any() and np.abs(wanted[[0, 2, 3]]).min() > 1e-4
 
 
-def test_a_brighter_photograph_of_a_gain_says_the_same_of_the_field(variant_rgb: str) -> None:
+def test_gain_cancels_the_exposure_of_a_brighter_photograph(variant_rgb: str) -> None:
     """Targets and gains times g: errors are g times as large, and derivatives by the field and the sky g^2 times."""
     problem, gain = problem_of(), 1.7
     batch = problem.batches.draw_tiles(1, np.array([1, 4]), 6, np.random.default_rng(4))
@@ -103,7 +103,7 @@ def test_a_brighter_photograph_of_a_gain_says_the_same_of_the_field(variant_rgb:
     [(0.9 * AGREE, "photographs agree in exposure to 3.6%, so gains are removed"), (1.1 * AGREE, "")],
     ids=["agree", "differ"],
 )
-def test_gains_of_photographs_that_agree_are_left_out(variant_rgb: str, spread: float, said: str) -> None:
+def test_gains_of_equal_exposures_are_removed(variant_rgb: str, spread: float, said: str) -> None:
     problem, logs = problem_of(replace(SMALL, stages=(*SMALL.stages, RadianceStage(24, 2)))), logs_of(5, spread)
     problem.exposure = Exposure(mi.Float(logs.ravel()))
     refinement = problem.refine(1)
@@ -126,7 +126,7 @@ def test_gains_need_cameras(variant_rgb: str, photos: list[Photo]) -> None:
         RadianceProblem(RayBatches.from_photos(photos[:2], (1, 2)), BOX, replace(PLAN, exposure=True))
 
 
-def test_gains_are_what_the_preset_or_the_file_says() -> None:
+def test_preset_or_file_sets_gains() -> None:
     def plan(preset: str, **settings: object) -> RadiancePlan:
         return make_plan(config.from_dict({"title": "x", "photos": {"path": "x"}, "field": {"preset": preset, **settings}}))
 
@@ -143,7 +143,7 @@ def problem_rates_fall() -> bool:
     )
 
 
-def test_a_plan_says_that_there_are_gains(variant_rgb: str) -> None:
+def test_plan_names_gains(variant_rgb: str) -> None:
     shown = capture_photos.capture(3)
     survey = type("Survey", (), {"box_from": "as given", "points": None})
     photos = type("Photos", (), {"views": shown, "box": MIDDLE, "survey": survey})
@@ -152,7 +152,7 @@ def test_a_plan_says_that_there_are_gains(variant_rgb: str) -> None:
     assert GAINS not in explain_plan(replace(SMALL, exposure=False), photos, batches)
 
 
-def test_gains_are_shown_those_far_from_1_first() -> None:
+def test_report_sorts_gains_by_distance_from_1() -> None:
     table = tabulate_gains(["a", "b", "c"], np.array([[1.0, 1.05, 1.0], [0.5, 1.0, 1.0], [1.0, 1.0, 1.3]]))
     assert table.head == ("photograph", "red", "green", "blue")
     assert table.rows == (("b", "0.500", "1.000", "1.000"), ("c", "1.000", "1.000", "1.300"), ("a", "1.000", "1.050", "1.000"))
@@ -163,7 +163,7 @@ def test_gains_are_shown_those_far_from_1_first() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("agree", [1.0, 0.0], ids=["agree", "differ"])
-def test_a_fit_that_went_on_equals_one_that_did_not_stop(
+def test_resumed_fit_equals_an_uninterrupted_fit(
     one_thread, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agree: float
 ) -> None:
     """To the last bit, before and after gains were left out."""
@@ -190,7 +190,7 @@ def test_a_fit_that_went_on_equals_one_that_did_not_stop(
 
 
 @pytest.mark.slow
-def test_gains_are_found_with_the_field(variant_rgb: str) -> None:
+def test_fit_recovers_gains_and_field(variant_rgb: str) -> None:
     """Photographs whose gains are spread by exp(0.15): clipping at 1 and the pull take some of that back. Views that were not
     fitted, of the mean exposure, have 0.54 of the error of a fit without gains; 0.75 allows for runs that differ by a tenth."""
     plan = replace(PRESETS["capture"], stages=(RadianceStage(16, 60, 1, 8, 32), RadianceStage(32, 90, 1, 8, 32)))

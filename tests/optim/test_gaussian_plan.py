@@ -1,4 +1,4 @@
-"""Plans of Gaussians: counts, rates, filters, memory, each held against its formula."""
+"""Plans of Gaussian fits: counts, rates, filters and memory against formulas."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PLAN = GaussianPlan(
 )
 
 
-def test_a_plan_counts_its_steps_and_begins_its_stages() -> None:
+def test_plan_counts_steps_and_stage_starts() -> None:
     more = UpdateOccupancy(every=3)
     course = PLAN.course(more)
     assert (PLAN.steps, PLAN.degree, PLAN.stage_starts) == (200, 3, (30, 80))
@@ -36,13 +36,13 @@ def test_a_plan_counts_its_steps_and_begins_its_stages() -> None:
 
 @pytest.mark.parametrize("step", [0, 12, 13, 14, 20, 63, 112, 113, 114, 199])
 @pytest.mark.parametrize("start", [100, 500, 900, 1200])
-def test_growth_is_even_between_its_ends(step: int, start: int) -> None:
+def test_growth_is_linear_in_time(step: int, start: int) -> None:
     """Growth is spread over the steps 20 to 120, and what is allowed holds to the next change, 7 steps on."""
     share = np.clip((step + 7 - 20) / 100, 0, 1)
     assert PLAN.count_at(step, start) == start + round(max(900 - start, 0) * share)
 
 
-def test_growth_without_a_length_is_a_step() -> None:
+def test_growth_over_no_steps_is_a_jump() -> None:
     sudden = replace(PLAN, growth=(0.1, 0.1))
     assert [sudden.count_at(step, 100) for step in (0, 13, 14, 50)] == [100, 100, 900, 900]
 
@@ -57,7 +57,7 @@ def test_rates_are_geometric(step: int) -> None:
 
 
 @pytest.mark.parametrize("shrink", [1, 2, 4, 8])
-def test_a_filter_has_the_variance_of_its_points(shrink: int) -> None:
+def test_low_pass_has_the_variance_of_averaged_pixels(shrink: int) -> None:
     """That of the full size and of ``shrink`` points side by side, in units of the larger pixels."""
     points = np.arange(shrink)
     assert PLAN.low_pass_at(shrink) == pytest.approx((0.3 + points.var()) / shrink**2, rel=1e-14)
@@ -72,13 +72,13 @@ def test_photographs_shrink_by_the_nearest_power_of_two(edge: int) -> None:
     assert [replace(stage, shrink=1) for stage in made.stages] == list(PLAN.stages)
 
 
-def test_effort_is_in_steps() -> None:
+def test_effort_scales_steps() -> None:
     assert [stage.steps for stage in PLAN.scaled(0.1).stages] == [3, 5, 12]
     assert [stage.steps for stage in PLAN.scaled(1e-6).stages] == [1, 1, 1]
     assert PLAN.scaled(2.0).steps == 400
 
 
-def test_the_extent_is_that_of_the_cameras() -> None:
+def test_extent_follows_the_cameras() -> None:
     """Cameras at 0, 1 and 5 along an axis: their mean is 2, the farthest is 3 away."""
     poses = [np.eye(4) for _ in range(3)]
     for pose, x in zip(poses, (0.0, 1.0, 5.0), strict=True):
@@ -88,14 +88,14 @@ def test_the_extent_is_that_of_the_cameras() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_bytes_are_counted(degree: int) -> None:
+def test_memory_estimate_matches_its_formula(degree: int) -> None:
     """A Gaussian has 3 + 3 + 4 + 1 numbers and 3 for each harmonic: six float32 of each; 32 entries of lists of 100 bytes."""
     plan = replace(PLAN, stages=(GaussianStage(100, 30, degree),))
     assert estimate_bytes(plan, 1000, 0) == 1000 * (24 * (3 + 3 + 4 + 1 + 3 * (degree + 1) ** 2) + 3200)
     assert estimate_bytes(plan, 0, 5000) == 5000 * 160
 
 
-def test_memory_is_said_and_refused(variant_rgb: str) -> None:
+def test_memory_is_described_and_checked(variant_rgb: str) -> None:
     """What is needed is what is there, to the byte; what fits is what would be taken."""
     pictures, pixels = 3 << 20, 10_000
     needed = pictures + estimate_bytes(PLAN, 900, pixels)
@@ -113,7 +113,7 @@ def test_memory_is_said_and_refused(variant_rgb: str) -> None:
         check_memory(PLAN, large, 0, 2 << 30)
 
 
-def test_minutes_become_steps_and_no_clock_is_asked() -> None:
+def test_minutes_become_steps_without_a_clock() -> None:
     """Twice the minutes are twice the steps, larger photographs take fewer, and the plan's own minutes leave it as it is."""
     plan = PRESETS["minute"].for_edge(200)
     own = plan.minutes(200 * 200)

@@ -1,4 +1,4 @@
-"""Gaussians and photographs of them as a problem: its gradient, a small fit, its changes of density, and how it resumes."""
+"""Fit of Gaussians to photographs: gradient, density control, a small fit, and resuming."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def fit_of(views: list[Photo], plan: GaussianPlan = PLAN, store: CheckpointFile 
 
 @pytest.mark.slow_for("0.2-behind0")
 @pytest.mark.parametrize(("ssim", "behind"), [(0.2, (0.0, 0.0, 0.0)), (0.0, (0.2, 0.7, 0.4))])
-def test_the_gradient_is_that_of_the_loss(
+def test_gaussian_gradient_matches_differences(
     variant_rgb: str, views: list[Photo], monkeypatch: pytest.MonkeyPatch, ssim: float, behind: tuple[float, ...]
 ) -> None:
     """Along a direction in each parameter, against central differences of the loss of one view over a colour.
@@ -109,7 +109,7 @@ def test_the_gradient_is_that_of_the_loss(
         assert float((np.array(gradient[name]) * way).sum()) == pytest.approx(expected, rel=0.01), name
 
 
-def test_the_rate_of_higher_harmonics_changes_no_picture(variant_rgb: str, views: list[Photo]) -> None:
+def test_sheen_changes_no_image(variant_rgb: str, views: list[Photo]) -> None:
     """One cloud whose reals are kept in two units: the loss is the same to the rounding of a mean of float32 numbers (1e-6),
     and slopes by reals are those by coefficients, times the unit. Harmonics of 0.3 move the loss by far more."""
     found = []
@@ -123,7 +123,7 @@ def test_the_rate_of_higher_harmonics_changes_no_picture(variant_rgb: str, views
     np.testing.assert_allclose(others, slopes, rtol=0, atol=1e-5 * np.abs(slopes).max())
 
 
-def test_a_fit_lowers_the_loss(variant_rgb: str, views: list[Photo]) -> None:
+def test_fit_lowers_the_loss(variant_rgb: str, views: list[Photo]) -> None:
     """80 steps from other points of the same ball; the mean loss of the last round of views is at most 0.55 of the first one's
     (recorded: 0.44), and there are as many Gaussians as the plan lets grow."""
     plan = replace(PLAN, stages=(GaussianStage(20, 20, 0, 2), GaussianStage(40, 60, 1, 1)), random_background=False)
@@ -136,7 +136,7 @@ def test_a_fit_lowers_the_loss(variant_rgb: str, views: list[Photo]) -> None:
 
 
 @pytest.mark.slow
-def test_a_resumed_fit_is_an_uninterrupted_one(one_thread: None, views: list[Photo], tmp_path: Path) -> None:
+def test_resumed_gaussian_fit_equals_an_uninterrupted_fit(one_thread: None, views: list[Photo], tmp_path: Path) -> None:
     """Stopped between two changes of density, after the second stage has begun: to the bit with one thread."""
     whole = fit_of(views, PLAN).complete()
     store = CheckpointFile(tmp_path / "checkpoint.npz", {})
@@ -152,7 +152,7 @@ def test_a_resumed_fit_is_an_uninterrupted_one(one_thread: None, views: list[Pho
 
 
 @pytest.mark.slow
-def test_growth_changes_what_is_learnt_row_by_row(variant_rgb: str, views: list[Photo]) -> None:
+def test_growth_carries_moments_row_by_row(variant_rgb: str, views: list[Photo]) -> None:
     """Moments follow the rows that stay, and are 0 for those that are new."""
     fit = fit_of(views, replace(PLAN, growth=(0.9, 1.0)))
     while fit.next_iteration < 14:
@@ -175,7 +175,7 @@ def test_growth_changes_what_is_learnt_row_by_row(variant_rgb: str, views: list[
 
 
 @pytest.mark.slow
-def test_relocation_keeps_the_picture_and_moves_the_unused(variant_rgb: str, views: list[Photo]) -> None:
+def test_relocation_keeps_the_image_and_moves_unused_gaussians(variant_rgb: str, views: list[Photo]) -> None:
     """Gaussians that have become transparent are gone afterwards, and the number is that of the plan's growth."""
     fit = fit_of(views, replace(PLAN, control="relocation", position_noise=0.0))
     while fit.next_iteration < 3:
@@ -192,7 +192,7 @@ def test_relocation_keeps_the_picture_and_moves_the_unused(variant_rgb: str, vie
 
 
 @pytest.mark.slow
-def test_opacities_are_reset_now_and_then(variant_rgb: str, views: list[Photo]) -> None:
+def test_opacities_are_reset_periodically(variant_rgb: str, views: list[Photo]) -> None:
     """Moments of opacities are forgotten then, those of places are not."""
     fit = fit_of(views, replace(PLAN, reset_every=8, most=150))
     while fit.next_iteration < 5:
@@ -205,7 +205,7 @@ def test_opacities_are_reset_now_and_then(variant_rgb: str, views: list[Photo]) 
 
 
 @pytest.mark.slow
-def test_every_view_comes_once_a_round(variant_rgb: str, views: list[Photo], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_epoch_has_every_view_once(variant_rgb: str, views: list[Photo], monkeypatch: pytest.MonkeyPatch) -> None:
     problem, seen = problem_of(views), []
     whole = problem.loss_of_view
     monkeypatch.setattr(problem, "loss_of_view", lambda reals, view, behind: seen.append(view) or whole(reals, view, behind))
@@ -216,7 +216,7 @@ def test_every_view_comes_once_a_round(variant_rgb: str, views: list[Photo], mon
     assert seen[:8] != seen[8:]
 
 
-def test_what_a_smaller_photograph_is_filtered_by() -> None:
+def test_filter_of_a_smaller_photograph() -> None:
     """A mean over 2 x 2 pixels is two points half a pixel from their middle: a variance of 1/4 beside the filter's, in pixels
     that are four times as large in area."""
     plan = GaussianPlan((GaussianStage(10, 1, 0),), low_pass=0.3)
@@ -224,13 +224,13 @@ def test_what_a_smaller_photograph_is_filtered_by() -> None:
     assert plan.low_pass_at(2) == pytest.approx((0.3 + 0.25) / 4)
 
 
-def test_plans_are_made_for_the_photographs_size() -> None:
+def test_plans_follow_the_size_of_the_photographs() -> None:
     plan = PRESETS["minute"].for_edge(800)
     assert [800 / stage.shrink for stage in plan.stages] == [stage.edge for stage in plan.stages]
     assert [stage.shrink for stage in PRESETS["minute"].for_edge(50).stages] == [1] * len(plan.stages)
 
 
-def test_memory_is_counted_and_what_fits_is_said() -> None:
+def test_memory_check_names_a_fitting_number() -> None:
     plan = PRESETS["minute"]
     room = estimate_bytes(plan, 5000, 40_000) + 10_000
     with pytest.raises(MivolError, match=r"gaussians.most = 5000 fits"):
@@ -255,7 +255,7 @@ def test_refusals(variant_rgb: str, views: list[Photo]) -> None:
     assert scene_extent([view.camera for view in views]) > 0
 
 
-def test_transparent_gaussians_wander_along_their_shape(variant_rgb: str) -> None:
+def test_random_moves_follow_the_shape_of_transparent_gaussians(variant_rgb: str) -> None:
     """A transparent one moves by its covariance times what was drawn, an opaque one stays; float32 products of order 1."""
     rng = np.random.default_rng(0)
     cloud = {
@@ -276,7 +276,7 @@ def test_transparent_gaussians_wander_along_their_shape(variant_rgb: str) -> Non
 
 
 @pytest.mark.slow
-def test_gains_of_photographs_are_found(views: list[Photo]) -> None:
+def test_gaussian_fit_recovers_gains(views: list[Photo]) -> None:
     """Four views, each photographed twice with opposite logarithms of its gains, spread by 0.2.
 
     A photograph has 40 turns of up to 0.05, of which the loss's other slopes and the prior (0.2 of each turn, times the
@@ -296,7 +296,7 @@ def test_gains_of_photographs_are_found(views: list[Photo]) -> None:
     assert np.corrcoef(found.ravel(), logs.ravel())[0, 1] > 0.9
 
 
-def test_derivatives_by_gains_are_those_of_the_loss(views: list[Photo]) -> None:
+def test_gain_gradient_matches_the_loss(views: list[Photo]) -> None:
     """Central differences of the loss, which is piecewise smooth in a gain: 1e-2 of it, float32."""
     plan = replace(PLAN, exposure=True, ssim=0.5)
     plain = [replace(view, alpha=None) for view in views]

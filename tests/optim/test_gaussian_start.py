@@ -1,4 +1,4 @@
-"""Where Gaussians begin: places, sizes and colours, each counted by hand."""
+"""Initial Gaussians: positions, scales and colours, computed by hand."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def seen_pixel(view: Photo, point: np.ndarray) -> tuple[int, int] | None:
     return int(y), int(x)
 
 
-def test_points_of_a_reconstruction_are_taken_as_they_are() -> None:
+def test_reconstruction_points_are_used_unchanged() -> None:
     """Those in the box, whose faces belong to it; fewer than 100 points say nothing."""
     points = np.random.default_rng(1).uniform(-1, 1, (120, 3))
     points[0], points[1] = BOX
@@ -51,7 +51,7 @@ def test_points_of_a_reconstruction_are_taken_as_they_are() -> None:
     assert len(find_start_points(photos([], points[:100]), 7, 3)[0]) < 100
 
 
-def test_places_are_drawn_where_no_view_sees_through() -> None:
+def test_random_points_avoid_transparent_pixels() -> None:
     """Points count where half of the views show them, and none shows them where it is transparent."""
     views = [photo(k, k) for k in range(3)]
     # A camera that looks the other way shows nothing of the box and says nothing against it.
@@ -74,7 +74,7 @@ def test_places_are_drawn_where_no_view_sees_through() -> None:
         find_start_points(photos(clear), 10, 5)
 
 
-def test_gaussians_are_as_large_as_their_neighbours_are_far() -> None:
+def test_scale_is_the_distance_of_neighbours() -> None:
     """The root mean square of the three nearest distances; of points that coincide, a thousandth of the median."""
     places = np.random.default_rng(2).uniform(-0.4, 0.4, (30, 3))
     places = np.concatenate([places, np.repeat([[0.45, 0.5, 0.6]], 5, axis=0)])
@@ -96,7 +96,7 @@ def test_gaussians_are_as_large_as_their_neighbours_are_far() -> None:
     assert all(array.dtype == np.float32 for array in made.values())
 
 
-def test_four_places_are_needed() -> None:
+def test_fewer_than_four_points_are_refused() -> None:
     assert len(make_start_cloud(np.eye(4, 3), [], 0)["means"]) == 4
     with pytest.raises(MivolError, match="found 3 initial points, expected at least 4"):
         make_start_cloud(np.eye(3), [], 0)

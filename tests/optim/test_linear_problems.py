@@ -1,4 +1,4 @@
-"""Problems that no solver can use are refused in a sentence."""
+"""Invalid problems of line integrals are refused."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ from mivol.optim.projections.smoothed_tv import SmoothedTV
         (lambda a, b: run("sirt", LeastSquares(a, b, prior=SmoothedTV(GRID.shape, 1.0, 1.0)), 1), "use pcg or ml-tr"),
     ],
 )
-def test_unusable_problems_are_refused_in_a_sentence(scan, build, sentence):
+def test_invalid_problems_are_refused(scan, build, sentence):
     with pytest.raises(MivolError, match=sentence):
         build(scan[0], scan[2])

@@ -1,4 +1,4 @@
-"""The loop: each optimiser finds a known optimum, derivatives belong together, randomness is where it is said to be."""
+"""The fit loop: every optimizer finds a known optimum, derivatives are consistent, and seeds control all randomness."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def vectors(problem: SceneProblem, seed: int = 0) -> tuple[dict, Packing, np.nda
     return reals, packing, v, w
 
 
-def test_gradient_is_that_of_the_loss(variant_rgb) -> None:
+def test_scene_gradient_matches_differences(variant_rgb) -> None:
     """Central differences of f along random directions, with fixed samples: h^2 f''' and the rounding of f, eps f / h,
     balanced at h = 1e-2: 1e-3 of |g| |v| is ample. A TV prior and a softplus map are in between."""
     parameter = Parameter(KEY, "1", (0.0, np.inf), "softplus", lr=0.1, priors=(TotalVariation(weight=0.01, edge=1.0),))
@@ -111,7 +111,7 @@ def test_gradient_of_a_sky(variant_rgb) -> None:
     assert dr.sum(gradient * v, axis=None).array[0] == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=0.02)
 
 
-def test_a_parameter_that_nothing_depends_on(variant_rgb) -> None:
+def test_parameter_without_derivative_is_refused(variant_rgb) -> None:
     """An albedo at depth 1 would stay as it is without a word."""
     problem = small_problem(parameters=[Parameter("cube.interior_medium.albedo.value.value", domain=(0.0, 1.0), lr=0.1)])
     problem.integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
@@ -119,7 +119,7 @@ def test_a_parameter_that_nothing_depends_on(variant_rgb) -> None:
         problem.loss_and_gradient(problem.initial_reals(), 0)
 
 
-def test_gauss_newton_product_is_that_of_the_jacobian(variant_rgb) -> None:
+def test_gauss_newton_product_matches_the_jacobian(variant_rgb) -> None:
     """<v, J^T W J v> is the weighted square of J v, which differences of images give; and the product is symmetric."""
     problem = small_problem()
     reals, packing, v, w = vectors(problem, 1)
@@ -203,7 +203,7 @@ def test_passes_sum_to_the_samples(variant_rgb) -> None:
 
 @pytest.mark.slow
 @pytest.mark.statistical
-def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:
+def test_nonlinear_loss_is_independent_of_passes(variant_rgb) -> None:
     """Parallel rays through a constant cube: each sample is exp(-2 sigma), so loss and gradient are known whatever the
     passes. A loss taken pass by pass would be the same here for any noise-free image; so noise is put in by cameras at
     the silhouette: there the split may change the image only as much as another seed does."""
@@ -324,7 +324,7 @@ def test_stop_waits_for_a_safe_point(ctrl_c) -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_what_was_ignored_stays_ignored(ctrl_c) -> None:
+def test_ignored_signals_stay_ignored(ctrl_c) -> None:
     """A shell starts what it puts into the background with Ctrl-C ignored: that is meant for the job in front."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with InterruptGuard() as stop:
@@ -357,7 +357,7 @@ def test_refused_views(variant_rgb, case: str) -> None:
         SceneProblem(absorbing_scene(np.ones((2, 2, 2, 1))), views, [Parameter(KEY)])
 
 
-def test_a_loss_that_is_not_finite_stops_the_run(variant_rgb) -> None:
+def test_nonfinite_loss_stops_the_run(variant_rgb) -> None:
     """And what was found before it is kept."""
     problem = small_problem()
     reals, kept = problem.initial_reals(), problem.loss_and_gradient

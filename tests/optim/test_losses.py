@@ -1,4 +1,4 @@
-"""Losses: their values by hand in float64, their slopes, and where they break elsewhere."""
+"""Losses against float64 values and gradients, also for extreme images."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def value_and_slope(loss, image: np.ndarray, reference: np.ndarray) -> tuple[flo
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_value_is_that_of_the_twin(variant_rgb, name: str) -> None:
+def test_loss_value_matches_the_oracle(variant_rgb, name: str) -> None:
     """The residual of two float32 images of size s has absolute error 2 eps s; a square doubles it, a log or a division
     by floor (1e-3, 1e-2) multiplies it by 1 / floor at most."""
     image, reference = images()
@@ -63,7 +63,7 @@ def test_value_is_that_of_the_twin(variant_rgb, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_slope_is_that_of_the_twin(variant_rgb, name: str) -> None:
+def test_loss_gradient_matches_the_oracle(variant_rgb, name: str) -> None:
     """Central differences of the float64 twin: h^2 third derivatives (1e-10 times 1e6 for the log) and 1e-16 / h.
     Pairs closer than 2 h to a kink are left out."""
     image, reference = images()

@@ -1,4 +1,4 @@
-"""Parameters: maps there and back, projection, refusals."""
+"""Parameters: maps and their inverses, projection, refusals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DOMAINS = {"identity": (0.0, math.inf), "softplus": (0.0, math.inf), "log": (0.0
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_there_and_back(variant_rgb, name: str) -> None:
+def test_maps_invert(variant_rgb, name: str) -> None:
     """Reals u = f(x) err by eps |u|, which e^u turns into a relative error of eps |u| <= 14 eps at x = 1e-6; logistic
     loses 1 - x, absolutely eps."""
     x = np.geomspace(1e-6, 0.999, 200).astype(np.float32)
@@ -52,7 +52,7 @@ def test_projection_is_the_nearest_point_of_the_domain(variant_rgb, name: str) -
     assert np.allclose(value, [0.5, 0.5 if name == "identity" else math.exp(0.1), 2.0], rtol=4 * EPS)
 
 
-def test_scene_values_of_any_type_go_through_tensors(variant_rgb) -> None:
+def test_scene_values_convert_to_tensors_and_back(variant_rgb) -> None:
     for value in (mi.Float(1.5), mi.Color3f(1, 2, 3), mi.TensorXf(np.ones((1, 2, 3, 1), "f"))):
         again = like(as_tensor(value), value)
         assert type(again) is type(value)

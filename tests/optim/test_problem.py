@@ -1,4 +1,4 @@
-"""A problem of another kind needs a class and, where its shape changes, nothing more: here a network that learns a curve."""
+"""A new kind of problem needs one class only: here a network that learns a curve."""
 
 from __future__ import annotations
 

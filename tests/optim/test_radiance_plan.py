@@ -1,4 +1,4 @@
-"""Plans of radiance fields: stages, rates, grids, and the memory that they take."""
+"""Plans of radiance field fits: stages, rates, grids and memory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Photo
 
 
-def test_memory_is_counted_first(variant_rgb: str, photos: list[Photo]) -> None:
+def test_memory_is_checked_first(variant_rgb: str, photos: list[Photo]) -> None:
     views = RayBatches.from_photos(photos[:2])
     text = check_memory(PRESETS["cpu"], BOX, views, limit=1 << 40)
     assert "MiB" in text
@@ -72,7 +72,7 @@ TOO_LARGE = [("cpu", 36, 40), ("cpu", 128, 100), ("gpu", 300, 500), ("many views
 
 
 @pytest.mark.parametrize(("preset", "longest", "limit"), TOO_LARGE)
-def test_the_resolution_that_is_said_to_fit_fits(
+def test_suggested_resolution_fits(
     variant_rgb: str, photos: list[Photo], preset: str, longest: int, limit: int
 ) -> None:
     """Taken as the next ``longest``, whichever stage then takes the most; one more is refused. Limits in MiB."""
@@ -100,7 +100,7 @@ def test_grids_have_cubic_voxels_and_cover_the_box(variant_rgb: str) -> None:
     np.testing.assert_allclose(place[:3, 3], [0, -0.05, -0.025], atol=1e-12)
 
 
-def test_a_stage_that_is_not_the_last_any_more_takes_half_its_steps() -> None:
+def test_former_last_stage_takes_half_its_steps() -> None:
     plan = RadiancePlan((RadianceStage(8, 10), RadianceStage(16, 31)))
     assert [(stage.longest, stage.steps) for stage in plan.with_longest(40).stages] == [(8, 10), (16, 15), (40, 31)]
     assert [(stage.longest, stage.steps) for stage in plan.with_longest(12).stages] == [(8, 10), (12, 31)]

@@ -1,4 +1,4 @@
-"""A radiance field as a problem: its gradient against what is known, and small fits from their first step to their pictures."""
+"""Fit of a radiance field to photographs: gradients, stages, memory, and small fits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import Fit, begin_fit, reconstruct
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import RadianceStage, estimate_bytes
-from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.radiance_problem import RadianceProblem, begin_radiance_fit, current_field
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Lens, Photo
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
@@ -26,7 +26,7 @@ from mivol.transport.line_integrals.radiance_source import bake
 
 
 @pytest.mark.slow
-def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) -> None:
+def test_fit_predicts_held_out_views(variant_rgb: str, photos: list[Photo]) -> None:
     # Total variation of an eighth of the rows a step: of a sixteenth, so few steps leave the surface 2.02 voxels deep.
     fit = fitted(RayBatches.from_photos(photos, (1, 2)), replace(PLAN, tv_share=1 / 8))
     # 0.0032: 25 dB in a view between those it saw. The mean colour of the views alone gives 11 dB.
@@ -42,7 +42,7 @@ def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) 
 
 
 @pytest.mark.slow
-def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, photos: list[Photo]) -> None:
+def test_finer_stage_continues_the_last_stage(variant_rgb: str, photos: list[Photo]) -> None:
     """Its first step knows how large derivatives were: begun anew, it would move all that it touches by a whole rate."""
     fit = fitted(RayBatches.from_photos(photos, (1, 2)), replace(PLAN, tv_density=0.0), PLAN.stages[0].steps)
     fit.course.events[0].apply(fit)
@@ -56,7 +56,7 @@ def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, phot
 
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [9, 14], ids=["first stage", "second stage"])
-def test_a_fit_that_went_on_equals_one_that_did_not_stop(one_thread, photos: list[Photo], tmp_path: Path, steps: int) -> None:
+def test_resumed_fit_equals_an_uninterrupted_fit(one_thread, photos: list[Photo], tmp_path: Path, steps: int) -> None:
     """With one thread every value and every mean square is equal to the last bit, and what is forgotten shows in it."""
     batches, path = RayBatches.from_photos(photos[:6], (1, 2)), tmp_path / "checkpoint.npz"
     plan = replace(PLAN, stages=(RadianceStage(8, 10, 2, 3, 8), RadianceStage(16, 10, 1, 3, 8)), tv_density=0.1, first_degree=0)
@@ -91,7 +91,7 @@ def most_held() -> int:
 
 
 @pytest.mark.parametrize(("longest", "views"), [(48, 4), (64, 2)])
-def test_steps_take_the_memory_that_is_counted(
+def test_steps_take_the_estimated_memory(
     variant_rgb: str, cpu_back_end: None, photos: list[Photo], longest: int, views: int
 ) -> None:
     """Not more, and more than half: a block that is let go may serve for something else, which is counted as another."""
@@ -107,7 +107,7 @@ def test_steps_take_the_memory_that_is_counted(
     assert counted / 2 < most_held() - before < counted
 
 
-def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu_back_end: None, photos: list[Photo]) -> None:
+def test_removing_nodes_takes_no_more_memory_than_steps(variant_rgb: str, cpu_back_end: None, photos: list[Photo]) -> None:
     """Though reals and their means are there of old and new nodes, of which most are kept here."""
     plan = replace(PLAN, stages=(RadianceStage(64, 9, 1, 2, 32),), degree=2, keep_weight=0.0, drop=1 / 3)
     fit = fitted(RayBatches.from_photos(photos), plan, 3)
@@ -120,7 +120,7 @@ def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu
     assert held < estimate_bytes(plan, plan.stages[0], BOX, rows)
 
 
-def test_invisible_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> None:
+def test_invisible_nodes_are_removed(variant_rgb: str, photos: list[Photo]) -> None:
     """What is left are the nodes of seen cells and their neighbours, with the values and the squares that they had; Dr.Jit
     holds nothing back of what was there before."""
     fit = fitted(RayBatches.from_photos(photos, (1, 2)), replace(PLAN, drop=1 / 9), 70)
@@ -167,7 +167,7 @@ def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: 
 
 
 @pytest.mark.slow
-def test_backgrounds_that_change_leave_no_white_in_the_air(variant_rgb: str, photos: list[Photo]) -> None:
+def test_changing_backgrounds_leave_no_white_matter(variant_rgb: str, photos: list[Photo]) -> None:
     batches = RayBatches.from_photos(photos, (1, 2), with_alpha=True)
     fit = fitted(batches, replace(PLAN, random_background=True))
     assert error_of(fit) < 0.0064
@@ -184,7 +184,7 @@ def slopes_of(photos: list[Photo], shrink: int = 2, background: np.ndarray | Non
     return [np.array(a) for a in (loss, *slopes.values())]
 
 
-def test_what_a_mask_leaves_out_is_not_fitted(variant_rgb: str, photos: list[Photo]) -> None:
+def test_masked_pixels_are_not_fitted(variant_rgb: str, photos: list[Photo]) -> None:
     """Whatever a masked pixel shows, nothing changes; a shrunk one counts where all that it is the mean of do."""
     rng = np.random.default_rng(8)
     mask = rng.random((48, 48)) > 0.2
@@ -205,7 +205,7 @@ def test_what_a_mask_leaves_out_is_not_fitted(variant_rgb: str, photos: list[Pho
     assert RayBatches.from_photos(some).digest() != RayBatches.from_photos([replace(p, mask=None) for p in some]).digest()
 
 
-def test_each_photograph_may_lie_over_its_own_colour(variant_rgb: str, photos: list[Photo]) -> None:
+def test_photographs_may_have_different_backgrounds(variant_rgb: str, photos: list[Photo]) -> None:
     """Photographs over three colours have the derivatives of the same over white, whatever is put behind both."""
     whole = [replace(p, alpha=(p.alpha > 0.5).astype(np.float32)) for p in photos[:3]]
     colours = np.array([[10, 200, 30], [0, 0, 0], [90, 80, 255]], np.float32) / 255
@@ -222,7 +222,7 @@ def test_each_photograph_may_lie_over_its_own_colour(variant_rgb: str, photos: l
 
 
 @pytest.mark.slow
-def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> None:
+def test_sky_is_recovered(variant_rgb: str, photos: list[Photo]) -> None:
     """A ball under a sky of two colours, photographs without alpha: the sky is found where rays pass the ball."""
     v, u = np.meshgrid(np.linspace(0, 1, 8), (np.arange(16) + 0.5) / 16, indexing="ij")
     image = np.stack([0.5 + 0.4 * np.sin(2 * np.pi * u), 0.9 - 0.8 * v, 0.3 + 0 * u], axis=-1)
@@ -245,7 +245,7 @@ def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> N
         RadianceProblem(RayBatches.from_photos(photos, (1, 2), with_alpha=True), BOX, problem.plan)
 
 
-def test_a_sky_begins_with_what_most_pixels_show(variant_rgb: str, photos: list[Photo]) -> None:
+def test_sky_starts_from_the_median_colour(variant_rgb: str, photos: list[Photo]) -> None:
     """A dark sky begins dark, or the field would have to be what darkens a grey one; what masks leave out says nothing."""
     dark = np.array([20, 30, 60], np.float32) / 255
     images = [np.where(p.alpha[..., None] > 0.5, p.image, dark) for p in photos[:3]]
@@ -258,7 +258,7 @@ def test_a_sky_begins_with_what_most_pixels_show(variant_rgb: str, photos: list[
     np.testing.assert_array_equal(RayBatches.from_photos(blind).median(), 0.5)
 
 
-def test_opacities_are_asked_to_be_none_or_all(variant_rgb: str, photos: list[Photo]) -> None:
+def test_beta_favours_opacities_of_0_or_1(variant_rgb: str, photos: list[Photo]) -> None:
     """The beta prior's part of the derivatives is that of the mean of log T + log(1 - T) over the rays."""
     batches, parts = RayBatches.from_photos(photos[:3], (1, 2)), {}
     problem = RadianceProblem(batches, BOX, replace(PLAN, start=1.0))  # a fog: no density is at the ReLU's kink
@@ -299,3 +299,15 @@ def test_fits_that_are_refused(variant_rgb: str, photos: list[Photo]) -> None:
     nothing = RadianceProblem(RayBatches.from_photos(empty, (1, 2)), BOX + 50.0, PLAN)
     with pytest.raises(MivolError, match="no view shows matter"):
         reconstruct(nothing, PLAN.optimizer, PLAN.course())
+
+
+@pytest.mark.slow
+def test_current_field_follows_the_latest_step(variant_rgb: str, photos: list[Photo]) -> None:
+    fit = begin_radiance_fit(RayBatches.from_photos(photos[:4], (1, 2)), BOX, PLAN)
+    before = np.array(current_field(fit).density)
+    for _ in range(2):
+        fit.advance()
+        found = current_field(fit)
+        assert np.array_equal(found.density, fit.run.reals["density"].array)
+        assert not np.array_equal(found.density, before)
+        before = np.array(found.density)

@@ -1,4 +1,4 @@
-"""Batches of rays: their directions and what the photographs show there."""
+"""Batches of rays: directions and pixel values."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
 
 
-def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo]) -> None:
+def test_batches_have_rays_and_pixels_of_their_views(variant_rgb: str, photos: list[Photo]) -> None:
     views = RayBatches.from_photos(photos[:3], (1, 2))
     batch = views.draw_tiles(1, np.array([0, 2]), 5, np.random.default_rng(0))
     assert dr.width(batch.slot) == 2 * 5 * TILE**2
@@ -26,7 +26,7 @@ def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo])
     assert views.digest() != RayBatches.from_photos(photos[1:4], (1, 2)).digest()
 
 
-def test_a_tile_is_the_smallest_view(variant_rgb: str) -> None:
+def test_smallest_view_is_a_tile(variant_rgb: str) -> None:
     """A view of one tile is taken as it is; at half its size it is refused, with the way out."""
     camera = Camera(intrinsics(10, 10, TILE / 2, TILE / 2), (TILE, TILE), np.eye(4))
     photo = Photo("a", np.full((TILE, TILE, 3), 0.5, np.float32), None, None, camera, np.zeros(3, np.float32))

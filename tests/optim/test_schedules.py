@@ -1,4 +1,4 @@
-"""Schedules: where they begin and where they end."""
+"""Schedules: first and last factors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from mivol.optim.schedules import SCHEDULES, Constant, Cosine, Exponential, Step
 
 
-def test_schedules_begin_at_one_and_end_where_they_say() -> None:
+def test_schedules_begin_at_1_and_end_at_their_final_value() -> None:
     n = 41
     chosen = [Constant(), Cosine(final=0.2), Step(at=(0.5, 0.9), ratio=0.1), Exponential(final=0.01, delay=10)]
     assert {schedule.label() for schedule in chosen} == set(SCHEDULES)

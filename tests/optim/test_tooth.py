@@ -1,4 +1,4 @@
-"""Real and simulated projections: noise, logarithm, drift and axis, up to the tooth whose held-out views are predicted."""
+"""Real and simulated projections: noise, logarithm, drift and rotation axis, and the tooth's held-out views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise in a loss: visible in the plain one, gone from pairs, measured, said once; and exact renders know nothing of it."""
+"""Noise of renders in a loss: measured, removed by pairs, and logged; exact renders have none."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def noisy_halves(n: int, mean: float, s: float, shares: tuple[float, ...], seed:
 @pytest.mark.statistical
 @pytest.mark.parametrize("shares", [(0.5, 0.5), (0.6, 0.4)], ids=["equal", "unequal"])
 @pytest.mark.parametrize("name", ["l2", "relative_l2"])
-def test_pairs_take_the_noise_out_of_a_squared_loss(variant_rgb, name: str, shares: tuple[float, ...]) -> None:
+def test_pairs_remove_the_noise_of_a_squared_loss(variant_rgb, name: str, shares: tuple[float, ...]) -> None:
     """W/2 (r^2 + s^2) plainly and W/2 r^2 with pairs; the standard errors are those of the docstring, 6 of them allowed.
     Unequal shares w1 w2 make the variance of b 2 s^4 as well, for b = w1 w2 (I1 - I2)^2."""
     n, r, s, reference = 40_000, 0.02, 0.05, 0.5
@@ -70,7 +70,7 @@ def test_pairs_take_the_noise_out_of_a_squared_loss(variant_rgb, name: str, shar
         assert np.allclose(np.asarray(found.adjoint), expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
 
-def test_two_halves_give_their_product(variant_rgb) -> None:
+def test_halves_of_a_squared_loss_give_their_product(variant_rgb) -> None:
     """f - b = (I1 - R)(I2 - R), pixel by pixel; rounding of squares of size 4."""
     rng = np.random.default_rng(1)
     for a, b, r in rng.uniform(-1, 1, (8, 3)):
@@ -79,7 +79,7 @@ def test_two_halves_give_their_product(variant_rgb) -> None:
 
 
 @pytest.mark.statistical
-def test_variance_is_as_said(variant_rgb) -> None:
+def test_variance_matches_the_docstring(variant_rgb) -> None:
     """Without a residual 2 s^4 plainly and 4 s^4 with pairs, from 300 images of 64 pixels: means of 64 squares (of excess
     kurtosis 12) or products (6) of normal numbers, s^2 and 0 in the mean."""
     s, trials, n = 0.1, 300, 64
@@ -121,7 +121,7 @@ def test_pairs_at_the_kink_of_l1(variant_rgb) -> None:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_adjoint_is_the_slope_by_the_mean_image(variant_rgb, name: str) -> None:
+def test_adjoint_is_the_gradient_by_the_mean_image(variant_rgb, name: str) -> None:
     """Both halves moved by +-h move the loss by the adjoint's sum; differences of float32 values of size 1 with h = 1e-2
     err by h^2 f'''/6 and by 1e-7 / h = 1e-5. The kinks of |r| (pixels within h of it) are left out by a residual of 0.3."""
     n, h = 64, 1e-2
@@ -180,7 +180,7 @@ def test_the_measured_noise_is_the_variance(variant_rgb) -> None:
 
 
 @pytest.mark.slow
-def test_exact_renders_do_not_pay(variant_rgb) -> None:
+def test_exact_renders_take_no_extra_samples(variant_rgb) -> None:
     """One render a batch, no noise, and pairs change no bit; noisy renders come in two halves of the samples."""
     for integrator, wanted in (("mivol", [SPP]), ("prbvolpath", [SPP // 2, SPP // 2])):
         losses = []
@@ -210,7 +210,7 @@ class Counting:
 
 
 @pytest.mark.slow
-def test_gauss_newton_carries_noise_back_by_other_samples(variant_rgb) -> None:
+def test_gauss_newton_gradient_uses_other_samples_if_noisy(variant_rgb) -> None:
     """Seeds of J^T differ from the image's where there is noise, and are the image's where there is none."""
     for integrator, same in (("mivol", True), ("prbvolpath", False)):
         problem = cube_problem(integrator)
@@ -228,7 +228,7 @@ def noted(problem: SceneProblem, method: str, place: int) -> list[int]:
     return seeds
 
 
-def test_who_is_noisy(variant_rgb) -> None:
+def test_noise_check_finds_sampled_light(variant_rgb) -> None:
     """Mivol where light may be sampled, with the values of now; every other integrator."""
     absorbing = absorbing_scene(np.ones((2, 2, 2, 1)))
     medium = {"type": "homogeneous", "albedo": 0.5, "sigma_t": {"type": "rgb", "value": 0.5}}
@@ -255,7 +255,7 @@ def test_who_is_noisy(variant_rgb) -> None:
 
 @pytest.mark.slow
 @pytest.mark.statistical
-def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
+def test_noise_message_is_logged_once(variant_rgb, tmp_path: Path, capsys) -> None:
     """At (T - R)^2 = 0.0227 and T (1 - T) / 8 = 0.031 the noise is 58 % of the loss; both are means over 4096 pixels in one
     iteration: sqrt(2 / 4096) = 2.2 % of the noise, 3 % of the loss, so 8 of their standard errors leave 40 to 75 %."""
     path = tmp_path / "checkpoint.npz"
@@ -274,20 +274,20 @@ def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_is_said_of_exact_renders_and_of_pairs(variant_rgb) -> None:
+def test_exact_renders_and_pairs_have_no_message(variant_rgb) -> None:
     assert reconstruct(cube_problem("mivol"), Adam(), 2).log == []
     assert reconstruct(cube_problem(loss=L2(pairs=True)), Adam(), 2).log == []
     assert reconstruct(small_problem(loss=L1()), Adam(), 2).log == []
 
 
-def test_a_single_sample_tells_nothing(variant_rgb) -> None:
+def test_single_sample_has_unknown_noise(variant_rgb) -> None:
     (line,) = reconstruct(cube_problem(spp=1), Adam(), 2).log
     assert "of unknown size at fit.spp = 1" in line
     with pytest.raises(MivolError, match="found fit.spp = 1: set fit.spp to 2"):
         reconstruct(cube_problem(spp=1, loss=L2(pairs=True)), Adam(), 1)
 
 
-def test_the_words(variant_rgb) -> None:
+def test_noise_message_text(variant_rgb) -> None:
     assert describe_noise(L2(), 1.0, 0.04) == describe_noise(L2(), 0.0, 0.0) == ""
     assert "6%" in describe_noise(RelativeL2(), 1.0, 0.06)
     assert "the gradient is biased too" in describe_noise(Huber(), 1.0, 0.5)

@@ -1,4 +1,4 @@
-"""L-BFGS step by step: the product with the inverse Hessian, what is remembered, and what becomes of a search that fails."""
+"""L-BFGS and its line search: inverse Hessian, stored pairs, and failed searches."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.optim.second_order import Lbfgs, LbfgsRun, apply_inverse_hessian
+from mivol.optim.second_order import Lbfgs, LbfgsRun, apply_inverse_hessian, search_line
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -68,7 +68,7 @@ def test_two_loops_are_the_product_with_the_inverse_hessian() -> None:
     np.testing.assert_array_equal(apply_inverse_hessian(nothing, [], []), nothing)
 
 
-def test_steps_are_those_of_the_matrices() -> None:
+def test_lbfgs_steps_match_dense_matrices() -> None:
     """The run is followed in float64 from what it met: the first step has the size 1 in units of the rate, the next ones go
     along -H g of the pairs that are remembered, the newest of them last; reals are float32, so 1e-5 of a step."""
     problem = Bowl()
@@ -112,7 +112,7 @@ def test_bounds_are_met_and_kept() -> None:
     assert np.abs(g[~at]).max() < 1e-3
 
 
-def test_a_failed_search_forgets_once_and_then_gives_up() -> None:
+def test_failed_search_drops_the_pairs_once_and_then_stops() -> None:
     """Where no step lowers the loss, pairs may be to blame: they are forgotten; without pairs there is nothing left."""
     problem = Bowl()
     run = Lbfgs().begin(problem)
@@ -154,3 +154,31 @@ def test_another_value_and_a_restored_run() -> None:
     fresh = Lbfgs().begin(Bowl())
     fresh.unpack(run.pack())
     assert fresh.last is None
+
+
+OPEN = SimpleNamespace(project=lambda x: x)
+
+
+@pytest.mark.parametrize(("limit", "alpha"), [(1.0, 1.0), (0.3, 0.25), (2.0**-9, 2.0**-9), (2.0**-9.5, 0.0)])
+def test_steps_are_halved_nine_times_at_most(limit: float, alpha: float) -> None:
+    """The first step that is no longer than what lowers the value; none where even 2^-9 is too long."""
+
+    def value(x: np.ndarray) -> float:
+        return -x[0] if x[0] <= limit else 1.0
+
+    new, found = search_line(value, OPEN, np.zeros(1), 0.0, np.array([-1.0]), np.ones(1))
+    assert (found, new.tolist()) == (alpha, [alpha])
+
+
+def test_steps_satisfy_armijos_rule() -> None:
+    """By 1e-4 of it: exactly that much is enough."""
+    x, g, p = np.zeros(1), np.array([-1.0]), np.ones(1)
+    assert search_line(lambda x: -1e-4 * x[0], OPEN, x, 0.0, g, p)[1] == 1.0
+    assert search_line(lambda x: -0.9e-4 * x[0], OPEN, x, 0.0, g, p)[1] == 0.0
+
+
+def test_steps_are_projected() -> None:
+    new, alpha = search_line(
+        lambda x: -x[0], SimpleNamespace(project=lambda x: np.minimum(x, 0.5)), np.zeros(1), 0.0, -np.ones(1), np.ones(1)
+    )
+    assert (new.tolist(), alpha) == ([0.5], 1.0)

@@ -1,4 +1,4 @@
-"""The loss of whole pictures: values against scikit-image and a float64 twin, slopes against differences of the twin."""
+"""Loss of whole images against scikit-image and a float64 oracle, with gradients against differences."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def loss_of(x: np.ndarray, y: np.ndarray, weight: float) -> float:
     return (1 - weight) * np.abs(x.astype(np.float64) - y).mean() + weight * (1 - twin(x, y).mean())
 
 
-def test_the_twin_is_scikit_images_inside(variant_rgb: str) -> None:
+def test_oracle_matches_scikit_image_inside(variant_rgb: str) -> None:
     """Where the whole window is inside, zeros beyond the border play no part; both are float64."""
     x, y = (a.astype(np.float64) for a in pictures())
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -55,7 +55,7 @@ def test_the_twin_is_scikit_images_inside(variant_rgb: str) -> None:
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_loss_is_that_of_the_twin(variant_rgb: str, weight: float) -> None:
+def test_image_loss_matches_the_oracle(variant_rgb: str, weight: float) -> None:
     """Variances are differences of numbers of about 1 in float32 and divided by C2 = 9e-4 at least: 4 x 2^-24 / 9e-4 = 3e-4 a
     pixel at worst, of random sign; the mean over 714 keeps below a tenth of that."""
     x, y = pictures()
@@ -63,7 +63,7 @@ def test_loss_is_that_of_the_twin(variant_rgb: str, weight: float) -> None:
 
 
 @pytest.mark.parametrize("weight", [0.2, 1.0])
-def test_slope_is_the_difference_quotient(variant_rgb: str, weight: float) -> None:
+def test_image_loss_gradient_matches_differences(variant_rgb: str, weight: float) -> None:
     """Central differences of the float64 twin at pixels in a corner, on an edge and inside, where x is not y.
 
     With a step of 1e-5 they are exact to 1e-10 of slopes of 1e-3; the float32 slope has an error as above, 3e-4 relative.
@@ -78,7 +78,7 @@ def test_slope_is_the_difference_quotient(variant_rgb: str, weight: float) -> No
         assert slope[at] == pytest.approx(expected, abs=1e-3 * float(largest)), at
 
 
-def test_equal_pictures_have_no_slope(variant_rgb: str) -> None:
+def test_equal_images_have_no_gradient(variant_rgb: str) -> None:
     """SSIM is 1 there and stationary; rounding leaves what 4 x 2^-24 / C2 of the window's weight does."""
     x, _ = pictures()
     loss, slope = ours(x, x, 0.2)
@@ -86,7 +86,7 @@ def test_equal_pictures_have_no_slope(variant_rgb: str) -> None:
     assert np.abs(slope).max() < 1e-3 / x.size
 
 
-def test_a_recorded_loss_is_the_same_for_any_picture(variant_rgb: str) -> None:
+def test_recorded_loss_works_for_other_images(variant_rgb: str) -> None:
     """Pictures of another size and content through one recording."""
     frozen = dr.freeze(image_loss)
     for height, width in [(14, 17), (17, 14), (30, 9)]:

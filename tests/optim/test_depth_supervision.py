@@ -1,4 +1,4 @@
-"""Points of a reconstruction: what is drawn of them, the derivatives of their energy, and a fit that they help."""
+"""Depth supervision: drawn points, derivatives of the energy, and a fit with points."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def ends_of(sightings: DepthRays) -> tuple[np.ndarray, np.ndarray]:
     return (o + d * t).T.reshape(2, sightings.count, 3), t.reshape(2, sightings.count)
 
 
-def test_points_are_rays_that_end_before_and_behind_them(variant_rgb: str) -> None:
+def test_depth_rays_end_before_and_behind_points(variant_rgb: str) -> None:
     """By a voxel of the box in which they lie, of twice the edge in the next one, and by a share of their distance; points
     beyond all boxes are not drawn, nor are those of a photograph that has none."""
     near, far, beyond = np.array([[0.5, 0, 0.9]]), np.array([[1.0, -1.5, 0]]), np.array([[0, 0, 2.1]])
@@ -59,7 +59,7 @@ def energy(T: np.ndarray) -> float:
     return float(np.mean(-np.log((1 - OUTLIERS) * (before - behind) + OUTLIERS)))
 
 
-def test_slopes_of_the_energy_by_transmittances(variant_rgb: str) -> None:
+def test_depth_loss_gradient_matches_differences(variant_rgb: str) -> None:
     T = np.array([1.0, 0.9, 0.5, 0.2, 1.0, 0.1, 0.5, 0.0])
     found = np.array(depth_loss_gradient(mi.Float(T), 4))
     step = 1e-5
@@ -75,7 +75,7 @@ def sighted(photos: list[Photo]) -> list[Photo]:
     return [replace(photo, points=np.column_stack([rng.uniform(-0.5, 0.5, (9, 2)), np.zeros(9)])) for photo in photos[:4]]
 
 
-def test_derivatives_of_a_fog_are_those_of_a_closed_form(variant_rgb: str, sighted: list[Photo]) -> None:
+def test_depth_gradient_of_a_fog_matches_a_closed_form(variant_rgb: str, sighted: list[Photo]) -> None:
     """A fog is even, so that the sum over all nodes is the derivative by its one density s: T = exp(-s l)."""
     problem = RadianceProblem(RayBatches.from_photos(sighted, (1, 2)), BOX, replace(PLAN, depth=0.7))
     chosen = np.arange(4)
@@ -96,7 +96,7 @@ def test_derivatives_of_a_fog_are_those_of_a_closed_form(variant_rgb: str, sight
     np.testing.assert_allclose(found["density"].sum(), 0.7 * by_s.mean(), rtol=1e-4)
 
 
-def test_rays_of_a_fit_end_nearer_to_the_points_that_it_was_told(variant_rgb: str, photos: list[Photo]) -> None:
+def test_depth_supervision_moves_ray_ends_to_the_points(variant_rgb: str, photos: list[Photo]) -> None:
     """Three views, and points of the ball's surface that face them: more of the light of a ray comes from about its point."""
     rng, few = np.random.default_rng(4), []
     for photo in photos[:3]:
@@ -115,7 +115,7 @@ def test_rays_of_a_fit_end_nearer_to_the_points_that_it_was_told(variant_rgb: st
     assert ended[1] > ended[0]
 
 
-def test_points_change_a_fit_only_where_they_are_asked_for(one_thread: None, photos: list[Photo], sighted: list[Photo]) -> None:
+def test_points_change_only_fits_with_depth(one_thread: None, photos: list[Photo], sighted: list[Photo]) -> None:
     def slope(some: list[Photo], depth: float) -> np.ndarray:
         problem = RadianceProblem(RayBatches.from_photos(some, (1, 2)), BOX, replace(PLAN, depth=depth))
         return np.array(problem.loss_and_gradient(problem.initial_reals(), 0)[1]["density"])
