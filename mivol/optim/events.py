@@ -166,7 +166,7 @@ class ControlDensity(Event, tag="control_density"):
 
     every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 100
     begin: Annotated[int, setting("iteration", "first iteration", ge=1)] = 500
-    end: Annotated[int, setting("iteration", "end, exclusive", ge=1)] = 15000
+    end: Annotated[int, setting("iteration", "iteration after the last application", ge=1)] = 15000
 
     def due(self, iteration: int) -> bool:
         return self.begin <= iteration < self.end and iteration % self.every == 0
@@ -205,10 +205,7 @@ class Evaluate(Event, tag="evaluate"):
 
 
 EVENTS = make_table(Upsample, Checkpoint, Evaluate)
-"""Events available in files."""
-
-PLAN_EVENTS = make_table(CoarseToFine, DropUnseen, UpdateOccupancy, ControlDensity)
-"""Events of the plans of radiance fields and Gaussians."""
+"""Events available in files; plans of photographs use the others."""
 
 
 def checkpoints_first(events: tuple[Event, ...]) -> list[Event]:

@@ -140,13 +140,23 @@ class Refinement:
 
 
 class StagedProblem(DifferentiableProblem, Protocol):
-    """Additional methods for :class:`~mivol.optim.events.CoarseToFine`, ``DropUnseen`` and ``UpdateOccupancy``."""
+    """Additional members for :class:`~mivol.optim.events.CoarseToFine` and ``DropUnseen``.
+
+    Attributes:
+        stage: number of the current stage.
+    """
+
+    stage: int
 
     def refine(self, stage: int) -> Refinement:
         """Begin a stage, with the model at the latest reals; the problem has the stage's unknowns afterwards.
 
         The number of the current stage removes its unseen unknowns.
         """
+
+
+class SparseProblem(StagedProblem, Protocol):
+    """Additional method for :class:`~mivol.optim.events.UpdateOccupancy`."""
 
     def update_occupancy(self) -> None:
         """Update the list of cells that the next steps can skip without changing their result."""

@@ -345,9 +345,6 @@ class GaussianProblem:
         message = f"photographs shrunk by {now.shrink}, harmonics of degree {now.degree}"
         return Refinement(self.initial_reals(), carry, {}, message)
 
-    def update_occupancy(self) -> None:
-        """Do nothing: a step skips Gaussians outside the image only."""
-
     # -- On disk ------------------------------------------------------------------------------------------------------
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
