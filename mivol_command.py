@@ -1,7 +1,7 @@
-"""The command ``mivol`` from its first line on: Ctrl-C while Mitsuba is imported is one sentence too.
+"""The command ``mivol`` from its first line on: Ctrl-C during the import of Mitsuba is one sentence too.
 
-This module lies outside the package, since importing anything in it imports Mitsuba, which takes a second. Dr.Jit's own
-import makes another error of an interrupt, so a handler notes that one has come.
+This module lies outside the package, because any import from the package imports Mitsuba, which takes a second. Dr.Jit's import
+turns an interrupt into another error, so a handler records the signal.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ STOPPED = 130
 
 
 def main() -> int:
-    """Run ``mivol``; its exit code."""
+    """Run ``mivol``; return its exit code."""
     came: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:

@@ -1,7 +1,8 @@
-"""Ctrl-C and SIGTERM end a command with one sentence, wherever they strike.
+"""Ctrl-C and SIGTERM end a command with one sentence at any moment.
 
-Conventions. The handler raises KeyboardInterrupt. A call back from C++ (a render, a film) may make another error of it, with
-the interrupt as its reason, or with none: so it is also noted that a signal has come, and whatever error follows is its doing.
+Conventions. The handler raises KeyboardInterrupt. A callback from C++ (a render, a film) may turn it into another error, with
+or without the interrupt as its reason. Therefore the handler also records the signal, and every later error counts as its
+consequence.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ from types import FrameType
 
 
 class Signals:
-    """Notes that a signal has come, and raises KeyboardInterrupt.
+    """Records signals, and raises KeyboardInterrupt.
 
-    A signal that this process was started to ignore (Ctrl-C, for one that a script put into the background) stays ignored.
+    A signal that the process was started to ignore (such as Ctrl-C for a background job of a script) stays ignored.
 
     Attributes:
-        came: whether one has come.
+        came: whether a signal has come.
     """
 
     def __init__(self) -> None:
@@ -30,7 +31,7 @@ class Signals:
         raise KeyboardInterrupt
 
     def are_behind(self, error: BaseException) -> bool:
-        """Whether an error is the doing of a signal: one has come, or a KeyboardInterrupt is among the error's reasons."""
+        """Whether a signal caused an error: a signal has come, or a KeyboardInterrupt is among the error's reasons."""
         reason: BaseException | None = error
         while reason is not None and not self.came:
             if isinstance(reason, KeyboardInterrupt):

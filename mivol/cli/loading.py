@@ -1,4 +1,4 @@
-"""The scene that the flags of a verb ask for."""
+"""Loading of the scene in a verb's flags."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mivol.scene.load import LoadedScene, load_scene
 
 
 def load(arguments: argparse.Namespace) -> LoadedScene:
-    """The scene of the flags, its variant and threads set.
+    """Load the scene of the flags, with its variant and threads.
 
     Raises:
         MivolError: an unknown variant, a define without "=", or a scene that cannot be loaded.
@@ -25,10 +25,10 @@ def load(arguments: argparse.Namespace) -> LoadedScene:
 
 
 def defines(pairs: list[str]) -> dict[str, str]:
-    """``name=value`` pairs as a dict.
+    """Convert ``name=value`` pairs to a dict.
 
     Raises:
-        MivolError: one has no "=".
+        MivolError: a pair without "=".
     """
     wrong = next((pair for pair in pairs if "=" not in pair), None)
     if wrong is not None:

@@ -1,7 +1,7 @@
-"""How a run goes, on the terminal: what it says, how far it is, loss, errors, time left.
+"""Progress of a run on the terminal: messages, bars, loss, errors and remaining time.
 
-Conventions. Drawn from the run's own thread between iterations; where the error output is no terminal, one line per
-evaluation. What a fit logs (a refined grid, noise in its loss) is printed as it comes.
+Conventions. The run's own thread draws between iterations. If the error output is no terminal, each evaluation prints one line.
+Log messages of a fit (a refined grid, noise in its loss) are printed at once.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class TerminalProgress:
-    """A :class:`mivol.experiments.fit_kind.Progress` that prints to the error output."""
+    """A :class:`mivol.experiments.fit_kind.Progress` on the error output."""
 
     def say(self, lines: Sequence[str]) -> None:
         """Print lines."""
@@ -29,7 +29,7 @@ class TerminalProgress:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
 
     def track(self, items: Sequence[T], what: str) -> Iterator[T]:
-        """The items, with a bar of how many are done; one line at the end where there is no terminal."""
+        """Yield the items with a progress bar; without a terminal, print one line at the end."""
         console, start = Console(stderr=True), time.monotonic()
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, auto_refresh=False, disable=not console.is_terminal) as bar:
@@ -43,18 +43,18 @@ class TerminalProgress:
             console.print(f"{what}: {len(items)} in {time.monotonic() - start:.1f} s", soft_wrap=True)
 
     def watch(self, iterations: int) -> Display:
-        """A bar of the iterations, with the newest loss and errors."""
+        """Return a progress bar of the iterations, with the newest loss and errors."""
         return Display(iterations)
 
 
 def figures(fit: Fit) -> str:
-    """The newest loss and errors, in words."""
+    """The newest loss and errors in words."""
     words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in fit.latest_errors().items()]
     return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words])
 
 
 class Display:
-    """Context manager; called after each iteration."""
+    """Context manager that is called after each iteration."""
 
     def __init__(self, iterations: int) -> None:
         self.console = Console(stderr=True)
@@ -81,7 +81,7 @@ class Display:
             self.console.print(f"{fit.next_iteration} iterations in {fit.seconds:.1f} s: {figures(fit)}", soft_wrap=True)
 
     def __call__(self, fit: Fit) -> None:
-        """Draw, at most ten times a second; what the fit has to say is printed above."""
+        """Draw at most ten times a second; print new log messages above the bar."""
         self.newest = fit
         for line in fit.log[self.logged :]:
             self.console.print(line, soft_wrap=True, highlight=False, markup=False)

@@ -1,7 +1,7 @@
-"""Examples that come with mivol: which there are, where their files lie, and what it takes to run one.
+"""The examples of mivol: their list, their files, and their runs.
 
-Conventions. An example is a folder of ``scenes/`` with a ``fit.toml``; in a wheel they lie in ``mivol/examples``. One that
-shows public data has a stand-in, a procedural volume from a seed, so that it runs where the data has not been fetched.
+Conventions. An example is a folder of ``scenes/`` with a ``fit.toml``; a wheel has them in ``mivol/examples``. An example of
+public data has a stand-in, a procedural volume from a seed, so that it runs without the data.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ CHECKOUT = Path(__file__).resolve().parents[2] / "scenes"
 
 
 TEXTS = (".toml", ".xml", ".md", ".py")
-"""Suffixes of an example's files that may name others."""
+"""Suffixes of an example's files that may contain the names of other files."""
 
 NEIGHBOUR = re.compile(r"\.\./demo/([\w.]+)")
-"""A file of the example ``demo``, as another one names it."""
+"""A file of the example ``demo`` in the text of another example."""
 
 
 @dataclass(frozen=True)
 class StandIn:
-    """What takes the place of public data: a procedural volume.
+    """A procedural volume in place of public data.
 
     Attributes:
-        data: name of the public set.
-        setting: of the experiment that names the file.
-        shape: (Z, Y, X).
-        peak: largest value, about that of the set.
+        data: name of the public data.
+        setting: setting of the experiment with the file.
+        shape: shape (Z, Y, X).
+        peak: largest value, about as in the public data.
     """
 
     data: str
@@ -57,20 +57,21 @@ class StandIn:
     says = "a procedural volume stands in for it"
 
     def make(self, folder: Path) -> list[str]:
-        """Write the volume to a folder; the settings that name it."""
+        """Write the volume to a folder; return the settings with its path."""
         return [f"{self.setting}={to_toml_string(self.write(folder))}"]
 
     def write(self, folder: Path) -> Path:
-        """Write the volume to a folder; the path of its file."""
+        """Write the volume to a folder; return its path."""
         path = folder.resolve() / f"{self.data}.vol"
         write_volume(path, make_procedural("tangle", self.shape, 2, self.peak))
         return path
 
     def place(self, named: str, folder: Path) -> Path:
-        """What a script was given: a path, or ``data:NAME``, for which the stand-in is made where the set is not here.
+        """Return the path in a script's argument: a path, or ``data:NAME``, for which the stand-in is made if the data are not
+        here.
 
         Raises:
-            MivolError: another set was named, and it has not been fetched.
+            MivolError: other data, which have not been fetched.
         """
         if named != PREFIX + self.data or find_local_file(self.data) is not None:
             return resolve_path(Path(), named).resolve()
@@ -80,11 +81,11 @@ class StandIn:
 
 @dataclass(frozen=True)
 class ComputedScan:
-    """What takes the place of a public scan: projections of ellipsoids, computed with noise from the experiment's seed.
+    """Computed projections of ellipsoids in place of a public scan, with noise from the experiment's seed.
 
     Attributes:
-        data: name of the public set.
-        settings: of the experiment, in place of those of the file.
+        data: name of the public data.
+        settings: settings that replace those of the file.
     """
 
     data: str
@@ -93,7 +94,7 @@ class ComputedScan:
     says = "exact projections of a phantom, with noise, stand in for it"
 
     def make(self, folder: Path) -> list[str]:
-        """The settings; nothing is written."""
+        """Return the settings; nothing is written."""
         return list(self.settings)
 
 
@@ -102,12 +103,12 @@ class Example:
     """An example.
 
     Attributes:
-        says: what it shows.
-        stand_in: of the public data that it shows; None where it makes its own.
-        photographs: script of its folder that makes the photographs that are fitted; "" for none.
-        scan: script of its folder that makes the readings that are fitted, and finds a stand-in itself; "" for none.
-        folder: where its files lie; "" for a folder of its own name.
-        file: its experiment.
+        says: subject of the example.
+        stand_in: replacement of its public data; None without public data.
+        photographs: script in its folder that makes its photographs; "" for none.
+        scan: script in its folder that makes its readings, with a stand-in of its own; "" for none.
+        folder: folder of its files; "" for a folder of its own name.
+        file: experiment of the example.
     """
 
     says: str
@@ -118,7 +119,7 @@ class Example:
     file: str = "fit.toml"
 
     def source(self, name: str) -> Path:
-        """The folder of its files, given its own name."""
+        """Folder of the files of the example with this name."""
         return examples_folder() / (self.folder or name)
 
 
@@ -139,7 +140,7 @@ _SLICES = ComputedScan(
         "solve.iterations=20",
     ),
 )
-"""As many views as the tooth has and half as many columns; the head fills them."""
+"""As many views as the tooth, and half as many columns; the head fills them."""
 
 SCAN_FILES = {
     "scan.file": "panels.txt",
@@ -147,7 +148,7 @@ SCAN_FILES = {
     "data.flats": "flats.npy",
     "data.darks": "darks.npy",
 }
-"""Settings of an example with a ``scan``, and what the script writes for them."""
+"""Settings of an example with a ``scan``, and the files that its script writes."""
 
 EXAMPLES: dict[str, Example] = {
     "demo": Example("a tangle of absorbing matter from 16 pictures, about a minute"),
@@ -166,21 +167,21 @@ EXAMPLES: dict[str, Example] = {
 
 
 def examples_folder() -> Path:
-    """Where the examples' files lie: in the package, or beside it in a checkout."""
+    """Folder of the examples: in the package, or beside it in a checkout."""
     return INSTALLED if INSTALLED.is_dir() else CHECKOUT
 
 
 def list_examples() -> str:
-    """The examples, one a line."""
+    """List the examples, one per line."""
     width = max(map(len, EXAMPLES))
     return "\n".join(f"{name:<{width}}  {example.says}" for name, example in EXAMPLES.items())
 
 
 def find_example(name: str) -> Example:
-    """The example of that name.
+    """Return the example with this name.
 
     Raises:
-        MivolError: there is none; the nearest is offered.
+        MivolError: an unknown name, with the nearest known one.
     """
     if name not in EXAMPLES:
         raise MivolError(f'there is no example "{name}": {suggest_name(name, list(EXAMPLES))}')
@@ -188,17 +189,17 @@ def find_example(name: str) -> Example:
 
 
 def copy_example(name: str, into: Path) -> Path:
-    """Copy an example's files, to be read and changed.
+    """Copy the files of an example.
 
     Args:
         name: key of ``EXAMPLES``.
-        into: folder that is made; the files lie in it.
+        into: new folder for the files.
 
     Returns:
-        Its experiment.
+        The experiment in the copy.
 
     Raises:
-        MivolError: no such example, something lies there already, or what the system refuses (disk full, ...).
+        MivolError: an unknown example, an existing folder with files, or a disk error.
     """
     example = find_example(name)
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
@@ -217,10 +218,10 @@ def copy_example(name: str, into: Path) -> Path:
 
 
 def copy_text(path: Path, target: Path, source: Path, into: Path) -> None:
-    """Copy a text of an example that lies in ``source`` so that it holds in ``into``.
+    """Copy a text of an example from ``source``, and adapt its paths to ``into``.
 
-    What it takes from a neighbour (``../demo/empty.vol``) is copied beside it. Runs are those of this folder, where the
-    example's scripts write, and commands name the copy.
+    Files of a neighbour (``../demo/empty.vol``) are copied beside it. Runs go to the working directory, as for the example's
+    scripts, and commands contain the new folder.
     """
     text = path.read_text(encoding="utf-8")
     for name in NEIGHBOUR.findall(text):
@@ -231,7 +232,7 @@ def copy_text(path: Path, target: Path, source: Path, into: Path) -> None:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[None]:
-    """A folder that is filled, or not there: what an error has left of it is removed."""
+    """Remove the folder if an error interrupts its filling."""
     try:
         yield
     except BaseException:
@@ -242,17 +243,17 @@ def whole_folder(path: Path) -> Iterator[None]:
 def run_example(
     name: str, folder: Path | None, *, changes: tuple[str, ...] = (), progress: Progress | None = None, command: str = ""
 ) -> Path:
-    """Run an example; the page.
+    """Run an example; return the report page.
 
     Args:
         name: key of ``EXAMPLES``.
-        folder: run folder; None: the ``output`` of the changes, else runs/NAME.
-        changes: settings as ``--set`` takes them.
-        progress: who is told how it goes.
-        command: what was typed, for the record.
+        folder: run folder; None for the ``output`` of the changes, else runs/NAME.
+        changes: settings as in ``--set``.
+        progress: display of the run's progress.
+        command: command line, for the record.
 
     Raises:
-        MivolError: no such example, and whatever its fit refuses.
+        MivolError: an unknown example, and refusals of its fit.
     """
     example, progress = find_example(name), progress or NullProgress()
     source = example.source(name)
@@ -265,7 +266,7 @@ def run_example(
 
 
 def prepare(name: str, example: Example, source: Path, folder: Path, progress: Progress) -> list[str]:
-    """What lies ready before an example runs, as changes of settings: photographs, readings, or a stand-in for public data."""
+    """Make the photographs, the readings or the stand-in of an example; return the settings with their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     if example.photographs:
         photographs = folder.resolve() / "photographs"
@@ -289,12 +290,12 @@ def prepare(name: str, example: Example, source: Path, folder: Path, progress: P
 
 
 def to_toml_string(path: Path) -> str:
-    """A path as a string of TOML; backslashes are letters there."""
+    """A path as a string of TOML that keeps backslashes."""
     return f"'{path}'"
 
 
 def run_script(path: Path, arguments: list[str]) -> None:
-    """A script of an example, in this process: Mitsuba is loaded already."""
+    """Run a script of an example in this process, where Mitsuba is loaded already."""
     before = sys.argv
     sys.argv = [str(path), *arguments]
     try:

@@ -1,4 +1,4 @@
-"""Gaussians or points as a radiance field that stands in scenes, and back; what that loses [dB], by views of both."""
+"""Conversions of Gaussians and points to radiance fields, to meshes and back, with the errors of the conversions."""
 
 from __future__ import annotations
 
@@ -40,32 +40,32 @@ __all__ = [
 ]
 
 VIEWS = 6
-"""Views that are compared."""
+"""Number of compared views."""
 
 EDGE = 128
-"""Of a view that is compared [pixel]."""
+"""Edge of a compared view [pixel]."""
 
 ANGLE = 40.0
-"""Field of view of these views [degree]."""
+"""Field of view of a compared view [degree]."""
 
 VIEWED = (
     f"{VIEWS} views, {EDGE} x {EDGE} pixels each, {ANGLE:g} degrees wide, from a Fibonacci lattice of directions around the box"
 )
-"""These views in words, for what is printed."""
+"""Description of the compared views."""
 
 
 def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[float] | None, variant: str) -> str:
     """Write the Gaussians of a file, or points as Gaussians, as a radiance field.
 
     Args:
-        source: any format of Gaussians or points.
-        target: ends in .npz.
+        source: file of Gaussians or points in any format.
+        target: file that ends in .npz.
         resolution: voxels along the longest edge of the box.
-        box: two corners, six numbers [length]; None: what holds three standard deviations of all Gaussians.
-        variant: of Mitsuba, in which views are compared.
+        box: two corners, six numbers [length]; None for three standard deviations around all Gaussians.
+        variant: Mitsuba variant of the compared views.
 
     Returns:
-        What was written and what it lost, in lines.
+        A summary of file and error, in lines.
 
     Raises:
         MivolError: as the readers, :func:`mivol.fields.gaussian_grid.gaussians_to_grid` and the disk.
@@ -92,17 +92,16 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
 
     Args:
         source: field (.npz) of one level.
-        target: ends in .ply.
-        resolution: blocks of voxels along the longest edge of its grid, a Gaussian each; None: of 2 voxels.
-        variant: of Mitsuba, in which views are compared.
+        target: file that ends in .ply.
+        resolution: blocks of voxels along the longest edge of its grid, one Gaussian per block; None for blocks of 2 voxels.
+        variant: Mitsuba variant of the compared views.
 
     Returns:
-        What was written and what it lost, in lines.
+        A summary of file and error, in lines.
 
     Raises:
-        MivolError: as :func:`mivol.fields.field_files.read_field`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians`
-        and
-            the disk.
+        MivolError: as :func:`mivol.fields.field_files.read_field`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians` and the
+            disk.
     """
     select_by_suffix(target, GAUSSIAN_WRITERS)
     set_variant(variant)
@@ -117,12 +116,12 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
 
 
 def corners_of_box(cloud: Gaussians, box: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The lower and the upper corner (3,) of a given box [length]; None: of three standard deviations about all Gaussians."""
+    """Lower and upper corner (3,) of a given box [length]; None for three standard deviations around all Gaussians."""
     return gaussian_box(cloud) if box is None else (np.array(box[:3]), np.array(box[3:]))
 
 
 def read_as_gaussians(source: Path) -> Gaussians:
-    """The Gaussians of a file, or one for each of its points.
+    """Read Gaussians, or one Gaussian for each point.
 
     Raises:
         MivolError: as the readers.
@@ -132,12 +131,12 @@ def read_as_gaussians(source: Path) -> Gaussians:
 
 
 def field_psnr(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> float:
-    """PSNR between views of a field and splatted Gaussians [dB]: code values over black, the peak is 1.
+    """PSNR between views of a field and splatted Gaussians [dB]: code values over black, peak 1.
 
     Args:
-        cloud: what the field was made of, or what was made of it.
-        field: of one level, in code values.
-        edge: of a view [pixel].
+        cloud: Gaussians from which the field was made, or that were made from the field.
+        field: field of one level, in code values.
+        edge: edge of a view [pixel].
     """
     splatter, reals = Splatter(edge, edge, cloud.degree), to_tensors(cloud)
     truth, seen = [], []
@@ -148,7 +147,7 @@ def field_psnr(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> floa
 
 
 def cameras_around(to_world: np.ndarray, edge: int, views: int = VIEWS) -> list[Camera]:
-    """Square views of the whole of a box from directions that are spread evenly over the sphere (a Fibonacci lattice)."""
+    """Square views of a whole box from evenly spread directions (a Fibonacci lattice)."""
     middle = to_world[:3] @ np.array([0.5, 0.5, 0.5, 1])
     radius = 0.5 * float(np.linalg.norm(to_world[:3, :3].sum(axis=1)))
     distance = radius / math.sin(math.radians(ANGLE) / 2)
@@ -162,7 +161,7 @@ def cameras_around(to_world: np.ndarray, edge: int, views: int = VIEWS) -> list[
 
 
 FUSED = 64
-"""Views that are fused: from a Fibonacci lattice of directions around the box."""
+"""Number of fused views, from a Fibonacci lattice of directions around the box."""
 
 FINENESS = 2
 """Pixels of a fused view along the box's longest edge, over the voxels there."""
@@ -172,17 +171,17 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
     """Write the Gaussians of a file, or points as Gaussians, as a mesh with colours.
 
     Args:
-        source: any format of Gaussians or points.
-        target: ends in .ply or .obj.
+        source: file of Gaussians or points in any format.
+        target: file that ends in .ply or .obj.
         resolution: voxels of the fused distances along the longest edge of the box.
-        box: two corners, six numbers [length]; None: what holds three standard deviations of all Gaussians.
-        variant: of Mitsuba.
+        box: two corners, six numbers [length]; None for three standard deviations around all Gaussians.
+        variant: Mitsuba variant.
 
     Returns:
-        What was written and what it lost, in lines.
+        A summary of file and error, in lines.
 
     Raises:
-        MivolError: as the readers, :func:`mivol.fields.surfaces.fuse_depths` and the disk.
+        MivolError: as the readers, :func:`mivol.fields.depth_fusion.fuse_depths` and the disk.
     """
     select_by_suffix(target, MESH_WRITERS)
     set_variant(variant)
@@ -202,15 +201,15 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
 
 
 def mesh_of_gaussians(cloud: Gaussians, low: np.ndarray, high: np.ndarray, resolution: int) -> Mesh:
-    """The surface where splatted views of Gaussians become half opaque.
+    """Return the surface of opacity 0.5 in splatted views of Gaussians.
 
     Args:
-        cloud: any.
-        low, high: (3,) corners of the box that is looked at [length].
+        cloud: Gaussians.
+        low, high: corners (3,) of the box [length].
         resolution: voxels along its longest edge.
 
     Raises:
-        MivolError: as :func:`mivol.fields.surfaces.fuse_depths`.
+        MivolError: as :func:`mivol.fields.depth_fusion.fuse_depths`.
     """
     cameras = cameras_around(box_to_world(low, high), FINENESS * resolution, FUSED)
     return fuse_depths(_splat_depths(cloud, cameras), low, high, resolution)
@@ -218,12 +217,12 @@ def mesh_of_gaussians(cloud: Gaussians, low: np.ndarray, high: np.ndarray, resol
 
 @dataclass(frozen=True)
 class MeshLoss:
-    """How far a mesh lies from what splats show.
+    """Distance between a mesh and splatted views.
 
     Attributes:
-        median, most: of the distance along rays, and what nine tenths of them stay below [length].
-        missed: share of the pixels where splats are opaque and no mesh is.
-        invented: share of the other pixels where one is.
+        median, most: median and 0.9 quantile of the distance along rays [length].
+        missed: share of the opaque pixels without mesh.
+        invented: share of the other pixels with mesh.
     """
 
     median: float
@@ -236,10 +235,10 @@ def measure_mesh_error(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.n
     """Compare a mesh with splatted views, ray by ray.
 
     Args:
-        cloud: what the mesh was made of.
-        mesh: in the same world.
-        low, high: (3,) corners of the box that the views show.
-        edge: of a view [pixel].
+        cloud: Gaussians from which the mesh was made.
+        mesh: mesh in the same world.
+        low, high: corners (3,) of the box in the views.
+        edge: edge of a view [pixel].
     """
     scene = mi.load_dict({"type": "scene", "mesh": _shape_of(mesh)})
     apart, missed, invented = [], [], []
@@ -256,14 +255,14 @@ def measure_mesh_error(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.n
 
 
 def box_to_world(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(4, 4) unit cube to a box."""
+    """Transform (4, 4) from the unit cube to a box."""
     to_world = np.diag([*(high - low), 1.0])
     to_world[:3, 3] = low
     return to_world
 
 
 def _splat_depths(cloud: Gaussians, cameras: Sequence[Camera]) -> Iterator[DepthView]:
-    """What cameras of one size see of Gaussians."""
+    """Depths and colours of Gaussians for cameras of one size."""
     splatter, reals = Splatter(*cameras[0].size, cloud.degree, median=True), to_tensors(cloud)
     for camera in cameras:
         picture = np.array(splatter.forward(reals, camera, derivatives=False)[0], np.float64)
@@ -282,7 +281,7 @@ def _shape_of(mesh: Mesh) -> mi.Mesh:
 
 
 def _depth_in(scene: mi.Scene, camera: Camera) -> np.ndarray:
-    """(H, W) depth along the camera's axis of what its pixels meet [length]; infinite where they meet nothing."""
+    """Depth (H, W) along the camera's axis of the nearest surface [length]; infinite without a surface."""
     o, d = rays(camera, pixel_centres(camera.size))
     ray = mi.Ray3f(*(mi.Point3f(*np.float32(np.broadcast_to(v, d.shape).reshape(-1, 3)).T) for v in (o, d)))
     t = np.array(scene.ray_intersect_preliminary(ray).t).reshape(camera.size[::-1])

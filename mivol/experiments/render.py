@@ -1,7 +1,8 @@
-"""A scene to an image, pass by pass, by the scene's own integrator or another one.
+"""An image of a scene, a radiance field, points or Gaussians.
 
-Conventions. The image is the mean of passes of at most ``SAMPLES_PER_PASS`` samples, so that Ctrl-C acts within seconds;
-channels keep the names that Mitsuba gives them, with AOVs after the colour.
+Conventions. The image of a scene is the mean of passes of at most ``SAMPLES_PER_PASS`` samples, so that Ctrl-C acts within
+seconds. Channels keep Mitsuba's names, with AOVs after the colour. Fields, points and Gaussians are rendered without a scene,
+through a given camera.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ from mivol.splatting import Splatter, to_tensors
 
 SAMPLES_PER_PASS = 1 << 21
 KEPT = 2 * 4 * 8
-"""Bytes a pixel that are kept beside a pass: the sum of four channels in float64, and the pass as it is added."""
+"""Memory per pixel beside a pass [byte]: the sum of four channels in float64, and the pass while it is added."""
 
 COLOURS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def check_output(path: Path) -> None:
-    """Refuse a name that no image can be written to, before hours are spent on the image.
+    """Refuse an output file before the image is rendered.
 
     Raises:
-        MivolError: another suffix than .exr or .png, a folder that is not there, or one that nothing can be written to.
+        MivolError: another suffix than .exr or .png, a missing folder, or a folder without write access.
     """
     if path.suffix.lower() not in (".exr", ".png"):
         raise MivolError(f'images are written as .exr or .png, found "{path.name}": change the name of -o.')
@@ -53,15 +54,15 @@ def check_output(path: Path) -> None:
 
 
 def integrator_name(integrator: mi.Integrator) -> str:
-    """The plugin's name of an integrator: ours, or what it prints first."""
+    """Plugin name of an integrator."""
     return "mivol" if hasattr(integrator, "session") else str(integrator).partition("[")[0].strip()
 
 
 def choose_integrator(scene: mi.Scene, name: str | None = None) -> mi.Integrator:
-    """The scene's own integrator, or another one with the same ``max_depth`` where it knows that.
+    """Return the scene's integrator, or the named one with the same ``max_depth`` if it has that setting.
 
     Raises:
-        MivolError: the scene has none and none was named, or Mitsuba has none of that name.
+        MivolError: no integrator in the scene and no name, or an unknown name.
     """
     if name is None:
         if scene.integrator() is None:
@@ -78,17 +79,17 @@ def choose_integrator(scene: mi.Scene, name: str | None = None) -> mi.Integrator
 def render_image(
     scene: mi.Scene, sensor: int, integrator: mi.Integrator | None = None, spp: int | None = None, seed: int = 0
 ) -> tuple[np.ndarray, list[str]]:
-    """Render: image (height, width, channels) and the channels' names.
+    """Render a scene: image (height, width, channels) and channel names.
 
     Args:
         scene: the scene.
-        sensor: number of the sensor.
-        integrator: None for the scene's own.
-        spp: samples per pixel; None for those of the sensor's sampler.
-        seed: of the random numbers.
+        sensor: index of the sensor.
+        integrator: integrator; None for the scene's own.
+        spp: samples per pixel; None for the number of the sensor's sampler.
+        seed: seed of the random numbers.
 
     Raises:
-        MivolError: no such sensor, no integrator, no samples, or a film that is larger than the memory.
+        MivolError: an unknown sensor, no integrator, no samples, or a film beyond the memory.
     """
     integrator, camera = integrator or choose_integrator(scene), find_sensor(scene, sensor)
     spp = camera.sampler().sample_count() if spp is None else spp
@@ -108,10 +109,10 @@ def render_image(
 
 
 def write_image(path: Path, image: np.ndarray, names: list[str]) -> None:
-    """Write an image whole, in the format that its name asks for.
+    """Write an image in the format of its suffix.
 
     Raises:
-        MivolError: another suffix than .exr or .png, or what the disk refuses.
+        MivolError: another suffix than .exr or .png, or a disk error.
     """
     check_output(path)
     if path.suffix.lower() == ".png":
@@ -121,21 +122,21 @@ def write_image(path: Path, image: np.ndarray, names: list[str]) -> None:
 
 
 SKY_FILE = "sky.exr"
-"""What a fit writes beside its field, where it learned what is behind."""
+"""Name of the fitted sky beside its field."""
 
 
 def render_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> np.ndarray:
-    """What a pinhole sees of a field, over the sky beside its file or black: linear light (height, width, 3).
+    """Render a field through a pinhole, over the sky beside its file or black: linear light (height, width, 3).
 
     Args:
-        path: the field.
-        look_at: where the camera stands and what it looks at, six numbers [length].
-        up: the direction that is upwards in the picture, three numbers.
+        path: file of the field.
+        look_at: positions of camera and target, six numbers [length].
+        up: upward direction, three numbers.
         fov: horizontal field of view [degree].
         size: (width, height) [pixel].
 
     Raises:
-        MivolError: as :func:`mivol.fields.field_files.read_field`, or a camera that cannot be.
+        MivolError: as :func:`mivol.fields.field_files.read_field`, or an invalid camera.
     """
     camera = make_camera(look_at, up, fov, size)
     field, sky = read_field(path), sky_beside(path)
@@ -144,7 +145,7 @@ def render_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov:
 
 
 def sky_beside(path: Path) -> Sky | None:
-    """What a fit learned of what is behind its field, from the file beside the field's; None where there is none.
+    """Read the fitted sky beside a field's file; None without a sky.
 
     Raises:
         MivolError: as :func:`mivol.fields.sky.read_sky`.
@@ -154,10 +155,10 @@ def sky_beside(path: Path) -> Sky | None:
 
 
 def make_camera(look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> Camera:
-    """The camera of :func:`render_field`.
+    """Return the camera of :func:`render_field`.
 
     Raises:
-        MivolError: a view along ``up``, numbers that are not finite, or an angle or a size that no pinhole has.
+        MivolError: a view along ``up``, numbers that are not finite, or an invalid angle or size.
     """
     if not np.isfinite([*look_at, *up]).all() or not 0 < fov < 180 or min(size) < 1:
         found = f"--look-at {list(look_at)} --up {list(up)} --fov {fov:g} --size {list(size)}"
@@ -169,23 +170,24 @@ def make_camera(look_at: Sequence[float], up: Sequence[float], fov: float, size:
 
 
 DRAWN_AS = ("discs", "splats")
-"""What a point can be drawn as: a disc that faces the camera, or a Gaussian (EWA splatting, Zwicker et al. 2001)."""
+"""Shapes of points: a disc that faces the camera, or a Gaussian (EWA splatting, Zwicker et al. 2001)."""
 
 FROM = (1.0, -1.5, 0.7)
-"""Direction from the middle of a cloud to the camera where none was given; z is up."""
+"""Direction from the middle of a cloud to the default camera; z is up."""
 
 SHARE = 0.01
-"""Of the points, by which a cloud may reach out of its picture at either end of each axis."""
+"""Share of the points outside the default view at either end of each axis."""
 
 
 @dataclass(frozen=True)
 class PointLook:
-    """How points are drawn.
+    """Appearance of points.
 
     Attributes:
         drawn_as: one of :data:`DRAWN_AS`.
-        radius: of a disc, or standard deviation of a splat [length]; None: half the median distance to the nearest points.
-        opacity: of a point, above 0 and up to 1.
+        radius: radius of a disc, or standard deviation of a splat [length]; None for half the median distance to the nearest
+            points.
+        opacity: opacity of a point, above 0 and up to 1.
 
     Raises:
         MivolError: a number outside its domain.
@@ -205,21 +207,21 @@ class PointLook:
 def render_points(
     path: Path, look_at: Sequence[float] | None, up: Sequence[float], fov: float, size: tuple[int, int], look: PointLook
 ) -> np.ndarray:
-    """What a pinhole sees of points or Gaussians over black: linear light (height, width, 3).
+    """Render points or Gaussians through a pinhole over black: linear light (height, width, 3).
 
-    Points are sorted by depth and composited front to back. What is smaller than a pixel covers a share of it, so that a
-    point's light goes with the inverse square of its distance, however far it is.
+    Points are sorted by depth and composited front to back. A point smaller than a pixel covers a share of the pixel, so its
+    light decreases with the inverse square of its distance.
 
     Args:
-        path: any format of points or Gaussians; points without colours take theirs from how densely they stand.
-        look_at: where the camera stands and what it looks at, six numbers [length]; None: from where nearly all is seen.
-        up: the direction that is upwards in the picture, three numbers.
+        path: file of points or Gaussians in any format; points without colours are coloured by their local density.
+        look_at: positions of camera and target, six numbers [length]; None for a view of nearly all points.
+        up: upward direction, three numbers.
         fov: horizontal field of view [degree].
         size: (width, height) [pixel].
-        look: of points; Gaussians have their own sizes and opacities.
+        look: appearance of points; Gaussians have their own sizes and opacities.
 
     Raises:
-        MivolError: as the readers, a camera that cannot be, or a look for Gaussians.
+        MivolError: as the readers, an invalid camera, or an appearance for Gaussians.
     """
     is_cloud = not is_gaussian_file(check_file(path))
     if not is_cloud and look != PointLook():
@@ -230,7 +232,7 @@ def render_points(
 
 
 def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
-    """Round Gaussians of one radius at the points; those without colours are coloured by how densely they stand."""
+    """Round Gaussians of one radius at the points; points without colours are coloured by their local density."""
     made = points_to_gaussians(cloud, look.opacity)
     if cloud.colours is None:
         made = points_to_gaussians(replace(cloud, colours=density_colours(made.scales()[:, 0])), look.opacity)
@@ -239,7 +241,7 @@ def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
 
 
 def density_colours(distances: np.ndarray) -> np.ndarray:
-    """(N, 3) colours of points by the logarithms of their distances to others: light where they stand densely."""
+    """Colours (N, 3) of points by the logarithms of their distances to others; bright where the points are dense."""
     height = -np.log(distances.astype(np.float64))
     low, high = np.quantile(height, [SHARE, 1 - SHARE])
     return mpl.colormaps[COLOUR_MAP]((height - low) / max(high - low, 1e-12))[:, :3]
@@ -249,7 +251,7 @@ COLOUR_MAP = "magma"
 
 
 def frame_points(places: np.ndarray, up: Sequence[float], fov: float, size: tuple[int, int]) -> list[float]:
-    """Where a camera stands that sees a ball about the middle 98 % of places along each axis, and the ball's middle."""
+    """Position of a camera that sees a ball about the middle 98 % of the points along each axis, and the ball's centre."""
     low, high = np.quantile(places.astype(np.float64), [SHARE, 1 - SHARE], axis=0)
     middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
     half = min(math.radians(fov) / 2, math.atan(math.tan(math.radians(fov) / 2) * size[1] / size[0]))
@@ -258,6 +260,6 @@ def frame_points(places: np.ndarray, up: Sequence[float], fov: float, size: tupl
 
 
 def splat_points(held: Gaussians, camera: Camera, compensated: bool, discs: bool) -> np.ndarray:
-    """(height, width, 3) code values over black."""
+    """Code values (height, width, 3) over black."""
     splatter = Splatter(*camera.size, held.degree, compensated=compensated, discs=discs)
     return np.array(splatter.forward(to_tensors(held), camera, derivatives=False)[0])[..., :3]

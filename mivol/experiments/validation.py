@@ -1,9 +1,9 @@
-"""mivol beside Mitsuba's own path tracer on a scene: images, gradients, and a verdict in words.
+"""Comparison of mivol with Mitsuba's path tracer on a scene: images, gradients and a verdict.
 
-Conventions. Both images are means of independent renders, so each knows its variance; the comparison is
-:func:`mivol.validate.compare.compare`. A gradient is checked along a random direction v, by Student's t: the mean radiance of
-our image differentiated in reverse mode, g . v, against central differences of our own image, which the comparison judges
-(differences of Mitsuba's are hundreds of times noisier). A double step measures what the difference leaves out.
+Conventions. Both images are means of independent renders with known variances; :func:`mivol.validate.comparison.compare`
+compares them. A gradient is checked along a random direction v by Student's t. The mean radiance of mivol's image is
+differentiated in reverse mode, g . v, and by central differences of the same image (differences of Mitsuba's image are hundreds
+of times noisier). A double step measures the truncation error of the differences.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ AGREES, DIFFERS, UNTRUSTED = 0, 3, 4
 """Exit codes."""
 
 ALPHA = 1e-3
-"""Chance that a right renderer is called wrong, by the image and by the gradients each."""
+"""Probability that a correct renderer fails, for the image and for the gradients each."""
 
 STEP = 0.02
-"""Step of central differences, relative to each value: of e^-tau they err by (STEP tau)^2 / 6 of the slope."""
+"""Relative step of central differences. For e^-tau their relative error is (STEP tau)^2 / 6."""
 
 IMAGE, GRADIENT = 1, 2
 """Purposes of random numbers."""
@@ -49,14 +49,14 @@ IMAGE, GRADIENT = 1, 2
 
 @dataclass(frozen=True)
 class Validation:
-    """How a scene is validated.
+    """Settings of a validation.
 
     Attributes:
-        max_depth: longest path; None: that of the scene's own integrator.
-        spp: samples per pixel of ours.
-        reference_spp: of Mitsuba's ``volpath``.
+        max_depth: longest path; None for the scene's own integrator.
+        spp: samples per pixel of mivol.
+        reference_spp: samples per pixel of Mitsuba's ``volpath``.
         seed: root of all random numbers.
-        sensor: number of the sensor.
+        sensor: index of the sensor.
         parameters: keys of ``mi.traverse(scene)`` whose gradients are checked.
     """
 
@@ -77,12 +77,12 @@ class Slope:
     """A derivative of the mean radiance along a random direction of a parameter.
 
     Attributes:
-        key: of the parameter.
+        key: key of the parameter.
         ours: g . v by reverse mode.
-        differences: the central difference.
+        differences: central difference.
         error: standard error of their difference.
-        left_out: how far the central difference of twice the step is from that of the step, over 3: what the step leaves out.
-        bound: on their difference, beyond which they differ.
+        left_out: truncation error: the difference between central differences of double and single step, over 3.
+        bound: largest difference that counts as noise.
     """
 
     key: str
@@ -94,12 +94,12 @@ class Slope:
 
     @property
     def agrees(self) -> bool:
-        """Whether they do."""
+        """Whether both derivatives agree."""
         return abs(self.ours - self.differences) <= self.bound
 
     @property
     def text(self) -> str:
-        """A sentence."""
+        """The comparison in a sentence."""
         verdict = "agrees with" if self.agrees else "differs from"
         return (
             f"The derivative by {self.key} along a random direction {verdict} central differences: {self.ours:+.4g} and "
@@ -109,14 +109,14 @@ class Slope:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of a validation.
+    """Result of a validation.
 
     Attributes:
-        comparison: of the images.
+        comparison: comparison of the images.
         rel_mse: mean over pixels and channels of (ours - reference)^2 / (reference^2 + 1e-2 of its mean square).
-        slopes: of the parameters that were named.
-        doubts: why the reference should not be believed.
-        files: what was written.
+        slopes: derivatives of the named parameters.
+        doubts: reasons to distrust the reference.
+        files: written files.
     """
 
     comparison: Comparison
@@ -127,7 +127,7 @@ class Verdict:
 
     @property
     def code(self) -> int:
-        """0: they agree; 4: the reference cannot be trusted, whatever it says; 3: they differ."""
+        """Exit code: 0 for agreement, 4 for a reference that cannot be trusted, 3 for a difference."""
         if any(doubt.fatal for doubt in self.doubts):
             return UNTRUSTED
         return AGREES if self.comparison.agrees and all(slope.agrees for slope in self.slopes) else DIFFERS
@@ -143,22 +143,22 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        """All that is said."""
+        """All results in lines."""
         said = [f"Doubt: {doubt.sentence}" for doubt in self.doubts]
         said += [self.comparison.text, f"relMSE {self.rel_mse:.3g}.", *(slope.text for slope in self.slopes), self.words]
         return "\n".join([*said, *(str(path) for path in self.files)])
 
 
 def validate_scene(loaded: LoadedScene, folder: Path, chosen: Validation) -> Verdict:
-    """Compare mivol with Mitsuba's own path tracer; ``validation.json``, ``validation.png`` and the reference are written.
+    """Compare mivol with Mitsuba's path tracer; write ``validation.json``, ``validation.png`` and the reference.
 
     Args:
         loaded: the scene.
-        folder: where the files go; made where it is not there.
-        chosen: how.
+        folder: folder of the results; created if missing.
+        chosen: settings.
 
     Raises:
-        MivolError: what mivol or Mitsuba refuses to render, or a parameter that is not there.
+        MivolError: a scene that mivol or Mitsuba cannot render, or an unknown parameter.
     """
     scene, camera = loaded.scene, find_sensor(loaded.scene, chosen.sensor)
     for key in chosen.parameters:
@@ -185,7 +185,7 @@ def validate_scene(loaded: LoadedScene, folder: Path, chosen: Validation) -> Ver
 
 
 def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, chosen: Validation) -> Moments:
-    """Independent renders of the colour channels."""
+    """Render the colour channels in independent batches."""
     spp = math.ceil(chosen.spp / BATCHES)
     with dr.suspend_grad():
         seeds = (derive_seed(chosen.seed, IMAGE, batch) for batch in range(BATCHES))
@@ -196,7 +196,7 @@ def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator
 
 
 def check_gradients(scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, chosen: Validation) -> tuple[Slope, ...]:
-    """The derivative of the mean radiance along one random direction of each parameter."""
+    """Check the derivative of the mean radiance along one random direction of each parameter."""
     level = Significance(ALPHA, max(len(chosen.parameters), 1))
     return tuple(check_gradient(scene, camera, ours, key, chosen, level) for key in chosen.parameters)
 
@@ -204,8 +204,9 @@ def check_gradients(scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, cho
 def check_gradient(
     scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, key: str, chosen: Validation, level: Significance
 ) -> Slope:
-    """One direction of one parameter: each value times a random number from 0 to 2, so that no step leads past 0 and what
-    the values do to the light does not cancel."""
+    """Check one direction of one parameter: each value times a random number from 0 to 2, so that no step passes 0 and the
+    effects
+    of the values do not cancel."""
     params = mi.traverse(scene)
     start = np.array(as_tensor(params[key]), dtype=np.float64)
     direction = np.random.default_rng([chosen.seed, len(key)]).uniform(0.0, 2.0, start.shape) * start
@@ -228,12 +229,12 @@ def check_gradient(
 
 @dataclass(frozen=True)
 class MeanRadiance:
-    """The mean radiance of a render, as a function of one parameter of its scene.
+    """The mean radiance of a render as a function of one parameter.
 
     Attributes:
-        scene, camera, integrator: what is rendered.
-        key: the parameter, as ``mi.traverse`` names it.
-        spp: samples a pixel of one render.
+        scene, camera, integrator: the render.
+        key: parameter, a key of ``mi.traverse(scene)``.
+        spp: samples per pixel of one render.
     """
 
     scene: mi.Scene
@@ -255,7 +256,7 @@ class MeanRadiance:
         return float(np.sum(gradient * direction))
 
     def difference(self, start: np.ndarray, step: np.ndarray, seed: int) -> float:
-        """Half the difference of the mean a step on and a step back, with the same random numbers."""
+        """Half the difference of the means one step forward and one step back, with the same random numbers."""
         params, means = mi.traverse(self.scene), []
         for sign in (1.0, -1.0):
             set_parameter(params, self.key, start + sign * step)
@@ -270,7 +271,7 @@ class MeanRadiance:
 
 
 def write_verdict(verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, chosen: Validation) -> Verdict:
-    """``validation.json`` and ``validation.png``; the verdict that names them."""
+    """Write ``validation.json`` and ``validation.png``; return the verdict with their paths."""
     compared = verdict.comparison
     picture = figures.save_figure(figures.plot_image_row(reference.mean, image.mean, compared.z), folder / "validation.png")
     about = {
