@@ -214,7 +214,7 @@ def photo(camera: Camera) -> Photo:
     """What a camera among the walls of :mod:`capture_photos` sees."""
     seen = is_seen(camera, pixel_centres(camera.size))
     mask = None if seen.all() else seen
-    return Photo(camera.name, np.float32(capture_photos.image_of(camera)), None, mask, camera, np.zeros(3, np.float32))
+    return Photo(camera.name, np.float32(capture_photos.trace_image(camera)), None, mask, camera, np.zeros(3, np.float32))
 
 
 def test_batches_have_the_rays_of_each_lens(variant_rgb: str) -> None:

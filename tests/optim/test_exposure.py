@@ -204,7 +204,7 @@ def test_fit_recovers_gains_and_field(variant_rgb: str) -> None:
         problem.set_reals(fit.run.reals)
         mean = np.exp(np.mean(np.log(gains)))
         others = capture_photos.cameras(30)[24:]
-        pairs = [(render_view(problem.field, one, problem.sky).image, mean * capture_photos.image_of(one)) for one in others]
+        pairs = [(render_view(problem.field, one, problem.sky).image, mean * capture_photos.trace_image(one)) for one in others]
         errors[exposure] = np.mean([np.square(seen - wanted) for seen, wanted in pairs])
     assert errors[True] < 0.75 * errors[False]
     found = np.log(problem.exposure.table()).mean(axis=1)
