@@ -225,7 +225,7 @@ def test_meshes_that_are_none(tmp_path: Path) -> None:
         Mesh(np.eye(3), np.array([[0, 1]]))
     of_points = ({"normals": np.eye(4)}, {"colours": np.eye(3)[:2]}, {"points": np.eye(3)[:, :2]})
     for spoilt in (*of_points, {"faces": np.array([0, 1, 2])}):
-        with pytest.raises(MivolError, match="for each of the points and"):
+        with pytest.raises(MivolError, match="per point and"):
             Mesh(**{"points": np.eye(3), "faces": np.array([[0, 1, 2]])} | spoilt)
     with pytest.raises(MivolError, match="the suffix '.stl', expected one of .ply, .obj"):
         write_mesh(tmp_path / "a.stl", Mesh(np.eye(3), np.array([[0, 1, 2]])))
