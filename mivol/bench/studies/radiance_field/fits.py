@@ -108,7 +108,7 @@ def measure_locality(size: FieldSize) -> dict:
     )
     answer = {}
     for name, kind in {"tiles": RayBatches, "pixels": PixelBatches}.items():
-        views = kind.of(photos, (1, 2))
+        views = kind.from_photos(photos, (1, 2))
         compile_fit(views, stages[-1:])
         fit, watch = begin_radiance_fit(views, BOX, RadiancePlan(stages)), Stopwatch()
         with watch:
