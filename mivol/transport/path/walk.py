@@ -280,8 +280,8 @@ def walk_branch(
     path.beta = mi.Spectrum(collision.beta)
     path = _sample_first_emitter(estimators, _start_reservoirs(estimators, path, "later"))
     hit = make_collision(estimators.media, collision.ray, collision.t, collision.body, collision.on)
-    path = _scatter(estimators, path, PathEvent.from_collision(hit, sampler.next_1d()))
-    return _add_reservoirs(estimators, _walk_to_end(estimators, path)).score, path.depth
+    path = _walk_to_end(estimators, _scatter(estimators, path, PathEvent.from_collision(hit, sampler.next_1d())))
+    return _add_reservoirs(estimators, path).score, path.depth
 
 
 def advance_path(estimators: Estimators, path: Path) -> Path:

@@ -16,10 +16,10 @@ A baseline about as bright as L removes most of the noise.
 
 For an albedo below ``MIN_ALBEDO``, the probe estimates the derivative by the albedo, in place of L / albedo.
 
-A path keeps few of these points and shadow rays, by weighted reservoir sampling (Chao 1982). One probe is kept from its flights
-before the first scattering event, and one from its later flights. Of its shadow rays, one is kept in proportion to its light;
-its derivative is divided by the probability of having been kept. If one vertex carries most of a path's light, so does the kept
-ray.
+A path keeps few of these points and shadow rays, by weighted reservoir sampling (Chao 1982): one probe from its flights before
+the first scattering event, one probe from its later flights, and one of its shadow rays, in proportion to the light of each.
+The derivative along the kept shadow ray is divided by the probability of having been kept. The mean does not change, and the
+noise hardly changes if one vertex carries most of a path's light.
 
 References: Vicini et al. 2021 (path replay); Nimier-David et al. 2022 (probes in regions without extinction); Yu et al. 2026
 (one point for both terms).

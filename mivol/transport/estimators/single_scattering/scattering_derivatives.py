@@ -162,8 +162,8 @@ class ScatteredSegment:
                     sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, on)
                     value += dr.select(on, probe.weight * sigma_t * eval_albedo(body, probe.mei, on), 0)
             dL = take_tangent(value)
-        shadow, dimmed, on = _choose_shadow_ray(probe)
-        return dL - dr.select(on, carried * dimmed * jvp_optical_depth(self.media, shadow, on), 0)
+        shadow, light, on = _choose_shadow_ray(probe)
+        return dL - dr.select(on, carried * light * jvp_optical_depth(self.media, shadow, on), 0)
 
     # -- Coefficients along the segment --------------------------------------------------------------------------------
 
