@@ -75,6 +75,9 @@ class FreeFlight:
 
     Attributes:
         baseline: baseline of the derivatives (:mod:`.flight_derivatives`); None means 0.
+        bodies: media of the scene.
+        emitting: media with an emission by position.
+        has_gaussian_light: a medium of Gaussians emits light.
 
     Bias: none. Variance: one flight a segment. Cost: a walk of each medium to the first collision; one more walk for an rgb
     extinction or an emitting medium.
@@ -84,8 +87,10 @@ class FreeFlight:
     ends_in_media = True
 
     def __init__(self, media: SceneMedia) -> None:
-        self.media = media
+        self.media, self.bodies = media, media.bodies
         self.baseline: Baseline | None = None
+        self.emitting = [body for body in self.bodies if body.view.emits and not body.view.shows_gaussians]
+        self.has_gaussian_light = any(body.view.shows_gaussians for body in self.bodies)
 
     def draw(self, sampler: mi.Sampler | LaneSampler, active: mi.Bool, strata: Strata | None) -> tuple[mi.Float, mi.UInt32]:
         """Draw the number of the flight and the generator of the other numbers, in every lane, since all lanes fly."""
@@ -112,19 +117,20 @@ class FreeFlight:
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
         collision = make_collision(media, ray, flight.t, flight.body, collides)
         weight = self._channel_weight(segment, passed, active, collision)
-        emitting = [body for body in media.bodies if body.view.emits and not body.view.shows_gaussians]
-        emission = self._sample_point(segment, passed, emitting, at_emission, chance, active) if emitting else None
+        emission = None
+        if self.emitting:
+            emission = self._sample_point(segment, passed, self.emitting, at_emission, chance, active)
         if segment.emission_weight is not None:
             emission.gain *= segment.emission_weight
         gaussian_light = None
-        if any(body.view.shows_gaussians for body in media.bodies):
+        if self.has_gaussian_light:
             channel_weight = partial(self._channel_weight, segment, collision=None)
             gaussian_light = GaussianLight(media, segment, (end.t, t), channel_weight, active)
         # The path's own flights and probes account for the baseline; a side flight has none.
         baseline = None if segment.is_side_flight else self.baseline
         shared = FlightSegment(media, segment, passed, collision, weight, baseline, emission, gaussian_light, active)
         light = SegmentLight(shared, shared.emitted, is_replayed=True)
-        probe = self._sample_point(segment, passed, media.bodies, at_probe, chance, active) if purpose != IMAGE else None
+        probe = self._sample_point(segment, passed, self.bodies, at_probe, chance, active) if purpose != IMAGE else None
         return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)
 
     def _channel_weight(
