@@ -1,10 +1,10 @@
-r"""Scores: how a walked path accumulates its radiance, the gradients of its parameters, or the tangent of its radiance.
+r"""Scores: how a walked path accumulates radiance, gradients of parameters, or the tangent of the radiance.
 
 The radiance of a path is a sum of terms, each multiplied by the factors in front:
 
 .. math:: L = t_1 + f_1 (t_2 + f_2 (t_3 + \dots))
 
-The walk reports terms and factors to its score in the order of the path. There are three scores:
+The walk reports terms and factors to a score, in the order of the path. The three scores are:
 
 * ``Primal`` sums the radiance.
 * ``Replay`` (path replay backpropagation) follows a path whose radiance is known. It subtracts each term from ``L``, so ``L``
@@ -47,7 +47,7 @@ __all__ = [
 
 
 IMAGE, REVERSE, FORWARD = "image", "reverse", "forward"
-"""Purposes of a walk: the radiance, the gradients of its parameters, or its tangent."""
+"""Purposes of a walk: the radiance, the gradients of parameters, or the tangent of the radiance."""
 
 
 # -- Terms and factors ---------------------------------------------------------------------------------------------------
@@ -58,25 +58,25 @@ class Term(Protocol):
 
     Attributes:
         value: radiance at the camera, without derivatives; 0 in lanes without the term.
-        is_replayed: whether a replay finds the same value again, and subtracts it from the known radiance. False for light
-            sampled anew for its derivative.
+        is_replayed: whether a replay finds the same value again, and subtracts the value from the known radiance. False for
+            light sampled anew for derivatives.
     """
 
     value: mi.Spectrum
     is_replayed: bool
 
     def vjp(self, dL: mi.Spectrum) -> None:
-        """Add the derivatives of the value, weighted by ``dL``, to the gradients of its parameters."""
+        """Add the derivatives of the value, weighted by ``dL``, to the gradients of the parameters."""
 
     def jvp(self) -> mi.Spectrum:
-        """Tangent of the value, from the tangents of its parameters."""
+        """Tangent of the value, from the tangents of the parameters."""
 
 
 class Factor(Protocol):
     """A factor on all light from further along the path."""
 
     def vjp(self, dlog: mi.Spectrum) -> None:
-        """Add the derivatives of the factor's logarithm, weighted by ``dlog`` = dL L, to the gradients of its parameters."""
+        """Add the derivatives of the factor's logarithm, weighted by ``dlog`` = dL L, to the gradients of the parameters."""
 
     def jvp(self) -> mi.Spectrum:
         """Tangent of the factor's logarithm."""
@@ -156,7 +156,7 @@ class Primal:
 
 @dataclass
 class Replay:
-    """Follow a path again, and add its derivatives to the gradients of media, surfaces and emitters.
+    """Follow a path again, and add the derivatives to the gradients of media, surfaces and emitters.
 
     Attributes:
         L: radiance from further along the path. A path with a single segment does not need it (None): the only light behind its

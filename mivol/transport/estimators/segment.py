@@ -3,7 +3,7 @@ r"""Segment estimators: the light that media add along a segment of a path, and 
 .. math:: L = L_{media} + T\, L_{behind}
 
 A segment runs from one event to the next: to an opaque surface or, with some estimators, to a collision. A
-:class:`SegmentEstimator` computes the light of its media: none (:class:`Absorption`), emission, or scattered light. Light and
+:class:`SegmentEstimator` computes the light of the media: none (:class:`Absorption`), emission, or scattered light. Light and
 transmittance carry their derivatives as a term and a factor (:mod:`.scores`). If one walk of the cells computes the derivatives
 of both, term and factor share a :class:`SharedSegment`; the path reports the term first, then the factor.
 
@@ -264,7 +264,7 @@ class Absorption:
 
 
 class TrackedAbsorption:
-    """The segment estimator for media that only absorb, some of them with a known majorant only.
+    """The segment estimator for media that only absorb, some with a known majorant only.
 
     Args:
         media: media of the scene.

@@ -104,6 +104,7 @@ class FreeFlight:
         return self
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        # -- The first collision, or the end of the segment -------------------------------------------------------------
         media, ray = self.media, segment.ray
         u, rng = segment.samples
         rng, (pick, at_emission, at_probe, chance) = draw_pcg32(rng, 4)
@@ -117,6 +118,7 @@ class FreeFlight:
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
         collision = make_collision(media, ray, flight.t, flight.body, collides)
         weight = self._channel_weight(segment, passed, active, collision)
+        # -- The light of the media on the way --------------------------------------------------------------------------
         emission = None
         if self.emitting:
             emission = self._sample_point(segment, passed, self.emitting, at_emission, chance, active)
@@ -126,6 +128,7 @@ class FreeFlight:
         if self.has_gaussian_light:
             channel_weight = partial(self._channel_weight, segment, collision=None)
             gaussian_light = GaussianLight(media, segment, (end.t, t), channel_weight, active)
+        # -- Term, factor, and the point for derivatives ----------------------------------------------------------------
         # The path's own flights and probes account for the baseline; a side flight has none.
         baseline = None if segment.is_side_flight else self.baseline
         shared = FlightSegment(media, segment, passed, collision, weight, baseline, emission, gaussian_light, active)
