@@ -261,8 +261,8 @@ def run_example(
     wanted = config.load(source / example.file, (f"output=runs/{name}", *changes)).output
     folder = folder or Path(wanted)
     given = (*prepare(name, example, source, folder, progress), *changes)
-    chosen = config.load(source / example.file, given)
-    return run_experiment(RunContext(chosen, source, folder, progress=progress, command=command))
+    experiment = config.load(source / example.file, given)
+    return run_experiment(RunContext(experiment, source, folder, progress=progress, command=command))
 
 
 def prepare(name: str, example: Example, source: Path, folder: Path, progress: Progress) -> list[str]:

@@ -43,16 +43,16 @@ LEARNED = {"sky": ("sky", "sky_smooth"), "nested": ("sky", "sky_smooth", "levels
 """Fields of the plan that come from the preset ``capture``, by the word for the background."""
 
 
-def make_plan(chosen: FieldExperiment) -> RadiancePlan:
+def make_plan(settings: FieldExperiment) -> RadiancePlan:
     """Return the preset of the settings, changed by the other settings.
 
     Raises:
         MivolError: an unknown preset.
     """
-    wanted = chosen.field
+    wanted = settings.field
     if wanted.preset not in PRESETS:
         raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {suggest_name(wanted.preset, list(PRESETS))}')
-    plan = set_background(PRESETS[wanted.preset], chosen.photos.background)
+    plan = set_background(PRESETS[wanted.preset], settings.photos.background)
     names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure")
     given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})

@@ -147,13 +147,13 @@ class GaussianStart:
         return GaussianProblem(self.batches, [view.camera for view in self.views], self.cloud, self.plan, seed)
 
 
-def make_gaussian_plan(chosen: GaussianExperiment) -> GaussianPlan:
+def make_gaussian_plan(settings: GaussianExperiment) -> GaussianPlan:
     """Return the preset of the settings, changed by the other settings.
 
     Raises:
         MivolError: an unknown preset or density control.
     """
-    wanted = chosen.gaussians
+    wanted = settings.gaussians
     if wanted.preset not in PRESETS:
         raise MivolError(f'gaussians.preset = "{wanted.preset}" is unknown: {suggest_name(wanted.preset, list(PRESETS))}')
     if wanted.control is not None and wanted.control not in CONTROLS:
@@ -167,7 +167,7 @@ def make_gaussian_plan(chosen: GaussianExperiment) -> GaussianPlan:
     return plan.scaled(wanted.effort)
 
 
-def start_gaussians(chosen: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> GaussianStart:
+def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> GaussianStart:
     """Adapt the plan to the photographs, and place the first Gaussians; memory is checked before it is allocated.
 
     Raises:
@@ -176,10 +176,10 @@ def start_gaussians(chosen: GaussianExperiment, photos: Photos, plan: GaussianPl
     views = tuple(rectify(view) for view in photos.views)
     longest = max(max(view.camera.size) for view in views)
     plan = plan.for_edge(longest)
-    places, whence = find_start_points(photos, plan.start, chosen.seed)
+    places, whence = find_start_points(photos, plan.start, settings.seed)
     largest = max(view.camera.size[0] * view.camera.size[1] for view in views)
-    if chosen.gaussians.minutes is not None:
-        plan = plan.in_minutes(chosen.gaussians.minutes, largest)
+    if settings.gaussians.minutes is not None:
+        plan = plan.in_minutes(settings.gaussians.minutes, largest)
     pixels = largest // min(s.shrink for s in plan.stages) ** 2
     channels = 4 if all(view.alpha is not None for view in views) else 3
     sizes = {stage.shrink for stage in plan.stages}

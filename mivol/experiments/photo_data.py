@@ -20,18 +20,18 @@ from mivol.photos.region import near_and_far
 from mivol.validate.images import check_metrics
 
 
-def read_photos(chosen: PhotoExperiment, base: Path) -> tuple[Photos, Photos | None]:
+def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos | None]:
     """Read the photographs to fit, and the photographs that judge the fit (None for none).
 
     Raises:
         MivolError: as :func:`mivol.photos.load_photos`, metrics for larger photographs, or an unknown word for the box or the
             background.
     """
-    wanted = chosen.photos
+    wanted = settings.photos
     if isinstance(wanted.box, str) and wanted.box not in BOXES:
         raise MivolError(f'photos.box = "{wanted.box}" is unknown: {suggest_name(wanted.box, list(BOXES))}')
     box = "middle" if wanted.background == "nested" and wanted.box == "found" else wanted.box
-    settings: dict[str, Any] = {
+    options: dict[str, Any] = {
         "scale": wanted.scale,
         "largest": wanted.largest,
         "held_out": wanted.held_out,
@@ -39,44 +39,44 @@ def read_photos(chosen: PhotoExperiment, base: Path) -> tuple[Photos, Photos | N
         "stored": wanted.stored,
         "box": SEARCHED.get(box) if isinstance(box, str) else np.array(box, np.float64),
     }
-    if isinstance(chosen, GaussianExperiment):
+    if isinstance(settings, GaussianExperiment):
         if wanted.space == "linear":
             raise MivolError('photos.space = "linear" was asked for; Gaussians are fitted to code values: "srgb" is expected.')
-        settings["space"] = "srgb"
+        options["space"] = "srgb"
     path = base / wanted.path
-    surveyed = {"held_out": wanted.held_out, "box": settings["box"]}
+    surveyed = {"held_out": wanted.held_out, "box": options["box"]}
     fitted = survey_photos(path, split="train", **surveyed)
     is_judged = wanted.judged != "held_out" or wanted.held_out > 0
     others = survey_photos(path, split=wanted.judged, **surveyed).frames if is_judged else ()
     # Before any is read: a background that is asked for would be the first of two answers.
     has_alpha = check_alpha([*fitted.frames, *others])
-    check_background(chosen, has_alpha)
+    check_background(settings, has_alpha)
     if has_alpha:
-        settings["background"] = wanted.background or None
-    photos = _put_over(load_photos(path, split="train", **settings), wanted.background)
+        options["background"] = wanted.background or None
+    photos = _put_over(load_photos(path, split="train", **options), wanted.background)
     white = find_white(photos) if photos.space == "linear" else 1.0
     if not is_judged:
         return divide_by_white(photos, white), None
-    judged = load_photos(path, split=wanted.judged, **settings | {"space": photos.space})
-    check_metrics(chosen.show.metrics, *np.min([view.camera.size for view in judged.views], axis=0))
+    judged = load_photos(path, split=wanted.judged, **options | {"space": photos.space})
+    check_metrics(settings.show.metrics, *np.min([view.camera.size for view in judged.views], axis=0))
     return divide_by_white(photos, white), divide_by_white(_put_over(judged, wanted.background), white)
 
 
-def check_background(chosen: PhotoExperiment, has_alpha: bool) -> None:
+def check_background(settings: PhotoExperiment, has_alpha: bool) -> None:
     """Refuse an unknown word for the background, or a word for photographs of the other kind.
 
     Raises:
         MivolError: with the known words.
     """
-    word = chosen.photos.background
-    learned = [] if isinstance(chosen, GaussianExperiment) else list(LEARNED)
+    word = settings.photos.background
+    learned = [] if isinstance(settings, GaussianExperiment) else list(LEARNED)
     known = list(BACKGROUNDS) if has_alpha else ["white", "black", *learned]
     if not isinstance(word, str) or word in ("", *known):
         return
     if word not in (*BACKGROUNDS, *LEARNED):
         raise MivolError(f'photos.background = "{word}" is unknown: {suggest_name(word, known)}')
     kind = "photographs with alpha" if has_alpha else "photographs without alpha"
-    if word in LEARNED and isinstance(chosen, GaussianExperiment):
+    if word in LEARNED and isinstance(settings, GaussianExperiment):
         kind = "Gaussians"
     raise MivolError(f'photos.background = "{word}" is not for {kind}: {", ".join(known)} or an rgb triple is expected.')
 
@@ -126,13 +126,13 @@ def note_on_alpha(survey: PhotoSurvey) -> str:
     return f"alpha in all photographs: photos.background says what they are put over; {box}"
 
 
-def add_box(chosen: PhotoExperiment, photos: Photos) -> Photos:
+def add_box(settings: PhotoExperiment, photos: Photos) -> Photos:
     """Set the box of the matter.
 
     Raises:
         MivolError: as :meth:`mivol.photos.Photos.silhouette_box`.
     """
-    wanted = chosen.photos.box
+    wanted = settings.photos.box
     return BOXES[wanted](photos) if isinstance(wanted, str) else photos
 
 

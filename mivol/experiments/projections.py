@@ -65,16 +65,16 @@ class Projections:
         return hashlib.sha256(self.y.tobytes() + self.weights.tobytes()).hexdigest()
 
 
-def describe_beam(chosen: config.ScanExperiment) -> str:
+def describe_beam(settings: config.ScanExperiment) -> str:
     """Name of the beam."""
-    return f"{type(chosen.data if isinstance(chosen.scan, OfData) else chosen.scan).__name__.lower()} beam"
+    return f"{type(settings.data if isinstance(settings.scan, OfData) else settings.scan).__name__.lower()} beam"
 
 
-def make_geometry(chosen: config.ScanExperiment, base: Path) -> FlatDetector:
+def make_geometry(settings: config.ScanExperiment, base: Path) -> FlatDetector:
     """Return beam and detector of computed projections."""
-    wanted = chosen.scan
+    wanted = settings.scan
     angles = np.arange(0) if isinstance(wanted, Table | Matrices) else even_angles(wanted)
-    return make_beam(chosen, base, angles, wanted.detector)
+    return make_beam(settings, base, angles, wanted.detector)
 
 
 def even_angles(wanted: Detector) -> np.ndarray:
@@ -83,15 +83,15 @@ def even_angles(wanted: Detector) -> np.ndarray:
 
 
 def make_beam(
-    chosen: config.ScanExperiment, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
+    settings: config.ScanExperiment, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
 ) -> FlatDetector:
     """Return the beam of the settings, with these angles [rad] and pixels; a given ``axis_offset`` replaces the settings'."""
-    wanted = chosen.scan
+    wanted = settings.scan
     if isinstance(wanted, Table):
         return PanelViews(read_columns(base / wanted.file, COLUMNS), detector)
     if isinstance(wanted, Matrices):
         matrices = read_columns(base / wanted.file, COLUMNS).reshape(-1, 3, 4)
-        return panels_from_matrices(matrices, detector, chosen.grid.centre, wanted.first_pixel)
+        return panels_from_matrices(matrices, detector, settings.grid.centre, wanted.first_pixel)
     offsets = {
         "axis_offset": wanted.axis_offset if axis_offset is None else axis_offset,
         "detector_offset": wanted.detector_offset,
@@ -101,44 +101,44 @@ def make_beam(
     return ParallelBeam(angles, detector, wanted.pitch, **offsets)
 
 
-def make_grid(chosen: config.ScanExperiment, base: Path) -> VoxelGrid:
+def make_grid(settings: config.ScanExperiment, base: Path) -> VoxelGrid:
     """Return the voxels.
 
     Raises:
         MivolError: neither a table ``grid`` nor a grid in the data.
     """
-    wanted = chosen.grid
-    return nikon_grid(chosen.data, base) if wanted is None else VoxelGrid(wanted.shape, wanted.voxel_size, wanted.centre)
+    wanted = settings.grid
+    return nikon_grid(settings.data, base) if wanted is None else VoxelGrid(wanted.shape, wanted.voxel_size, wanted.centre)
 
 
-def make_data(chosen: config.ScanExperiment, base: Path, grid: VoxelGrid) -> Projections:
+def make_data(settings: config.ScanExperiment, base: Path, grid: VoxelGrid) -> Projections:
     """Read or compute the projections.
 
     Raises:
         MivolError: files that cannot be read or do not fit, rays that all miss the grid, or more rays than memory.
     """
-    is_measured = isinstance(chosen.data, Measured | Stack | Nikon)
+    is_measured = isinstance(settings.data, Measured | Stack | Nikon)
     if is_measured:
-        data = read_measured(chosen, base)
+        data = read_measured(settings, base)
     else:
-        check_rays(chosen)
-        geometry = make_geometry(chosen, base)
-        exact, truth = SIMULATED[type(chosen.data)](chosen.data, base, geometry, grid)
-        data = add_noise(geometry, exact, truth, chosen.data.photons, chosen.data.seed)
+        check_rays(settings)
+        geometry = make_geometry(settings, base)
+        exact, truth = SIMULATED[type(settings.data)](settings.data, base, geometry, grid)
+        data = add_noise(geometry, exact, truth, settings.data.photons, settings.data.seed)
     check_hits(Projector(data.geometry, grid))
     if not is_measured:
         return data
-    return replace(data, notes=(*data.notes, *note_rows(chosen.data, data.geometry, grid, data.y, data.weights)))
+    return replace(data, notes=(*data.notes, *note_rows(settings.data, data.geometry, grid, data.y, data.weights)))
 
 
-def check_rays(chosen: config.ScanExperiment) -> None:
+def check_rays(settings: config.ScanExperiment) -> None:
     """Refuse a computed scan beyond the memory; a table of views counts as one view.
 
     Raises:
         MivolError: with the number of rays.
     """
-    rows, columns = chosen.scan.detector
-    views = getattr(chosen.scan, "views", 1)
+    rows, columns = settings.scan.detector
+    views = getattr(settings.scan, "views", 1)
     what = f"a scan of {views} x {rows} x {columns} rays"
     check_memory(RAY_BYTES * views * rows * columns, what, "give scan.detector or scan.views fewer of them")
 
@@ -197,43 +197,43 @@ def add_noise(geometry: FlatDetector, exact: np.ndarray, truth: np.ndarray, phot
     return Projections(geometry, y, counts, truth, quanta, is_noise_known=True)
 
 
-def read_measured(chosen: config.ScanExperiment, base: Path) -> Projections:
+def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
     """Read measured projections as line integrals with weights; find the rotation axis of a circular scan if requested.
 
     Raises:
         MivolError: a file that cannot be read, or does not fit the others.
     """
-    wanted, found = chosen.data, read_scan(chosen, base)
+    wanted, found = settings.data, read_scan(settings, base)
     notes, angles = list(found.notes), found.angles
     if angles is not None:
         notes += note_order(angles)
     y, weights = to_line_integrals(normalise_air(found.transmission, wanted.air) if wanted.air else found.transmission)
     offset = None
-    if isinstance(chosen.scan, Parallel | Cone):
-        offset, said = resolve_axis(chosen, base, y, weights, angles)
+    if isinstance(settings.scan, Parallel | Cone):
+        offset, said = resolve_axis(settings, base, y, weights, angles)
         notes += said
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
     geometry = found.geometry
     if geometry is None:
-        geometry = make_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
+        geometry = make_beam(settings, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
-    quanta = count_measured_quanta(chosen, found) if ALL_SOLVERS[chosen.solve.solver].problem is PoissonCounts else None
+    quanta = count_measured_quanta(settings, found) if ALL_SOLVERS[settings.solve.solver].problem is PoissonCounts else None
     return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=found.intensity is not None)
 
 
 def resolve_axis(
-    chosen: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
+    settings: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
 ) -> tuple[float | None, list[str]]:
     """Return the found ``axis_offset`` of a circular scan [length] or None, and notes.
 
     An offset in the settings holds, unless they also have ``data.find_axis = true``.
     """
-    wanted, given = chosen.data.find_axis, chosen.scan.axis_offset
+    wanted, given = settings.data.find_axis, settings.scan.axis_offset
     if wanted or (wanted is None and not given):
-        offset, said = find_rotation_axis(chosen, base, y, weights, angles)
+        offset, said = find_rotation_axis(settings, base, y, weights, angles)
         return offset, [said]
     if wanted is None:
         return None, [f"the rotation axis is where scan.axis_offset has it, {given:g}: data.find_axis = true looks for it"]
@@ -241,18 +241,18 @@ def resolve_axis(
 
 
 def find_rotation_axis(
-    chosen: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
+    settings: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
 ) -> tuple[float | None, str]:
     """Return the ``axis_offset`` of a circular scan [length] and a note; None if a cone beam does not determine it.
 
     Raises:
         MivolError: as :func:`mivol.tomography.rotation_axis.find_axis`, for a parallel beam.
     """
-    if isinstance(chosen.scan, Parallel):
+    if isinstance(settings.scan, Parallel):
         axis = find_axis(y, weights, angles)
-        offset = axis.offset(y.shape[2], float(np.broadcast_to(chosen.scan.pitch, (2,))[1]))
+        offset = axis.offset(y.shape[2], float(np.broadcast_to(settings.scan.pitch, (2,))[1]))
     else:
-        beam = make_beam(chosen, base, angles, y.shape[1:])
+        beam = make_beam(settings, base, angles, y.shape[1:])
         try:
             axis = axis_from_fans(y, weights, beam)
         except MivolError as error:
@@ -261,26 +261,26 @@ def find_rotation_axis(
     return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
 
 
-def count_measured_quanta(chosen: config.ScanExperiment, found: ScanReadings) -> Quanta:
+def count_measured_quanta(settings: config.ScanExperiment, found: ScanReadings) -> Quanta:
     """Return the numbers of quanta of a measured scan; named air columns correct the brightness of the light without an object.
 
     Raises:
         MivolError: data without flats and darks, or with a drift, which only line integrals have.
     """
-    if found.intensity is None or chosen.data.drift:
+    if found.intensity is None or settings.data.drift:
         raise MivolError(
             "ml-tr needs counts of quanta, found line integrals, transmissions or a drift: give readings with flats and darks, "
             "and no data.drift, or choose pcg."
         )
-    quanta = count_quanta(*found.intensity, chosen.data.saturation)
-    if not chosen.data.air:
+    quanta = count_quanta(*found.intensity, settings.data.saturation)
+    if not settings.data.air:
         return quanta
-    return replace(quanta, blank=quanta.blank * fit_air(found.transmission.value, chosen.data.air))
+    return replace(quanta, blank=quanta.blank * fit_air(found.transmission.value, settings.data.air))
 
 
-def held_out_views(chosen: config.ScanExperiment, count: int) -> np.ndarray:
+def held_out_views(settings: config.ScanExperiment, count: int) -> np.ndarray:
     """Indices of the held-out views, which are predicted and not fitted."""
-    every = chosen.held_out_every
+    every = settings.held_out_every
     if every == 1:
         raise MivolError("held_out_every = 1 holds out all views, expected some to fit: choose 2 or more, or 0.")
     return np.arange(every // 2, count, every) if every else np.arange(0)

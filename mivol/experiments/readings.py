@@ -40,13 +40,13 @@ class ScanReadings:
     notes: tuple[str, ...] = ()
 
 
-def read_scan(chosen: config.ScanExperiment, base: Path) -> ScanReadings:
+def read_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
     """Read a measured scan.
 
     Raises:
         MivolError: a file that cannot be read, or does not fit the others.
     """
-    wanted = chosen.data
+    wanted = settings.data
     if isinstance(wanted, Nikon):
         transmission, geometry, notes = read_nikon_scan(wanted, base)
         return ScanReadings(transmission, geometry=geometry, notes=tuple(notes))
@@ -55,16 +55,16 @@ def read_scan(chosen: config.ScanExperiment, base: Path) -> ScanReadings:
         fields = scan.projections, scan.flats, scan.darks
         check_unit(np.degrees(scan.angles), "degree", "write theta in degrees")
         return ScanReadings(correct_transmission(*fields, wanted.saturation), scan.angles, intensity=fields)
-    return read_stack_scan(chosen, base)
+    return read_stack_scan(settings, base)
 
 
-def read_stack_scan(chosen: config.ScanExperiment, base: Path) -> ScanReadings:
+def read_stack_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
     """Read a stack of images or an array.
 
     Raises:
         MivolError: as :func:`read_scan`.
     """
-    wanted: Stack = chosen.data
+    wanted: Stack = settings.data
 
     def stack(name: str) -> np.ndarray:
         values = read_stack(base / name, wanted.dataset or None)
@@ -76,20 +76,20 @@ def read_stack_scan(chosen: config.ScanExperiment, base: Path) -> ScanReadings:
         transmission = correct_transmission(*fields, wanted.saturation)
     else:
         transmission = assume_quantum_noise(np.exp(-readings.astype(float)) if wanted.reading == "line_integral" else readings)
-    return ScanReadings(transmission, read_angles(chosen, base, len(readings)), intensity=fields)
+    return ScanReadings(transmission, read_angles(settings, base, len(readings)), intensity=fields)
 
 
-def read_angles(chosen: config.ScanExperiment, base: Path, views: int) -> np.ndarray | None:
+def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.ndarray | None:
     """Return the angles [rad] of a stack: from a file, or evenly over the arc; None if a table has the geometry.
 
     Raises:
         MivolError: numbers of angles and views that differ, or angles in another unit.
     """
-    wanted: Stack = chosen.data
-    if isinstance(chosen.scan, Table | Matrices):
+    wanted: Stack = settings.data
+    if isinstance(settings.scan, Table | Matrices):
         return None
     if not wanted.angles:
-        return np.radians(chosen.scan.arc) * np.arange(views) / views
+        return np.radians(settings.scan.arc) * np.arange(views) / views
     angles = read_columns(base / wanted.angles, 1)[:, 0]
     if len(angles) != views:
         raise MivolError(f"{wanted.angles} has {len(angles)} angles for {views} projections: give one for each.")

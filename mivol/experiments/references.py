@@ -93,32 +93,32 @@ def find_references(
     return references
 
 
-def find_sensors(chosen: SceneExperiment, scene: mi.Scene) -> tuple[list[Any], frozenset[int]]:
+def find_sensors(settings: SceneExperiment, scene: mi.Scene) -> tuple[list[Any], frozenset[int]]:
     """Return the sensors of all views, and the indices of the held-out views.
 
     Raises:
         MivolError: no views, views of different sizes, more views than memory, or unknown held-out views.
     """
-    sensors = list(chosen.views.sensors(scene))
-    more = list(chosen.held_out.sensors(scene)) if chosen.held_out is not None else []
-    check_held_out(chosen.reference.held_out, len(sensors))
-    held_out = (*chosen.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
+    sensors = list(settings.views.sensors(scene))
+    more = list(settings.held_out.sensors(scene)) if settings.held_out is not None else []
+    check_held_out(settings.reference.held_out, len(sensors))
+    held_out = (*settings.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
     sensors += more
     check_film(to_sensor(sensors[0]), SEEN * len(sensors))
     check_sizes({f"view {index}": to_sensor(sensor) for index, sensor in enumerate(sensors)})
     return sensors, frozenset(held_out)
 
 
-def load_experiment_scene(chosen: SceneExperiment, base: Path) -> LoadedScene:
+def load_experiment_scene(settings: SceneExperiment, base: Path) -> LoadedScene:
     """Load the scene of an experiment with its defines; a define may name public data (``data:NAME``).
 
     Raises:
         MivolError: as :func:`mivol.scene.load.load_scene`, or data that are not here.
     """
-    given = chosen.scene.define.items()
+    given = settings.scene.define.items()
     is_data = {key: isinstance(value, str) and value.startswith(PREFIX) for key, value in given}
     defines = {key: str(resolve_path(base, value)) if is_data[key] else value for key, value in given}
-    return load_scene(base / chosen.scene.file, defines)
+    return load_scene(base / settings.scene.file, defines)
 
 
 def to_sensor(sensor: dict | mi.Sensor) -> mi.Sensor:
@@ -161,14 +161,14 @@ def standard_error(made: ReferenceResult) -> np.ndarray:
 
 
 def read_references(
-    chosen: SceneExperiment, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: frozenset[int]
+    settings: SceneExperiment, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: frozenset[int]
 ) -> References:
     """Read references from OpenEXR files. A file of mivol must show the named scene.
 
     Raises:
         MivolError: numbers of files and views that differ, or a file of another scene.
     """
-    wanted, seen = chosen.reference, References(held_out)
+    wanted, seen = settings.reference, References(held_out)
     if len(wanted.paths) != len(sensors):
         raise MivolError(f"found {len(wanted.paths)} reference files for {len(sensors)} views: give one for each.")
     of = load_scene(base / wanted.scene).content_hash if wanted.scene else loaded.content_hash
@@ -199,32 +199,32 @@ VOXEL_BYTES = 9 * 8
 """Memory per voxel of a procedural volume while it is made [byte]: the position twice, and three numbers, in float64."""
 
 
-def make_truth(chosen: SceneExperiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
+def make_truth(settings: SceneExperiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
     """Return the true volume (Z, Y, X, C) of an experiment; None if unknown.
 
     Raises:
         MivolError: an unknown key, a file that cannot be read, or a volume beyond the memory.
     """
-    if chosen.truth is None:
+    if settings.truth is None:
         return None
-    find(chosen.truth.key, mi.traverse(scene))
-    if chosen.truth.file:
-        return read_volume(resolve_path(base, chosen.truth.file)).values
-    wanted = chosen.truth
+    find(settings.truth.key, mi.traverse(scene))
+    if settings.truth.file:
+        return read_volume(resolve_path(base, settings.truth.file)).values
+    wanted = settings.truth
     said = " x ".join(str(n) for n in wanted.shape)
     check_memory(VOXEL_BYTES * math.prod(wanted.shape), f"a truth of {said} voxels", "give truth.shape fewer voxels")
     return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
 
 
-def check_truth(chosen: SceneExperiment) -> None:
+def check_truth(settings: SceneExperiment) -> None:
     """Refuse a true volume of a parameter that is not fitted: references and renders would show different volumes.
 
     Raises:
         MivolError: with the key.
     """
-    if chosen.truth is not None and chosen.truth.key not in [sought.key for sought in chosen.parameter]:
+    if settings.truth is not None and settings.truth.key not in [sought.key for sought in settings.parameter]:
         raise MivolError(
-            f"truth.key is {chosen.truth.key}, which is no parameter of the fit, so the references would show another volume "
+            f"truth.key is {settings.truth.key}, which is no parameter of the fit, so the references would show another volume "
             "than the renders: look for it too, or put what is known into the scene (scene.define) and take the truth out."
         )
 

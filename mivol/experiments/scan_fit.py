@@ -172,30 +172,32 @@ class ScanFit(FitKind):
         return Explanation((f"  solver    {settings.solve.name}, at most {settings.solve.iterations} iterations",))
 
 
-def make_projector(chosen: config.ScanExperiment, data: Projections, grid: VoxelGrid) -> Projector:
+def make_projector(settings: config.ScanExperiment, data: Projections, grid: VoxelGrid) -> Projector:
     """Return the projector of all rays through the unknowns.
 
     Raises:
         MivolError: more unknowns than memory.
     """
-    unknowns = subdivide_grid(grid, chosen.solve.supersampling, data.geometry)
-    check_grid(chosen, unknowns)
+    unknowns = subdivide_grid(grid, settings.solve.supersampling, data.geometry)
+    check_grid(settings, unknowns)
     return Projector(data.geometry, unknowns)
 
 
-def make_problem(chosen: config.ScanExperiment, projector: Projector, data: Projections, kept: np.ndarray) -> ProjectionProblem:
+def make_problem(
+    settings: config.ScanExperiment, projector: Projector, data: Projections, kept: np.ndarray
+) -> ProjectionProblem:
     """Return the solver's problem for the fitted views.
 
     Raises:
         MivolError: ML-TR without counts.
     """
-    wanted = chosen.solve
+    wanted = settings.solve
     a = projector.subset(kept)
     prior = make_prior(wanted, a, data, kept)
     x0 = start_volume(wanted, a, data, kept)
     if ALL_SOLVERS[wanted.name].problem is LeastSquares:
         least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, wanted.nonnegative, prior)
-        return ProjectionProblem(least_squares, times=view_times(data)[kept] if getattr(chosen.data, "drift", 0) else None)
+        return ProjectionProblem(least_squares, times=view_times(data)[kept] if getattr(settings.data, "drift", 0) else None)
     if data.quanta is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
     quanta = data.quanta.of_views(kept)
@@ -228,24 +230,24 @@ def start_volume(wanted: config.SolveSettings, a: Projector, data: Projections, 
     return np.maximum(x, 0) if wanted.nonnegative else x
 
 
-def expected_noise(chosen: config.ScanExperiment, problem: ProjectionProblem, data: Projections) -> float | None:
+def expected_noise(settings: config.ScanExperiment, problem: ProjectionProblem, data: Projections) -> float | None:
     """Norm of the residual that the noise alone leaves; None if the noise is unknown.
 
     Raises:
         MivolError: a stop by an unknown noise.
     """
-    if chosen.solve.discrepancy:
+    if settings.solve.discrepancy:
         check_noise("solve.discrepancy", data)
-    return expected_residual_norm(problem.linear_problem, chosen.solve.name) if data.is_noise_known else None
+    return expected_residual_norm(problem.linear_problem, settings.solve.name) if data.is_noise_known else None
 
 
-def make_solver(chosen: config.ScanExperiment, noise: float | None) -> LinearSolve:
+def make_solver(settings: config.ScanExperiment, noise: float | None) -> LinearSolve:
     """Return the solver with its settings; it stops at the noise if requested."""
-    wanted = chosen.solve
+    wanted = settings.solve
     shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     if wanted.discrepancy:
         shared["stop_norm"] = wanted.discrepancy * noise
-    return LinearSolve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
+    return LinearSolve(solver=wanted.name, drift=getattr(settings.data, "drift", 0), **shared)
 
 
 def data_norm(task: LeastSquares | PoissonCounts) -> float:

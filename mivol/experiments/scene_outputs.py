@@ -32,18 +32,18 @@ class SceneOutputs:
     """Outputs of a scene fit.
 
     Attributes:
-        chosen: settings of the experiment.
+        settings: settings of the experiment.
         run: run folder with the record.
         fit: the finished fit.
-        seen: the references.
+        references: the references.
         truth: true volume, if known.
         best: the best iterate.
     """
 
-    chosen: SceneExperiment
+    settings: SceneExperiment
     run: RunFolder
     fit: Fit
-    seen: References
+    references: References
     truth: np.ndarray | None
     best: BestIterate
 
@@ -51,19 +51,19 @@ class SceneOutputs:
         """Write images, volumes and curves, and put them and the results on record."""
         record, fit = self.run.record, self.fit
         self.run.make("views", "volumes")
-        for number, view in enumerate((*self.seen.fitted, *self.seen.held_out)):
+        for number, view in enumerate((*self.references.fitted, *self.references.held_out)):
             record.images += self.write_view(view, number)
-        for sought in self.chosen.parameter:
+        for sought in self.settings.parameter:
             record.volumes += self.write_grid(sought)
             record.images += self.write_image(sought.key)
-        views = {"train": self.seen.fitted, "held_out": self.seen.held_out}
+        views = {"train": self.references.fitted, "held_out": self.references.held_out}
         record.images += draw_view_cameras(self.run.path, fit.problem.scene, views)
         self.run.write_curves()
         record.results = {
             **fit.latest_errors(),
             "loss": fit.history[-1]["loss"],
             "iterations": float(fit.next_iteration),
-            "views": float(len(self.seen.fitted)),
+            "views": float(len(self.references.fitted)),
             "fit_seconds": fit.seconds,
         }
 
@@ -74,8 +74,8 @@ class SceneOutputs:
         The render's own noise counts. At the edge of a lit region, the render may see light that no path of the reference has
         found, and its noise is then the larger part. It is estimated from ``BATCHES`` renders of at least one sample.
         """
-        render, spp = self.fit.problem.render, self.chosen.fit.spp_shown or self.chosen.fit.spp
-        seed, error = (self.chosen.seed, 0, number, FINAL), self.seen.standard_errors.get(view.name)
+        render, spp = self.fit.problem.render, self.settings.fit.spp_shown or self.settings.fit.spp
+        seed, error = (self.settings.seed, 0, number, FINAL), self.references.standard_errors.get(view.name)
         if error is None:
             return np.asarray(render(view.sensor, derive_seed(*seed), spp)), None
         share = math.ceil(spp / BATCHES)
@@ -94,7 +94,7 @@ class SceneOutputs:
         write_exr(self.run.path / f"{stem}.exr", planes)
         write_png(self.run.path / f"{stem}.png", image)
         write_png(self.run.path / f"{stem}_reference.png", reference)
-        about = {"view": view.name, "held_out": any(view is other for other in self.seen.held_out)}
+        about = {"view": view.name, "held_out": any(view is other for other in self.references.held_out)}
         return [Image(path=f"{stem}.exr", role=role, layer=layer_name(*part), **about) for role, part in parts.items()]
 
     def write_grid(self, sought: Sought) -> list[Volume]:
@@ -109,7 +109,7 @@ class SceneOutputs:
         is_along_axes = np.array_equal(place[:3, :3], np.diag(np.abs(np.diagonal(place)[:3])))
         quantity = next((word for word in ("sigma_t", "sigma_a", "sigma_s", "albedo") if word in sought.key), "value")
         grids = {"reconstruction": value}
-        if self.truth is not None and self.chosen.truth.key == sought.key:
+        if self.truth is not None and self.settings.truth.key == sought.key:
             grids["truth"] = self.truth
         found = []
         unit = find_unit(sought)

@@ -273,5 +273,5 @@ def run_photo_experiment(
         for table in tables:
             place = place.setdefault(table, {})
         place[last] = value
-    chosen = config.from_dict(raw, "settings")
-    run_experiment(RunContext(chosen, Path(), Path(output), progress=progress or NullProgress()))
+    experiment = config.from_dict(raw, "settings")
+    run_experiment(RunContext(experiment, Path(), Path(output), progress=progress or NullProgress()))

@@ -88,13 +88,13 @@ FIELDS, FIELDS_OF_ONE_STEP = 10, 3
 """Fields of 4-byte numbers, one per unknown, in an iterative and in a direct solver."""
 
 
-def check_grid(chosen: config.ScanExperiment, grid: VoxelGrid) -> None:
+def check_grid(settings: config.ScanExperiment, grid: VoxelGrid) -> None:
     """Refuse unknowns beyond the memory.
 
     Raises:
         MivolError: with their number.
     """
-    fields = FIELDS_OF_ONE_STEP if chosen.solve.solver in DIRECT else FIELDS
+    fields = FIELDS_OF_ONE_STEP if settings.solve.solver in DIRECT else FIELDS
     what = f"a reconstruction of {' x '.join(str(n) for n in grid.shape)} unknowns"
     check_memory(4 * fields * math.prod(grid.shape), what, "give grid.shape fewer voxels, or set solve.supersampling = 1")
 

@@ -36,25 +36,25 @@ class Start:
     value: np.ndarray
 
 
-def make_starts(chosen: SceneExperiment, base: Path, scene: mi.Scene) -> list[Start]:
+def make_starts(settings: SceneExperiment, base: Path, scene: mi.Scene) -> list[Start]:
     """Return all parameters of a fit with their first values; the scene is not changed.
 
     Raises:
         MivolError: as :func:`make_start`, refined grids beyond the memory, or an upsample event without a grid.
     """
-    starts = [make_start(sought, base, scene) for sought in chosen.parameter]
+    starts = [make_start(sought, base, scene) for sought in settings.parameter]
     grids = [start for start in starts if start.value.ndim == GRID]
-    if any(isinstance(event, Upsample) for event in chosen.event):
+    if any(isinstance(event, Upsample) for event in settings.event):
         check_for_grids(len(grids))
     for start in grids:
-        check_grid(start.parameter.name, final_shape(start.value.shape, chosen), "let upsample refine less, or start coarser")
+        check_grid(start.parameter.name, final_shape(start.value.shape, settings), "let upsample refine less, or start coarser")
     return starts
 
 
-def final_shape(shape: Sequence[int], chosen: SceneExperiment) -> tuple[int, ...]:
+def final_shape(shape: Sequence[int], settings: SceneExperiment) -> tuple[int, ...]:
     """Shape of a grid after all events of a fit."""
-    factor, last = 1, chosen.fit.iterations
-    for event in chosen.event:
+    factor, last = 1, settings.fit.iterations
+    for event in settings.event:
         if isinstance(event, Upsample):
             factor *= event.factor ** sum(0 <= iteration < last for iteration in set(event.at))
     return (*(n * factor for n in shape[:3]), *shape[3:])

@@ -149,73 +149,73 @@ class Verdict:
         return "\n".join([*said, *(str(path) for path in self.files)])
 
 
-def validate_scene(loaded: LoadedScene, folder: Path, chosen: Validation) -> Verdict:
+def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> Verdict:
     """Compare mivol with Mitsuba's path tracer; write ``validation.json``, ``validation.png`` and the reference.
 
     Args:
         loaded: the scene.
         folder: folder of the results; created if missing.
-        chosen: settings.
+        settings: settings.
 
     Raises:
         MivolError: a scene that mivol or Mitsuba cannot render, or an unknown parameter.
     """
-    scene, camera = loaded.scene, find_sensor(loaded.scene, chosen.sensor)
-    for key in chosen.parameters:
+    scene, camera = loaded.scene, find_sensor(loaded.scene, settings.sensor)
+    for key in settings.parameters:
         find(key, mi.traverse(scene))
     folder.mkdir(parents=True, exist_ok=True)
-    depth = read_settings(scene).max_depth if chosen.max_depth is None else chosen.max_depth
+    depth = read_settings(scene).max_depth if settings.max_depth is None else settings.max_depth
     ours = mi.load_dict({"type": "mivol", "max_depth": depth})
-    image = render_batches(scene, camera, ours, chosen)
+    image = render_batches(scene, camera, ours, settings)
     doubts = tuple(find_doubts(scene, [camera]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # doubts are part of the verdict
         reference = render_reference(
-            loaded, folder, max_depth=depth, max_spp=chosen.reference_spp, seed=chosen.seed + 1, sensor=camera,
+            loaded, folder, max_depth=depth, max_spp=settings.reference_spp, seed=settings.seed + 1, sensor=camera,
             accept_doubts=True, progress=False,
         )  # fmt: skip
     estimate = Estimate.of(image)
     # Our spread of a pixel that saw nothing is 0, and so may be volpath's: one missed event a pixel is allowed for.
     compared = compare(estimate, reference, alpha=ALPHA, samples_seen=float(reference.mean.max()), correlated=27)
-    slopes = check_gradients(scene, camera, ours, chosen)
+    slopes = check_gradients(scene, camera, ours, settings)
     floor = 1e-2 * float(np.mean(reference.mean**2)) or 1.0
     rel_mse = float(np.mean((estimate.mean - reference.mean) ** 2 / (reference.mean**2 + floor)))
     verdict = Verdict(compared, rel_mse, slopes, doubts)
-    return write_verdict(verdict, estimate, reference, folder, chosen)
+    return write_verdict(verdict, estimate, reference, folder, settings)
 
 
-def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, chosen: Validation) -> Moments:
+def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, settings: Validation) -> Moments:
     """Render the colour channels in independent batches."""
-    spp = math.ceil(chosen.spp / BATCHES)
+    spp = math.ceil(settings.spp / BATCHES)
     with dr.suspend_grad():
-        seeds = (derive_seed(chosen.seed, IMAGE, batch) for batch in range(BATCHES))
+        seeds = (derive_seed(settings.seed, IMAGE, batch) for batch in range(BATCHES))
         return Moments.of_each(integrator.render(scene, camera, seed=seed, spp=spp) for seed in seeds)
 
 
 # -- Gradients ----------------------------------------------------------------------------------------------------
 
 
-def check_gradients(scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, chosen: Validation) -> tuple[Slope, ...]:
+def check_gradients(scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, settings: Validation) -> tuple[Slope, ...]:
     """Check the derivative of the mean radiance along one random direction of each parameter."""
-    level = Significance(ALPHA, max(len(chosen.parameters), 1))
-    return tuple(check_gradient(scene, camera, ours, key, chosen, level) for key in chosen.parameters)
+    level = Significance(ALPHA, max(len(settings.parameters), 1))
+    return tuple(check_gradient(scene, camera, ours, key, settings, level) for key in settings.parameters)
 
 
 def check_gradient(
-    scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, key: str, chosen: Validation, level: Significance
+    scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, key: str, settings: Validation, level: Significance
 ) -> Slope:
     """Check one direction of one parameter: each value times a random number from 0 to 2, so that no step passes 0 and the
     effects
     of the values do not cancel."""
     params = mi.traverse(scene)
     start = np.array(as_tensor(params[key]), dtype=np.float64)
-    direction = np.random.default_rng([chosen.seed, len(key)]).uniform(0.0, 2.0, start.shape) * start
+    direction = np.random.default_rng([settings.seed, len(key)]).uniform(0.0, 2.0, start.shape) * start
     if not direction.any():
         raise MivolError(f"{key} is 0 everywhere, where a central difference would step below 0: put values into the scene.")
-    mean = MeanRadiance(scene, camera, ours, key, math.ceil(chosen.spp / BATCHES))
+    mean = MeanRadiance(scene, camera, ours, key, math.ceil(settings.spp / BATCHES))
     slopes, near, far = Moments.empty(), Moments.empty(), Moments.empty()
     for batch in range(BATCHES):
-        seeds = [derive_seed(chosen.seed, GRADIENT, batch, which) for which in range(4)]
+        seeds = [derive_seed(settings.seed, GRADIENT, batch, which) for which in range(4)]
         slopes = slopes.add(mean.slope(direction, seeds[0], seeds[1]))
         near = near.add(mean.difference(start, STEP * direction, seeds[2]) / STEP)
         far = far.add(mean.difference(start, 2 * STEP * direction, seeds[3]) / (2 * STEP))
@@ -270,7 +270,7 @@ class MeanRadiance:
 # -- Files --------------------------------------------------------------------------------------------------------
 
 
-def write_verdict(verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, chosen: Validation) -> Verdict:
+def write_verdict(verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, settings: Validation) -> Verdict:
     """Write ``validation.json`` and ``validation.png``; return the verdict with their paths."""
     compared = verdict.comparison
     picture = figures.save_figure(figures.plot_image_row(reference.mean, image.mean, compared.z), folder / "validation.png")
@@ -283,7 +283,7 @@ def write_verdict(verdict: Verdict, image: Estimate, reference: ReferenceResult,
         "psnr": compared.psnr,
         "gradients": [asdict(slope) | {"agrees": slope.agrees} for slope in verdict.slopes],
         "doubts": [asdict(doubt) for doubt in verdict.doubts],
-        "settings": asdict(chosen),
+        "settings": asdict(settings),
         "reference": reference.path.name,
     }
     path = folder / "validation.json"
