@@ -1,7 +1,7 @@
-"""Mitsuba plugins: importing or reloading this package registers each of them for the active variant.
+"""Mitsuba plugins: importing or reloading this package registers each plugin for the active variant.
 
-The body runs at import and at each reload, as Mitsuba does with its own integrators. Nothing imports from
-here: plugins are reached by name, so a stale class of an earlier variant can never be used by accident.
+The body runs at import and at each reload, as in Mitsuba's own integrators. No module imports from here: plugins are reached
+by name, so a stale class of an earlier variant can never be used by accident.
 """
 
 from __future__ import annotations

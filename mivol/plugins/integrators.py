@@ -14,21 +14,21 @@ from mivol.transport.path.estimators import Settings
 class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
     """``<integrator type="mivol">``: volumes rendered by exact optical depths and free flights.
 
-    Takes the place of ``prbvolpath`` over ``mivol_medium``, ``homogeneous`` and ``heterogeneous`` media.
+    Replaces ``prbvolpath`` for ``mivol_medium``, ``homogeneous`` and ``heterogeneous`` media.
 
     Parameters:
         max_depth: counted as in ``volpath``. 1: emitters seen through media; 2: surfaces lit directly, and media that scatter
             once; n: n - 1 scatterings; -1: no limit. Default 6.
-        rr_depth: depth from which roulette may end a path. Default 5.
+        rr_depth: depth from which Russian roulette may end a path. Default 5.
         hide_emitters: do not show emitters to the camera. Default false.
         deterministic: scattered light by quadrature along the ray, without noise; at depth 2, for point, spot and directional
-            lights. Derivatives are drawn as ever. Default false.
-        shadows: exact; estimated: without bias, from a few look-ups, in pictures (gradients walk every cell); grid: with
-            ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated where grids are fine. Default
+            lights. Derivatives are still sampled. Default false.
+        shadows: exact; estimated: unbiased, from a few look-ups, in images (gradients walk every cell); grid: with
+            ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated for fine grids. Default
             auto.
-        media_light: how light that media emit finds what scatters it. drawn: points of them are drawn, too; met: by chance;
-            auto: whichever reaches an error sooner in a small preview. Default auto.
-        aovs: comma list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the order named.
+        media_light: how light emitted by media finds scattering points. drawn: points in media are sampled, besides chance
+            hits; met: by chance hits only; auto: the method with the smaller error in a small preview. Default auto.
+        aovs: comma-separated list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the given order.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -85,7 +85,7 @@ EXPECTED = {int: "a whole number", bool: "true or false", str: "a text"}
 
 
 def _read(props: mi.Properties, name: str, default: int | bool | str) -> int | bool | str:
-    """A parameter of the type that its default has. (Mitsuba's own ADIntegrator takes a max_depth of 2.5 for a number.)
+    """Read a parameter of the same type as its default. (Mitsuba's own ADIntegrator accepts a max_depth of 2.5.)
 
     Raises:
         MivolError: a value of another type.

@@ -16,11 +16,10 @@ class MivolMedium(mi.Medium):
         sigma_t, albedo: extinction [1/length] and single-scattering albedo (default 0), or
         sigma_a, sigma_s: absorption and scattering [1/length]; each a float, rgb (above 1 allowed) or a volume.
         scale: factor on the extinction, differentiable. Default 1.
-        emission: radiance Le that the medium shows where nothing is seen through it (its source function is
-            (1 - albedo) Le), a float, rgb or a volume; in an extinction that is a grid, of voxels no smaller than its own. A
-            ``mivol_sh`` brings its own extinction: give nothing else with it.
-            Default none.
-        emission_density: radiance per length that does not go with the extinction, likewise. Default none.
+        emission: radiance Le of an opaque part of the medium (the source function is (1 - albedo) Le), a float, rgb or a
+            volume; in an extinction grid, with voxels no smaller than the grid's. A ``mivol_sh`` brings its own extinction:
+            give nothing else with it. Default none.
+        emission_density: emitted radiance per length, independent of the extinction, in the same forms. Default none.
         a phase function: default isotropic.
     """
 

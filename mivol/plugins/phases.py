@@ -1,9 +1,9 @@
-"""The phase functions <phase type="mivol_hg">, "mivol_rayleigh", "mivol_draine", "mivol_tabulated" and "mivol_mixture".
+"""The phase function plugins "mivol_hg", "mivol_rayleigh", "mivol_draine", "mivol_tabulated" and "mivol_mixture".
 
-Conventions. A phase function of the angle alone is one component; a mixture has those of its lobes. A stock ``blendphase``
-does not see this count: it reads a C++ member that Mitsuba 3.9 gives Python no access to, and numbers no phase function that is
-written in Python. Its renders are right, since no integrator of Mitsuba's asks for a component. Where components are asked
-for, nest the phase functions in a ``mivol_mixture``.
+Conventions. A phase function of the angle alone has a single component; a mixture has the components of its lobes. A stock
+``blendphase`` reads this count from a C++ member that Mitsuba 3.9 hides from Python, so ``blendphase`` numbers no phase
+function written in Python. Its renders are still right, because no integrator of Mitsuba asks for a component. To use
+components, nest the phase functions in a ``mivol_mixture``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scatter
 from mivol.phase.table import Lookup, Table, check_values
 
 VOLUME_KEYS = ("data", "value.value")
-"""Keys under which Mitsuba's grids and constants, and ours, hold their values."""
+"""Keys of the values of grids and constants, of Mitsuba and of mivol."""
 
 ALL_COMPONENTS = 2**32 - 1
 
@@ -151,7 +151,7 @@ class Tabulated(AnglePhase):
         values: numbers at the cosines, text with commas or a tensor; differentiable. Or
         moments: Legendre moments chi_0 = 1, chi_1, ...; or
         filename: a CSV table of two columns, ``cos`` (or ``angle`` in degrees) and value.
-        cosines: where the values stand, rising from -1 (straight back) to 1 (straight on). Default: equally spaced.
+        cosines: cosines of the values, rising from -1 (backwards) to 1 (forwards). Default: equally spaced.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -182,11 +182,12 @@ class Tabulated(AnglePhase):
 
 
 class Mixture(mi.PhaseFunction):
-    """``<phase type="mivol_mixture">``: a weighted sum of any number of phase functions.
+    """``<phase type="mivol_mixture">``: a weighted sum of phase functions.
 
     Parameters:
         nested phase functions, each with a name, for instance ``haze``.
-        weight_<name>: of each, at least 0, a float or a volume; divided by their sum. Default, for all or none: equal ones.
+        weight_<name>: weight of each, at least 0, a float or a volume; divided by the sum of weights. Give all weights or
+            none; default: equal weights.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -272,14 +273,14 @@ class Mixture(mi.PhaseFunction):
     def _component(
         self, ctx: mi.PhaseFunctionContext, shares: list[mi.Float]
     ) -> tuple[mi.Float, mi.PhaseFunction, mi.PhaseFunctionContext]:
-        """The lobe that holds one component, its share, and the context that asks it for that component."""
+        """The lobe of a component, its share, and the context that selects the component."""
         name, index = self._find_component(ctx.component)
         inner = mi.PhaseFunctionContext(ctx.sampler, ctx.mode)
         inner.type_mask, inner.component = ctx.type_mask, index
         return shares[list(self.lobes).index(name)], self.lobes[name], inner
 
     def _find_component(self, index: int) -> tuple[str, int]:
-        """The name of the lobe that holds one component, and the number that the lobe itself gives it."""
+        """The name of the lobe of a component, and the component's number inside the lobe."""
         left = index
         for name, lobe in self.lobes.items():
             if left < _count(lobe):
@@ -301,7 +302,7 @@ class Mixture(mi.PhaseFunction):
 
 
 def _count(lobe: mi.PhaseFunction) -> int:
-    """Components of a phase function; stock ``rayleigh`` counts none of its own, and is one."""
+    """Number of components of a phase function; stock ``rayleigh`` reports 0 and counts as 1."""
     return max(lobe.component_count(), 1)
 
 

@@ -1,5 +1,6 @@
-"""Volumes: "mivol_voxels", a dense grid; "mivol_transfer", one seen through a table; "mivol_sh", a radiance field;
-"mivol_gaussians", Gaussians that rays are traced through."""
+"""Volumes: "mivol_voxels", a dense grid; "mivol_transfer", a grid seen through a table; "mivol_sh", a radiance field;
+"mivol_gaussians", Gaussians for ray tracing.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ class VoxelVolume(mi.Volume):
         filename, grid or data: a file (.vol, .npy, .npz, .nrrd, .mhd, .nii, .vti, ...), a ``mi.VolumeGrid`` or a tensor.
         to_world: places the unit cube.
         use_grid_bbox: place the grid by its file's own box first. Default false.
-        signed: values may be given that are negative, as a ``g``. Default false.
+        signed: permit negative values, as for a ``g``. Default false.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -74,18 +75,18 @@ class SphericalVolume(mi.Volume):
     """``<volume type="mivol_sh">``: density, and colour that depends on the direction, as a medium's ``emission``.
 
     Parameters:
-        filename: a field that ``mivol`` or svox2 wrote (.npz), or
+        filename: a field written by ``mivol`` or svox2 (.npz), or
         density, sh: tensors (Z, Y, X, 1) and (Z, Y, X, basis, 3), 1 to 25 harmonics in the order of ``dr.sh_eval``.
-        to_world: places the unit cube; a field of a file stands where the file says, and is moved from there. Densities are per
-            length of the world: a field made n times as large is n times as opaque, unless they are divided by n.
+        to_world: places the unit cube; moves a field of a file from the place given in the file. Densities are per world
+            length: a field scaled by n is n times as opaque, unless its densities are divided by n.
         activation: none, relu, softplus or exp, of the interpolated density. Default relu, or the file's.
         offset: added to colours. Default 0.5, or the file's.
         clamp: show colours below 0 as 0. Default true, or the file's.
-        space: what the colours are: linear (radiance) or srgb (code values, as fits of photographs have them), which are shown
-            as the radiance that they stand for. Default linear, or the file's.
+        space: space of the colours: linear (radiance) or srgb (code values, as in fits of photographs), shown as the
+            corresponding radiance. Default linear, or the file's.
 
-    ``density`` and ``sh`` are its parameters; a sparse field has them as (nodes, 1) and (nodes, basis, 3). A nested field fills
-    the box of its outermost level; the medium's shape must be a cube.
+    ``density`` and ``sh`` are its parameters; a sparse field has them as (nodes, 1) and (nodes, basis, 3). A nested field
+    fills the box of its outermost level; the medium's shape must be a cube.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -101,7 +102,7 @@ class SphericalVolume(mi.Volume):
         self.seen = self.state()
 
     def state(self) -> tuple[int, ...]:
-        """Which arrays the parameters hold, and whether their derivatives are followed."""
+        """The arrays of the parameters, and whether gradients are enabled."""
         return tuple(k for t in (self.density, self.sh) for k in (t.array.index, t.array.index_ad))
 
     @property
@@ -113,7 +114,7 @@ class SphericalVolume(mi.Volume):
 
     @property
     def mivol_to_world(self) -> np.ndarray:
-        """Where all of it lies: the box of the outermost level."""
+        """Placement of the whole field: the box of the outermost level."""
         return self.mivol_field.level_to_world(self.mivol_field.levels - 1)
 
     def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
@@ -153,19 +154,19 @@ class TransferVolume(VoxelVolume):
     """``<volume type="mivol_transfer">``: a scalar grid seen through a table, as an extinction or as an emission.
 
     Parameters:
-        filename or data: the scalar grid, a file or a tensor (Z, Y, X, 1); any finite numbers.
+        filename or data: the scalar grid, a file or a tensor (Z, Y, X, 1); arbitrary finite numbers.
         table: entries at equal steps of the value, 1 or 3 numbers each: ``0, 0, 2, 10`` or ``0 0 0, 1 0.9 0.7``, or a tensor
             (n, C). Differentiable, as is the grid (``scalar``).
-        domain: values of the first and the last entry, ``-1000, 2000``. Default: those that the grid has.
-        refine: nodes that stand for a voxel in each direction. Default 1.
+        domain: values of the first and the last entry, ``-1000, 2000``. Default: smallest and largest value of the grid.
+        refine: nodes per voxel in each direction. Default 1.
         to_world: places the unit cube.
-        gradient_opacity: factors on the table's entries at equal steps of the gradient's magnitude, ``0, 1``: of an extinction,
-            it leaves boundaries and takes insides away. Default none.
+        gradient_opacity: factors on the table's entries at equal steps of the gradient's magnitude, ``0, 1``: in an
+            extinction, they keep boundaries and remove interiors. Default none.
         gradient_domain: magnitudes [value per length] of the first and the last factor. Default 0 and the largest of the grid.
-        shade: whether an emission is lit by its gradient, as a surface is. Default false.
-        eye: where it is looked at from, ``x, y, z`` in the world; a parameter, for cameras that move.
-        light: where the light stands. Default at the eye.
-        ambient, diffuse, specular, specular_power: of that light. Default 0.1, 0.7, 0.2 and 10, as in VTK.
+        shade: whether the gradient shades an emission like a surface. Default false.
+        eye: position of the viewer, ``x, y, z`` in the world; a parameter, for moving cameras.
+        light: position of the light. Default at the eye.
+        ambient, diffuse, specular, specular_power: terms of the light. Default 0.1, 0.7, 0.2 and 10, as in VTK.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -190,23 +191,25 @@ class TransferVolume(VoxelVolume):
 
 
 class GaussianVolume(mi.Volume):
-    """``<volume type="mivol_gaussians">``: Gaussians that rays are traced through: as a medium's ``emission`` they show their
-    colours, as its ``sigma_t`` they are lit.
+    """``<volume type="mivol_gaussians">``: Gaussians for ray tracing: as a medium's ``emission`` they show their colours, as
+    its
+    ``sigma_t`` they are lit.
 
     Parameters:
         filename: Gaussians (.ply, .spz, .splat, .ksplat), or
-        means, log_scales, quaternions, opacity_logits: tensors (N, 3), (N, 3), (N, 4) and (N,), as files have them: scales are
-            exp(log_scales), opacities logistic(opacity_logits), quaternions (w, x, y, z) of any length.
-        harmonics: tensor (N, K, 3) beside them, K = 1, 4, 9 or 16 harmonics of the colours. Default none.
-        to_world: places them in the world; opacities stay as they are. Default: where the file has them.
-        space: what the colours are: srgb (code values, as fits of photographs have them), which are shown as the radiance that
-            they stand for, or linear (radiance). Default srgb.
-        blur: standard deviation by which each is widened, in the lengths of the file. A fit looks as its splats do with that of
-            their low-pass filter: sqrt(0.3) times the distance, over the focal length of its photographs in pixels. Default 0.
+        means, log_scales, quaternions, opacity_logits: tensors (N, 3), (N, 3), (N, 4) and (N,), as in files: scales are
+            exp(log_scales), opacities logistic(opacity_logits), quaternions (w, x, y, z) of arbitrary length.
+        harmonics: tensor (N, K, 3) of colours, K = 1, 4, 9 or 16 harmonics. Default none.
+        to_world: places the Gaussians in the world; opacities do not change. Default: the file's place.
+        space: space of the colours: srgb (code values, as in fits of photographs), shown as the corresponding radiance, or
+            linear (radiance). Default srgb.
+        blur: standard deviation of a blur that widens each Gaussian, in the lengths of the file. To match the splats of a fit,
+            use the blur of the fit's low-pass filter: sqrt(0.3) times the distance, over the focal length of the photographs
+            in pixels. Default 0.
 
-    A ray through a Gaussian loses the share of light that a splat of its opacity would hide there, and what is shown is
-    composited in the order in which a ray passes their peaks. The tensors are its parameters. The shape that the medium fills
-    should hold them all, and cuts what it does not.
+    A ray through a Gaussian loses the light that a splat of the same opacity would hide. Colours are composited in the order
+    in which the ray passes the peaks. The tensors are its parameters. The medium's shape should hold all Gaussians; the shape
+    cuts off the parts outside.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -238,7 +241,7 @@ class GaussianVolume(mi.Volume):
 
 
 def _towards(it: mi.Interaction3f) -> mi.Vector3f:
-    """The direction to the eye; up where an interaction has none."""
+    """Direction to the eye; up for an interaction without a direction."""
     wi = getattr(it, "wi", mi.Vector3f(0, 0, 1))
     return dr.select(dr.squared_norm(wi) > 0, wi, mi.Vector3f(0, 0, 1))
 

@@ -1,9 +1,9 @@
-"""Where views are taken from: named camera rigs, each a list of sensors for one scene.
+"""Named camera rigs: each makes a list of sensors for a scene.
 
-Conventions. A rig is placed about a box (2, 3) [low, high] in world units; ``distance`` counts radii of the sphere that
-holds the box, so that one TOML serves scenes of every size. Angles are degrees; azimuth turns about ``up`` from the
-axis after it in x, y, z, x, y to the next (y up: from z to x), elevation rises from the horizon towards ``up``. A rig
-is a frozen struct; its tag is the name under which a TOML asks for it: ``rig = "ring"``.
+Conventions. A rig is placed about a box (2, 3) [low, high] in world units. ``distance`` counts radii of the sphere around the
+box, so the same TOML serves scenes of every size. Angles are in degrees. Azimuth turns about ``up`` from the next axis in the
+cycle x, y, z towards the axis after it (y up: from z to x); elevation rises from the horizon towards ``up``. A rig is a frozen
+struct whose tag is its name in a TOML file: ``rig = "ring"``.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True,
     """A way to place cameras."""
 
     def sensors(self, scene: mi.Scene) -> list[dict | mi.Sensor]:
-        """One sensor for each view: dicts for ``mitsuba.load_dict``, or sensors that the scene has already."""
+        """Make a sensor for each view: dicts for ``mitsuba.load_dict``, or existing sensors of the scene."""
         raise NotImplementedError
 
 
 class PlacedRig(Rig, frozen=True, kw_only=True):
-    """What all rigs of perspective cameras share.
+    """Settings shared by all rigs of perspective cameras.
 
-    ``fov`` 0 means: the sphere that holds the box just fits the shorter side of the image.
+    With ``fov`` 0 the sphere around the box just fits the shorter side of the image.
     """
 
     fov: Annotated[float, _setting("degree", "field of view of the shorter side; 0: fit the box", ge=0, lt=180)] = 0.0
@@ -58,15 +58,15 @@ class PlacedRig(Rig, frozen=True, kw_only=True):
             raise ValueError(f"near = {self.near} is not below far = {self.far}")
 
     def poses(self, center: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """(origin, target, up) of each camera about the sphere that holds the box."""
+        """(origin, target, up) of each camera about the sphere around the box."""
         raise NotImplementedError
 
     def sensors(self, scene: mi.Scene) -> list[dict | mi.Sensor]:
-        """Perspective cameras about the scene's media, or about all of it where it has none."""
+        """Make perspective cameras about the scene's media, or about the whole scene without media."""
         return self.sensors_about(find_media_box(scene))
 
     def sensors_about(self, box: np.ndarray) -> list[dict]:
-        """Perspective cameras about a box.
+        """Make perspective cameras about a box.
 
         Args:
             box: (2, 3) low and high corner [length].
@@ -98,10 +98,10 @@ class PlacedRig(Rig, frozen=True, kw_only=True):
 
 
 class Ring(PlacedRig, frozen=True, tag="ring"):
-    """Cameras on a circle about the ``up`` axis, all looking at the middle of the box.
+    """Cameras on a circle about the ``up`` axis, looking at the middle of the box.
 
-    A full circle (``arc`` 360) has ``count`` equal steps and does not repeat its first camera; a shorter arc has a
-    camera at both ends.
+    A full circle (``arc`` 360) has ``count`` equal steps and does not repeat the first camera. A shorter arc has a camera at
+    both ends.
     """
 
     count: Count = 8
@@ -112,7 +112,7 @@ class Ring(PlacedRig, frozen=True, tag="ring"):
     up: Literal["x", "y", "z"] = "y"
 
     def poses(self, center: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Equal steps of azimuth at one elevation."""
+        """Equal steps of azimuth at the same elevation."""
         steps = self.count if self.arc == 360 else max(self.count - 1, 1)
         for azimuth in self.start + self.arc * np.arange(self.count) / steps:
             direction = _direction(azimuth, np.sin(np.radians(self.elevation)), self.up)
@@ -122,8 +122,8 @@ class Ring(PlacedRig, frozen=True, tag="ring"):
 class Hemisphere(PlacedRig, frozen=True, tag="hemisphere"):
     """Cameras spread evenly over the part of a sphere above ``lowest``, on a golden-angle spiral.
 
-    Camera i of n has the height (i + 1/2)/n of the way from the lowest height to the top, so that each stands for the
-    same area, and the azimuth i times the golden angle, 180 (3 - sqrt(5)) degrees.
+    Camera i of n has the height (i + 1/2)/n of the way from the lowest height to the top, so all cameras stand for the same
+    area, and the azimuth i times the golden angle, 180 (3 - sqrt(5)) degrees.
     """
 
     count: Count = 16
@@ -142,9 +142,9 @@ class Hemisphere(PlacedRig, frozen=True, tag="hemisphere"):
 
 
 class LookAts(PlacedRig, frozen=True, tag="look_at"):
-    """Cameras at given places.
+    """Cameras at given positions.
 
-    ``targets`` and ``ups`` hold one entry for each origin, or a single one for all.
+    ``targets`` and ``ups`` hold an entry for each origin, or a single entry for all.
     """
 
     origins: Annotated[tuple[Vector, ...], _setting("length", "camera positions", min_length=1)]
@@ -159,22 +159,22 @@ class LookAts(PlacedRig, frozen=True, tag="look_at"):
                 raise ValueError(f"{found} {name} for {wanted} origins; give 1 or as many")
 
     def poses(self, center: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """The poses as given; the box only decides the field of view where none is given."""
+        """The poses as given; the box only sets a missing field of view."""
         n = len(self.origins)
         targets, ups = (v * n if len(v) == 1 else v for v in (self.targets, self.ups))
         yield from ((np.array(o), np.array(t), np.array(u)) for o, t, u in zip(self.origins, targets, ups, strict=True))
 
 
 class SceneSensors(Rig, frozen=True, tag="scene"):
-    """The scene's own sensors, all or those numbered."""
+    """The scene's own sensors: all sensors, or the sensors with given numbers."""
 
     indices: Annotated[tuple[int, ...], _setting("1", "numbers of the sensors; empty: all")] = ()
 
     def sensors(self, scene: mi.Scene) -> list[dict | mi.Sensor]:
-        """Sensors as the scene has them.
+        """Return existing sensors.
 
         Raises:
-            MivolError: the scene has no sensor, or none of that number.
+            MivolError: no sensor in the scene, or no sensor with a given number.
         """
         own = list(scene.sensors())
         if not own:
@@ -189,13 +189,13 @@ RIGS: dict[str, type[Rig]] = {r.__struct_config__.tag: r for r in (Ring, Hemisph
 
 
 def parse_rig(table: Mapping[str, Any]) -> Rig:
-    """A rig from a table such as ``[views]`` of a TOML file.
+    """Parse a rig from a table such as ``[views]`` of a TOML file.
 
     Args:
         table: ``rig`` (a key of ``RIGS``) and its settings.
 
     Raises:
-        MivolError: unknown rig or setting (the nearest is offered), or a value outside its domain.
+        MivolError: an unknown rig or setting (with the nearest name), or a value outside its domain.
     """
     name = table.get("rig", "ring")
     if name not in RIGS:
@@ -220,10 +220,10 @@ def _nearest(word: str, known: list[str] | tuple[str, ...]) -> str:
 def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Camera to world, (4, 4) float64, in Mitsuba's frame: x to the left in the image, y up, z into the scene.
 
-    Where ``up`` is along the view, the coordinate axis least along it takes its place.
+    If ``up`` is parallel to the view, the coordinate axis with the smallest component along the view replaces ``up``.
 
     Raises:
-        MivolError: origin and target are one point.
+        MivolError: origin and target coincide.
     """
     forward = np.asarray(target, dtype=np.float64) - origin
     length = np.linalg.norm(forward)
@@ -241,10 +241,10 @@ def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
 
 
 def find_media_box(scene: mi.Scene) -> np.ndarray:
-    """Box (2, 3) of all shapes that bound a medium, or of the whole scene where none does [length].
+    """Find the box (2, 3) around all shapes that bound a medium, or around the whole scene without media [length].
 
     Raises:
-        MivolError: the scene holds no shape.
+        MivolError: a scene without shapes.
     """
     shapes = [s for s in scene.shapes() if s.interior_medium() is not None or s.exterior_medium() is not None]
     boxes = [s.bbox() for s in shapes] or [scene.bbox()]
@@ -277,7 +277,7 @@ def _unit_vector(name: str) -> np.ndarray:
 
 
 def _direction(azimuth: float, height: float, up: str) -> np.ndarray:
-    """Unit vector at an azimuth [degree] and a height (sine of the elevation) above the plane across ``up``."""
+    """Unit vector at an azimuth [degree] and a height (sine of the elevation) above the plane perpendicular to ``up``."""
     u = "xyz".index(up)
     first, second = np.eye(3)[(u + 1) % 3], np.eye(3)[(u + 2) % 3]
     phi = np.radians(azimuth)

@@ -1,4 +1,4 @@
-"""Choices about a scene, one function each, with the reason that ``explain`` prints."""
+"""Choices about a scene: a function each, with the reason printed by ``explain``."""
 
 from __future__ import annotations
 
@@ -31,35 +31,37 @@ __all__ = [
 
 
 MAX_SKIPPED_SHARE = 0.45
-"""Share of occupied blocks below which skipping pays (it costs 8 reads a cell in place of 4; measured, as fast as
-without: smoke of 48 % 0.9 times, CT of 43 % 1.05 to 1.1 times, smoke of 256^3, 43 %, 1.3 to 1.4 times)."""
+"""Share of occupied blocks below which skipping empty blocks pays. Skipping reads 8 instead of 4 values per cell. Measured time
+without skipping over time with skipping: smoke with 48 % occupied 0.9, CT with 43 % 1.05 to 1.1, smoke of 256^3 with 43 % 1.3
+to 1.4."""
 
 MIN_ESTIMATED_CELLS = 300
-"""Occupied cells along the three axes together from which look-ups for a shadow cost less than its cells (measured on 2 cores,
-variance x time: smoke of 142 cells 0.4 times as fast, of 256^3 twice; CT of 445 cells 1.9 times; threads of 111 0.9)."""
+"""Number of occupied cells along the three axes above which random look-ups for a shadow cost less than walking all cells.
+Measured on 2 cores, efficiency (variance x time): smoke of 142 cells 0.4, smoke of 256^3 2, CT of 445 cells 1.9, threads of
+111 cells 0.9."""
 
 SCATTERING_POINTS = {(True, False): 4, (True, True): 8, (False, False): 2, (False, True): 2}
-"""Points of a camera ray that scatter, by whether its grid is filled and whether every emitter has one position or direction,
-so that a walk costs more and a shadow ray less (measured, variance x time over that of 1 point: smoke 1.5 to 2, CT 1.5 to 2.4;
-threads, whose noise is what a pixel sees of them: 1.0 to 1.2, 4 points 0.9 to 1.3; of 8 points over 4, point lights: smoke 1.1,
-CT 1.1 and 1.3)."""
+"""Scattering points per camera ray, by (grid is filled, all emitters have one position or direction). Walking a filled grid
+costs
+more, and a shadow ray to such an emitter less. Measured efficiency (variance x time) over 1 point: smoke 1.5 to 2, CT 1.5 to
+2.4; threads, whose noise comes from the pixel's own footprint, 1.0 to 1.2 with 2 points and 0.9 to 1.3 with 4. With 8 points
+over 4, point lights: smoke 1.1, CT 1.1 and 1.3."""
 
 MIN_SIDE_FLIGHT_COSINE = 0.5
-"""Mean cosine of a phase function from which side flights pay: below it the phase function's own directions find the light
-(measured, variance x time: HG 0.8 under a sun 2 to 4 times less)."""
+"""Mean cosine of a phase function above which side flights pay. Below, samples of the phase function find the light. Measured
+for
+Henyey-Greenstein with g = 0.8 under a sun: variance x time is 2 to 4 times smaller."""
 
 SUCCESSIVE_PATHS, MIN_SUCCESSIVE_SCATTERINGS = 16, 16
-"""Paths that a lane walks one after the other, and the number of scatterings from which they do (measured on 2 cores, processor
-time of one path a lane over that of 16: at depth 6, 16, 64 and unlimited smoke 1.0, 1.0, 1.1; a cloud of albedo 0.999 0.9, 1.2,
-1.5, 1.4; a white box of optical depth 64 0.8, 1.0, 1.35, 2.2)."""
+"""Paths per lane walked one after the other."""
 
 MIN_FILLED_SHARE = 0.25
-"""Share of occupied blocks from which a grid counts as filled."""
+"""Share of occupied blocks above which a grid counts as filled."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One decision: about what, which, and why."""
+    """A decision: its subject, the choice and the reason."""
 
     about: str
     choice: str
@@ -67,7 +69,7 @@ class Choice:
 
 
 def shares_cells(needs: Needs) -> bool:
-    """Whether one walk of cells passes all parts of the first medium: its grids share their cells."""
+    """Whether one walk visits the cells of all parts of the first medium."""
     parts = needs.views[0].parts
     return len(flight_parts(parts)) == len(parts)
 
@@ -75,13 +77,13 @@ def shares_cells(needs: Needs) -> bool:
 def is_scattering_visible(needs: Needs, settings: Settings) -> bool:
     """Whether media scatter light to the camera.
 
-    Media whose values a recording cannot read count as scattering, unless an earlier render has read them.
+    Media with unreadable values, in a recording, count as scattering unless an earlier render has read them.
     """
     return settings.scatterings >= 1 and any(m.is_scattering for m in needs.media)
 
 
 def choose_transport(needs: Needs, settings: Settings, segment: str) -> Choice:
-    """How light passes media: what is computed of it."""
+    """Choose how to integrate light through media."""
     if not needs.media:
         return Choice("media", "none", "no shape bounds a medium")
     if segment == "free_flight":
@@ -104,7 +106,7 @@ def choose_transport(needs: Needs, settings: Settings, segment: str) -> Choice:
 
 
 def _explain_free_flights(needs: Needs, settings: Settings) -> str:
-    """What a single scattering on straight segments would leave out."""
+    """List the effects that a single scattering on straight segments would leave out."""
     reasons = [f"{m.name} emits beside scattering" for m in needs.media if m.emits]
     reasons += [f"{m.name} is bounded" for m in needs.media if m.bounded]
     reasons += [f"{m.name} is made of Gaussians" for m in needs.media if m.gaussians]
@@ -115,7 +117,7 @@ def _explain_free_flights(needs: Needs, settings: Settings) -> str:
 
 
 def choose_emission(needs: Needs, segment: str) -> list[Choice]:
-    """How emitted light is summed."""
+    """Choose how to sum emitted light."""
     choices = []
     shown = [m.name for m in needs.media if m.emits and m.gaussians]
     if shown:
@@ -130,7 +132,7 @@ def choose_emission(needs: Needs, segment: str) -> list[Choice]:
 
 
 def choose_lighting(needs: Needs, settings: Settings, segment: str) -> list[Choice]:
-    """How scattered light is found."""
+    """Choose how to find scattered light."""
     if not is_scattering_visible(needs, settings):
         return []
     drawn = [kind for kind in needs.emitter_kinds if kind != "uniform"]
@@ -166,7 +168,7 @@ def choose_lighting(needs: Needs, settings: Settings, segment: str) -> list[Choi
 
 
 def choose_tracing(needs: Needs) -> Choice:
-    """Whether Mitsuba's acceleration structure is traced."""
+    """Choose whether rays are traced through Mitsuba's acceleration structure."""
     traced = [m.name for m, b in zip(needs.media, needs.boundaries, strict=True) if b.box is None]
     if needs.surfaces:
         return Choice("acceleration structure", "traced", f"surfaces may stop a ray: {', '.join(sorted(set(needs.surfaces)))}")
@@ -176,7 +178,7 @@ def choose_tracing(needs: Needs) -> Choice:
 
 
 def choose_channels(needs: Needs) -> Choice:
-    """How many channels an extinction is integrated in."""
+    """Choose the number of channels for integrating the extinction."""
     rgb = [m.name for m in needs.media if m.extinction == "rgb"]
     if rgb:
         return Choice("channels", "3", f"rgb extinction in {', '.join(rgb)}")
@@ -184,13 +186,13 @@ def choose_channels(needs: Needs) -> Choice:
 
 
 def choose_skipping(medium: MediumFacts, skip: bool) -> Choice:
-    """Whether a walk of a medium skips empty blocks."""
+    """Choose whether a walk skips empty blocks of a medium."""
     share = f"{medium.occupied:.0%} of its blocks hold anything"
     return Choice(f"empty space in {medium.name}", "skipped" if skip else "walked", share)
 
 
 def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
-    """How flights through a medium are drawn; None where there are none."""
+    """Choose how to sample flights through a medium; None without flights."""
     if segment != "free_flight":
         return None
     about = f"flights in {medium.name}"
@@ -208,7 +210,7 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
 
 
 def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Choice | None:
-    """Whether shadow rays walk every cell of a medium or look here and there; None where the question does not arise."""
+    """Choose whether shadow rays walk all cells of a medium or sample a few; None without shadows in a grid."""
     if not medium.resolutions or not is_scattering_visible(needs, settings) or settings.deterministic:
         return None
     about, cells = f"shadows of {medium.name}", medium.occupied * max(sum(r) for r in medium.resolutions)
@@ -225,7 +227,7 @@ def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Cho
 
 
 def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple[float | None, list[Choice]]:
-    """The mean cosine of the lobe that side flights are drawn from; None for no side flights."""
+    """Choose the mean cosine of the lobe for side flights; None for no side flights."""
     if segment != "free_flight" or settings.scatterings < 2 or not needs.are_emitters_far or needs.is_sealed:
         return None, []
     cosine = max((m.mean_cosine for m in needs.media if m.mean_cosine is not None), default=0.0)
@@ -236,7 +238,7 @@ def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple
 
 
 def choose_successive_paths(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
-    """How many paths a lane walks one after the other, in pictures, where there are enough of them."""
+    """Choose the number of paths per lane, walked one after the other, for images with enough paths."""
     if segment != "free_flight" or settings.scatterings < MIN_SUCCESSIVE_SCATTERINGS:
         return 1, []
     about = "lanes"
@@ -249,7 +251,7 @@ def choose_successive_paths(needs: Needs, settings: Settings, segment: str) -> t
 
 
 def choose_branches(needs: Needs, settings: Settings, segment: str) -> tuple[bool, list[Choice]]:
-    """Whether paths branch where they first collide, for derivatives."""
+    """Choose whether paths branch at their first collision, for derivatives."""
     if segment != "free_flight" or settings.scatterings < 1 or not needs.are_samples_independent:
         return False, []
     why = "most noise of derivatives is that of paths that collide, and few camera rays may do so"
@@ -257,7 +259,7 @@ def choose_branches(needs: Needs, settings: Settings, segment: str) -> tuple[boo
 
 
 def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Choice]]:
-    """Whether light that media emit is drawn where paths scatter."""
+    """Choose whether scattering points sample the light emitted by media."""
     about = "light of media"
     if settings.scatterings < 1 or not any(m.emits for m in needs.media):
         return False, []
@@ -274,7 +276,7 @@ def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Cho
 
 
 def _explain_missing_light(needs: Needs) -> str:
-    """Why light of media cannot be drawn."""
+    """The reason why the light of media cannot be sampled."""
     if any(m.unread for m in needs.media):
         return "where media emit cannot be read while dr.freeze records"
     if any(m.gaussians for m in needs.media):
@@ -283,7 +285,7 @@ def _explain_missing_light(needs: Needs) -> str:
 
 
 def choose_scattering_points(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
-    """How many points of a camera ray scatter."""
+    """Choose the number of scattering points per camera ray."""
     if segment != "single_scattering":
         return 1, []
     about = "points that scatter"

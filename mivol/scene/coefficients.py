@@ -2,8 +2,8 @@ r"""The coefficients of a medium: extinction and albedo, or absorption and scatt
 
 .. math:: \sigma_t = \sigma_a + \sigma_s, \qquad \alpha = \sigma_s / \sigma_t, \qquad \sigma_n = \bar\sigma - \sigma_t
 
-Conventions. Coefficients are per world length. Numbers and rgb triples become constant volumes, so that every coefficient
-answers the same questions; a constant fills whatever bounds the medium.
+Conventions. Coefficients are per world length. Numbers and rgb triples become constant volumes, so all coefficients have the
+same interface. A constant fills the whole boundary of the medium.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ OPAQUE_EXTINCTION = 1e10
 
 
 class Coefficients:
-    """The volumes behind the coefficients of one medium.
+    """The volumes behind the coefficients of a medium.
 
     Args:
         volumes: ``sigma_t`` and ``albedo``, or ``sigma_a`` and ``sigma_s``.
-        lights: ``emission`` and ``emission_density``, as far as they are given.
+        lights: ``emission`` and ``emission_density``, if given.
     """
 
     def __init__(self, volumes: dict[str, mi.Volume], lights: dict[str, mi.Volume]) -> None:
@@ -37,10 +37,10 @@ class Coefficients:
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Coefficients:
-        """Read a medium's coefficients from plugin parameters.
+        """Read the coefficients of a medium from plugin parameters.
 
         Raises:
-            MivolError: both pairs, half of a pair, a negative number, or a radiance field for another thing than the emission.
+            MivolError: both pairs, half of a pair, a negative number, or a radiance field in another place than the emission.
         """
         given = [n for pair in COEFFICIENT_PAIRS for n in pair if n in props]
         if is_radiance_field(props.get("emission", 0.0)) or _is_made_of_gaussians(props, "emission"):
@@ -78,7 +78,7 @@ class Coefficients:
 
     @classmethod
     def _of_field(cls, props: mi.Properties, given: list[str]) -> Coefficients:
-        """A medium that is a radiance field, which has an extinction of its own."""
+        """Make a medium from a radiance field, which brings its own extinction."""
         extra, field = [*given, *(n for n in ("scale", "emission_density") if n in props)], props["emission"]
         kind = "mivol_sh" if is_radiance_field(field) else "mivol_gaussians"
         if extra:
@@ -97,14 +97,14 @@ class Coefficients:
 
     @property
     def extinction(self) -> list[mi.Volume]:
-        """The volumes whose sum is the extinction."""
+        """The volumes that sum to the extinction."""
         return [v for n, v in self.volumes.items() if n != "albedo"]
 
     def check_constants(self) -> None:
-        """Refuse constants that an update may have brought. Not while ``dr.freeze`` records, which cannot read values.
+        """Refuse invalid constants after an update. Not while ``dr.freeze`` records: values cannot be read then.
 
         Raises:
-            MivolError: NaN, infinite, negative, or an albedo above 1.
+            MivolError: NaN, infinite or negative constants, or an albedo above 1.
         """
         for name, volume in {**self.volumes, **self.lights}.items():
             if _is_constant(volume):
@@ -112,7 +112,7 @@ class Coefficients:
 
     @property
     def is_homogeneous(self) -> bool:
-        """Whether every coefficient is a constant."""
+        """Whether all coefficients are constants."""
         return all(_is_constant(v) for v in self.volumes.values())
 
     @property
@@ -123,8 +123,8 @@ class Coefficients:
     def bound(self) -> mi.Spectrum:
         """Largest extinction over space, without the medium's scale.
 
-        Of each channel where it is constant, since Mitsuba samples a homogeneous medium by its majorant alone; of all
-        channels together elsewhere, as stock ``heterogeneous`` has it. A medium that emits stops every ray, see :meth:`eval`.
+        For constants the bound is per channel, because Mitsuba samples a homogeneous medium by its majorant alone. For grids
+        all channels share a bound, as in stock ``heterogeneous``. A medium that emits stops every ray, see :meth:`eval`.
         """
         if self.lights:
             return mi.Spectrum(OPAQUE_EXTINCTION)
@@ -133,7 +133,7 @@ class Coefficients:
         return mi.Spectrum(sum(_maximum(v) for v in self.extinction))
 
     def reach(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Whether and where a ray can meet extinction: in the boxes of the grids, or anywhere where a part is constant."""
+        """Whether and where a ray can meet extinction: in the boxes of the grids, or anywhere with a constant part."""
         if self.lights or any(_is_constant(v) for v in self.extinction):
             return mi.Bool(True), mi.Float(0), mi.Float(dr.inf)
         boxes = [volume.bbox() for volume in self.extinction]
@@ -147,10 +147,10 @@ class Coefficients:
     def eval(
         self, mei: mi.MediumInteraction3f, scale: mi.Float, majorant: mi.Spectrum, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
-        """Scattering, null and total coefficients at a point, as Mitsuba's media return them.
+        """Scattering, null and total coefficients at a point, as returned by Mitsuba's media.
 
-        NaN for a medium that emits: no integrator of Mitsuba's asks for its light, and an image without it would look right.
-        (Not an error: Mitsuba also compiles the media of other scenes that are alive.)
+        NaN for a medium that emits: Mitsuba's integrators ignore the light, and an image without it would look right. An error
+        is not raised, because Mitsuba also compiles media of other living scenes.
         """
         if self.lights:
             self._warn()
@@ -163,7 +163,7 @@ class Coefficients:
         return scale * sigma_s, sigma_n, scale * sigma_t
 
     def _warn(self) -> None:
-        """Say once what an integrator of Mitsuba's would leave out."""
+        """Warn once of the light that a Mitsuba integrator would leave out."""
         if not self.has_warned:
             mi.Log(
                 mi.LogLevel.Warn,
@@ -187,13 +187,13 @@ def _is_made_of_gaussians(props: mi.Properties, name: str) -> bool:
 
 
 def _is_shaded(props: mi.Properties, name: str) -> bool:
-    """Whether a volume is lit: light is no coefficient."""
+    """Whether a volume is lit; light is not a coefficient."""
     transfer = getattr(props.get(name, 0.0), "mivol_transfer", None)
     return transfer is not None and transfer.effects.shading is not None
 
 
 def _to_volume(props: mi.Properties, name: str) -> mi.Volume:
-    """One coefficient as a volume: a number, an rgb triple (of any size) or a volume."""
+    """Convert a coefficient to a volume: a number, an rgb triple (of any size) or a volume."""
     value = props.get(name, 0.0)
     if isinstance(value, mi.Volume):
         return value
@@ -212,15 +212,15 @@ def _to_volume(props: mi.Properties, name: str) -> mi.Volume:
 
 
 def check_coefficient(value: float, name: str, owner: str = "") -> None:
-    """Refuse a number that no coefficient can be.
+    """Refuse a number that is not a valid coefficient.
 
     Args:
         value: the number.
         name: ``sigma_t``, ``albedo``, ``scale`` and so on.
-        owner: whose it is, where an optimiser may have moved it: `` of the medium in smoke``.
+        owner: the owner of the coefficient, if an optimizer may have moved the number: `` of the medium in smoke``.
 
     Raises:
-        MivolError: NaN, infinite, negative, or an albedo above 1.
+        MivolError: a NaN, infinite or negative number, or an albedo above 1.
     """
     way_out = ": clip it after each step" if owner else ""
     if not np.isfinite(value) or value < 0:
@@ -230,7 +230,7 @@ def check_coefficient(value: float, name: str, owner: str = "") -> None:
 
 
 def check_constant(value: float | mi.Float | mi.Color3f, name: str, owner: str) -> None:
-    """Refuse a constant, grey or rgb, that no coefficient can be. Reads it: not while ``dr.freeze`` records.
+    """Refuse an invalid constant, grey or rgb. Reads the constant: not while ``dr.freeze`` records.
 
     Raises:
         MivolError: as :func:`check_coefficient`.

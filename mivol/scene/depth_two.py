@@ -1,23 +1,22 @@
-r"""How much of the light that a medium scatters is missing where it may scatter once only: a measured table.
+r"""How much of the light scattered by a medium does ``max_depth`` 2 leave out? A measured table.
 
 .. math:: e = 1 - S_2 / S = 1 - s_1 \Big/ \sum_{n \ge 1} \omega^{n-1} s_n
 
-with the radiance :math:`\omega^n s_n` that reaches the eye after n scatterings in a medium of albedo :math:`\omega`:
-max_depth 2 knows :math:`s_1` only. So e rises with the albedo, always.
+with the radiance :math:`\omega^n s_n` that reaches the eye after n scatterings in a medium of albedo :math:`\omega`.
+``max_depth`` 2 covers only :math:`s_1`, so e always rises with the albedo.
 
-Conventions. S is the mean over all lines through the medium (uniform in place and direction) of the scattered radiance; light
-that reaches the eye unscattered is in neither S. The optical depth that belongs to it is that of the same lines, each
-counted by what it scatters,
+Conventions. S is the scattered radiance, averaged over all lines through the medium (uniform in place and direction);
+unscattered light does not count. The optical depth belonging to S averages the same lines, each weighted by its scattered
+light,
 
-.. math:: \tau = E[\tau_{line}^2] / E[\tau_{line}],
+.. math:: \tau = E[\tau_{line}^2] / E[\tau_{line}].
 
-for in thin matter twice-scattered light goes with the depth from the first collision to the border, half of that in the mean:
-:math:`e \to \omega\tau/2`, whatever the shape, the clumps and (in constant light) the phase function. A cube of edge a has
-:math:`\tau = 0.8966\,\sigma_t a`. The largest extinction times the diagonal would not do: it is twice that for a
-cube, and 7 times tau for the smoke of Mitsuba's tutorial.
+In thin matter twice-scattered light grows with the depth from the first collision to the border, on average half of the line:
+:math:`e \to \omega\tau/2`, for every shape, all clumps and (in constant light) every phase function. A cube of edge a has
+:math:`\tau = 0.8966\,\sigma_t a`. The largest extinction times the diagonal would be a poor measure: 2 times tau for a cube,
+and 7 times tau for the smoke of Mitsuba's tutorial.
 
-Source: the tables are printed by ``mivol bench depth`` (Mitsuba's ``volpath``, a cube); standard errors are
-below 0.008.
+Source: ``scripts/bench_depth.py`` prints the tables (Mitsuba's ``volpath``, a cube); standard errors are below 0.008.
 """
 
 from __future__ import annotations
@@ -87,24 +86,23 @@ from everywhere or collimated, at any angle to the eye."""
 
 
 def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: str = "isotropic") -> float:
-    """Share of the scattered light that max_depth 2 leaves out.
+    """Share of the scattered light left out by ``max_depth`` 2.
 
-    Bilinear in the albedo and log tau; proportional to tau below the table and to the albedo below its first row; held
-    above its last column, where it hardly rises.
+    Bilinear in the albedo and log tau; proportional to tau below the table, and to the albedo below its first row; constant
+    above its last column, where e hardly rises.
 
     Args:
-        albedo: single-scattering albedo, in [0, 1]; of a volume, its mean weighted by extinction.
-        tau: optical depth as :func:`scattering_depth` measures it, at least 0.
+        albedo: single-scattering albedo, in [0, 1]; for a volume the mean weighted by extinction.
+        tau: optical depth of :func:`scattering_depth`, at least 0.
         light: "constant" (sky, environment) or "collimated" (sun, point and spot lights).
         phase: "isotropic" or "forward".
 
     Returns:
-        e, in [0, 1): that of a homogeneous cube. The tutorial's smoke has 0 to 0.15 less (0.51 for 0.61 with albedo 0.9 and
-        tau = 10), a cube below a point light 0.016 less at most. It is a mean over all views; one of them may differ by
-        more.
+        e, in [0, 1), of a homogeneous cube, averaged over all views; single views differ more. The tutorial's smoke is lower
+            by 0 to 0.15 (0.51 for 0.61 at albedo 0.9 and tau = 10), a cube below a point light by at most 0.016.
 
     Raises:
-        MivolError: an albedo or an optical depth outside its domain, or a name that is not in the table.
+        MivolError: an albedo or an optical depth outside its domain, or a name missing from the table.
     """
     if (light, phase) not in TABLES:
         known = " and ".join(sorted({f'"{name}"' for key in TABLES for name in key}))
@@ -119,15 +117,15 @@ def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: s
 
 
 def sample_lines(box: Box, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lines through a box, uniform in place and direction: uniform over its faces, cosine-weighted inwards.
+    """Sample lines through a box, uniform in place and direction: uniform over the faces, cosine-weighted inwards.
 
     Args:
-        box: in the world.
-        n: how many.
-        seed: of the draw.
+        box: the box in the world.
+        n: number of lines.
+        seed: seed of the samples.
 
     Returns:
-        Where they enter (n, 3), unit directions (n, 3) and the lengths inside (n,), float64, in the world.
+        Entry points (n, 3), unit directions (n, 3) and lengths inside (n,), float64, in the world.
     """
     u = np.random.default_rng(seed).random((n, 5))
     edges = box.to_world[:3, :3].T
@@ -150,7 +148,7 @@ def sample_lines(box: Box, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarra
 
 
 def _sample_cosine(normal: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Unit directions (n, 3) about normals, of density cos / pi: a point on the unit sphere added to the normal."""
+    """Unit directions (n, 3) about normals with density cos / pi: a point on the unit sphere added to the normal."""
     z, phi = 2 * u - 1, 2 * np.pi * v
     r = np.sqrt(np.maximum(1 - z * z, 0))
     d = normal + np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
@@ -160,17 +158,17 @@ def _sample_cosine(normal: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarr
 
 
 def scattering_depth(view: MediumView, box: Box, n: int = 1 << 14, scene: mi.Scene | None = None) -> float:
-    """Optical depth of a medium as its scattered light sees it, E[tau^2] / E[tau] over all lines through it.
+    """Optical depth of a medium, weighted by scattered light: E[tau^2] / E[tau] over all lines through the medium.
 
     Args:
         view: the medium.
-        box: its boundary, or any box around it: lines that miss the medium count in neither mean.
-        n: lines drawn, the same in every call.
-        scene: where its boundary is traced, the scene that holds it.
+        box: its boundary, or a box around the medium; lines that miss the medium count in neither mean.
+        n: number of lines; all calls use the same lines.
+        scene: the scene, for a traced boundary.
 
     Returns:
-        The optical depth [1] of the densest channel; 0 for an empty medium. Its standard error is 0.3 % for a cube, 0.7 % for
-        the tutorial's smoke.
+        Optical depth [1] of the densest channel; 0 for an empty medium. Standard error: 0.3 % for a cube, 0.7 % for the
+            tutorial's smoke.
     """
     o, d, length = sample_lines(box, n)
     origin, direction = (kind(np.ascontiguousarray(x.T, np.float32)) for kind, x in ((mi.Point3f, o), (mi.Vector3f, d)))
@@ -193,7 +191,7 @@ def _depths(view: MediumView, o: mi.Point3f, d: mi.Vector3f, length: np.ndarray)
 
 
 def _traced_depths(scene: mi.Scene, view: MediumView, ray: mi.Ray3f) -> np.ndarray:
-    """Optical depth (n, channels) of lines in a boundary of any shape, up to the first opaque surface."""
+    """Optical depth (n, channels) of lines in a boundary of arbitrary shape, up to the first opaque surface."""
     media = SceneMedia(scene, [Body(view, None)], has_surfaces=True, size=scene_diagonal(scene))
     nowhere = dr.zeros(mi.MediumPtr, dr.width(ray))
     _, tau = integrate_optical_depth(media, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
@@ -201,7 +199,7 @@ def _traced_depths(scene: mi.Scene, view: MediumView, ray: mi.Ray3f) -> np.ndarr
 
 
 def mean_albedo(view: MediumView) -> float:
-    """Albedo [1] of a medium, mean over space (of scattering over that of extinction, where given), of its highest channel."""
+    """Albedo [1] of the highest channel, averaged over space; from ``sigma_s`` as mean scattering over mean extinction."""
     means = [np.asarray(dr.detach(a), np.float64) for a in view.albedo_arrays]
     scattering = max(float(m.reshape(-1, m.shape[-1]).mean(axis=0).max()) if m.ndim == 4 else float(m.max()) for m in means)
     if view.albedo is not None:
@@ -211,7 +209,7 @@ def mean_albedo(view: MediumView) -> float:
 
 
 def _mean_value(part: ExactExtinction) -> float:
-    """Mean of a part over space, of its highest channel."""
+    """Mean of a part over space, of the highest channel."""
     values = part.constant if part.is_constant else part.lattice.values
     host = np.asarray(dr.detach(values), np.float64)
     return float(host.reshape(-1, part.channels).mean(axis=0).max()) if not part.is_constant else float(host.max())

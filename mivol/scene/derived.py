@@ -1,9 +1,9 @@
-"""Derived values: the textures and tables that plugins compute from their parameters, and that derivatives pass through.
+"""Derived values: textures and tables that plugins compute from their parameters, on the way of derivatives.
 
-Conventions. A plugin computes them when a parameter changes. Dr.Jit follows the edge from a parameter to a derived value only
-once, and never from inside a loop. So before a reverse pass the derived values are computed anew, with fresh edges; for a
-forward pass they are computed from copies of the parameters, and the tangents are carried to them before any kernel reads
-them. Extinction needs neither: transport reads it from the parameters themselves.
+Conventions. A plugin computes derived values when a parameter changes. Dr.Jit follows the edge from a parameter to a derived
+value only once, and never from inside a loop. So a reverse pass first recomputes the derived values with fresh edges. A
+forward pass computes them from copies of the parameters, and carries the tangents to them before any kernel reads them.
+Extinction needs neither: transport reads extinction from the parameters.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["carry_tangents", "recompute_derived"]
 
 @dataclass
 class _DifferentiatedParameter:
-    """A parameter whose derivative is asked for: a copy of what stands there, since an update may put other arrays there."""
+    """A parameter with gradients enabled, with a copy of its value: an update may replace the array."""
 
     params: mi.SceneParameters
     key: str
@@ -32,22 +32,22 @@ class _DifferentiatedParameter:
 
     @property
     def numbers(self) -> Any:
-        """The array itself, or the matrix of a transform."""
+        """The array, or the matrix of a transform."""
         return self.value if dr.is_array_v(self.value) else self.value.matrix
 
     def make_of(self, value: Any) -> None:
-        """Set the parameter to a value, and compute all derived values from it."""
+        """Set the parameter, and compute all derived values from the new value."""
         self.params[self.key] = value
         self.params.set_dirty(self.key)
         self.params.update()
 
     def put_back(self) -> None:
-        """Set the parameter to what it was, without an update."""
+        """Restore the original value without an update."""
         self.params[self.key] = self.value
 
 
 def recompute_derived(scene: mi.Scene) -> None:
-    """Compute the derived values of all parameters with gradients anew. While ``dr.freeze`` records, nothing is done."""
+    """Recompute the derived values of all parameters with gradients. Does nothing while ``dr.freeze`` records."""
     for asked in _find_differentiated(scene):
         asked.make_of(asked.value)
         asked.put_back()
@@ -55,7 +55,7 @@ def recompute_derived(scene: mi.Scene) -> None:
 
 @contextmanager
 def carry_tangents(scene: mi.Scene) -> Iterator[None]:
-    """Within this context derived values come from copies of the parameters, and have their tangents."""
+    """Compute derived values from copies of the parameters, with tangents, inside a ``with`` block."""
     with dr.resume_grad():
         found = _find_differentiated(scene)
         copies = [dr.detach(asked.numbers) for asked in found]
@@ -76,7 +76,7 @@ def carry_tangents(scene: mi.Scene) -> Iterator[None]:
 
 
 def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
-    """Arrays with derivatives, by the plugin that they belong to."""
+    """Find the parameters with gradients of emitters, BSDFs, phase functions and volumes."""
     if is_recording():
         return []
     inside = [shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None]
@@ -90,7 +90,7 @@ def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
 
 
 def _find_derived_owners(medium: mi.Medium) -> list[mi.Object]:
-    """The phase function of a medium, and its volumes but for those whose numbers transport reads where they stand."""
+    """The phase function of a medium, and its volumes except those read directly by transport."""
     known = traverse_medium(medium).properties
     volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
     stands = [n for n, v in volumes.items() if n.startswith("sigma_") or hasattr(v, "mivol_extinction")]
@@ -99,11 +99,11 @@ def _find_derived_owners(medium: mi.Medium) -> list[mi.Object]:
 
 
 def _is_differentiated(value: Any) -> bool:
-    """Whether the derivative of an array or of a transform is asked for."""
+    """Whether an array or a transform has gradients enabled."""
     array = value if dr.is_array_v(value) else getattr(value, "matrix", None)
     return array is not None and dr.is_diff_v(array) and dr.grad_enabled(array)
 
 
 def _is_computed(params: mi.SceneParameters, key: str) -> bool:
-    """Whether a parameter is what a plugin makes of its others: the grid of a ``mivol_transfer``."""
+    """Whether a plugin computes the parameter from its other parameters, such as the grid of a ``mivol_transfer``."""
     return key == "data" and "table" in params

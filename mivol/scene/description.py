@@ -1,4 +1,8 @@
-"""Scene files and dicts as trees of parsed objects, before anything of them is made; and the files that they name."""
+"""A scene's description before Mitsuba builds the scene: parsed objects, the files named by them, and a hash of the contents.
+
+Conventions. The hash covers visible contents (shapes, media, textures, emitters, sensors, the contents of every named file),
+not the method: integrators and samplers are left out, so more samples keep a reference valid.
+"""
 
 from __future__ import annotations
 
@@ -36,23 +40,23 @@ __all__ = [
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
 MAX_REASON_LENGTH = 700
-"""Characters of a message of Mitsuba's that are quoted: its lists of plugins and parameters are shorter."""
+"""Characters quoted of a message of Mitsuba: lists of plugins and parameters are shorter."""
 
 NOT_UTF8 = "it names things in bytes that are not UTF-8; correct them"
-"""What is wrong with a file that Mitsuba quotes in a refusal that is no text."""
+"""The fault of a file whose quotation by Mitsuba is not UTF-8."""
 
 TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)+(?:(?:[\w.]+\.)?MivolError: )?")
-"""A traceback in a text, up to what was raised; the name of a refusal of mivol's belongs to it."""
+"""A traceback in a text, up to the raised message and without the name of mivol's own error."""
 
 # Header formats whose voxels lie in a second file: the key of the line that names it.
 DATA_FILE_KEYS = {".mhd": "ElementDataFile", ".nhdr": "data file"}
 
 
 def check_variant() -> str:
-    """The active variant's name.
+    """Return the name of the active variant.
 
     Raises:
-        MivolError: none is active, or one in which mivol does not render.
+        MivolError: no active variant, or an unsupported variant.
     """
     variant = mi.variant()
     if variant is None:
@@ -63,15 +67,15 @@ def check_variant() -> str:
 
 
 def format_override(value: Any) -> str:
-    """A value as an override of an XML parameter."""
+    """Format a value as an override of an XML parameter."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def describe_error(error: Exception) -> str:
-    """Mitsuba's message without its source position, in one line that does not quote all of a long file.
+    """Format an error of Mitsuba as one line, without the source position, shortened for long files.
 
-    Of an error of a plugin in Python, mivol's own among them, Mitsuba quotes the traceback: what the plugin says is at its end.
-    A message that is no UTF-8 is lost in Python 3.11.2 (later ones raise UnicodeDecodeError in its place).
+    For an error in a Python plugin Mitsuba quotes the whole traceback; only the message at its end is kept. Python 3.11.2
+    loses a message that is not UTF-8 (later versions raise UnicodeDecodeError).
     """
     text = TRACEBACK.sub("", re.sub(r"^\s*\[[\w.]+:\d+\]\s*", "", str(error)))
     text = " ".join(text.split()) or NOT_UTF8
@@ -80,7 +84,7 @@ def describe_error(error: Exception) -> str:
 
 @contextmanager
 def resolve_beside(path: Path) -> Iterator[None]:
-    """Look for files beside the XML, and forget its ``<path>`` elements afterwards."""
+    """Search for files beside the XML inside a ``with`` block, and drop the XML's ``<path>`` elements afterwards."""
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
     resolver.prepend(str(path.parent.resolve()))
@@ -113,7 +117,7 @@ def parse_dict(source: dict) -> Any:
     """Parse a scene dict, with references resolved.
 
     Raises:
-        MivolError: what Mitsuba refuses.
+        MivolError: a refusal of Mitsuba.
     """
     import mitsuba.parser as parser
 
@@ -143,7 +147,7 @@ def _describe_unused_override(path: Path, overrides: dict[str, str], message: st
 
 
 def _parameter_names(path: Path) -> set[str]:
-    """Parameters that an XML file and what it includes mention."""
+    """Names of the parameters used by an XML file and its includes."""
     text = path.read_text(encoding="utf-8", errors="replace")
     names = set(re.findall(r"\$\{?(\w+)", text)) | set(re.findall(r"<default[^>]*?name\s*=\s*[\"'](\w+)", text))
     for included in re.findall(r"<include[^>]*?filename\s*=\s*[\"']([^\"']+)", text):
@@ -153,7 +157,7 @@ def _parameter_names(path: Path) -> set[str]:
 
 
 def find_named_files(state: Any) -> Iterator[Path]:
-    """The files that parsed objects name, each with its companion."""
+    """Find the files named by parsed objects, each with its data file."""
     for node in state.nodes:
         for key in node.props.keys():  # noqa: SIM118  (Properties is not iterable)
             found = find_named_file(key, node.props[key])
@@ -162,7 +166,7 @@ def find_named_files(state: Any) -> Iterator[Path]:
 
 
 def find_named_file(key: str, value: Any) -> Path | None:
-    """The file that a setting names; None where it names none that is there."""
+    """Find the file named by a setting; None without an existing file."""
     if not (isinstance(value, str) and key.endswith("filename")):
         return None
     path = Path(str(mi.file_resolver().resolve(value)))
@@ -170,7 +174,7 @@ def find_named_file(key: str, value: Any) -> Path | None:
 
 
 def list_data_files(path: Path) -> Iterator[Path]:
-    """The file, and the one that holds its voxels where its header names another."""
+    """List a file, and the file of its voxels if the header names another file."""
     yield path
     key = DATA_FILE_KEYS.get(path.suffix.lower())
     if key:
@@ -185,14 +189,14 @@ UNHASHED_KINDS = ("Integrator", "Sampler")
 
 
 def content_hash(source: str | os.PathLike | Mapping | mi.Object, overrides: Mapping[str, Any] | None = None) -> str:
-    """SHA-256 of what a scene, or a part of one such as a sensor's dict, shows; nothing is rendered.
+    """SHA-256 of the contents of a scene or of a part, such as a sensor's dict; nothing is rendered.
 
-    For XML and dicts: class, parameters and order of every object with overrides and references resolved, and the
-    contents (not the names) of every file. For an object already made: class names, settings as Mitsuba prints them
-    (6 digits) and the full contents of ``mitsuba.traverse``. The same scene has another hash in each of these forms.
+    For XML and dicts the hash covers class, parameters and order of every object, with overrides and references resolved, and
+    the contents (not the names) of every file. For an existing object the hash covers class names, settings as printed by
+    Mitsuba (6 digits) and the full contents of ``mi.traverse``. The same scene has different hashes in the three forms.
 
     Raises:
-        MivolError: something in it has contents that cannot be read, or it cannot be parsed.
+        MivolError: unreadable contents, or a source that cannot be parsed.
     """
     check_variant()
     if isinstance(source, mi.Object):
@@ -205,7 +209,7 @@ def content_hash(source: str | os.PathLike | Mapping | mi.Object, overrides: Map
 
 
 def hash_description(state: Any) -> str:
-    """Hash the tree of parsed objects from the root; an object met again is named by the number of its first visit."""
+    """Hash the tree of parsed objects from the root; a repeated object is named by the number of its first visit."""
     h = hashlib.sha256(b"mivol scene 1")
     visited: dict[int, int] = {}
 
@@ -235,12 +239,12 @@ def _node_kind(node: Any) -> str:
 
 
 def _stable_key(key: str) -> str:
-    """A key without the counters and addresses that Mitsuba puts into the names of unnamed objects."""
+    """A key without Mitsuba's counters and addresses of unnamed objects."""
     return re.sub(r"^_arg_\d+$", "_arg", re.sub(r"\bobject_\d+", "object", key))
 
 
 def _hash_value(h: Any, value: Any, key: str) -> None:
-    """Feed one value, with its type, to the hash."""
+    """Add a value with its type to the hash."""
     path = find_named_file(key, value)
     if path is not None:
         for part in list_data_files(path):
@@ -277,7 +281,7 @@ def _hash_array(h: Any, value: Any, key: str) -> None:
 
 
 def hash_object(thing: mi.Object) -> str:
-    """Hash an object already made: what Mitsuba prints of it, and every value that can be traversed."""
+    """Hash an existing object: its printed form and every value of ``mi.traverse``."""
     h = hashlib.sha256(b"mivol object 1")
     h.update(_printed_settings(thing).encode())
     params = mi.traverse(thing)
@@ -288,7 +292,7 @@ def hash_object(thing: mi.Object) -> str:
 
 
 def _printed_settings(thing: mi.Object) -> str:
-    """The object's printed form without integrators, samplers and addresses."""
+    """The printed form of an object, without integrators, samplers and addresses."""
     text = str(thing)
     for match in reversed(list(re.finditer(r"\b\w*(Sampler|Integrator)\[", text))):
         text = text[: match.start()] + text[_find_closing_bracket(text, match.end()) :]
@@ -296,7 +300,7 @@ def _printed_settings(thing: mi.Object) -> str:
 
 
 def _find_closing_bracket(text: str, start: int) -> int:
-    """Position after the bracket that closes the one before ``start``."""
+    """Position after the bracket that closes the bracket before ``start``."""
     depth = 1
     for match in re.finditer(r"[\[\]]", text[start:]):
         depth += 1 if match[0] == "[" else -1

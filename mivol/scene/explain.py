@@ -1,6 +1,6 @@
-"""What a scene needs and what will be done about it, in words, before anything is rendered.
+"""The facts of a scene and the plan of its render, in words.
 
-Conventions. The facts come first, whatever is refused; a refusal is the last part of the text.
+Conventions. The facts come first, even for a refused scene. A refusal is the last part of the text.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from mivol.transport.traversal.box import Box
 __all__ = ["Explanation", "explain_scene", "read_settings"]
 
 UNLIMITED = 0xFFFFFFFF
-"""The depth that Mitsuba's integrators print for -1."""
+"""The depth printed by Mitsuba's integrators for -1."""
 
 
 def read_settings(scene: mi.Scene) -> Settings:
-    """What the scene's own integrator is set to: all of it where it is mivol, the depth of others, which they print."""
+    """Read the settings of the scene's integrator: all settings of mivol, or the depth printed by another integrator."""
     integrator = scene.integrator()
     session = getattr(integrator, "session", None)
     if session is not None:
@@ -50,11 +50,11 @@ def read_settings(scene: mi.Scene) -> Settings:
 
 @dataclass(frozen=True)
 class Explanation:
-    """What can be said of a scene before anything is rendered.
+    """The description of a scene.
 
     Attributes:
         lines: facts, plan and references.
-        refusal: why it cannot be rendered as it is; empty where it can.
+        refusal: the reason why the scene cannot be rendered; empty for a scene that can.
     """
 
     lines: tuple[str, ...]
@@ -62,7 +62,7 @@ class Explanation:
 
     @property
     def text(self) -> str:
-        """All of it."""
+        """The whole description."""
         return "\n".join([*self.lines, *(["refused", f"  {self.refusal}"] if self.refusal else [])])
 
 
@@ -72,12 +72,12 @@ def explain_scene(
     sensor: int | mi.Sensor = 0,
     noise: float | None = None,
 ) -> Explanation:
-    """What a scene needs and what will be done about it, before more than a small preview is rendered.
+    """Describe the facts of a scene and the plan of its render. At most small previews are rendered.
 
-    Arguments as those of :func:`mivol.experiments.script.explain`.
+    Arguments as in :func:`mivol.experiments.script.explain`.
 
     Returns:
-        Facts, choices with their reasons, and by itself what is refused, where something is.
+        Facts and choices with their reasons, and a refusal separately.
     """
     eye = find_sensor(scene, sensor)
     settings = read_settings(scene) if max_depth is None else Settings(max_depth=max_depth)
@@ -116,14 +116,14 @@ def _describe_facts(needs: Needs) -> list[str]:
 
 
 def _kind_without_grids(medium: MediumFacts) -> str:
-    """What a medium is made of that has no grids."""
+    """The kind of a medium without grids."""
     if medium.gaussians:
         return f"{medium.gaussians} Gaussians"
     return f"a bounded {medium.bounded}" if medium.bounded else "homogeneous"
 
 
 def _describe_unread_scene(scene: mi.Scene) -> list[str]:
-    """What Mitsuba itself tells of a scene that mivol refuses to look into."""
+    """Facts printed by Mitsuba, for a scene that mivol refuses to read."""
     lines = []
     for shape in scene.shapes():
         medium = shape.interior_medium()
@@ -140,7 +140,7 @@ def _describe_unread_scene(scene: mi.Scene) -> list[str]:
 
 
 def _find_warnings(scene: mi.Scene) -> list[str]:
-    """Media that no light reaches: behind a BSDF that lets none through, as Mitsuba's default one."""
+    """Warn of media without light: media behind an opaque BSDF, such as Mitsuba's default BSDF."""
     lines, open_ = [], int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Transmission)
     for shape in scene.shapes():
         if not shape.is_medium_transition():
@@ -176,7 +176,7 @@ def _describe_plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Sett
 
 
 def _describe_light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
-    """What a transmittance grid in place of shadow rays costs, and its measured bias."""
+    """Cost and measured bias of a transmittance grid in place of shadow rays."""
     if not is_scattering_visible(needs, settings) or set(needs.emitter_kinds) != {"delta"} or len(needs.media) != 1:
         return []
     if not shares_cells(needs) or any(part.lattice is None for part in needs.views[0].parts):
@@ -196,7 +196,7 @@ def _describe_light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Se
 
 
 def _describe_transfer_tables(needs: Needs) -> list[str]:
-    """How far each ``mivol_transfer``, whose nodes are made by a table, departs from that table between its nodes."""
+    """Error of each ``mivol_transfer`` between its nodes, compared with its table."""
     lines = []
     for facts, boundary in zip(needs.media, needs.boundaries, strict=True):
         volumes = {key.split(".")[0]: entry[2] for key, entry in traverse_medium(boundary.medium).properties.items()}
@@ -214,9 +214,9 @@ def _describe_transfer_tables(needs: Needs) -> list[str]:
 
 
 def _describe_depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
-    """Which share of the light that each medium scatters is missing at max_depth 2 (:mod:`mivol.scene.depth_two`).
+    """Share of the scattered light of each medium that ``max_depth`` 2 omits (:mod:`mivol.scene.depth_two`).
 
-    Nothing is said of a bounded medium, whose optical depth is not known.
+    Bounded media are left out: their optical depth is unknown.
     """
     lines = []
     light = "collimated" if "delta" in needs.emitter_kinds else "constant"
@@ -236,7 +236,9 @@ def _describe_depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
 
 
 def _padded_box(scene: mi.Scene, medium: mi.Medium) -> Box | None:
-    """A box around all that a medium fills; None where it lies outside of shapes, without an end."""
+    """A box slightly larger than a medium, so that the lines of :func:`sample_lines` start outside; None for a medium outside
+    shapes.
+    """
     inside = [s.interior_medium() for s in scene.shapes()]
     boxes = [shape_bounds(s) for s, m in zip(scene.shapes(), inside, strict=True) if m is not None and m.ptr == medium.ptr]
     if not boxes:

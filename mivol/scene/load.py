@@ -1,7 +1,6 @@
-"""A scene from XML, a dict or an object already made, with the files that were read and a hash of what it shows.
+"""Load a scene from XML, a dict or an existing object, with the list of read files and a hash of the contents.
 
-Conventions. :func:`load_scene` is the only way in: overrides are Mitsuba's ``-D name=value``, and an unused one is an
-error.
+Conventions. :func:`load_scene` is the only entry. Overrides are Mitsuba's ``-D name=value``; an unused override is an error.
 """
 
 from __future__ import annotations
@@ -40,13 +39,13 @@ SceneSource = str | os.PathLike | Mapping
 @with_short_repr
 @dataclass(frozen=True)
 class LoadedScene:
-    """A scene, and where it came from.
+    """A scene with its origin.
 
     Attributes:
         scene: the Mitsuba scene.
         name: short name for files and titles.
         kind: "file", "dict" or "object".
-        files: every file that was read: the XML, its includes, meshes, textures, volumes.
+        files: all files read: the XML, its includes, meshes, textures, volumes.
     """
 
     scene: mi.Scene
@@ -62,10 +61,10 @@ class LoadedScene:
 
     @property
     def content_hash(self) -> str:
-        """SHA-256 of what the scene shows, as 64 hexadecimal digits, taken when it was loaded.
+        """SHA-256 of the scene's contents at loading, as 64 hexadecimal digits.
 
         Raises:
-            MivolError: something in the scene has contents that cannot be read.
+            MivolError: unreadable contents in the scene.
         """
         if self._digest is None:
             raise MivolError(self._obstacle)
@@ -74,10 +73,9 @@ class LoadedScene:
 
 @contextmanager
 def ensure_two_threads() -> Iterator[None]:
-    """Give Dr.Jit a second thread while Mitsuba reads files, where it has one only.
+    """Give Dr.Jit at least two threads while Mitsuba reads files.
 
-    Mitsuba hands an EXR to another thread of the pool and waits for it: without end in a process that is pinned to one CPU, or
-    in which one thread was asked for.
+    Mitsuba hands an EXR file to another thread of the pool and waits, forever in a process with a single thread.
     """
     single = mi.variant().startswith("llvm") and dr.thread_count() == 1
     if single:
@@ -94,12 +92,12 @@ def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] |
     """Load a scene.
 
     Args:
-        source: path of a Mitsuba XML file, a dict as for ``mitsuba.load_dict``, or a scene already made.
+        source: path of a Mitsuba XML file, a dict as for ``mitsuba.load_dict``, or an existing scene.
         overrides: values of the XML's ``$name`` parameters (``-D name=value``).
 
     Raises:
-        MivolError: no usable variant, no such file, an unused override, overrides for something that is not XML, or a
-            scene that Mitsuba refuses (with Mitsuba's own reason).
+        MivolError: no usable variant, a missing file, an unused override, overrides without XML, or a scene refused by Mitsuba
+            (with Mitsuba's reason).
 
     Example:
         >>> loaded = load_scene("scenes/smoke/scene.xml", {"res": 32})
@@ -163,7 +161,7 @@ def _check_scene(thing: Any, origin: Any) -> mi.Scene:
 
 
 def _try_hash(make: Callable[[], str]) -> tuple[str | None, str]:
-    """The hash, or why there is none: a scene without one can still be rendered."""
+    """The hash and an empty text, or None and the reason: a scene without a hash can still be rendered."""
     try:
         return make(), ""
     except MivolError as error:

@@ -1,15 +1,15 @@
-r"""Is light of media better drawn, or met by chance?  Asked of a coarse table of what they emit, before anything is rendered.
+r"""Predict whether sampling the light of media pays, from a coarse table of the emission, before a render.
 
-Light that a medium emits reaches what scatters it in two ways: the path happens to pass through the medium, or a point of it is
-drawn (:mod:`mivol.transport.estimators.lighting.emission_sampling`). A fire over a floor is seldom met, and draws pay. In a
-room that glows evenly nearly every path meets the same light, and draws add noise and time. So both are compared: at points
-that the camera sees, directions are drawn either way, and the light along them is summed from the table. With the variances V
-over the directions of a point, the gain is
+Light emitted by a medium reaches a scattering point in two ways: a path passes through the medium by chance, or the estimator
+samples a point of the medium (:mod:`mivol.transport.estimators.lighting.emission_sampling`). Paths seldom hit a fire over a
+floor by chance, and sampling pays. In a room of even glow nearly every path sees the same light, and sampling only adds noise
+and time. The prediction compares both: at points seen by the camera, directions are sampled either way, and the table gives
+the light along them. With the variances V over the directions of a point, the gain is
 
 .. math:: g = \frac{\sum_x V_{chance}(x)}{c\,\sum_x V_{drawn}(x)}
 
-with c the time that a path with draws takes over that of one without. Surfaces count as diffuse and phase functions as
-isotropic, and nothing dims the light or stands in its way: the answer decides about noise only, never about the mean.
+with c the time of a path with sampling over the time of a path without. The prediction assumes diffuse surfaces and isotropic
+phase functions, and ignores extinction and occlusion: the gain decides about noise only, never about the mean.
 """
 
 from __future__ import annotations
@@ -37,19 +37,20 @@ __all__ = ["find_emitting_boxes", "predict_gain", "read_media_light", "MediaLigh
 
 
 SAMPLING_COST = 2.0
-"""Time of a path with draws over that of a path without (measured on two cores: 1.4 to 2.5)."""
+"""Time of a path with sampling over the time of a path without (measured on two cores: 1.4 to 2.5)."""
 
 SIDE, DIRECTIONS, SEED = 32, 32, 0xF12E
-"""Camera rays along an edge of the film, directions at each point, seed of both."""
+"""Camera rays along an edge of the film, directions per point, and seed of both."""
 
 
 def read_media_light(
     media: SceneMedia, boundaries: Sequence[Boundary], scattering: Sequence[Body], sensor: mi.Sensor, survey: SceneSurvey
 ) -> MediaLight | None:
-    """Read where media emit, and predict what draws of it gain, once for each state of the media.
+    """Locate the light of media, and predict the gain of sampling, once for each state of the media.
 
     Returns:
-        None where the place of some medium that emits is not known: where it fills no shape, or shapes are instances.
+        The light; None if the place of an emitting medium is unknown, because the medium fills no shape or shapes are
+            instances.
     """
     boxes = find_emitting_boxes(media, boundaries)
     if boxes is None:
@@ -66,7 +67,7 @@ def read_media_light(
 
 
 def find_emitting_boxes(media: SceneMedia, boundaries: Sequence[Boundary]) -> list[EmittingBox] | None:
-    """The media that emit, each with a box that all of its light comes from; None where that is not known of one."""
+    """Find the media that emit, each with a box around all of its light; None if a box is unknown."""
     scene, lost = media.scene, {b.medium.ptr for b in boundaries if b.shape == OUTSIDE_SHAPES}
     has_instances, boxes = any(is_instance(s) for s in scene.shapes()), []
     for body in media.bodies:
@@ -84,7 +85,7 @@ def find_emitting_boxes(media: SceneMedia, boundaries: Sequence[Boundary]) -> li
 
 
 def _emission_boxes(view: MediumView) -> list[np.ndarray]:
-    """The boxes of grids outside of which a medium does not emit."""
+    """Boxes of grids outside of which a medium emits nothing."""
     if view.emission_density is not None:
         light = [view.emission_density] if view.emission is None else []
         parts = []
@@ -100,7 +101,7 @@ def _emission_boxes(view: MediumView) -> list[np.ndarray]:
 
 
 def _box_of_shapes(scene: mi.Scene, medium: mi.Medium) -> np.ndarray:
-    """The box around all shapes that a medium fills."""
+    """Box around all shapes filled by a medium."""
     inside = [
         shape_bounds(s) for s in scene.shapes() if s.interior_medium() is not None and s.interior_medium().ptr == medium.ptr
     ]
@@ -111,7 +112,7 @@ def _box_of_shapes(scene: mi.Scene, medium: mi.Medium) -> np.ndarray:
 
 
 def _emission_state(view: MediumView) -> list:
-    """What the light of a medium depends on: flat arrays, and numbers that are none."""
+    """The values behind the light of a medium: flat arrays and numbers."""
     found = []
     for _, value in traverse_medium(view.medium):
         if isinstance(value, int | float):
@@ -123,12 +124,12 @@ def _emission_state(view: MediumView) -> list:
 
 
 def predict_gain(media: SceneMedia, table: EmissionTable, sensor: mi.Sensor, scattering: Sequence[Body]) -> float:
-    """How much sooner draws reach an error than chance does [1]: the variance by chance over that of draws and their time.
+    """Predict the gain of sampling: variance by chance, over the variance of sampling times its cost [1].
 
     Args:
-        media: of the scene.
-        table: of what they emit.
-        sensor: whose rays find the points that scatter.
+        media: media of the scene.
+        table: their emission.
+        sensor: the sensor whose rays find scattering points.
         scattering: media that scatter.
     """
     sampler = mi.load_dict({"type": "independent"})
@@ -155,12 +156,12 @@ def predict_gain(media: SceneMedia, table: EmissionTable, sensor: mi.Sensor, sca
 
 
 def _estimate_variances(table: EmissionTable, p: mi.Point3f, normal: mi.Vector3f | None, on: mi.Bool) -> tuple[float, float]:
-    """The variance of the light that points scatter, by chance and with draws, each summed over the points.
+    """Variances of the light scattered by points, by chance and with sampling, each summed over the points.
 
     Args:
-        table: of the light.
+        table: the emission.
         p: the points.
-        normal: of surfaces, which scatter as the cosine; None for media, which scatter evenly.
+        normal: normals of surfaces, which scatter with the cosine; None for media, which scatter evenly.
         on: points that count.
     """
     points, n = dr.width(p), dr.width(p) * DIRECTIONS
@@ -187,11 +188,11 @@ def _estimate_variances(table: EmissionTable, p: mi.Point3f, normal: mi.Vector3f
 
 @dataclass
 class MediaLight:
-    """What was read of the light that media emit.
+    """The light that media emit.
 
     Attributes:
-        density, cumulative: of :class:`mivol.transport.estimators.lighting.emission_sampling.EmissionTable`.
-        gain: how much sooner draws of it reach an error than chance does [1], as predicted.
+        density, cumulative: as in :class:`mivol.transport.estimators.lighting.emission_sampling.EmissionTable`.
+        gain: predicted gain in time to an error of sampling over chance [1].
     """
 
     density: mi.Float

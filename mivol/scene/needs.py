@@ -1,8 +1,8 @@
-"""What a scene needs: the facts found in it, before anything is rendered.
+"""The facts of a scene that a plan is made from.
 
-Conventions. Facts only; what is done about them is a plan's (:mod:`mivol.scene.choices`). Shapes, boundaries and places are
-found once for each scene; values (is the albedo zero, which blocks are empty) are looked at again whenever an array has
-been replaced, and never while a function is being recorded by ``dr.freeze``.
+Conventions. This module holds facts; decisions follow in :mod:`mivol.scene.choices`. Shapes, boundaries and placements are
+found once for each scene. Values (zero albedo, empty blocks) are read again after an array was replaced, and never while
+``dr.freeze`` records.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ __all__ = ["find_needs", "MediumFacts", "Needs", "mean_cosine"]
 def find_needs(
     scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = None, spp: int = 0, reads_emission: bool = True
 ) -> Needs:
-    """Ask a scene what it needs.
+    """Find the facts of a scene.
 
     Args:
         scene: a loaded scene.
-        sensor: the one to render from.
-        survey: an earlier survey of the same scene, to save finding what cannot have changed.
-        spp: samples a pixel; 0 for the sampler's own count.
-        reads_emission: look at where media emit, so that a plan may draw their light.
+        sensor: the sensor to render.
+        survey: an earlier survey of the same scene; by default a new survey.
+        spp: samples per pixel; 0 for the sampler's own count.
+        reads_emission: whether to locate the light of media, so that a plan may sample the light.
 
     Raises:
         MivolError: a variant or a medium that mivol does not render.
@@ -100,7 +100,7 @@ def _find_misplaced(
 
 
 def warn_of_misplaced_grids(needs: Needs, survey: SceneSurvey) -> None:
-    """Warn of each medium whose grids lie outside of the shape filled by the medium, once for each scene."""
+    """Warn once for each scene and medium if the whole grid lies outside of the shape filled by the medium."""
     for facts in needs.media:
         if facts.misplaced and (facts.name, "misplaced") not in survey.warned:
             survey.warned.add((facts.name, "misplaced"))
@@ -108,14 +108,14 @@ def warn_of_misplaced_grids(needs: Needs, survey: SceneSurvey) -> None:
 
 
 def _is_placement(key: str, owner: object) -> bool:
-    """Whether a parameter says where a shape or a sensor is; what is painted on a mesh does not."""
+    """Whether a parameter places a shape or a sensor; colours painted on a mesh do not count."""
     name = key.rsplit(".", 1)[-1]
     painted = name.startswith(("vertex_", "face_")) and name not in ("vertex_positions", "vertex_normals", "vertex_texcoords")
     return isinstance(owner, mi.Shape | mi.Sensor) and not painted
 
 
 def _may_camera_be_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> bool:
-    """Whether the sensor may lie in the bounding box of a boundary that has to be traced."""
+    """Whether the sensor may lie in the bounding box of a traced boundary."""
     if all(b.box is not None for b in survey.boundaries):
         return False
     eye = sensor.bbox()
@@ -166,14 +166,14 @@ def _describe_boundary(boundary: Boundary) -> str:
 
 
 def _phase_name(phase: mi.PhaseFunction | None) -> str:
-    """The kind of a phase function (Mitsuba calls every Python class by its base)."""
+    """Name of a phase function. Mitsuba gives every Python class the name of its base class."""
     if phase is None:
         return "none"
     return phase.class_name() if phase.class_name() != "PhaseFunction" else str(phase).partition("[")[0]
 
 
 def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridReading]) -> float | None:
-    """Bound the optical depth through a medium: its largest extinction times the diagonal of its box."""
+    """Bound the optical depth of a medium by its largest extinction times the diagonal of its box."""
     bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
     bounds += [p.field.bound()[0] for p in view.parts if isinstance(p, GaussianExtinction)]
     constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.is_constant]
@@ -187,24 +187,25 @@ def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridR
 
 @dataclass(frozen=True)
 class MediumFacts:
-    """What one medium is made of.
+    """The facts of one medium.
 
     Attributes:
-        name: of the shape that it fills.
+        name: name of the shape filled by the medium.
         kind: class of the medium.
-        boundary: where it is, in words.
+        boundary: description of the boundary.
         extinction: ``grey`` or ``rgb``.
-        resolutions: of its grids (Z, Y, X); none for a homogeneous medium.
-        is_scattering: some albedo or ``sigma_s`` is above 0, or its derivative is asked for.
-        emits: it has an emission or an emission density.
-        phase: kind of its phase function.
-        occupied: fraction of its blocks of cells that are not empty; of its emptiest grid.
-        tau_max: upper bound of the optical depth [1] through its box; None where its boundary is no box.
-        unread: values could not be read, because ``dr.freeze`` records.
-        mean_cosine: of its phase function [1], when it was first asked; None where it does not scatter, or where some emitter
-            is not at infinity and nothing depends on it.
-        bounded: class of a field of which no more than a majorant is known along a ray; None where optical depths are exact.
-        gaussians: how many Gaussians it is made of that rays are traced through; 0 for none.
+        resolutions: resolutions (Z, Y, X) of the grids; empty for a homogeneous medium.
+        is_scattering: whether an albedo or ``sigma_s`` is above 0 or has gradients enabled.
+        emits: whether the medium has an emission or an emission density.
+        phase: kind of the phase function.
+        occupied: smallest share of occupied blocks of all grids [1].
+        tau_max: upper bound of the optical depth through the box [1]; None for a boundary of another shape.
+        unread: whether values could not be read because ``dr.freeze`` records.
+        bounded: class of a field with only a known majorant along a ray; None for exact optical depths.
+        gaussians: number of Gaussians for ray tracing; 0 for other media.
+        mean_cosine: mean cosine of the phase function at the first reading [1]; None for a medium that does not scatter, or
+            with a near emitter.
+        misplaced: names of the grids that lie wholly outside of the shape.
     """
 
     name: str
@@ -225,7 +226,7 @@ class MediumFacts:
 
     @property
     def misplacement(self) -> str:
-        """The sentence about the misplaced grids; empty without one."""
+        """A sentence about the misplaced grids; empty without misplaced grids."""
         if not self.misplaced:
             return ""
         return (
@@ -236,30 +237,29 @@ class MediumFacts:
 
 @dataclass(frozen=True)
 class Needs:
-    """The facts of a scene that a plan is made from.
+    """The facts of a scene.
 
     Attributes:
         variant: the active variant.
-        boundaries: media and where they are.
-        views: their extinction, in the same order, with its gradients.
-        media: what each is made of, in the same order.
+        boundaries: the media with their boundaries.
+        views: the extinction of each boundary's medium, with gradients.
+        media: the facts of each boundary's medium.
         surfaces: class names of the shapes that are more than boundaries.
-        has_null_transmission: some surface lets light through undeviated and is more than a boundary.
-        emitters: class names.
-        emitter_kinds: ``uniform`` (an environment that is the same in all directions), ``delta`` (one position or direction) or
-            ``extended``, of each emitter.
-        are_emitters_far: every emitter is at infinity, and one of them is not ``uniform``.
-        refractive: names of the boundaries that bend or blur the light that passes them.
-        is_sealed: every medium lies behind such boundaries and no light passes them undeviated; emitters lie outside of them,
-            and paths can hit each. No emitter sample finds light from a point in a medium.
-        start: medium that the sensor names.
-        camera_inside: the camera may be inside the box around a boundary.
-        parameters: keys whose derivatives are asked for.
-        places: those of them that are of shapes and sensors.
-        film_samples: pixels times samples of the sensor asked about.
-        are_samples_independent: its sampler stratifies nothing, so that other random numbers may stand for its own.
-        media_light: what was read of the light that media emit; None where none does, where nothing scatters it, or where it
-            could not be read.
+        has_null_transmission: whether a surface passes light undeviated and is more than a boundary.
+        emitters: class names of the emitters.
+        emitter_kinds: kind of each emitter: ``uniform`` (environment of one radiance), ``delta`` (one position or direction)
+            or ``extended``.
+        are_emitters_far: whether all emitters are at infinity, and at least one emitter is not ``uniform``.
+        refractive: names of the boundaries that refract or blur transmitted light.
+        is_sealed: whether every medium lies behind refracting boundaries without undeviated light, with all emitters outside
+            and hittable by paths. Emitter sampling then finds no light from inside a medium.
+        start: medium named by the sensor.
+        camera_inside: whether the camera may be inside the box around a boundary.
+        parameters: keys of the parameters with gradients enabled.
+        places: keys among ``parameters`` that place shapes and sensors.
+        film_samples: pixels times samples per pixel of the sensor.
+        are_samples_independent: whether the sampler stratifies nothing, so that other random numbers may replace its own.
+        media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
     """
 
     variant: str
@@ -282,11 +282,11 @@ class Needs:
     media_light: MediaLight | None = None
 
     def media_of(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
-        """The media of the scene among its surfaces, as these facts have them.
+        """Build the media of the scene among its surfaces.
 
         Args:
-            bodies: one for each of ``boundaries``, in the same order.
-            size: of the scene [length].
+            bodies: a body for each of ``boundaries``, in the same order.
+            size: diagonal of the scene [length].
         """
         return SceneMedia(
             scene,
@@ -300,7 +300,9 @@ class Needs:
 
 
 def mean_cosine(phase: mi.PhaseFunction, n: int = 1 << 12) -> float:
-    """Mean cosine [1] of a phase function by its own samples, to 1 / sqrt(n), in the middle of the world."""
+    """Estimate the mean cosine [1] of a phase function from n of its own samples, with error 1 / sqrt(n), at the world's
+    origin.
+    """
     mei = dr.zeros(mi.MediumInteraction3f, n)
     mei.wi = mi.Vector3f(0, 0, 1)
     mei.sh_frame = mi.Frame3f(mei.wi)

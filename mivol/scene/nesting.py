@@ -1,9 +1,8 @@
-"""Do the boundaries of media agree about what lies between them?
+"""Do the boundaries of media agree about the medium between them?
 
-What a ray enters behind one boundary is what has to be in front of the next one: a boundary says so by what it names as its
-interior and exterior. Shapes that overlap, and shapes whose surfaces coincide, so that a ray meets one of the two only, leave
-it open which medium is where; stock integrators then go by the order of the crossings, and drop the outer medium behind the
-inner one.
+A boundary names its interior and exterior medium. A ray leaving one boundary must be in the medium in front of the next
+boundary. Overlapping shapes, and shapes with coinciding surfaces of which a ray hits only one, leave the medium undetermined.
+Mitsuba's integrators then follow the order of crossings, and lose the outer medium behind the inner one.
 """
 
 from __future__ import annotations
@@ -22,41 +21,43 @@ from mivol.transport.traversal.rays import spawn_ray
 __all__ = ["OrientedBox", "shape_bounds", "oriented_box", "scene_diagonal", "find_nesting_fault"]
 
 RAYS_PER_PAIR = 512
-"""Rays for each pair of shapes that share space, through what their boxes share."""
+"""Rays for each pair of shapes, through the space shared by their boxes."""
 
 CROSSINGS = 16
-"""Surfaces that a ray is followed through."""
+"""Most surfaces along a ray."""
 
 MAX_PAIRS = 64
-"""Pairs that are looked at: more have the same fault as these, or none."""
+"""Most tested pairs; further pairs usually share the fault of these pairs, or have none."""
 
 MIN_FAULT_SHARE = 0.01
-"""Share of a pair's rays that must find the fault: single ones graze an edge, and miss where they leave a shape."""
+"""Smallest share of a pair's rays that must find the fault: single rays graze an edge, and miss on leaving a shape."""
 
 MIN_OPEN_FAULT_SHARE = 0.2
-"""The same where a shape has holes: rays that leave through them seem to be inside still."""
+"""The same share for a shape with holes: rays leaving through a hole seem to be still inside."""
 
 FACE_TOLERANCE = 1e-6
-"""Depth, in sizes, to which neighbours may reach into each other: faces of float32 vertices agree to it."""
+"""Depth, in sizes, to which neighbours may overlap: float32 vertices of touching faces agree to this depth."""
 
 UNKNOWN = -1
-"""In place of what Dr.Jit calls a medium by."""
+"""Stands for the registry index of an unknown medium."""
 
 
 @dataclass(frozen=True)
 class OrientedBox:
-    """A parallelepiped around a shape: a ``cube`` itself, else the upright bounding box.
+    """A parallelepiped around a shape: a ``cube`` itself, else the axis-aligned bounding box.
 
     Attributes:
         corners: (8, 3).
-        edges: (3, 3) directions, one a row.
+        edges: (3, 3) directions, in rows.
     """
 
     corners: np.ndarray
     edges: np.ndarray
 
     def shares(self, other: OrientedBox, margin: float = -FACE_TOLERANCE) -> bool:
-        """Whether no plane separates two boxes by less than ``margin`` (in sizes; negative: they may reach into each other)."""
+        """Whether two boxes share space: no plane separates them by ``margin`` (in sizes; a negative margin permits an
+        overlap).
+        """
         across = [np.cross(a, b) for a in self.edges for b in other.edges]
         across += [np.cross(r.edges[i], r.edges[i - 1]) for r in (self, other) for i in range(3)]
         axes = np.array([a / n for a in across if (n := np.linalg.norm(a)) > FACE_TOLERANCE])
@@ -68,13 +69,13 @@ class OrientedBox:
 
     @classmethod
     def from_box(cls, box: Box) -> OrientedBox:
-        """The same parallelepiped."""
+        """Convert a parallelepiped."""
         edges = box.to_world[:3, :3].T
         return cls(box.corners(), edges / np.linalg.norm(edges, axis=1, keepdims=True))
 
 
 def oriented_box(shape: mi.Shape) -> OrientedBox:
-    """A box around a shape."""
+    """Box around a shape."""
     if shape.class_name() == "Cube":
         return OrientedBox.from_box(fit_box(shape))
     low, high = shape_bounds(shape)
@@ -82,16 +83,16 @@ def oriented_box(shape: mi.Shape) -> OrientedBox:
 
 
 def find_nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | None:
-    """Find boundaries that do not agree which medium lies between them.
+    """Find boundaries that disagree about the medium between them.
 
     Args:
         scene: the scene.
-        traced: boundaries that rays are traced to, so that coinciding surfaces matter; all overlaps do.
+        traced: boundaries traced by rays, for which coinciding surfaces matter; overlaps always matter.
 
     Returns:
-        A sentence about two shapes, or pieces of one, and the way out; None where all is well.
+        A sentence about two shapes, or about pieces of a shape, with the way out; None without a fault.
 
-    Cost: nothing where no boundaries share space and none is a mesh; else 512 rays for each pair, up to 64 pairs.
+    Cost: nothing if no boundaries share space and no boundary is a mesh; else 512 rays for each pair, up to 64 pairs.
     """
     shapes = [s for s in scene.shapes() if s.is_medium_transition()]
     pairs = _pairs(shapes, {_registry_id(mi.ShapePtr(s)) for s in traced})
@@ -109,7 +110,7 @@ def find_nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str 
 
 
 def _pairs(shapes: list[mi.Shape], traced: set[int]) -> list[tuple[mi.Shape, mi.Shape]]:
-    """Shapes that share space, or touch where it matters; meshes, which may hold several pieces, with themselves."""
+    """Pairs of shapes that share space, or that touch if traced; a mesh of several pieces is paired with itself."""
     boxes = [(s, oriented_box(s), _registry_id(mi.ShapePtr(s)) in traced) for s in shapes]
     alone = [(s, s) for s in shapes if s.is_mesh() and s.class_name() not in ("Cube", "Rectangle")]
     close = (
@@ -119,7 +120,7 @@ def _pairs(shapes: list[mi.Shape], traced: set[int]) -> list[tuple[mi.Shape, mi.
 
 
 def shape_bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner of a shape. Meshes that Mitsuba 3.9.1 has merged have no valid box of their own."""
+    """Lower and upper corner of a shape. Meshes merged by Mitsuba 3.9.1 have no valid box of their own."""
     box = shape.bbox()
     if box.valid():
         return np.array(box.min), np.array(box.max)
@@ -128,13 +129,13 @@ def shape_bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scene_diagonal(scene: mi.Scene) -> float:
-    """Diagonal of the box around all shapes [length]; 0 where there are none."""
+    """Diagonal of the box around all shapes [length]; 0 for a scene without shapes."""
     corners = [c for s in scene.shapes() for c in shape_bounds(s)]
     return float(np.linalg.norm(np.ptp(corners, axis=0))) if corners else 0.0
 
 
 def _is_closed(shape: mi.Shape) -> bool:
-    """Whether a shape encloses what is inside it: a ball, or a mesh whose every edge is passed once each way."""
+    """Whether a shape encloses its interior: a ball, or a mesh with every edge passed once each way."""
     geometry = mi.traverse(shape)
     if "vertex_positions" not in geometry:  # no mesh, or a rectangle, whose vertices Mitsuba does not show
         return shape.shape_type() in (mi.ShapeType.Sphere.value, mi.ShapeType.Ellipsoids.value)
@@ -146,7 +147,7 @@ def _is_closed(shape: mi.Shape) -> bool:
 
 
 def _make_rays(pairs: list[tuple[mi.Shape, mi.Shape]], far: float) -> mi.Ray3f:
-    """Rays from so far away through the box that the boxes of two shapes share."""
+    """Rays from a distance through the space shared by the boxes of two shapes."""
     rng, origins, targets = np.random.default_rng(0), [], []
     for a, b in pairs:
         one, two = shape_bounds(a), shape_bounds(b)
@@ -160,10 +161,10 @@ def _make_rays(pairs: list[tuple[mi.Shape, mi.Shape]], far: float) -> mi.Ray3f:
 
 
 def _find_disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int], size: float) -> list[tuple[int, int, int]]:
-    """The (ray, shape, shape) of each time that the second names another medium than the one the ray is in since the first.
+    """Find each (ray, shape, shape) whose second shape names another medium than the ray's medium since the first shape.
 
-    Between closed shapes every side counts, and a ray that leaves the scene must be in the medium that it came from. Of shapes
-    with holes only entries from inside another one do. What is behind an opaque surface without media is not known.
+    Between closed shapes every side counts, and a ray leaving the scene must end in its first medium. For shapes with holes
+    only entries from inside another shape count. The medium behind an opaque surface without media is unknown.
     """
     n = dr.width(ray)
     inside, outside, last = np.full(n, UNKNOWN), np.full(n, UNKNOWN), np.zeros(n, int)
@@ -201,7 +202,7 @@ def _is_opaque(si: mi.SurfaceInteraction3f) -> mi.Bool:
 
 
 def _registry_ids(pointers: mi.ShapePtr | mi.MediumPtr) -> mi.UInt32:
-    """What Dr.Jit calls objects by; 0 for none."""
+    """Dr.Jit's registry indices of objects; 0 for no object."""
     return dr.reinterpret_array(mi.UInt32, pointers)
 
 

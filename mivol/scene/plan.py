@@ -1,7 +1,7 @@
-"""What is done about a scene's needs: choices, each with its reason, before anything is rendered.
+"""The plan of a render: choices with reasons, and the media and estimators built from them.
 
-Conventions. A plan is made of :class:`Choice` only; ``explain`` prints it. What cannot be rendered is refused here, with a
-sentence, before a kernel runs.
+Conventions. ``explain`` prints the choices. The plan refuses, with a sentence, a scene that cannot be rendered before a kernel
+runs.
 """
 
 from __future__ import annotations
@@ -67,23 +67,28 @@ __all__ = ["Plan", "make_plan", "build_estimators", "build_media"]
 
 
 PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
-"""Most rays of one pass, through media without grids or with small ones."""
+"""Most rays of a pass through media with small grids or without grids."""
 
 PASS_STEPS = {"llvm": 1 << 29, "cuda": 1 << 34, "metal": 1 << 32}
-"""Most cells that the rays of one pass may cross: a second or two of work, so that Ctrl-C is heard."""
+"""Most cells crossed by all rays of a pass: a second or two of work, so that Ctrl-C acts soon."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """The choices for a scene.
 
-    ``skips`` tells for each medium whether empty blocks are skipped, ``tracks`` whether its shadows are estimated in pictures;
-    ``segment`` names the estimator of what media add along a segment, in
-    :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`; ``events`` how many points of a camera ray scatter in
-    pictures; ``pass_rays`` how many rays a pass may hold; ``gradient_bytes`` what a gradient step takes beyond the rays;
-    ``lobe`` the mean cosine of the lobe that side flights are drawn from, None for no side flights; ``draws_emission`` whether
-    light that media emit is drawn where paths scatter; ``successive`` how many paths a lane walks one after the other, at most;
-    ``branches`` whether paths branch at their first collision for derivatives.
+    Attributes:
+        choices: all choices with their reasons.
+        skips: whether empty blocks of each medium are skipped.
+        tracks: whether shadows of each medium are estimated in images.
+        segment: name of the segment estimator in :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`.
+        events: scattering points per camera ray in images.
+        pass_rays: most rays of a pass.
+        gradient_bytes: memory of a gradient step besides the rays [byte].
+        lobe: mean cosine of the lobe for side flights; None for no side flights.
+        draws_emission: whether scattering points sample the light emitted by media.
+        successive: most paths per lane, walked one after the other.
+        branches: whether paths branch at their first collision for derivatives.
     """
 
     choices: tuple[Choice, ...]
@@ -103,8 +108,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     """Choose from the facts.
 
     Raises:
-        MivolError: what is asked for is not there (quadrature of several scatterings, derivatives of shapes), or a gradient
-            step would not fit into memory.
+        MivolError: a request that mivol does not answer (quadrature of several scatterings, derivatives of shapes), or a
+            gradient step larger than the memory.
     """
     check_scattering(needs, settings)
     check_emission_cells(needs, settings)
@@ -149,7 +154,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
 
 
 def _choose_segment(needs: Needs, settings: Settings) -> str:
-    """Name of the estimator of what media add along a segment; what no estimator answers has been refused."""
+    """Choose the name of the segment estimator. Requests without an estimator have been refused before."""
     emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
     scatters = (emits or bool(needs.emitter_kinds)) and is_scattering_visible(needs, settings)
     question = SegmentNeeds(
@@ -165,7 +170,7 @@ def _choose_segment(needs: Needs, settings: Settings) -> str:
 
 
 def _rays_per_pass(needs: Needs) -> int:
-    """How many rays a pass may hold: fewer where each has many cells to cross."""
+    """Number of rays per pass: fewer for grids with many cells."""
     backend = needs.variant.split("_")[0]
     cells = sum(sum(res) for medium in needs.media for res in medium.resolutions)
     return min(PASS_RAYS[backend], PASS_STEPS[backend] // max(cells, 1))
@@ -192,7 +197,7 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
 
 
 def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) -> SceneMedia:
-    """Build the media that transport walks through, as planned."""
+    """Build the media for transport as planned."""
     bodies = []
     for boundary, view, skip, tracks in zip(needs.boundaries, needs.views, plan.skips, plan.tracks, strict=True):
         for part in view.parts:
@@ -210,7 +215,7 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) 
 def build_estimators(
     scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: SceneSurvey, pictures: bool
 ) -> Estimators:
-    """Build the estimators that the plan has chosen, for pictures or for derivatives."""
+    """Build the planned estimators, for images or for derivatives."""
     media = build_media(scene, needs, plan, survey)
     direct = DirectLighting(media)
     choice = SegmentInputs(direct, plan.events)
@@ -230,7 +235,7 @@ def build_estimators(
 
 
 def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:
-    """The estimator of light of media, by the table that was read of them."""
+    """Make the estimator of the light of media from the table of the needs."""
     found = needs.media_light
     table = EmissionTable(find_emitting_boxes(media, needs.boundaries), found.density, found.cumulative)
     return EmissionSampling(media, table)
@@ -239,7 +244,9 @@ def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) ->
 def _make_visibility_cache(
     direct: DirectLighting, needs: Needs, plan: Plan, survey: SceneSurvey, pictures: bool
 ) -> VisibilityCache | None:
-    """Find where emitters shine; derivatives are not 0 in empty blocks, which only values that were read can tell."""
+    """Make the cache of emitter visibility. Derivatives are nonzero in empty blocks, and only values that were read tell the
+    empty blocks.
+    """
     blind = not pictures or any(m.unread for m in needs.media)
     rays = needs.film_samples * (plan.events if pictures else 1)
     occupied = None if blind else needs.media[0].occupied

@@ -1,14 +1,23 @@
-r"""Which depth does a scene need?  Measured on a small preview, against the noise that is asked for.
+r"""Questions about a scene that small previews answer: the sufficient ``max_depth``, and the gain of sampling the light of
+media.
 
-A path tracer that ends at ``max_depth`` d leaves out the light that scatters more often. A preview of 32 x 32 cells of the
-film is rendered at each depth of :data:`DEPTHS`; with the means I_d of a cell, a depth leaves out
+**Depth.** A path tracer with ``max_depth`` d omits light that scatters more often. :func:`find_sufficient_depth` renders a
+preview of 32 x 32 cells of the film at each depth of :data:`DEPTHS`. With the means I_d of a cell, a depth has the error
 
 .. math:: e_d = \sqrt{ \langle (I_d - I_\infty)^2 \rangle } \,/\, \langle I_\infty \rangle
 
-The smallest depth whose e_d is below the noise of a pixel that is asked for is enough: what it leaves out would not be seen.
-The squares are products of differences of independent batches, so the noise of the preview has no mean in them.
+The sufficient depth is the smallest depth with e_d below the requested noise of a pixel. Squares are products of differences
+of independent batches, so noise adds no mean. Bias: none in e_d^2. The standard error comes from the jackknife over the
+batches (Efron & Stein 1981).
 
-Bias: none in e_d^2. Variance: said as a standard error, by the jackknife over the batches (Efron & Stein 1981).
+**Light of media.** The prediction of :mod:`mivol.scene.media_light` considers only the light of media. If other light is
+noisier, sampling costs time and removes hardly any noise. So :func:`measure_media_light` renders cells of the film with and
+without sampling, along one ray per cell. The gain is the median over the cells of
+
+.. math:: g = \frac{\max( s_{met}^2,\; n\,(m_{met} - m_{drawn})^2 )}{c\,s_{drawn}^2}
+
+with the means m and variances s^2 of n samples, and c the time of a path with sampling over the time of a path without. If no
+path hits a light found by sampling, the difference of the means stands for the unseen noise.
 """
 
 from __future__ import annotations
@@ -42,27 +51,27 @@ __all__ = [
 ]
 
 DEPTHS = (2, 3, 6, -1)
-"""Depths that are compared; the last one, which has no limit, judges the others."""
+"""Compared depths; the last depth, without a limit, is the reference."""
 
 NOISE = 0.02
-"""Noise of a pixel over the mean radiance, where none is asked for."""
+"""Default noise of a pixel over the mean radiance [1]."""
 
 DEPTH_SIDE, DEPTH_BATCHES, DEPTH_SAMPLES = 32, 8, 16
-"""Cells along an edge of the preview, batches, and samples of a cell in each."""
+"""Cells along an edge of the depth preview, batches, and samples per cell and batch."""
 
 DEPTH_SEED = 0xDE97
-"""Of all depths: what their paths share cancels in the differences."""
+"""Seed of all depths: common random numbers cancel in the differences."""
 
 
 @dataclass(frozen=True)
 class DepthError:
-    """What a depth leaves out.
+    """The light omitted by a depth.
 
     Attributes:
         depth: ``max_depth``.
-        share: of the mean radiance [1].
-        rms: root mean square over the cells of the preview, over the mean radiance [1].
-        at_most: that, and two standard errors of its square [1].
+        share: omitted light over the mean radiance [1].
+        rms: root mean square error over the cells, over the mean radiance [1].
+        at_most: ``rms`` with two standard errors added to its square [1].
     """
 
     depth: int
@@ -76,11 +85,11 @@ class DepthError:
 
 @dataclass(frozen=True)
 class SufficientDepth:
-    """The depth that a scene needs.
+    """The depth sufficient for a scene.
 
     Attributes:
-        left_out: by each limited depth of :data:`DEPTHS`.
-        noise: of a pixel over the mean radiance that is asked for [1].
+        left_out: error of each limited depth of :data:`DEPTHS`.
+        noise: requested noise of a pixel over the mean radiance [1].
     """
 
     left_out: tuple[DepthError, ...]
@@ -88,29 +97,29 @@ class SufficientDepth:
 
     @property
     def depth(self) -> int:
-        """The smallest depth of :data:`DEPTHS` that leaves out less than the noise."""
+        """The smallest depth of :data:`DEPTHS` whose error is below the noise."""
         return next((found.depth for found in self.left_out if found.at_most <= self.noise), DEPTHS[-1])
 
     @property
     def reason(self) -> str:
-        """Why it is that one, in words."""
+        """The measurements behind the depth, in words."""
         measured = "; ".join(map(str, self.left_out))
         return f"{measured}; noise of {self.noise:.2%} is asked for"
 
 
 def find_sufficient_depth(scene: mi.Scene, sensor: mi.Sensor, settings: Settings, noise: float = NOISE) -> SufficientDepth:
-    """Measure what each depth leaves out of the light that a sensor sees.
+    """Find the smallest sufficient ``max_depth`` for the light seen by a sensor.
 
     Args:
-        scene: with everything that is looked at in place.
-        sensor: one of its sensors, or another.
-        settings: of the integrator; their depth is not looked at.
-        noise: of a pixel over the mean radiance that is asked for [1].
+        scene: the complete scene.
+        sensor: a sensor of the scene, or another sensor.
+        settings: settings of the integrator; the depth is ignored.
+        noise: requested noise of a pixel over the mean radiance [1].
 
     Raises:
         MivolError: as :func:`mivol.scene.plan.make_plan`.
 
-    Cost: half a million paths, and one kernel for each depth.
+    Cost: half a million paths, and one kernel per depth.
     """
     with dr.suspend_grad():
         survey = survey_scene(scene)
@@ -121,7 +130,7 @@ def find_sufficient_depth(scene: mi.Scene, sensor: mi.Sensor, settings: Settings
 
 
 def measure_depth_error(depth: int, some: NDArray, full: NDArray) -> DepthError:
-    """Compare the cells (batches, cells) of a depth with those of all light."""
+    """Compare the cells (batches, cells) of a depth with the cells of all light."""
     lost, level = full - some, full.mean()
     if level <= 0:
         return DepthError(depth, 0.0, 0.0, 0.0)
@@ -134,13 +143,13 @@ def measure_depth_error(depth: int, some: NDArray, full: NDArray) -> DepthError:
 
 
 def _mean_square(lost: NDArray) -> float:
-    """Mean over cells of the square of the mean over batches, without the mean of its noise."""
+    """Mean over cells of the squared mean over batches, without the mean of the noise."""
     count = len(lost)
     return float(np.mean(np.square(lost.sum(axis=0)) - np.square(lost).sum(axis=0)) / (count * (count - 1)))
 
 
 def _render_depth_preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey, settings: Settings) -> NDArray:
-    """Mean radiance of all colours of each cell (batches, cells)."""
+    """Mean radiance over all colours of each cell (batches, cells)."""
     cells = DEPTH_SIDE * DEPTH_SIDE
     needs = find_needs(scene, sensor, survey, cells * DEPTH_BATCHES * DEPTH_SAMPLES, settings.may_draw_emission)
     plan = make_plan(needs, settings)
@@ -159,17 +168,20 @@ def _render_depth_preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurve
 
 
 DRAW_SIDE, DRAW_SAMPLES, DRAW_SEED = 24, 48, 0xD3A4
-"""Cells along an edge of the preview, samples of each, seed."""
+"""Cells along an edge of the preview, samples per cell, and seed."""
 
 
 def measure_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
-    """The needs of a scene with the gain of draws as it is measured, where it is predicted to be above 1.
+    """Measure the gain of sampling the light of media, if the predicted gain is above 1.
 
     Args:
-        scene, sensor: what is seen.
-        needs: of the scene.
-        survey: keeps what was measured; where a fit changes the scene, what is made of this stays unbiased.
-        settings: of the integrator.
+        scene, sensor: the scene and the sensor to render.
+        needs: facts of the scene.
+        survey: keeps the measured gain. If a fit changes the scene later, the stale gain affects noise only, not the mean.
+        settings: settings of the integrator.
+
+    Returns:
+        The needs with the measured gain.
 
     Cost: 2 x 27648 paths once, and two kernels.
     """
@@ -186,7 +198,7 @@ def measure_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey
 
 
 def sampling_gain(met: NDArray, drawn: NDArray) -> float:
-    """How much sooner draws reach an error than chance does [1], from samples (cells, n) of both; 0 where all is black."""
+    """Gain in time to an error of sampling over chance [1], from samples (cells, n) of both; 0 for black cells."""
     n = met.shape[1]
     missed = n * np.square(met.mean(axis=1) - drawn.mean(axis=1))
     noise = np.maximum(met.var(axis=1, ddof=1), missed)
@@ -197,7 +209,7 @@ def sampling_gain(met: NDArray, drawn: NDArray) -> float:
 
 
 def _render_draw_preview(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> NDArray:
-    """Mean radiance of all colours of each sample (cells, DRAW_SAMPLES), along the middle of each cell."""
+    """Mean radiance over all colours of each sample (cells, DRAW_SAMPLES), along the middle of each cell."""
     cells, n = DRAW_SIDE * DRAW_SIDE, DRAW_SIDE * DRAW_SIDE * DRAW_SAMPLES
     estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, pictures=True)
     sampler = mi.load_dict({"type": "independent"})

@@ -1,7 +1,7 @@
-"""Values of a scene's arrays, each read once: are they finite, which blocks are empty, is an albedo zero.
+"""Values of a scene's arrays, each read once: finite or not, empty blocks, albedo of zero.
 
-Conventions. What was read is kept by the array itself; a new array is read again, and nothing is read while
-``dr.freeze`` records.
+Conventions. The cache key of a reading is the array itself: a new array is read again. Nothing is read while ``dr.freeze``
+records.
 """
 
 from __future__ import annotations
@@ -40,7 +40,14 @@ __all__ = ["GridReading", "check_emission", "check_constants", "is_scattering", 
 
 @dataclass
 class GridReading:
-    """What was read of an array; ``floored``: its values with 0 for those below it, None where there are none."""
+    """The result of reading a grid.
+
+    Attributes:
+        bounds: largest value of each block.
+        occupied: share of blocks with a positive value [1].
+        maximum: largest value of the grid.
+        floored: values with 0 in place of negative values; None without negative values.
+    """
 
     bounds: mi.Float | None
     occupied: float
@@ -49,9 +56,9 @@ class GridReading:
 
 
 def _read_once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
-    """Make something once for each state of an array, which is kept so that its number cannot be given to another one.
+    """Compute something once for each state of an array. The array is kept, so Dr.Jit cannot give its index to another array.
 
-    While a function is being recorded it is made anew: a recording can use no array that was made before it.
+    While ``dr.freeze`` records, the result is computed anew: a recording cannot use arrays made before the recording.
     """
     if is_recording():
         return make()
@@ -64,15 +71,14 @@ def _read_once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable
 
 
 def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> GridReading:
-    """Read the bounds of a part of an extinction once for each state of its array.
+    """Read the bounds of one part of an extinction, once for each state of its array.
 
-    Voxels below 0, where a step of an optimiser or a filter overshot, count as 0 from here on, and have the derivative that
-    they would have at 0, so that a step may bring them back. The first ones of each grid of a scene are told in a warning.
+    Negative voxels, left by a step of an optimizer or by a filter, count as 0. Their derivative is the derivative at 0, so
+    that a later step can raise them again. The first negative voxels of each grid cause a warning.
 
     Raises:
-        MivolError: NaN or infinite values (those of a radiance field may be negative only where its activation takes them);
-            the first bad voxel of a grid is named. A stock grid that is looked up otherwise than between voxel centres
-            with clamped borders.
+        MivolError: NaN or infinite values, or negative values of a radiance field whose activation takes none (the sentence
+            names the first bad voxel of a grid); a stock grid with another filter than trilinear or with unclamped borders.
     """
     array = dr.detach(part.lattice.values.array)
 
@@ -100,7 +106,7 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
 
 
 def _clip_negative(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.Float:
-    """The values of a grid with 0 for those below it; says so once for each grid of a scene.
+    """Clip the negative values of a grid to 0, with one warning for each grid of a scene.
 
     Raises:
         MivolError: NaN or infinite values.
@@ -122,7 +128,7 @@ def _clip_negative(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.
 
 
 def _check_stored_density(array: mi.Float, activation: Activation, name: str) -> None:
-    """Refuse densities of a radiance field that are none: an activation would make vacuum of them in silence."""
+    """Refuse invalid densities of a radiance field: an activation would turn them into vacuum silently."""
     if not bool(dr.all(dr.isfinite(array) & (activation.signed | (array >= 0)))):
         low, high = float(dr.min(array)[0]), float(dr.max(array)[0])
         expected = "finite numbers" if activation.signed else "finite numbers of at least 0 (without an activation)"
@@ -133,15 +139,18 @@ def _check_stored_density(array: mi.Float, activation: Activation, name: str) ->
 
 
 LOOK_UP_POINTS = 2048
-"""Points at which a stock grid is looked up, half of them in its outermost half voxels, half around voxels that are not 0."""
+"""Points for testing the interpolation of a stock grid: half in the outermost half voxels, half around nonzero voxels."""
 
 LOOK_UP_TOLERANCE = 0.02
-"""How far a look-up may be from the trilinear one, in differences between the 8 voxels around (it is 5e-6 of a grid's size off
-where a turned stock grid does not fill its boundary; the nearest voxel is about 0.4 off)."""
+"""Largest deviation from trilinear interpolation, over the range of the 8 surrounding voxels. A rotated stock grid that does
+not
+fill its boundary deviates by 5e-6 of its size, a nearest-voxel filter by about 0.4."""
 
 
 def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> None:
-    """Refuse a stock grid with another filter or with borders that are not clamped: it tells neither, but its values do."""
+    """Refuse a stock grid with another filter or with unclamped borders. Mitsuba exposes neither setting, so values are
+    compared.
+    """
     volume, lattice = part.volume, part.lattice
     mixes = mi.is_monochromatic and lattice.channels > 1
     if volume is None or volume.ptr in survey.looked_up or mixes:
@@ -178,7 +187,7 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
 
 
 def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt8:
-    """Measure how far each block of a part is from the nearest one that is not empty, once for each state of its array."""
+    """Measure the distance of each block to the nearest occupied block, once for each state of the array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
     return _read_once(
         survey, ("empty distances",), array, lambda: find_distances_of_bounds(read_extinction(part, survey, name).bounds, res)
@@ -186,19 +195,19 @@ def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) 
 
 
 def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges:
-    """Read what the blocks of a grid hold, once for each state of its array."""
+    """Read the range of values of each block of a grid, once for each state of the array."""
     values = part.lattice.values
     return _read_once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values))
 
 
 def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
-    """Make a grid coarser once for each state of its array and place."""
+    """Coarsen a grid, once for each state of the array and each placement."""
     kind = ("coarse", shift, lists, lattice.empty_distances is None, lattice.to_world.tobytes())
     return _read_once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
 
 
 def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:
-    """Whether any albedo (or sigma_s) of a medium is above 0, or its derivative is asked for. Each array is read once.
+    """Whether an albedo (or ``sigma_s``) of a medium is above 0 or has gradients enabled. Each array is read once.
 
     Raises:
         MivolError: an albedo outside [0, 1].
@@ -224,7 +233,7 @@ def _is_positive(values: mi.TensorXf, survey: SceneSurvey, name: str, is_albedo:
 
 
 def check_constants(view: MediumView, survey: SceneSurvey, name: str) -> None:
-    """Look at the constants of an extinction and its scale. Each state of them is read once.
+    """Check the constants and the scale of an extinction. Each state is read once.
 
     Raises:
         MivolError: a number that is NaN, infinite or negative.
@@ -239,17 +248,17 @@ def check_constants(view: MediumView, survey: SceneSurvey, name: str) -> None:
 
 
 def _constant_state(value: float | mi.Float | mi.Color3f) -> float | tuple[int, ...]:
-    """What changes with a number: itself, or the indices of its arrays."""
+    """The state of a constant: the number itself, or the indices of its arrays."""
     if not dr.is_array_v(value):
         return value
     return (value.index,) if dr.depth_v(value) == 1 else tuple(v.index for v in value)
 
 
 def check_emission(view: MediumView, survey: SceneSurvey, name: str) -> None:
-    """Look at what a medium emits. Each array is read once.
+    """Check the light that a medium emits. Each array is read once.
 
     Raises:
-        MivolError: light that is negative, infinite or NaN.
+        MivolError: negative, infinite or NaN values.
     """
     for values in view.emission_arrays:
         flat = dr.detach(dr.ravel(values))

@@ -1,4 +1,4 @@
-"""What cannot be rendered is refused here, in a sentence, before a kernel runs."""
+"""Refusals: a scene or a setting that mivol cannot render raises with a sentence before a kernel runs."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ __all__ = [
 
 
 SHADOWS = ("auto", "exact", "estimated", "grid")
-"""How shadows are found: ``exact``, in a ``grid`` (quadrature) or ``estimated`` (Monte Carlo images); ``auto`` chooses."""
+"""Methods for shadows: ``exact``, from a ``grid`` (quadrature) or ``estimated`` (Monte Carlo images); ``auto`` chooses."""
 
 
 MEDIA_LIGHT = ("auto", "drawn", "met")
-"""How light that media emit finds what scatters it: points of them are ``drawn`` too, or it is ``met`` by chance."""
+"""Methods for the light of media: ``drawn`` (sampled, besides chance hits) or ``met`` (chance hits only); ``auto`` chooses."""
 
 
 def parse_aovs(names: str) -> tuple[str, ...]:
-    """Split a comma list of AOVs.
+    """Split a comma-separated list of AOVs.
 
     Raises:
-        MivolError: a name that is not in :data:`mivol.transport.line_integrals.aovs.AOVS`, or one given twice.
+        MivolError: a name missing from :data:`mivol.transport.line_integrals.aovs.AOVS`, or a repeated name.
     """
     asked = tuple(n.strip() for n in names.split(",") if n.strip())
     for name in asked:
@@ -65,7 +65,7 @@ def check_scattering(needs: Needs, settings: Settings) -> None:
 
 
 def check_emission_cells(needs: Needs, settings: Settings) -> None:
-    """Refuse emission that varies faster than the cells that are summed."""
+    """Refuse emission that varies faster than the integrated cells."""
     for facts, view in zip(needs.media, needs.views, strict=True):
         if isinstance(view.emission_density, mi.Volume) and not have_same_cells(view.walked_lattice, view.emission_lattice):
             raise MivolError(
@@ -85,7 +85,7 @@ def check_emission_cells(needs: Needs, settings: Settings) -> None:
 
 
 def _voxel_to_cell_ratio(volume: mi.Volume, view: MediumView) -> float:
-    """A voxel of a volume over the longest edge of a cell that is walked, both as the volume counts lengths."""
+    """Edge of a voxel of the volume over the longest edge of a walked cell, both in the volume's lengths."""
     cells = view.walked_lattice
     place = volume.mivol_to_world if hasattr(volume, "mivol_to_world") else view.stock_boxes[volume.ptr].to_world
     edges = cells.to_world[:3, :3] / np.array(cells.res[::-1])
@@ -94,7 +94,7 @@ def _voxel_to_cell_ratio(volume: mi.Volume, view: MediumView) -> float:
 
 
 def check_placements(needs: Needs) -> None:
-    """Refuse derivatives of places that are not followed."""
+    """Refuse derivatives with respect to unsupported placements."""
     if needs.places:
         raise MivolError(
             f"the derivative of {needs.places[0]} was asked for; mivol has none of shapes, of emitters that have a size, nor "
@@ -103,7 +103,7 @@ def check_placements(needs: Needs) -> None:
 
 
 def check_quadrature(needs: Needs, settings: Settings) -> None:
-    """Refuse settings of shadows that contradict each other, and quadrature of scenes that it does not serve."""
+    """Refuse contradicting settings of shadows, and quadrature of unsuitable scenes."""
     if settings.shadows not in SHADOWS:
         raise MivolError(f"shadows is {settings.shadows!r}; {', '.join(SHADOWS[:-1])} or {SHADOWS[-1]} is expected.")
     if settings.shadows == "estimated" and settings.deterministic:
@@ -133,7 +133,7 @@ def check_quadrature(needs: Needs, settings: Settings) -> None:
 
 
 def check_media_light(needs: Needs, settings: Settings) -> None:
-    """Refuse draws of light of media where they are asked for and cannot be made."""
+    """Refuse the setting ``drawn`` for a scene in which the light of media cannot be sampled."""
     if settings.media_light not in MEDIA_LIGHT:
         known = f"{', '.join(MEDIA_LIGHT[:-1])} or {MEDIA_LIGHT[-1]}"
         raise MivolError(f"media_light is {settings.media_light!r}; {known} is expected.")
@@ -143,7 +143,7 @@ def check_media_light(needs: Needs, settings: Settings) -> None:
 
 
 def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> None:
-    """Refuse what needs an exact optical depth where a field declares none."""
+    """Refuse requests for exact optical depths in a scene with a bounded field."""
     medium = next((m for m in needs.media if m.bounded), None)
     if medium is None:
         return
@@ -162,7 +162,7 @@ def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> No
 
 
 def check_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
-    """Refuse what needs the cells of a grid where a medium is made of Gaussians."""
+    """Refuse requests for the cells of a grid in a medium of Gaussians."""
     medium = next((m for m in needs.media if m.gaussians), None)
     if medium is None:
         return
@@ -176,7 +176,9 @@ def check_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
 
 
 def check_nested(needs: Needs) -> None:
-    """Refuse derivatives of the place of emitters where a field is nested: no terms of its levels' faces are known."""
+    """Refuse derivatives with respect to the placement of emitters beside a nested field: the terms at the faces of its levels
+    are unknown.
+    """
     moved = _emitter_placements(needs)
     level = next((b.name for b in needs.boundaries if b.hole is not None), None)
     if moved and level is not None:
@@ -187,12 +189,12 @@ def check_nested(needs: Needs) -> None:
 
 
 def _raise_first(medium: str, reasons: list[tuple[bool, str, str]], other_way: str) -> None:
-    """Refuse for the first of the reasons (does it hold, what was found, the way out) that holds."""
+    """Raise for the first reason (condition, finding, way out) whose condition holds."""
     for holds, what, way_out in reasons:
         if holds:
             raise MivolError(f"{medium}, and {what}: {way_out}, or {other_way}.")
 
 
 def _emitter_placements(needs: Needs) -> list[str]:
-    """The parameters asked for that say where an emitter is."""
+    """The keys of parameters with gradients that place an emitter."""
     return [k for k in needs.parameters if k.endswith((".position", ".to_world"))]

@@ -1,4 +1,8 @@
-"""The sensor of a scene that a number names, and whether there is room for its pictures."""
+"""Mitsuba's sensors: found by number, checked against memory, and converted to and from cameras of photographs.
+
+Conventions. Mitsuba's camera has x to the left in the image, y up and z into the scene. Its principal point offset is a
+fraction of the film, positive for an optical axis left of (above) the middle of the image. Pixels are square.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +20,20 @@ from mivol.photos.camera import PIXELS_LOST
 __all__ = ["check_film", "find_sensor", "to_camera", "to_sensor"]
 
 FILM_NUMBERS = 5
-"""Red, green, blue, alpha and the filter's weight, which a film sums for each pixel."""
+"""Numbers summed by a film for each pixel: red, green, blue, alpha and the weight of the filter."""
 
 PIXEL_BYTES = 4 * (FILM_NUMBERS + 4)
-"""Of a picture while it is rendered: the sums, and the picture that is made of them."""
+"""Memory of a rendered image per pixel [byte]: the sums and the developed image."""
 
 MOST_ENTRIES = 2**32
-"""Dr.Jit counts the entries of an array in 32 bits."""
+"""Limit of Dr.Jit, which counts entries of an array in 32 bits."""
 
 
 def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """A sensor of the scene by its number, or the one that is given.
+    """Find a sensor of the scene by number; a given sensor is returned unchanged.
 
     Raises:
-        MivolError: the scene has none of that number.
+        MivolError: no sensor with the number.
     """
     if not isinstance(sensor, int):
         return sensor
@@ -40,14 +44,14 @@ def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
 
 
 def check_film(sensor: mi.Sensor, kept: int = 0) -> None:
-    """Refuse a film that is larger than the memory, or than an array can be, before anything is rendered on it.
+    """Refuse a film larger than the memory or than an array, before a render.
 
     Args:
-        sensor: with its film, of which the crop is counted.
-        kept: bytes a pixel that the caller keeps beside the picture that is rendered.
+        sensor: the sensor; the crop of its film counts.
+        kept: memory kept by the caller besides the image [byte per pixel].
 
     Raises:
-        MivolError: with the size of the film.
+        MivolError: a film that does not fit; the sentence names its size.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     what, way_out = f"a film of {width} x {height} pixels", "give it fewer pixels, or render it in crops"
@@ -57,19 +61,19 @@ def check_film(sensor: mi.Sensor, kept: int = 0) -> None:
 
 
 AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""Mitsuba's camera axes in ours."""
+"""Mitsuba's camera axes in the axes of :class:`mivol.photos.Camera`."""
 
 
 def to_sensor(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pixel_format: str = "rgb") -> dict:
-    """A perspective sensor with a box filter, for ``mitsuba.load_dict``.
+    """Convert a camera to a perspective sensor with a box filter, for ``mitsuba.load_dict``.
 
     Args:
-        camera: a pinhole with square pixels (:func:`mivol.photos.rectify` makes one).
+        camera: a pinhole with square pixels (see :func:`mivol.photos.rectify`).
         near_far: clipping distances [length].
-        pixel_format: of the film.
+        pixel_format: pixel format of the film.
 
     Raises:
-        MivolError: distortion, or pixels that are not square: Mitsuba has no such camera.
+        MivolError: lens distortion, or pixels that are not square; Mitsuba has no such camera.
     """
     (fx, _, cx), (_, fy, cy), _ = camera.K
     if camera.distortion or abs(fx / fy - 1) * max(camera.size) / 2 > PIXELS_LOST:
@@ -99,7 +103,7 @@ def to_sensor(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pi
 
 
 def to_camera(sensor: mi.Sensor, name: str = "sensor") -> Camera:
-    """The camera of a perspective sensor; of a cropped film, that of the crop.
+    """Convert a perspective sensor to a camera. For a cropped film the camera sees the crop.
 
     Raises:
         MivolError: another kind of sensor.

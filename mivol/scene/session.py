@@ -1,7 +1,7 @@
-"""A render from the question to the image: a scene's needs, the plan, the walk, the film, and the way back.
+"""A session renders scenes with one set of settings: facts, plan, walk and film, and the same way back for derivatives.
 
-Conventions. A session belongs to one integrator. It keeps the survey of the scene it saw last and nothing else, so that the
-same integrator may be used on one scene after the other.
+Conventions. A session belongs to one integrator. The session keeps only the survey of the last scene, so the same integrator
+may render one scene after the other.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ __all__ = ["Session"]
 
 @dataclass
 class _SurveyedScene:
-    """A scene, known by its shapes and emitters, and its survey.
+    """The survey of a scene, and the shapes and emitters by which the scene is recognised.
 
-    Not the scene itself: it may hold the integrator that this session belongs to, and neither would ever be freed.
+    The scene itself is not kept: the scene may hold the integrator of this session, and then neither would ever be freed.
     """
 
     parts: list[mi.Object]
     survey: SceneSurvey
 
     def is_of(self, parts: list[mi.Object]) -> bool:
-        """Whether these are the very same shapes and emitters."""
+        """Whether ``parts`` are the very same shapes and emitters."""
         return len(parts) == len(self.parts) and all(a is b for a, b in zip(parts, self.parts, strict=True))
 
 
@@ -50,11 +50,11 @@ class Session:
     """Renders scenes with one set of settings.
 
     Args:
-        settings: depth, roulette, hidden emitters.
-        aovs: comma list of the names in :data:`mivol.transport.line_integrals.aovs.AOVS`.
+        settings: depth, Russian roulette, hidden emitters and the like.
+        aovs: comma-separated names from :data:`mivol.transport.line_integrals.aovs.AOVS`.
 
     Raises:
-        MivolError: an unknown AOV, or one named twice.
+        MivolError: an unknown AOV, or a repeated name.
     """
 
     def __init__(self, settings: Settings, aovs: str = "") -> None:
@@ -72,7 +72,7 @@ class Session:
         """Render an image (height, width, colours + AOVs).
 
         Raises:
-            MivolError: what the plan refuses, a film that is larger than the memory, or ``develop`` false.
+            MivolError: a refusal of the plan, a film larger than the memory, or ``develop`` set to false.
         """
         if not develop:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
@@ -86,7 +86,7 @@ class Session:
         return image
 
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
-        """Render the derivative of an image along the gradients that were set on the parameters."""
+        """Render the derivative of an image along the gradients set on the parameters."""
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad(), carry_tangents(scene):
             with dr.resume_grad():
@@ -98,7 +98,7 @@ class Session:
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
 
-        Cost: a render and its replay; memory independent of the samples, beyond those of a pass.
+        Cost: a render and its replay. Memory: that of one pass, independent of the number of samples.
         """
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
@@ -118,7 +118,7 @@ class Session:
                 media.deliver_gradients()
 
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
-        """Radiance along given rays, for integrators that nest this one, which do not tell what sensor the rays come from."""
+        """Estimate the radiance along given rays, for integrators that nest this integrator and do not name a sensor."""
         with dr.suspend_grad():
             estimators, _ = self._open(scene, find_sensor(scene, 0), 1, pictures=True)
             media = estimators.media
@@ -130,7 +130,7 @@ class Session:
             return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[Estimators, Plan]:
-        """Survey a scene that is not known yet, find its needs, plan, and build estimators for images or for derivatives."""
+        """Survey a new scene, find the needs, plan, and build the estimators for images or for derivatives."""
         parts = [*scene.shapes(), *scene.emitters()]
         if self._surveyed is None or not self._surveyed.is_of(parts) or not self._surveyed.survey.is_current:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
@@ -179,7 +179,7 @@ class Session:
 
 
 def _find_renderable_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """The sensor that is rendered, whose pictures fit into memory."""
+    """Find the sensor, and check that its image fits into memory."""
     found = find_sensor(scene, sensor)
     check_film(found)
     return found

@@ -1,4 +1,4 @@
-"""What does not change while shapes stay where they are: boundaries, surfaces, emitters, found once for each scene."""
+"""Where the media, surfaces and emitters of a scene are: found once, and valid while no shape moves."""
 
 from __future__ import annotations
 
@@ -20,28 +20,29 @@ __all__ = ["OUTSIDE_SHAPES", "SceneSurvey", "find_outside_media", "is_instance",
 
 
 OUTSIDE_SHAPES = "space around shapes"
+"""Class of shape of a medium that fills no shape."""
 
 
 @dataclass
 class SceneSurvey:
-    """What does not change while shapes stay where they are, and a cache of what was read of arrays.
+    """The facts about shapes and emitters, and a cache of values read from arrays.
 
     Attributes:
         boundaries, surfaces, has_null_transmission, emitters, emitter_kinds, are_emitters_far, refractive, is_sealed: as in
             :class:`mivol.scene.needs.Needs`.
-        marks: boundaries, each with what another place would change of it: its vertices or its box.
+        marks: placement of each boundary: the array of its vertices, or its box.
         size: diagonal of the box around all shapes [length].
-        looked_up: stock grids whose look-up was compared with mivol's, by pointer.
-        scatters: whether each medium scattered when it was last read, by name.
-        values, numbers: what was read of arrays and of constants (:mod:`mivol.scene.readings`).
-        places: where grids lie (:func:`mivol.transport.media.medium_view.view_medium`).
+        looked_up: stock grids whose interpolation agrees with mivol's, by pointer.
+        scatters: whether each medium scattered at the last reading, by name.
+        values, numbers: results of reading arrays and constants (:mod:`mivol.scene.readings`).
+        places: placements of grids (:func:`mivol.transport.media.medium_view.view_medium`).
         cosines: mean cosines of phase functions, by the name of the medium.
-        warned: media and grids that were warned of.
+        warned: media and grids with a warning already given.
         misplaced: names of the grids of each medium that lie outside of its shapes.
-        media_light: what was read of the light that media emit, with the arrays that it was read of
-            (:mod:`mivol.scene.media_light`); None where nothing was.
-        gain_of_draws: how much sooner draws of that light reach an error [1] (:mod:`mivol.scene.previews`); None where it
-            was not measured.
+        media_light: the light of the media with the arrays behind the light (:mod:`mivol.scene.media_light`); None before the
+            first reading.
+        gain_of_draws: measured gain of sampling the light of media [1] (:mod:`mivol.scene.previews`); None before a
+            measurement.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -67,7 +68,9 @@ class SceneSurvey:
 
     @property
     def is_current(self) -> bool:
-        """Whether no boundary has been moved since. While ``dr.freeze`` records, which cannot be told, all count as unmoved."""
+        """Whether no boundary has moved since the survey. While ``dr.freeze`` records, placements cannot be read and count as
+        unmoved.
+        """
         return is_recording() or all(_is_unmoved(shape, mark) for shape, mark in self.marks)
 
 
@@ -75,7 +78,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     """Find the media, surfaces and emitters of a scene.
 
     Raises:
-        MivolError: boundaries that do not agree which medium lies between them.
+        MivolError: boundaries that disagree about the medium between them.
     """
     boundaries, surfaces, refractive, has_null = [], [], [], False
     shapes = scene.shapes()
@@ -122,7 +125,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
 
 
 def _read_placement(shape: mi.Shape) -> object:
-    """What another place would change of a shape: the array of a mesh's vertices, else its box."""
+    """The placement of a shape: the array of a mesh's vertices, else the bounding box."""
     params = mi.traverse(shape)
     # A rectangle is a mesh that keeps its vertices to itself.
     if "vertex_positions" in params:
@@ -142,13 +145,13 @@ def _emitter_kind(emitter: mi.Emitter) -> str:
 
 
 def _are_emitters_far(emitters: list[mi.Emitter]) -> bool:
-    """Whether every emitter is at infinity, and one of them is not the same from everywhere."""
+    """Whether all emitters are at infinity, and at least one emitter is not uniform."""
     infinite = all(int(e.flags()) & int(mi.EmitterFlags.Infinite) for e in emitters)
     return infinite and any(_emitter_kind(e) != "uniform" for e in emitters)
 
 
 def _are_sealed(boundaries: Sequence[Boundary], shapes: Sequence[mi.Shape], emitters: Sequence[mi.Emitter]) -> bool:
-    """Whether every medium fills shapes that bend all light, outside of which all emitters lie, which paths can hit."""
+    """Whether all media lie behind purely refracting shapes, with all emitters outside and hittable by paths."""
     if not boundaries or any(b.shape == OUTSIDE_SHAPES for b in boundaries):
         return False
     holders = [s for s in shapes if s.is_medium_transition() and s.interior_medium() is not None]
@@ -159,7 +162,7 @@ def _are_sealed(boundaries: Sequence[Boundary], shapes: Sequence[mi.Shape], emit
 
 
 def _refracts_all_light(shape: mi.Shape) -> bool:
-    """Whether a shape lets light through by refraction alone."""
+    """Whether a shape transmits light only by refraction."""
     flags = int(shape.bsdf().flags())
     bends = flags & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission))
     return bool(bends) and not flags & (int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.DiffuseTransmission))
@@ -172,7 +175,7 @@ def _is_bare(shape: mi.Shape) -> bool:
 
 
 def is_instance(shape: mi.Shape) -> bool:
-    """Whether a shape is an instance of a group of shapes."""
+    """Whether a shape is an instance of a shape group."""
     return shape.class_name() == "Instance"
 
 
@@ -184,19 +187,19 @@ def _make_boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox]) ->
 
 
 def find_outside_media(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:
-    """The media that fill no shape of their own: a ray learns of them from the exterior of a boundary, or from the sensor."""
+    """Find the media that fill no shape. A ray learns of such a medium from the exterior of a boundary or from the sensor."""
     held = {b.medium.ptr for b in boundaries}
     found = [Boundary(m, m.id() or "a medium without an id", OUTSIDE_SHAPES, None) for m in media if m.ptr not in held]
     return [part for boundary in found for part in _split_levels(boundary)]
 
 
 def _split_levels(boundary: Boundary) -> list[Boundary]:
-    """A boundary for each level of a nested radiance field; any other one by itself.
+    """Split the boundary of a nested radiance field into levels; other boundaries stay whole.
 
-    A level fills its own box, as far as the boundary holds that, but for the box of the level before it.
+    A level fills the part of its box inside the boundary, without the box of the level before.
 
     Raises:
-        MivolError: a nested field in anything but a box.
+        MivolError: a nested field in a shape other than a box.
     """
     field = nested_field(boundary.medium)
     if field is None:
@@ -220,21 +223,21 @@ def _split_levels(boundary: Boundary) -> list[Boundary]:
 
 
 LEVEL_TOLERANCE = 1e-6
-"""How far a level may stand out of its boundary, in edges: the boundary's vertices are float32."""
+"""Largest distance by which a level may exceed its boundary [edge of the level]: vertices of the boundary are float32."""
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """One medium and where it is.
+    """A medium, and the boundary that the medium fills.
 
     Attributes:
         medium: Mitsuba's object.
-        name: of the shape that it fills.
-        shape: class of that shape; ``AROUND`` for a medium that fills none (around other shapes or the camera, in instances).
-        box: the shape, where it is a box that no other boundary overlaps; None where it has to be traced.
-        level: of a nested radiance field, each level of which is a medium of its own.
-        hole: box of the inner level, which this level leaves out; None for other media.
-        around: box around the shape; None if the medium fills no shape or also surrounds one.
+        name: name of the shape.
+        shape: class of the shape; ``OUTSIDE_SHAPES`` for a medium around shapes, around the camera or in instances.
+        box: the shape as a box overlapped by no other boundary; None if rays must be traced to the shape.
+        level: level of a nested radiance field; each level is a medium of its own.
+        hole: box of the inner level, left out by this level; None for other media.
+        around: box around the shape; None if the medium fills no shape or also surrounds a shape.
     """
 
     medium: mi.Medium
@@ -246,7 +249,7 @@ class Boundary:
     around: OrientedBox | None = None
 
     def view(self, places: dict) -> MediumView:
-        """Its medium as a sum of fields; ``places`` as in :func:`mivol.transport.media.medium_view.view_medium`.
+        """View the medium as a sum of fields; ``places`` as in :func:`mivol.transport.media.medium_view.view_medium`.
 
         Raises:
             MivolError: a medium that mivol does not render.
@@ -254,5 +257,5 @@ class Boundary:
         return view_medium(self.medium, self.box, places, self.level)
 
     def body(self, view: MediumView, estimates_shadows: bool = False) -> Body:
-        """A view of its medium, where it is."""
+        """Place a view of the medium inside its boundary."""
         return Body(view, self.box, estimates_shadows, self.hole)

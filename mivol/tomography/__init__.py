@@ -1,1 +1,1 @@
-"""Line integrals measured from many sides: geometries, the matched projector pair, phantoms, and real projections."""
+"""Computed tomography: geometries, the matched projector pair, filtered back-projection, phantoms, and measured projections."""

@@ -1,11 +1,11 @@
-"""Where the rotation axis of a circular cone-beam scan falls on the detector, from rays that were measured from both ends.
+"""Find the rotation axis of a circular cone-beam scan on the detector, from rays measured from both ends.
 
-Conventions. ``alpha`` is the angle [rad] between a ray and the central one, positive towards larger columns; the axis is seen
+Conventions. ``alpha`` is the angle [rad] between a ray and the central ray, positive towards larger columns; the axis appears
 at ``alpha = epsilon``. In the plane of the source's circle, and in the geometry of :mod:`mivol.tomography.geometry`, the ray
-(theta, alpha) and the ray (theta + pi + 2 epsilon - 2 alpha, 2 epsilon - alpha) are one line, seen from its two ends. Sorted by
-``phi = theta - alpha``, the direction of the line, the two become a projection and its mirror image half a turn away, as in
-parallel light: ``P(phi, alpha) = P(phi + pi, 2 epsilon - alpha)``. What is told is the column of the axis: that the central ray
-meets the detector where ``detector_offset`` says is taken for granted.
+(theta, alpha) and the ray (theta + pi + 2 epsilon - 2 alpha, 2 epsilon - alpha) run along the same line from its two ends.
+Sort both rays by the direction of the line, ``phi = theta - alpha``. A cone-beam ray and its opposite then form a
+parallel-beam pair, half a turn apart: ``P(phi, alpha) = P(phi + pi, 2 epsilon - alpha)``. The result is the column of the
+axis. The place of the central ray is not estimated: ``detector_offset`` is taken as given.
 
 References: Parker 1982, Med. Phys. 9, 254 (the two ends of a line); Vo et al. 2014 (mirror images and the axis); White 1980,
 Econometrica 48, 817 (the variance of a least-squares fit from the scatter of its parts).
@@ -26,29 +26,31 @@ from mivol.tomography.redundancy import covers_circle, widest_gap
 from mivol.tomography.rotation_axis import Axis
 
 MAX_ROWS, MAX_DIRECTIONS = 4, 360
-"""So many rows and directions of lines are enough: each pair of views of a row alone tells the axis to a part of a column."""
+"""Rows and directions of lines; more are not needed, since each pair of views of a row gives the axis to a fraction of a
+column."""
 
 SEARCH_DIRECTIONS, MIN_OVERLAP, MIN_CORRELATION = 24, 0.02, 0.5
-"""Of the search for the nearest column: directions that are looked at; the share of all slopes that must be seen twice; the
-correlation of slopes below which the two ends are not alike (1: without noise; noise alone stays below 0.2, where 24
-directions have 5 columns each that are independent)."""
+"""Limits of the search for the nearest column: number of directions; smallest share of slopes measured twice; smallest
+correlation of slopes for matching ends (1 without noise; noise alone stays below 0.2 for 24 directions with 5 independent
+columns each)."""
 
 SECTORS = 24
-"""The uncertainty comes from how far so many sectors of directions disagree: Student's t of 23 degrees of freedom."""
+"""Sectors of directions. The disagreement of the sectors gives the uncertainty: Student's t with 23 degrees of freedom."""
 
 
 SAMPLING_ERROR = 0.01
-"""One standard deviation [columns] of what edges between columns and views add: the axis of a head in 60 to 360 views is found
-so far from where it is, at most, when nothing is noisy."""
+"""Standard deviation [columns] caused by edges between columns and views: the largest error without noise for a head in 60 to
+360
+views."""
 
 
 @dataclass(frozen=True, eq=False)
 class MirroredRows:
-    """Projections of one row, sorted by the direction of their lines, and those half a turn away.
+    """Projections of a row, sorted by the direction of their lines, and the projections half a turn away.
 
     Attributes:
         here, there: (directions, cols) line integrals, smoothed; ``there`` as a spline in the column.
-        weights_here, weights_there: 0 where nothing was measured.
+        weights_here, weights_there: 0 for unmeasured rays.
     """
 
     here: np.ndarray
@@ -58,21 +60,21 @@ class MirroredRows:
 
 
 def axis_from_fans(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> Axis:
-    """Find the column of the axis for which rays that run along one line, one each way, agree best (weighted least squares).
+    """Find the column of the axis at which opposite rays along the same line agree best (weighted least squares).
 
-    The rows next to the plane of the source's circle are used, where the two rays of a line part by half a row at most. Columns
-    are smoothed by at least one column, and by half of what an edge moves between neighbouring views, so that neither the
-    interpolation between columns nor that between views prefers a place of its own. The standard deviation is that of
-    the sum of 24 sectors of directions, from how far their slopes scatter about 0 at the minimum: noise of any law, and errors
-    of the light or of the geometry, are in it.
+    Only rows next to the plane of the source's circle are used: opposite rays then part by at most half a row. Columns are
+    smoothed by at least a column, and by half of the movement of an edge between neighbouring views, so interpolation between
+    columns and views prefers no column. The standard deviation comes from 24 sectors of directions, by the scatter of their
+    slopes about 0 at the minimum. The scatter includes noise of every distribution, and errors of the light and of the
+    geometry.
 
     Args:
         y: (views, rows, cols) line integrals.
         weights: inverse variances of ``y``; 0: not used.
-        beam: angles, distances and pixels; its ``axis_offset`` is not looked at.
+        beam: angles, distances and pixels; its ``axis_offset`` is ignored.
 
     Raises:
-        MivolError: no row near the plane of the circle, no line that was measured twice, or no least misfit.
+        MivolError: no row near the plane of the circle, no line measured twice, or no minimum of the misfit.
     """
     pairs = [_pair_rows(y[:, row], weights[:, row], beam) for row in _rows_in_the_plane(beam)]
     alpha = _fan_angles(beam)
@@ -91,7 +93,7 @@ def axis_from_fans(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> Axis:
 
 
 def cone_axis_offset(axis: Axis, beam: ConeBeam) -> float:
-    """The ``axis_offset`` of a cone beam whose axis is seen at a column [length]."""
+    """The ``axis_offset`` of a cone beam with the axis at a column [length]."""
     return _detector_position(beam, axis.column) * beam.source_to_axis / beam.source_to_detector
 
 
@@ -106,17 +108,17 @@ def _fan_angles(beam: ConeBeam) -> np.ndarray:
 
 
 def _mirrored_columns(beam: ConeBeam, alpha: np.ndarray, column: float) -> np.ndarray:
-    """Columns (cols,) that see each column's line from its other end where the axis is at ``column``."""
+    """Columns (cols,) of the opposite rays, for an axis at ``column``."""
     epsilon = np.arctan(_detector_position(beam, column) / beam.source_to_detector)
     place = beam.source_to_detector * np.tan(2 * epsilon - alpha)
     return (place - beam.detector_offset[1]) / beam.pitch[1] + (beam.detector[1] - 1) / 2
 
 
 def _rows_in_the_plane(beam: ConeBeam) -> np.ndarray:
-    """Up to MOST_ROWS rows next to the plane of the circle.
+    """Up to MAX_ROWS rows next to the plane of the circle.
 
-    The two rays of a line that rises by ``v / source_to_detector`` cross at the axis; at a distance r they are ``2 r v /
-    source_to_detector`` apart, which must be at most half of a row as wide as the axis sees it.
+    Two opposite rays rising by ``v / source_to_detector`` cross at the axis. At a distance r they are ``2 r v /
+    source_to_detector`` apart, which must be at most half the height of a row at the axis.
     """
     widest = np.abs(_detector_position(beam, np.array([0, beam.detector[1] - 1]))).max()
     reach = widest * beam.source_to_axis / beam.source_to_detector
@@ -129,7 +131,7 @@ def _rows_in_the_plane(beam: ConeBeam) -> np.ndarray:
 
 
 def _pair_rows(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> MirroredRows:
-    """A row (views, cols) sorted by direction."""
+    """Sort a row (views, cols) by direction."""
     alpha, cols = _fan_angles(beam), beam.detector[1]
     turn = _ViewSpline.of(interpolate_gaps(y[:, None], weights[:, None])[:, 0], weights, beam.angles)
     phi = np.pi * np.arange(turn.directions) / turn.directions
@@ -142,7 +144,7 @@ def _pair_rows(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> MirroredRo
 
 
 def _smooth(value: np.ndarray, weights: np.ndarray, was_seen: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """A Gaussian over so many columns; the weight is 0 where it reaches beyond what was seen."""
+    """Smooth by a Gaussian over ``width`` columns; the weight is 0 where the Gaussian reaches unmeasured columns."""
     margin = 2 * min(int(np.ceil(2 * width)), value.shape[1] // 8) + 1
     whole = ndimage.minimum_filter1d(was_seen.astype(np.uint8), margin, axis=1, mode="constant")
     return ndimage.gaussian_filter1d(value, width, axis=1, mode="nearest"), np.where(whole, weights, 0.0)
@@ -150,7 +152,7 @@ def _smooth(value: np.ndarray, weights: np.ndarray, was_seen: np.ndarray, width:
 
 @dataclass(frozen=True, eq=False)
 class _ViewSpline:
-    """A row of a scan between its views: a spline in theta, around the circle where views lie all around it."""
+    """A row of a scan interpolated between views: a spline in theta, periodic for views all around the circle."""
 
     spline: interpolate.CubicSpline
     theta: np.ndarray
@@ -176,9 +178,9 @@ class _ViewSpline:
         return cls(spline, theta, weights, is_closed, directions)
 
     def at(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Line integrals, weights, and whether it was seen, of each column at angles (directions, cols) of its own.
+        """Line integrals, weights, and whether the ray was measured, for angles (directions, cols).
 
-        Beyond the views it is what the nearest of them sees, and not seen.
+        Beyond the views, the nearest view stands in and counts as unmeasured.
         """
         theta = np.mod(theta - self.theta[0] + 1e-9, 2 * np.pi) + self.theta[0] - 1e-9
         was_seen = theta <= self.theta[-1] + 1e-9
@@ -193,7 +195,7 @@ class _ViewSpline:
 
 
 def _pair_weights(pair: MirroredRows, columns: np.ndarray) -> np.ndarray:
-    """Inverse variances (directions, cols) of the differences of mirrored rays; 0 where one of the two was not measured."""
+    """Inverse variances (directions, cols) of the differences of mirrored rays; 0 if a ray of the pair was not measured."""
     nearest = np.rint(columns).astype(int)
     inside = (columns >= 0) & (columns <= len(columns) - 1)
     there = np.where(inside, pair.weights_there[:, np.clip(nearest, 0, len(columns) - 1)], 0.0)
@@ -202,14 +204,14 @@ def _pair_weights(pair: MirroredRows, columns: np.ndarray) -> np.ndarray:
 
 
 def _sector_misfits(pair: MirroredRows, columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted squares of the differences of mirrored rays, (sectors,) sums over sectors of directions."""
+    """Weighted squared differences of mirrored rays, summed over each sector of directions (sectors,)."""
     squares = weights * (pair.here - pair.there(np.clip(columns, 0, len(columns) - 1))) ** 2
     bounds = np.linspace(0, len(squares), min(SECTORS, len(squares)) + 1).astype(int)[:-1]
     return np.add.reduceat(squares.sum(1), bounds)
 
 
 def _nearest_column(pair: MirroredRows, beam: ConeBeam, alpha: np.ndarray) -> float:
-    """The whole column about which mirrored slopes are alike most: their correlation where both were measured."""
+    """The whole column with the highest correlation of mirrored slopes, over rays measured from both ends."""
     some = slice(None, None, max(1, len(pair.here) // SEARCH_DIRECTIONS))
     here, rising = np.gradient(pair.here[some], axis=1), pair.there.derivative()
     thinned = MirroredRows(here, pair.there, pair.weights_here[some], pair.weights_there[some])
@@ -230,10 +232,10 @@ def _nearest_column(pair: MirroredRows, beam: ConeBeam, alpha: np.ndarray) -> fl
 
 
 def _sector_minimum(misfit: Callable[[float], np.ndarray], centre: float, width: float) -> tuple[float, float]:
-    """(column, standard deviation) of the least of a parabola, fitted to the misfits (sectors,) at five columns.
+    """(column, standard deviation) of the minimum of a parabola, fitted to the misfits (sectors,) at five columns.
 
-    The slope of the misfit is a sum over sectors of independent noise; at the minimum it is 0, and the slopes of
-    the sectors scatter about 0 as far as it might have.
+    The slope of the misfit is a sum over sectors of independent noise. The slope is 0 at the minimum, and the scatter of the
+    sectors' slopes about 0 gives the variance.
     """
     offsets = np.linspace(-1.0, 1.0, 5)
     a, b, _ = np.polyfit(offsets, [misfit(centre + width * o) for o in offsets], 2)

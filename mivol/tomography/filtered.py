@@ -1,8 +1,11 @@
-"""Filtered back-projection in parallel and in cone beams: one step, cheap and without noise weights.
+"""Filtered back-projection in parallel and in cone beams: fast, in a single step and without noise weights.
+
+Back-projection runs voxel by voxel: every voxel reads each view once, interpolated between the pixels at its shadow. The
+operation is not the transpose of the projector, which spreads rays over voxels: do not use it in an iterative solver.
 
 References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), sections 3.3 and 3.6; Feldkamp, Davis & Kress
 1984, J. Opt. Soc. Am. A 1, 612; Parker 1982; Wang 2002; Gullberg, Crawford & Tsui 1986, IEEE Trans. Med. Imaging 5, 23 (a
-rotation axis that the central ray misses).
+rotation axis beside the central ray).
 """
 
 from __future__ import annotations
@@ -32,25 +35,25 @@ __all__ = [
 
 
 def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
-    """Reconstruct a parallel-beam scan in one step: ``x = sum_views step share (h * y)(x . u)``.
+    """Reconstruct a parallel-beam scan in a single step: ``x = sum_views step share (h * y)(x . u)``.
 
-    The views may be spread in any way over half a turn or more: each stands for the directions nearest to it. A detector
-    that the rotation axis divides unevenly reaches its whole width over a whole turn
+    Views may be spread arbitrarily over half a turn or more: each view stands for its nearest directions. A detector divided
+    unevenly by the rotation axis reaches its whole width over a whole turn
     (:func:`~mivol.tomography.redundancy.full_turn_weights`).
 
     Args:
-        projector: of a :class:`~mivol.tomography.geometry.ParallelBeam`; its views are those of ``y``.
+        projector: projector of a :class:`~mivol.tomography.geometry.ParallelBeam`, with the views of ``y``.
         y: (views, rows, cols) line integrals.
-        window, cutoff: of :func:`~mivol.tomography.ramp.filter_ramp`.
+        window, cutoff: as in :func:`~mivol.tomography.ramp.filter_ramp`.
 
     Returns:
         (Z, Y, X) float32 [1/length].
 
     Raises:
-        MivolError: another beam, or directions that are missing.
+        MivolError: another beam, or missing directions.
 
     Bias: the ramp stops at the pixels' Nyquist frequency; few views leave streaks. Values are not clipped at 0.
-    Cost: four reads a voxel and view.
+    Cost: four reads per voxel and view.
     """
     beam, weights = projector.geometry, _parallel_weights(projector)
     weighted, matrices = _pad_detector(y * weights[:, None], pixel_matrices(beam, projector.grid, projector.views), beam.u)
@@ -77,20 +80,21 @@ def _parallel_weights(projector: Projector) -> np.ndarray:
 
 
 def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
-    """Reconstruct a circular cone-beam scan in one step (FDK).
+    """Reconstruct a circular cone-beam scan in a single step (FDK).
 
-    ``x = sum_views step / U^2 (h * (share cos y))``: ``U`` is a voxel's depth over the axis' depth, ``cos`` the cosine of a
-    ray's angle to the central one, and the ramp acts on rows scaled to the axis. Where the central ray misses the axis by
-    ``tau``, ``cos = (D^2 + tau p) / (D sqrt(D^2 + p^2 + q^2))`` for the ray through (p, q) in the axis' plane (Gullberg
-    1986). Shares are those of a whole turn, of a displaced detector on one, or Parker's on half a turn and the fan.
+    ``x = sum_views step / U^2 (h * (share cos y))``: ``U`` is the depth of a voxel over the depth of the axis, and ``cos`` the
+    cosine of the angle between a ray and the central ray. The ramp acts on rows scaled to the axis. For an axis at the
+    distance ``tau`` from the central ray, ``cos = (D^2 + tau p) / (D sqrt(D^2 + p^2 + q^2))`` for the ray through (p, q) in
+    the axis' plane (Gullberg 1986). The shares belong to a whole turn, to a displaced detector on a whole turn, or (Parker) to
+    half a turn plus the fan.
 
-    Args, returns: as :func:`filtered_backprojection`, of a :class:`~mivol.tomography.geometry.ConeBeam`.
+    Args, returns: as :func:`filtered_backprojection`, for a :class:`~mivol.tomography.geometry.ConeBeam`.
 
     Raises:
-        MivolError: another beam, or fewer views than half a turn and the fan's angle.
+        MivolError: another beam, or fewer views than half a turn plus the angle of the fan.
 
-    Bias: exact in the source's plane; elsewhere it grows with the cone's angle (Feldkamp 1984).
-    Cost: four reads a voxel and view.
+    Bias: exact in the source's plane; elsewhere the bias grows with the cone's angle (Feldkamp 1984).
+    Cost: four reads per voxel and view.
     """
     weights = _circle_weights(projector)
     beam, grid, scale = projector.geometry, projector.grid, _scale_to_axis(projector.geometry)
@@ -105,25 +109,25 @@ def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutof
 
 
 def check_directions(projector: Projector) -> None:
-    """Refuse scans that filtered back-projection does not invert.
+    """Refuse scans unsuitable for filtered back-projection.
 
     Raises:
-        MivolError: what :func:`filtered_backprojection` of a parallel beam, or :func:`feldkamp` of any other, would raise.
+        MivolError: as :func:`filtered_backprojection` for a parallel beam, or :func:`feldkamp` for other beams.
     """
     (check_parallel if isinstance(projector.geometry, ParallelBeam) else check_circle)(projector)
 
 
 def check_parallel(projector: Projector) -> None:
-    """Refuse scans that :func:`filtered_backprojection` does not invert.
+    """Refuse scans unsuitable for :func:`filtered_backprojection`.
 
     Raises:
-        MivolError: another beam, or directions that are missing.
+        MivolError: another beam, or missing directions.
     """
     _parallel_weights(projector)
 
 
 def check_circle(projector: Projector) -> None:
-    """Refuse scans that :func:`feldkamp` does not invert.
+    """Refuse scans unsuitable for :func:`feldkamp`.
 
     Raises:
         MivolError: as :func:`feldkamp`.
@@ -149,10 +153,10 @@ def _circle_weights(projector: Projector) -> np.ndarray:
 
 
 def cone_weights(angles: np.ndarray, gamma: np.ndarray, needed: float) -> np.ndarray:
-    """Step times share (views, cols) of rays at ``gamma`` to the axis, an object within ``needed`` of it [rad].
+    """Step times share (views, cols) of rays at ``gamma`` to the axis, for an object within ``needed`` of the axis [rad].
 
     Raises:
-        MivolError: the views cover less than half a turn and twice ``needed``.
+        MivolError: views over less than half a turn plus twice ``needed``.
     """
     if covers_circle(angles, 2 * np.pi):
         return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_weights(gamma)
@@ -174,9 +178,11 @@ def cone_weights(angles: np.ndarray, gamma: np.ndarray, needed: float) -> np.nda
 
 
 def _pad_detector(y: np.ndarray, matrices: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Projections with columns of 0 added, and their matrices, until the detector reaches as far on either side of the axis.
+    """Add columns of 0 to projections and shift their matrices, until the detector reaches equally far on both sides of the
+    axis.
 
-    The filter spreads a row beyond its ends. Voxels whose shadow misses the shorter side of a displaced detector read there.
+    The filter spreads a row beyond its ends. Voxels with a shadow beyond the shorter side of a displaced detector read the
+    added columns.
     """
     missing = round(abs(u[0] + u[-1]) * (len(u) - 1) / (u[-1] - u[0])) if len(u) > 1 else 0
     on_the_left = missing if u[-1] > -u[0] else 0
@@ -195,13 +201,13 @@ def _object_fan(projector: Projector, gamma: np.ndarray) -> float:
 
 
 VIEWS_AT_ONCE = 4
-"""Views of one kernel: the sums are read and written once for all of them."""
+"""Views per kernel; the kernel reads and writes the sums once for all its views."""
 
 
 def pixel_matrices(beam: FlatDetector, grid: VoxelGrid, views: Sequence[int] | np.ndarray | None = None) -> np.ndarray:
-    """(views, 3, 4) float64: a voxel's indices (x, y, z, 1) to (column t, row t, t) of the pixel that it shades.
+    """(views, 3, 4) float64 matrices from a voxel's indices (x, y, z, 1) to (column t, row t, t) of the shadowed pixel.
 
-    ``t`` is the voxel's part of the way from the source to the detector's plane; 1 in parallel light.
+    ``t`` is the fraction of the way from the source to the detector's plane; 1 in parallel light.
     """
     panels = beam.panels(views)
     to_corner = panels.corner - panels.source if not beam.whole_lines else panels.source
@@ -217,18 +223,18 @@ def pixel_matrices(beam: FlatDetector, grid: VoxelGrid, views: Sequence[int] | n
 
 
 def backproject_voxels(matrices: np.ndarray, images: np.ndarray, grid: VoxelGrid, weighted: bool) -> np.ndarray:
-    """Sum over views of what each voxel reads, bilinear between pixel centres, 0 beyond the detector's edge.
+    """Sum over views of the pixel at each voxel's shadow, bilinear between pixel centres, 0 beyond the detector's edge.
 
     Args:
-        matrices: of :func:`pixel_matrices`.
+        matrices: matrices of :func:`pixel_matrices`.
         images: (views, rows, cols).
-        grid: of the result.
-        weighted: divide what is read by t^2.
+        grid: grid of the result.
+        weighted: whether each reading is divided by t^2.
 
     Returns:
         (Z, Y, X) float32.
 
-    Cost: four reads a voxel and view.
+    Cost: four reads per voxel and view.
     """
     check_one_thread()
     total = dr.zeros(mi.Float, grid.size)
@@ -252,7 +258,7 @@ def _read_view(
     size: tuple[mi.UInt32, mi.UInt32],
     weighted: bool,
 ) -> mi.Float:
-    """What each voxel reads of one view; ``shape`` is (X, Y) of the grid, ``size`` (rows, cols) of the image."""
+    """Reading of each voxel in a view; ``shape`` is (X, Y) of the grid, ``size`` (rows, cols) of the image."""
     index = dr.arange(mi.UInt32, n)
     line, x = index // shape[0], index % shape[0]
     p = (mi.Float(x), mi.Float(line % shape[1]), mi.Float(line // shape[1]))

@@ -1,12 +1,11 @@
-"""Where the rays of a scanner run: parallel beam, circular cone beam, and free lists of pencil rays.
+"""The rays of scanners: parallel beam, circular cone beam, and free lists of pencil rays.
 
-Conventions. The object stands still and the scanner turns about the z axis through the world's origin. At angle
-``theta`` the beam runs along ``w = (-sin theta, cos theta, 0)`` and the detector's columns along
-``u = (cos theta, sin theta, 0)``, its rows along ``v = z``: a pixel right of the axis sees ``u . x > 0``, so a parallel
-projection is the Radon transform ``s = x cos(theta) + y sin(theta)``. Row 0 is the lowest row (smallest z) and column
-0 the smallest u, as voxel 0 is the lowest along each axis of a grid. All lengths (distances, pitches, offsets,
-voxels) are in one unit that the user chooses, and reconstructed values are per that unit; all angles are radians.
-Rays go through pixel centres and are float64.
+Conventions. The object stands still and the scanner turns about the z axis through the world's origin. At angle ``theta`` the
+beam runs along ``w = (-sin theta, cos theta, 0)`` and the detector's columns along ``u = (cos theta, sin theta, 0)``, its rows
+along ``v = z``. A pixel right of the axis sees ``u . x > 0``, so a parallel projection is the Radon transform ``s = x
+cos(theta) + y sin(theta)``. Row 0 is the lowest row (smallest z) and column 0 the smallest u, as voxel 0 is the lowest along
+each axis of a grid. All lengths (distances, pitches, offsets, voxels) are in the same unit, chosen by the user; reconstructed
+values are per this unit, and all angles are radians. Rays go through pixel centres and are float64.
 
 References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), chapter 3.
 """
@@ -26,7 +25,7 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 
 class Geometry(Protocol):
-    """What a projector asks of a scanner."""
+    """The interface of a scanner for a projector."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -35,7 +34,7 @@ class Geometry(Protocol):
 
     @property
     def whole_lines(self) -> bool:
-        """Whether a ray is the whole straight line through ``o`` (parallel light), and not the half line that starts there."""
+        """Whether a ray is the whole straight line through ``o`` (parallel light), not the half line from ``o``."""
         ...
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]: ...
@@ -43,12 +42,12 @@ class Geometry(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Panels:
-    """Where the flat detector stands in each view, (views, 3) float64 each [length].
+    """Placement of the flat detector in each view, (views, 3) float64 each [length].
 
     Attributes:
         source: position of the source; in parallel light the direction of the beam.
         corner: centre of the pixel of row 0 and column 0.
-        along_u, along_v: from a pixel's centre to that of the next column, and of the next row.
+        along_u, along_v: step from a pixel's centre to the next column, and to the next row.
     """
 
     source: np.ndarray
@@ -58,18 +57,18 @@ class Panels:
 
 
 class FlatDetector(Geometry, Protocol):
-    """A geometry whose detector is a plane with a regular lattice of pixels."""
+    """A geometry with a plane detector and a regular lattice of pixels."""
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels: ...
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Where the voxels lie: an axis-aligned box of ``shape`` voxels.
+    """Placement of voxels: an axis-aligned box of ``shape`` voxels.
 
     Args:
         shape: (Z, Y, X) numbers of voxels.
-        voxel_size: edge of a voxel [length], one number or (x, y, z).
+        voxel_size: edge of a voxel [length], a number or (x, y, z).
         centre: world position (x, y, z) of the box's middle [length].
     """
 
@@ -123,11 +122,11 @@ class VoxelGrid:
 @with_short_repr
 @dataclass(frozen=True, eq=False)
 class PencilRays:
-    """A free list of half lines, each ray a view of its own.
+    """A free list of half lines; each ray is a view of its own.
 
     Args:
         o: (N, 3) starting points [length].
-        d: (N, 3) directions of any positive length; they are normalised.
+        d: (N, 3) directions of arbitrary positive length; they are normalised.
     """
 
     o: np.ndarray
@@ -161,16 +160,15 @@ class PencilRays:
 @with_short_repr
 @dataclass(frozen=True, eq=False)
 class ParallelBeam:
-    """Parallel light and a flat detector that turn together about the z axis.
+    """Parallel light and a flat detector, turning together about the z axis.
 
     Args:
         angles: view angles [rad].
         detector: (rows, columns).
-        pitch: distance of pixel centres [length], one number or (along v, along u).
-        axis_offset: where the rotation axis falls on the detector, measured from the middle of the detector along +u
-            [length]. An axis found at column ``c`` (pixel centres are whole numbers) means ``(c - (columns - 1) / 2)
-            * pitch``.
-        detector_offset: shift of the detector's middle (along v, along u) [length]; along u it undoes ``axis_offset``.
+        pitch: distance of pixel centres [length], a number or (along v, along u).
+        axis_offset: position of the rotation axis on the detector, from the middle of the detector along +u [length]. An axis
+            at column ``c`` (pixel centres are whole numbers) means ``(c - (columns - 1) / 2) * pitch``.
+        detector_offset: shift of the detector's middle (along v, along u) [length]; along u the shift cancels ``axis_offset``.
     """
 
     angles: np.ndarray
@@ -199,12 +197,12 @@ class ParallelBeam:
 
     @property
     def u(self) -> np.ndarray:
-        """Where each column lies [length], from the rotation axis."""
+        """Position of each column [length], from the rotation axis."""
         return _pixel_centres(self)[1]
 
     @property
     def v(self) -> np.ndarray:
-        """Where each row lies [length], from z = 0."""
+        """Position of each row [length], from z = 0."""
         return _pixel_centres(self)[0]
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
@@ -223,9 +221,8 @@ class ConeBeam:
         detector: (rows, columns).
         source_to_axis: distance from the source to the rotation axis, along the central ray [length].
         source_to_detector: distance from the source to the detector's plane [length].
-        pitch: distance of pixel centres on the detector [length], one number or (along v, along u).
-        axis_offset: distance of the rotation axis from the central ray along +u, in the axis' plane (not magnified)
-            [length].
+        pitch: distance of pixel centres on the detector [length], a number or (along v, along u).
+        axis_offset: distance of the rotation axis from the central ray along +u, in the axis' plane (not magnified) [length].
         detector_offset: shift of the detector's middle from the central ray (along v, along u) [length].
     """
 
@@ -265,12 +262,12 @@ class ConeBeam:
 
     @property
     def u(self) -> np.ndarray:
-        """Where each column lies on the detector [length], from the foot of the rotation axis' plane."""
+        """Position of each column on the detector [length], from the foot of the rotation axis' plane."""
         return _pixel_centres(self)[1]
 
     @property
     def v(self) -> np.ndarray:
-        """Where each row lies on the detector [length], from the central ray."""
+        """Position of each row on the detector [length], from the central ray."""
         return _pixel_centres(self)[0]
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
@@ -285,10 +282,10 @@ class ConeBeam:
 
 
 def tigre_cone_beam(n: int = 256, n_views: int = 100) -> tuple[ConeBeam, VoxelGrid]:
-    """The cone beam of TIGRE's own algorithm tests ("configuration 1"), at any resolution.
+    """The cone beam of TIGRE's own algorithm tests ("configuration 1"), at a chosen resolution.
 
-    A cube of 256 mm, source to axis 1000 mm, source to detector 1536 mm, a square detector of 409.6 mm, full circle
-    with the last view on top of the first. Lengths are mm.
+    A cube of 256 mm, source to axis 1000 mm, source to detector 1536 mm, a square detector of 409.6 mm, full circle with the
+    last view on top of the first. Lengths are mm.
 
     Args:
         n: voxels along an edge, and pixels along a detector's edge (256 in TIGRE).
@@ -320,10 +317,10 @@ def _check_detector(beam: ParallelBeam | ConeBeam) -> None:
 
 
 def view_index(views: Sequence[int] | np.ndarray | None, n_views: int) -> np.ndarray:
-    """Numbers of views as an array: all of them for None.
+    """Numbers of views as an array; all views for None.
 
     Raises:
-        MivolError: numbers from 0 to ``n_views`` - 1 are expected, in a row.
+        MivolError: numbers other than a row of 0 to ``n_views`` - 1.
     """
     if views is None:
         return np.arange(n_views)
@@ -339,7 +336,7 @@ def view_index(views: Sequence[int] | np.ndarray | None, n_views: int) -> np.nda
 
 
 def _to_finite(given: object) -> np.ndarray:
-    """Numbers in float64; none where it is no numbers, or some are not finite."""
+    """Convert to float64 numbers; empty for other objects or for numbers that are not finite."""
     try:
         found = np.array(given, float)
     except (TypeError, ValueError):
@@ -348,13 +345,13 @@ def _to_finite(given: object) -> np.ndarray:
 
 
 def _to_lengths(given: object, count: int) -> np.ndarray:
-    """One number for all, or as many as there are; none where it is something else."""
+    """Convert to ``count`` lengths, from a single number or ``count`` numbers; empty for other objects."""
     found = _to_finite(given)
     return np.broadcast_to(found, (count,)) if found.shape in ((), (1,), (count,)) else np.empty(0)
 
 
 def _to_counts(given: object) -> tuple[int, ...]:
-    """Whole numbers of at least 1; none where some are not."""
+    """Convert to whole numbers of at least 1; empty for other numbers."""
     found = np.atleast_1d(_to_finite(given))
     return tuple(found.astype(int).tolist()) if found.ndim == 1 and (found % 1 == 0).all() and (found >= 1).all() else ()
 
@@ -378,9 +375,11 @@ def _make_read_only(a: np.ndarray) -> np.ndarray:
 
 
 def subdivide_grid(grid: VoxelGrid, parts: int, geometry: Geometry) -> VoxelGrid:
-    """The same box in ``parts`` times as many voxels along each axis, and along x and y only for a parallel beam.
+    """Divide the voxels of a grid into ``parts`` along each axis, for a parallel beam along x and y only.
 
-    Each row of a parallel beam sees one height: there is nothing to tell finer layers apart.
+    A ray sees edges inside voxels. Line integrals of sharp edges agree with no field of voxels, and least squares trades the
+    misfit for ripples at the edges that grow with each iteration. Finer unknowns absorb the misfit, and their mean loses the
+    ripples. Each row of a parallel beam sees a single height, so finer layers could not be distinguished.
     """
     times = (1 if isinstance(geometry, ParallelBeam) else parts, parts, parts)
     shape = tuple(k * n for k, n in zip(times, grid.shape, strict=True))
@@ -388,9 +387,9 @@ def subdivide_grid(grid: VoxelGrid, parts: int, geometry: Geometry) -> VoxelGrid
 
 
 def voxel_means(x: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    """Means over blocks: a field (Z, Y, X) on a subdivided grid as one of ``shape``, in the same dtype.
+    """Means over blocks: a field (Z, Y, X) on a subdivided grid becomes a field of ``shape``, in the same dtype.
 
-    Values at the middles of equal parts are averaged, which is the mean of the field up to its curvature.
+    The mean of values at the middles of equal parts equals the mean of the field up to its curvature.
     """
     blocks = [n for edge, fine in zip(shape, x.shape, strict=True) for n in (edge, fine // edge)]
     return x.reshape(blocks).mean((1, 3, 5), dtype=x.dtype)

@@ -1,8 +1,18 @@
-"""Cone beams on any trajectory: where source and flat detector stand is a table, a row for each view.
+"""Cone beams on arbitrary trajectories: a table places source and flat detector in each view.
 
-Conventions. A row holds twelve lengths, x y z each: the source, the middle of the detector, the step from a pixel's centre to
-that of the next column, and the step to the next row. Row 0 and column 0 are where the steps begin. This is the order of
-"cone_vec" geometries elsewhere. Helices, tilted circles, tomosynthesis arcs and calibrated scanners are all such tables.
+Conventions. A row of the table holds twelve lengths, x y z each: the source, the middle of the detector, the step from a
+pixel's centre to the next column, and the step to the next row. The steps start at row 0 and column 0. Other projects call
+this order "cone_vec". Helices, tilted circles, tomosynthesis arcs and calibrated scanners are such tables.
+
+*Projection matrices.* A matrix P (3 x 4) of a calibration maps a world position to a pixel: ``(column, row, 1) ~ P (x, y, z,
+1)``, whole numbers at the middles of pixels unless ``first_pixel`` says otherwise. A factor on the matrix, even a negative
+factor, changes nothing.
+
+*Nikon (X-Tek) scans.* At rest the light runs along +y and z is up. The sample turns clockwise as seen from above, so the
+scanner turns counter-clockwise about the sample: by the sample's angle less half a turn, as in the Core Imaging Library
+(``NikonDataReader`` and ``convert_geometry_to_astra_vec_3D``).
+
+Reference: Hartley & Zisserman, Multiple View Geometry in Computer Vision (2004), section 6.2.
 """
 
 from __future__ import annotations
@@ -28,7 +38,7 @@ class PanelViews:
         detector: (rows, columns).
 
     Raises:
-        MivolError: another shape, numbers that are not finite, steps that span no plane, a source in the detector's plane.
+        MivolError: another shape, numbers that are not finite, steps that span no plane, or a source in the detector's plane.
     """
 
     table: np.ndarray
@@ -88,7 +98,7 @@ def _first_index(wrong: np.ndarray) -> int:
 
 
 MIN_SINGULAR_VALUE = 1e-12
-"""A matrix whose smallest singular value is below this share of its largest has no source that float64 could place."""
+"""Smallest over largest singular value of a matrix below which float64 cannot place its source."""
 
 
 def panels_from_matrices(
@@ -97,10 +107,11 @@ def panels_from_matrices(
     seen: Sequence[float] = (0.0, 0.0, 0.0),
     first_pixel: Sequence[float] = (0.0, 0.0),
 ) -> PanelViews:
-    """The source and a detector of each view, whose rays are those of its matrix.
+    """Find the source and a detector of each view from its projection matrix.
 
-    With ``P = (M | p)`` the source is ``-M^-1 p``, and the ray through a pixel runs along ``M^-1 (column, row, 1)``. Where
-    along its rays a detector stands is not in a matrix: it is put through ``seen``, which also tells the half of the lines.
+    With ``P = (M | p)`` the source is ``-M^-1 p``, and the ray through a pixel runs along ``M^-1 (column, row, 1)``. A matrix
+    does not give the distance of the detector, so the detector is placed through ``seen``. ``seen`` also selects the half of
+    each line.
 
     Args:
         matrices: (views, 3, 4).
@@ -109,8 +120,8 @@ def panels_from_matrices(
         first_pixel: (column, row) of the middle of the first pixel.
 
     Raises:
-        MivolError: another shape, and by its number the first view with numbers that are not finite, without a source (a
-            singular M, as of parallel light), or whose source has ``seen`` beside it.
+        MivolError: another shape, or (with the number of the first such view) numbers that are not finite, no source (a
+            singular M, as of parallel light), or ``seen`` beside the source.
     """
     p = np.asarray(matrices, np.float64)
     if p.ndim != 3 or p.shape[1:] != (3, 4) or len(p) == 0:
@@ -145,7 +156,7 @@ def _check_views(wrong: np.ndarray, found: str, expected: str) -> None:
 
 
 def geometry_from_nikon(scan: NikonScan, angles: np.ndarray) -> ConeBeam | PanelViews:
-    """A cone beam on a circle; where the rotation axis is tilted or rolled, a table of views whose z is along the axis.
+    """Make a cone beam on a circle; for a tilted or rolled rotation axis, a table of views with z along the axis.
 
     Args:
         scan: distances, detector and axis [mm].
@@ -163,13 +174,15 @@ def geometry_from_nikon(scan: NikonScan, angles: np.ndarray) -> ConeBeam | Panel
 
 
 def _axis_at_rest(tilt: float, roll: float) -> np.ndarray:
-    """Direction of the rotation axis at rest: z rolled about the light's direction, then tilted about the columns'."""
+    """Direction of the rotation axis at rest: z rolled about the light's direction, then tilted about the direction of the
+    columns.
+    """
     t, r = np.radians([-tilt, roll])
     return np.array([np.sin(r), -np.sin(t) * np.cos(r), np.cos(t) * np.cos(r)])
 
 
 def _rotate_to_z(axis: np.ndarray) -> np.ndarray:
-    """The least rotation that brings a direction on to z (Rodrigues)."""
+    """The smallest rotation from a direction to z (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + z)

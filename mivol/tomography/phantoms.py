@@ -1,14 +1,13 @@
-"""Objects whose line integrals are known on paper: sums of homogeneous ellipsoids, the Shepp-Logan heads among them.
+"""Phantoms with exact line integrals: sums of homogeneous ellipsoids, such as the Shepp-Logan heads.
 
-Conventions. An ellipsoid is ``|S R (x - c)| <= 1`` with semi-axes ``1 / diag(S) = (a, b, c)`` and the rotation ``R``
-of the Euler angles (phi about z, theta about the new x, psi about the newest z), the values of all ellipsoids that
-hold a point add up. Projections are exact chords in float64 (no grid), so a reconstruction from them cannot commit
-the inverse crime.
+Conventions. An ellipsoid is ``|S R (x - c)| <= 1`` with semi-axes ``1 / diag(S) = (a, b, c)`` and the rotation ``R`` of the
+Euler angles (phi about z, theta about the new x, psi about the newest z). The values of overlapping ellipsoids add up.
+Projections are exact chords in float64 without a grid, so a reconstruction from them cannot commit the inverse crime.
 
-References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), section 3.1 (chord of an ellipse), p.
-    102 (table). Yu, Ye & Wang, Proc. SPIE 5535, 550 (2004) (contrast). Toft, The Radon Transform (1996), and M.
-    Schabel, "3D Shepp-Logan phantom", MATLAB Central File Exchange 9416 (modified head). The numbers of all three
-    were compared with those in CERN/TIGRE at e702473, Python/tigre/utilities/sl3d.py (BSD-3, T. Sadakane).
+References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), section 3.1 (chord of an ellipse), p. 102
+(table). Yu, Ye & Wang, Proc. SPIE 5535, 550 (2004) (contrast). Toft, The Radon Transform (1996), and M. Schabel, "3D
+Shepp-Logan phantom", MATLAB Central File Exchange 9416 (modified head). The numbers of all three were compared with CERN/TIGRE
+at e702473, Python/tigre/utilities/sl3d.py (BSD-3, T. Sadakane).
 """
 
 from __future__ import annotations
@@ -53,9 +52,9 @@ class EllipsoidPhantom:
     """A sum of homogeneous ellipsoids.
 
     Args:
-        to_body: (N, 3, 3) matrices ``S R`` that carry an ellipsoid to the unit sphere [1/length].
+        to_body: (N, 3, 3) matrices ``S R`` from an ellipsoid to the unit sphere [1/length].
         centres: (N, 3) centres x, y, z [length].
-        values: (N,) what each adds to the field [1/length].
+        values: (N,) contribution of each ellipsoid to the field [1/length].
     """
 
     to_body: np.ndarray
@@ -63,7 +62,7 @@ class EllipsoidPhantom:
     values: np.ndarray
 
     def scaled(self, length: float) -> EllipsoidPhantom:
-        """The same object ``length`` times as large, its values per the new unit kept as they are."""
+        """The same object, ``length`` times as large; its values per the new unit do not change."""
         return EllipsoidPhantom(self.to_body / length, self.centres * length, self.values)
 
     def eval_points(self, points: np.ndarray) -> np.ndarray:
@@ -78,14 +77,14 @@ class EllipsoidPhantom:
         """Mean of the field over sub-points of each voxel.
 
         Args:
-            grid: where the voxels lie.
-            supersampling: sub-points along each edge of a voxel; their mean misses the true mean of a voxel on a
-                surface by about 1 / (2 supersampling) of the step there.
+            grid: placement of the voxels.
+            supersampling: sub-points along each edge of a voxel. At a surface, their mean misses the true mean of the voxel by
+                about 1 / (2 supersampling) of the step.
 
         Returns:
             (Z, Y, X) float32 [1/length].
 
-        Cost: one test a voxel and ellipsoid; sub-points only where a surface may cut the voxel.
+        Cost: a test per voxel and ellipsoid; sub-points only in voxels near a surface.
         """
         steps = (np.arange(supersampling) + 0.5) / supersampling - 0.5
         offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3) * grid.voxel_size
@@ -102,9 +101,9 @@ class EllipsoidPhantom:
     def integrate_lines(self, o: np.ndarray, d: np.ndarray, whole_lines: bool = False) -> np.ndarray:
         """Exact line integrals.
 
-        In the frame where the ellipsoid is the unit sphere the ray is ``q + t e``; with ``m = t`` of the point
-        nearest the centre the chord is ``2 sqrt(1 - |q + m e|^2) / |e|``, which unlike ``sqrt(B^2 - A C)`` loses
-        nothing to cancellation when the ray starts far away.
+        In the frame of the unit sphere the ray is ``q + t e``. With ``m`` the ``t`` nearest the centre, the chord is ``2
+        sqrt(1 - |q + m e|^2) / |e|``. Unlike ``sqrt(B^2 - A C)``, this form loses no digits to cancellation for a distant
+        origin.
 
         Args:
             o: (..., 3) points on the rays [length].
@@ -126,7 +125,7 @@ class EllipsoidPhantom:
         return total
 
     def project(self, geometry: Geometry) -> np.ndarray:
-        """Exact projections of the phantom, (views, rows, cols) float64, one view at a time."""
+        """Exact projections of the phantom, (views, rows, cols) float64, computed view by view."""
         return np.concatenate(
             [self.integrate_lines(*geometry.rays([view]), geometry.whole_lines) for view in range(geometry.shape[0])]
         )
@@ -151,9 +150,9 @@ SHEPP_LOGAN = {"kak-slaney": _kak_slaney, "yu-ye-wang": _yu_ye_wang, "toft-schab
 
 
 def shepp_logan(variant: str = "yu-ye-wang", half_width: float = 1.0) -> EllipsoidPhantom:
-    """A three-dimensional Shepp-Logan head that fits into the cube of ``half_width`` [length] around the origin.
+    """A three-dimensional Shepp-Logan head inside the cube of ``half_width`` [length] around the origin.
 
-    Raises: MivolError: the variant is not in SHEPP_LOGAN.
+    Raises: MivolError: a variant missing from SHEPP_LOGAN.
     """
     if variant not in SHEPP_LOGAN:
         raise MivolError(f"Found no Shepp-Logan head '{variant}', expected one of {', '.join(SHEPP_LOGAN)}.")
@@ -161,12 +160,12 @@ def shepp_logan(variant: str = "yu-ye-wang", half_width: float = 1.0) -> Ellipso
 
 
 def random_ellipsoids(n: int, seed: int, half_width: float = 1.0) -> EllipsoidPhantom:
-    """``n`` ellipsoids of value 0.2 to 1, in any orientation, all inside the ball of radius ``half_width``.
+    """``n`` ellipsoids of value 0.2 to 1, in random orientations, inside the ball of radius ``half_width``.
 
     Args:
-        n: how many.
-        seed: of the generator; the same seed gives the same phantom.
-        half_width: radius of the ball that holds them all [length].
+        n: number of ellipsoids.
+        seed: seed of the generator; the same seed gives the same phantom.
+        half_width: radius of the ball around all ellipsoids [length].
     """
     rng = np.random.default_rng(seed)
     axes = rng.uniform(0.05, 0.35, (n, 3))
@@ -180,7 +179,7 @@ def random_ellipsoids(n: int, seed: int, half_width: float = 1.0) -> EllipsoidPh
 
 
 def _from_table(table: np.ndarray, centres_turn: bool = False) -> EllipsoidPhantom:
-    """``centres_turn``: the centres are given in the turned frame, as in the toft-schabel head."""
+    """With ``centres_turn`` the centres are given in the rotated frame, as in the toft-schabel head."""
     rotations = np.stack([_euler(*np.radians(row[6:9])) for row in table])
     centres = np.einsum("nji,nj->ni", rotations, table[:, 3:6]) if centres_turn else table[:, 3:6]
     return EllipsoidPhantom(rotations / table[:, 0:3, None], centres, table[:, 9])
@@ -197,7 +196,7 @@ def _euler(phi: float, theta: float, psi: float) -> np.ndarray:
 
 
 def _covered_share(points: np.ndarray, offsets: np.ndarray, to_body: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Share of ``points + offsets`` that lies in an ellipsoid, for each of ``points`` (..., 3)."""
+    """Share of ``points + offsets`` inside an ellipsoid, for each of ``points`` (..., 3)."""
     q = (points - centre) @ to_body.T
     moved = offsets @ to_body.T
     r, reach = np.linalg.norm(q, axis=-1), np.linalg.norm(moved, axis=-1).max()

@@ -1,9 +1,9 @@
 """From a detector's readings to line integrals: flat and dark fields, noise, logarithm, and the drift of the light.
 
-Conventions. Readings, flats (light, no object) and darks (no light) are in one unit (counts or volts); transmission
-``T = (reading - dark) / (flat - dark)`` has no unit, line integrals are ``y = -log T``. Arrays are (views, rows, cols).
+Conventions. Readings, flats (light, no object) and darks (no light) share a unit (counts or volts). Transmission ``T =
+(reading - dark) / (flat - dark)`` has no unit; line integrals are ``y = -log T``. Arrays are (views, rows, cols).
 
-References: delta method for the variance of a ratio (any textbook).
+References: delta method for the variance of a ratio (textbooks).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mivol.errors import MivolError
 
 @dataclass(frozen=True, eq=False)
 class Transmission:
-    """Transmission and its variance, both (views, rows, cols) float64; not finite where a reading was not."""
+    """Transmission and its variance, both (views, rows, cols) float64; not finite for readings that are not finite."""
 
     value: np.ndarray
     variance: np.ndarray
@@ -26,13 +26,13 @@ class Transmission:
 # -- Readings to line integrals -----------------------------------------------------------------------------------------
 
 UNKNOWN_NOISE = 1e-4
-"""Variance of a transmission of 1 where the noise was not measured: that of 1e4 quanta."""
+"""Variance of a transmission of 1 for unmeasured noise: the variance of 1e4 quanta."""
 
 
 def assume_quantum_noise(transmission: np.ndarray) -> Transmission:
-    """A transmission of whose noise only the form is known: that of quanta, ``var T ~ T``.
+    """Give a transmission of unknown noise the variance of quanta, ``var T ~ T``.
 
-    Its size, ``UNKNOWN_NOISE``, matters to a solver with a prior only.
+    The size of the noise, ``UNKNOWN_NOISE``, matters only to a solver with a prior.
     """
     t = np.asarray(transmission, np.float64)
     return Transmission(t, np.maximum(t, 0.0) * UNKNOWN_NOISE)
@@ -40,14 +40,14 @@ def assume_quantum_noise(transmission: np.ndarray) -> Transmission:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What flats and darks say of a detector: ``var(reading) = dark_variance + gain (reading - dark)``.
+    """Calibration of a detector by flats and darks: ``var(reading) = dark_variance + gain (reading - dark)``.
 
     Attributes:
-        dark, light: (rows, cols) mean reading without light, and what light adds to it; ``light`` is NaN at a dead pixel.
-        dark_variance: of a reading without light, pooled over all pixels.
-        gain: reading per quantum, from how much more the flats scatter, pooled over all pixels.
-        n_flats, n_darks: how many there were.
-        saturation: readings from here on are saturated.
+        dark, light: (rows, cols) mean reading without light, and the reading added by light; ``light`` is NaN at a dead pixel.
+        dark_variance: variance of a reading without light, pooled over all pixels.
+        gain: reading per quantum, from the additional scatter of the flats, pooled over all pixels.
+        n_flats, n_darks: numbers of flats and darks.
+        saturation: smallest saturated reading.
     """
 
     dark: np.ndarray
@@ -59,22 +59,22 @@ class Calibration:
     saturation: float = np.inf
 
     def signal(self, readings: np.ndarray) -> np.ndarray:
-        """Readings less the dark ones; NaN where a pixel is dead or saturated."""
+        """Readings minus the dark reading; NaN at dead or saturated pixels."""
         lost = (readings >= self.saturation) | np.isnan(self.light)
         return np.where(lost, np.nan, readings - self.dark)
 
 
 def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, saturation: float = np.inf) -> Calibration:
-    """Calibrate a detector by its flats and darks. A pixel is dead where its flats are saturated or not above its darks.
+    """Calibrate a detector by flats and darks. A pixel is dead if its flats are saturated or not above its darks.
 
     Args:
-        readings: (views, rows, cols), for their shape.
+        readings: (views, rows, cols); only the shape is used.
         flats: (n_flats, rows, cols), at least 2.
         darks: (n_darks, rows, cols), at least 2.
-        saturation: readings from here on are saturated.
+        saturation: smallest saturated reading.
 
     Raises:
-        MivolError: shapes that do not fit, too few fields, or as many dead pixels as others.
+        MivolError: shapes that do not fit, too few fields, or at least half of the pixels dead.
     """
     if readings.ndim != 3 or not readings.shape[1:] == flats.shape[1:] == darks.shape[1:]:
         raise MivolError(
@@ -100,9 +100,9 @@ def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, satura
 def correct_transmission(
     readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, saturation: float = np.inf
 ) -> Transmission:
-    """Transmission from readings, and its variance from the spread of the flats and darks.
+    """Compute transmission from readings, with a variance from the spread of flats and darks.
 
-    The detector's noise is that of :class:`Calibration`. To first order
+    The noise model is :class:`Calibration`. To first order
 
     ``var T = (var(reading) + T^2 var(flat) / n_flats + (1 - T)^2 var(dark) / n_darks) / (flat - dark)^2``.
 
@@ -122,13 +122,13 @@ def correct_transmission(
 
 @dataclass(frozen=True, eq=False)
 class Quanta:
-    """Numbers of quanta, ``counts ~ Poisson(blank exp(-y) + background)``, for solvers that take no logarithm.
+    """Numbers of quanta, ``counts ~ Poisson(blank exp(-y) + background)``, for solvers without a logarithm.
 
     Attributes:
-        counts: (views, rows, cols); 0 where a pixel is not used.
-        blank: without an object, one number or as ``counts``.
-        background: expected besides them.
-        used: (views, rows, cols); False where a pixel is dead or saturated.
+        counts: (views, rows, cols); 0 at unused pixels.
+        blank: quanta without an object, a number or shaped as ``counts``.
+        background: expected additional quanta.
+        used: (views, rows, cols); False at dead or saturated pixels.
     """
 
     counts: np.ndarray
@@ -137,16 +137,16 @@ class Quanta:
     used: np.ndarray
 
     def of_views(self, views: np.ndarray) -> Quanta:
-        """Those of some views."""
+        """Select views."""
         blank = self.blank[views] if isinstance(self.blank, np.ndarray) else self.blank
         return Quanta(self.counts[views], blank, self.background, self.used[views])
 
 
 def count_quanta(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, saturation: float = np.inf) -> Quanta:
-    """Quanta from readings: ``(reading - dark) / gain``, with the read noise as a background of as many quanta as its variance.
+    """Convert readings to quanta, ``(reading - dark) / gain``, with the read noise as a background of equal variance.
 
-    Shifted by ``dark_variance / gain^2``, a Poisson number has the mean and the variance of the reading; a sum below 0 counts
-    as 0. A pixel without light keeps its count: no logarithm is taken.
+    Shifted by ``dark_variance / gain^2``, a Poisson number has the mean and the variance of the reading; a negative sum counts
+    as 0. A pixel without light keeps its count, because no logarithm is taken.
 
     Args: as :func:`calibrate`.
 
@@ -170,11 +170,11 @@ def count_quanta(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, sat
 def normalise_air(transmission: Transmission, n_columns: int) -> Transmission:
     """Divide each row of each view by the straight line through its air at both edges of the detector.
 
-    Undoes a beam that drifts between the flats and the views. Where the object reaches into these columns it would be
-    divided away: that is the caller's to know.
+    This corrects a beam that drifts between flats and views. Precondition: the object does not reach into these columns, else
+    its absorption is divided away.
 
     Args:
-        transmission: of a scan whose first and last ``n_columns`` columns see no object.
+        transmission: transmission of a scan with air in its first and last ``n_columns`` columns.
         n_columns: at least 2, at most half of the columns.
     """
     value, columns = transmission.value, transmission.value.shape[2]
@@ -185,7 +185,7 @@ def normalise_air(transmission: Transmission, n_columns: int) -> Transmission:
 
 
 def fit_air(transmission: np.ndarray, n_columns: int) -> np.ndarray:
-    """(views, rows, cols): the straight line of each row through the mean of its ``n_columns`` at both edges that are finite.
+    """(views, rows, cols): the straight line of each row through the mean of the finite pixels in ``n_columns`` at both edges.
 
     Raises:
         MivolError: a row of a view without a finite pixel at an edge.
@@ -206,15 +206,15 @@ def fit_air(transmission: np.ndarray, n_columns: int) -> np.ndarray:
 
 
 def to_line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
-    """``y = -log T`` and the weights ``1 / var y = T^2 / var T`` (delta method).
+    """Compute ``y = -log T`` and the weights ``1 / var y = T^2 / var T`` (delta method).
 
-    A pixel whose transmission is below ``n_sigma`` standard deviations (no light came through), or is not finite, gets
-    y = 0 and weight 0. A pixel brighter than the light keeps its negative y: clipping it would bias the air.
+    A pixel with a transmission below ``n_sigma`` standard deviations (no light), or not finite, gets y = 0 and weight 0. A
+    pixel brighter than the light keeps its negative y: clipping would bias the air.
 
     Args:
-        transmission: with its variance.
-        n_sigma: below how many standard deviations light is noise. The log's bias, ``var T / (2 T^2)``, is then at most
-            ``1 / (2 n_sigma^2)``.
+        transmission: transmission with its variance.
+        n_sigma: number of standard deviations below which light is noise. The bias of the log, ``var T / (2 T^2)``, is then at
+            most ``1 / (2 n_sigma^2)``.
 
     Returns:
         (y, weights), each (views, rows, cols) float64.
@@ -227,15 +227,15 @@ def to_line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple
 
 
 def interpolate_gaps(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Line integrals with unused pixels (weight 0: dead, saturated, no light) on the line between their neighbours.
+    """Interpolate unused pixels (weight 0: dead, saturated, no light) linearly between their neighbours in the row.
 
-    For methods without weights, as filtered back-projection, in which a pixel of 0 would leave a streak through the object.
+    For methods without weights, such as filtered back-projection: a pixel of 0 would leave a streak through the object.
 
     Args:
         y, weights: (views, rows, cols).
 
     Returns:
-        (views, rows, cols); a row without any used pixel is 0.
+        (views, rows, cols); a row without used pixels is 0.
     """
     used = weights > 0
     if used.all():
@@ -252,10 +252,10 @@ def interpolate_gaps(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class LightDrift:
-    """How the pattern of the light moved away from the flats: line integrals ``offset + slope time`` of each pixel.
+    """Drift of the light's pattern away from the flats: line integrals ``offset + slope time`` of each pixel.
 
-    Flats taken before a scan are out of date at its end: the beam's stripes have moved, and each pixel of every view
-    is too dark or too bright by a factor that changes slowly (stripes in the sinogram, rings in the slice).
+    Flats taken before a scan are outdated at its end: the beam's stripes have moved, and each pixel is too dark or too bright
+    by a factor that changes slowly between views (stripes in the sinogram, rings in the slice).
     """
 
     offset: np.ndarray
@@ -267,15 +267,15 @@ class LightDrift:
 
 
 def fit_light_drift(residual: np.ndarray, weights: np.ndarray, times: np.ndarray) -> LightDrift:
-    """Fit each pixel's offset and slope to what the object does not explain, by weighted least squares.
+    """Fit each pixel's offset and slope to the residual of the object, by weighted least squares.
 
-    In turns with a few iterations of a solver on ``y - drift`` this is block descent on the joint weighted least
+    Alternating with a few iterations of a solver on ``y - drift``, the fit is block descent on the joint weighted least
     squares of object and drift.
 
     Args:
         residual: (views, rows, cols), ``y - A x``.
         weights: inverse variances; a pixel with fewer than two weighted views gets no drift.
-        times: (views,) when each was taken, in any unit, best about 0.
+        times: (views,) time of each view, in an arbitrary unit, best centred about 0.
     """
     t = np.asarray(times, float)[:, None, None]
     w0, w1, w2 = weights.sum(0), (weights * t).sum(0), (weights * t * t).sum(0)

@@ -1,13 +1,14 @@
-"""The system matrix of a scan and its exact transpose, never formed: ``A @ x`` are line integrals, ``A.T @ y`` goes back.
+"""The system matrix of a scan and its exact transpose, never formed: ``A @ x`` are line integrals, ``A.T @ y`` the
+back-projection.
 
-Conventions. x is a grid (Z, Y, X) [1/length] of the trilinear model (values at voxel centres, clamped borders, nothing
-outside the box), y are projections (views, rows, cols), no unit. Either may be flat; the answer has the form of the
-question. Both are float32 and both operators are the very sums that :mod:`mivol.transport.media.grid_integral` defines, so the
-pair is matched: ``<A x, y> = <x, A.T y>`` to rounding.
+Conventions. x is a grid (Z, Y, X) [1/length] of the trilinear model (values at voxel centres, clamped borders, nothing outside
+the box); y are projections (views, rows, cols), without unit. Both may be flat; the result has the form of the input. Both are
+float32. Both operators are the sums defined in :mod:`mivol.transport.media.grid_integral`, so the pair is matched: ``<A x, y>
+= <x, A.T y>`` to rounding.
 
-Rays are set up in float64: their origins are moved to the edge of a sphere around the grid and measured from its
-centre, so a source or an object far from the world's origin costs no accuracy. They are given to the kernels as
-arrays; a subset of views, another pass or another geometry compiles nothing, and traces nothing (:class:`RecordedKernels`).
+Rays are set up in float64: origins move to a sphere around the grid and are measured from its centre, so a source or an object
+far from the world's origin costs no accuracy. Kernels receive rays as arrays. So a subset of views, another pass or another
+geometry compiles and traces nothing (:class:`RecordedKernels`).
 """
 
 from __future__ import annotations
@@ -32,37 +33,38 @@ if TYPE_CHECKING:
     import torch
 
 PASS_CELLS = 1 << 30
-"""Most cells that the rays of one kernel may cross: about a second on two cores, so that Ctrl-C is heard."""
+"""Most cells crossed by the rays of a kernel: about a second on two cores, so that Ctrl-C acts soon."""
 
 PASS_SUM = 1 << 13
-"""Most rays of one kernel through a voxel, on average: 1e6 equal float32 terms added in turn err by 8e-4, 8192 by 1e-5.
+"""Most rays of a kernel through a voxel, on average: adding 1e6 equal float32 terms in turn errs by 8e-4, adding 8192 by 1e-5.
 Kernels are added up in float64."""
 
 MIN_CELLS_PER_VOXEL = 16
-"""Empty blocks are looked for, and values copied with a margin, where the rays cross this many times as many cells as the grid
-has: either reads each voxel a few times."""
+"""Crossed cells per voxel of the grid above which empty blocks are located and values are copied with a margin: either reads
+each
+voxel a few times."""
 
 MAX_ALONG = 0.2
-"""Largest part of its cells that rays enter along one axis, on average, for the walk between columns along that axis: each of
-these is a fresh start. Rays of any direction gain 1.2 at 0.2, those of scanners 1.8 to 2.3 at 0 to 0.06."""
+"""Largest share of cells entered along an axis, on average, for the walk between columns along this axis: each such step is a
+fresh start. Measured gain: 1.2 at 0.2 for rays of random direction, 1.8 to 2.3 at 0 to 0.06 for rays of scanners."""
 
 MAX_EMPTY = 0.6
-"""Part of the blocks that may be empty for the walk between columns, which skips none (measured on balls and on a head)."""
+"""Largest share of empty blocks for the walk between columns, which skips no block (measured on balls and on a head)."""
 
 RAY_BYTES = 28
-"""Of a ray: origin, direction and number."""
+"""Memory of a ray [byte]: origin, direction and number."""
 
 CACHE_BYTES = 1 << 30
-"""Rays are kept between calls up to this size, and set up anew in each call beyond it."""
+"""Largest size of rays kept between calls [byte]; larger sets are built anew in each call."""
 
 
 class RayPass(NamedTuple):
-    """Rays of one kernel.
+    """Rays of a kernel.
 
     Attributes:
-        numbers: of the rays among all.
+        numbers: numbers of the rays among all rays.
         o, d: origins and directions, from the grid's centre.
-        is_ordered: whether the numbers are in another order than that of projections.
+        is_ordered: whether the numbers are in another order than the projections.
     """
 
     numbers: mi.UInt32
@@ -71,15 +73,15 @@ class RayPass(NamedTuple):
     is_ordered: bool
 
     def are_all(self, count: int) -> bool:
-        """Whether these are the ``count`` rays of the projector, in order."""
+        """Whether the pass holds all ``count`` rays of the projector, in order."""
         return dr.width(self.o) == count and not self.is_ordered
 
 
 def check_geometry(geometry: object, grid: object) -> None:
-    """Refuse what is no scanner, and what is no place for voxels.
+    """Refuse an object that is not a scanner, or a grid that is not a VoxelGrid.
 
     Raises:
-        MivolError: with what it is.
+        MivolError: the sentence names the type.
     """
     if not all(hasattr(geometry, name) for name in ("rays", "whole_lines", "shape")):
         raise MivolError(
@@ -96,16 +98,16 @@ class Projector:
     """Line integrals of a grid along the rays of a scan, and their transpose.
 
     Args:
-        geometry: a ParallelBeam, ConeBeam, PencilRays, or anything with ``shape``, ``whole_lines`` and ``rays(views)``.
-        grid: where the voxels lie, in the geometry's unit of length.
-        views: the views that take part, in this order; all by default.
-        kernels: of another projector of this grid, whose recordings are to be shared; its own by default.
+        geometry: a ParallelBeam, ConeBeam, PencilRays, or an object with ``shape``, ``whole_lines`` and ``rays(views)``.
+        grid: placement of the voxels.
+        views: participating views, in this order; by default all.
+        kernels: kernels of another projector of this grid, to share recordings; by default its own.
 
     Attributes:
         shape: (rays, voxels). dtype: float32. n_views: number of views. projection_shape: (views, rows, cols).
         T: the transpose, with ``@``, ``shape`` and ``T``.
 
-    Cost: one walk through the grid per ray; memory 28 bytes a ray up to CACHE_BYTES, besides x and y.
+    Cost: a walk through the grid per ray; memory 28 bytes per ray up to CACHE_BYTES, besides x and y.
 
     Example:
         >>> A = Projector(ParallelBeam(angles, (1, 640)), VoxelGrid((1, 640, 640)))
@@ -154,16 +156,16 @@ class Projector:
         return Transpose(self)
 
     def subset(self, views: Sequence[int] | np.ndarray) -> Projector:
-        """The rows of some views, counted among this projector's own. Compiles nothing."""
+        """Select the rows of some views, counted among this projector's own. Compiles nothing."""
         return Projector(self.geometry, self.grid, self.views[np.asarray(views, int)], self._kernels)
 
     @cached_property
     def column_sums(self) -> np.ndarray:
-        """``A.T @ 1``, (Z, Y, X): how much each voxel is seen [length]."""
+        """``A.T @ 1``, (Z, Y, X): total length of all rays in each voxel [length]."""
         return self.T @ np.ones(self.projection_shape, np.float32)
 
     def as_linear_operator(self) -> scipy.sparse.linalg.LinearOperator:
-        """The pair as SciPy knows it, for ``lsqr``, ``lsmr``, ``cg``, ``eigsh`` and others."""
+        """The pair as a SciPy linear operator, for ``lsqr``, ``lsmr``, ``cg``, ``eigsh`` and others."""
         from scipy.sparse.linalg import LinearOperator
 
         return LinearOperator(
@@ -192,7 +194,7 @@ class Projector:
     def to_torch(self) -> Callable[[torch.Tensor], torch.Tensor]:
         """The projector as a differentiable PyTorch function from (Z, Y, X) to (views, rows, cols), through ``dr.wrap``.
 
-        Raises: MivolError: PyTorch is not installed; later, a tensor that is not where the variant computes.
+        Raises: MivolError: PyTorch is not installed; later, a tensor on another device than the variant.
 
         Example:
             >>> project = A.to_torch()
@@ -250,7 +252,7 @@ class Projector:
         return y
 
     def _backproject(self, y: mi.Float) -> mi.Float:
-        """``A^T y``, flat; the passes are added up in float64."""
+        """``A^T y``, flat; passes are added up in float64."""
         check_one_thread()
         total = None
         for rays in self._passes():
@@ -270,12 +272,12 @@ class Projector:
 
     @property
     def _pays_to_prepare(self) -> bool:
-        """Whether rays cross so many cells that the voxels may be read a few times before."""
+        """Whether rays cross so many cells that a preparation of the voxels pays."""
         return self.shape[0] * sum(self.grid.shape) > MIN_CELLS_PER_VOXEL * self.grid.size
 
     @cached_property
     def _along(self) -> int | None:
-        """The axis that the rays cross seldom, by up to eight of the views; None where they cross each, or on a GPU."""
+        """The axis seldom crossed by the rays, judged by up to eight views; None if all axes are crossed, or on a GPU."""
         if dr.backend_v(mi.Float) != dr.JitBackend.LLVM:
             return None
         some = self.views[np.unique(np.linspace(0, self.n_views - 1, 8).astype(int))]
@@ -306,11 +308,11 @@ class Projector:
 
     @property
     def _is_ordered(self) -> bool:
-        """Whether the order of rays matters: with one row, they are in the best one already."""
+        """Whether the order of rays matters; a single row is in the best order already."""
         return self._pays_to_prepare and self.projection_shape[1] > 1
 
     def _rays(self, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rays (N, 3) that start on the sphere around the grid, from the grid's centre."""
+        """Rays (N, 3) starting on the sphere around the grid, from the grid's centre."""
         o, d = (np.reshape(a, (-1, 3)) for a in self.geometry.rays(views))
         o = o - np.asarray(self.grid.centre)
         to_sphere = -np.einsum("ij,ij->i", o, d) - self.grid.radius
@@ -353,7 +355,7 @@ class _Projection(dr.CustomOp):
 
 
 class _ProjectionOfTorch(_Projection):
-    """The same for PyTorch, whose own threads ask for derivatives on a GPU, while the one that asked them waits."""
+    """The same for PyTorch, whose own threads request derivatives on a GPU while the calling thread waits."""
 
     def eval(self, values: mi.Float, projector: Projector) -> mi.Float:
         y = super().eval(values, projector)
@@ -382,11 +384,14 @@ def _to_flat(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarr
 
 
 TILE = (2, 8)
-"""Rows and columns of a tile: 16 lanes, one vector of 512 bits."""
+"""Rows and columns of a tile: 16 lanes, a vector of 512 bits."""
 
 
 def order_rays(views: int, rows: int, columns: int) -> np.ndarray:
-    """The numbers of rays (view, row, column) in the order in which they are walked.
+    """Order the numbers of rays (view, row, column) so that successive rays read the same voxels and a cache still holds them.
+
+    A vector of lanes takes a tile of the detector, with parallel neighbouring rays. Then follow the same rows of the other
+    views, which cross the same layers of voxels; the rest of the same view is a whole volume away.
 
     Returns:
         (views * rows * columns,), each number once.

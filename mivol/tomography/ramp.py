@@ -26,14 +26,14 @@ WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def filter_ramp(y: np.ndarray, pitch: float, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
     """Convolve each row with the band-limited ramp, zero beyond the detector.
 
-    ``h(0) = 1 / (4 pitch^2)``, ``h(n) = -1 / (pi n pitch)^2`` for odd n, 0 for even n; the sum is times ``pitch``. This kernel
-    is sampled in space, so that its mean is right; the ramp sampled in frequency would shift all values of the object.
+    ``h(0) = 1 / (4 pitch^2)``, ``h(n) = -1 / (pi n pitch)^2`` for odd n, 0 for even n; the sum is multiplied by ``pitch``. The
+    kernel is sampled in space, so its mean is right; a ramp sampled in frequency would shift all values of the object.
 
     Args:
         y: (..., cols).
-        pitch: of the columns [length].
+        pitch: pitch of the columns [length].
         window: key of WINDOWS.
-        cutoff: where the window ends, in parts of the Nyquist frequency, in (0, 1].
+        cutoff: end of the window over the Nyquist frequency, in (0, 1].
 
     Returns:
         (..., cols) float64 [1/length].

@@ -1,4 +1,4 @@
-"""The operators of a scan through a grid, traced once and replayed for any rays and values."""
+"""The operators of a scan through a grid, traced once and replayed for other rays and values."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Rows = list
 
 
 class RecordedKernels:
-    """Both operators through a grid for any rays, traced once and replayed.
+    """Both operators through a grid for arbitrary rays, traced once and replayed.
 
-    Tracing a walk takes milliseconds, which is more than the walk itself where a subset has a few hundred rays. Dr.Jit records
-    the kernels at the first call (``dr.freeze``) and launches them for any other rays and values without tracing.
+    Tracing a walk takes milliseconds, longer than the walk itself for a subset of a few hundred rays. Dr.Jit records the
+    kernels at the first call (``dr.freeze``) and launches them for other rays and values without tracing.
 
     Args:
-        grid: the grid's centre is the origin of the rays.
+        grid: the grid; its centre is the origin of the rays.
     """
 
     def __init__(self, grid: VoxelGrid) -> None:
@@ -51,16 +51,16 @@ class RecordedKernels:
         self._columns: dict[str, Callable] = {}
 
     def _renew(self) -> None:
-        """Record anew where there are other threads than were recorded."""
+        """Record anew after a change of the number of threads."""
         if self._threads != dr.thread_count():
             self._record()
 
     def integrate(self, values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
-        """Line integrals of ``values`` along rays; blocks that are ``empty`` are skipped."""
+        """Line integrals of ``values`` along rays; ``empty`` blocks are skipped."""
         return self._integrate(values, empty, o, d, self._from_world)
 
     def backproject(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
-        """Sum over rays of ``weight`` times what each voxel adds to them."""
+        """Sum over rays of ``weight`` times the contribution of each voxel to the ray."""
         self._renew()
         return self._backproject(weight, o, d, self._from_world)
 
@@ -80,7 +80,7 @@ class RecordedKernels:
     # -- Rays that seldom cross one axis --------------------------------------------------------------------------------------
 
     def pad(self, values: mi.Float) -> mi.Float:
-        """The values with a margin of one node, which :meth:`integrate_columns` reads."""
+        """The values with a margin of a node, for :meth:`integrate_columns`."""
         return self._pad(values)
 
     def integrate_columns(self, padded: mi.Float, o: mi.Point3f, d: mi.Vector3f, along: int) -> mi.Float:

@@ -1,9 +1,9 @@
-"""How much each ray counts where a scan measures some lines twice: the weights of filtered back-projection.
+"""Redundancy weights of filtered back-projection: the share of each ray in a line that the scan measures twice.
 
-Conventions. The inverse is an integral over all lines, each of them once. A share is what one ray counts of its line: shares
-of all rays on one line add up to 1. ``gamma`` is the angle [rad] between a ray and the one through the rotation axis, positive
-towards larger columns. In the geometry of :mod:`mivol.tomography.geometry` the ray (theta, gamma) and the ray
-(theta + pi - 2 gamma, -gamma) are one line, seen from its two ends.
+Conventions. The inverse is an integral over all lines, each counted once. A share is the part of a ray in its line; the shares
+of all rays on a line add up to 1. ``gamma`` is the angle [rad] between a ray and the ray through the rotation axis, positive
+towards larger columns. In the geometry of :mod:`mivol.tomography.geometry` the ray (theta, gamma) and the ray (theta + pi - 2
+gamma, -gamma) run along the same line from its two ends.
 
 References: Parker 1982, Med. Phys. 9, 254 (half scans); Wang 2002, Med. Phys. 29, 1634 (displaced detectors); Kak & Slaney
 1988, section 3.4.
@@ -16,18 +16,19 @@ import numpy as np
 from mivol.errors import MivolError
 
 MAX_GAP = 4.0
-"""Steps (the whole range over the number of views) that may lie between two neighbours. Golden-angle views are at most 1.9
-steps apart; where it is more than 4, directions are missing."""
+"""Largest gap between neighbouring views, in steps (the whole range over the number of views). Golden-angle views are at most
+1.9
+steps apart; a gap above 4 steps means missing directions."""
 
 BLEND_COLUMNS = 20
-"""Least width, in columns, over which a displaced detector's share goes from a half to one or none: the ramp filter turns a
+"""Smallest width, in columns, of the change from a share of a half to 1 or 0 on a displaced detector: the ramp filter turns a
 sharper change into a ring."""
 
 
 def angle_steps(angles: np.ndarray, period: float) -> np.ndarray:
-    """The part of a circle of ``period`` [rad] for which each view stands: to the middle of its neighbours on either side.
+    """The part of a circle of ``period`` [rad] for which each view stands: to the middle between neighbours on both sides.
 
-    Equal angles share theirs. The steps add up to ``period``.
+    Equal angles share their part. The steps add up to ``period``.
     """
     order = np.argsort(np.mod(angles, period), kind="stable")
     sorted_angles = np.mod(angles, period)[order]
@@ -46,16 +47,16 @@ def widest_gap(angles: np.ndarray, period: float) -> tuple[float, float]:
 
 
 def covers_circle(angles: np.ndarray, period: float) -> bool:
-    """Whether views lie all around a circle of ``period``."""
+    """Whether the views cover a circle of ``period``."""
     return widest_gap(angles, period)[0] <= MAX_GAP * period / len(angles) + 1e-9
 
 
 def full_turn_weights(gamma: np.ndarray) -> np.ndarray:
-    """Shares (cols,) of the rays of a whole turn, where each line of a centred detector is seen twice.
+    """Shares (cols,) of the rays of a whole turn; a centred detector measures each line twice.
 
-    A half each, where the detector reaches as far on either side of the axis. Beyond its shorter side a line is seen once,
-    and counts 1; the share goes from a half to 1 (and to 0 on the shorter side) smoothly, over the outer fifth of the
-    shorter side or BLEND_COLUMNS.
+    The share is a half in columns mirrored by the other side of the axis. Beyond the shorter side a line is measured once and
+    counts 1. The share changes smoothly from a half to 1 (and to 0 on the shorter side), over the outer fifth of the shorter
+    side or BLEND_COLUMNS.
     """
     short = min(-gamma[0], gamma[-1])
     column = float(np.mean(np.diff(gamma))) if len(gamma) > 1 else 0.0
@@ -76,9 +77,9 @@ def parker_weights(beta: np.ndarray, gamma: np.ndarray, excess: float) -> np.nda
     """Parker's shares (views, cols) of a scan over ``pi + 2 excess``.
 
     Args:
-        beta: (views,) angle from the first view on [rad].
+        beta: (views,) angle from the first view [rad].
         gamma: (cols,).
-        excess: half of what the scan covers beyond half a turn [rad]; not less than the largest gamma that sees the object.
+        excess: half of the scan's range beyond half a turn [rad]; at least the largest gamma that sees the object.
     """
     b = beta[:, None]
     # Parker counts gamma the other way round: his ray (beta, gamma) is the line of (beta + pi + 2 gamma, -gamma).

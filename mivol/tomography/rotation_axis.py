@@ -1,10 +1,10 @@
-"""Where the rotation axis of a parallel-beam scan falls on the detector.
+"""Find the rotation axis of a parallel-beam scan on the detector.
 
 Conventions. Line integrals ``y`` are (views, rows, cols); columns are counted from 0 at pixel centres, so the middle of a
 detector of C columns is (C - 1) / 2. Angles are in radians.
 
-References: Helgason 1965 and Ludwig 1966 (moments of a sinogram); Vo et al. 2014 (why the mirrored views hold the axis);
-Donath, Beckmann & Schreyer 2006 (axis from trial reconstructions).
+References: Helgason 1965 and Ludwig 1966 (moments of a sinogram); Vo et al. 2014 (the axis from mirrored views); Donath,
+Beckmann & Schreyer 2006 (axis from trial reconstructions).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ __all__ = ["Axis", "axis_from_mirrors", "axis_from_moments", "axis_from_reconstr
 
 @dataclass(frozen=True)
 class Axis:
-    """Where the rotation axis falls on the detector.
+    """The rotation axis on the detector.
 
     Args:
-        column: in pixels, counted from 0 at the first column's centre.
-        uncertainty: one standard deviation [pixels].
-        method: how it was found.
+        column: column in pixels, counted from 0 at the first column's centre.
+        uncertainty: standard deviation [pixels].
+        method: method of the search.
     """
 
     column: float
@@ -38,23 +38,23 @@ class Axis:
     method: str
 
     def offset(self, n_columns: int, pitch: float = 1.0) -> float:
-        """The ``axis_offset`` of a :class:`~mivol.tomography.geometry.ParallelBeam` with that many columns [length]."""
+        """The ``axis_offset`` of a :class:`~mivol.tomography.geometry.ParallelBeam` with ``n_columns`` columns [length]."""
         return (self.column - (n_columns - 1) / 2) * pitch
 
 
 def axis_from_mirrors(y: np.ndarray, angles: np.ndarray, n_pairs: int = 12) -> Axis:
-    """Find the axis from views half a turn apart, which are mirror images of one another about it.
+    """Find the axis from views half a turn apart, which are mirror images about the axis.
 
-    Each of the ``n_pairs`` pairs nearest to half a turn gives the column about which one is the best mirror of the other
-    (least squares, cubic interpolation). A pair that misses half a turn by ``e`` is off by about ``slope e``; a straight
-    line through the columns of all pairs is read at ``e = 0``.
+    Each of the ``n_pairs`` pairs nearest to half a turn gives the column of the best mirror image (least squares, cubic
+    interpolation). A pair that misses half a turn by ``e`` is off by about ``slope e``; a straight line through the columns of
+    all pairs is read at ``e = 0``.
 
     Args:
         y: (views, rows, cols) line integrals of a parallel beam.
         angles: (views,) [rad].
-        n_pairs: how many pairs to use at most.
+        n_pairs: most pairs to use.
 
-    Raises: MivolError: no two views are within 5 degrees of half a turn, or one of them shows nothing.
+    Raises: MivolError: no two views within 5 degrees of half a turn, or an empty view among them.
     """
     first, second, miss = _opposite_pairs(np.asarray(angles, float), n_pairs)
     used = np.union1d(first, second)
@@ -69,11 +69,11 @@ def axis_from_mirrors(y: np.ndarray, angles: np.ndarray, n_pairs: int = 12) -> A
 
 
 def axis_from_moments(y: np.ndarray, angles: np.ndarray) -> Axis:
-    """Find the axis from the shadow's centre of mass, which follows ``c + a cos(theta) + b sin(theta)`` (Ludwig).
+    """Find the axis from the centre of mass of each view, which follows ``c + a cos(theta) + b sin(theta)`` (Ludwig).
 
-    Needs the whole object in every view and air at 0: a constant error of the air pulls the centre of mass towards the
-    middle of the detector. The standard deviation is that of the views' scatter, or of the rows' where that is larger: the
-    flats' errors are the same in all views, and only rows tell them.
+    The method needs the whole object in every view and air at 0: a constant error of the air pulls the centre of mass towards
+    the middle of the detector. The standard deviation is the scatter of the views, or of the rows if larger: errors of the
+    flats are the same in all views, and only rows reveal them.
 
     Args:
         y: (views, rows, cols) line integrals of a parallel beam.
@@ -90,22 +90,22 @@ def axis_from_moments(y: np.ndarray, angles: np.ndarray) -> Axis:
 
 
 def axis_from_reconstructions(y: np.ndarray, weights: np.ndarray, angles: np.ndarray, start: float, width: float = 2.0) -> Axis:
-    """Refine the axis: the column with which one half of the views predicts the other half best.
+    """Refine the axis: find the column at which half of the views best predicts the other half.
 
-    Filtered back-projection from every other view, forward projection to the views between, weighted mean squared
-    residual; a parabola fitted to five trial columns, then once more on a fourth of the width. Done twice, the halves
-    changing roles: the estimate is their mean. Its standard deviation is that of the parabola's curvature (the residual
-    taken as noise), or half of the two estimates' difference where that is larger.
+    Each trial back-projects every other view with a filter, projects to the views between, and takes the weighted mean squared
+    residual. A parabola is fitted to five trial columns, then again on a quarter of the width. The halves then change roles,
+    and the estimate is the mean of both results. The standard deviation comes from the parabola's curvature (with the residual
+    as noise), or from half of the difference of both results if larger.
 
     Args:
-        y: (views, rows, cols) line integrals of a parallel beam; the middle row or two are used.
+        y: (views, rows, cols) line integrals of a parallel beam; only the middle row or two are used.
         weights: inverse variances of ``y``.
-        angles: (views,) [rad], evenly over half a turn or a whole one.
-        start: column to search around.
+        angles: (views,) [rad], evenly over half a turn or a whole turn.
+        start: first column of the search.
         width: half width of the search [pixels].
 
-    Raises: MivolError: the misfit has no minimum within the search.
-    Cost: for each of the 20 trials one A and two A^T over half of the views, at the detector's resolution.
+    Raises: MivolError: no minimum of the misfit within the search.
+    Cost: for each of the 20 trials an A and two A^T over half of the views, at the detector's resolution.
     """
     middle = slice((y.shape[1] - 1) // 2, y.shape[1] // 2 + 1)
     y, weights = y[:, middle], weights[:, middle]
@@ -127,8 +127,8 @@ def axis_from_reconstructions(y: np.ndarray, weights: np.ndarray, angles: np.nda
 def find_axis(y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> Axis:
     """Find the rotation axis of a parallel-beam scan: by mirror images (else by moments), refined by reconstructions.
 
-    The refined column counts; its uncertainty is at least half of its distance from the rough one, since pixels of
-    finite width and light that drifts move both by more than noise does.
+    The result is the refined column. Its uncertainty is at least half of the distance from the rough column, because finite
+    pixels and drifting light move both columns by more than noise does.
 
     Args:
         y: (views, rows, cols) line integrals.
@@ -155,7 +155,7 @@ def _opposite_pairs(angles: np.ndarray, n_pairs: int) -> tuple[np.ndarray, np.nd
 
 
 def _find_mirror_column(a: np.ndarray, b: np.ndarray) -> float:
-    """Column c for which ``a(s) = b(2 c - s)`` at best; ``a`` and ``b`` are (rows, cols)."""
+    """Column c of the best fit of ``a(s) = b(2 c - s)``; ``a`` and ``b`` are (rows, cols)."""
     n = a.shape[-1]
     # sum_s a(s) b(k - s), k = 2 c, is a convolution: its peak is the best whole k.
     size = 2 * n
@@ -193,13 +193,13 @@ def _held_out_misfit(
 
 
 def _object_radius(y: np.ndarray, column: float) -> int:
-    """Pixels from the axis to the outermost one that ever sees a tenth of the densest ray, and a tenth more."""
+    """Pixels from the axis to the outermost pixel that ever sees a tenth of the densest ray, plus a tenth."""
     seen = np.flatnonzero((y > 0.1 * y.max()).any(axis=(0, 1)))
     return int(np.ceil(1.1 * np.abs(seen - column).max()))
 
 
 def _parabola_minimum(f: Callable[[float], float], centre: float, width: float, n: int) -> tuple[float, float]:
-    """(abscissa, standard deviation) of the least of a parabola fitted to a mean of ``n`` weighted squares."""
+    """(abscissa, standard deviation) of the minimum of a parabola fitted to a mean of ``n`` weighted squares."""
     offsets = np.linspace(-1.0, 1.0, 5)
     a, b, c = map(float, np.polyfit(offsets, [f(centre + width * o) for o in offsets], 2))
     if a <= 0 or abs(b) > 2 * a:

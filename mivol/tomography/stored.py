@@ -1,7 +1,14 @@
-"""A projector whose matrix is stored: for scans whose rays lie in layers, one layer's rows serve them all.
+r"""A projector with a stored matrix, for scans whose rays lie in layers: all layers share the rows of a single layer.
 
-A walk computes each entry anew in every product. Where a layer's matrix fits into memory, a product reads it: that takes
-half of a walk's time for one slice and a tenth for sixty-four, and a subset of views is a part of it that costs nothing.
+A walk computes each entry anew in every product. If the matrix of a layer fits into memory, a product reads the matrix
+instead: half of a walk's time for a single slice, and a tenth for sixty-four. A subset of views is a part of the matrix at no
+cost.
+
+Conventions. A line is followed along its major axis, which crosses more voxels: x is a coordinate in voxels along the major
+axis (0 at the first centre), and the other coordinate is ``offset + slope x`` with \|slope\| <= 1. A row of voxels (the same
+x) then meets at most four voxels of the line. Entries are the integrals of the trilinear model of
+:class:`mivol.tomography.projector.Projector`: hat functions at voxel centres, constant beyond the outermost centres, nothing
+outside the box. Positions are float64, fractions of a voxel and entries float32.
 """
 
 from __future__ import annotations
@@ -30,22 +37,22 @@ __all__ = [
 ]
 
 LAYERS_AT_ONCE = 32
-"""Columns of one product: 32 floats are two cache lines, and a layer of 256^2 of them fits into a second-level cache."""
+"""Columns of a product: 32 floats are two cache lines, and a layer of 256^2 of them fits into a second-level cache."""
 
 MIN_PRODUCTS = 9
-"""Products with A and its transpose, counted a layer, after which storing is paid for: an entry takes the processor about 23 ns
-to store, and each pair of products reads it 2.6 ns sooner than a walk finds it (2.2 and 4.8 ns, one layer)."""
+"""Products with A and its transpose per layer after which storing pays: storing an entry takes about 23 ns, and each pair of
+products reads the entry 2.6 ns sooner than a walk computes it (2.2 and 4.8 ns, a single layer)."""
 
 Blocks = list[scipy.sparse.csr_array]
 
 
 class StoredProjector(Projector):
-    """The operators of a :class:`~mivol.tomography.projector.Projector`, from stored rows; made by :func:`store_matrix`.
+    """The operators of a :class:`~mivol.tomography.projector.Projector` from stored rows; made by :func:`store_matrix`.
 
     ``A = H S``: H interpolates between the layers of the grid at the heights of the detector's rows, S is the stored matrix of
-    a layer. Products agree with the walk's to its rounding, and ``A.T`` is the transpose of the same numbers.
+    a layer. Products agree with the walk's products to rounding, and ``A.T`` is the transpose of the same numbers.
 
-    Cost: 8 bytes an entry of S, and a multiplication an entry and layer.
+    Cost: 8 bytes per entry of S, and a multiplication per entry and layer.
     """
 
     def __init__(self, walk: Projector, blocks: Blocks, to_rows: scipy.sparse.csr_array | None) -> None:
@@ -60,7 +67,7 @@ class StoredProjector(Projector):
         return sum(part.nbytes for b in self._blocks for part in (b.data, b.indices, b.indptr))
 
     def subset(self, views: Sequence[int] | np.ndarray) -> StoredProjector:
-        """The rows of some views, counted among this projector's own: the same memory, read in part."""
+        """Select the rows of some views, counted among this projector's own, in the same memory."""
         walk = super().subset(views)
         return StoredProjector(
             walk, _select_views(self._blocks, np.asarray(views, int), self.projection_shape[2]), self._to_rows
@@ -89,7 +96,7 @@ class StoredProjector(Projector):
         return (layers if self._to_rows is None else self._to_rows.T @ layers).reshape(-1)
 
     def _back(self, operand: np.ndarray) -> np.ndarray:
-        """Blocks are added up in float64, as the walk's passes are."""
+        """Back-project; blocks are added up in float64, as passes of the walk are."""
         if len(self._blocks) == 1:
             return self._transposed[0] @ operand
         total, start = np.zeros((self._blocks[0].shape[1], *operand.shape[1:])), 0
@@ -106,27 +113,27 @@ class StoredProjector(Projector):
 
 
 def matrix_bytes(projector: Projector) -> int | None:
-    """Bytes that :func:`store_matrix` would take, counted without storing; None where the rays do not lie in layers."""
+    """Memory needed by :func:`store_matrix` [byte], counted without storing; None for rays that do not lie in layers."""
     lines = find_lines(projector.geometry, projector.grid, projector.views)
     return None if lines is None else count_bytes(lines)
 
 
 def is_worth_storing(rows: int, iterations: int, is_by_subsets: bool) -> bool:
-    """Whether storing costs less than it saves.
+    """Whether storing costs less than the later products save.
 
     Args:
-        rows: of the detector: layers that share the stored rows.
-        iterations: of a solver, each with about one product with A and one with its transpose.
+        rows: rows of the detector: layers that share the stored rows.
+        iterations: iterations of a solver, each with about a product with A and a product with its transpose.
         is_by_subsets: whether an iteration takes many small products; a walk of a few hundred rays costs mostly its start.
     """
     return is_by_subsets or rows * iterations >= MIN_PRODUCTS
 
 
 def store_matrix(projector: Projector) -> StoredProjector:
-    """The same projector with its rows stored.
+    """Store the rows of a projector.
 
     Raises:
-        MivolError: rays that do not lie in layers: only parallel beams and fans of one row do.
+        MivolError: rays that do not lie in layers; only parallel beams and fans of a single row do.
     """
     lines = find_lines(projector.geometry, projector.grid, projector.views)
     if lines is None:
@@ -138,7 +145,7 @@ def store_matrix(projector: Projector) -> StoredProjector:
 
 
 def _row_interpolation(projector: Projector, heights: np.ndarray) -> scipy.sparse.csr_array | None:
-    """(rows, Z) linear interpolation at the heights, clamped and 0 outside the box; None where rows are layers."""
+    """(rows, Z) linear interpolation at the heights, clamped and 0 outside the box; None if rows coincide with layers."""
     grid = projector.grid
     n, where = grid.shape[0], (heights - grid.centre[2]) / grid.voxel_size[2] + (grid.shape[0] - 1) / 2
     inside = (where > -0.5) & (where < n - 0.5)
@@ -168,13 +175,14 @@ def _select_views(blocks: Blocks, views: np.ndarray, columns: int) -> Blocks:
 
 
 VOXELS_PER_ROW = 4
-"""Most voxels of a row that a line meets: hats are 2 wide, and a line crosses at most 2 voxels while it crosses a row's hat."""
+"""Most voxels of a row met by a line: hats are 2 wide, and a line crosses at most 2 voxels while crossing a row's hat."""
 
 MIN_ENTRY = 1e-9
-"""Integrals [voxels] below this are rounding, of kinks that fall on a centre: left out, which is 1e-7 of a voxel in 100."""
+"""Integrals [voxels] below this limit are rounding, from kinks at a centre; they are left out, an error of 1e-7 of a voxel in
+100."""
 
 PAIRS_PER_BLOCK = 1 << 21
-"""Pairs of a line and a row that are computed at once: 64 MiB of places and entries."""
+"""Pairs of a line and a row computed at once: 64 MiB of places and entries."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,10 +190,10 @@ class Lines:
     """Lines in a plane of ``shape`` voxels (Y, X), each with its part inside.
 
     Attributes:
-        heights: (rows,) z of the layers that lines lie in, the same lines in each [length].
+        heights: (rows,) z of the layers, with the same lines in each [length].
         slope, offset: (views, cols), as above [voxels].
         length: (views, cols), length of the line over a step of 1 along x [length].
-        low, high: (views, cols), its part in the box and, of half lines, beyond the source; high <= low where there is none.
+        low, high: (views, cols), the part in the box and, for half lines, beyond the source; high <= low for an empty part.
         along_x: (views, cols), whether the major axis is the grid's x.
         shape: (Y, X).
     """
@@ -201,9 +209,9 @@ class Lines:
 
 
 def find_lines(geometry: Geometry, grid: VoxelGrid, views: np.ndarray) -> Lines | None:
-    """The lines of a scan whose detector rows see layers of constant z, all the same way; None of any other.
+    """Find the lines of a scan whose detector rows all see layers of constant z in the same way; None for other scans.
 
-    These are parallel beams, and fan beams: cones of one row in the plane of the source.
+    Such scans are parallel beams, and fan beams: cones of a single row in the plane of the source.
     """
     heights, starts, directions = None, [], []
     for view in views:
@@ -220,7 +228,7 @@ def find_lines(geometry: Geometry, grid: VoxelGrid, views: np.ndarray) -> Lines 
 
 
 def _clip_lines(heights: np.ndarray, q: np.ndarray, e: np.ndarray, shape: tuple[int, int], whole: bool) -> Lines:
-    """Of points ``q`` and directions ``e`` (views, cols, 2) in voxels, of which a step of 1 is a unit of length."""
+    """Clip lines with points ``q`` and directions ``e`` (views, cols, 2) in voxels; a step of 1 is a unit of length."""
     along_x = np.abs(e[..., 0]) >= np.abs(e[..., 1])
     swap = np.where(along_x, 0, 1)[..., None]
     (q0, q1), (e0, e1) = ([np.take_along_axis(a, s, -1)[..., 0] for s in (swap, 1 - swap)] for a in (q, e))
@@ -241,8 +249,9 @@ def _clip_lines(heights: np.ndarray, q: np.ndarray, e: np.ndarray, shape: tuple[
 
 
 def count_bytes(lines: Lines) -> int:
-    """Bytes of the rows of all lines, counted beforehand: 8 an entry, ``2 + 2 |slope|`` of them in the mean over offsets in
-    each row of voxels that a line's part reaches."""
+    """Memory of the rows of all lines [byte], counted beforehand: 8 per entry, with ``2 + 2 |slope|`` entries on average over
+    offsets for each row of voxels reached by a line.
+    """
     last = np.where(lines.along_x, lines.shape[1], lines.shape[0]) - 1
     reached = np.minimum(np.ceil(lines.high), last) - np.maximum(np.floor(lines.low), 0) + 1
     entries = np.sum(np.where(lines.high > lines.low, reached * (2 + 2 * np.abs(lines.slope)), 0.0))
@@ -276,7 +285,7 @@ def _build_block(lines: Lines, part: slice, steps: int) -> scipy.sparse.csr_arra
 def _integrate_entries(
     line: dict[str, mi.Float64], along_x: mi.Bool, shape: tuple[int, int], steps: int
 ) -> tuple[mi.Int32, mi.Float]:
-    """Places and integrals, ``PLACES`` for each line and row of voxels; 0 where a line meets fewer."""
+    """Places and integrals, ``VOXELS_PER_ROW`` for each line and row of voxels; unused places hold 0."""
     n_y, n_x = (dr.opaque(mi.UInt32, n) for n in shape)
     pair = dr.arange(mi.UInt32, dr.width(along_x) * steps)
     # Exact: pairs are fewer than 2^32, half a step from the next whole number. Processors divide whole numbers one by one.

@@ -1,1 +1,1 @@
-"""Is it right: statistics, reference renders by Mitsuba, where Mitsuba is not to be trusted, comparison."""
+"""Is a result right: statistics, reference renders by Mitsuba, doubts about Mitsuba, comparison."""

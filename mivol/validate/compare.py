@@ -1,8 +1,8 @@
-"""An image beside its reference: how far apart, in units of what chance explains.
+"""Compare an image with its reference, in units of the expected noise.
 
-Conventions. The reference's variance is estimated from its batches, the image's is given (0: exact). Of ``alpha``, the
-chance of a false alarm, one half goes to the largest of all pixels and one half to the mean difference, as in
-:mod:`mivol.validate.statistics`; PSNR cannot tell noise from error, so it is reported and never judged.
+Conventions. Batches give the variance of the reference; the variance of the image is given (0: exact). Half of ``alpha``, the
+chance of a false alarm, goes to the largest difference of all pixels, half to the mean difference, as in
+:mod:`mivol.validate.statistics`. PSNR cannot tell noise from error; PSNR is reported but never decides.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ __all__ = ["Comparison", "compare"]
 @with_short_repr
 @dataclass(frozen=True)
 class Comparison:
-    """What can be said of an image and its reference.
+    """The comparison of an image with its reference.
 
     Attributes:
         z: (H, W, C) difference in standard errors.
-        bound: on |z|, which one of all values exceeds with chance ``alpha``/2 if the means agree.
-        beyond: share of values whose |z| exceeds it; 0 expected.
+        bound: bound on |z|; if the means agree, the largest |z| of all values exceeds the bound with chance ``alpha``/2.
+        beyond: share of values with |z| above the bound; 0 expected.
         above_three: share of values with |z| > 3; 0.0027 expected of normal noise.
         worst: (row, column, channel) of the largest |z|.
         bias: mean difference with its confidence interval.
-        detectable: median over pixels of the smallest bias that would be found 9 times in 10 [radiance].
-        psnr: [dB], peak of the reference; -inf where the reference is black.
-        nrmse: norm of the difference over the norm of the reference; inf where that is black.
+        detectable: median over pixels of the smallest bias found 9 times in 10 [radiance].
+        psnr: [dB], peak of the reference; -inf for a black reference.
+        nrmse: norm of the difference over the norm of the reference; inf for a black reference.
         alpha: chance of a false alarm.
     """
 
@@ -51,12 +51,12 @@ class Comparison:
 
     @property
     def agrees(self) -> bool:
-        """No pixel beyond the bound, and the interval of the bias holds 0."""
+        """Whether no pixel exceeds the bound, and the interval of the bias contains 0."""
         return self.beyond == 0 and self.bias.low <= 0 <= self.bias.high
 
     @property
     def text(self) -> str:
-        """One paragraph."""
+        """A paragraph."""
         verdict = "agrees with the reference" if self.agrees else "differs from the reference"
         return (
             f"The image {verdict}: {100 * self.beyond:.2g} % of its values lie beyond {self.bound:.1f} standard errors (alpha "
@@ -79,16 +79,17 @@ def compare(
     """Compare an image with a reference.
 
     Args:
-        image: (H, W, C), with the variance of its own mean; 0 where it is exact.
-        reference: what ``render_reference`` gave, or ``read_reference`` (which refuses the reference of another scene).
-        alpha: chance that images of equal mean are said to differ.
-        samples_seen: largest value of one sample [radiance], for instance the background's: what the samples of a pixel may
-            have missed is then allowed for, see :meth:`ReferenceResult.variance_with_unseen`. 0: as estimated.
-        rounding: see :func:`mivol.validate.statistics.z_image`.
-        correlated: see :func:`mivol.validate.statistics.estimate_bias`; 3: the channels share their paths, the filter is a box.
+        image: (H, W, C), with the variance of its own mean; 0 for an exact image.
+        reference: result of ``render_reference`` or ``read_reference`` (which refuses the reference of another scene).
+        alpha: chance that images of equal mean are reported as different.
+        samples_seen: largest value of a single sample [radiance], for instance the background's. The variance then allows for
+            light missed by the samples, see :meth:`ReferenceResult.variance_with_unseen`. 0: the variance as estimated.
+        rounding: as in :func:`mivol.validate.statistics.z_image`.
+        correlated: as in :func:`mivol.validate.statistics.estimate_bias`; 3: the channels share their paths, with a box
+            filter.
 
     Raises:
-        MivolError: another size, or values that are not finite.
+        MivolError: an image of another size, or values that are not finite.
     """
     mean = np.asarray(image.mean, dtype=np.float64)
     if mean.shape != reference.mean.shape:

@@ -1,13 +1,13 @@
-"""How good are the views of a radiance field? One written protocol, since each of its choices is worth 0.2 to 6 dB.
+"""Scores of the views of a radiance field, by a written protocol: each choice of a protocol is worth 0.2 to 6 dB.
 
-Protocol. Render and photograph are compared as a screen shows them: sRGB values, clipped to 0..1 and rounded to 8 bits, over
-the same background, at the size at which they were read. PSNR has the peak 1 and is taken of each image over all pixels and
-channels (those that a mask leaves); **the number for a set is the mean of its images' PSNR**, not the PSNR of the mean error.
-SSIM has the 11 x 11 Gaussian window of Wang et al., FLIP the viewing distance of its authors (67 pixels per degree); smaller is
-better there. Where a mask leaves pixels out, SSIM and FLIP see the photograph in both.
+Protocol. Render and photograph are compared as displayed: sRGB values, clipped to 0..1 and rounded to 8 bits, over the same
+background, at the size of reading. PSNR has the peak 1 and covers all pixels (inside a mask, if given) and channels of an
+image. **The PSNR of a set is the mean of its images' PSNR**, not the PSNR of the mean error. SSIM has the 11 x 11 Gaussian
+window of Wang et al., FLIP the viewing distance of its authors (67 pixels per degree); smaller FLIP is better. Outside a mask,
+SSIM and FLIP compare the photograph with itself.
 
-Source: Wang et al. 2004 (IEEE TIP 13); Andersson et al. 2020 (PACM CGIT 3, FLIP). For the choices: the protocol that the
-reruns of the NerfBaselines project follow for NeRF's synthetic scenes.
+Source: Wang et al. 2004 (IEEE TIP 13); Andersson et al. 2020 (PACM CGIT 3, FLIP). The choices follow the protocol of the
+NerfBaselines project for NeRF's synthetic scenes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ImageScore:
-    """What the metrics say of one image, by their names in ``METRICS``."""
+    """The metrics of an image, by their names in ``METRICS``."""
 
     name: str
     values: dict[str, float]
@@ -44,7 +44,7 @@ class ImageScore:
 
 @dataclass(frozen=True)
 class MeanScore:
-    """What they say of a set of images: means over images, and each image."""
+    """The metrics of a set of images: means over images, and each image."""
 
     images: tuple[ImageScore, ...]
 
@@ -63,7 +63,7 @@ class MeanScore:
 
 @dataclass(frozen=True)
 class Metric:
-    """A distance of two quantised images (H, W, 3): its function, how it is called and to how many digits it is told."""
+    """A distance of two quantised images (H, W, 3): its function, its label and its printed digits."""
 
     measure: Callable[[np.ndarray, np.ndarray], float]
     label: str
@@ -82,7 +82,7 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
 
 
 def load_flip() -> Callable:
-    """FLIP's own implementation.
+    """Import FLIP's own implementation.
 
     Raises:
         MivolError: flip-evaluator is not installed.
@@ -103,14 +103,14 @@ METRICS: dict[str, Metric] = {
 
 
 def check_metrics(names: Sequence[str], width: int, height: int) -> None:
-    """Refuse metrics that will not judge images of a size, before there is anything to judge.
+    """Refuse metrics that cannot score images of a size, before a fit.
 
     Args:
         names: keys of ``METRICS``.
-        width, height: of the smallest image [pixel].
+        width, height: size of the smallest image [pixel].
 
     Raises:
-        MivolError: images smaller than SSIM's window, or FLIP that is not installed.
+        MivolError: images smaller than SSIM's window, or FLIP without its package.
     """
     if "ssim" in names:
         check_window(width, height)
@@ -119,11 +119,11 @@ def check_metrics(names: Sequence[str], width: int, height: int) -> None:
 
 
 def quantise(image: np.ndarray, space: str = "srgb") -> np.ndarray:
-    """An image as a screen of 8 bits shows it, in sRGB values: multiples of 1/255, float64.
+    """Quantise an image like an 8-bit screen, in sRGB values: multiples of 1/255, float64.
 
     Args:
         image: (H, W, 3).
-        space: "srgb" or "linear", what its values are.
+        space: space of the values, "srgb" or "linear".
 
     Raises:
         MivolError: another shape or space, or NaN.
@@ -153,13 +153,13 @@ def score_image(
     Args:
         image: (H, W, 3).
         truth: (H, W, 3).
-        space: what the values of both are.
-        mask: (H, W) bool, False where a pixel does not count; None: all count.
+        space: space of the values of both.
+        mask: (H, W) bool, False for pixels that do not count; None: all pixels count.
         metrics: keys of ``METRICS``.
-        name: of the image.
+        name: name of the image.
 
     Raises:
-        MivolError: shapes that differ, an unknown metric, a metric that is not installed, NaN, a mask that leaves nothing.
+        MivolError: different shapes, an unknown metric, a metric without its package, NaN, or an empty mask.
     """
     unknown = next((metric for metric in metrics if metric not in METRICS), None)
     if unknown is not None:
@@ -178,14 +178,14 @@ def score_image(
 
 
 def fit_colours(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-    """An image whose channels are each a x + b, as near to its photograph as they can be (least squares over what counts).
+    """Fit each channel of an image to its photograph by a x + b, with least squares over counting pixels.
 
-    A camera that chose another exposure or white balance for a view that was not fitted says nothing of the field; this is what
-    the field is worth without that. It is told beside the PSNR of the image itself, never instead of it.
+    A camera may choose another exposure or white balance for a held-out view. The fitted image shows the quality of the field
+    without this choice. Its PSNR is reported beside the PSNR of the image itself, never in its place.
 
     Args:
         image, truth: (H, W, 3).
-        mask: (H, W) bool, False where a pixel does not count.
+        mask: (H, W) bool, False for pixels that do not count.
     """
     counts = np.ones(np.shape(truth)[:2], bool) if mask is None else np.asarray(mask, bool)
     fitted = np.empty(np.shape(image))
@@ -198,10 +198,10 @@ def fit_colours(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = 
 
 
 def average_scores(images: Iterable[ImageScore]) -> MeanScore:
-    """The score of a set of images.
+    """Average the scores of a set of images.
 
     Raises:
-        MivolError: there is none.
+        MivolError: an empty set.
     """
     found = tuple(images)
     if not found:

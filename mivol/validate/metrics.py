@@ -1,4 +1,4 @@
-"""Distances between images and between volumes: PSNR, relative error, structural similarity. None of them knows of noise."""
+"""Distances between images and between volumes: PSNR, relative error, structural similarity. All ignore noise."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def psnr(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> flo
     """Peak signal to noise ratio, 20 log10(peak / RMSE) [dB]; infinite for equal images.
 
     Args:
-        peak: the largest value of a signal; by default the truth's.
+        peak: largest value of a signal; by default the largest value of the truth.
 
     Raises:
-        MivolError: the peak is not above 0.
+        MivolError: a peak of at most 0.
     """
     peak = float(np.max(truth)) if peak is None else peak
     if not peak > 0:
@@ -32,10 +32,10 @@ def psnr(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> flo
 def nrmse(x: np.ndarray, truth: np.ndarray) -> float:
     """Root mean square error divided by the root mean square of the truth: |x - truth| / |truth|.
 
-    (Some divide by the range of the truth instead, which makes the number of a mostly empty volume several times smaller.)
+    Other authors divide by the range of the truth. For a mostly empty volume the range gives a several times smaller number.
 
     Raises:
-        MivolError: the truth is 0 everywhere.
+        MivolError: a truth of 0 everywhere.
     """
     norm = float(np.linalg.norm(np.asarray(truth, dtype=np.float64)))
     if norm == 0:
@@ -48,10 +48,10 @@ WINDOW = 11
 
 
 def check_window(width: int, height: int) -> None:
-    """Refuse images that SSIM cannot judge.
+    """Refuse images too small for SSIM.
 
     Raises:
-        MivolError: they are smaller than its window.
+        MivolError: images smaller than the window.
     """
     if min(width, height) < WINDOW:
         raise MivolError(
@@ -63,7 +63,8 @@ def check_window(width: int, height: int) -> None:
 def ssim(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> float:
     """Structural similarity (Wang et al. 2004, IEEE TIP 13), by scikit-image, mean over channels; 1 for equal images.
 
-    The window is the paper's, 11 x 11 pixels with Gaussian weights of standard deviation 1.5, wholly inside the image.
+    The window has the paper's 11 x 11 pixels with Gaussian weights of standard deviation 1.5, and lies wholly inside the
+    image.
 
     Raises:
         MivolError: as :func:`check_window`.

@@ -1,6 +1,6 @@
 """Running means and variances of independent batches, and averages over tiles of pixels.
 
-Conventions. float64 throughout; the variance of a mean is the standard error squared.
+Conventions. All numbers are float64. The variance of a mean is the squared standard error.
 
 Source: Welford 1962 (Technometrics 4) and Chan, Golub, LeVeque 1983 (The American Statistician 37).
 """
@@ -18,12 +18,12 @@ from mivol.errors import MivolError
 __all__ = ["BATCHES", "Moments", "average_tiles", "split_tiles"]
 
 BATCHES = 16
-"""Independent renders behind a mean: its standard error is known to 1 / sqrt(2 * 15) = 18 %."""
+"""Independent renders behind a mean: the standard error is known to 1 / sqrt(2 * 15) = 18 %."""
 
 
 @dataclass(frozen=True)
 class Moments:
-    r"""Mean and sum of squared deviations of n values, one or many at a time.
+    r"""Mean and sum of squared deviations of n values, as scalars or arrays.
 
     A value x changes the mean m and the sum M of squared deviations by
 
@@ -31,9 +31,9 @@ class Moments:
 
     and two sets merge by
 
-    .. math:: m = m_a + \delta\,n_b/n, \quad M = M_a + M_b + \delta^2 n_a n_b/n, \quad \delta = m_b - m_a:
+    .. math:: m = m_a + \delta\,n_b/n, \quad M = M_a + M_b + \delta^2 n_a n_b/n, \quad \delta = m_b - m_a.
 
-    no large numbers are subtracted, so that M keeps its digits where the naive sum of squares minus n m^2 loses them all.
+    No large numbers are subtracted, so M keeps its digits; the naive sum of squares minus n m^2 would lose all digits.
 
     Attributes:
         n: number of values.
@@ -47,7 +47,7 @@ class Moments:
 
     @staticmethod
     def empty(shape: tuple[int, ...] = ()) -> Moments:
-        """No values yet."""
+        """Moments of no values."""
         return Moments(0, np.zeros(shape), np.zeros(shape))
 
     @staticmethod
@@ -59,21 +59,21 @@ class Moments:
 
     @staticmethod
     def of_each(values: Iterable[ArrayLike]) -> Moments:
-        """Moments of values of one shape as they come: no two are in memory."""
+        """Moments of a stream of values of the same shape, with a single value in memory."""
         found = Moments.empty()
         for value in values:
             found = found.add(np.asarray(value))
         return found
 
     def add(self, value: np.ndarray) -> Moments:
-        """With one value more (Welford)."""
+        """Add a value (Welford)."""
         x = np.asarray(value, dtype=np.float64)
         n = self.n + 1
         mean = self.mean + (x - self.mean) / n
         return Moments(n, mean, self.m2 + (x - self.mean) * (x - mean))
 
     def merge(self, other: Moments) -> Moments:
-        """With all values of another set (Chan, Golub, LeVeque)."""
+        """Add all values of another set (Chan, Golub, LeVeque)."""
         n = self.n + other.n
         if n == 0:
             return self
@@ -83,7 +83,7 @@ class Moments:
 
     @property
     def variance(self) -> np.ndarray:
-        """Unbiased variance of one value, M/(n - 1).
+        """Unbiased variance of a single value, M/(n - 1).
 
         Raises:
             MivolError: fewer than two values.
@@ -101,9 +101,9 @@ class Moments:
 def average_tiles(mean: np.ndarray, var: np.ndarray, tile: int) -> tuple[np.ndarray, np.ndarray]:
     """Average tiles of pixels, for estimators with heavy tails.
 
-    A batch mean with rare bright samples is far from normal: seen rarely, both its mean and its variance are too small.
-    The skewness of an average of k independent values falls as 1/sqrt(k), so tiles come nearer to the normal law than
-    pixels; what is lost is the place of a bias smaller than a tile. Rows and columns that fill no tile are left out.
+    A batch mean with rare bright samples is far from normal: without these samples, both its mean and its variance are too
+    small. The skewness of an average of k independent values falls as 1/sqrt(k), so tiles come nearer to the normal law than
+    pixels. A bias smaller than a tile can no longer be located. Rows and columns beyond the last whole tile are left out.
 
     Args:
         mean: (H, W, C).
@@ -117,7 +117,7 @@ def average_tiles(mean: np.ndarray, var: np.ndarray, tile: int) -> tuple[np.ndar
 
 
 def split_tiles(image: np.ndarray, tile: int) -> np.ndarray:
-    """An image (H, W, C) as (rows of tiles, tile, columns of tiles, tile, C), without what fills no tile."""
+    """An image (H, W, C) as (rows of tiles, tile, columns of tiles, tile, C), cut to whole tiles."""
     h, w, c = image.shape
     if tile < 1 or h < tile or w < tile:
         raise MivolError(f"tiles of {tile} pixels do not fit an image of {w}x{h}; choose 1 to {min(h, w)}.")

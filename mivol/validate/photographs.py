@@ -1,8 +1,8 @@
-"""A scene's own renders as photographs: references by Mitsuba, and the file of cameras beside them.
+"""Renders of a scene as photographs: references by Mitsuba, with the file of their cameras.
 
-Conventions. The folder holds one reference per view (:mod:`mivol.validate.reference`), linear radiance in OpenEXR, and a
-``transforms.json`` that :func:`mivol.photos.load_photos` reads like any other data set. A reference has no alpha: the
-background is what the scene shows.
+Conventions. The folder holds a reference per view (:mod:`mivol.validate.reference`), linear radiance in OpenEXR, and a
+``transforms.json`` readable by :func:`mivol.photos.load_photos`. A reference has no alpha: the background belongs to the
+scene.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ def render_photographs(
     test: Sequence[int] = (),
     **reference: Any,
 ) -> list[ReferenceResult]:
-    """Render each view of a scene as a reference, and write where the cameras stood.
+    """Render each view of a scene as a reference, and write the cameras.
 
-    Views that the folder holds already are continued or fetched, as :func:`render_reference` does.
+    Existing views in the folder are continued or reused, as :func:`render_reference` does.
 
     Args:
         scene: as for :func:`render_reference`.
-        folder: is made where it is missing; views are named ``view_000.exr`` and so on.
-        sensors: numbers, dicts or sensors, all perspective; None: all of the scene's.
-        test: numbers of the views that are the test split.
+        folder: created if missing; views are named ``view_000.exr`` and so on.
+        sensors: numbers, dicts or sensors, all perspective; None: all sensors of the scene.
+        test: numbers of the views of the test split.
         reference: settings of :func:`render_reference`, ``max_depth`` among them.
 
     Raises:
-        MivolError: a scene without sensors, one that is not perspective, or as :func:`render_reference`.
+        MivolError: a scene without sensors, a sensor that is not perspective, or as :func:`render_reference`.
     """
     loaded = scene if isinstance(scene, LoadedScene) else load_scene(scene, reference.pop("overrides", None))
     looks = list(range(len(loaded.scene.sensors()))) if sensors is None else list(sensors)

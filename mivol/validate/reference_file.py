@@ -1,9 +1,9 @@
-"""A reference image on disk, and the checkpoint of its batches.
+"""Reference images on disk, with a checkpoint of their batches.
 
-Conventions. A reference is one OpenEXR file, float32: channels R, G, B and variance.R, .G, .B (Y and variance.Y in mono
-variants). Its header says what it is an image of (the scene's content hash) and how it was made. Beside it
-``<name>.state.npz`` holds the moments of the batches so far in float64, so that stopping changes nothing and a better reference
-can be asked for later.
+Conventions. A reference is an OpenEXR file, float32: channels R, G, B and variance.R, .G, .B (Y and variance.Y in mono
+variants). Its header holds the identity of the image (the scene's content hash) and the method. The file ``<name>.state.npz``
+beside the image holds the moments of all batches in float64. So an interrupted reference continues unchanged, and a later call
+can reach a higher accuracy.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class ReferenceResult:
         variance: (H, W, C) of the mean.
         batches: independent batches behind both.
         spp: samples behind each pixel and channel.
-        identity: what it is an image of, and how it was made; equal for references that may be averaged.
-        path: its file.
-        doubts: why it should not be believed, where there are reasons.
-        seconds: time spent rendering, all sessions together.
-        reached: whether it has the accuracy that was asked for; False where ``max_spp`` came first.
+        identity: scene and method; equal for references that may be averaged.
+        path: the file.
+        doubts: reasons not to trust the reference.
+        seconds: rendering time of all sessions together.
+        reached: whether the requested accuracy was reached; False if ``max_spp`` came first.
     """
 
     mean: np.ndarray
@@ -72,14 +72,14 @@ class ReferenceResult:
         return float(np.sqrt(self.variance.mean()))
 
     def variance_with_unseen(self, brightest: float) -> np.ndarray:
-        """Variance of the mean, with room for light that the samples of a pixel met too seldom, or never.
+        """Variance of the mean, with an allowance for light that the samples of a pixel hit too seldom, or never.
 
-        Where no path of a pixel met a faint light, its estimated variance is 0; where few did, variance and mean are too small
-        together. The pixels around it met that light by other chances: the variance is at least the mean of 3 x 3 pixels, and
-        that of one sample in all, (brightest / spp)^2.
+        If no path of a pixel hits a faint light, the estimated variance is 0; if few paths do, variance and mean are both too
+        small. Neighbouring pixels hit the same light independently. So the variance is at least the mean over 3 x 3 pixels,
+        and at least the variance of a single bright sample, (brightest / spp)^2.
 
         Args:
-            brightest: largest value of one sample [radiance].
+            brightest: largest value of a sample [radiance].
 
         Returns:
             (H, W, C) [radiance^2].
@@ -94,7 +94,7 @@ class ReferenceResult:
 
     @property
     def text(self) -> str:
-        """One paragraph."""
+        """A paragraph."""
         how = self.identity
         missed = "" if self.reached else ", above the target"
         one = "each channel alone" if how["channels_alone"] else "all channels at once"
@@ -108,7 +108,7 @@ class ReferenceResult:
 
 
 def relative_error(error: float, mean: np.ndarray) -> float:
-    """An error divided by the mean absolute radiance of an image; infinite where that is 0 and the error is not."""
+    """An error over the mean absolute radiance of an image; infinite for a black image with an error."""
     level = float(np.abs(mean).mean())
     return error / level if level > 0 else (0.0 if error == 0 else float("inf"))
 
@@ -117,11 +117,11 @@ def read_reference(path: str | Path, content_hash: str | None = None) -> Referen
     """Read a reference from its file.
 
     Args:
-        path: the EXR.
-        content_hash: of the scene that it must be a reference of; None: any.
+        path: the EXR file.
+        content_hash: expected content hash of the scene; None: not checked.
 
     Raises:
-        MivolError: not a reference of mivol's, a damaged one, or that of another scene.
+        MivolError: a file that is not a reference, a damaged reference, or the reference of another scene.
     """
     channels, header = read_exr(path)
     if "mivol_reference" not in header:
@@ -136,13 +136,17 @@ def read_reference(path: str | Path, content_hash: str | None = None) -> Referen
 
 
 def _parse_identity(made: dict[str, Any]) -> dict[str, Any]:
-    """What an image is of and how it was made; KeyError where the scene or the samples of a pass are missing."""
+    """Scene and method of an image.
+
+    Raises:
+        KeyError: no scene, or no samples per pass.
+    """
     identity = dict(made["identity"])
     return identity | {"scene": str(identity["scene"]), "pass_spp": int(identity["pass_spp"])}
 
 
 def _from_channels(path: Path, channels: dict[str, np.ndarray], made: dict[str, Any]) -> ReferenceResult:
-    """A reference of the channels of its file and of what its header says."""
+    """Make a reference from the channels and the header of its file."""
     names = [name for name in ("R", "G", "B", "Y") if name in channels]
     return ReferenceResult(
         mean=np.stack([channels[n] for n in names], axis=-1).astype(np.float64),
@@ -172,15 +176,15 @@ def reference_path(out: Path, name: str, identity: dict[str, Any]) -> Path:
 
 
 def checkpoint_path(path: Path) -> Path:
-    """Where the batches so far are kept."""
+    """The file of the batches."""
     return path.with_suffix(".state.npz")
 
 
 def check_identity(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Refuse what is on disk where it shows another scene or was made in another way than is wanted.
+    """Refuse a file of another scene or another method.
 
     Raises:
-        MivolError: the first key that differs.
+        MivolError: the first differing key.
     """
     for key, value in wanted.items():
         if found.get(key) != value:
@@ -197,17 +201,17 @@ def _describe_difference(path: Path, key: str, found: Any, wanted: Any) -> str:
 
 
 def write_checkpoint(path: Path, identity: dict[str, Any], moments: Moments, seconds: float) -> None:
-    """Write the batches so far beside a reference."""
+    """Write the batches beside a reference."""
     text = json.dumps({"identity": identity, "seconds": seconds})
     m = moments
     write_whole(checkpoint_path(path), lambda file: np.savez(file, n=m.n, mean=m.mean, m2=m.m2, made=np.array(text)))
 
 
 def read_checkpoint(state: Path) -> tuple[dict[str, Any], Moments]:
-    """The batches of a checkpoint, with ``identity`` and ``seconds``.
+    """Read the batches of a checkpoint, with ``identity`` and ``seconds``.
 
     Raises:
-        MivolError: it is not whole.
+        MivolError: an incomplete checkpoint.
     """
     try:
         stored = read_archive(state)
@@ -219,7 +223,7 @@ def read_checkpoint(state: Path) -> tuple[dict[str, Any], Moments]:
 
 
 def write_reference(result: ReferenceResult) -> None:
-    """Write the image, its variance and how it was made to ``result.path``."""
+    """Write the image, its variance and its header to ``result.path``."""
     names = "RGB" if result.mean.shape[-1] == 3 else "Y"
     channels = {name: result.mean[..., i] for i, name in enumerate(names)}
     channels |= {f"variance.{name}": result.variance[..., i] for i, name in enumerate(names)}

@@ -1,11 +1,11 @@
-r"""Do two images have the same mean? Tests of noisy means whose rate of false alarms is set beforehand.
+"""Do two images have the same mean? Tests of noisy means with a chosen rate of false alarms.
 
-Conventions. An :class:`Estimate` is a mean of independent batches with the variance *of that mean* (standard error squared),
-both float64 arrays of one shape. A :class:`Significance` is the chance that a test raises the alarm although the means
-agree, for a whole image: it is divided among the comparisons (:data:`FAMILIES`). Nothing here knows of Mitsuba.
+Conventions. An :class:`Estimate` is a mean of independent batches with the variance *of this mean* (squared standard error),
+both float64 arrays of the same shape. A :class:`Significance` is the chance of a false alarm for a whole image; the chance is
+divided among the comparisons (:data:`FAMILIES`). The module does not depend on Mitsuba.
 
 Source: Sidak 1967 (JASA 62) for many comparisons; Satterthwaite 1946 (Biometrics Bulletin 2) and Welch 1947 (Biometrika 34)
-for sums of estimated variances.
+for sums of estimated variances; Hoeffding 1963 (JASA 58), Theorem 1, for bounded samples.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ __all__ = [
 
 
 class Estimate(NamedTuple):
-    """Means (any shape), the variances of these means, and the degrees of freedom of the variances.
+    """Means (of arbitrary shape), the variances of the means, and the degrees of freedom of the variances.
 
     Attributes:
-        mean: of independent batches, or an exact answer.
+        mean: mean of independent batches, or an exact answer.
         var: variances of the means; 0 for an exact answer.
-        dof: degrees of freedom of each variance: one less than the batches behind it, or what :func:`effective_dof` gives for
-            a sum; infinite where the variance is exact.
+        dof: degrees of freedom of each variance: number of batches minus 1, or from :func:`effective_dof` for a sum; infinite
+            for an exact variance.
     """
 
     mean: np.ndarray
@@ -55,7 +55,7 @@ class Estimate(NamedTuple):
 
     @staticmethod
     def of(given: Estimate | Moments | np.ndarray | float) -> Estimate:
-        """Moments of batches, or an exact answer, as an estimate."""
+        """Convert moments of batches or an exact answer to an estimate."""
         if isinstance(given, Estimate):
             return given
         if isinstance(given, Moments):
@@ -69,23 +69,23 @@ class Estimate(NamedTuple):
 def effective_dof(variances: np.ndarray, dof: np.ndarray | float, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
     r"""Degrees of freedom of a sum of independent estimated variances, by Welch and Satterthwaite.
 
-    An estimate v of a variance with d degrees of freedom, of normal values, is :math:`E[v]\,\chi^2_d/d`: its own variance is
-    :math:`2 E[v]^2/d`. The sum of independent ones has the mean :math:`\sum E[v_i]` and the variance
-    :math:`\sum 2 E[v_i]^2/d_i`; a single scaled :math:`\chi^2_\nu` of the same mean and variance has
+    An estimate v of a variance with d degrees of freedom, of normal values, is :math:`E[v]\,\chi^2_d/d` with the variance
+    :math:`2 E[v]^2/d`. A sum of independent estimates has the mean :math:`\sum E[v_i]` and the variance :math:`\sum 2
+    E[v_i]^2/d_i`. A single scaled :math:`\chi^2_\nu` of the same mean and variance has
 
     .. math:: \nu = \frac{(\sum_i v_i)^2}{\sum_i v_i^2/d_i}
 
-    with the estimates in the place of the expectations. Since :math:`E[v_i^2] = E[v_i]^2 (1 + 2/d_i)`, the denominator is
-    estimated too large and :math:`\nu` too small: a t-test at it is cautious. k equal variances of d degrees have k d, one
-    that outweighs all others has its own d.
+    with estimates in place of the expectations. Since :math:`E[v_i^2] = E[v_i]^2 (1 + 2/d_i)`, the denominator is too large on
+    average and :math:`\nu` too small: a t-test with :math:`\nu` is cautious. A sum of k equal variances of d degrees has k d
+    degrees; a sum with a dominating variance has the degrees of that variance.
 
     Args:
-        variances: estimates, at least 0, in any common unit.
-        dof: degrees of freedom of each; inf where a variance is known.
-        axis: along which variances are added; all by default.
+        variances: estimates, at least 0, in a common unit.
+        dof: degrees of freedom of each; inf for a known variance.
+        axis: axis of the sum; by default all axes.
 
     Returns:
-        float64 array; inf where no variance was estimated or all are 0.
+        float64 array; inf without estimated variances or for variances of 0.
     """
     v = np.asarray(variances, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -96,11 +96,11 @@ def effective_dof(variances: np.ndarray, dof: np.ndarray | float, axis: int | tu
 
 
 def pooled_dof(var: np.ndarray, dof: float, tile: int) -> np.ndarray:
-    """Degrees of freedom of the variances that :func:`mivol.validate.moments.average_tiles` gives, (H // tile, W // tile, C).
+    """Degrees of freedom of the variances from :func:`mivol.validate.moments.average_tiles`, (H // tile, W // tile, C).
 
     Args:
         var: (H, W, C), of independent pixels.
-        dof: of the variance of one pixel.
+        dof: degrees of freedom of the variance of a pixel.
         tile: side of a tile [pixel].
     """
     return effective_dof(split_tiles(var, tile), dof, axis=(1, 3))
@@ -124,15 +124,15 @@ FAMILIES: dict[str, Callable[[float, int], float]] = {
 
 @dataclass(frozen=True)
 class Significance:
-    """How often a family of comparisons may raise a false alarm.
+    """Rate of false alarms of a family of comparisons.
 
     Attributes:
-        alpha: chance that any of the comparisons raises although all means agree.
-        comparisons: how many share ``alpha``; None: the entries of the arrays that are compared.
+        alpha: chance of at least a single false alarm although all means agree.
+        comparisons: number of comparisons that share ``alpha``; None: the entries of the compared arrays.
         family: key of ``FAMILIES``.
 
     Raises:
-        MivolError: alpha outside (0, 1), no comparison, or a family that is not in ``FAMILIES``.
+        MivolError: alpha outside (0, 1), no comparison, or a family missing from ``FAMILIES``.
     """
 
     alpha: float = 1e-6
@@ -151,25 +151,25 @@ class Significance:
         return f"alpha {self.alpha:g} over {self.comparisons} comparisons"
 
     def over(self, size: int) -> Significance:
-        """The level of as many comparisons as were asked for, else of ``size``."""
+        """The level with its own number of comparisons, else with ``size`` comparisons."""
         return replace(self, comparisons=self.comparisons or max(size, 1))
 
     @property
     def of_one(self) -> float:
-        """Chance of a false alarm that each of the comparisons may have."""
+        """Chance of a false alarm of each comparison."""
         return FAMILIES[self.family](self.alpha, self.comparisons or 1)
 
 
 STRICT = Significance()
-"""The level of a single test in a suite of many."""
+"""Level of a single test in a suite of many tests."""
 
 
 def z_bound(level: Significance, dof: np.ndarray | float = np.inf) -> np.ndarray:
-    """Two-sided bound on |z| that a family of comparisons exceeds with the chance ``level.alpha``.
+    """Two-sided bound on |z|, exceeded by a family of comparisons with the chance ``level.alpha``.
 
     Args:
-        level: of the family; one comparison where it does not say how many.
-        dof: degrees of freedom of the variance; inf where it is known (normal), else Student's t.
+        level: level of the family; a single comparison by default.
+        dof: degrees of freedom of the variance; inf for a known variance (normal law), else Student's t.
     """
     tail = level.of_one / 2
     dof = np.asarray(dof, dtype=np.float64)
@@ -192,10 +192,10 @@ def z_image(a: Estimate, b: Estimate, rounding: float = 0.0) -> np.ndarray:
 
     Args:
         a, b: means, with their variances.
-        rounding: what float32 arithmetic alone may cause, as one standard deviation in units of the means.
+        rounding: standard deviation of float32 rounding, in units of the means.
 
     Returns:
-        float64 array; 0 where the means are equal, infinite where they differ without any variance.
+        float64 array; 0 for equal means, infinite for different means without variance.
     """
     difference = np.asarray(a.mean, dtype=np.float64) - b.mean
     variance = np.broadcast_to(np.asarray(a.var, dtype=np.float64) + b.var + rounding**2, difference.shape)
@@ -213,21 +213,21 @@ def assert_same_mean(
     rounding: float = 0.0,
     what: str = "the means",
 ) -> None:
-    """Raise unless two images have the same mean, each pixel by a z-test (or t-test) at a level that alpha pays for.
+    """Raise unless two images have the same mean: a z-test (or t-test) for each pixel at the given level.
 
     Args:
-        a, b: means of any shape, (H, W, C) where ``tile`` is above 1. Student's t with Welch's degrees of freedom takes the
-            place of the normal law where variances are estimated; ``dof`` is one number where ``tile`` is above 1.
-        level: chance that this call raises although the means agree. Name the comparisons where several images share it.
-        tile: average tiles of so many pixels first; for heavy tails, see :func:`mivol.validate.moments.average_tiles`. The
-            variance of a tile has the degrees of freedom of all its pixels, :func:`pooled_dof`.
-        rounding: see :func:`z_image`.
+        a, b: means of arbitrary shape; (H, W, C) with ``tile`` above 1. Estimated variances use Student's t with Welch's
+            degrees of freedom; ``dof`` is a single number with ``tile`` above 1.
+        level: chance of raising although the means agree. Give the number of comparisons if several images share the chance.
+        tile: side of tiles that are averaged first [pixel]; for heavy tails, see :func:`mivol.validate.moments.average_tiles`.
+            The variance of a tile has the degrees of freedom of all its pixels, :func:`pooled_dof`.
+        rounding: as in :func:`z_image`.
         what: subject of the sentence.
 
     Raises:
-        AssertionError: which pixel differs, by how many standard errors, the bound, how many differ, and the smallest bias
-            that this test would find nine times in ten.
-        MivolError: a value that is not finite, or a negative variance: nothing can be said then.
+        AssertionError: the worst pixel, its difference in standard errors, the bound, the number of differing pixels, and the
+            smallest bias found nine times in ten.
+        MivolError: a value that is not finite, or a negative variance.
     """
     a, b, dof = _prepare_tiles(a, b, tile)
     level = level.over(a.mean.size)
@@ -246,9 +246,10 @@ def assert_same_mean(
 
 
 def p_value(a: Estimate, b: Estimate, *, comparisons: int | None = None, tile: int = 1, rounding: float = 0.0) -> float:
-    """Chance that means that agree differ as much as these do somewhere: the alpha at which :func:`assert_same_mean` turns.
+    """Chance of a difference as large as the largest difference here, for means that agree: the alpha at which
+    :func:`assert_same_mean` starts to raise.
 
-    Args: see :func:`assert_same_mean`; many comparisons by Sidak's formula.
+    Args: as :func:`assert_same_mean`; many comparisons by Sidak's formula.
     """
     from scipy.special import ndtr, stdtr
 
@@ -268,10 +269,10 @@ def _prepare_tiles(a: Estimate, b: Estimate, tile: int) -> tuple[Estimate, Estim
 
 
 def _check_estimates(a: Estimate, b: Estimate) -> tuple[Estimate, Estimate]:
-    """Two estimates as float64 arrays of one shape.
+    """Two estimates as float64 arrays of the same shape.
 
     Raises:
-        MivolError: other shapes, a value that is not finite, or a negative variance.
+        MivolError: different shapes, a value that is not finite, or a negative variance.
     """
     first, second = np.asarray(a.mean, dtype=np.float64), np.asarray(b.mean, dtype=np.float64)
     if second.ndim and first.shape != second.shape:
@@ -291,16 +292,16 @@ def _check_estimates(a: Estimate, b: Estimate) -> tuple[Estimate, Estimate]:
 def smallest_detectable_bias(
     variance: np.ndarray, *, level: Significance = STRICT, power: float = 0.9, dof: np.ndarray | float = np.inf
 ) -> np.ndarray:
-    """Bias that a two-sided z-test finds with chance ``power``: (z_alpha + z_power) standard errors.
+    """Bias found by a two-sided z-test with chance ``power``: (z_alpha + z_power) standard errors.
 
-    The test fires when |difference| > z_alpha s; with a bias b the difference is normal about b, and exceeds z_alpha s with
-    chance Phi(b/s - z_alpha) (the other tail is below alpha/2): b = (z_alpha + Phi^-1(power)) s. With ``dof`` degrees of
-    freedom z_alpha is the bound of Student's t, and b what is found in the mean over estimates of s.
+    The test raises if |difference| > z_alpha s. With a bias b the difference is normal about b, and exceeds z_alpha s with
+    chance Phi(b/s - z_alpha), neglecting the other tail below alpha/2. So b = (z_alpha + Phi^-1(power)) s. With ``dof``
+    degrees of freedom z_alpha is the bound of Student's t, and b the average over estimates of s.
 
     Args:
-        variance: of the difference of the means, s^2.
-        level: of the test.
-        power: in (0, 1).
+        variance: variance s^2 of the difference of the means.
+        level: level of the test.
+        power: chance of finding the bias, in (0, 1).
         dof: degrees of freedom of the variance.
     """
     if not 0 < power < 1:
@@ -310,12 +311,12 @@ def smallest_detectable_bias(
 
 
 def required_batches(wanted_bias: float, variance: float, *, level: Significance = STRICT, power: float = 0.9) -> int:
-    """Batches (or samples) so that a bias worth catching is caught: variance ((z_alpha + z_power)/bias)^2, rounded up.
+    """Batches (or samples) needed to find a bias: variance ((z_alpha + z_power)/bias)^2, rounded up.
 
     Args:
-        wanted_bias: smallest bias worth catching, above 0.
-        variance: of one batch (or sample).
-        level, power: as :func:`smallest_detectable_bias`.
+        wanted_bias: smallest bias to find, above 0.
+        variance: variance of a batch (or sample).
+        level, power: as in :func:`smallest_detectable_bias`.
     """
     if not wanted_bias > 0:
         raise MivolError(f"a bias of {wanted_bias} cannot be looked for; give one above 0.")
@@ -329,8 +330,8 @@ class Bias:
 
     Attributes:
         value: mean over pixels and channels of a - b.
-        standard_error: of ``value``.
-        low, high: ends of the interval that misses the true bias with chance ``alpha``.
+        standard_error: standard error of ``value``.
+        low, high: ends of the interval; the interval misses the true bias with chance ``alpha``.
     """
 
     value: float
@@ -341,15 +342,15 @@ class Bias:
 
 
 def estimate_bias(a: Estimate, b: Estimate, *, alpha: float = 1e-3, correlated: int = 1) -> Bias:
-    """Mean difference of two images: finds a bias too small for any one pixel to show.
+    """Estimate the mean difference of two images: finds a bias too small to show in a single pixel.
 
     Args:
-        a, b: images; ``dof`` is that of each pixel's variance. The sum has as many as :func:`effective_dof` says, of which
-            ``correlated`` pixels share each one.
+        a, b: images; ``dof`` belongs to the variance of each pixel. The sum has the degrees of :func:`effective_dof`, divided
+            by ``correlated``.
         alpha: chance that the interval misses the true bias.
-        correlated: how many values share samples with any one, itself included (1: box filter and grey noise; a filter of
-            radius r pixels: at most (2 floor(2 r) + 1)^2 pixels; times 3 where the channels share paths). The variance of
-            the sum is at most ``correlated`` times the sum of variances, since Cov(i, j) <= (v_i + v_j)/2.
+        correlated: number of values that share samples, including the value itself. 1: box filter and grey noise. A filter of
+            radius r pixels: at most (2 floor(2 r) + 1)^2. Times 3 if the channels share paths. The variance of the sum is at
+            most ``correlated`` times the sum of variances, since Cov(i, j) <= (v_i + v_j)/2.
     """
     a, b = _check_estimates(a, b)
     value = float((a.mean - b.mean).mean())
@@ -360,25 +361,25 @@ def estimate_bias(a: Estimate, b: Estimate, *, alpha: float = 1e-3, correlated: 
 
 
 def bounded_p_value(mean: np.ndarray, n: int, truth: np.ndarray, bounds: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
-    r"""Chance, at most, of a mean of n samples at least as far from the truth, for samples between two bounds.
+    r"""Upper bound of the chance of a mean of n samples at least as far from the truth, for samples between two bounds.
 
-    Hoeffding's first bound: for samples in [0, 1] of expectation p, the mean X of n of them satisfies
+    Hoeffding's first bound: for samples in [0, 1] of expectation p, the mean X of n samples satisfies
 
     .. math:: P(X \ge x) \le e^{-n\,K(x, p)}, \quad K(x, p) = x\ln\frac{x}{p} + (1 - x)\ln\frac{1 - x}{1 - p}
         \quad (x \ge p),
 
-    and the same below p; twice the smaller exponential bounds both sides. No variance is estimated and no limit theorem
-    used, so it holds where the z-test fails: a transmittance of 1e-6 that delta tracking has not seen once in n samples
-    has an estimated variance of 0. It is nearly sharp for samples that are 0 or 1, and cautious for others.
+    and the same below p; twice the smaller exponential bounds both sides. The bound needs no estimated variance and no limit
+    theorem, so the bound holds where the z-test fails: a transmittance of 1e-6 never seen by delta tracking in n samples has
+    an estimated variance of 0. The bound is nearly sharp for samples of 0 or 1, and cautious for others.
 
     Args:
         mean: sample means.
-        n: samples behind each.
+        n: samples behind each mean.
         truth: expectations.
-        bounds: of one sample, for instance 0 and the radiance of the background.
+        bounds: bounds of a sample, for instance 0 and the radiance of the background.
 
     Returns:
-        Upper bound of the p-value, in [0, 1]; 0 where the truth is a bound and the mean is not.
+        Upper bound of the p-value, in [0, 1]; 0 if the truth equals a bound and the mean does not.
     """
     low, high = bounds
     scale = high - low
@@ -406,12 +407,12 @@ def assert_same_bounded_mean(
     level: Significance = STRICT,
     what: str = "the means",
 ) -> None:
-    """Raise unless means of n bounded samples agree with an exact answer: no normality, no estimated variance.
+    """Raise unless means of n bounded samples agree with an exact answer, without normality or estimated variance.
 
-    Args and bound: see :func:`bounded_p_value`; level: see :class:`mivol.validate.statistics.Significance`.
+    Args and bound: as :func:`bounded_p_value`; level: as :class:`mivol.validate.statistics.Significance`.
 
     Raises:
-        AssertionError: which pixel differs and how unlikely that is.
+        AssertionError: the worst pixel, and the probability of its difference.
     """
     p = np.atleast_1d(bounded_p_value(mean, n, truth, bounds))
     level = level.over(p.size)

@@ -1,9 +1,9 @@
-"""Where Mitsuba 3.9.1 cannot be the judge: the cases in which its ``volpath`` is known to be wrong.
+"""Doubts about Mitsuba 3.9.1: the known cases in which ``volpath`` is wrong.
 
-Conventions. A doubt is fatal where the image is wrong, and a remark where it is right but may surprise, or is slightly
-off. Every case was reproduced on the 3.9.1 wheel; tests/conformance/test_reference.py shows each still wrong, so that a
-release that mends one is noticed. Extinction that differs between channels is no doubt here:
-:func:`mivol.validate.reference.render_reference` renders it one channel at a time.
+Conventions. A doubt is fatal if the image is wrong, and a remark if the image is right but surprising, or slightly off. All
+cases were reproduced with the 3.9.1 wheel. tests/conformance/test_reference.py checks that each case is still wrong, so a
+release with a correction is noticed. Extinction that differs between channels raises no doubt:
+:func:`mivol.validate.reference.render_reference` renders each channel alone.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MIN_G = 1e-3
 NEAR_EMITTER = 0.1
 
 TOUCH_POINTS = 512
-"""Those of them that are looked at for another boundary."""
+"""Surface points tested for another boundary."""
 
 # The smallest share of the light that is worth a word: below the noise of most references.
 MIN_SKIN_LOSS = 2e-3
@@ -49,12 +49,12 @@ MIN_SKIN_LOSS = 2e-3
 
 @dataclass(frozen=True)
 class Doubt:
-    """One reason not to believe an image of Mitsuba's.
+    """A reason not to trust an image of Mitsuba.
 
     Attributes:
-        kind: key of ``CHECKS``.
-        sentence: what was found, what Mitsuba makes of it, the way out.
-        fatal: the image would be wrong.
+        kind: key of ``DOUBT_CHECKS``.
+        sentence: the finding, Mitsuba's fault, and the way out.
+        fatal: whether the image would be wrong.
     """
 
     kind: str
@@ -63,11 +63,11 @@ class Doubt:
 
 
 def find_doubts(scene: mi.Scene, sensors: Sequence[mi.Sensor] | None = None) -> list[Doubt]:
-    """Every reason not to believe what Mitsuba 3.9.1 renders of a scene.
+    """Find all reasons not to trust a render of Mitsuba 3.9.1.
 
     Args:
         scene: the scene.
-        sensors: the cameras that will look at it; by default its own.
+        sensors: the sensors to render; by default the scene's own sensors.
     """
     boundaries = [read_medium_shape(s) for s in scene.shapes() if s.interior_medium() is not None]
     doubts = [Doubt(kind, *found) for kind, check in DOUBT_CHECKS.items() for b in boundaries for found in check(b)]
@@ -197,7 +197,7 @@ DOUBT_CHECKS: dict[str, Callable[[MediumShape], Found]] = {
 
 
 def _touch(a: MediumShape, b: MediumShape) -> bool:
-    """Whether part of one's surface lies on the other's: a point that passes the one changes sides of the other as well."""
+    """Whether the surfaces of two shapes coincide in part: a point passing a common face changes sides of both shapes."""
     return _lies_on(a, b) or _lies_on(b, a)
 
 
@@ -252,33 +252,35 @@ def _camera_inside(sensor: mi.Sensor, boundaries: list[MediumShape]) -> Iterator
 
 
 FACE_TOLERANCE = 1e-4
-"""Mitsuba prints transforms to 6 digits, and float32 vertices carry 1e-7 of their size: what lies this little outside the unit
-cube lies on its face."""
+"""Distance outside the unit cube that still counts as on its face: Mitsuba prints transforms with 6 digits, and float32
+vertices
+carry 1e-7 of their size."""
 
 RESTART_DISTANCE = 1500 * 2.0**-24
-"""math::RayEpsilon of float32: Mitsuba restarts a ray at p on a surface (1 + max|p|) times this behind it, along the normal."""
+"""math::RayEpsilon of float32: Mitsuba restarts a ray at a surface point p by (1 + max|p|) times this distance behind the
+surface, along the normal."""
 
 POINTS = 4096
-"""Points of a boundary at which its extinction is looked up."""
+"""Points of a boundary for reading the extinction."""
 
 
 @dataclass(frozen=True)
 class MediumShape:
-    """A shape that holds a medium, and where the medium's extinction is given.
+    """A shape that holds a medium, with the placement of the medium's extinction.
 
     Attributes:
-        name: of the shape.
+        name: name of the shape.
         points: (N, 3) world points whose hull holds the shape: mesh vertices, else the corners of its box.
         faces: (M, 3) indices of a mesh, else None.
-        to_world: (4, 4) of a shape that is no mesh, else None.
+        to_world: (4, 4) of a shape without mesh, else None.
         to_local: (4, 4) world to the unit cube of the volume under a stock ``heterogeneous``, else None.
-        to_local_inverse: (4, 4) transpose of what Mitsuba takes for the inverse of a stock volume's, else None.
+        to_local_inverse: (4, 4) transpose of Mitsuba's inverse of a stock volume's transform, else None.
         volume: class of the volume under a stock ``heterogeneous``, else "".
         grids: (4, 4) world to the unit cube of each stock grid of the extinction.
-        surface: (POINTS, 3) points on the shape, or on its box where it is neither a mesh nor a ball.
+        surface: (POINTS, 3) points on a mesh or a ball, else on the box.
         majorant: largest extinction [1/length].
-        skin: largest optical depth, along the normal, of what Mitsuba leaps over where a ray enters.
-        params: what can be traversed of the medium.
+        skin: largest optical depth along the normal that Mitsuba skips at the entry of a ray.
+        params: parameters of the medium.
     """
 
     name: str
@@ -300,13 +302,13 @@ class MediumShape:
         return self.to_local is not None and self.overhang(self.to_local)
 
     def overhang(self, to_local: np.ndarray) -> bool:
-        """Whether the shape reaches outside a box that is mapped to the unit cube."""
+        """Whether the shape reaches outside a box mapped to the unit cube."""
         q = self.points @ to_local[:3, :3].T + to_local[:3, 3]
         return bool(np.any(q < -FACE_TOLERANCE) or np.any(q > 1 + FACE_TOLERANCE))
 
     @property
     def diagonal(self) -> float:
-        """Of the box about the shape: no chord is longer."""
+        """Diagonal of the box around the shape; no chord is longer."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     def holds(self, p: np.ndarray) -> bool:
@@ -323,7 +325,7 @@ class MediumShape:
 
 
 def read_medium_shape(shape: mi.Shape) -> MediumShape:
-    """Read what there is to know of a shape with a medium inside."""
+    """Read the facts of a shape with a medium inside."""
     geometry = mi.traverse(shape)
     params = traverse_medium(shape.interior_medium())
     volumes = _extinction_volumes(shape.interior_medium())
@@ -352,7 +354,7 @@ def read_medium_shape(shape: mi.Shape) -> MediumShape:
 
 
 def _surface(points: np.ndarray, faces: np.ndarray | None, to_world: np.ndarray | None) -> np.ndarray:
-    """Points (N, 3) of a boundary: of a mesh, of a ball, else the corners of a box about it."""
+    """Points (N, 3) of a boundary: on a mesh or a ball, else the corners of the box."""
     rng = np.random.default_rng(0)
     if faces is not None:
         share = rng.dirichlet((1, 1, 1), POINTS)
@@ -364,7 +366,7 @@ def _surface(points: np.ndarray, faces: np.ndarray | None, to_world: np.ndarray 
 
 
 def _skin(points: np.ndarray, volumes: list[mi.Volume], to_local: np.ndarray | None) -> float:
-    """Largest optical depth, along the normal, of what a restarted ray leaps over at some points, but for the scale."""
+    """Largest optical depth along the normal that a restarted ray skips at some points, without the scale."""
     it = mi.Interaction3f()
     it.p = mi.Point3f(points.T.astype(np.float32))
     sigma = np.zeros(len(points))
@@ -378,15 +380,15 @@ def _skin(points: np.ndarray, volumes: list[mi.Volume], to_local: np.ndarray | N
 
 
 def _extinction_volumes(medium: mi.Medium) -> list[mi.Volume]:
-    """The volumes whose sum is a medium's extinction."""
+    """The volumes that sum to a medium's extinction."""
     return [v for name, v in find_children(medium).items() if name in ("sigma_t", "sigma_a", "sigma_s")]
 
 
 def _stock_box(kind: str, volumes: list[mi.Volume]) -> np.ndarray | None:
-    """World to the unit cube of the volume under a stock ``heterogeneous``; None for media that have no such box.
+    """World to the unit cube of the volume under a stock ``heterogeneous``; None for media without such a box.
 
-    A ``mivol_medium`` in a boundary larger than its grids is right under stock integrators (seen at depths of 1800), and a
-    turned ``mivol_voxels`` is vacuum outside its own box: its upright box is enough here.
+    A ``mivol_medium`` in a boundary larger than its grids is right under stock integrators (tested to optical depths of 1800).
+    A rotated ``mivol_voxels`` is vacuum outside its own box, so its axis-aligned box suffices.
     """
     if kind != "HeterogeneousMedium":
         return None
@@ -399,12 +401,12 @@ def _stock_box(kind: str, volumes: list[mi.Volume]) -> np.ndarray | None:
 
 
 def first_number(value: object) -> float:
-    """The first number of whatever ``mi.traverse`` hands out."""
+    """The first number of a value of ``mi.traverse``."""
     return float(np.ravel(np.array(value))[0])
 
 
 def _printed(volume: mi.Volume | None, name: str) -> np.ndarray | None:
-    """A matrix from the printed form of a stock volume, the only place where Mitsuba shows it."""
+    """A matrix parsed from the printed form of a stock volume; Mitsuba shows the matrix in no other place."""
     found = re.search(rf"to_local = Transform\[.*?\b{name}=(\[\[.*?\]\])", str(volume), re.DOTALL)
     return np.array(re.findall(r"[-+\w.]+", found[1]), dtype=np.float64).reshape(4, 4) if found else None
 
@@ -419,7 +421,7 @@ def _corners(box: object) -> np.ndarray:
 
 
 def _crossings(p: np.ndarray, triangles: np.ndarray) -> int:
-    """How many triangles a ray from p meets (Moeller, Trumbore 1997), along a direction that follows no axis."""
+    """Number of triangles met by a ray from p (Moeller, Trumbore 1997), along a direction parallel to no axis."""
     d = np.array([0.8017837, 0.2672612, 0.5345225])
     a, e1, e2 = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     h = np.cross(d, e2)
