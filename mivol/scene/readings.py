@@ -167,7 +167,7 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
         chosen = held[rng.integers(len(held), size=LOOK_UP_POINTS - len(border))]
         u[len(border) :] = np.clip((chosen + rng.uniform(0, 1, chosen.shape)) / sizes, 1e-3, 1 - 1e-3)
     it = dr.zeros(mi.Interaction3f, LOOK_UP_POINTS)
-    it.p = lattice.place(mi.Vector3f(u.T.astype(np.float32)))
+    it.p = lattice.to_world_points(mi.Vector3f(u.T.astype(np.float32)))
     cell, frac, _ = locate_cell(lattice, it.p, mi.Vector3f(0, 0, 1), mi.Float(0))
     nodes, c = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res), lattice.channels
     corners = [[dr.gather(mi.Float, dr.detach(lattice.values.array), k * c + i) for k in nodes] for i in range(c)]

@@ -22,7 +22,7 @@ def test_a_constant_source_function_shows_the_opacity(ratio):
     """At every optical depth, and for every two extinctions; the relative error of the opacity is 4e-7."""
     shares = share_opacity(mi.Float64(DT), mi.Float64(SIGMAS), mi.Float64(ratio * SIGMAS))
     exact = -np.expm1(-0.5 * DT * (1 + ratio) * SIGMAS)
-    np.testing.assert_allclose(np.array(shares.sent(mi.Float64(3), mi.Float64(3))), 3 * exact, rtol=5e-7)
+    np.testing.assert_allclose(np.array(shares.radiance(mi.Float64(3), mi.Float64(3))), 3 * exact, rtol=5e-7)
     np.testing.assert_allclose(sum(np.array(w) for w in shares.weights), exact, rtol=5e-7)
     assert all((np.array(w) >= 0).all() for w in shares.weights)
 

@@ -157,7 +157,7 @@ def test_derivatives_of_a_cell(scale):
 
     def sent(s1, s2):
         share, density = cell(dt, s1, s2)
-        return np.array(share.sent(*c)), np.array(density.weights[0] * c[0] + density.weights[1] * c[1])
+        return np.array(share.radiance(*c)), np.array(density.weights[0] * c[0] + density.weights[1] * c[1])
 
     share, density = cell(dt, s1, s2)
     slopes = np.array(share.slopes(*c)), np.array([density.slopes[0][q] * c[0] + density.slopes[1][q] * c[1] for q in (0, 1)])

@@ -114,7 +114,7 @@ def test_neighbours_enter_and_leave_side_by_side(levels: int, sorts: None):
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     rays = rays_of(o, d)
     order = RayOrder.find(cells, rays.o, rays.d, rays.t_max)
-    places, back = np.array(order.places), np.array(order.back)
+    places, back = np.array(order.rays), np.array(order.positions)
     np.testing.assert_array_equal(places[back], np.arange(FEWEST))
     sides = [(side - o) / d for side in (-1, 1)]
     t0, t1 = np.minimum(*sides).max(axis=1), np.maximum(*sides).min(axis=1)
@@ -171,5 +171,5 @@ def test_another_number_of_rays_compiles_nothing(sorts: None, monkeypatch: pytes
         # Two walks, tables before and sums after them, and a few that read lanes: not a walk for each array that is read.
         assert len(kernels) < 12
         compiled.append(sum(not k["cache_hit"] or k["cache_disk"] for k in kernels))
-        assert [a.numpy().ctypes.data % ALIGNMENT for a in (seen.order.places, seen.order.back)] == [0, 0]
+        assert [a.numpy().ctypes.data % ALIGNMENT for a in (seen.order.rays, seen.order.positions)] == [0, 0]
     assert compiled[1:] == [0, 0]

@@ -111,7 +111,7 @@ class _EmissionIntegrand:
             N, dN = mi.Float(0), [mi.Float(0), mi.Float(0)]
             if source:
                 c = [value[r] for value in source]
-                N, dN = share.sent(*c), list(share.slopes(*c))
+                N, dN = share.radiance(*c), list(share.slopes(*c))
             if emission_density:
                 g, j = density_weights[r % self.channels], [value[r] for value in emission_density]
                 N += g.weights[0] * j[0] + g.weights[1] * j[1]

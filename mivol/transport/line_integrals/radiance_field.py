@@ -220,11 +220,11 @@ def render_rays(cells: OccupiedCells, source: Source, model: Model, rays: RayBun
     order = RayOrder.find(cells, rays.o, rays.d, rays.t_max) if source.gains_by_sorting else None
     if order is None:
         return _render_in_order(cells, source, model, rays, active)
-    lanes = order.places
+    lanes = order.rays
     sorted_result = _render_in_order(
         cells, source.gather_lanes(lanes), model, _gather_lanes(rays, lanes), _gather_lanes(active, lanes)
     )
-    return replace(_gather_lanes(sorted_result, order.back), rays=rays, order=order)
+    return replace(_gather_lanes(sorted_result, order.positions), rays=rays, order=order)
 
 
 def _gather_lanes(tree: Any, which: mi.UInt32) -> Any:
@@ -248,7 +248,7 @@ def _render_in_order(cells: OccupiedCells, source: Source, model: Model, rays: R
         T = dr.select(on, dr.exp(-tau), 0)
         times = _point_distances(piece.segment, visited, piece.scale)
         pairs = [*zip(*at.colour, strict=True), times]
-        light = [dr.fma(T, share.sent(a, b), s) for s, (a, b) in zip(light, pairs, strict=True)]
+        light = [dr.fma(T, share.radiance(a, b), s) for s, (a, b) in zip(light, pairs, strict=True)]
         begins = on & (share.tau > 0) & (first.piece < 0)
         before = dr.select(on, tau, before)
         tau = dr.select(on, tau + share.tau, tau)
@@ -362,7 +362,7 @@ def vjp_rays(
     """
     active, order = mi.Bool(active), rendered.order
     if order is not None:
-        lanes, rendered = order.places, replace(rendered, order=None)
+        lanes, rendered = order.rays, replace(rendered, order=None)
         source, rendered, by, active = (
             source.gather_lanes(lanes),
             *(_gather_lanes(tree, lanes) for tree in (rendered, by, active)),
@@ -405,7 +405,7 @@ def _vjp_in_order(
             first, second = (dr.select(s[k], p * by_colour[k], 0) for s, p in zip(at.is_positive, parts, strict=True))
             corners_colour.append([a * first + b * second for a, b in zip(w1, w2, strict=True)])
         carried = source.add(cells, visited, read, carried, corners_raw, corners_colour, on)
-        r = dr.select(on, share.sent(*ends) + share.T * r, r)
+        r = dr.select(on, share.radiance(*ends) + share.T * r, r)
         return [r, dr.select(on, before, state[1]), is_last & ~on, carried]
 
     state = _follow_back(cells, rendered, visit, state, active & (rendered.first.piece >= 0))

@@ -75,7 +75,7 @@ class OpacityShares:
         """Weights of the source functions at the two points; their sum is the opacity."""
         return self.alpha * self.f, self.alpha * (1 - self.f)
 
-    def sent(self, c1: mi.Float, c2: mi.Float) -> mi.Float:
+    def radiance(self, c1: mi.Float, c2: mi.Float) -> mi.Float:
         """Radiance S leaving the cell towards the origin of the ray, for source functions c1 and c2 [radiance]."""
         return self.alpha * dr.fma(self.f, c1 - c2, c2)
 

@@ -196,7 +196,7 @@ class BlockRanges:
     channels: int
     shift: int
 
-    def at(self, block: mi.Vector3i, active: mi.Bool) -> tuple[list[mi.Float], mi.Float]:
+    def read(self, block: mi.Vector3i, active: mi.Bool) -> tuple[list[mi.Float], mi.Float]:
         """Read the smallest value of each channel in a block, and the range above the smallest values."""
         _, y, x = self.res
         n = self.channels + 1

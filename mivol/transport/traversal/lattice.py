@@ -70,7 +70,7 @@ class Lattice:
         """Number of values at each voxel."""
         return self.values.shape[3]
 
-    def place(self, u: mi.Vector3f) -> mi.Point3f:
+    def to_world_points(self, u: mi.Vector3f) -> mi.Point3f:
         """Map points of the unit cube to the world, in float32."""
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in self.to_world[:3]]
         return mi.Point3f(*(dr.fma(r[0], u.x, dr.fma(r[1], u.y, dr.fma(r[2], u.z, r[3]))) for r in rows))

@@ -36,12 +36,12 @@ class RayOrder:
     """An order of the rays of a call.
 
     Attributes:
-        places: index of the first ray, of the second ray, and so on.
-        back: position of each ray in the order.
+        rays: index of the first ray, of the second ray, and so on.
+        positions: position of each ray in the order.
     """
 
-    places: mi.UInt32
-    back: mi.UInt32
+    rays: mi.UInt32
+    positions: mi.UInt32
 
     @classmethod
     def find(cls, cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> RayOrder | None:
@@ -61,11 +61,11 @@ class RayOrder:
         # machines; NumPy's stable sort takes twenty times as long.
         keys = np.array(_key(cells, o, d, t_max)).astype(np.uint64) << np.uint64(32) | np.arange(count, dtype=np.uint64)
         keys.sort()
-        places = keys.astype(np.uint32)
-        back = np.empty_like(places)
-        back[places] = np.arange(count, dtype=np.uint32)
+        order = keys.astype(np.uint32)
+        positions = np.empty_like(order)
+        positions[order] = np.arange(count, dtype=np.uint32)
         # Dr.Jit compiles a kernel for arrays at aligned addresses, and another for others.
-        return cls(*(mi.UInt32(copy_aligned(a)) for a in (places, back)))
+        return cls(*(mi.UInt32(copy_aligned(a)) for a in (order, positions)))
 
 
 def _key(cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> mi.UInt32:

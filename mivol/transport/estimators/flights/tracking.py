@@ -106,7 +106,7 @@ def residual_ratio_tracking(
     coarse = block_segment(segment, blocks.shift)
 
     def visit(state: _TrackedRay, cell: Cell, on: mi.Bool) -> tuple[_TrackedRay, mi.Float]:
-        least, above = blocks.at(cell.lower + 1, on)
+        least, above = blocks.read(cell.lower + 1, on)
         density = rate * above
         # -- To the end of the block, or to the next point of the process -----------------------------------------------
         meets = on & (state.ahead < density * cell.dt)
@@ -239,7 +239,7 @@ def delta_tracking_in_blocks(
 
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple[tuple, mi.Float]:
         ahead, s, collides, rng = state
-        (least,), above = blocks.at(cell.lower + 1, on)
+        (least,), above = blocks.read(cell.lower + 1, on)
         majorant = least + above
         rate = scale * majorant
         # -- To the end of the block, or to the next tentative collision --------------------------------------------------

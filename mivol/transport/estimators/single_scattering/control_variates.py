@@ -160,7 +160,7 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     rows = [interpolate([dr.gather(mi.Float, c, k) for k in corner], frac) for c in coarse]
     if isinstance(body.view.albedo, mi.Volume):
         u = mi.Vector3f(*(mi.Float(c) / m for c, m in zip(cell[::-1], lattice.res[::-1], strict=True)))
-        albedo = eval_albedo(body, _interaction_at(lattice.place(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
+        albedo = eval_albedo(body, _interaction_at(lattice.to_world_points(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
     else:
         albedo = eval_albedo(body, dr.zeros(mi.MediumInteraction3f), mi.Bool(True))
     rows = _merge_equal([row * dr.detach(albedo[c]) for c, row in enumerate(rows)])
@@ -189,7 +189,7 @@ def _estimate_node_light(
     node, turn = lane // DIRECTIONS, mi.Float(lane % DIRECTIONS)
     at = [node % x, (node // x) % y, node // (x * y)]
     u = mi.Vector3f(*(mi.Float(a) / (k - 1) for a, k in zip(at, (x, y, z), strict=True)))
-    p = lattice.place(u)
+    p = lattice.to_world_points(u)
     mei = _interaction_at(p, origins.towards(p))
     mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(lane)), mi.MediumPtr(body.view.medium), None)
     # A rank-1 lattice over the directions of a node, shifted by the node's number (Cranley-Patterson rotation).

@@ -169,7 +169,7 @@ def _block_centres(lattice: Lattice, blocks: tuple[int, int, int], shift: int, i
         dr.clip((mi.Float(a) * (1 << shift) + half) / n, 0.25 / n, 1 - 0.25 / n)
         for a, n in zip(at, lattice.res[::-1], strict=True)
     ]
-    return lattice.place(mi.Vector3f(*u))
+    return lattice.to_world_points(mi.Vector3f(*u))
 
 
 # -- The transmittance grid ---------------------------------------------------------------------------------------------
@@ -232,7 +232,7 @@ def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: 
     at = (index % x, (index // x) % y, index // (x * y))
     # Slightly inside, since a shadow ray in the plane of a face counts as outside the box.
     u = [dr.clip(mi.Float(a) / (m - 1), INSET, 1 - INSET) for a, m in zip(at, (x, y, z), strict=True)]
-    p = lattice.place(mi.Vector3f(*u))
+    p = lattice.to_world_points(mi.Vector3f(*u))
     count, k = len(emitters.sampled), media.channels
     tau = dr.zeros(mi.Float, z * y * x * count * k)
     for number, emitter in enumerate(emitters.sampled):
@@ -253,7 +253,7 @@ def measure_transmittance_bias(
     (body,) = media.bodies
     k = mi.Float64(dr.arange(mi.UInt32, points)) + 0.5
     u = [k / points, k * 0.7548776662 - dr.floor(k * 0.7548776662), k * 0.5698402910 - dr.floor(k * 0.5698402910)]
-    p = grid.lattice.place(mi.Vector3f(*(mi.Float(v) for v in u)))
+    p = grid.lattice.to_world_points(mi.Vector3f(*(mi.Float(v) for v in u)))
     ray = mi.Ray3f(p, mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     weight = body.extinction_at(ray, mi.Float(0), 1, mi.Bool(True))[0]
     total, first, second = dr.sum(weight), mi.Float(0), mi.Float(0)
