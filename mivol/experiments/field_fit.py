@@ -7,11 +7,11 @@ the sky behind it, and ``volumes/`` has its density for other programs.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mivol import config
 from mivol.config import FieldExperiment
 from mivol.experiments.field_plan import adapt_plan, explain_plan, make_batches, make_plan
 from mivol.experiments.fit_kind import Say
@@ -27,7 +27,7 @@ from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos
 from mivol.photos.photo_file import CONVERSIONS, decode_srgb
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
-from mivol.report.record import Image, PlanLine, RunRecord, Table, Volume
+from mivol.report.record import Image, PlanLine, Table, Volume
 from mivol.validate.images import ImageScore, score_image
 
 
@@ -45,17 +45,14 @@ class FieldFit(PhotoFit):
     def make_plan(self, settings: FieldExperiment) -> RadiancePlan:
         return make_plan(settings)
 
-    def new_record(self) -> RunRecord:
+    def describe_run(self) -> dict[str, Any]:
         preset = self.settings.field.preset
-        return RunRecord.new(
-            self.settings.title,
-            method=f"a sparse grid of density and spherical harmonics, fitted to photographs; preset {preset}",
-            config=config.resolved(self.settings),
-            command=self.context.command,
-            seeds={"fit": self.settings.seed},
-            units={"loss": "1"},
-            citations=["mitsuba3", "drjit", "plenoxels_2022", "relu_fields_2022", "max_1995"],
-        )
+        return {
+            "method": f"a sparse grid of density and spherical harmonics, fitted to photographs; preset {preset}",
+            "seeds": {"fit": self.settings.seed},
+            "units": {"loss": "1"},
+            "citations": ["mitsuba3", "drjit", "plenoxels_2022", "relu_fields_2022", "max_1995"],
+        }
 
     def load(self, say: Say) -> None:
         super().load(say)

@@ -114,11 +114,14 @@ class FitKind(ABC):
     def __init__(self, context: RunContext) -> None:
         self.context = context
         self.settings: Any = context.settings
-        self.record = self.new_record()
+        about = self.describe_run()
+        self.record = RunRecord.new(
+            self.settings.title, config=config.resolved(self.settings), command=context.command, **about
+        )
 
     @abstractmethod
-    def new_record(self) -> RunRecord:
-        """Return the record of a run before its first step."""
+    def describe_run(self) -> dict[str, Any]:
+        """Return method, seeds, citations and units for the record, as :meth:`RunRecord.new` names them."""
 
     @abstractmethod
     def load(self, say: Say) -> None:

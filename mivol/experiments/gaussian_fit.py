@@ -7,11 +7,11 @@ viewers read them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mivol import config
 from mivol.config import GaussianExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Stages
@@ -25,7 +25,7 @@ from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.points import Gaussians, write_gaussians
-from mivol.report.record import PlanLine, RunRecord, Table
+from mivol.report.record import PlanLine, Table
 from mivol.validate.images import ImageScore, score_image
 
 __all__ = ["GaussianStart", "GaussianFit", "start_gaussians", "judge_view", "make_gaussian_plan", "render_gaussians"]
@@ -52,17 +52,14 @@ class GaussianFit(PhotoFit):
     def make_plan(self, settings: GaussianExperiment) -> GaussianPlan:
         return make_gaussian_plan(settings)
 
-    def new_record(self) -> RunRecord:
+    def describe_run(self) -> dict[str, Any]:
         relocates = self.plan.control == "relocation"
-        return RunRecord.new(
-            self.settings.title,
-            method=f"3D Gaussians, splatted in tiles and fitted to photographs; preset {self.settings.gaussians.preset}",
-            config=config.resolved(self.settings),
-            command=self.context.command,
-            seeds={"fit": self.settings.seed},
-            units={"loss": "1"},
-            citations=["mitsuba3", "drjit", "kerbl_2023", "zwicker_2001", "wang_2004"] + ["kheradmand_2024"] * relocates,
-        )
+        return {
+            "method": f"3D Gaussians, splatted in tiles and fitted to photographs; preset {self.settings.gaussians.preset}",
+            "seeds": {"fit": self.settings.seed},
+            "units": {"loss": "1"},
+            "citations": ["mitsuba3", "drjit", "kerbl_2023", "zwicker_2001", "wang_2004"] + ["kheradmand_2024"] * relocates,
+        }
 
     def plan_fit(self) -> list[PlanLine]:
         self.begun = start_gaussians(self.settings, self.photos, self.plan)

@@ -7,6 +7,7 @@ truth is known. Held-out views are predicted at the end.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -34,7 +35,7 @@ from mivol.optim.projections.inversion import LinearSolve, ProjectionProblem, fi
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.pixel_scale import is_preview_due, write_preview
-from mivol.report.record import PlanLine, RunRecord
+from mivol.report.record import PlanLine
 from mivol.scene.explain import Explanation
 from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
@@ -68,22 +69,19 @@ class ScanFit(FitKind):
     settings: ScanExperiment
     problem: ProjectionProblem
 
-    def new_record(self) -> RunRecord:
+    def describe_run(self) -> dict[str, Any]:
         settings = self.settings
         name = settings.solve.solver
         prior = ["rudin_1992", "huber_1964"] if tv_strength(settings.solve) else []
-        return RunRecord.new(
-            settings.title,
-            method=f"{name} on line integrals of a {describe_beam(settings)}",
-            config=config.resolved(settings),
-            command=self.context.command,
-            seeds={"noise": getattr(settings.data, "seed", 0)},
-            units={"loss": "1"},
-            plan=[
+        return {
+            "method": f"{name} on line integrals of a {describe_beam(settings)}",
+            "seeds": {"noise": getattr(settings.data, "seed", 0)},
+            "units": {"loss": "1"},
+            "plan": [
                 PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
             ],
-            citations=["mitsuba3", "drjit", *CITED[name], *prior],
-        )
+            "citations": ["mitsuba3", "drjit", *CITED[name], *prior],
+        }
 
     def load(self, say: Say) -> None:
         base = self.context.base

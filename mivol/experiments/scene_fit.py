@@ -14,7 +14,6 @@ import mitsuba as mi
 import msgspec
 import numpy as np
 
-from mivol import config
 from mivol.config import AUTO, Files, Rendered, SceneExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import FitKind, Say, Stages
@@ -40,7 +39,7 @@ from mivol.optim.parameters import check_names
 from mivol.optim.scenes.emissive_start import check_given_start, find_emissive_start
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import HELD_OUT, RenderBatch, derive_seed, make_batches
-from mivol.report.record import PlanLine, RunRecord
+from mivol.report.record import PlanLine
 from mivol.scene.explain import Explanation, explain_scene
 from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
@@ -74,21 +73,18 @@ class SceneFit(FitKind):
     settings: SceneExperiment
     problem: SceneProblem
 
-    def new_record(self) -> RunRecord:
+    def describe_run(self) -> dict[str, Any]:
         settings = self.settings
         priors = [prior for sought in settings.parameter for prior in sought.prior]
         strategies = [settings.optimiser, settings.loss, *priors]
         keys = ", ".join(sought.key for sought in settings.parameter)
         emission = ["nimier_david_2022"] if any(sought.start_fit for sought in settings.parameter) else []
         method = f"{settings.fit.integrator}, {settings.optimiser.label()} on {settings.loss.label()}; looked for: {keys}"
-        return RunRecord.new(
-            settings.title,
-            method=method,
-            config=config.resolved(settings),
-            command=self.context.command,
-            seeds={"fit": settings.seed, "references": getattr(settings.reference, "seed", 0)},
-            citations=["mitsuba3", "drjit", *emission, *dict.fromkeys(key for s in strategies for key in s.cites)],
-        )
+        return {
+            "method": method,
+            "seeds": {"fit": settings.seed, "references": getattr(settings.reference, "seed", 0)},
+            "citations": ["mitsuba3", "drjit", *emission, *dict.fromkeys(key for s in strategies for key in s.cites)],
+        }
 
     def load(self, say: Say) -> None:
         self.loaded = load_experiment_scene(self.settings, self.context.base)
