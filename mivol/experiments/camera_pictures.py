@@ -33,7 +33,7 @@ def draw_photo_cameras(folder: Path, photos: Photos, judged: Photos | None, leve
     Args:
         folder: run folder.
         photos: photographs to fit.
-        judged: photographs that judge the fit; None for none.
+        judged: photographs that judge the fit; may be None.
         levels: nested boxes of the model.
     """
     return _pictures(folder, survey_all_cameras(photos, judged, levels))

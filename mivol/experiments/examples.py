@@ -105,8 +105,8 @@ class Example:
     Attributes:
         says: subject of the example.
         stand_in: replacement of its public data; None without public data.
-        photographs: script in its folder that makes its photographs; "" for none.
-        scan: script in its folder that makes its readings, with a stand-in of its own; "" for none.
+        photographs: script in its folder that makes its photographs; may be "".
+        scan: script in its folder that makes its readings, with a stand-in of its own; may be "".
         folder: folder of its files; "" for a folder of its own name.
         file: experiment of the example.
     """
@@ -247,7 +247,7 @@ def run_example(
 
     Args:
         name: key of ``EXAMPLES``.
-        folder: run folder; None for the ``output`` of the changes, else runs/NAME.
+        folder: run folder; None means the ``output`` of the changes, else runs/NAME.
         changes: settings as in ``--set``.
         progress: display of the run's progress.
         command: command line, for the record.

@@ -131,7 +131,7 @@ class FitKind(ABC):
             say: receives the facts that ``mivol explain`` prints, as they are found.
 
         Raises:
-            MivolError: data that cannot be read or fitted.
+            MivolError: unreadable data, or data without a fit.
         """
 
     # -- Run -------------------------------------------------------------------------------------------------------

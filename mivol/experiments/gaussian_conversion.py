@@ -59,9 +59,9 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
 
     Args:
         source: file of Gaussians or points in any format.
-        target: file that ends in .npz.
+        target: file ending in .npz.
         resolution: voxels along the longest edge of the box.
-        box: two corners, six numbers [length]; None for three standard deviations around all Gaussians.
+        box: two corners, six numbers [length]; None means three standard deviations around all Gaussians.
         variant: Mitsuba variant of the compared views.
 
     Returns:
@@ -92,8 +92,8 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
 
     Args:
         source: field (.npz) of one level.
-        target: file that ends in .ply.
-        resolution: blocks of voxels along the longest edge of its grid, one Gaussian per block; None for blocks of 2 voxels.
+        target: file ending in .ply.
+        resolution: blocks of voxels along the longest edge of its grid, one Gaussian per block; None means blocks of 2 voxels.
         variant: Mitsuba variant of the compared views.
 
     Returns:
@@ -116,7 +116,7 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
 
 
 def corners_of_box(cloud: Gaussians, box: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner (3,) of a given box [length]; None for three standard deviations around all Gaussians."""
+    """Lower and upper corner (3,) of a given box [length]; None means three standard deviations around all Gaussians."""
     return gaussian_box(cloud) if box is None else (np.array(box[:3]), np.array(box[3:]))
 
 
@@ -172,9 +172,9 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
 
     Args:
         source: file of Gaussians or points in any format.
-        target: file that ends in .ply or .obj.
+        target: file ending in .ply or .obj.
         resolution: voxels of the fused distances along the longest edge of the box.
-        box: two corners, six numbers [length]; None for three standard deviations around all Gaussians.
+        box: two corners, six numbers [length]; None means three standard deviations around all Gaussians.
         variant: Mitsuba variant.
 
     Returns:

@@ -115,7 +115,7 @@ def write_view(
         image: render (H, W, 3) in ``space``.
         space: colour space of both.
         caption: caption of the view.
-        edge: longest edge of the written images [pixel], by means of squares of pixels; None for the full size.
+        edge: longest edge of the written images [pixel], by means of squares of pixels; None means the full size.
     """
     written = []
     for role, values in {"render": image, "reference": photo.image}.items():
@@ -156,7 +156,7 @@ def tabulate_views(camera: Camera, found: Sequence[ImageScore], fitted: Sequence
     Args:
         camera: camera of the first view, for the size in the title.
         found: metrics of each view.
-        fitted: PSNR [dB] of each view after colour correction; empty for none.
+        fitted: PSNR [dB] of each view after colour correction; may be empty.
     """
     metrics = list(found[0].values)
     head = ("view", *(METRICS[name].label for name in metrics))

@@ -105,7 +105,7 @@ def explain_experiment(settings: config.Experiment, base: Path, picture: Path | 
     Args:
         settings: all settings.
         base: folder from which relative paths in the settings start.
-        picture: image file (.png, .svg) for the cameras of photographs and the boxes; None for none.
+        picture: image file (.png, .svg) for the cameras of photographs and the boxes; may be None.
 
     Returns:
         The facts found, and the reason of a refusal.

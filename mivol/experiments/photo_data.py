@@ -21,7 +21,7 @@ from mivol.validate.images import check_metrics
 
 
 def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos | None]:
-    """Read the photographs to fit, and the photographs that judge the fit (None for none).
+    """Read the photographs to fit, and the photographs that judge the fit (may be None).
 
     Raises:
         MivolError: as :func:`mivol.photos.load_photos`, metrics for larger photographs, or an unknown word for the box or the

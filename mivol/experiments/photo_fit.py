@@ -47,7 +47,7 @@ class PhotoFit(FitKind):
     Attributes:
         plan: stages, steps and rates of the fit.
         photos: photographs to fit, with their box.
-        judged: photographs to judge by; None for none.
+        judged: photographs to judge by; may be None.
         film: cameras of the film.
         levels: nested boxes of the model.
         fits_colours: whether judged views also have a PSNR with their colours fitted to the photographs'.

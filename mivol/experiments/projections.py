@@ -115,7 +115,7 @@ def make_data(settings: config.ScanExperiment, base: Path, grid: VoxelGrid) -> P
     """Read or compute the projections.
 
     Raises:
-        MivolError: files that cannot be read or do not fit, rays that all miss the grid, or more rays than memory.
+        MivolError: unreadable files, files of different sizes, rays that all miss the grid, or more rays than memory.
     """
     is_measured = isinstance(settings.data, Measured | Stack | Nikon)
     if is_measured:
@@ -201,7 +201,7 @@ def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
     """Read measured projections as line integrals with weights; find the rotation axis of a circular scan if requested.
 
     Raises:
-        MivolError: a file that cannot be read, or does not fit the others.
+        MivolError: an unreadable file, or files of different sizes.
     """
     wanted, found = settings.data, read_scan(settings, base)
     notes, angles = list(found.notes), found.angles

@@ -44,7 +44,7 @@ def read_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
     """Read a measured scan.
 
     Raises:
-        MivolError: a file that cannot be read, or does not fit the others.
+        MivolError: an unreadable file, or files of different sizes.
     """
     wanted = settings.data
     if isinstance(wanted, Nikon):
@@ -83,7 +83,7 @@ def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.n
     """Return the angles [rad] of a stack: from a file, or evenly over the arc; None if a table has the geometry.
 
     Raises:
-        MivolError: numbers of angles and views that differ, or angles in another unit.
+        MivolError: different numbers of angles and views, or angles in another unit.
     """
     wanted: Stack = settings.data
     if isinstance(settings.scan, Table | Matrices):

@@ -80,7 +80,7 @@ def find_references(
         sensors, held_out: from :func:`find_sensors`.
 
     Raises:
-        MivolError: files that cannot be read or do not fit the views.
+        MivolError: unreadable files, or files of other sizes than the views.
     """
     if isinstance(settings.reference, Files):
         return read_references(settings, context.base, loaded, sensors, held_out)
@@ -166,7 +166,7 @@ def read_references(
     """Read references from OpenEXR files. A file of mivol must show the named scene.
 
     Raises:
-        MivolError: numbers of files and views that differ, or a file of another scene.
+        MivolError: different numbers of files and views, or a file of another scene.
     """
     wanted, seen = settings.reference, References(held_out)
     if len(wanted.paths) != len(sensors):
@@ -203,7 +203,7 @@ def make_truth(settings: SceneExperiment, base: Path, scene: mi.Scene) -> np.nda
     """Return the true volume (Z, Y, X, C) of an experiment; None if unknown.
 
     Raises:
-        MivolError: an unknown key, a file that cannot be read, or a volume beyond the memory.
+        MivolError: an unknown key, an unreadable file, or a volume beyond the memory.
     """
     if settings.truth is None:
         return None

@@ -84,8 +84,8 @@ def render_image(
     Args:
         scene: the scene.
         sensor: index of the sensor.
-        integrator: integrator; None for the scene's own.
-        spp: samples per pixel; None for the number of the sensor's sampler.
+        integrator: integrator; None means the scene's own.
+        spp: samples per pixel; None means the number of the sensor's sampler.
         seed: seed of the random numbers.
 
     Raises:
@@ -158,7 +158,7 @@ def make_camera(look_at: Sequence[float], up: Sequence[float], fov: float, size:
     """Return the camera of :func:`render_field`.
 
     Raises:
-        MivolError: a view along ``up``, numbers that are not finite, or an invalid angle or size.
+        MivolError: a view along ``up``, infinite numbers or NaN, or an invalid angle or size.
     """
     if not np.isfinite([*look_at, *up]).all() or not 0 < fov < 180 or min(size) < 1:
         found = f"--look-at {list(look_at)} --up {list(up)} --fov {fov:g} --size {list(size)}"
@@ -185,7 +185,7 @@ class PointLook:
 
     Attributes:
         drawn_as: one of :data:`DRAWN_AS`.
-        radius: radius of a disc, or standard deviation of a splat [length]; None for half the median distance to the nearest
+        radius: radius of a disc, or standard deviation of a splat [length]; None means half the median distance to the nearest
             points.
         opacity: opacity of a point, above 0 and up to 1.
 
@@ -214,7 +214,7 @@ def render_points(
 
     Args:
         path: file of points or Gaussians in any format; points without colours are coloured by their local density.
-        look_at: positions of camera and target, six numbers [length]; None for a view of nearly all points.
+        look_at: positions of camera and target, six numbers [length]; None means a view of nearly all points.
         up: upward direction, three numbers.
         fov: horizontal field of view [degree].
         size: (width, height) [pixel].

@@ -214,7 +214,7 @@ class BestIterate:
 
     Attributes:
         run: run folder; its ``best.npz`` has the best iterate, from which a resumed run continues.
-        files: more files of the best iterate; None for none.
+        files: more files of the best iterate; may be None.
         judge: name of the judging error, a key of ``JUDGES``; "" before the first judgement, and without any error.
         iteration: iteration of the best iterate.
         value: error of the best iterate.

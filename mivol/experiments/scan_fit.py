@@ -216,7 +216,7 @@ def subtract_drift(problem: ProjectionProblem, data: Projections, held_out: np.n
 
 
 def start_volume(wanted: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
-    """Return the first volume of an iterative solver, nonnegative if requested; None for an empty volume.
+    """Return the first volume of an iterative solver, nonnegative if requested; None means an empty volume.
 
     Raises:
         MivolError: geometries that filtered back-projection refuses.

@@ -262,7 +262,7 @@ def make_problem(
 
 
 def plan_renders(settings: SceneExperiment, problem: SceneProblem) -> Plan | None:
-    """Return the plan of mivol's integrator for the scene; None for other integrators."""
+    """Return the plan of mivol's integrator for the scene; None with another integrator."""
     if settings.fit.integrator != "mivol":
         return None
     needs = find_needs(problem.scene, problem.batches[0].sensor, survey_scene(problem.scene))

@@ -50,14 +50,14 @@ class Problem(SceneProblem):
         parameters: keys of ``mi.traverse(scene)``, or :class:`Parameter` with domain, rate and priors.
         loss: one of ``mivol.optim.losses``, or any function (image, reference) -> one number, of tensors (height, width,
             channels).
-        integrator: an integrator with derivatives; None for the scene's own if it is mivol's, else for mivol's at the same
+        integrator: an integrator with derivatives; None means the scene's own if it is mivol's, else mivol's at the same
             depth.
-        sensors: sensors of the images; None for the scene's own sensors.
+        sensors: sensors of the images; None means the scene's own sensors.
         spp: samples per pixel of an image, and of its derivative.
         seed: root of all random numbers.
 
     Raises:
-        MivolError: numbers of images and sensors that differ, images of another size than their sensors or not finite, or an
+        MivolError: different numbers of images and sensors, images of another size than their sensors or not finite, or an
             unknown key.
 
     Example:
@@ -128,7 +128,7 @@ def make_views(references: Sequence[Reference] | SceneSource | mi.Scene, sensors
     """Return the sensors with their images.
 
     Raises:
-        MivolError: numbers of images and sensors that differ, or as :func:`load_reference_scene`.
+        MivolError: different numbers of images and sensors, or as :func:`load_reference_scene`.
     """
     if isinstance(references, str | os.PathLike | Mapping | mi.Scene):
         scene = load_reference_scene(references)
@@ -147,7 +147,7 @@ def to_image_tensor(reference: Reference) -> mi.TensorXf:
     """Return a reference as a tensor (height, width, channels); a file gives its colours.
 
     Raises:
-        MivolError: a file that cannot be read, or an array of another shape.
+        MivolError: an unreadable file, or an array of another shape.
     """
     if isinstance(reference, str | os.PathLike):
         values = stack_layers(read_exr(Path(reference))[0])[""][..., :3]
@@ -196,7 +196,7 @@ def explain(
 
     Args:
         scene: a scene, a dict, or the path of an XML file.
-        max_depth: longest path; None for the settings of the scene's own integrator.
+        max_depth: longest path; None means the settings of the scene's own integrator.
         sensor: a sensor, or its index.
         noise: noise of a pixel over the mean radiance; the smallest ``max_depth`` that neglects less is measured
             (:mod:`mivol.scene.depth_preview`); None to measure nothing.
@@ -223,7 +223,7 @@ def fit_photographs(
         photographs: a folder, or its file of cameras (Blender, nerfstudio, instant-ngp, COLMAP).
         output: run folder.
         settings: settings of the TOML file by dotted key, as ``{"field.preset": "tiny", "photos.background": "white"}``.
-        progress: display of the run's progress; None for none.
+        progress: display of the run's progress; may be None.
 
     Raises:
         MivolError: as ``mivol optimize``.

@@ -74,7 +74,7 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
     """Return a parameter with its first value; the scene is not changed.
 
     Raises:
-        MivolError: an unknown parameter, a value outside its domain, a file that cannot be read, or a grid beyond the memory.
+        MivolError: an unknown parameter, a value outside its domain, an unreadable file, or a grid beyond the memory.
     """
     params = mi.traverse(scene)
     now = as_tensor(params[find(sought.key, params)])

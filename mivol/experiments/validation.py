@@ -52,7 +52,7 @@ class Validation:
     """Settings of a validation.
 
     Attributes:
-        max_depth: longest path; None for the scene's own integrator.
+        max_depth: longest path; None means the scene's own integrator.
         spp: samples per pixel of mivol.
         reference_spp: samples per pixel of Mitsuba's ``volpath``.
         seed: root of all random numbers.
