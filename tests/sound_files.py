@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
+import laspy
 import numpy as np
 from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
 from photo_sets import write_blender, write_colmap, write_transforms
@@ -18,6 +19,22 @@ from PIL import Image
 from volume_files import les, meta_head, mha, nifti, nrrd, nrrd_head, numbered, packed, pbrt, vol, vti, vtk
 
 import mivol
+from mivol import config
+from mivol.fields.field_files import write_field
+from mivol.fields.sky import read_sky
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.files import read_columns, read_exr, read_projections, read_stack, write_exr, write_png
+from mivol.files.mesh import Mesh, read_ply, write_mesh
+from mivol.files.nikon import read_nikon, read_nikon_angles, read_nikon_transmission
+from mivol.files.npy import read_archive
+from mivol.photos.photo_file import read_mask, read_photo
+from mivol.points.cloud import PointCloud, read_points, write_points
+from mivol.points.gaussian_files import read_gaussians
+from mivol.report import record
+from mivol.report.page import write_page
+from mivol.validate.moments import Moments
+from mivol.validate.reference_file import ReferenceResult, read_checkpoint, read_reference, write_checkpoint, write_reference
+from mivol.validate.trust import Doubt
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -54,8 +71,6 @@ def _picture(path: Path) -> None:
 
 
 def _field(path: Path) -> None:
-    from mivol.fields.spherical_grid import SphericalGrid
-
     rng = np.random.default_rng(2)
     keep = rng.random((3, 4, 5)) < 0.5
     values = rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3))
@@ -63,16 +78,11 @@ def _field(path: Path) -> None:
 
 
 def _svox2(path: Path) -> None:
-    from mivol.fields.field_files import write_field
-    from mivol.fields.spherical_grid import SphericalGrid
-
     rng = np.random.default_rng(3)
     write_field(path, SphericalGrid.from_dense(rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3)), np.eye(4)))
 
 
 def _mesh(path: Path) -> None:
-    from mivol.files.mesh import Mesh, write_mesh
-
     points, faces = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3]])
     write_mesh(path, Mesh(points, faces, colours=np.full((4, 3), 0.5)))
 
@@ -87,21 +97,15 @@ def _volume(path: Path) -> None:
 
 
 def _exr(path: Path) -> None:
-    from mivol.files import write_exr
-
     write_exr(path, {"": np.random.default_rng(5).random((6, 12, 3)).astype(np.float32)})
 
 
 def _cloud(path: Path) -> None:
-    from mivol.points.cloud import PointCloud, write_points
-
     rng = np.random.default_rng(6)
     write_points(path, PointCloud(rng.random((9, 3)), rng.random((9, 3))))
 
 
 def _las(path: Path) -> None:
-    import laspy
-
     header = laspy.LasHeader(point_format=2, version="1.2")
     header.scales = np.full(3, 0.001)
     one = laspy.LasData(header)
@@ -133,18 +137,12 @@ IDENTITY = {"scene": "0" * 64, "integrator": "volpath", "max_depth": 2, "channel
 
 
 def _reference(path: Path) -> None:
-    from mivol.validate.reference_file import ReferenceResult, write_reference
-    from mivol.validate.trust import Doubt
-
     image = np.random.default_rng(8).random((4, 5, 3))
     doubts = (Doubt("phase", "Mitsuba samples it with an error of 0.1 %."),)
     write_reference(ReferenceResult(image, image**2, 4, 64, IDENTITY, path, doubts))
 
 
 def _state(path: Path) -> None:
-    from mivol.validate.moments import Moments
-    from mivol.validate.reference_file import write_checkpoint
-
     write_checkpoint(
         path.with_suffix("").with_suffix(".exr"), IDENTITY, Moments(3, np.ones((4, 5, 3)), np.ones((4, 5, 3))), 1.0
     )
@@ -179,116 +177,27 @@ def _nikon(folder: Path) -> None:
 
 def _run(folder: Path) -> None:
     """A run folder with one picture, one volume and a curve."""
-    from mivol.files import write_png
-    from mivol.report.record import Image as Picture
-    from mivol.report.record import RunRecord, Volume, append_metrics, write_record
-
     write_png(folder / "a.png", np.full((4, 4, 3), 0.5, np.float32))
     mivol.write_volume(folder / "a.vol", numbered())
-    shown = {"images": [Picture(path="a.png", role="picture")], "volumes": [Volume(path="a.vol", role="reconstruction")]}
-    write_record(RunRecord.new("a run", method="adam", config={"fit": {"iterations": 4}}, **shown), folder)
+    shown = {
+        "images": [record.Image(path="a.png", role="picture")],
+        "volumes": [record.Volume(path="a.vol", role="reconstruction")],
+    }
+    record.write_record(record.RunRecord.new("a run", method="adam", config={"fit": {"iterations": 4}}, **shown), folder)
     for iteration in range(3):
-        append_metrics(folder, iteration, 0.1 * iteration, loss=1 / (1 + iteration))
+        record.append_metrics(folder, iteration, 0.1 * iteration, loss=1 / (1 + iteration))
 
 
 # -- Readers ---------------------------------------------------------------------------------------------------------------
 
 
-def _read_mesh(path: Path) -> object:
-    from mivol.files.mesh import read_ply
-
-    return read_ply(path)
-
-
-def _read_exr(path: Path) -> object:
-    from mivol.files import read_exr
-
-    return read_exr(path)
-
-
-def _read_sky(path: Path) -> object:
-    from mivol.fields.sky import read_sky
-
-    return read_sky(path)
-
-
-def _read_projections(path: Path) -> object:
-    from mivol.files import read_projections
-
-    return read_projections(path)
-
-
-def _read_stack(path: Path) -> object:
-    from mivol.files import read_stack
-
-    return read_stack(path)
-
-
-def _read_archive(path: Path) -> object:
-    from mivol.files.npy import read_archive
-
-    return read_archive(path)
-
-
-def _read_columns(path: Path) -> object:
-    from mivol.files import read_columns
-
-    return read_columns(path, 3)
-
-
-def _read_picture(path: Path) -> object:
-    from mivol.photos.photo_file import read_photo
-
-    return read_photo(path, "srgb")
-
-
-def _read_mask(path: Path) -> object:
-    from mivol.photos.photo_file import read_mask
-
-    return read_mask(path)
-
-
-def _read_experiment(path: Path) -> object:
-    from mivol import config
-
-    return config.load(path)
-
-
-def _read_gaussians(path: Path) -> object:
-    from mivol.points.gaussian_files import read_gaussians
-
-    return read_gaussians(path)
-
-
-def _read_points(path: Path) -> object:
-    from mivol.points.cloud import read_points
-
-    return read_points(path)
-
-
-def _read_reference(path: Path) -> object:
-    from mivol.validate.reference_file import read_reference
-
-    return read_reference(path)
-
-
-def _read_state(path: Path) -> object:
-    from mivol.validate.reference_file import read_checkpoint
-
-    return read_checkpoint(path)
-
-
 def _read_nikon(folder: Path) -> object:
-    from mivol.files.nikon import read_nikon, read_nikon_angles, read_nikon_transmission
-
     scan = read_nikon(folder / "bead.xtekct")
     return read_nikon_angles(folder / "_ctdata.txt", len(scan.angles)), read_nikon_transmission(scan)
 
 
-def _read_run(folder: Path) -> object:
-    from mivol.report.page import write_page
-
-    return write_page(folder)
+def _read_picture(path: Path) -> object:
+    return read_photo(path, "srgb")
 
 
 def _of(values: np.ndarray) -> list[tuple]:
@@ -311,32 +220,32 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "pbrt": (".pbrt", _bytes(pbrt(numbered())), mivol.read_volume),
     "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
     "hdf5": (".h5", _hdf5, mivol.read_volume),
-    "projections": (".h5", _projections, _read_projections),
-    "stack": (".tif", lambda path: Image.fromarray(np.eye(8, 9, dtype=np.float32)).save(path), _read_stack),
-    "exr": (".exr", _exr, _read_exr),
-    "sky": (".exr", _exr, _read_sky),
+    "projections": (".h5", _projections, read_projections),
+    "stack": (".tif", lambda path: Image.fromarray(np.eye(8, 9, dtype=np.float32)).save(path), read_stack),
+    "exr": (".exr", _exr, read_exr),
+    "sky": (".exr", _exr, read_sky),
     "png": (".png", _picture, _read_picture),
     "jpeg": (".jpg", lambda path: Image.fromarray(np.eye(9, 8, dtype=np.uint8) * 200).save(path), _read_picture),
     "radiance": (".exr", _exr, _read_picture),
-    "mask": (".png", _picture, _read_mask),
+    "mask": (".png", _picture, read_mask),
     "field": (".npz", _field, mivol.read_field),
     "svox2": (".svox2.npz", _svox2, mivol.read_field),
-    "mesh": (".ply", _mesh, _read_mesh),
-    "columns": (".txt", _bytes(b"# a table\n1 2 3\n4.5 -6 7e-3\n8 9 10\n"), _read_columns),
-    "checkpoint": (".npz", _checkpoint, _read_archive),
-    "toml": (".toml", _copy("scenes/demo/fit.toml"), _read_experiment),
-    "toml scan": (".toml", _copy("scenes/shepp_logan/fit.toml"), _read_experiment),
-    "gaussians": (".ply", _bytes(inria_bytes(random_gaussians(5, 1))), _read_gaussians),
-    "compressed gaussians": (".ply", _bytes(compressed_bytes(random_gaussians(5, 0))), _read_gaussians),
-    "spz 2": (".spz", _bytes(spz_bytes(random_gaussians(5, 1), 2)), _read_gaussians),
-    "spz 4": (".spz", _bytes(spz_bytes(random_gaussians(5, 1), 4)), _read_gaussians),
-    "splat": (".splat", _bytes(splat_bytes(random_gaussians(5, 0))), _read_gaussians),
-    "ksplat": (".ksplat", _bytes(ksplat_bytes([in_buckets(random_gaussians(5, 1))], 1)), _read_gaussians),
-    "points": (".ply", _cloud, _read_points),
-    "points npy": (".npy", _cloud, _read_points),
-    "las": (".las", _las, _read_points),
-    "reference": (".exr", _reference, _read_reference),
-    "reference state": (".state.npz", _state, _read_state),
+    "mesh": (".ply", _mesh, read_ply),
+    "columns": (".txt", _bytes(b"# a table\n1 2 3\n4.5 -6 7e-3\n8 9 10\n"), lambda path: read_columns(path, 3)),
+    "checkpoint": (".npz", _checkpoint, read_archive),
+    "toml": (".toml", _copy("scenes/demo/fit.toml"), config.load),
+    "toml scan": (".toml", _copy("scenes/shepp_logan/fit.toml"), config.load),
+    "gaussians": (".ply", _bytes(inria_bytes(random_gaussians(5, 1))), read_gaussians),
+    "compressed gaussians": (".ply", _bytes(compressed_bytes(random_gaussians(5, 0))), read_gaussians),
+    "spz 2": (".spz", _bytes(spz_bytes(random_gaussians(5, 1), 2)), read_gaussians),
+    "spz 4": (".spz", _bytes(spz_bytes(random_gaussians(5, 1), 4)), read_gaussians),
+    "splat": (".splat", _bytes(splat_bytes(random_gaussians(5, 0))), read_gaussians),
+    "ksplat": (".ksplat", _bytes(ksplat_bytes([in_buckets(random_gaussians(5, 1))], 1)), read_gaussians),
+    "points": (".ply", _cloud, read_points),
+    "points npy": (".npy", _cloud, read_points),
+    "las": (".las", _las, read_points),
+    "reference": (".exr", _reference, read_reference),
+    "reference state": (".state.npz", _state, read_checkpoint),
     "scene": (".xml", _bytes(SCENE), mivol.load_scene),
 }
 """Name: suffix, what writes a sound file, what reads it."""
@@ -345,7 +254,7 @@ SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
     "nrrd detached": (_detached_nrrd, ("a.nhdr", "a.raw"), lambda folder: mivol.read_volume(folder / "a.nhdr")),
     "metaimage detached": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.mhd")),
     "nikon": (_nikon, ("bead.xtekct", "_ctdata.txt", "bead_0002.tif"), _read_nikon),
-    "run": (_run, ("run.json", "metrics.jsonl", "a.png", "a.vol"), _read_run),
+    "run": (_run, ("run.json", "metrics.jsonl", "a.png", "a.vol"), write_page),
     "blender": (
         lambda folder: write_blender(folder, alpha=False),
         ("transforms_train.json", "transforms_test.json", "train/r_0.png"),
@@ -357,7 +266,7 @@ SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
         mivol.load_photos,
     ),
     "colmap": (
-        lambda folder: write_colmap(folder),
+        write_colmap,
         ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
         mivol.load_photos,
     ),
