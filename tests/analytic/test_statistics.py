@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 from false_alarms import assert_rate, assert_same_variance, note
 from scipy.special import erfc, stdtr
-from scipy.stats import norm
+from scipy.stats import binom, norm
 
 from mivol.errors import MivolError
-from mivol.validate.moments import Moments
+from mivol.validate.moments import Moments, average_tiles
 from mivol.validate.statistics import (
     FAMILIES,
     Estimate,
     Significance,
+    assert_same_bounded_mean,
     assert_same_mean,
+    bounded_p_value,
     effective_dof,
     estimate_bias,
     p_value,
@@ -32,9 +34,6 @@ def _raises(a: Estimate, b: Estimate, alpha: float = 1e-6, **settings: object) -
     except AssertionError:
         return True
     return False
-
-
-# -- Levels and bounds ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -63,9 +62,6 @@ def test_z_of_equal_and_of_exact_values():
     one, two = Estimate(np.array([1.0])), Estimate(np.array([2.0]))
     np.testing.assert_allclose(z_image(one, two, rounding=0.5), -2)
     np.testing.assert_allclose(z_image(one._replace(var=9.0), two._replace(var=16.0)), -0.2)
-
-
-# -- The rates that are promised, measured ---------------------------------------------------------
 
 
 @pytest.mark.statistical
@@ -175,9 +171,6 @@ def test_p_values_are_even(seed):
     assert_rate(below, runs, 0.1)
 
 
-# -- Bias ---------------------------------------------------------------------------
-
-
 @pytest.mark.statistical
 def test_bias_covers_and_finds(seed):
     """Its interval misses the truth at the rate alpha; 3 % of a pixel's noise is found in 10^5 of them."""
@@ -242,3 +235,86 @@ def test_refusals():
     for call, words in cases:
         with pytest.raises(MivolError, match=words):
             call()
+
+
+def test_moments_keep_their_digits(seed):
+    """Values of spread 1 about 1e8: the naive sum of squares has no digit left in float64 (1e16 * 1e-16 = 1)."""
+    offsets = np.random.default_rng(seed).normal(size=(1000, 3))
+    values = 1e8 + offsets
+    offsets = values - 1e8  # exact: what the sum with 1e8 has left of the offset
+    one_by_one = Moments.empty((3,))
+    for value in values:
+        one_by_one = one_by_one.add(value)
+    merged = Moments.of(values[:1]).merge(Moments.of(values[1:17])).merge(Moments.empty((3,))).merge(Moments.of(values[17:]))
+    for moments in (one_by_one, merged, Moments.of(values)):
+        assert moments.n == 1000
+        # Each step rounds the mean (1e8) to 1.5e-8; n such steps move M by 1e-8 sum|x - m| at most: 1e-8 relative.
+        np.testing.assert_allclose(moments.variance, offsets.var(axis=0, ddof=1), rtol=1e-7)
+        np.testing.assert_allclose(moments.mean - 1e8, offsets.mean(axis=0), atol=1e-6)
+        np.testing.assert_allclose(moments.variance_of_mean, moments.variance / 1000, rtol=1e-15)
+
+
+def test_variance_of_one_batch_is_refused():
+    """One batch says nothing of its variance."""
+    with pytest.raises(MivolError, match="the variance of 1 batches is not known"):
+        _ = Moments.empty().add(np.array(3.0)).variance
+
+
+@pytest.mark.statistical
+def test_pooled_tiles(seed):
+    """Means of 2x2 tiles, their variance by measurement over 4000 images, and what does not fill a tile left out."""
+    rng = np.random.default_rng(seed)
+    sigma = np.arange(1, 31, dtype=float).reshape(5, 6, 1)
+    means = np.array([average_tiles(rng.normal(size=sigma.shape) * sigma, sigma**2, 2)[0] for _ in range(4000)])
+    _, var = average_tiles(sigma, sigma**2, 2)
+    assert means.shape[1:] == (2, 3, 1)
+    assert_same_variance(means, var, what="tiles")
+    with pytest.raises(MivolError, match="tiles of 9 pixels"):
+        average_tiles(sigma, sigma, 9)
+
+
+@pytest.mark.parametrize("p", [1e-4, 0.03, 0.5, 0.97])
+@pytest.mark.parametrize("n", [16, 500])
+def test_bounded_p_values_hold(p, n):
+    """For 0/1 samples the exact binomial chance of a mean as far out is below the bound, and not 30 times below.
+
+    The exponential bound misses the exact tail by a factor of order sqrt(2 pi n p (1 - p)) (Bahadur, Rao 1960), and twice
+    for the other side: below 2 sqrt(2 pi 125) = 56 here, and never below 1.
+    """
+    k = np.arange(n + 1)
+    upper, lower = binom.sf(k - 1, n, p), binom.cdf(k, n, p)
+    exact = np.minimum(upper, lower)
+    claimed = bounded_p_value(k / n, n, np.full(n + 1, p))
+    assert np.all(claimed >= exact * (1 - 1e-9))
+    seen = exact > 1e-250
+    assert np.all(claimed[seen] <= 120 * exact[seen] + 1e-12)
+
+
+def test_bounded_p_value_at_the_ends():
+    """Certain where the truth is a bound and the mean is not; 1 where they are equal; refused outside the bounds."""
+    p = bounded_p_value(np.array([0.0, 1.0, 0.1, 0.0]), 10, np.array([0.0, 1.0, 0.0, 1.0]))
+    np.testing.assert_array_equal(p, [1, 1, 0, 0])
+    assert bounded_p_value(3.0, 100, 3.0, (2, 7)) == 1
+    with pytest.raises(MivolError, match="outside the bounds"):
+        bounded_p_value(np.array([1.5]), 10, np.array([0.5]))
+    with pytest.raises(MivolError, match="low below high"):
+        bounded_p_value(0.0, 10, 0.0, (1, 1))
+
+
+def test_unseen_transmittance_is_no_alarm():
+    """T = 1e-6 that 4096 samples of delta tracking never saw: the z-test cannot say, the bounded one is silent.
+
+    It still speaks where T = 0.01 was never seen: 4096 samples miss it with chance 1e-18.
+    """
+    unseen = np.zeros((8, 8, 1))
+    with pytest.raises(AssertionError):
+        assert_same_mean(Estimate(unseen), Estimate(np.full_like(unseen, 1e-6)))
+    assert_same_bounded_mean(unseen, 4096, np.full_like(unseen, 1e-6))
+    with pytest.raises(AssertionError, match="p < "):
+        assert_same_bounded_mean(unseen, 4096, np.full_like(unseen, 0.01))
+
+
+def test_a_bounded_mean_that_differs_is_named() -> None:
+    assert_same_bounded_mean(np.array([0.5, 0.5]), 1000, 0.5, bounds=(0, 1), what="rays")
+    with pytest.raises(AssertionError, match=r"rays differ at \(1,\): 0.9 for 0.5 after 1000 samples, p < .* 1 of 2 beyond it"):
+        assert_same_bounded_mean(np.array([0.5, 0.9]), 1000, 0.5, bounds=(0, 1), what="rays")
