@@ -118,7 +118,7 @@ class SceneFit(FitKind):
         plan = plan_renders(self.settings, self.problem)
         self.record.plan = list(self.depth_plan)
         if plan is not None:
-            self.record.plan += [PlanLine(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in plan.choices]
+            self.record.plan += [PlanLine(choice=f"{c.subject}: {c.choice}", reason=c.reason) for c in plan.choices]
             cites = SEGMENT_ESTIMATORS[plan.segment].cites
             self.record.citations += [key for key in cites if key not in self.record.citations]
 

@@ -15,8 +15,8 @@ MODULES = ("volumes", "phases", "media", "integrators")  # order = dependency or
 
 
 def _register() -> None:
-    # Nothing in scalar_*: Mitsuba asks scalar_rgb for a plugin's kind, and a volume registered as a texture (there is no
-    # register_volume) would be one in every variant.
+    # Register nothing in scalar_*: Mitsuba takes a plugin's kind from scalar_rgb, and a volume registered as a texture
+    # (Mitsuba has no register_volume) would then be a texture in every variant.
     if mi.variant() is None or mi.variant().startswith("scalar"):
         return
     for name in MODULES:

@@ -26,7 +26,7 @@ class MivolMedium(mi.Medium):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.coefficients = Coefficients.from_props(props)
-        # dr.freeze finds arrays among a plugin's own attributes only.
+        # dr.freeze finds arrays only among a plugin's own attributes.
         self.volumes = {**self.coefficients.volumes, **self.coefficients.lights}
         self.scale = mi.Float(props.get("scale", 1.0))
         dr.make_opaque(self.scale)

@@ -192,8 +192,8 @@ class Mixture(mi.PhaseFunction):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        # Mitsuba counts a property as used once it is read, and raises for those that never are. So only phase functions are
-        # read here.
+        # Mitsuba raises for properties that are never read. So only phase functions are read, and other objects cause the
+        # error.
         nested = dict(props.objects(False))
         self.lobes = {name: props[name] for name, part in nested.items() if isinstance(part, mi.PhaseFunction)}
         self.weights = _read_weights(props, list(self.lobes))
@@ -240,8 +240,8 @@ class Mixture(mi.PhaseFunction):
             chosen, inside = choose_lobe(shares, sample1)
             wo = dr.zeros(mi.Vector3f)
             for k, lobe in enumerate(self.lobes.values()):
-                here = active & (chosen == k)
-                wo = dr.select(here, lobe.sample(ctx, mei, inside, sample2, here)[0], wo)
+                selected = active & (chosen == k)
+                wo = dr.select(selected, lobe.sample(ctx, mei, inside, sample2, selected)[0], wo)
             value, pdf = self._sum(ctx, mei, wo, shares, active)
             return wo, value * dr.select(pdf > 0, dr.rcp(pdf), 0), pdf
 
@@ -286,7 +286,7 @@ class Mixture(mi.PhaseFunction):
             if left < _count(lobe):
                 return name, left if lobe.component_count() else ALL_COMPONENTS
             left -= _count(lobe)
-        raise MivolError(f"component {index} of mivol_mixture was asked for, which has {self.component_count()}.")
+        raise MivolError(f"component {index} of mivol_mixture was requested; the mixture has {self.component_count()}.")
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         for name, weight in self.weights.items():

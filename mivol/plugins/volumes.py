@@ -99,7 +99,7 @@ class SphericalVolume(mi.Volume):
     def refresh(self) -> None:
         self.mivol_field = self.mivol_field.with_tensors(self.density, self.sh)
         self.dense = self.mivol_field.dense_densities()
-        self.seen = self.state()
+        self.refreshed_state = self.state()
 
     def state(self) -> tuple[int, ...]:
         """The arrays of the parameters, and whether gradients are enabled."""
@@ -108,7 +108,7 @@ class SphericalVolume(mi.Volume):
     @property
     def mivol_densities(self) -> list[mi.TensorXf]:
         """The density of each level."""
-        if self.seen != self.state():  # derivatives may be asked for without an update
+        if self.refreshed_state != self.state():  # gradients may be enabled without an update
             self.refresh()
         return self.dense
 

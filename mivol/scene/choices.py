@@ -1,4 +1,4 @@
-"""Choices about a scene: a function each, with the reason printed by ``explain``."""
+"""Choices subject a scene: a function each, with the reason printed by ``explain``."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ MIN_FILLED_SHARE = 0.25
 class Choice:
     """A decision: its subject, the choice and the reason."""
 
-    about: str
+    subject: str
     choice: str
     reason: str
 
@@ -92,22 +92,24 @@ def choose_transport(needs: Needs, settings: Settings, segment: str) -> Choice:
         )
         return Choice("media", f"free flights from collision to collision; {often}", _explain_free_flights(needs, settings))
     if is_scattering_visible(needs, settings):
-        where = "by quadrature" if settings.deterministic else "at a distance drawn in proportion to the light it takes"
+        where = "by quadrature" if settings.deterministic else "at a distance sampled in proportion to the scattered light"
         shadows = "a light grid for shadows" if settings.shadows == "grid" else "exact shadow rays"
-        what = f"exact optical depth; one scattering {where}, {shadows}"
-        return Choice("media", what, "an albedo is above 0 and max_depth is 2")
-    why = "albedo 0" if not any(m.is_scattering for m in needs.media) else "max_depth 1 sees no scattered light"
+        method = f"exact optical depth; one scattering {where}, {shadows}"
+        return Choice("media", method, "an albedo is above 0 and max_depth is 2")
+    why = "albedo 0" if not any(m.is_scattering for m in needs.media) else "max_depth 1 includes no scattered light"
     if any(m.unread for m in needs.media):
-        why = "values cannot be read while dr.freeze records; absorption was promised by max_depth or by an earlier render"
+        why = "values cannot be read while dr.freeze records; max_depth or an earlier render implies absorption only"
     tracked = [m.name for m in needs.media if m.bounded]
-    what = "exact optical depth" if not tracked else f"transmittance of {', '.join(tracked)} by ratio tracking, exact elsewhere"
-    what += "; no phase function, no light sampling in media, no albedo look-up"
-    return Choice("media", what, why)
+    method = (
+        "exact optical depth" if not tracked else f"transmittance of {', '.join(tracked)} by ratio tracking, exact elsewhere"
+    )
+    method += "; no phase function, no light sampling in media, no albedo look-up"
+    return Choice("media", method, why)
 
 
 def _explain_free_flights(needs: Needs, settings: Settings) -> str:
     """List the effects that a single scattering on straight segments would leave out."""
-    reasons = [f"{m.name} emits beside scattering" for m in needs.media if m.emits]
+    reasons = [f"{m.name} emits and scatters" for m in needs.media if m.emits]
     reasons += [f"{m.name} is bounded" for m in needs.media if m.bounded]
     reasons += [f"{m.name} is made of Gaussians" for m in needs.media if m.gaussians]
     reasons += [f"{name} refracts" for name in needs.refractive]
@@ -119,15 +121,15 @@ def _explain_free_flights(needs: Needs, settings: Settings) -> str:
 def choose_emission(needs: Needs, segment: str) -> list[Choice]:
     """Choose how to sum emitted light."""
     choices = []
-    shown = [m.name for m in needs.media if m.emits and m.gaussians]
-    if shown:
-        where = "flight that gets to them" if segment == "free_flight" else "ray"
-        choices.append(Choice("Gaussians", f"in the order of their peaks along each {where}", f"{', '.join(shown)}: colours"))
+    names = [m.name for m in needs.media if m.emits and m.gaussians]
+    if names:
+        where = "flight through them" if segment == "free_flight" else "ray"
+        choices.append(Choice("Gaussians", f"in the order of their peaks along each {where}", f"{', '.join(names)}: colours"))
     names = ", ".join(m.name for m in needs.media if m.emits and not m.gaussians)
     if names and segment == "free_flight":
         choices.append(Choice("emission", "at one point of each flight", f"{names} emit, and light scatters"))
     elif names:
-        choices.append(Choice("emission", "two points a cell, swept from the far end", f"{names} emit"))
+        choices.append(Choice("emission", "two points per cell, summed from the far end", f"{names} emit"))
     return choices
 
 
@@ -141,29 +143,37 @@ def choose_lighting(needs: Needs, settings: Settings, segment: str) -> list[Choi
         return [Choice("directions", "none", "the scene has no emitter")]
     if settings.deterministic:
         where = "at two points of each piece of a cell, from every emitter"
-        return [Choice("where to scatter", where, "deterministic was asked for")]
+        return [Choice("where to scatter", where, "deterministic is set")]
     if segment == "free_flight":
         if not drawn:
             return [
-                Choice("directions", "one, of the phase function", "light is the same from everywhere: what escapes finds it")
+                Choice(
+                    "directions",
+                    "one sample of the phase function",
+                    "all emitters are uniform: escaping paths find their light",
+                )
             ]
         if needs.is_sealed:
-            why = "media lie behind boundaries that refract: emitters are met, and no straight ray finds one"
-            return [Choice("directions", "one, of the phase function", why)]
-        what = "to an emitter from each collision, and of the phase function onwards"
-        return [Choice("directions", what, "the power heuristic weighs emitters that both can find")]
+            why = "media lie behind refracting boundaries: no straight ray finds an emitter, and paths hit emitters by chance"
+            return [Choice("directions", "one sample of the phase function", why)]
+        method = "an emitter sample at each collision, and a phase function sample onwards"
+        return [Choice("directions", method, "the power heuristic weighs both samples")]
     if not drawn:
-        choices = [Choice("directions", "one, of the phase function", "light is the same from everywhere")]
+        choices = [Choice("directions", "one sample of the phase function", "all emitters are uniform")]
     elif not met:
-        choices = [Choice("directions", f"one, to one of {len(drawn)} emitters", "no phase sample can hit one")]
+        choices = [Choice("directions", f"one, to one of {len(drawn)} emitters", "no phase function sample can hit an emitter")]
     else:
-        why = f"{len(drawn)} emitters to sample, {len(met)} that phase samples can hit: the power heuristic weighs both"
-        choices = [Choice("directions", "two: to an emitter, and of the phase function", why)]
+        why = (
+            f"{len(drawn)} emitters to sample, {len(met)} reachable by phase function samples: the power heuristic weighs both"
+        )
+        choices = [Choice("directions", "two: an emitter sample and a phase function sample", why)]
     if "delta" in drawn:
         alone = len(needs.media) == 1 and len(needs.media[0].resolutions) == 1
-        what = "weighed by optical depth towards the emitters, from blocks of the grid" if alone else "by the camera's own ray"
+        method = (
+            "weighed by optical depth towards the emitters, from blocks of the grid" if alone else "along the camera ray only"
+        )
         why = "an emitter of one position or direction" + ("" if alone else ", but more than one grid or none")
-        choices.append(Choice("where to scatter", what, why))
+        choices.append(Choice("where to scatter", method, why))
     return choices
 
 
@@ -173,7 +183,7 @@ def choose_tracing(needs: Needs) -> Choice:
     if needs.surfaces:
         return Choice("acceleration structure", "traced", f"surfaces may stop a ray: {', '.join(sorted(set(needs.surfaces)))}")
     if traced:
-        return Choice("acceleration structure", "traced", f"not a box, or not alone in its place: {', '.join(traced)}")
+        return Choice("acceleration structure", "traced", f"not a box, or overlapping another boundary: {', '.join(traced)}")
     return Choice("acceleration structure", "not traced", "every shape is the box of a medium: slab tests in float64")
 
 
@@ -187,7 +197,7 @@ def choose_channels(needs: Needs) -> Choice:
 
 def choose_skipping(medium: MediumFacts, skip: bool) -> Choice:
     """Choose whether a walk skips empty blocks of a medium."""
-    share = f"{medium.occupied:.0%} of its blocks hold anything"
+    share = f"{medium.occupied:.0%} of its blocks are occupied"
     return Choice(f"empty space in {medium.name}", "skipped" if skip else "walked", share)
 
 
@@ -195,35 +205,39 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
     """Choose how to sample flights through a medium; None without flights."""
     if segment != "free_flight":
         return None
-    about = f"flights in {medium.name}"
+    subject = f"flights in {medium.name}"
     if medium.bounded:
-        return Choice(about, "delta tracking", "a majorant is known, and no optical depth")
+        return Choice(subject, "delta tracking", "only a majorant is known")
     if medium.gaussians:
         return Choice(
-            about, "exact, one in each Gaussian that a ray meets", "the shortest of them is a flight through their sum"
+            subject, "exact, one flight in each Gaussian along a ray", "the shortest flight is a flight through the sum"
         )
     if not medium.resolutions:
-        return Choice(about, "exact", "its extinction is a constant")
+        return Choice(subject, "exact", "its extinction is a constant")
     if medium.extinction == "rgb":
-        return Choice(about, "exact, by one channel each", "rgb extinction: the optical depth of all channels weighs them")
-    return Choice(about, "delta tracking", "majorants of blocks are known; derivatives walk back through every cell")
+        return Choice(
+            subject,
+            "exact, with one sampled channel per flight",
+            "rgb extinction: weights use the optical depth of all channels",
+        )
+    return Choice(subject, "delta tracking", "majorants of blocks are known; derivatives walk every cell")
 
 
 def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Choice | None:
     """Choose whether shadow rays walk all cells of a medium or sample a few; None without shadows in a grid."""
     if not medium.resolutions or not is_scattering_visible(needs, settings) or settings.deterministic:
         return None
-    about, cells = f"shadows of {medium.name}", medium.occupied * max(sum(r) for r in medium.resolutions)
+    subject, cells = f"shadows of {medium.name}", medium.occupied * max(sum(r) for r in medium.resolutions)
     if medium.unread:
-        return Choice(about, "exact", "values cannot be read while dr.freeze records")
+        return Choice(subject, "exact", "values cannot be read while dr.freeze records")
     if settings.shadows != "auto":
-        return Choice(about, settings.shadows, "it was asked for")
+        return Choice(subject, settings.shadows, "set by the user")
     size = f"{cells:.0f} occupied cells along the three axes"
     if cells < MIN_ESTIMATED_CELLS:
-        return Choice(about, "exact", f"{size}: they are soon walked")
+        return Choice(subject, "exact", f"{size}: a walk is cheap")
     if set(needs.emitter_kinds) == {"delta"}:
-        return Choice(about, "exact", "no emitter is extended: where all light is faint, estimates are coarse")
-    return Choice(about, "estimated", f"{size}: unbiased look-ups cost less; gradients walk every cell")
+        return Choice(subject, "exact", "no emitter is extended: estimates are coarse where all light is faint")
+    return Choice(subject, "estimated", f"{size}: unbiased look-ups cost less; gradients walk every cell")
 
 
 def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple[float | None, list[Choice]]:
@@ -241,56 +255,56 @@ def choose_successive_paths(needs: Needs, settings: Settings, segment: str) -> t
     """Choose the number of paths per lane, walked one after the other, for images with enough paths."""
     if segment != "free_flight" or settings.scatterings < MIN_SUCCESSIVE_SCATTERINGS:
         return 1, []
-    about = "lanes"
+    subject = "lanes"
     if not needs.are_samples_independent:
-        return 1, [Choice(about, "one path each", "the sampler has numbers for one path a lane")]
+        return 1, [Choice(subject, "one path each", "the sampler stratifies one path per lane")]
     many = f"up to {SUCCESSIVE_PATHS} paths one after the other"
-    return SUCCESSIVE_PATHS, [
-        Choice(about, many, "their lengths differ, and lanes would wait for the longest of their neighbours")
-    ]
+    return SUCCESSIVE_PATHS, [Choice(subject, many, "path lengths differ, and lanes would wait for the longest path")]
 
 
 def choose_branches(needs: Needs, settings: Settings, segment: str) -> tuple[bool, list[Choice]]:
     """Choose whether paths branch at their first collision, for derivatives."""
     if segment != "free_flight" or settings.scatterings < 1 or not needs.are_samples_independent:
         return False, []
-    why = "most noise of derivatives is that of paths that collide, and few camera rays may do so"
+    why = "colliding paths cause most noise of derivatives, and few camera rays may collide"
     return True, [Choice("derivatives", "paths branch where they first collide", why)]
 
 
 def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Choice]]:
     """Choose whether scattering points sample the light emitted by media."""
-    about = "light of media"
+    subject = "light of media"
     if settings.scatterings < 1 or not any(m.emits for m in needs.media):
         return False, []
     if not needs.surfaces and not any(m.is_scattering for m in needs.media):
         return False, []
     if settings.media_light == "met":
-        return False, [Choice(about, "met by chance", "it was asked for")]
-    found = needs.media_light
-    if found is None:
-        return False, [Choice(about, "met by chance", _explain_missing_light(needs))]
-    draws, gain = settings.media_light == "drawn" or found.gain > 1, f"{found.gain:.2g} times as soon as chance alone"
-    what = "drawn by where they emit, and met by chance" if draws else "met by chance"
-    return draws, [Choice(about, what, f"draws reach an error {gain}")]
+        return False, [Choice(subject, "met by chance", "set by the user")]
+    light = needs.media_light
+    if light is None:
+        return False, [Choice(subject, "met by chance", _explain_missing_light(needs))]
+    draws, gain = settings.media_light == "drawn" or light.gain > 1, f"{light.gain:.2g} times as fast as chance alone"
+    method = "sampled by emission, and met by chance" if draws else "met by chance"
+    return draws, [Choice(subject, method, f"sampling reaches the same error {gain}")]
 
 
 def _explain_missing_light(needs: Needs) -> str:
     """The reason why the light of media cannot be sampled."""
     if any(m.unread for m in needs.media):
-        return "where media emit cannot be read while dr.freeze records"
+        return "the emission cannot be read while dr.freeze records"
     if any(m.gaussians for m in needs.media):
-        return "a medium is made of Gaussians, which are in no table of light"
-    return "a medium that emits fills no shape of its own, or shapes are instances"
+        return "a medium consists of Gaussians, which the table of light does not hold"
+    return "an emitting medium fills no shape of its own, or shapes are instances"
 
 
 def choose_scattering_points(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
     """Choose the number of scattering points per camera ray."""
     if segment != "single_scattering":
         return 1, []
-    about = "points that scatter"
+    subject = "points that scatter"
     if len(needs.media) != 1 or len(needs.media[0].resolutions) != 1:
-        return 1, [Choice(about, "1 of a camera ray", "there is more than one grid or none")]
+        return 1, [Choice(subject, "1 per camera ray", "there is more than one grid or none")]
     share = needs.media[0].occupied
     count = SCATTERING_POINTS[share >= MIN_FILLED_SHARE, set(needs.emitter_kinds) == {"delta"}]
-    return count, [Choice(about, f"{count} of a camera ray", f"one walk for them all; {share:.0%} of the blocks hold anything")]
+    return count, [
+        Choice(subject, f"{count} per camera ray", f"one walk for all points; {share:.0%} of the blocks are occupied")
+    ]

@@ -139,7 +139,7 @@ class Coefficients:
         boxes = [volume.bbox() for volume in self.extinction]
         low = np.min([np.array(b.min) for b in boxes], axis=0).tolist()
         high = np.max([np.array(b.max) for b in boxes], axis=0).tolist()
-        # Not Mitsuba's own box: its class belongs to the first variant of a process, and refuses the rays of a second one.
+        # Mitsuba's own box class belongs to the first variant of a process, and refuses rays of a second variant.
         axes = np.eye(3, 4).tolist()
         _, _, t0, t1 = clip_to_box(axes, low, high, ray.o, ray.d, mi.Float64(0), mi.Float64(ray.maxt))
         return t1 > t0, mi.Float(t0), mi.Float(t1)
@@ -157,8 +157,7 @@ class Coefficients:
             return (mi.Spectrum(dr.nan),) * 3
         first, second = (_eval(v, mei, active) for v in self.volumes.values())
         sigma_t, sigma_s = (first, first * second) if "sigma_t" in self.volumes else (first + second, second)
-        # The majorant was rounded, and is compared with a sum rounded otherwise: a null coefficient below 0 would be a
-        # negative probability.
+        # Majorant and sum are rounded differently: without the clamp a null coefficient could be a negative probability.
         sigma_n = dr.maximum(scale * (majorant - sigma_t), 0)
         return scale * sigma_s, sigma_n, scale * sigma_t
 

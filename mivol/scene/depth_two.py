@@ -142,7 +142,7 @@ def sample_lines(box: Box, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarra
     slope = d @ np.linalg.inv(edges)
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.where(slope > 0, (1 - local) / slope, np.where(slope < 0, -local / slope, np.inf))
-    # Where a line enters, the distance to its own face is 0 and not an end.
+    # At the entry face the distance is 0, which is not the end of the line.
     ends[rows, axis] = np.abs(1 / slope[rows, axis])
     return local @ edges + box.to_world[:3, 3], d, ends.min(axis=1)
 
@@ -152,7 +152,7 @@ def _sample_cosine(normal: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarr
     z, phi = 2 * u - 1, 2 * np.pi * v
     r = np.sqrt(np.maximum(1 - z * z, 0))
     d = normal + np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
-    # u = v-th point opposite to the normal: a sum of 0, of probability 0; the normal itself stands in for it.
+    # The point opposite to the normal gives a sum of 0, with probability 0; the normal replaces the direction.
     length = np.linalg.norm(d, axis=1, keepdims=True)
     return np.where(length > 1e-12, d / np.maximum(length, 1e-12), normal)
 

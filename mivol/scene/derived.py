@@ -35,34 +35,34 @@ class _DifferentiatedParameter:
         """The array, or the matrix of a transform."""
         return self.value if dr.is_array_v(self.value) else self.value.matrix
 
-    def make_of(self, value: Any) -> None:
+    def assign(self, value: Any) -> None:
         """Set the parameter, and compute all derived values from the new value."""
         self.params[self.key] = value
         self.params.set_dirty(self.key)
         self.params.update()
 
-    def put_back(self) -> None:
+    def restore(self) -> None:
         """Restore the original value without an update."""
         self.params[self.key] = self.value
 
 
 def recompute_derived(scene: mi.Scene) -> None:
     """Recompute the derived values of all parameters with gradients. Does nothing while ``dr.freeze`` records."""
-    for asked in _find_differentiated(scene):
-        asked.make_of(asked.value)
-        asked.put_back()
+    for parameter in _find_differentiated(scene):
+        parameter.assign(parameter.value)
+        parameter.restore()
 
 
 @contextmanager
 def carry_tangents(scene: mi.Scene) -> Iterator[None]:
     """Compute derived values from copies of the parameters, with tangents, inside a ``with`` block."""
     with dr.resume_grad():
-        found = _find_differentiated(scene)
-        copies = [dr.detach(asked.numbers) for asked in found]
-        for asked, copy in zip(found, copies, strict=True):
+        parameters = _find_differentiated(scene)
+        copies = [dr.detach(parameter.numbers) for parameter in parameters]
+        for parameter, copy in zip(parameters, copies, strict=True):
             dr.enable_grad(copy)
-            dr.set_grad(copy, dr.grad(asked.numbers))
-            asked.make_of(type(asked.value)(copy))
+            dr.set_grad(copy, dr.grad(parameter.numbers))
+            parameter.assign(type(parameter.value)(copy))
         if copies:
             dr.enqueue(dr.ADMode.Forward, copies)
             dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
@@ -70,9 +70,9 @@ def carry_tangents(scene: mi.Scene) -> Iterator[None]:
         yield
     finally:
         with dr.resume_grad():
-            for asked in found:
-                asked.make_of(asked.value)
-                asked.put_back()
+            for parameter in parameters:
+                parameter.assign(parameter.value)
+                parameter.restore()
 
 
 def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
@@ -81,12 +81,12 @@ def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
         return []
     inside = [shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None]
     owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _find_derived_owners(m))]
-    found = []
+    parameters = []
     for owner in {o.ptr: o for o in owners if o is not None}.values():
         params = mi.traverse(owner)
-        asked = [(k, v) for k, v in params if _is_differentiated(v) and not _is_computed(params, k)]
-        found += [_DifferentiatedParameter(params, k, type(v)(v)) for k, v in asked]
-    return found
+        followed = [(k, v) for k, v in params if _is_differentiated(v) and not _is_computed(params, k)]
+        parameters += [_DifferentiatedParameter(params, k, type(v)(v)) for k, v in followed]
+    return parameters
 
 
 def _find_derived_owners(medium: mi.Medium) -> list[mi.Object]:

@@ -48,7 +48,7 @@ NOT_UTF8 = "it names things in bytes that are not UTF-8; correct them"
 TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)+(?:(?:[\w.]+\.)?MivolError: )?")
 """A traceback in a text, up to the raised message and without the name of mivol's own error."""
 
-# Header formats whose voxels lie in a second file: the key of the line that names it.
+# Header formats with voxels in a second file, and the key of the line with the name of the second file.
 DATA_FILE_KEYS = {".mhd": "ElementDataFile", ".nhdr": "data file"}
 
 
@@ -184,7 +184,7 @@ def list_data_files(path: Path) -> Iterator[Path]:
             yield beside
 
 
-# Kinds of objects that say how an image is computed, not what is in it.
+# Kinds of objects that define the method of a render, not its contents.
 UNHASHED_KINDS = ("Integrator", "Sampler")
 
 

@@ -43,8 +43,8 @@ def read_settings(scene: mi.Scene) -> Settings:
     session = getattr(integrator, "session", None)
     if session is not None:
         return session.settings
-    told = re.search(r"max_depth ?= ?(-?\d+)", str(integrator))
-    depth = Settings().max_depth if told is None else int(told.group(1))
+    printed = re.search(r"max_depth ?= ?(-?\d+)", str(integrator))
+    depth = Settings().max_depth if printed is None else int(printed.group(1))
     return Settings(max_depth=-1 if depth == UNLIMITED else depth)
 
 
@@ -110,7 +110,7 @@ def _describe_facts(needs: Needs) -> list[str]:
         *lines,
         f"  surfaces  {', '.join(needs.surfaces) or 'none'}",
         f"  emitters  {', '.join(needs.emitters) or 'none'}",
-        f"  camera    {'may be inside a medium' if needs.start or needs.camera_inside else 'in no traced boundary'}",
+        f"  camera    {'may be inside a medium' if needs.start or needs.camera_inside else 'outside all traced boundaries'}",
         f"  variant   {needs.variant}, {dr.thread_count()} threads",
     ]
 
@@ -149,8 +149,8 @@ def _find_warnings(scene: mi.Scene) -> list[str]:
         flags = 0 if bsdf is None else int(mi.BSDFFlags.Null) if bsdf.class_name() == "NullBSDF" else _flags(bsdf)
         if bsdf is not None and not flags & open_:
             lines.append(
-                f"  warning   the medium of {shape.id()} lies behind an opaque {bsdf.class_name()}, so that no light gets in: "
-                'give the shape <bsdf type="null"/> (Mitsuba takes a diffuse one where none is given)'
+                f"  warning   the medium of {shape.id()} lies behind an opaque {bsdf.class_name()}, so no light enters: "
+                'give the shape <bsdf type="null"/> (the default of Mitsuba is a diffuse BSDF)'
             )
     return lines
 
@@ -162,8 +162,8 @@ def _flags(bsdf: mi.BSDF) -> int:
 
 def _describe_plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Settings, noise: float | None) -> list[str]:
     plan = make_plan(needs, settings)
-    width = max(len(c.about) for c in plan.choices)
-    lines = ["plan", *(f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices)]
+    width = max(len(c.subject) for c in plan.choices)
+    lines = ["plan", *(f"  {c.subject:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices)]
     lines += [f"  table     {text}" for text in _describe_transfer_tables(needs)]
     if settings.scatterings == 1:
         lines += [f"  model     {text}" for text in _describe_depth_two(scene, needs)]
@@ -188,7 +188,7 @@ def _describe_light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Se
     nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
     rays = needs.film_samples * sum(needs.media[0].resolutions[0])
     pays = "pays" if nodes < rays else "does not pay"
-    asked = "asked for" if settings.shadows == "grid" else "exact; with deterministic"
+    asked = "set" if settings.shadows == "grid" else "exact; with deterministic"
     return [
         f"{asked}, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
         f"{bias:+.2g} of an emitter's light (rms {rms:.2g}, measured against exact shadows)"
@@ -205,9 +205,9 @@ def _describe_transfer_tables(needs: Needs) -> list[str]:
                 continue
             table = volume.mivol_transfer
             missed, finer = table.interpolation_error(), table.refine + 2
-            advice = f"; refine = {finer} would follow it closer, at {(finer / table.refine) ** 3:.3g} times the memory"
+            advice = f"; refine = {finer} would be closer, at {(finer / table.refine) ** 3:.3g} times the memory"
             lines.append(
-                f"{name} of {facts.name} departs from its table by {missed:.2g} of the largest entry half-way between nodes "
+                f"{name} of {facts.name} differs from its table by {missed:.2g} of the largest entry halfway between nodes "
                 f"(rms){advice if missed > 0.02 else ''}"
             )
     return lines
@@ -227,10 +227,10 @@ def _describe_depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
         tau, albedo = scattering_depth(view, box, scene=traced), mean_albedo(view)
         phase = "forward" if mean_cosine(boundary.medium.phase_function()) > 0.4 else "isotropic"
         missing = depth_two_error(min(albedo, 1.0), tau, light, phase)
-        warning = "; depth 2 is a poor model of it: raise max_depth (what fits lose: docs/examples.md)" if missing > 0.1 else ""
+        way_out = "; depth 2 is a poor model of this medium: raise max_depth (docs/examples.md shows the effect on fits)"
         lines.append(
-            f"one scattering leaves out {missing:.0%} of the light that {facts.name} scatters (albedo {albedo:.2f}, optical "
-            f"depth {tau:.2g}, {light} light, {phase} phase){warning}"
+            f"max_depth 2 leaves out {missing:.0%} of the light that {facts.name} scatters (albedo {albedo:.2f}, optical "
+            f"depth {tau:.2g}, {light} light, {phase} phase){way_out if missing > 0.1 else ''}"
         )
     return lines
 
@@ -244,7 +244,7 @@ def _padded_box(scene: mi.Scene, medium: mi.Medium) -> Box | None:
     if not boxes:
         return None
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    # A little larger than the medium, so that the lines of :func:`sample_lines` begin outside of its boundary.
+    # The padding lets the lines of :func:`sample_lines` start outside of the boundary.
     room, place = 1e-3 * (high - low).max(), np.eye(4)
     place[:3, :3], place[:3, 3] = np.diag(high - low + 2 * room), low - room
     return Box(place)

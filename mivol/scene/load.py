@@ -133,7 +133,7 @@ def _load_file(path: Path, overrides: dict[str, str]) -> LoadedScene:
         files = tuple(dict.fromkeys([*(Path(str(f)) for f in state.files), *find_named_files(state)]))
         digest, obstacle = _try_hash(lambda: hash_description(state))
     try:
-        # One thread of a process uses Dr.Jit: not parallel.
+        # Not parallel: only one thread of a process may use Dr.Jit.
         with ensure_two_threads():
             scene = mi.load_file(str(path), parallel=False, **overrides)
     except RuntimeError as error:

@@ -55,7 +55,7 @@ def read_media_light(
     boxes = find_emitting_boxes(media, boundaries)
     if boxes is None:
         return None
-    # Arrays are kept with what was made of them, so that their numbers cannot be given to others.
+    # Keep the arrays with the result, so that Dr.Jit cannot give their indices to other arrays.
     arrays = [array for box in boxes for array in _emission_state(box.body.view)]
     state = (*(a.index if dr.is_array_v(a) else a for a in arrays), *(box.box.to_world.tobytes() for box in boxes))
     if survey.media_light is None or survey.media_light[0] != state:

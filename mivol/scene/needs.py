@@ -52,7 +52,7 @@ def find_needs(
     boundaries = (*survey.boundaries, *find_outside_media(start, survey.boundaries))
     views = tuple(b.view(survey.places) for b in boundaries)
     params = mi.traverse(scene)
-    asked = tuple(k for k, v in params if dr.grad_enabled(v))
+    differentiated = tuple(k for k, v in params if dr.grad_enabled(v))
     media = tuple(
         replace(_read_medium_facts(b, view, survey, recording), misplaced=_find_misplaced(b, view, boundaries, survey))
         for b, view in zip(boundaries, views, strict=True)
@@ -71,8 +71,8 @@ def find_needs(
         is_sealed=survey.is_sealed,
         start=sensor.get_medium(),
         camera_inside=_may_camera_be_inside(scene, sensor, survey),
-        parameters=asked,
-        places=tuple(k for k in asked if _is_placement(k, params.properties[k][2])),
+        parameters=differentiated,
+        places=tuple(k for k in differentiated if _is_placement(k, params.properties[k][2])),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
     )
@@ -120,11 +120,11 @@ def _may_camera_be_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurve
         return False
     eye = sensor.bbox()
     boxes = [shape_bounds(s) for s in scene.shapes() if s.is_medium_transition() or is_instance(s)]
-    # A sensor at infinity has no box of its own: its rays start outside the scene. Walls of a room are flat.
+    # A sensor at infinity has no box: its rays start outside the scene. Boxes may be flat, as the walls of a room.
     if not eye.valid() or not boxes:
         return False
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    # Rays begin at the near plane: this far from the eye in a field of view of 150 degrees.
+    # Rays begin at the near plane, at most this far from the eye for a field of view up to 150 degrees.
     ahead = 4 * sensor.near_clip() if hasattr(sensor, "near_clip") else 0.0
     return bool((np.array(eye.max) + ahead >= low).all() and (np.array(eye.min) - ahead <= high).all())
 
@@ -145,7 +145,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
         "bounded": next((type(p.field).__name__ for p in view.parts if not p.exact_line), None),
     }
     if recording:
-        # What it was when it was last read; a medium that was never read may scatter.
+        # Use the last reading; a medium without a reading may scatter.
         known = survey.scatters.get(boundary.name, True)
         return MediumFacts(**common, is_scattering=known, occupied=1.0, tau_max=None, unread=True)
     check_constants(view, survey, boundary.name)
@@ -154,7 +154,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
     occupied = min((r.occupied for r in reads), default=1.0)
     scatters = survey.scatters[boundary.name] = is_scattering(view, survey, boundary.name)
     if scatters and survey.are_emitters_far and common["mean_cosine"] is None:
-        # Once: where a fit changes the phase function, what is made of this stays unbiased.
+        # Read once: if a fit changes the phase function, side flights stay unbiased.
         common["mean_cosine"] = survey.cosines[boundary.name] = mean_cosine(phase)
     return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_bound_optical_depth(boundary, view, reads))
 
@@ -187,7 +187,7 @@ def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridR
 
 @dataclass(frozen=True)
 class MediumFacts:
-    """The facts of one medium.
+    """The facts of a medium.
 
     Attributes:
         name: name of the shape filled by the medium.
@@ -198,10 +198,10 @@ class MediumFacts:
         is_scattering: whether an albedo or ``sigma_s`` is above 0 or has gradients enabled.
         emits: whether the medium has an emission or an emission density.
         phase: kind of the phase function.
-        occupied: smallest share of occupied blocks of all grids [1].
-        tau_max: upper bound of the optical depth through the box [1]; None for a boundary of another shape.
+        occupied: smallest share of occupied blocks among the grids [1].
+        tau_max: upper bound of the optical depth through the box [1]; None unless the boundary is a box.
         unread: whether values could not be read because ``dr.freeze`` records.
-        bounded: class of a field with only a known majorant along a ray; None for exact optical depths.
+        bounded: class of a field with only a known majorant along a ray; None with exact optical depths.
         gaussians: number of Gaussians for ray tracing; 0 for other media.
         mean_cosine: mean cosine of the phase function at the first reading [1]; None for a medium that does not scatter, or
             with a near emitter.

@@ -174,8 +174,8 @@ def _find_disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int], size: 
         sides = [_registry_ids(p) for p in (si.shape, si.target_medium(-ray.d), si.target_medium(ray.d))]
         facts = [si.is_valid(), si.is_medium_transition(), dr.dot(si.n, ray.d) < 0, _is_opaque(si)]
         ray = spawn_ray(si, ray.d, size)
-        # At once, and the next ray too: otherwise the kernels of each crossing would repeat all crossings before it, so that
-        # every one of them would be compiled anew (8 s for 12 boxes).
+        # Evaluate now, with the next ray: otherwise the kernel of each crossing would repeat all earlier crossings and be
+        # compiled anew (8 s for 12 boxes).
         dr.eval(sides, facts, ray)
         shape, near, far = (np.array(numbers).astype(int) for numbers in sides)
         valid, transition, enters, opaque = map(np.array, facts)

@@ -184,16 +184,16 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
             packed = gradient_bytes((z, y, x), channels)
             fits = needs.variant.startswith("llvm") and packed <= PACKED_LIMIT
             memory += (packed if fits else 0) + 8 * z * y * x * channels
-            ways.add("packed corners, one copy a thread" if fits else "added to the nodes")
+            ways.add("packed corners, one copy per thread" if fits else "added to the nodes")
     free = available_memory()
     if needs.parameters and needs.variant.startswith("llvm") and free is not None and memory > free:
         raise MivolError(
             f"a gradient step would take {memory / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free; lower the resolution "
             "of the grids."
         )
-    asked = ", ".join(needs.parameters) or "none asked for yet"
-    what = f"{memory / 2**20:.1f} MiB beyond the rays ({'; '.join(sorted(ways)) or 'no grid'})"
-    return memory, Choice("gradient step", what, f"parameters: {asked}")
+    parameters = ", ".join(needs.parameters) or "none with gradients yet"
+    size = f"{memory / 2**20:.1f} MiB besides the rays ({'; '.join(sorted(ways)) or 'no grid'})"
+    return memory, Choice("gradient step", size, f"parameters: {parameters}")
 
 
 def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) -> SceneMedia:
@@ -203,7 +203,8 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) 
         for part in view.parts:
             if skip and part.lattice is not None:
                 part.lattice.empty_distances = read_empty_distances(part, survey, boundary.name)
-            # A grey variant sees the mean of an rgb extinction, and its transmittance is no mean.
+            # A grey variant averages an rgb extinction over the channels; the transmittance of the mean is not the mean
+            # transmittance.
             mixes = mi.is_monochromatic and part.channels > 1
             flies = plan.segment == "free_flight" and part.channels == 1
             if (tracks or flies) and part.lattice is not None and part.activation is None and not mixes:
@@ -236,8 +237,8 @@ def build_estimators(
 
 def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:
     """Make the estimator of the light of media from the table of the needs."""
-    found = needs.media_light
-    table = EmissionTable(find_emitting_boxes(media, needs.boundaries), found.density, found.cumulative)
+    light = needs.media_light
+    table = EmissionTable(find_emitting_boxes(media, needs.boundaries), light.density, light.cumulative)
     return EmissionSampling(media, table)
 
 
@@ -250,5 +251,5 @@ def _make_visibility_cache(
     blind = not pictures or any(m.unread for m in needs.media)
     rays = needs.film_samples * (plan.events if pictures else 1)
     occupied = None if blind else needs.media[0].occupied
-    take = lambda *asked: read_coarse_grid(survey, *asked)  # noqa: E731
+    take = lambda *arguments: read_coarse_grid(survey, *arguments)  # noqa: E731
     return build_visibility_cache(direct.media, direct.emitters, rays, occupied, take)

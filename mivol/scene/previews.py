@@ -104,7 +104,7 @@ class SufficientDepth:
     def reason(self) -> str:
         """The measurements behind the depth, in words."""
         measured = "; ".join(map(str, self.left_out))
-        return f"{measured}; noise of {self.noise:.2%} is asked for"
+        return f"{measured}; noise of {self.noise:.2%} is requested"
 
 
 def find_sufficient_depth(scene: mi.Scene, sensor: mi.Sensor, settings: Settings, noise: float = NOISE) -> SufficientDepth:

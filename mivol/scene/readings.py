@@ -86,7 +86,7 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
         values, activation, floored = part.lattice.values, part.activation, None
         if activation is not None:
             _check_stored_density(array, activation, name)
-            # Nothing is below an empty value; an extinction rises with what is stored.
+            # Values up to the empty value give no extinction; above, the extinction rises with the stored value.
             empty = activation.empty_below
             values = mi.TensorXf(dr.maximum(array, empty) if empty is not None else dr.abs(array) + 1, values.shape)
         elif not dr.all((array >= 0) & dr.isfinite(array)):
@@ -97,12 +97,12 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
         _check_look_up(part, survey, name)
         return GridReading(blocks, float((host > 0).mean()), float(host.max(initial=0.0)), floored)
 
-    read = _read_once(survey, ("part",), array, make)
-    if read.floored is not None:
+    reading = _read_once(survey, ("part",), array, make)
+    if reading.floored is not None:
         values = part.lattice.values
-        # The stock grid is not looked up again: it interpolates the values below 0, these do not.
-        part.lattice.values, part.volume = mi.TensorXf(dr.replace_grad(read.floored, values.array), values.shape), None
-    return read
+        # Do not evaluate the stock grid from here on: the stock grid still interpolates negative values.
+        part.lattice.values, part.volume = mi.TensorXf(dr.replace_grad(reading.floored, values.array), values.shape), None
+    return reading
 
 
 def _clip_negative(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.Float:
@@ -171,12 +171,12 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
     cell, frac, _ = locate_cell(lattice, it.p, mi.Vector3f(0, 0, 1), mi.Float(0))
     nodes, c = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res), lattice.channels
     corners = [[dr.gather(mi.Float, dr.detach(lattice.values.array), k * c + i) for k in nodes] for i in range(c)]
-    ours = np.array([np.array(interpolate(row, frac)) for row in corners])
-    theirs = np.array(volume.eval_1(it))[None] if c == 1 else np.array(volume.eval(it))
+    expected = np.array([np.array(interpolate(row, frac)) for row in corners])
+    actual = np.array(volume.eval_1(it))[None] if c == 1 else np.array(volume.eval(it))
     spread = np.ptp(np.array([[np.array(v) for v in row] for row in corners]), axis=1)
-    off, most = np.abs(ours - theirs), float(np.abs(ours).max())
+    error, scale = np.abs(expected - actual), float(np.abs(expected).max())
     groups = [*(border[axis[border] == a] for a in range(3)), slice(len(border), None)]
-    if any(off[:, s].sum() > LOOK_UP_TOLERANCE * spread[:, s].sum() + 1e-5 * most * LOOK_UP_POINTS for s in groups):
+    if any(error[:, s].sum() > LOOK_UP_TOLERANCE * spread[:, s].sum() + 1e-5 * scale * LOOK_UP_POINTS for s in groups):
         raise MivolError(
             f"{part.name} of the medium in {name} is a gridvolume with another filter_type than trilinear or another wrap_mode "
             "than clamp: its values between voxels are not those that rays are integrated over; leave both at these, or "
@@ -239,7 +239,7 @@ def check_constants(view: MediumView, survey: SceneSurvey, name: str) -> None:
         MivolError: a number that is NaN, infinite or negative.
     """
     for key, given in view.numbers.items():
-        # A copy is kept: what traverse hands out changes in place, and the index of an array that is gone is given to others.
+        # Keep a copy: values of mi.traverse change in place, and Dr.Jit reuses the index of a deleted array.
         value = dr.detach(given)
         state = _constant_state(value)
         if survey.numbers.get((view.medium.ptr, key), (None, None))[1] != state:

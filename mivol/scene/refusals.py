@@ -42,14 +42,14 @@ def parse_aovs(names: str) -> tuple[str, ...]:
     Raises:
         MivolError: a name missing from :data:`mivol.transport.line_integrals.aovs.AOVS`, or a repeated name.
     """
-    asked = tuple(n.strip() for n in names.split(",") if n.strip())
-    for name in asked:
+    listed = tuple(n.strip() for n in names.split(",") if n.strip())
+    for name in listed:
         if name not in AOVS:
             near = difflib.get_close_matches(name, AOVS, 1, 0.0)[0]
             raise MivolError(f"aovs asks for {name!r}; mivol has {', '.join(AOVS)} (did you mean {near!r}?).")
-        if asked.count(name) > 1:
-            raise MivolError(f"aovs asks for {name!r} {asked.count(name)} times; a film has one channel of a name: ask once.")
-    return asked
+        if listed.count(name) > 1:
+            raise MivolError(f"aovs asks for {name!r} {listed.count(name)} times; a film has one channel of a name: ask once.")
+    return listed
 
 
 def check_scattering(needs: Needs, settings: Settings) -> None:
@@ -60,7 +60,7 @@ def check_scattering(needs: Needs, settings: Settings) -> None:
     if settings.deterministic and settings.scatterings > 1:
         raise MivolError(
             f"deterministic is set, the medium in {medium} scatters and max_depth is {settings.max_depth}; quadrature is for "
-            "one scattering: set max_depth to 2, or leave deterministic out."
+            "a single scattering: set max_depth to 2, or leave deterministic out."
         )
 
 
@@ -97,8 +97,8 @@ def check_placements(needs: Needs) -> None:
     """Refuse derivatives with respect to unsupported placements."""
     if needs.places:
         raise MivolError(
-            f"the derivative of {needs.places[0]} was asked for; mivol has none of shapes, of emitters that have a size, nor "
-            "of cameras: take that of a point, spot or directional light, or finite differences."
+            f"the derivative of {needs.places[0]} was requested; mivol differentiates the placement of point, spot and "
+            "directional lights only: use finite differences."
         )
 
 
@@ -155,7 +155,7 @@ def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> No
         (any(m.emits for m in needs.media), "a medium of its scene emits", "take the emission out"),
         (bool(rgb), f"light scatters where the extinction of {', '.join(rgb)} is rgb", "make it grey, or set max_depth to 1"),
         (any(v.microflakes is not None for v in needs.views), "a medium of its scene has sggx microflakes", "take them out"),
-        (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
+        (bool(moved), f"the derivative of {', '.join(moved)} was requested", "use finite differences"),
     ]
     kind = f"is a {medium.bounded}, which is bounded (a majorant is known, and no optical depth of a ray)"
     _raise_first(f"the medium in {medium.name} {kind}", reasons, "voxelise the field")
@@ -169,7 +169,7 @@ def check_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
     moved = _emitter_placements(needs)
     reasons = [
         ("depth" in aovs, "aovs asks for depth", "ask for tau and alpha only"),
-        (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
+        (bool(moved), f"the derivative of {', '.join(moved)} was requested", "use finite differences"),
     ]
     kind = f"is made of {medium.gaussians} Gaussians that rays are traced through"
     _raise_first(f"the medium in {medium.name} {kind}", reasons, "convert them to a grid (mivol convert)")
@@ -183,16 +183,16 @@ def check_nested(needs: Needs) -> None:
     level = next((b.name for b in needs.boundaries if b.hole is not None), None)
     if moved and level is not None:
         raise MivolError(
-            f"the derivative of {', '.join(moved)} was asked for and {level} belongs to a nested field, at whose inner faces "
-            "no shadow ray is followed as it turns: take finite differences."
+            f"the derivative of {', '.join(moved)} was requested and {level} belongs to a nested field, at whose inner faces "
+            "no shadow ray is followed as it turns: use finite differences."
         )
 
 
 def _raise_first(medium: str, reasons: list[tuple[bool, str, str]], other_way: str) -> None:
     """Raise for the first reason (condition, finding, way out) whose condition holds."""
-    for holds, what, way_out in reasons:
+    for holds, finding, way_out in reasons:
         if holds:
-            raise MivolError(f"{medium}, and {what}: {way_out}, or {other_way}.")
+            raise MivolError(f"{medium}, and {finding}: {way_out}, or {other_way}.")
 
 
 def _emitter_placements(needs: Needs) -> list[str]:

@@ -75,7 +75,7 @@ class Session:
             MivolError: a refusal of the plan, a film larger than the memory, or ``develop`` set to false.
         """
         if not develop:
-            raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
+            raise MivolError("found develop=False, expected True: mivol returns only developed images.")
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, pictures=True)
@@ -98,7 +98,7 @@ class Session:
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
 
-        Cost: a render and its replay. Memory: that of one pass, independent of the number of samples.
+        Cost: a render and its replay. Memory: a single pass, independent of the number of samples.
         """
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
@@ -108,8 +108,8 @@ class Session:
             media = estimators.media
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
             media.start_gradients()
-            # Gradients of volumes wait for the end of all passes: Dr.Jit follows the edge from a derived value to its parameter
-            # only once.
+            # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only
+            # once.
             with dr.isolate_grad():
                 for rays, dL, daovs in adjoint_rays(samples, self.aovs, grad_in):
                     self._replay(estimators, rays, dL, daovs, plan.branches)
@@ -126,7 +126,7 @@ class Session:
             media.start = named[0] if all(medium is named[0] for medium in named) else None
             media.locates_camera = bool(media.traced)
             score, alpha = walk_path(estimators, sampler, ray, Primal(_zero_radiance(ray)), active)
-            # To an integrator that nests this one alpha is a mask, whether something is seen: it is drawn with that chance.
+            # An integrator that nests this integrator treats alpha as a mask: sample the mask with probability alpha.
             return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[Estimators, Plan]:
@@ -162,7 +162,7 @@ class Session:
         self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float], branches: bool
     ) -> None:
         prepare_derivatives(estimators, rays.ray, rays.on_film)
-        # Branches are counted, which a recording of Dr.Jit cannot do.
+        # The number of branches is read on the host, which is impossible while Dr.Jit records.
         if branches and not is_recording():
             replay_branches(estimators, rays, dL)
         else:

@@ -92,10 +92,10 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
                 refractive.append(f"{name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
             surfaces.append(shape.class_name())
-            # What an instance shows has other BSDFs than its own.
+            # The shapes of an instance have other BSDFs than the instance itself.
             has_null |= is_instance(shape) or mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
     names = tuple(e.class_name() for e in scene.emitters())
-    # Mitsuba makes one object of equal media: where one boundary has to be traced, all boundaries of that medium are.
+    # Mitsuba merges equal media into one object: if a boundary of a medium is traced, all its boundaries are.
     traced = {b.medium.ptr for b in boundaries if b.box is None}
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
     boxed = {b.medium.ptr for b in boundaries if b.box is not None}
@@ -127,7 +127,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
 def _read_placement(shape: mi.Shape) -> object:
     """The placement of a shape: the array of a mesh's vertices, else the bounding box."""
     params = mi.traverse(shape)
-    # A rectangle is a mesh that keeps its vertices to itself.
+    # A rectangle is a mesh, but does not expose its vertices.
     if "vertex_positions" in params:
         return dr.detach(params["vertex_positions"])
     return [*shape.bbox().min, *shape.bbox().max]

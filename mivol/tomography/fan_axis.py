@@ -88,8 +88,8 @@ def axis_from_fans(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> Axis:
             return np.sum([_sector_misfits(pair, columns, w) for pair, w in zip(pairs, fixed, strict=True)], axis=0)
 
         column, sigma = _sector_minimum(misfit, column, width)
-    said = f"rays measured from both ends, {len(pairs)} row" + "s" * (len(pairs) > 1)
-    return Axis(column, float(np.hypot(sigma, SAMPLING_ERROR)), said)
+    method = f"rays measured from both ends, {len(pairs)} row" + "s" * (len(pairs) > 1)
+    return Axis(column, float(np.hypot(sigma, SAMPLING_ERROR)), method)
 
 
 def cone_axis_offset(axis: Axis, beam: ConeBeam) -> float:
@@ -135,7 +135,7 @@ def _pair_rows(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> MirroredRo
     alpha, cols = _fan_angles(beam), beam.detector[1]
     turn = _ViewSpline.of(interpolate_gaps(y[:, None], weights[:, None])[:, 0], weights, beam.angles)
     phi = np.pi * np.arange(turn.directions) / turn.directions
-    # An edge at the widest ray moves by so many columns from one view to the next.
+    # Movement of an edge at the widest ray between neighbouring views [columns].
     step = np.ptp(alpha) / 2 * (np.pi / turn.directions) * beam.source_to_detector / beam.pitch[1]
     width = max(1.0, step)
     sides = [_smooth(*turn.at(phi[:, None] + alpha + half), width) for half in (0.0, np.pi)]
@@ -221,11 +221,11 @@ def _nearest_column(pair: MirroredRows, beam: ConeBeam, alpha: np.ndarray) -> fl
         columns = _mirrored_columns(beam, alpha, column)
         w = _pair_weights(thinned, columns)
         there = -rising(np.clip(columns, 0, len(alpha) - 1))[some]
-        ours, theirs = np.sum(w * here**2), np.sum(w * there**2)
-        if 2 * min(ours, theirs) <= MIN_OVERLAP * energy:
+        here_energy, there_energy = np.sum(w * here**2), np.sum(w * there**2)
+        if 2 * min(here_energy, there_energy) <= MIN_OVERLAP * energy:
             continue
-        alike = np.sum(w * here * there) / np.sqrt(ours * theirs)
-        best, found = max((best, found), (alike, float(column)))
+        correlation = np.sum(w * here * there) / np.sqrt(here_energy * there_energy)
+        best, found = max((best, found), (correlation, float(column)))
     if best < MIN_CORRELATION:
         raise MivolError("found no lines of a structure that both of their ends show, expected some: check the angles.")
     return found

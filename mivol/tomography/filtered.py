@@ -99,7 +99,7 @@ def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutof
     weights = _circle_weights(projector)
     beam, grid, scale = projector.geometry, projector.grid, _scale_to_axis(projector.geometry)
     distance, tau = beam.source_to_axis, beam.axis_offset
-    # From the central ray, on a detector that is scaled down to the axis.
+    # Positions from the central ray, on the detector scaled to the axis.
     p, q = (beam.u + tau) * scale, beam.v * scale
     cosine = (distance**2 + tau * p) / (distance * np.sqrt(distance**2 + p**2 + q[:, None] ** 2))
     weighted, matrices = _pad_detector(y * weights[:, None] * cosine, pixel_matrices(beam, grid, projector.views), p)
@@ -271,7 +271,7 @@ def _read_view(
     parts = []
     for place, count in ((row, size[0]), (column, size[1])):
         last = mi.Float(count - 1)
-        # A pixel is as wide as its pitch: half of it lies beyond the outermost centres.
+        # A pixel is as wide as its pitch: half of the pixel lies beyond the outermost centres.
         seen &= (place > -0.5) & (place < last + 0.5)
         inside = dr.clip(place, 0, last)
         lower = mi.UInt32(inside)

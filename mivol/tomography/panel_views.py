@@ -128,7 +128,7 @@ def panels_from_matrices(
         raise MivolError(f"found projection matrices of shape {p.shape}, expected (views, 3, 4), one for each view.")
     _check_views(~np.isfinite(p).all((1, 2)), "numbers that are not finite", "finite ones: complete the matrix")
     m = p[:, :, :3]
-    # Rows have units of their own (pixels, pixels, 1), and whole matrices any factor: neither says how near to singular one is.
+    # Rows have different units (pixels, pixels, 1), and matrices arbitrary factors: normalise before judging singularity.
     lengths = np.linalg.norm(m, axis=2, keepdims=True)
     values = np.linalg.svd(m / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
     _check_views(

@@ -281,7 +281,7 @@ def fit_light_drift(residual: np.ndarray, weights: np.ndarray, times: np.ndarray
     w0, w1, w2 = weights.sum(0), (weights * t).sum(0), (weights * t * t).sum(0)
     r0, r1 = (weights * residual).sum(0), (weights * residual * t).sum(0)
     det = w0 * w2 - w1 * w1
-    # Equal times leave det at the rounding of its terms: no slope can be told then.
+    # For equal times det is rounding of its terms: the slope is undetermined.
     known = det > 1e-9 * w0 * w2
     det = np.where(known, det, 1.0)
     offset, slope = (w2 * r0 - w1 * r1) / det, (w0 * r1 - w1 * r0) / det

@@ -373,8 +373,8 @@ def _to_flat(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarr
     try:
         a = np.asarray(a)
     except ValueError:
-        said = f"Found rows of different lengths, expected {shape} or flat, one number for each of the {what}."
-        raise MivolError(said) from None
+        message = f"Found rows of different lengths, expected {shape} or flat, one number for each of the {what}."
+        raise MivolError(message) from None
     flat = a.shape == (int(np.prod(shape)),)
     if not flat and a.shape != shape:
         raise MivolError(f"Found an array of shape {a.shape}, expected {shape} or flat, one number for each of the {what}.")

@@ -44,7 +44,7 @@ class RecordedKernels:
         self._record()
 
     def _record(self) -> None:
-        # A buffer with a copy for each thread is part of the recording of the transpose.
+        # The recording of the transpose includes a buffer with a copy per thread.
         self._threads = dr.thread_count()
         self._integrate, self._backproject = dr.freeze(self._trace_integral), dr.freeze(self._trace_backprojection)
         self._pad = dr.freeze(lambda values: pad_nodes(values, ColumnGrid(self.grid.shape, 2)))

@@ -82,7 +82,7 @@ def parker_weights(beta: np.ndarray, gamma: np.ndarray, excess: float) -> np.nda
         excess: half of the scan's range beyond half a turn [rad]; at least the largest gamma that sees the object.
     """
     b = beta[:, None]
-    # Parker counts gamma the other way round: his ray (beta, gamma) is the line of (beta + pi + 2 gamma, -gamma).
+    # Parker's gamma has the opposite sign: his ray (beta, gamma) is the line of (beta + pi + 2 gamma, -gamma).
     g = np.clip(-gamma, -excess, excess)[None, :]
     rise, fall = 2 * (excess - g), 2 * (excess + g)
     tiny = np.finfo(float).tiny

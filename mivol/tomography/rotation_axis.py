@@ -110,16 +110,16 @@ def axis_from_reconstructions(y: np.ndarray, weights: np.ndarray, angles: np.nda
     middle = slice((y.shape[1] - 1) // 2, y.shape[1] // 2 + 1)
     y, weights = y[:, middle], weights[:, middle]
     halves = (slice(0, None, 2), slice(1, None, 2))
-    found = []
-    for known, asked in (halves, halves[::-1]):
+    estimates = []
+    for known_part, hidden_part in (halves, halves[::-1]):
 
-        def misfit(column: float, known: slice = known, asked: slice = asked) -> float:
-            return _held_out_misfit(y, weights, angles, column, known, asked)
+        def misfit(column: float, known_part: slice = known_part, hidden_part: slice = hidden_part) -> float:
+            return _held_out_misfit(y, weights, angles, column, known_part, hidden_part)
 
-        n = int((weights[asked] > 0).sum())
+        n = int((weights[hidden_part] > 0).sum())
         coarse, _ = _parabola_minimum(misfit, start, width, n)
-        found.append(_parabola_minimum(misfit, coarse, width / 4, n))
-    (a, sigma_a), (b, sigma_b) = found
+        estimates.append(_parabola_minimum(misfit, coarse, width / 4, n))
+    (a, sigma_a), (b, sigma_b) = estimates
     sigma = max(abs(a - b) / 2, float(np.hypot(sigma_a, sigma_b)) / 2)
     return Axis((a + b) / 2, sigma, "one half of the views predicted from the other")
 
@@ -179,15 +179,16 @@ def _fit_first_coefficient(design: np.ndarray, values: np.ndarray) -> tuple[floa
 
 
 def _held_out_misfit(
-    y: np.ndarray, weights: np.ndarray, angles: np.ndarray, column: float, known: slice, asked: slice
+    y: np.ndarray, weights: np.ndarray, angles: np.ndarray, column: float, known_part: slice, hidden_part: slice
 ) -> float:
     rows, cols = y.shape[1:]
     n = 2 * _object_radius(y, column) + 1
     grid, offset = VoxelGrid((rows, n, n)), Axis(column, 0.0, "trial").offset(cols)
-    seen, hidden = (Projector(ParallelBeam(angles[part], (rows, cols), axis_offset=offset), grid) for part in (known, asked))
-    predicted = hidden @ filtered_backprojection(seen, y[known])
-    w, target = weights[asked], y[asked]
-    # Filtered back-projection of few views loses a little of its scale: one factor is fitted.
+    beams = (ParallelBeam(angles[part], (rows, cols), axis_offset=offset) for part in (known_part, hidden_part))
+    known, hidden = (Projector(beam, grid) for beam in beams)
+    predicted = hidden @ filtered_backprojection(known, y[known_part])
+    w, target = weights[hidden_part], y[hidden_part]
+    # Filtered back-projection of few views loses some scale: fit a factor.
     scale = np.sum(w * predicted * target) / np.sum(w * predicted**2)
     return float(np.sum(w * (target - scale * predicted) ** 2) / np.sum(w > 0))
 
@@ -207,5 +208,5 @@ def _parabola_minimum(f: Callable[[float], float], centre: float, width: float, 
             f"Found no least misfit between columns {centre - width:.1f} and {centre + width:.1f}, expected one: start "
             "nearer, or search wider."
         )
-    # n a (offset / sigma)^2 rises by the residual's own mean square at one standard deviation.
+    # At a standard deviation from the minimum, n a (offset / sigma)^2 rises by the mean square of the residual.
     return centre - width * b / (2 * a), width * float(np.sqrt((c - b * b / (4 * a)) / (n * a)))

@@ -58,7 +58,7 @@ class StoredProjector(Projector):
     def __init__(self, walk: Projector, blocks: Blocks, to_rows: scipy.sparse.csr_array | None) -> None:
         super().__init__(walk.geometry, walk.grid, walk.views, walk._kernels)
         self._blocks, self._to_rows = blocks, to_rows
-        # Made once: a transpose copies nothing, but takes as long to make as a view takes to multiply.
+        # Transposes copy nothing, but making a transpose takes as long as multiplying a view: make them once.
         self._transposed = [block.T for block in blocks]
 
     @property
@@ -242,7 +242,7 @@ def _clip_lines(heights: np.ndarray, q: np.ndarray, e: np.ndarray, shape: tuple[
     safe = np.where(level, 1.0, slope)
     ends = np.sort([(-0.5 - offset) / safe, (n1 - 0.5 - offset) / safe], axis=0)
     low, high = (np.where(level, old, new) for old, new in ((low, np.maximum(low, ends[0])), (high, np.minimum(high, ends[1]))))
-    # In the plane of a face a line counts as outside, as in the walk.
+    # A line in the plane of a face counts as outside, as in the walk.
     missed = (high <= low) | (level & ((offset <= -0.5) | (offset >= n1 - 0.5)))
     low, high = (np.where(missed, 0.0, end) for end in (low, high))
     return Lines(heights, slope, offset, 1 / np.abs(e0), low, high, along_x, shape)
@@ -288,13 +288,13 @@ def _integrate_entries(
     """Places and integrals, ``VOXELS_PER_ROW`` for each line and row of voxels; unused places hold 0."""
     n_y, n_x = (dr.opaque(mi.UInt32, n) for n in shape)
     pair = dr.arange(mi.UInt32, dr.width(along_x) * steps)
-    # Exact: pairs are fewer than 2^32, half a step from the next whole number. Processors divide whole numbers one by one.
+    # Exact: pairs are fewer than 2^32, half a step from the next whole number. Processors have no vector division of integers.
     which = mi.UInt32((mi.Float64(pair) + 0.5) * dr.opaque(mi.Float64, 1 / steps))
     row = pair - which * dr.opaque(mi.UInt32, steps)
     slope, offset, length, low, high = (dr.gather(mi.Float64, line[name], which) for name in line)
     major_x = dr.gather(mi.Bool, along_x, which)
     n0, n1 = dr.select(major_x, n_x, n_y), dr.select(major_x, n_y, n_x)
-    # From here on x and the other coordinate are measured from the row and from a voxel near the line: no digits are lost.
+    # Measure x from the row and the other coordinate from a voxel near the line, so that no digits are lost.
     i = mi.Float64(row)
     middle = dr.fma(slope, i, offset)
     origin = dr.floor(middle)
@@ -306,7 +306,7 @@ def _integrate_entries(
     def across(x: mi.Float) -> mi.Float:
         return dr.fma(slope, x, fraction)
 
-    # The hat of the row reaches one voxel to either side, and half a voxel beyond the outermost centres.
+    # The hat of the row reaches a voxel to either side, and half a voxel beyond the outermost centres.
     begin = dr.maximum(low, dr.select(row == 0, -0.5, -1))
     end = dr.minimum(high, dr.select(row + 1 == n0, 0.5, 1))
     first = dr.floor(dr.clip(dr.minimum(across(begin), across(end)), nearest, last))
@@ -321,8 +321,8 @@ def _integrate_entries(
     inverse = 1 / dr.select(slope == 0, 1, slope)
     for a, b in ((begin, dr.minimum(end, 0)), (dr.maximum(begin, 0), end)):
         b = dr.maximum(a, b)
-        # On this side of the row the line crosses one line of centres at most. Between kinks it lies between two voxels of the
-        # row, and the product of the hats is a square of x, which Simpson's rule integrates exactly.
+        # On this side of the row the line crosses at most a single line of centres. Between kinks the line lies between two
+        # voxels of the row, and the product of the hats is quadratic in x, which Simpson's rule integrates exactly.
         kink = (dr.floor(dr.maximum(across(a), across(b))) - fraction) * inverse
         kink = dr.select(slope == 0, b, dr.clip(kink, a, b))
         for c, d in ((a, kink), (kink, b)):
@@ -339,7 +339,7 @@ def _integrate_entries(
     base = row * step0 + mi.UInt32(mi.Int32(origin) + mi.Int32(first)) * step1
     active = (row < n0) & (end > begin)
     at, entries = dr.empty(mi.Int32, VOXELS_PER_ROW * dr.width(pair)), dr.empty(mi.Float, VOXELS_PER_ROW * dr.width(pair))
-    # Four neighbours at once: single numbers would take thrice the time of all that goes before.
+    # Scatter four neighbours at once: single scatters would take three times as long as all earlier work.
     kept = [dr.select(active & (t > MIN_ENTRY), t * mi.Float(length), 0) for t in total]
     dr.scatter(at, mi.Vector4i([mi.Int32(base + j * step1) for j in range(VOXELS_PER_ROW)]), pair)
     dr.scatter(entries, mi.Vector4f(kept), pair)

@@ -132,7 +132,7 @@ def quantise(image: np.ndarray, space: str = "srgb") -> np.ndarray:
     if values.ndim != 3 or values.shape[2] != 3 or values.size == 0:
         raise MivolError(f"an image of shape {values.shape} cannot be judged; give (height, width, 3).")
     if (space, "srgb") not in CONVERSIONS:
-        raise MivolError(f'the values of an image are "srgb" or "linear", found "{space}"; choose one of those.')
+        raise MivolError(f'the values of an image are "srgb" or "linear", found "{space}": choose one of both.')
     if np.isnan(values).any():
         row, column = (int(i) for i in np.argwhere(np.isnan(values))[0][:2])
         raise MivolError(f"an image holds NaN at row {row}, column {column}; find its cause.")
@@ -166,15 +166,15 @@ def score_image(
         raise MivolError(f'there is no metric "{unknown}"; choose among {", ".join(METRICS)}.')
     if np.shape(image) != np.shape(truth):
         raise MivolError(f"{name} has shape {np.shape(image)} and its photograph {np.shape(truth)}; render it at that size.")
-    shown, wanted = quantise(image, space), quantise(truth, space)
+    render, photograph = quantise(image, space), quantise(truth, space)
     if mask is None:
-        return ImageScore(name, {metric: METRICS[metric].measure(shown, wanted) for metric in metrics})
-    if np.shape(mask) != shown.shape[:2] or not np.any(mask):
-        raise MivolError(f"the mask of {name} has shape {np.shape(mask)} or leaves no pixel; give one of {shown.shape[:2]}.")
-    filled = np.where(np.asarray(mask, bool)[..., None], shown, wanted)
-    # The error of the pixels that are left out is 0; PSNR is that of the others.
-    counted = -10 * np.log10(np.size(mask) / np.count_nonzero(mask))
-    return ImageScore(name, {m: METRICS[m].measure(filled, wanted) + counted * (m == "psnr") for m in metrics})
+        return ImageScore(name, {metric: METRICS[metric].measure(render, photograph) for metric in metrics})
+    if np.shape(mask) != render.shape[:2] or not np.any(mask):
+        raise MivolError(f"the mask of {name} has shape {np.shape(mask)} or leaves no pixel; give one of {render.shape[:2]}.")
+    filled = np.where(np.asarray(mask, bool)[..., None], render, photograph)
+    # Pixels outside the mask have an error of 0; the offset removes them from the PSNR.
+    offset = -10 * np.log10(np.size(mask) / np.count_nonzero(mask))
+    return ImageScore(name, {m: METRICS[m].measure(filled, photograph) + offset * (m == "psnr") for m in metrics})
 
 
 def fit_colours(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
@@ -187,12 +187,12 @@ def fit_colours(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = 
         image, truth: (H, W, 3).
         mask: (H, W) bool, False for pixels that do not count.
     """
-    counts = np.ones(np.shape(truth)[:2], bool) if mask is None else np.asarray(mask, bool)
+    used = np.ones(np.shape(truth)[:2], bool) if mask is None else np.asarray(mask, bool)
     fitted = np.empty(np.shape(image))
     for channel in range(3):
         values = np.clip(image[..., channel], 0, 1).astype(np.float64)
-        terms = np.stack([values[counts], np.ones(np.count_nonzero(counts))], axis=1)
-        a, b = np.linalg.lstsq(terms, np.asarray(truth, np.float64)[..., channel][counts], rcond=None)[0]
+        terms = np.stack([values[used], np.ones(np.count_nonzero(used))], axis=1)
+        a, b = np.linalg.lstsq(terms, np.asarray(truth, np.float64)[..., channel][used], rcond=None)[0]
         fitted[..., channel] = a * values + b
     return fitted
 
@@ -203,7 +203,7 @@ def average_scores(images: Iterable[ImageScore]) -> MeanScore:
     Raises:
         MivolError: an empty set.
     """
-    found = tuple(images)
-    if not found:
+    scores = tuple(images)
+    if not scores:
         raise MivolError("there is no image to judge; hold some out.")
-    return MeanScore(found)
+    return MeanScore(scores)

@@ -52,7 +52,7 @@ class Moments:
 
     @staticmethod
     def of(values: np.ndarray) -> Moments:
-        """Moments of all values along the first axis."""
+        """Moments of values along the first axis."""
         v = np.asarray(values, dtype=np.float64)
         mean = v.mean(axis=0)
         return Moments(len(v), mean, ((v - mean) ** 2).sum(axis=0))

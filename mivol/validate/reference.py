@@ -42,16 +42,16 @@ from mivol.validate.trust import Doubt, find_doubts
 
 __all__ = ["INTEGRATORS", "render_reference", "RgbExtinction", "find_rgb_extinctions", "use_channel"]
 
-# Who may judge: Mitsuba's forward integrators for media.
+# Mitsuba's forward integrators for media.
 INTEGRATORS = ("volpath", "volpathmis")
 
-# Fewer batches say too little of their variance: with 32 a standard error is known to 1/sqrt(2 * 31) = 13 %.
+# With 32 batches a standard error is known to 1/sqrt(2 * 31) = 13 %; fewer batches estimate the variance too poorly.
 MIN_BATCHES = 32
 
-# Paths in one render, by backend: below a second or so on two cores, so that Ctrl-C acts soon, and enough to fill a GPU.
+# Paths per render, by backend: about a second on two cores, so that Ctrl-C acts soon, and enough to fill a GPU.
 PATHS_PER_PASS = {"llvm": 2**18, "cuda": 2**22}
 
-# Bytes a pixel that are kept beside a batch: mean and squares of three channels in float64, and what a batch makes of them.
+# Memory per pixel besides a batch [byte]: mean and squares of three channels in float64, and temporary copies.
 BATCH_BYTES = (2 + 3) * 3 * 8
 
 SECONDS_BETWEEN_CHECKPOINTS = 20.0
@@ -323,7 +323,7 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_BatchRun], None]]:
                 return
             error = float(np.sqrt(run.moments.variance_of_mean.mean()))
             reached = relative_error(error, run.moments.mean) if goal.relative else error
-            # The error falls as 1/sqrt(n): batches still to come follow from the error now.
+            # The error falls as 1/sqrt(n), which predicts the total number of batches.
             most = goal.max_spp / run.pass_spp
             needed = run.moments.n * (reached / goal.target_se) ** 2 if goal.target_se else most
             total = int(np.ceil(max(MIN_BATCHES, min(most, needed))))

@@ -114,8 +114,8 @@ def _sidak(alpha: float, m: int) -> float:
     return float(-np.expm1(np.log1p(-alpha) / m))
 
 
-# Significance of one of m comparisons so that the family raises a false alarm with chance alpha. Sidak is exact for independent
-# comparisons (and safe for any jointly normal ones, two-sided); Bonferroni is safe for all.
+# Significance of each of m comparisons for a chance alpha of a false alarm in the family. Sidak is exact for independent
+# comparisons (and safe for jointly normal comparisons, two-sided); Bonferroni is always safe.
 FAMILIES: dict[str, Callable[[float, int], float]] = {
     "sidak": _sidak,
     "bonferroni": lambda alpha, m: alpha / m,

@@ -30,7 +30,7 @@ __all__ = [
     "read_medium_shape",
 ]
 
-# exp(-x) is 0 in float32 (denormals flushed) from 87.3: the density of passing untouched, by which Mitsuba divides.
+# exp(-x) is 0 in float32 (denormals flushed) from x = 87.3. Mitsuba divides by this probability of passing without a collision.
 MAX_OPTICAL_DEPTH = 87.0
 
 # Mean cosine of `hg` samples, measured: -0.41 at g = 1e-7, -0.029 at 1e-6; the error falls as 1/g.
@@ -43,7 +43,7 @@ NEAR_EMITTER = 0.1
 TOUCH_POINTS = 512
 """Surface points tested for another boundary."""
 
-# The smallest share of the light that is worth a word: below the noise of most references.
+# Smallest reported loss, as a share of the light: below the noise of most references.
 MIN_SKIN_LOSS = 2e-3
 
 
@@ -270,14 +270,14 @@ class MediumShape:
 
     Attributes:
         name: name of the shape.
-        points: (N, 3) world points whose hull holds the shape: mesh vertices, else the corners of its box.
-        faces: (M, 3) indices of a mesh, else None.
-        to_world: (4, 4) of a shape without mesh, else None.
-        to_local: (4, 4) world to the unit cube of the volume under a stock ``heterogeneous``, else None.
-        to_local_inverse: (4, 4) transpose of Mitsuba's inverse of a stock volume's transform, else None.
-        volume: class of the volume under a stock ``heterogeneous``, else "".
+        points: (N, 3) world points whose hull holds the shape: mesh vertices, or the corners of its box.
+        faces: (M, 3) indices of a mesh; None without a mesh.
+        to_world: (4, 4) of a shape without mesh; None for a mesh.
+        to_local: (4, 4) world to the unit cube of the volume under a stock ``heterogeneous``; None under other media.
+        to_local_inverse: (4, 4) transpose of Mitsuba's inverse of a stock volume's transform; None under other media.
+        volume: class of the volume under a stock ``heterogeneous``; empty under other media.
         grids: (4, 4) world to the unit cube of each stock grid of the extinction.
-        surface: (POINTS, 3) points on a mesh or a ball, else on the box.
+        surface: (POINTS, 3) points on a mesh, on a ball, or on the box of another shape.
         majorant: largest extinction [1/length].
         skin: largest optical depth along the normal that Mitsuba skips at the entry of a ray.
         params: parameters of the medium.
@@ -312,7 +312,9 @@ class MediumShape:
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     def holds(self, p: np.ndarray) -> bool:
-        """Whether a point is inside: by crossings of a ray for a mesh, by the unit ball for a sphere, else by the box."""
+        """Whether a point is inside: by crossings of a ray for a mesh, by the unit ball for a sphere, by the box for other
+        shapes.
+        """
         if self.faces is not None:
             return _crossings(p, self.points[self.faces]) % 2 == 1
         return bool(np.all(p > self.points.min(axis=0)) and np.all(p < self.points.max(axis=0))) and self._in_ball(p)
@@ -354,7 +356,7 @@ def read_medium_shape(shape: mi.Shape) -> MediumShape:
 
 
 def _surface(points: np.ndarray, faces: np.ndarray | None, to_world: np.ndarray | None) -> np.ndarray:
-    """Points (N, 3) of a boundary: on a mesh or a ball, else the corners of the box."""
+    """Points (N, 3) of a boundary: on a mesh, on a ball, or the corners of the box of another shape."""
     rng = np.random.default_rng(0)
     if faces is not None:
         share = rng.dirichlet((1, 1, 1), POINTS)

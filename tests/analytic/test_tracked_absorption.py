@@ -221,4 +221,4 @@ def test_a_plan_is_explained_where_no_optical_depth_is_known() -> None:
     """The plan tells the error of single scattering by the optical depth, for media with a known optical depth."""
     text = explain(scene([0, -4, 0], [0, 0, 0], fog=shape("cube", {**fog(), "albedo": 0.5})), max_depth=2)
     assert "a bounded Ball" in text
-    assert "one scattering leaves out" not in text
+    assert "max_depth 2 leaves out" not in text

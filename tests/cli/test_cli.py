@@ -121,7 +121,7 @@ def test_explain_asks_about_another_depth(variant_rgb, folder: Path, capsys: pyt
     assert run("explain", scene) == 0
     assert "free flights" in capsys.readouterr().out
     assert run("explain", scene, "--max-depth", 2) == 0
-    assert "one scattering leaves out" in capsys.readouterr().out
+    assert "max_depth 2 leaves out" in capsys.readouterr().out
 
 
 def test_reference_is_rendered_and_said(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:

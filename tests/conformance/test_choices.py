@@ -33,7 +33,7 @@ def needs(*media: MediumFacts, emitters: tuple[str, ...] = ("delta",), **more: o
         (
             (fog(),),
             LIT,
-            "exact optical depth; one scattering at a distance drawn in proportion to the light it takes, exact",
+            "exact optical depth; one scattering at a distance sampled in proportion to the scattered light, exact",
             "max_depth is 2",
         ),
         (
@@ -42,7 +42,7 @@ def needs(*media: MediumFacts, emitters: tuple[str, ...] = ("delta",), **more: o
             "by quadrature, a light grid for shadows",
             "above 0",
         ),
-        ((fog(),), Settings(max_depth=1), "exact optical depth; no phase function", "max_depth 1 sees no scattered light"),
+        ((fog(),), Settings(max_depth=1), "exact optical depth; no phase function", "max_depth 1 includes no scattered light"),
         ((fog(is_scattering=False),), LIT, "exact optical depth; no phase function", "albedo 0"),
         ((fog(is_scattering=False, unread=True),), LIT, "no albedo look-up", "values cannot be read while dr.freeze records"),
         (
@@ -70,34 +70,38 @@ def test_light_is_scattered_from_depth_2_on(depth: int, lit: bool) -> None:
     ("emitters", "media", "found"),
     [
         ((), (fog(),), [("directions", "none")]),
-        (("uniform",), (fog(),), [("directions", "one, of the phase function")]),
+        (("uniform",), (fog(),), [("directions", "one sample of the phase function")]),
         (
             ("delta", "delta"),
             (fog(),),
             [("directions", "one, to one of 2 emitters"), ("where to scatter", "weighed by optical depth")],
         ),
-        (("area",), (fog(),), [("directions", "two: to an emitter, and of the phase function")]),
+        (("area",), (fog(),), [("directions", "two: an emitter sample and a phase function sample")]),
         (("delta", "uniform"), (fog(),), [("directions", "two:"), ("where to scatter", "weighed by optical depth towards")]),
-        (("delta",), (fog(), fog("b")), [("directions", "one, to one of 1"), ("where to scatter", "by the camera's own ray")]),
+        (
+            ("delta",),
+            (fog(), fog("b")),
+            [("directions", "one, to one of 1"), ("where to scatter", "along the camera ray only")],
+        ),
         (
             ("delta",),
             (fog(resolutions=()),),
-            [("directions", "one, to one of 1"), ("where to scatter", "by the camera's own ray")],
+            [("directions", "one, to one of 1"), ("where to scatter", "along the camera ray only")],
         ),
     ],
 )
 def test_lighting(emitters: tuple, media: tuple, found: list) -> None:
     chosen = choices.choose_lighting(needs(*media, emitters=emitters), LIT, ONCE)
     assert len(chosen) == len(found)
-    assert all(c.about == about and c.choice.startswith(choice) for c, (about, choice) in zip(chosen, found, strict=True))
+    assert all(c.subject == about and c.choice.startswith(choice) for c, (about, choice) in zip(chosen, found, strict=True))
 
 
 def test_lighting_of_sealed_media():
     found = lambda kinds, **more: choices.choose_lighting(needs(fog(), emitters=kinds, **more), LIT, FLIGHTS)  # noqa: E731
     (same,), (drawn,), (met,) = found(("uniform",)), found(("area",)), found(("area",), is_sealed=True)
-    assert same.choice == met.choice == "one, of the phase function"
+    assert same.choice == met.choice == "one sample of the phase function"
     assert same.reason != met.reason and "refract" in met.reason
-    assert drawn.choice.startswith("to an emitter from each collision")
+    assert drawn.choice.startswith("an emitter sample at each collision")
 
 
 def test_lighting_by_quadrature_and_without_light():
@@ -138,7 +142,7 @@ def test_shadows_are_no_question_without_a_grid_or_light():
 def test_points_that_scatter(occupied: float, emitters: tuple, count: int) -> None:
     medium = fog(occupied=occupied)
     found, (choice,) = choices.choose_scattering_points(needs(medium, emitters=emitters), LIT, ONCE)
-    assert found == count and choice.choice == f"{count} of a camera ray" and f"{occupied:.0%} of the blocks" in choice.reason
+    assert found == count and choice.choice == f"{count} per camera ray" and f"{occupied:.0%} of the blocks" in choice.reason
 
 
 def test_one_point_scatters_where_there_is_more_than_one_grid():
@@ -159,7 +163,7 @@ def test_channels_emission_skipping_and_tracing():
     assert [choices.choose_skipping(grey, skip).choice for skip in (True, False)] == ["skipped", "walked"]
     scene = needs(grey, rgb)
     scene.boundaries = (SimpleNamespace(box=1), SimpleNamespace(box=None))
-    assert choices.choose_tracing(scene).reason == "not a box, or not alone in its place: smoke"
+    assert choices.choose_tracing(scene).reason == "not a box, or overlapping another boundary: smoke"
     scene.boundaries = (SimpleNamespace(box=1), SimpleNamespace(box=1))
     assert choices.choose_tracing(scene).choice == "not traced"
     scene.surfaces = ("Sphere", "Rectangle", "Sphere")
@@ -171,7 +175,7 @@ def test_channels_emission_skipping_and_tracing():
     [
         ((fog(),), (), 4, "at most 3 scatterings", "an albedo is above 0 and max_depth is 4"),
         ((fog(),), (), -1, "any number of scatterings", "an albedo is above 0 and max_depth is -1"),
-        ((fog(emits=True),), (), 2, "at most 1 scatterings", "fog emits beside scattering"),
+        ((fog(emits=True),), (), 2, "at most 1 scatterings", "fog emits and scatters"),
         ((fog(bounded="Ball"), fog("b")), ("glass",), 2, "free flights", "fog is bounded; glass refracts"),
     ],
 )
@@ -182,8 +186,8 @@ def test_free_flights(media: tuple, refractive: tuple, depth: int, what: str, wh
 
 def test_lighting_of_free_flights():
     for emitters, directions in (
-        (("uniform",), "one, of the phase function"),
-        (("delta", "uniform"), "to an emitter from each"),
+        (("uniform",), "one sample of the phase function"),
+        (("delta", "uniform"), "an emitter sample at each"),
     ):
         (found,) = choices.choose_lighting(needs(fog(), emitters=emitters), LIT, FLIGHTS)
         assert found.choice.startswith(directions)
@@ -194,7 +198,7 @@ def test_lighting_of_free_flights():
     [
         (fog(bounded="Ball"), "delta tracking"),
         (fog(resolutions=()), "exact"),
-        (fog(extinction="rgb"), "exact, by one channel each"),
+        (fog(extinction="rgb"), "exact, with one sampled channel per flight"),
         (fog(unread=True), "delta tracking"),
         (fog(), "delta tracking"),
     ],

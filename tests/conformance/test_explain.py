@@ -28,7 +28,7 @@ def test_a_number_in_a_box_is_homogeneous():
     assert found["medium"].startswith("fog: HomogeneousMedium in a box")
     assert ", grey extinction, homogeneous, albedo 0, IsotropicPhaseFunction, optical depth at most 1.73" in found["medium"]
     assert (found["surfaces"], found["emitters"]) == ("none", "none")
-    assert found["camera"] == "in no traced boundary" and found["variant"].startswith(mi.variant())
+    assert found["camera"] == "outside all traced boundaries" and found["variant"].startswith(mi.variant())
 
 
 def test_a_grid_says_its_voxels_and_a_bounded_field_its_name():
@@ -53,5 +53,5 @@ def test_what_one_scattering_leaves_out(value: float, doubtful: bool) -> None:
     scene = mi.load_dict({"type": "scene", **parts, "sensor": camera([0, -9, 0], [0, 0, 0])})
     text = explain(scene, max_depth=2)
     assert "of the light that fog scatters (albedo 0.90, optical depth" in text and "constant light, isotropic phase)" in text
-    assert ("depth 2 is a poor model of it" in text) == doubtful
+    assert ("depth 2 is a poor model of this medium" in text) == doubtful
     assert "one scattering" not in explain(scene, max_depth=1)

@@ -261,9 +261,9 @@ def test_a_plan_says_what_is_done_with_them() -> None:
     text = explain(scene(volume(cloud(5)), 0.5, POINT), max_depth=2)
     assert "grey extinction, 5 Gaussians, scatters" in text
     assert "cloud is made of Gaussians" in text
-    assert "exact, one in each Gaussian that a ray meets" in text
+    assert "exact, one flight in each Gaussian along a ray" in text
     # (albedo 0.50, optical depth ...): the mean over lines through the cube.
-    assert "one scattering leaves out" in text
+    assert "max_depth 2 leaves out" in text
 
 
 def test_what_needs_the_cells_of_a_grid_is_refused_by_name() -> None:
@@ -277,7 +277,7 @@ def test_the_derivative_by_the_place_of_a_lamp_is_refused() -> None:
     params, integrator = mi.traverse(found), mi.load_dict({"type": "mivol", "max_depth": 2})
     dr.enable_grad(params["light.position"])
     params.update()
-    with pytest.raises(MivolError, match=r"the derivative of light.position was asked for: take finite differences"):
+    with pytest.raises(MivolError, match=r"the derivative of light.position was requested: use finite differences"):
         integrator.render_backward(found, params, mi.TensorXf(np.ones((SIDE, SIDE, 3), np.float32)), spp=1)
 
 

@@ -186,8 +186,8 @@ def test_a_render_asks_the_preview() -> None:
 
 def test_explain_says_how_light_of_media_is_found() -> None:
     said = " ".join(explain(seen("over a floor"), 2).split())
-    assert "light of media drawn by where they emit, and met by chance because draws reach an error" in said
-    assert "light of media met by chance because draws reach an error" in " ".join(explain(room(), 2).split())
+    assert "light of media sampled by emission, and met by chance because sampling reaches the same error" in said
+    assert "light of media met by chance because sampling reaches the same error" in " ".join(explain(room(), 2).split())
     assert "light of media" not in explain(seen("over a floor"), 1)
 
 
@@ -241,7 +241,7 @@ def test_what_cannot_be_drawn_is_refused_or_met() -> None:
     skip_recorded_grids_on_a_gpu()
     image = np.array(dr.freeze(_shoot)(scene, auto, mi.UInt32(3)))
     assert np.array_equal(image, np.array(_shoot(scene, by_chance, mi.UInt32(3))))
-    with refused("media_light is 'drawn', and where media emit cannot be read while dr.freeze records"):
+    with refused("media_light is 'drawn', and the emission cannot be read while dr.freeze records"):
         dr.freeze(_shoot)(scene, by_draws, mi.UInt32(1))
 
 

@@ -179,11 +179,11 @@ def test_explain_asks_the_scene_how_deep_its_paths_are(integrator, depth):
     if depth == 2:
         text = explain(scene)
         assert ("quadrature, a light grid" in text) == ("deterministic" in integrator)
-        assert "one scattering leaves out" in text
+        assert "max_depth 2 leaves out" in text
     else:
         text = explain(scene)
         assert "free flights from collision to collision" in text and f"max_depth is {depth}" in text
-    assert "one scattering leaves out" not in explain(scene, max_depth=1)
+    assert "max_depth 2 leaves out" not in explain(scene, max_depth=1)
 
 
 def test_scene_without_a_sensor():
@@ -221,7 +221,7 @@ def test_derivatives_of_places_are_refused(key):
     ask(scene)
     dr.enable_grad(params[key])
     params.update()
-    with refused(f"the derivative of {key} was asked for"):
+    with refused(f"the derivative of {key} was requested"):
         make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1))
 
 

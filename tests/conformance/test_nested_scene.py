@@ -175,7 +175,7 @@ def test_where_a_nested_field_cannot_stand(tmp_path: Path) -> None:
     lit = scene(field, tmp_path, lamp=lamp, floor=floor)
     params = mi.traverse(lit)
     dr.enable_grad(params["lamp.position"])
-    with refused("lamp.position was asked for and box .level 1. belongs to a nested field"):
+    with refused("lamp.position was requested and box .level 1. belongs to a nested field"):
         lit.integrator().render_backward(lit, params, dr.ones(mi.TensorXf, (8, 8, 3)), spp=1)
 
 

@@ -49,15 +49,15 @@ def test_memory_of_a_gradient_is_counted(monkeypatch: pytest.MonkeyPatch, extinc
     monkeypatch.setattr(plan, "available_memory", lambda: None)
     memory, choice = plan._plan_gradient_memory(needs(fog(small, extinction=extinction)))
     assert memory == packed + 8 * nodes * channels
-    assert choice.choice == f"{memory / 2**20:.1f} MiB beyond the rays (packed corners, one copy a thread)"
-    assert (choice.about, choice.reason) == ("gradient step", "parameters: none asked for yet")
+    assert choice.choice == f"{memory / 2**20:.1f} MiB besides the rays (packed corners, one copy per thread)"
+    assert (choice.subject, choice.reason) == ("gradient step", "parameters: none with gradients yet")
     elsewhere, _ = plan._plan_gradient_memory(needs(fog(small, extinction=extinction), variant="cuda_ad_rgb"))
     assert elsewhere == 8 * nodes * channels
     both, choice = plan._plan_gradient_memory(needs(fog(small, large, extinction=extinction), fog(), parameters=("a", "b")))
     assert both == memory + 8 * 2000**3 * channels
-    assert "(added to the nodes; packed corners, one copy a thread)" in choice.choice and choice.reason == "parameters: a, b"
+    assert "(added to the nodes; packed corners, one copy per thread)" in choice.choice and choice.reason == "parameters: a, b"
     nothing, choice = plan._plan_gradient_memory(needs(fog()))
-    assert nothing == 0 and choice.choice == "0.0 MiB beyond the rays (no grid)"
+    assert nothing == 0 and choice.choice == "0.0 MiB besides the rays (no grid)"
 
 
 def test_a_gradient_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,8 +115,8 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (made.segment, made.events, made.lobe) == ("single_scattering", 1, None)
     assert made.pass_rays == min(2**22, 2**29 // 1500)
     passes = math.ceil((2**24 + 1) / made.pass_rays)
-    said = {choice.about: choice.choice for choice in made.choices}
+    said = {choice.subject: choice.choice for choice in made.choices}
     assert said["passes"] == f"{passes} of at most {made.pass_rays} rays"
-    assert [c.choice for c in made.choices if c.about == "empty space in fog"] == ["skipped", "walked"]
-    assert [c.choice for c in made.choices if c.about == "shadows of fog"] == ["exact", "estimated"]
+    assert [c.choice for c in made.choices if c.subject == "empty space in fog"] == ["skipped", "walked"]
+    assert [c.choice for c in made.choices if c.subject == "shadows of fog"] == ["exact", "estimated"]
     assert made.gradient_bytes == plan._plan_gradient_memory(asked)[0]

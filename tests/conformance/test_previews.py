@@ -73,6 +73,6 @@ def test_what_is_left_out_is_what_renders_differ_by(variant_rgb: str) -> None:
 def test_explain_says_which_depth_is_enough(variant_rgb: str) -> None:
     scene = fog(SIGMA, ALBEDO)
     said = explain(scene, max_depth=2, noise=0.5)
-    assert "depth     2 is enough\n              because depth 2 leaves out" in said and "noise of 50.00% is asked for" in said
+    assert "depth     2 is enough\n              because depth 2 leaves out" in said and "noise of 50.00% is requested" in said
     assert "without a limit (-1) is enough" in explain(scene, max_depth=2, noise=1e-9)
     assert "is enough" not in explain(scene, max_depth=2) + explain(scene, max_depth=1, noise=0.5)

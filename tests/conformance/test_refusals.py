@@ -15,7 +15,7 @@ from scenes import grid_volume, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-MOVED = "the derivative of fog.vertex_positions was asked for"
+MOVED = "the derivative of fog.vertex_positions was requested"
 KEY, PLACE = "fog.interior_medium.sigma_t.value.value", "fog.vertex_positions"
 
 
@@ -48,9 +48,9 @@ def update() -> None:
 QUADRATURE = mivol(max_depth=6, deterministic=True)
 
 ROUTES = {
-    "render": (lambda: render(QUADRATURE), "quadrature is for one scattering"),
-    "nested": (lambda: render({"type": "moment", "inner": QUADRATURE}), "quadrature is for one scattering"),
-    "method": (lambda: mi.load_dict(QUADRATURE).render(foggy()), "quadrature is for one scattering"),
+    "render": (lambda: render(QUADRATURE), "quadrature is for a single scattering"),
+    "nested": (lambda: render({"type": "moment", "inner": QUADRATURE}), "quadrature is for a single scattering"),
+    "method": (lambda: mi.load_dict(QUADRATURE).render(foggy()), "quadrature is for a single scattering"),
     "backward": (lambda: carry(lambda image, _: dr.backward(dr.mean(image, axis=None))), MOVED),
     "forward": (lambda: carry(lambda image, _: dr.forward_to(image)), MOVED),
     "from a parameter": (lambda: carry(lambda _, variable: dr.forward(variable)), MOVED),

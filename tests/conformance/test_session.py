@@ -39,7 +39,7 @@ def test_a_film_is_counted_with_what_is_kept_beside_it(monkeypatch: pytest.Monke
     film = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 1024, "height": 1024}})
     monkeypatch.setattr("mivol.machine.available_memory", lambda: 36 << 20)
     check_film(film)
-    with refused("a film of 1024 x 1024 pixels takes"):
+    with refused("a film of 1024 x 1024 pixels needs"):
         check_film(film, 1)
 
 
@@ -48,15 +48,15 @@ def test_a_film_beyond_the_memory_is_refused() -> None:
     eye = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 100000, "height": 100000}})
     session, scene = mi.load_dict({"type": "mivol"}).session, mi.load_dict({"type": "scene", "sky": sky(0.5)})
     for render in (session.render, session.render_forward):
-        with refused("a film of 100000 x 100000 pixels takes"):
+        with refused("a film of 100000 x 100000 pixels needs"):
             render(scene, eye, 0, 1)
-    with refused("a film of 100000 x 100000 pixels takes"):
+    with refused("a film of 100000 x 100000 pixels needs"):
         session.render_backward(scene, mi.TensorXf(0.0), eye, 0, 1)
 
 
 def test_pictures_are_developed():
     scene = mi.load_dict({"type": "scene", "sensor": pencil((0, 0, 0), (0, 0, 1))})
-    with refused("develop=False was asked for"):
+    with refused("found develop=False"):
         mi.load_dict({"type": "mivol"}).render(scene, spp=1, develop=False)
 
 

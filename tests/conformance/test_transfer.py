@@ -78,7 +78,7 @@ def test_explain_says_what_a_grid_misses_of_its_table():
     ends = [(values.take(range(n - 1), a).ravel(), values.take(range(1, n), a).ravel()) for a, n in enumerate(values.shape)]
     low, high = (np.concatenate(side).astype(np.float64) for side in zip(*ends, strict=True))
     missed = looked_up(OPACITY, (low + high) / 2) - (looked_up(OPACITY, low) + looked_up(OPACITY, high)) / 2
-    told = re.findall(r"(\w+) of box departs from its table by (\S+) of", explain(view(values).scene))
+    told = re.findall(r"(\w+) of box differs from its table by (\S+) of", explain(view(values).scene))
     assert [name for name, _ in told] == ["sigma_t", "emission"]
     # Two digits are printed.
     assert float(told[0][1]) == pytest.approx(np.sqrt(np.mean(missed**2)) / OPACITY.max(), rel=0.06)
