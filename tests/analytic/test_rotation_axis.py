@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
 import numpy as np
 import pytest
+from false_alarms import assert_same_mean, assert_same_variance, fresh
 
 from mivol.errors import MivolError
+from mivol.files import write_volume
+from mivol.tomography import fan_axis
 from mivol.tomography import rotation_axis as axes
+from mivol.tomography.geometry import ConeBeam
+from mivol.tomography.phantoms import shepp_logan
+from mivol.validate.statistics import Estimate
 
 
 def test_the_offset_of_a_column() -> None:
@@ -157,3 +169,214 @@ def test_pairs_that_miss_half_a_turn_are_read_where_they_do_not(monkeypatch: pyt
         axes.axis_from_mirrors(flat, exact, 2)
     flat[2, 0, 0] = 0.9
     axes.axis_from_mirrors(flat, exact, 2)
+
+
+def beam_of(axis_offset: float, views: int = 60, columns: int = 48, arc: float = 360.0, **changes: object) -> ConeBeam:
+    """A head of half width 1, seen whole from 6 half widths away."""
+    angles = np.radians(arc) * np.arange(views) / views
+    return replace(ConeBeam(angles, (1, columns), 6.0, 9.0, 4.5 / columns, axis_offset), **changes)
+
+
+def light_of(beam: ConeBeam, parts: int = 3) -> np.ndarray:
+    """Transmission of the head, as pixels see it: the mean over parts of each column, no grid takes part."""
+    (rows, columns), (v, u) = beam.detector, beam.pitch
+    fine = replace(beam, detector=(rows, columns * parts), pitch=(v, u / parts))
+    light = np.exp(-2.0 * shepp_logan().project(fine))
+    return light.reshape(len(beam.angles), rows, columns, parts).mean(-1)
+
+
+def column_of(beam: ConeBeam) -> float:
+    """Where the axis was put: magnified, from the middle of the detector, which may be displaced."""
+    seen = beam.axis_offset * beam.source_to_detector / beam.source_to_axis - beam.detector_offset[1]
+    return seen / beam.pitch[1] + (beam.detector[1] - 1) / 2
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3])
+def test_a_line_is_seen_from_both_ends(shift: float) -> None:
+    """The ray of a column at theta, and that of its mirrored column at theta + pi + 2 epsilon - 2 alpha: one line, two ways."""
+    beam = beam_of(0.4, detector_offset=(0.0, shift))
+    alpha = np.arctan((np.arange(48) - 23.5) * beam.pitch[1] / 9.0 + shift / 9.0)
+    epsilon = np.arctan(0.4 / 6.0)
+    mirrored = fan_axis._mirrored_columns(beam, alpha, column_of(beam))
+    np.testing.assert_allclose(fan_axis._fan_angles(beam), alpha, rtol=1e-14)
+    for column in (0, 11, 30):
+        here = replace(beam, angles=np.array([0.7])).rays()
+        away = beam.pitch[1] * (mirrored[column] - 23.5)
+        theta = 0.7 + np.pi + 2 * epsilon - 2 * alpha[column]
+        there = replace(beam, angles=np.array([theta]), detector=(1, 1), detector_offset=(0.0, shift + away)).rays()
+        np.testing.assert_allclose(here[1][0, 0, column], -there[1][0, 0, 0], atol=1e-12)
+        across = np.cross(here[0][0, 0, column] - there[0][0, 0, 0], here[1][0, 0, column])
+        np.testing.assert_allclose(across, 0.0, atol=1e-12)
+
+
+SCANS = {
+    "as it should be": beam_of(0.0),
+    "a little beside": beam_of(0.07),
+    "far to the left": beam_of(-0.5),
+    "few views": beam_of(0.1, views=24),
+    "half a turn and more": beam_of(0.05, views=60, arc=225.0),
+    "the other way round": beam_of(0.05, angles=-np.radians(6.0) * np.arange(60)),
+    "twice around": beam_of(0.05, angles=np.radians(12.0) * np.arange(60)),
+    "a displaced detector": beam_of(0.02, columns=56, pitch=3.5 / 56, detector_offset=(0.0, 1.0), views=180),
+    "rows beside the plane": beam_of(0.07, detector=(6, 48), pitch=(0.02, 4.5 / 48), detector_offset=(0.025, 0.0)),
+}
+
+
+@pytest.mark.parametrize("case", SCANS)
+def test_the_axis_is_where_it_was_put(case: str) -> None:
+    """Without noise, to twice the standard deviation that is claimed, which is at most five times what sampling does to edges.
+
+    Of six rows, 0.02 high, those at -0.005 and 0.015 are nearer to the plane than 0.02 = 0.02 * 6 / (4 * 1.5).
+    """
+    beam = SCANS[case]
+    light = light_of(beam)
+    axis = fan_axis.axis_from_fans(-np.log(light), light, replace(beam, axis_offset=9.0))
+    assert abs(axis.column - column_of(beam)) < 2 * axis.uncertainty
+    assert fan_axis.SAMPLING_ERROR <= axis.uncertainty < 5 * fan_axis.SAMPLING_ERROR
+    assert fan_axis.cone_axis_offset(axis, beam) == pytest.approx(beam.axis_offset, abs=2 * axis.uncertainty * beam.pitch[1])
+    rows = "2 rows" if case == "rows beside the plane" else "1 row"
+    assert axis.method == f"rays measured from both ends, {rows}"
+
+
+@pytest.mark.statistical
+def test_the_uncertainty_is_that_of_repeated_noise() -> None:
+    """64 scans of 300 quanta a pixel scatter as the sectors of each say, and about the axis as far as sampling may move it.
+
+    The variance of 24 sectors has 23 degrees of freedom in each scan, so the mean of 64 is known to 4 %, and the scatter of
+    64 scans to 18 %: what passes is below 2.2 times the variance that is claimed.
+    """
+    beam = beam_of(0.07)
+    light = light_of(beam)
+    found = []
+    for seed in range(64):
+        counts = np.random.default_rng(fresh(seed)).poisson(300.0 * light).astype(float)
+        y = -np.log(np.maximum(counts, 1.0) / 300.0)
+        axis = fan_axis.axis_from_fans(y, counts, beam)
+        found.append((axis.column, axis.uncertainty**2 - fan_axis.SAMPLING_ERROR**2))
+    columns, claimed = np.transpose(found)
+    assert_same_variance(columns, claimed.mean(), what="axes of cone beams")
+    mean = Estimate(columns.mean(), columns.var(ddof=1) / 64, 63)
+    assert_same_mean(mean, column_of(beam), rounding=fan_axis.SAMPLING_ERROR, what="axes of cone beams")
+
+
+def test_pixels_that_are_not_used_tell_nothing() -> None:
+    """A dead column and a scratch of any value, of weight 0: the axis as before, to what sampling may do."""
+    beam = beam_of(0.07)
+    light = light_of(beam)
+    y, weights = -np.log(light), light.copy()
+    weights[..., 9] = weights[20:22] = 0.0
+    y[weights == 0] = 50.0
+    assert abs(fan_axis.axis_from_fans(y, weights, beam).column - column_of(beam)) < 2 * fan_axis.SAMPLING_ERROR
+
+
+REFUSED = {
+    "no row in the plane": (beam_of(0.0, detector_offset=(1.0, 0.0)), "no row of the detector in the plane"),
+    "three views": (beam_of(0.0, views=3), "3 different view angles"),
+    "no line twice": (beam_of(0.0, arc=140.0), "no lines of a structure that both of their ends show"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_scans_that_do_not_tell_the_axis(case: str) -> None:
+    beam, sentence = REFUSED[case]
+    light = light_of(beam, 1)
+    with pytest.raises(MivolError, match=sentence):
+        fan_axis.axis_from_fans(-np.log(light), light, beam)
+
+
+@pytest.mark.parametrize("y", [np.zeros((60, 1, 48)), np.random.default_rng(1).normal(size=(60, 1, 48))])
+def test_air_and_noise_have_no_axis(y: np.ndarray) -> None:
+    """The correlation of noise with its mirror image is far below a half (24 directions of 5 independent columns)."""
+    with pytest.raises(MivolError, match="no lines of a structure"):
+        fan_axis.axis_from_fans(y, np.ones_like(y), beam_of(0.0))
+
+
+def test_the_least_of_sectors() -> None:
+    """Two sectors of 3 (x - 7 -+ 0.2)^2: least at 7, and their slopes of -+1.2 there make 0.2; a ridge is refused."""
+    found = fan_axis._sector_minimum(lambda x: np.array([3 * (x - 7.2) ** 2, 3 * (x - 6.8) ** 2]), 6.5, 1.0)
+    assert found == pytest.approx((7.0, np.sqrt(2 * 2 * 1.2**2) / 12))
+    for ridge in (lambda x: np.array([-(x**2), 0.0]), lambda x: np.array([x, (x - 9) ** 2])):
+        with pytest.raises(MivolError, match="no column near 0"):
+            fan_axis._sector_minimum(ridge, 0.0, 1.0)
+
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scenes" / "bonsai" / "scan.py"
+SPREAD, PLACE = 6.0, np.array([5.0, -9.0, 3.0])
+
+
+@pytest.fixture(scope="module")
+def scan() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("bonsai_scan", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("turn", [0, 3, 7])
+def test_sums_are_the_integrals_of_a_blob(scan: ModuleType, turn: int) -> None:
+    """A Gaussian has the integral sqrt(2 pi) s exp(-b^2 / 2 s^2) along a line that passes it at a distance b.
+
+    Sums over the planes are exact to exp(-(pi s)^2), which is nothing; linear interpolation in a plane adds at most h^2 / 8
+    (f_uu + f_vv), which is 2 / (8 s^2) of the peak.
+    """
+    n = 64
+    z, y, x = np.ogrid[:n, :n, :n]
+    middle = (n - 1) / 2
+    r2 = (x - middle - PLACE[0]) ** 2 + (y - middle - PLACE[1]) ** 2 + (z - middle - PLACE[2]) ** 2
+    blob = np.exp(-r2 / (2 * SPREAD**2))
+    panel, shape = scan.panels(n, 11, 20)[turn], (12, 20)
+    ray = panel.pixels(shape) - panel.source
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    off = PLACE - panel.source
+    b2 = off @ off - (ray @ off) ** 2
+    exact = np.sqrt(2 * np.pi) * SPREAD * np.exp(-b2 / (2 * SPREAD**2))
+    found = scan.joseph(blob, panel, shape)
+    assert exact.max() > 14
+    assert np.abs(found - exact).max() < exact.max() / (4 * SPREAD**2)
+
+
+def test_the_shadow_of_the_cylinder_falls_on_the_detector(scan: ModuleType) -> None:
+    """Tangents to the cylinder end inside of the outermost columns, on either side, though the detector is off the middle."""
+    edge, columns = 64, 40
+    panel = scan.panels(edge, 5, columns)[2]
+    ends = panel.pixels((1, columns))[0, [0, -1]] - panel.source
+    ends /= np.linalg.norm(ends, axis=-1, keepdims=True)
+    distances = [np.linalg.norm(np.cross(panel.source, end)) for end in ends]
+    # 1.02 of the shadow's half, less half a column at the edge and 1.5 off the middle.
+    assert min(distances) > edge / 2 * (1.02 - 4 / columns - 0.01)
+    assert max(distances) < edge / 2 * (1.02 + 4 / columns)
+
+
+def test_readings_become_a_table_and_a_stack(scan: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flats are the light and the dark level, darks the dark level, a shadow lies between; a line of the table is a panel."""
+    write_volume(tmp_path / "object.npz", np.ones((64, 64, 64, 1), np.float32))
+    small = ["--views", "3", "--columns", "8", "--object", str(tmp_path / "object.npz")]
+    monkeypatch.setattr(sys, "argv", ["scan.py", *small, "-o", str(tmp_path)])
+    scan.main()
+    readings, flats, darks = (np.load(tmp_path / f"{name}.npy") for name in ("readings", "flats", "darks"))
+    # Means of 10 x 8 x rows readings: noise of sqrt(3e4) and 2 a reading, over sqrt(640) at least; six standard errors.
+    assert abs(flats.mean() - 3.01e4) < 6 * np.sqrt(3e4) / np.sqrt(640)
+    assert abs(darks.mean() - 100) < 6 * 2 / np.sqrt(640)
+    # A cylinder as high as it is wide, of an optical depth of 9 across: no light to speak of within, all of it beside.
+    assert readings.min() < 150 and readings.max() > 0.9 * flats.mean()
+    table = np.loadtxt(tmp_path / "panels.txt")
+    assert table.shape == (3, 12)
+    assert np.allclose(table[1], np.concatenate(scan.panels(64, 3, 8)[1]), rtol=1e-12, atol=1e-9)
+
+
+def test_a_run_is_judged_by_its_volume(scan: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A volume that is a tenth too large errs by 0.1."""
+    truth = np.random.default_rng(0).random((4, 4, 4, 1)).astype(np.float32)
+    (tmp_path / "volumes").mkdir()
+    write_volume(tmp_path / "truth.npz", truth)
+    write_volume(tmp_path / "volumes" / "reconstruction.npz", np.float32(1.1) * truth)
+    scan.judge(tmp_path, tmp_path)
+    assert capsys.readouterr().out == "nRMSE 0.1000\n"
+
+
+def test_a_slice_is_halved_in_its_mean(scan: ModuleType) -> None:
+    values = np.arange(64.0).reshape(4, 4, 4)
+    # The mean of corners 0, 1, 4, 5, 16, 17, 20, 21.
+    assert scan.halved(values)[0, 0, 0] == 10.5
+    assert scan.halved(values).mean() == values.mean()

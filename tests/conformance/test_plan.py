@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
+import mitsuba as mi
+import numpy as np
 import pytest
+from scattering_scenes import close_up, smoke
 
 from mivol.errors import MivolError
 from mivol.scene import plan
-from mivol.scene.needs import MediumFacts
+from mivol.scene.needs import MediumFacts, find_needs
+from mivol.scene.plan import build_media, make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path.estimators import Settings
+from scenes import sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 GIB = 2**30
 
@@ -120,3 +129,36 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [c.choice for c in made.choices if c.subject == "empty space in fog"] == ["skipped", "walked"]
     assert [c.choice for c in made.choices if c.subject == "shadows of fog"] == ["exact", "estimated"]
     assert made.gradient_bytes == plan._plan_gradient_memory(asked)[0]
+
+
+CASES = [(False, False, 2), (True, False, 2), (False, True, 2), (False, False, 4)]
+
+
+@pytest.mark.parametrize(("skips", "tracks", "depth"), CASES)
+def test_a_grid_has_what_the_plan_asks_for(skips: bool, tracks: bool, depth: int) -> None:
+    """Nothing is read from the grid that no estimator will ask for."""
+    values = np.zeros((8, 8, 8, 1), np.float32)
+    values[2:4, 2:4, 2:4] = 1
+    scene = close_up({"smoke": smoke(values)[0], "sky": sky()})
+    survey, settings = survey_scene(scene), Settings(max_depth=depth)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    plan = make_plan(needs, settings)
+    assert (plan.segment == "free_flight") == (depth == 4)
+    media = build_media(scene, needs, replace(plan, skips=(skips,), tracks=(tracks,)), survey)
+    ((part,),) = [body.view.parts for body in media.bodies]
+    assert (part.lattice.empty_distances is not None) == skips
+    assert (part.lattice.block_ranges is not None) == (tracks or depth == 4)
+    assert media.bodies[0].estimates_shadows == tracks
+    assert not media.has_surfaces
+
+
+@pytest.mark.parametrize(("depth", "scatterings"), [(-1, math.inf), (0, 0), (1, 0), (2, 1), (6, 5)])
+def test_scatterings(depth: int, scatterings: float) -> None:
+    """Depth 1 is what the camera sees directly, and each event adds 1; no limit is no limit."""
+    assert Settings(max_depth=depth).scatterings == scatterings
+
+
+def test_what_holds_where_nothing_is_said(variant_rgb: str) -> None:
+    """The defaults of the integrator's documentation, for a scene file as for a script."""
+    assert Settings() == Settings(max_depth=6, rr_depth=5, hide_emitters=False, deterministic=False, shadows="auto")
+    assert mi.load_dict({"type": "mivol"}).session.settings == Settings()

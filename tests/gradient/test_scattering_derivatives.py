@@ -8,6 +8,7 @@ voxel (tests/false_alarms.py). The twin's derivatives are exact, or central diff
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -31,15 +32,14 @@ from scattering_gradients import (
 from scattering_scenes import PLACE, Pencils, aimed, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
+from mivol.transport.estimators.single_scattering.scattering_derivatives import _choose_shadow_ray
+from mivol.transport.media.ray_intervals import RaySegment
 from mivol.validate.moments import Moments
-from scenes import as_float32, box_of, grid_volume, medium
+from scenes import as_float32, box_of, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 MEDIUM = "smoke.interior_medium."
-
-
-# -- Gradients of renders -----------------------------------------------------------------------------------------------
 
 
 def jvp(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
@@ -54,8 +54,6 @@ def jvp(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integrato
     release(scene, key, variable)
     return tangent
 
-
-# -- Density, voxel by voxel ---------------------------------------------------------------------------------------------
 
 EMITTERS = {
     "point": lambda: point([1.5, 1, 2.0]),
@@ -146,9 +144,6 @@ def test_constvolume_whose_density_is_its_majorant():
     assert_gradient(gradients(seen, MEDIUM + "sigma_t.value.value", w, 2048), truth, "constvolume", 0.06)
 
 
-# -- Several channels, several media, boundaries that are traced ------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("lit", small.cases(["point", "sky"], ["sky"]))
@@ -226,9 +221,6 @@ def test_two_media():
     ):
         # The ball's edges are kinks of the twin's shadows: 1e-3.
         assert_gradient(sums(seen, key, w, 2048, along), np.array([truth]), key, 0.08, rounding=2e-3)
-
-
-# -- Every other parameter -------------------------------------------------------------------------------------------------
 
 
 def scalar(parts: dict, key: str, light: Callable[[float, np.ndarray, np.ndarray], np.ndarray], x: float) -> None:
@@ -474,9 +466,6 @@ def test_extinction_of_microflakes(key):
     assert_gradient(found[:, None], np.array([truth]), key, rounding=1e-2)
 
 
-# -- Emitters ------------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("point-intensity")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
@@ -507,9 +496,6 @@ def test_radiance_of_the_sky():
     w, rows = weights(3)
     truth = rows @ twins.radiance([m], [twins.Sky(1.0, 24)], seen.o, seen.d, background=1.0)[:, 0]
     assert_gradient(sums(seen, "sky.radiance.value", w, 2048), np.array([truth]), "sky", rounding=3e-4)
-
-
-# -- Forward against reverse, and differences ---------------------------------------------------------------------------------
 
 
 def everything(kind: str = "own") -> mi.Scene:
@@ -613,3 +599,88 @@ def test_seeds_of_picture_and_gradient_are_independent():
         found.append(np.array(dr.grad(variable), dtype=np.float64).reshape(1))
         release(seen.scene, key, variable)
     assert_gradient(np.array(found), np.array([np.sum(3 * 2 * 0.1 * L * L / float(as_float32(0.7)))]), "squared loss", 0.2)
+
+
+def shadow_ray(x: float, value: list[float], on: list[bool]) -> SimpleNamespace:
+    """A ray towards +x from (x, 0, 0), of length 10 + x."""
+    ray = mi.Ray3f(mi.Point3f(mi.Float([x] * len(on)), 0, 0), mi.Vector3f(1, 0, 0), 0, mi.Color0f())
+    segment = RaySegment(ray, dr.zeros(mi.MediumPtr, len(on)), mi.Float([10 + x] * len(on)))
+    return SimpleNamespace(ray_segment=segment, value=mi.Spectrum(*value), on=mi.Bool(on))
+
+
+def test_each_has_its_light_as_probability() -> None:
+    """Light of 3 and 1: the first ray for a chance below 3/4, with 4/3 of its value; else the second with 4 times its value.
+    Without light, none.
+    """
+    probe = SimpleNamespace(
+        chance=mi.Float([0.0, 0.74, 0.76, 0.99]),
+        direct=[shadow_ray(1.0, [0.5, 1.0, 1.5], [True] * 4), shadow_ray(2.0, [0.25, 0.25, 0.5], [True, True, True, False])],
+    )
+    ray, value, on = _choose_shadow_ray(probe)
+    assert np.array(ray.ray.o.x).tolist() == [1, 1, 2, 2] and np.array(ray.length).tolist() == [11, 11, 12, 12]
+    np.testing.assert_allclose(np.array(value).T, [[2 / 3, 4 / 3, 2]] * 2 + [[1, 1, 2]] * 2, rtol=2.0**-21)  # three roundings
+    assert np.array(on).tolist() == [True, True, True, False]
+    dark = SimpleNamespace(chance=mi.Float([0.2, 0.8]), direct=[shadow_ray(x, [0, 0, 0], [True] * 2) for x in (1.0, 2.0)])
+    _, value, on = _choose_shadow_ray(dark)
+    assert not np.any(np.array(value)) and not np.any(np.array(on))
+
+
+def test_one_alone_is_taken() -> None:
+    probe = SimpleNamespace(chance=mi.Float(0.9), direct=[shadow_ray(1.0, [0.5, 1.0, 1.5], [True])])
+    ray, value, on = _choose_shadow_ray(probe)
+    assert ray is probe.direct[0].ray_segment and np.array(value).ravel().tolist() == [0.5, 1, 1.5] and on[0]
+
+
+WHITE = {
+    "a box": lambda interior: {"smoke": box_of(interior, PLACE)},
+    "a ball": lambda interior: {"smoke": scenes.ball_of(interior, (0, 0, 0), 1.2)},
+    "two boxes": lambda interior: {"smoke": box_of(interior, PLACE), "fog": fog(0.0, 1.0, centred(np.eye(3), (0, 0, 1.6)))[0]},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "place"),
+    small.cases([("stock", "a box"), *(("own", place) for place in WHITE)], [("own", "a box"), ("own", "two boxes")]),
+)
+def test_white_smoke_of_no_density_in_a_constant_sky_has_no_gradient(kind, place):
+    """In-scattering equals out-scattering: 0 in each sample, up to the rounding of the two (a few EPS of their size)."""
+    gradients = []
+    for albedo in (0.0, 1.0):
+        medium_type, volume_type = small.KINDS[kind]
+        interior = medium(medium_type, grid_volume(volume_type, as_float32(DENSITIES["empty"]()), PLACE), albedo)
+        seen = pencils({**WHITE[place](interior), "sky": scenes.sky(0.7)}, *aimed(1, 8))
+        integrator = mi.load_dict(mivol())
+        gradients.append([vjp(seen.scene, GRID, np.ones((1, 8, 3)), 1, seed, integrator) for seed in range(8)])
+    black, white = (np.abs(g).max() for g in gradients)
+    assert black > 0.1
+    assert white <= 4e-6 * black
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_ball_under_a_constant_sky(alone):
+    """Density in a traced boundary, alone and behind a box shading it, against differences."""
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", 0.2 + rough_grid(1), PLACE), 0.8)
+    parts = {"smoke": scenes.ball_of(interior, (0, 0, 0), 1.0), "sky": scenes.sky(0.7)}
+    if not alone:
+        parts["fog"] = fog(0.8, 0.3, centred(np.eye(3), (0.9, -0.9, 1.3)))[0]
+    scene, integrator, w = small.close_up(parts, res=8), mi.load_dict(mivol()), np.ones((8, 8, 3))
+    params = mi.traverse(scene)
+    start, h = np.array(params[GRID]), 0.02
+    v = np.random.default_rng(2).uniform(0.2, 1, start.shape)
+
+    def at(x: float, seed: int) -> float:
+        params[GRID] = mi.TensorXf((start + x * v).astype(np.float32))
+        params.update()
+        return np.array(integrator.render(scene, seed=seed, spp=256), dtype=np.float64).sum()
+
+    seeds = [fresh(s) for s in range(BATCHES)]
+    differences = np.array([(at(h, s) - at(-h, s)) / (2 * h) for s in seeds])
+    at(0, 0)
+    found = np.array([np.sum(v * vjp(scene, GRID, w, 256, s, integrator)) for s in seeds])
+    m, level = Moments.of((differences - found)[:, None]), abs(differences.mean())
+    # Truncation as below.
+    assert_same_mean(m, rounding=2e-3 * level, what="ball")
+    assert_precise(m, 0.02 * level, what="ball")

@@ -16,7 +16,7 @@ defect    what goes wrong there                               shown by
 10        rays end at a transmittance of exactly 0            here; ``analytic/test_radiance_field::test_a_ray_that_stops...``
 11        no forward mode                                     ``conformance/test_spherical_volume::test_derivatives_...``
 12        texture units round weights on a GPU                does not arise: nodes are gathered, no texture is read
-13        another field after refinement                      ``analytic/test_resampling::test_a_field_on_finer...``
+13        another field after refinement                      ``analytic/test_spherical_grid::test_a_field_on_finer...``
 14        images of one size, jitter inside pixels            here; ``optim/test_ray_batches::test_views_know_their...``
 15        nothing to stop, resume, measure or look at         ``optim/test_radiance_problem::test_a_fit_that...``,
                                                               ``experiments/test_photo_fit``
