@@ -52,7 +52,7 @@ def over_pixels(image: Moments) -> Estimate:
 
 def difference(a: Estimate | Moments, b: Estimate | Moments | np.ndarray | float) -> Estimate:
     """a - b of independent estimates."""
-    a, b = Estimate.of(a), Estimate.of(b)
+    a, b = Estimate.from_result(a), Estimate.from_result(b)
     var, dof = np.broadcast_arrays(a.var, b.var), np.broadcast_arrays(a.dof, b.dof)
     dof = np.stack([np.broadcast_to(d, var[0].shape) for d in dof])
     return Estimate(a.mean - b.mean, var[0] + var[1], effective_dof(np.stack(var), dof, axis=0))
@@ -72,7 +72,7 @@ def assert_same_mean(
         tile: images (H, W, C) are averaged over tiles of so many pixels first.
         rounding: what float32 arithmetic may cause, as one standard deviation.
     """
-    a, b = Estimate.of(a), Estimate.of(b)
+    a, b = Estimate.from_result(a), Estimate.from_result(b)
     b = b._replace(mean=np.broadcast_to(b.mean, np.shape(a.mean)))
     how = {"tile": tile, "rounding": rounding}
     note(ALPHA, what, statistics.p_value(a, b, **how))
@@ -124,7 +124,7 @@ def assert_precise(
     Args:
         of: np.max asks it of each entry, np.median of half of them (which fails only where one of that half fails).
     """
-    given = Estimate.of(given)
+    given = Estimate.from_result(given)
     var, allowed, dof = np.broadcast_arrays(given.var, np.square(limit), given.dof)
     known = np.isinf(dof)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -150,7 +150,7 @@ def assert_same_spread(
     Both are sums over independent pixels (give one channel), of effective degrees of freedom d_a and d_b, or of those given.
     Their ratio over ``expected`` follows F(d_a, d_b), which gives the chance of either side.
     """
-    a, b = Estimate.of(a), Estimate.of(b)
+    a, b = Estimate.from_result(a), Estimate.from_result(b)
     dof = dof or tuple(float(effective_dof(x.var, x.dof)) for x in (a, b))
     ratio = float(np.mean(a.var) / np.mean(b.var))
     law = stats.f(*dof)

@@ -67,7 +67,7 @@ def assert_gradient(found: np.ndarray, truth: np.ndarray, what: str, precision: 
     v = np.random.default_rng(4).uniform(0.5, 1.5, truth.shape)
     axes = tuple(range(1, found.ndim))
     for each, exact in ((found, truth), (np.sum(found * v, axis=axes, keepdims=True)[:, 0], np.sum(truth * v)[None])):
-        m, exact = Moments.of(each.reshape(BATCHES, -1)), exact.ravel()
+        m, exact = Moments.from_values(each.reshape(BATCHES, -1)), exact.ravel()
         top = np.abs(exact).max()
         assert_same_mean(m, exact, rounding=rounding * top, what=what)
     assert_precise(m, precision * np.sum(np.abs(truth * v)), what=what)

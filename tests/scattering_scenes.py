@@ -38,7 +38,9 @@ def moments(scene: mi.Scene, integrator: dict | mi.Integrator, spp: int, batches
     """Mean and variance of an image over independent renders."""
     integrator = mi.load_dict(integrator) if isinstance(integrator, dict) else integrator
     seeds = range(first, first + batches)
-    return Moments.of(np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=fresh(s))) for s in seeds]))
+    return Moments.from_values(
+        np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=fresh(s))) for s in seeds])
+    )
 
 
 def mivol(**more: object) -> dict:
@@ -107,7 +109,7 @@ class Pencils:
         made, sensor = mi.load_dict(integrator), mi.load_dict(self.copies)
         seeds = (fresh(first + s) for s in range(batches // COPIES))
         images = [np.array(mi.render(self.scene, integrator=made, sensor=sensor, spp=spp, seed=seed)) for seed in seeds]
-        return Moments.of(np.reshape(images, (batches, len(self.o), -1)))
+        return Moments.from_values(np.reshape(images, (batches, len(self.o), -1)))
 
 
 def pencils(parts: dict, o: np.ndarray, d: np.ndarray) -> Pencils:

@@ -149,14 +149,15 @@ def test_comparisons_keep_their_rate(monkeypatch):
     but where it is cautious (Hoeffding's bound; counts that jump; degrees of freedom that are estimated)."""
     rng = np.random.default_rng(fresh(1))
     draws = {
-        "mean": lambda: raised(assert_same_mean, Moments.of(rng.normal(2, 1, (8, 3))), 2.0),
+        "mean": lambda: raised(assert_same_mean, Moments.from_values(rng.normal(2, 1, (8, 3))), 2.0),
         "difference": lambda: raised(
-            assert_same_mean, difference(Moments.of(rng.normal(2, 1, (8, 2))), Moments.of(rng.normal(2, 5, (4, 2))))
+            assert_same_mean,
+            difference(Moments.from_values(rng.normal(2, 1, (8, 2))), Moments.from_values(rng.normal(2, 5, (4, 2)))),
         ),
-        "pixels": lambda: raised(assert_same_mean, over_pixels(Moments.of(rng.normal(2, 1, (4, 6, 5, 1)))), 2.0),
+        "pixels": lambda: raised(assert_same_mean, over_pixels(Moments.from_values(rng.normal(2, 1, (4, 6, 5, 1)))), 2.0),
         "bounded": lambda: raised(assert_same_bounded_mean, rng.binomial(50, 0.3, 3) / 50, 50, 0.3),
         "median": lambda: raised(assert_same_median, rng.standard_cauchy((40, 2)) + 3, 3.0),
-        "precision": lambda: raised(assert_precise, Moments.of(rng.normal(0, 1, (8, 3))), 8**-0.5),
+        "precision": lambda: raised(assert_precise, Moments.from_values(rng.normal(0, 1, (8, 3))), 8**-0.5),
         "variance": lambda: raised(assert_same_variance, rng.normal(0, 2, (30, 2)), 4.0, what="v"),
         "variance about a known mean": lambda: raised(assert_same_variance, rng.normal(1, 2, 30), 4.0, mean=1.0, what="v"),
     }
@@ -172,7 +173,7 @@ def test_comparisons_keep_their_rate(monkeypatch):
 def test_what_is_wrong_is_seen(noted):
     """Each comparison on values that break its claim by far."""
     rng = np.random.default_rng(2)
-    batches, even = Moments.of(rng.normal(2, 1, (16, 3))), Estimate(0, np.ones(300), 9)
+    batches, even = Moments.from_values(rng.normal(2, 1, (16, 3))), Estimate(0, np.ones(300), 9)
     wrong = [
         (assert_same_mean, (batches, 8.0), {}),
         (assert_same_mean, (Estimate(np.array([1.0]), np.array([0.01])), 2.0), {}),
@@ -193,7 +194,7 @@ def test_what_is_wrong_is_seen(noted):
 
 
 def batches_of(rng: np.random.Generator, mean: float) -> Moments:
-    return Moments.of(rng.normal(mean, 1, 32))
+    return Moments.from_values(rng.normal(mean, 1, 32))
 
 
 def test_the_chance_noted_is_that_of_the_claim(noted):

@@ -198,7 +198,7 @@ def make_problem(
         return ProjectionProblem(least_squares, times=view_times(data)[kept] if getattr(settings.data, "drift", 0) else None)
     if data.quanta is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
-    quanta = data.quanta.of_views(kept)
+    quanta = data.quanta.select_views(kept)
     return ProjectionProblem(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
 
 

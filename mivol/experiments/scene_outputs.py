@@ -79,7 +79,7 @@ class SceneOutputs:
         if error is None:
             return np.asarray(render(view.sensor, derive_seed(*seed), spp)), None
         share = math.ceil(spp / BATCHES)
-        batches = Moments.of_each(render(view.sensor, derive_seed(*seed, batch), share) for batch in range(BATCHES))
+        batches = Moments.from_batches(render(view.sensor, derive_seed(*seed, batch), share) for batch in range(BATCHES))
         return batches.mean.astype(np.float32), np.sqrt(np.square(error) + batches.variance_of_mean).astype(np.float32)
 
     def write_view(self, view: View, number: int) -> list[Image]:

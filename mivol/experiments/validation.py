@@ -174,7 +174,7 @@ def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> V
             loaded, folder, max_depth=depth, max_spp=settings.reference_spp, seed=settings.seed + 1, sensor=camera,
             accept_doubts=True, progress=False,
         )  # fmt: skip
-    estimate = Estimate.of(image)
+    estimate = Estimate.from_result(image)
     # Our spread of a pixel that saw nothing is 0, and so may be volpath's: one missed event a pixel is allowed for.
     compared = compare(estimate, reference, alpha=ALPHA, samples_seen=float(reference.mean.max()), correlated=27)
     slopes = check_gradients(scene, camera, ours, settings)
@@ -189,7 +189,7 @@ def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator
     spp = math.ceil(settings.spp / BATCHES)
     with dr.suspend_grad():
         seeds = (derive_seed(settings.seed, IMAGE, batch) for batch in range(BATCHES))
-        return Moments.of_each(integrator.render(scene, camera, seed=seed, spp=spp) for seed in seeds)
+        return Moments.from_batches(integrator.render(scene, camera, seed=seed, spp=spp) for seed in seeds)
 
 
 # -- Gradients ----------------------------------------------------------------------------------------------------
@@ -220,7 +220,7 @@ def check_gradient(
         near = near.add(mean.difference(start, STEP * direction, seeds[2]) / STEP)
         far = far.add(mean.difference(start, 2 * STEP * direction, seeds[3]) / (2 * STEP))
     set_parameter(params, key, start)
-    g, d = Estimate.of(slopes), Estimate.of(near)
+    g, d = Estimate.from_result(slopes), Estimate.from_result(near)
     error = float(np.sqrt(g.var + d.var))
     left_out = abs(float(far.mean - near.mean)) / 3
     dof = effective_dof(np.array([g.var, d.var]), np.array([g.dof, d.dof]))

@@ -82,7 +82,7 @@ def find_needs(
         return needs
     bodies = [boundary.body(view) for boundary, view in zip(boundaries, views, strict=True)]
     scattering = [body for body, facts in zip(bodies, media, strict=True) if facts.is_scattering]
-    light = read_media_light(needs.media_of(scene, bodies, survey.size), boundaries, scattering, sensor, survey)
+    light = read_media_light(needs.make_media(scene, bodies, survey.size), boundaries, scattering, sensor, survey)
     return replace(needs, media_light=light)
 
 
@@ -281,7 +281,7 @@ class Needs:
     are_samples_independent: bool = True
     media_light: MediaLight | None = None
 
-    def media_of(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
+    def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
         """Build the media of the scene among its surfaces.
 
         Args:

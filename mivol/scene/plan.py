@@ -79,28 +79,28 @@ class Plan:
 
     Attributes:
         choices: all choices with their reasons.
-        skips: whether empty blocks of each medium are skipped.
-        tracks: whether shadows of each medium are estimated in images.
+        skips_empty: whether empty blocks of each medium are skipped.
+        estimates_shadows: whether shadows of each medium are estimated in images.
         segment: name of the segment estimator in :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`.
-        events: scattering points per camera ray in images.
+        scattering_points: scattering points per camera ray in images.
         pass_rays: most rays of a pass.
         gradient_bytes: memory of a gradient step besides the rays [byte].
-        lobe: mean cosine of the lobe for side flights; None for no side flights.
+        side_flight_cosine: mean cosine of the lobe for side flights; None for no side flights.
         draws_emission: whether scattering points sample the light emitted by media.
-        successive: most paths per lane, walked one after the other.
+        successive_paths: most paths per lane, walked one after the other.
         branches: whether paths branch at their first collision for derivatives.
     """
 
     choices: tuple[Choice, ...]
-    skips: tuple[bool, ...]
-    tracks: tuple[bool, ...]
+    skips_empty: tuple[bool, ...]
+    estimates_shadows: tuple[bool, ...]
     segment: str
-    events: int
+    scattering_points: int
     pass_rays: int
     gradient_bytes: int
-    lobe: float | None = None
+    side_flight_cosine: float | None = None
     draws_emission: bool = False
-    successive: int = 1
+    successive_paths: int = 1
     branches: bool = False
 
 
@@ -199,7 +199,9 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
 def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) -> SceneMedia:
     """Build the media for transport as planned."""
     bodies = []
-    for boundary, view, skip, tracks in zip(needs.boundaries, needs.views, plan.skips, plan.tracks, strict=True):
+    for boundary, view, skip, tracks in zip(
+        needs.boundaries, needs.views, plan.skips_empty, plan.estimates_shadows, strict=True
+    ):
         for part in view.parts:
             if skip and part.lattice is not None:
                 part.lattice.empty_distances = read_empty_distances(part, survey, boundary.name)
@@ -210,26 +212,26 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) 
             if (tracks or flies) and part.lattice is not None and part.activation is None and not mixes:
                 part.lattice.block_ranges = read_block_ranges(part, survey)
         bodies.append(boundary.body(view, tracks))
-    return needs.media_of(scene, bodies, survey.size)
+    return needs.make_media(scene, bodies, survey.size)
 
 
 def build_estimators(
-    scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: SceneSurvey, pictures: bool
+    scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: SceneSurvey, for_images: bool
 ) -> Estimators:
     """Build the planned estimators, for images or for derivatives."""
     media = build_media(scene, needs, plan, survey)
     direct = DirectLighting(media)
-    choice = SegmentInputs(direct, plan.events)
+    choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():
-            choice.visibility_cache = _make_visibility_cache(direct, needs, plan, survey, pictures)
+            choice.visibility_cache = _make_visibility_cache(direct, needs, plan, survey, for_images)
             if settings.shadows == "grid":
                 choice.transmittance_grid = build_transmittance_grid(media, direct.emitters)
     lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1
     segment = SEGMENT_ESTIMATORS[plan.segment].make(choice)
     is_even = all(kind == "uniform" for kind in needs.emitter_kinds)
     lights_media = segment.ends_in_media and not needs.is_sealed and not is_even
-    lobe = None if plan.lobe is None else dr.opaque(mi.Float, plan.lobe)
+    lobe = None if plan.side_flight_cosine is None else dr.opaque(mi.Float, plan.side_flight_cosine)
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)
     return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count)
@@ -243,13 +245,13 @@ def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) ->
 
 
 def _make_visibility_cache(
-    direct: DirectLighting, needs: Needs, plan: Plan, survey: SceneSurvey, pictures: bool
+    direct: DirectLighting, needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool
 ) -> VisibilityCache | None:
     """Make the cache of emitter visibility. Derivatives are nonzero in empty blocks, and only values that were read tell the
     empty blocks.
     """
-    blind = not pictures or any(m.unread for m in needs.media)
-    rays = needs.film_samples * (plan.events if pictures else 1)
+    blind = not for_images or any(m.unread for m in needs.media)
+    rays = needs.film_samples * (plan.scattering_points if for_images else 1)
     occupied = None if blind else needs.media[0].occupied
     take = lambda *arguments: read_coarse_grid(survey, *arguments)  # noqa: E731
     return build_visibility_cache(direct.media, direct.emitters, rays, occupied, take)

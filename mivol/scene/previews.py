@@ -153,7 +153,7 @@ def _render_depth_preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurve
     cells = DEPTH_SIDE * DEPTH_SIDE
     needs = find_needs(scene, sensor, survey, cells * DEPTH_BATCHES * DEPTH_SAMPLES, settings.may_draw_emission)
     plan = make_plan(needs, settings)
-    estimators = build_estimators(scene, needs, plan, settings, survey, pictures=True)
+    estimators = build_estimators(scene, needs, plan, settings, survey, for_images=True)
     n = DEPTH_BATCHES * cells * DEPTH_SAMPLES
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(DEPTH_SEED, n)
@@ -211,7 +211,7 @@ def sampling_gain(met: NDArray, drawn: NDArray) -> float:
 def _render_draw_preview(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> NDArray:
     """Mean radiance over all colours of each sample (cells, DRAW_SAMPLES), along the middle of each cell."""
     cells, n = DRAW_SIDE * DRAW_SIDE, DRAW_SIDE * DRAW_SIDE * DRAW_SAMPLES
-    estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, pictures=True)
+    estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(DRAW_SEED, n)
     cell = dr.arange(mi.UInt32, n) // DRAW_SAMPLES

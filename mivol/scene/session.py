@@ -78,9 +78,9 @@ class Session:
             raise MivolError("found develop=False, expected True: mivol returns only developed images.")
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
-            estimators, plan = self._open(scene, sensor, spp, pictures=True)
+            estimators, plan = self._open(scene, sensor, spp, for_images=True)
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
-            image = render_on_film(samples, self.aovs, lambda rays: self._primal(estimators, rays, plan.successive))
+            image = render_on_film(samples, self.aovs, lambda rays: self._primal(estimators, rays, plan.successive_paths))
         if evaluate:
             dr.eval(image)
         return image
@@ -120,7 +120,7 @@ class Session:
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
         """Estimate the radiance along given rays, for integrators that nest this integrator and do not name a sensor."""
         with dr.suspend_grad():
-            estimators, _ = self._open(scene, find_sensor(scene, 0), 1, pictures=True)
+            estimators, _ = self._open(scene, find_sensor(scene, 0), 1, for_images=True)
             media = estimators.media
             named = [sensor.get_medium() for sensor in scene.sensors()]
             media.start = named[0] if all(medium is named[0] for medium in named) else None
@@ -129,7 +129,7 @@ class Session:
             # An integrator that nests this integrator treats alpha as a mask: sample the mask with probability alpha.
             return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
-    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[Estimators, Plan]:
+    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, for_images: bool = False) -> tuple[Estimators, Plan]:
         """Survey a new scene, find the needs, plan, and build the estimators for images or for derivatives."""
         parts = [*scene.shapes(), *scene.emitters()]
         if self._surveyed is None or not self._surveyed.is_of(parts) or not self._surveyed.survey.is_current:
@@ -139,7 +139,7 @@ class Session:
         warn_of_misplaced_grids(needs, survey)
         needs = measure_media_light(scene, sensor, needs, survey, self.settings)
         plan = make_plan(needs, self.settings, self.aovs)
-        return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan
+        return build_estimators(scene, needs, plan, self.settings, survey, for_images), plan
 
     def _primal(self, estimators: Estimators, rays: CameraRays, successive: int) -> tuple:
         count = paths_per_lane(successive, dr.width(rays.ray))

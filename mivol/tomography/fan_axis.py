@@ -133,7 +133,7 @@ def _rows_in_the_plane(beam: ConeBeam) -> np.ndarray:
 def _pair_rows(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> MirroredRows:
     """Sort a row (views, cols) by direction."""
     alpha, cols = _fan_angles(beam), beam.detector[1]
-    turn = _ViewSpline.of(interpolate_gaps(y[:, None], weights[:, None])[:, 0], weights, beam.angles)
+    turn = _ViewSpline.from_views(interpolate_gaps(y[:, None], weights[:, None])[:, 0], weights, beam.angles)
     phi = np.pi * np.arange(turn.directions) / turn.directions
     # Movement of an edge at the widest ray between neighbouring views [columns].
     step = np.ptp(alpha) / 2 * (np.pi / turn.directions) * beam.source_to_detector / beam.pitch[1]
@@ -161,7 +161,7 @@ class _ViewSpline:
     directions: int
 
     @classmethod
-    def of(cls, y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> _ViewSpline:
+    def from_views(cls, y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> _ViewSpline:
         """Args: y, weights: (views, cols)."""
         is_closed = covers_circle(angles, 2 * np.pi)
         start = 0.0 if is_closed else widest_gap(angles, 2 * np.pi)[1]

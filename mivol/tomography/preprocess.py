@@ -136,7 +136,7 @@ class Quanta:
     background: float
     used: np.ndarray
 
-    def of_views(self, views: np.ndarray) -> Quanta:
+    def select_views(self, views: np.ndarray) -> Quanta:
         """Select views."""
         blank = self.blank[views] if isinstance(self.blank, np.ndarray) else self.blank
         return Quanta(self.counts[views], blank, self.background, self.used[views])

@@ -51,14 +51,14 @@ class Moments:
         return Moments(0, np.zeros(shape), np.zeros(shape))
 
     @staticmethod
-    def of(values: np.ndarray) -> Moments:
+    def from_values(values: np.ndarray) -> Moments:
         """Moments of values along the first axis."""
         v = np.asarray(values, dtype=np.float64)
         mean = v.mean(axis=0)
         return Moments(len(v), mean, ((v - mean) ** 2).sum(axis=0))
 
     @staticmethod
-    def of_each(values: Iterable[ArrayLike]) -> Moments:
+    def from_batches(values: Iterable[ArrayLike]) -> Moments:
         """Moments of a stream of values of the same shape, with a single value in memory."""
         found = Moments.empty()
         for value in values:

@@ -116,7 +116,7 @@ def render_reference(
         )
     loaded = scene if isinstance(scene, LoadedScene) else load_scene(scene, overrides)
     method = {"integrator": integrator, "max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
-    setup = _RenderSetup.of(loaded, sensor, method, seed)
+    setup = _RenderSetup.from_scene(loaded, sensor, method, seed)
     check_film(setup.sensor, BATCH_BYTES)
     path = reference_path(Path(out), loaded.name, setup.identity)
     doubts = _check_trust(loaded.scene, setup.sensor, accept_doubts)
@@ -149,7 +149,7 @@ class _RenderSetup:
     pass_spp: int = 0
 
     @staticmethod
-    def of(
+    def from_scene(
         loaded: LoadedScene, sensor: int | Mapping[str, object] | mi.Sensor, method: dict[str, Any], seed: int
     ) -> _RenderSetup:
         """Make the setup without the samples of a pass."""

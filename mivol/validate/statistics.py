@@ -54,7 +54,7 @@ class Estimate(NamedTuple):
     dof: np.ndarray | float = np.inf
 
     @staticmethod
-    def of(given: Estimate | Moments | np.ndarray | float) -> Estimate:
+    def from_result(given: Estimate | Moments | np.ndarray | float) -> Estimate:
         """Convert moments of batches or an exact answer to an estimate."""
         if isinstance(given, Estimate):
             return given

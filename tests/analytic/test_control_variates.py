@@ -44,7 +44,7 @@ def control_of(emitter: dict) -> GridControl:
     with dr.suspend_grad():
         needs = find_needs(scene, scene.sensors()[0], survey)
         plan = make_plan(needs, settings)
-        direct = build_estimators(scene, needs, plan, settings, survey, pictures=False).direct
+        direct = build_estimators(scene, needs, plan, settings, survey, for_images=False).direct
         origins = CameraOrigins(mi.Point3f(0, 0, 5), mi.Float(0), mi.Vector3f(0, 0, -1))
         return build_grid_control(direct, direct.media.bodies[0], origins)
 

@@ -115,7 +115,7 @@ def test_lines_are_even(name: str) -> None:
     edges = box.to_world[:3, :3].T
     area = 2 * sum(np.linalg.norm(np.cross(edges[i], edges[j])) for i, j in ((0, 1), (1, 2), (2, 0)))
     wanted = 4 * abs(np.linalg.det(edges)) / area
-    assert_same_mean(Moments.of(length), wanted, what="lengths")
+    assert_same_mean(Moments.from_values(length), wanted, what="lengths")
     assert np.allclose(np.linalg.norm(d, axis=1), 1, atol=1e-12)
     for t, on_border in ((0.0, True), (1.0, True), (0.37, False)):
         q = (o + (t * length)[:, None] * d - box.to_world[:3, 3]) @ np.linalg.inv(edges)

@@ -87,7 +87,7 @@ def test_points_are_drawn_with_their_density() -> None:
     ]
     found = np.stack([near / density, ~near / density, near * q[:, 0] / density, near * q[:, 1] * q[:, 2] / density], axis=1)
     truth = [0.28, 0.0625, 0.14, 0.07]
-    assert_same_mean(Moments.of(found), np.array(truth), rounding=1e-5, what="integrals")
+    assert_same_mean(Moments.from_values(found), np.array(truth), rounding=1e-5, what="integrals")
 
 
 @pytest.mark.statistical
@@ -98,7 +98,9 @@ def test_dark_cells_are_seldom_drawn() -> None:
     q = (np.array(table.sample_point(u, inside)).T - PLACE[:3, 3]) / np.diag(PLACE)[:3]
     cell = np.clip(np.floor(q * CELLS_PER_AXIS).astype(int), 0, CELLS_PER_AXIS - 1)
     each = np.array(table.density)[(cell[:, 2] * CELLS_PER_AXIS + cell[:, 1]) * CELLS_PER_AXIS + cell[:, 0]].astype(np.float64)
-    assert_same_mean(Moments.of(np.stack([1 / each, q[:, 0] / each], axis=1)), [0.28, 0.14], rounding=1e-4, what="integrals")
+    assert_same_mean(
+        Moments.from_values(np.stack([1 / each, q[:, 0] / each], axis=1)), [0.28, 0.14], rounding=1e-4, what="integrals"
+    )
 
 
 @pytest.mark.parametrize("origin", [(0.1, 0.05, -0.1), (-2.0, 0.3, 0.4)], ids=["inside", "outside"])
@@ -111,7 +113,7 @@ def test_the_density_of_directions_integrates_to_one(origin: tuple) -> None:
     pdf = np.array(
         table.integrate_density(o, mi.warp.square_to_uniform_sphere(mi.Point2f(u, v)), dr.full(mi.Bool, True, N)).pdf
     )
-    assert_same_mean(Moments.of(4 * np.pi * pdf[:, None].astype(np.float64)), np.ones(1), what="integral")
+    assert_same_mean(Moments.from_values(4 * np.pi * pdf[:, None].astype(np.float64)), np.ones(1), what="integral")
     d = dr.normalize(table.sample_point(w, rest) - o)
     assert (np.array(table.integrate_density(o, d, dr.full(mi.Bool, True, N)).pdf) > 0).all()
 
@@ -133,7 +135,7 @@ def test_points_of_a_ray_are_drawn_with_their_density() -> None:
     assert np.ptp((t[box == 0] - 0.7) / (0.7 / CELLS_PER_AXIS) % 1) > 0.9  # not only the middles of cells
     found = np.stack([(box == 0) / density, (box == 1) / density, t / density], axis=1)
     truth = [0.7, 0.5, (1.4**2 - 0.7**2 + 2.5**2 - 2.0**2) / 2]
-    assert_same_mean(Moments.of(found), np.array(truth), rounding=1e-5, what="integrals")
+    assert_same_mean(Moments.from_values(found), np.array(truth), rounding=1e-5, what="integrals")
     seen_along = table.integrate_density(o + dr.zeros(mi.Point3f, N), d + dr.zeros(mi.Vector3f, N), on)
     assert np.array(seen_along.pdf) == pytest.approx(np.array(line.pdf), rel=1e-5)
     shares = np.array(table.density)[np.argsort(order(table)) * CELLS_PER_AXIS**3]

@@ -81,10 +81,10 @@ def test_quanta_of_a_pixel() -> None:
     np.testing.assert_allclose(found.counts[:, 0], wanted, rtol=1e-14)
     np.testing.assert_allclose(found.blank[:, 0], [np.array([98, 107, gain, 88, 78]) / gain] * 2, rtol=1e-14)
     assert found.used[:, 0].tolist() == [[True, True, False, True, True]] * 2
-    some = found.of_views(np.array([1]))
+    some = found.select_views(np.array([1]))
     assert (some.counts.tolist(), some.blank.tolist()) == (found.counts[1:].tolist(), found.blank[1:].tolist())
     assert some.used.tolist() == found.used[1:].tolist() and some.background == found.background
-    assert preprocess.Quanta(found.counts, 3.0, 0.0, found.used).of_views(np.array([0])).blank == 3.0
+    assert preprocess.Quanta(found.counts, 3.0, 0.0, found.used).select_views(np.array([0])).blank == 3.0
 
 
 def test_air_is_a_straight_line_through_both_edges() -> None:

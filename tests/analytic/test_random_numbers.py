@@ -25,11 +25,11 @@ def test_numbers_are_uniform():
     _, numbers = draw_pcg32(seed_pcg32(start(0.25), 1 << 16), 4)
     u = np.array([np.array(x, dtype=np.float64) for x in numbers])
     assert u.min() > 0 and u.max() < 1
-    assert_same_mean(Moments.of(u.T), 1 / 2, what="numbers")
-    assert_same_mean(Moments.of(u.T**2), 1 / 3, what="squares")
+    assert_same_mean(Moments.from_values(u.T), 1 / 2, what="numbers")
+    assert_same_mean(Moments.from_values(u.T**2), 1 / 3, what="squares")
     rows = np.vstack([u, np.roll(u[0], 1)]) - 0.5
     pairs = [rows[i] * rows[j] for i in range(5) for j in range(i)]
-    assert_same_mean(Moments.of(np.array(pairs).T), what="products")
+    assert_same_mean(Moments.from_values(np.array(pairs).T), what="products")
 
 
 @pytest.mark.statistical
@@ -39,7 +39,7 @@ def test_numbers_of_paths_are_uniform() -> None:
     u = np.array([np.array(x, dtype=np.float64) for x in (sampler.next_1d(), *sampler.next_2d(), sampler.next_1d())])
     rows = np.vstack([u, np.roll(u[0], 1)]) - 0.5
     pairs = [rows[i] * rows[j] for i in range(5) for j in range(i)]
-    assert_same_mean(Moments.of(np.vstack([u - 1 / 2, u**2 - 1 / 3, pairs]).T), 0, what="numbers, squares, products")
+    assert_same_mean(Moments.from_values(np.vstack([u - 1 / 2, u**2 - 1 / 3, pairs]).T), 0, what="numbers, squares, products")
     assert np.array_equal(np.array(sampler.next_1d(False)), np.array(sampler.next_1d(False)))
 
 

@@ -26,7 +26,7 @@ def swapped(shape: dict, looks: list[float], travels: list[float], depth: int) -
     scene = mi.load_dict({"type": "scene", "shape": shape, "sun": sun, "sensor": sensor})
     integrator = mi.load_dict({"type": "mivol", "max_depth": depth})
     means = [scenes.render(scene, integrator, 512, seed=fresh(k)).mean(dtype=np.float64) for k in range(16)]
-    return Estimate.of(Moments.of(np.array(means)[:, None]))
+    return Estimate.from_result(Moments.from_values(np.array(means)[:, None]))
 
 
 @pytest.mark.slow

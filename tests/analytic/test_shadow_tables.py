@@ -78,7 +78,7 @@ def test_a_cell_has_the_weight_of_its_block(shift):
 def open_direct(scene: mi.Scene):
     survey, settings = survey_scene(scene), Settings(max_depth=2)
     needs = find_needs(scene, scene.sensors()[0], survey)
-    return build_estimators(scene, needs, make_plan(needs, settings), settings, survey, pictures=True).direct
+    return build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True).direct
 
 
 @pytest.mark.slow

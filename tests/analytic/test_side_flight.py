@@ -70,7 +70,9 @@ def test_light_at_the_end_of_a_side_flight():
     p, q = of_cosine(c, G), of_cosine(c, LOBE)
     exact = ALBEDO**2 * SUN * 2 * np.pi * np.sum(wc * q / (p + q) * p * p * inner)
     # The ball is traced: its surface is known to 1e-5, and one lane of all is off.
-    assert_same_mean(Moments.of(value.T), exact * np.array([0.5, 1, 2]), rounding=(1e-5 + 1 / N) * exact, what="the light")
+    assert_same_mean(
+        Moments.from_values(value.T), exact * np.array([0.5, 1, 2]), rounding=(1e-5 + 1 / N) * exact, what="the light"
+    )
     assert not value[:, 0].any()
 
 

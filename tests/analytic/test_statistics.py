@@ -87,8 +87,8 @@ def test_false_alarms_of_estimated_variance(seed, n):
     hits = normal = 0
     runs = 2000
     for _ in range(runs):
-        m = Moments.of(rng.normal(size=(n, 10)))
-        hits += _raises(Estimate.of(m), Estimate(np.zeros(10)), alpha=0.05)
+        m = Moments.from_values(rng.normal(size=(n, 10)))
+        hits += _raises(Estimate.from_result(m), Estimate(np.zeros(10)), alpha=0.05)
         normal += _raises(Estimate(m.mean, m.variance_of_mean), Estimate(np.zeros(10)), alpha=0.05)
     assert_rate(hits, runs, 0.05)
     # 0.16 of the runs with 12 batches and more with 4, beside 0.05: 1.5 times are 7 standard deviations away.
@@ -151,8 +151,8 @@ def test_false_alarms_of_pooled_variances(seed):
     sigma = rng.uniform(0.2, 3, (8, 8, 1))
     runs, hits = 2000, 0
     for _ in range(runs):
-        m = Moments.of(rng.normal(size=(4, 8, 8, 1)) * sigma)
-        hits += _raises(Estimate.of(m), Estimate(np.zeros((8, 8, 1))), alpha=0.05, tile=4)
+        m = Moments.from_values(rng.normal(size=(4, 8, 8, 1)) * sigma)
+        hits += _raises(Estimate.from_result(m), Estimate(np.zeros((8, 8, 1))), alpha=0.05, tile=4)
     assert_rate(hits, runs, 0.05, at_least=0.02)
 
 
@@ -162,8 +162,8 @@ def test_p_values_are_even(seed):
     rng = np.random.default_rng(seed)
     runs, below = 2000, 0
     for _ in range(runs):
-        m = Moments.of(rng.normal(size=(6, 10)))
-        given = Estimate.of(m), Estimate(np.zeros(10))
+        m = Moments.from_values(rng.normal(size=(6, 10)))
+        given = Estimate.from_result(m), Estimate(np.zeros(10))
         p = p_value(*given)
         below += p < 0.1
         assert not _raises(*given, alpha=0.999 * p)
@@ -193,8 +193,8 @@ def test_bias_of_estimated_variances(seed):
     rng = np.random.default_rng(seed)
     runs, missed = 2000, 0
     for _ in range(runs):
-        m = Moments.of(rng.normal(0.3, 1, (3, 2)))
-        found = estimate_bias(Estimate.of(m), Estimate(np.zeros(2)), alpha=0.05)
+        m = Moments.from_values(rng.normal(0.3, 1, (3, 2)))
+        found = estimate_bias(Estimate.from_result(m), Estimate(np.zeros(2)), alpha=0.05)
         missed += not found.low <= 0.3 <= found.high
     assert_rate(missed, runs, 0.05, at_least=0.02)
 
@@ -245,8 +245,13 @@ def test_moments_keep_their_digits(seed):
     one_by_one = Moments.empty((3,))
     for value in values:
         one_by_one = one_by_one.add(value)
-    merged = Moments.of(values[:1]).merge(Moments.of(values[1:17])).merge(Moments.empty((3,))).merge(Moments.of(values[17:]))
-    for moments in (one_by_one, merged, Moments.of(values)):
+    merged = (
+        Moments.from_values(values[:1])
+        .merge(Moments.from_values(values[1:17]))
+        .merge(Moments.empty((3,)))
+        .merge(Moments.from_values(values[17:]))
+    )
+    for moments in (one_by_one, merged, Moments.from_values(values)):
         assert moments.n == 1000
         # Each step rounds the mean (1e8) to 1.5e-8; n such steps move M by 1e-8 sum|x - m| at most: 1e-8 relative.
         np.testing.assert_allclose(moments.variance, offsets.var(axis=0, ddof=1), rtol=1e-7)

@@ -144,7 +144,7 @@ def test_variance_is_as_derived():
     variance = T**2 * np.expm1(square * 2 / 7 / (tracking.LOOKUP_RATE * 0.9))
     assert T > 3 * tracking.ROULETTE_BELOW * 0.9
     # The midpoints of the square's integral err by 1e-6, optical depths of 1 by 2e-6.
-    assert_same_mean(Moments.of((found - T) ** 2), variance, rounding=1e-5 * variance, what="variances")
+    assert_same_mean(Moments.from_values((found - T) ** 2), variance, rounding=1e-5 * variance, what="variances")
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------
@@ -240,8 +240,8 @@ def assert_flights(t: mi.Float64, tau: np.ndarray, T: float) -> None:
     assert u.max() <= 1 - T + 1e-5
     assert_rate(int(met.sum()), N, 1 - T)
     # Optical depths of about 1 are known to 1e-5.
-    assert_same_mean(Moments.of(u), (1 - T) ** 2 / 2, rounding=1e-5, what="the mean of u")
-    assert_same_mean(Moments.of(u**2), (1 - T) ** 3 / 3, rounding=1e-5, what="the mean of u^2")
+    assert_same_mean(Moments.from_values(u), (1 - T) ** 2 / 2, rounding=1e-5, what="the mean of u")
+    assert_same_mean(Moments.from_values(u**2), (1 - T) ** 3 / 3, rounding=1e-5, what="the mean of u^2")
 
 
 def face() -> tuple[float, float]:

@@ -43,7 +43,7 @@ def test_standard_error_of_a_ratio() -> None:
     once = 0.6 * every * rng.random((2000, 400))
     result = [study.missing_share(a, b) for a, b in zip(once, every, strict=True)]
     errors, standard_errors = np.array(result).T
-    assert_same_mean(Moments.of(errors), 0.7, rounding=1e-3, what="ratios")
+    assert_same_mean(Moments.from_values(errors), 0.7, rounding=1e-3, what="ratios")
     assert_same_variance(errors, np.mean(standard_errors**2), what="ratios")
 
 

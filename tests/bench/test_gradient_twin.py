@@ -50,9 +50,9 @@ def test_its_light_is_that_of_volpath(variant_rgb: str, name: str) -> None:
     peer = light.integrator("volpath")
     paths = np.concatenate([mivol.paths(fresh(k), 512)[0] for k in range(4)])
     images = [np.array(mi.render(mivol.scene, integrator=peer, spp=256, seed=fresh(100 + k)), np.float64) for k in range(16)]
-    light_of_theirs = over_pixels(Moments.of(np.array(images).mean(axis=-1, keepdims=True)))
+    light_of_theirs = over_pixels(Moments.from_values(np.array(images).mean(axis=-1, keepdims=True)))
     assert_precise(light_of_theirs, 0.02 * light_of_theirs.mean)
-    assert_same_mean(light_of_theirs, Moments.of(paths))
+    assert_same_mean(light_of_theirs, Moments.from_values(paths))
 
 
 @pytest.mark.parametrize("depth", [6, -1])
@@ -85,7 +85,7 @@ def test_what_takes_the_noise_has_the_mean_0(variant_rgb: str) -> None:
     tracer = Twin(np.where(np.arange(5) < 2, 0, 3 * NOISE), NOISE, SIDE, UNLIMITED["glass"])
     _, _, controls = tracer.paths(fresh(9), 4096)
     for row in controls:
-        assert_same_mean(Moments.of(row), 0.0)
+        assert_same_mean(Moments.from_values(row), 0.0)
 
 
 def test_levels_of_each_number_of_scatterings_take_more_noise(variant_rgb: str) -> None:

@@ -55,7 +55,7 @@ def sensor_of(kind: str = "perspective", rfilter: str = "box", **film: object) -
 def moments(scene: mi.Scene, integrator: mi.Integrator, spp: int, first: int, batches: int = 12) -> Moments:
     """Mean and its variance over independent images."""
     images = [np.array(mi.render(scene, integrator=integrator, spp=spp, seed=fresh(first + seed))) for seed in range(batches)]
-    return Moments.of(np.stack(images))
+    return Moments.from_values(np.stack(images))
 
 
 CAMERAS = {

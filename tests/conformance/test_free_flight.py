@@ -268,7 +268,7 @@ def test_media_scenes_of_mitsubas_own_tests(two_threads, name, data_dir):
     for kind, spp in (("mivol", 16), (judge, 32)):
         integrator = mi.load_dict({"type": kind, "max_depth": 6, "rr_depth": 5})
         pictures = [scenes.render(scene, integrator, spp, seed=fresh(k))[..., :3].mean(axis=(0, 1)) for k in range(16)]
-        found.append(Moments.of(np.array(pictures, dtype=np.float64)))
+        found.append(Moments.from_values(np.array(pictures, dtype=np.float64)))
     assert_same_mean(*found, rounding=1e-6, what="pictures")
     assert_precise(difference(*found), 0.02 * found[1].mean, what="pictures")
 

@@ -247,9 +247,9 @@ def test_empty_space_is_skipped_where_it_pays():
     sparse[:8, :8, :8] = 1
     scene = scene_of(sigma_t=grid_volume("mivol_voxels", sparse, PLACE))
     needs = find_needs(scene, scene.sensors()[0])
-    assert make_plan(needs, Settings(max_depth=1)).skips == (True,)
+    assert make_plan(needs, Settings(max_depth=1)).skips_empty == (True,)
     scene = scene_of()
-    assert make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1)).skips == (False,)
+    assert make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1)).skips_empty == (False,)
 
 
 def nested(*balls: dict, kind: str = "homogeneous") -> mi.Scene:

@@ -46,7 +46,7 @@ def test_moment_has_the_same_mean_and_the_right_second_moment():
     single = np.stack([np.array(mi.render(scene, integrator=integrator, spp=1, seed=fresh(1000 + s))) for s in range(48)])
     squares = ((single @ XYZ.T) ** 2).mean(axis=(1, 2)).reshape(16, 3, 3).mean(axis=1)
     # The batches of ``moment`` share no random numbers, and neither do pixels of one.
-    whole, truth = over_pixels(Moments(nested.n, nested.mean[..., 6:], nested.m2[..., 6:])), Moments.of(squares)
+    whole, truth = over_pixels(Moments(nested.n, nested.mean[..., 6:], nested.m2[..., 6:])), Moments.from_values(squares)
     assert_same_mean(whole, truth, what="second moments")
     assert_precise(difference(whole, truth), 0.015 * truth.mean, what="second moments")
     # It is not the square of the mean, by more than 3 of the 1.5 % above.

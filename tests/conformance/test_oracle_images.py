@@ -384,7 +384,7 @@ def test_corner_in_the_medium_lit_by_the_sky(kind, depth):
     ours = np.array([render(scene, mivol(max_depth=depth, rr_depth=99), 32, fresh(seed)) for seed in seeds])
     stock = {"type": "volpath", "max_depth": depth, "rr_depth": 99}
     theirs = np.array([render(scene, stock, 256, fresh(100 + seed)) for seed in seeds])
-    ours, theirs = (Moments.of(x.mean(axis=(1, 2, 3))) for x in (ours, theirs))
+    ours, theirs = (Moments.from_values(x.mean(axis=(1, 2, 3))) for x in (ours, theirs))
     assert_same_mean(ours, theirs, what="lit by the sky")
     assert_precise(difference(ours, theirs), 0.01 * theirs.mean, what="lit by the sky")
 

@@ -436,7 +436,7 @@ def test_same_image_as_stock_under_volpath(name):
         )
         seeds = range(16) if not means else range(16, 32)
         batches = [render(scene, {"type": "volpath", "max_depth": 4}, 64, seed=fresh(s))[..., :1] for s in seeds]
-        means.append(Moments.of(np.array(batches)))
+        means.append(Moments.from_values(np.array(batches)))
     a, b = means
     assert_same_mean(a, b)
 
@@ -587,7 +587,7 @@ def test_image_gradient_against_finite_differences(name):
             params.update()
             images.append(render(scene, {"type": "prbvolpath", "max_depth": 2}, 256, seed=100 + seed).mean())
         want.append((images[0] - images[1]) / 2)
-    got, want = (Moments.of(np.array(x)[:, None]) for x in (got, want))
+    got, want = (Moments.from_values(np.array(x)[:, None]) for x in (got, want))
     # The step is 1/8 of the way to g = 1 at most: its cube is 1/500 of the difference, below the noise of either.
     assert_same_mean(got, want)
     assert_precise(got, np.abs(want.mean) / 3)

@@ -119,9 +119,9 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = needs(thin, thick, homogeneous, film_samples=2**24 + 1, emitter_kinds=("extended",), surfaces=("Rectangle",),
                   boundaries=[SimpleNamespace(box="a box", hole=None)] * 3, are_emitters_far=False)  # fmt: skip
     made = plan.make_plan(asked, Settings(max_depth=2))
-    assert made.skips == (True, False, False)
-    assert made.tracks == (False, True, False)
-    assert (made.segment, made.events, made.lobe) == ("single_scattering", 1, None)
+    assert made.skips_empty == (True, False, False)
+    assert made.estimates_shadows == (False, True, False)
+    assert (made.segment, made.scattering_points, made.side_flight_cosine) == ("single_scattering", 1, None)
     assert made.pass_rays == min(2**22, 2**29 // 1500)
     passes = math.ceil((2**24 + 1) / made.pass_rays)
     said = {choice.subject: choice.choice for choice in made.choices}

@@ -483,8 +483,10 @@ def test_doubt_a_sampler_whose_dimensions_depend_on_each_other(variant_rgb):
     scenes = {sampler: _sampled_by(sampler) for sampler in ("independent", "ldsampler")}
     assert [d.kind for d in find_doubts(mi.load_dict(scenes["ldsampler"])) if d.fatal] == ["sampler"]
     # 0.0294 by independent numbers and 0.0279 by ldsampler's, measured once with errors of 1e-4.
-    assert_apart(*(Moments.of(_lit(s, "volpath")) for s in scenes.values()), expected=1.5e-3, what="volpath by two samplers")
-    assert_same_mean(*(Moments.of(_lit(s, "mivol")) for s in scenes.values()), what="mivol by two samplers")
+    assert_apart(
+        *(Moments.from_values(_lit(s, "volpath")) for s in scenes.values()), expected=1.5e-3, what="volpath by two samplers"
+    )
+    assert_same_mean(*(Moments.from_values(_lit(s, "mivol")) for s in scenes.values()), what="mivol by two samplers")
 
 
 def _emitter_near_haze(unit: float) -> dict:
@@ -506,7 +508,7 @@ def test_doubt_an_emitter_near_a_boundary(variant_rgb):
     found = {}
     for unit in (1.0, 0.01):
         scene = _emitter_near_haze(unit)
-        found[unit] = [Moments.of(_lit(scene, kind)) for kind in ("volpath", "mivol")]
+        found[unit] = [Moments.from_values(_lit(scene, kind)) for kind in ("volpath", "mivol")]
         assert [d.kind for d in find_doubts(mi.load_dict(scene)) if d.fatal] == ([] if unit == 1 else ["near emitter"])
     (stock, ours), (lost, same) = found[1.0], found[0.01]
     # Stock rays start 1e-4 of a length behind a surface, in an extinction of 1.
@@ -580,7 +582,7 @@ def test_microflakes_are_drawn_from_another_density_than_is_told(variant_rgb, in
     evenly = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
     told = 4 * np.pi * np.array(microflakes.eval_pdf(ctx, mei, evenly)[1]) * np.array(evenly.x)
     # 0.27 and 0, measured once
-    means = (Moments.of(np.array(x, dtype=np.float64)) for x in (drawn.x, told))
+    means = (Moments.from_values(np.array(x, dtype=np.float64)) for x in (drawn.x, told))
     assert_apart(*means, expected=0.27, what="directions drawn and told")
 
 
@@ -604,7 +606,7 @@ def test_a_dense_medium_loses_its_skin(variant_rgb):
     mean = np.exp(-200 * 1500 * 2.0**-24 * (1 + np.maximum(x, x[:, None]))).mean()
     loaded, integrator = mi.load_dict(scene), mi.load_dict({"type": "volpath", "max_depth": 2})
     images = [mi.render(loaded, integrator=integrator, spp=1024, seed=fresh(s)) for s in range(32)]
-    found = Moments.of(8 * np.pi * np.array(images).mean(axis=(1, 2, 3), dtype=np.float64))
+    found = Moments.from_values(8 * np.pi * np.array(images).mean(axis=(1, 2, 3), dtype=np.float64))
     assert_same_mean(found, mean, rounding=1e-4)
     assert_apart(found, 1.0, expected=1 - mean, what="light with and without its skin")
     share = re.search(r"about ([\d.]+)%", doubt.sentence)

@@ -63,7 +63,7 @@ def test_emitters_are_drawn_where_a_straight_ray_may_find_one(name: str) -> None
     plan = make_plan(needs, settings)
     drawn = any(kind != "uniform" for kind in needs.emitter_kinds)
     assert build_estimators(scene, needs, plan, settings, survey, True).lights_media == (drawn and not sealed)
-    assert not (sealed and plan.lobe is not None)
+    assert not (sealed and plan.side_flight_cosine is not None)
 
 
 def test_media_around_shapes_are_not_sealed() -> None:

@@ -94,10 +94,10 @@ def test_the_derivative_is_the_sum_of_both(name):
             else:
                 dr.backward(dr.mean(image, axis=None))
                 found.append(float((np.array(dr.grad(variable), dtype=np.float64) * w).sum()))
-    slopes = Moments.of(np.array(slopes))
+    slopes = Moments.from_values(np.array(slopes))
     slope = abs(float(slopes.mean))
     for mode, found in drawn.items():
-        found = Moments.of(np.array(found))
+        found = Moments.from_values(np.array(found))
         assert_precise(difference(found, slopes), 0.02 * slope, what=mode)
         # A step of h = 0.02 either way in an extinction that is
         # 0.3 on average changes the slope by less than h^2 / 6 times its second derivative, (2 optical lengths)^2: 3e-4.

@@ -41,7 +41,7 @@ def test_a_plan_takes_them_where_they_pay(g, emitter, depth, flies):
     shine = small.sun([0.3, 0.2, -1.0])[0] if emitter == "sun" else small.point([1.5, 1, 2.0])[0]
     scene = close_up({"smoke": smoke(rough_grid(7), 0.9, name="hg", g=g)[0], "emitter": shine}, res=2)
     made = plan.make_plan(find_needs(scene, scene.sensors()[0], survey_scene(scene)), Settings(max_depth=depth))
-    assert (made.lobe is not None) == flies
+    assert (made.side_flight_cosine is not None) == flies
     if flies:
         # Means of 4096 samples: 1 / 64 of the spread of the cosine, which is below 1.
-        assert made.lobe == pytest.approx(g, abs=0.02)
+        assert made.side_flight_cosine == pytest.approx(g, abs=0.02)

@@ -160,12 +160,12 @@ def test_fog_without_an_end_by_quadrature_and_its_derivatives():
         return float(np.array(mi.render(scene, integrator=quiet, spp=spp, seed=seed)).mean(dtype=np.float64))
 
     seeds = [fresh(s) for s in range(16)]
-    drawn = Moments.of(np.array([scenes.render(scene, mivol(), 512, s).mean(dtype=np.float64) for s in seeds]))
+    drawn = Moments.from_values(np.array([scenes.render(scene, mivol(), 512, s).mean(dtype=np.float64) for s in seeds]))
     # Both know a pixel by some of its rays only.
-    known = Moments.of(np.array([picture(0.3, 64, s) for s in seeds]))
+    known = Moments.from_values(np.array([picture(0.3, 64, s) for s in seeds]))
     assert_same_mean(drawn, known, rounding=1e-3 * float(drawn.mean), what="pictures")
     assert_precise(difference(drawn, known), 0.005 * float(drawn.mean), what="pictures")
-    slope = Moments.of(np.array([(picture(0.33, 64, s) - picture(0.27, 64, s)) / 0.06 for s in seeds]))
+    slope = Moments.from_values(np.array([(picture(0.33, 64, s) - picture(0.27, 64, s)) / 0.06 for s in seeds]))
     params[key] = mi.Float(0.3)
     dr.enable_grad(params[key])
     params.update()
@@ -175,7 +175,7 @@ def test_fog_without_an_end_by_quadrature_and_its_derivatives():
         dr.set_grad(params[key], 0)
         dr.backward(dr.mean(image, axis=None))
         found.append(float(dr.grad(params[key])[0]))
-    found = Moments.of(np.array(found))
+    found = Moments.from_values(np.array(found))
     # 1 % for the difference's own curvature
     assert_same_mean(found, slope, rounding=0.01 * abs(float(slope.mean)), what="slopes")
     assert_precise(difference(found, slope), 0.05 * abs(float(slope.mean)), what="slopes")

@@ -30,7 +30,7 @@ def radiance(scene: mi.Scene, count: int) -> np.ndarray:
     """Radiance and alpha (4, 3 * 8 * 8) of three samples per pixel."""
     session, sensor = Session(Settings(max_depth=-1)), scene.sensors()[0]
     with dr.suspend_grad():
-        estimators, _ = session._open(scene, sensor, 3, pictures=True)
+        estimators, _ = session._open(scene, sensor, 3, for_images=True)
         rays = next(film_passes(RenderSamples(sensor, 5, 3, 1 << 20)))
         L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
     return np.array([*L, alpha])
@@ -82,8 +82,8 @@ def test_a_plan_takes_them_where_lengths_differ(monkeypatch: pytest.MonkeyPatch)
     assert "up to 16 paths one after the other" in explain(scene, -1)
     assert "lanes" not in explain(scene, 16)
     facts = find_needs(scene, scene.sensors()[0])
-    assert make_plan(facts, Settings(max_depth=-1)).successive == 16
-    assert make_plan(replace(facts, are_samples_independent=False), Settings(max_depth=-1)).successive == 1
+    assert make_plan(facts, Settings(max_depth=-1)).successive_paths == 16
+    assert make_plan(replace(facts, are_samples_independent=False), Settings(max_depth=-1)).successive_paths == 1
     stratified = mi.load_dict({"type": "perspective", "sampler": {"type": "stratified", "sample_count": 4}})
     assert facts.are_samples_independent and not find_needs(scene, stratified).are_samples_independent
 

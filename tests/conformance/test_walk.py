@@ -85,7 +85,7 @@ FAST = ("sky, no limit", "glossy under a wide emitter", "mask, depth 3", "glass 
 def batches(scene: mi.Scene, kind: str, depth: int, first: int, **more: object) -> Moments:
     integrator = mi.load_dict({"type": kind, "max_depth": depth, "rr_depth": 50, **more})
     seeds = (fresh(first + s) for s in range(10))
-    return Moments.of(np.stack([np.array(mi.render(scene, integrator=integrator, spp=96, seed=s)) for s in seeds]))
+    return Moments.from_values(np.stack([np.array(mi.render(scene, integrator=integrator, spp=96, seed=s)) for s in seeds]))
 
 
 @pytest.mark.slow_for("glossy under a wide emitter", "mask, depth 3", "sky, no limit")

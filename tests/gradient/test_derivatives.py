@@ -200,7 +200,7 @@ def test_branches_keep_the_mean(name: str, key: str, depth: int, monkeypatch: py
 
     def along(spp: int) -> Estimate:
         found = [np.sum(gradient_of_mean_image(scene, KEYS[key], spp, fresh(k), depth) * v) for k in range(BATCHES)]
-        return Estimate.of(Moments.of(np.array(found)[:, None]))
+        return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
 
     monkeypatch.setattr(derivatives, "BALANCE", 2.0)
     found = along(512)
@@ -260,7 +260,7 @@ def find_baselines(
         needs = find_needs(scene, scene.sensors()[0], survey)
         plan = make_plan(needs, settings)
         assert plan.segment == "free_flight"
-        estimators = build_estimators(scene, needs, plan, settings, survey, pictures=False)
+        estimators = build_estimators(scene, needs, plan, settings, survey, for_images=False)
         prepare_derivatives(estimators, ray, mi.Point2f(mi.Float(seen[: len(at)]), 0.5))
     return estimators.segment.baseline
 

@@ -79,7 +79,7 @@ def _along(scene: mi.Scene, key: str, v: np.ndarray | float, integrator: dict, s
     """The derivative of the mean image along v, from independent reverse passes."""
     w = np.full((8, 8, 3), 1 / 192)
     found = [np.sum(_backward(scene, key, w, spp, fresh(k), integrator) * v) for k in range(BATCHES)]
-    return Estimate.of(Moments.of(np.array(found)[:, None]))
+    return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
 
 
 @pytest.mark.slow_for("over a floor-sigma_t")

@@ -150,7 +150,7 @@ def _along(scene: mi.Scene, key: str, v: np.ndarray, integrator: mi.Integrator, 
     """The derivative of the mean image along v, from 16 reverse passes."""
     w = np.full((8, 8, 3), 1 / 192)
     found = [np.sum(_backward(scene, key, w, spp, fresh(k), integrator) * v) for k in range(BATCHES)]
-    return Estimate.of(Moments.of(np.array(found)[:, None]))
+    return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
 
 
 def _difference(scene: mi.Scene, key: str, v: np.ndarray, h: float, integrator: mi.Integrator, spp: int) -> Estimate:
@@ -169,7 +169,7 @@ def _difference(scene: mi.Scene, key: str, v: np.ndarray, h: float, integrator: 
     value = start.astype(np.float32)
     params[key] = kind(value) if value.ndim else kind(float(value))
     params.update()
-    return Estimate.of(Moments.of(np.array(found)[:, None]))
+    return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
 
 
 ROOMS = {
@@ -229,7 +229,7 @@ def test_what_no_camera_ray_meets():
     twin = Twin(values, direction, 8, light)
     found = [float(np.array(subject.of_mean(fresh(k), 512), np.float64) @ direction.ravel()) for k in range(BATCHES)]
     truth = [twin.derivative(fresh(100 + k), 256) for k in range(BATCHES)]
-    found, truth = (Estimate.of(Moments.of(np.array(x)[:, None])) for x in (found, truth))
+    found, truth = (Estimate.from_result(Moments.from_values(np.array(x)[:, None])) for x in (found, truth))
     assert_same_mean(found, truth, rounding=1e-6, what="derivative")
     assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean), what="derivative")
 

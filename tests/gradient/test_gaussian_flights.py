@@ -145,6 +145,6 @@ def test_all_parameters_by_differences() -> None:
         for name in EXTINCTION_PARAMETERS:
             params[PARAMETERS[name]] = mi.TensorXf(start[name].astype(np.float32))
         params.update()
-    found, truth = (Estimate.of(Moments.of(np.array(values)[:, None])) for values in (found, truth))
+    found, truth = (Estimate.from_result(Moments.from_values(np.array(values)[:, None])) for values in (found, truth))
     assert_same_mean(found, truth, rounding=5e-3 * np.abs(truth.mean), what="derivative")
     assert_precise(difference(found, truth), 0.03 * np.abs(truth.mean), what="derivative")

@@ -83,7 +83,7 @@ def pictures(found: mi.Scene, depth: int, spp: int, first: int) -> Moments:
 def over_tiles(drawn: np.ndarray) -> Moments:
     """Batches (n, 2, 2, 3) of means over the quarters of pictures."""
     half = SIDE // 2
-    return Moments.of(drawn.reshape(len(drawn), 2, half, 2, half, 3).mean(axis=(2, 4)))
+    return Moments.from_values(drawn.reshape(len(drawn), 2, half, 2, half, 3).mean(axis=(2, 4)))
 
 
 @pytest.mark.statistical
@@ -163,7 +163,7 @@ def test_derivatives_are_those_of_what_is_composited(nested: bool) -> None:
             for key, value in by_key.items():
                 change.setdefault(key, np.abs(rng.normal(size=np.shape(value))))
             sums.append([np.sum(by_key[key] * change[key]) for key in by_key])
-        found.append(Estimate.of(Moments.of(np.array(sums))))
+        found.append(Estimate.from_result(Moments.from_values(np.array(sums))))
     flown, exact = found
     assert_same_mean(flown, exact, what="derivative by each kind of parameter")
     assert_precise(flown, np.maximum(0.15 * np.abs(exact.mean), 2e-3), what="derivative")

@@ -121,7 +121,7 @@ def test_place_of_an_emitter_over_a_floor(depth):
         dr.enable_grad(x)
         dr.backward(picture(x, seed))
         found.append(dr.grad(x)[0])
-    m = Moments.of((np.array(differences) - np.array(found))[:, None])
+    m = Moments.from_values((np.array(differences) - np.array(found))[:, None])
     level = abs(np.mean(differences))
     # Truncation: (h / distance)^2 = 1e-4; the box's edges are kinks of the haze in between.
     assert_same_mean(m, rounding=2e-3 * level, what="floor")

@@ -571,7 +571,7 @@ def test_against_differences_with_common_random_numbers(key, kind):
     differences = np.array([(at(start + h * v, s) - at(start - h * v, s)) / (2 * h) for s in seeds])
     at(start, 0)
     jv = np.array([jvp(scene, name, v, spp, s, integrator).mean(axis=(0, 1)) for s in seeds])
-    m, level = Moments.of(differences - jv), np.abs(differences.mean(axis=0))
+    m, level = Moments.from_values(differences - jv), np.abs(differences.mean(axis=0))
     assert_same_mean(m, rounding=2e-3 * level.max(), what=key)
     assert_precise(m, 0.02 * level.max(), what=key)
 

@@ -213,7 +213,7 @@ def test_replay_counts_down_to_zero():
     settings = Settings(max_depth=5)
     survey = survey_scene(scene)
     needs = find_needs(scene, sensor, survey)
-    estimators = build_estimators(scene, needs, plan.make_plan(needs, settings), settings, survey, pictures=False)
+    estimators = build_estimators(scene, needs, plan.make_plan(needs, settings), settings, survey, for_images=False)
     sampler = sensor.sampler().clone()
     n = 2000
     position = mi.Point2f(np.random.default_rng(0).uniform(size=(2, n)).astype(np.float32))

@@ -36,7 +36,7 @@ def gradients(seen: Pencils, key: str, spp: int, batches: int = BATCHES) -> Mome
         found.append(np.array(dr.grad(params[key]), dtype=np.float64).reshape(np.shape(params[key])))
         dr.set_grad(params[key], 0)
     dr.disable_grad(params[key])
-    return Moments.of(np.array(found))
+    return Moments.from_values(np.array(found))
 
 
 def set_grid(scene: mi.Scene, values: np.ndarray, key: str = GRID) -> None:

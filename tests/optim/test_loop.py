@@ -221,7 +221,7 @@ def test_nonlinear_loss_is_independent_of_passes(variant_rgb) -> None:
     for most in (1 << 20, 3 * 64):
         problem = small_problem(spp=4, samples_per_pass=most, loss=Huber(delta=0.02))
         problem.set_reals(problem.initial_reals())
-        coverage.append(Moments.of(np.array([problem.mean_loss(fresh(i)) for i in range(24)])))
+        coverage.append(Moments.from_values(np.array([problem.mean_loss(fresh(i)) for i in range(24)])))
     # One pass of 4 samples and 4 passes of one: a mean of losses of single passes would be about 4 times as large.
     assert_same_mean(*coverage, what="losses")
     assert_precise(coverage[0], 0.1 * float(coverage[0].mean), what="losses")

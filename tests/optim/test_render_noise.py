@@ -161,7 +161,7 @@ def test_the_renderers_noise_in_the_loss(variant_rgb, pairs: bool) -> None:
     Expected: the mean of 60 losses is (T - R)^2 plus that, and with pairs without it."""
     problem = cube_problem(loss=L2(pairs=pairs))
     problem.set_reals(problem.initial_reals())
-    losses = Moments.of(np.array([problem.mean_loss(i) for i in range(60)]))
+    losses = Moments.from_values(np.array([problem.mean_loss(i) for i in range(60)]))
     bias = T * (1 - T) / SPP
     assert_precise(losses, bias / 20, what="losses")
     assert_same_mean(losses, (T - SEEN) ** 2 + (0 if pairs else bias), what="losses")
@@ -176,7 +176,7 @@ def test_the_measured_noise_is_the_variance(variant_rgb) -> None:
     for i in range(60):
         problem.loss_and_gradient(problem.initial_reals(), i)
         found.append(problem.newest_loss[1])
-    assert_same_mean(Moments.of(np.array(found)), T * (1 - T) / SPP, what="noise")
+    assert_same_mean(Moments.from_values(np.array(found)), T * (1 - T) / SPP, what="noise")
 
 
 @pytest.mark.slow

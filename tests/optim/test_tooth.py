@@ -81,7 +81,7 @@ def test_variance_of_the_transmission_is_measured():
     ratio = claimed / values.var(axis=0, ddof=1)
     assert_within(ratio.mean() - 1, 0.01 + 6 * math.sqrt(2 / 4000 / 64), chance=2 * stats.norm.sf(6), what="variances")
     # The bias of a ratio with a noisy denominator is T var(flat) / n / flat^2 = 2.5e-5.
-    assert_same_mean(Moments.of(values), t, rounding=2.5e-5, what="transmissions")
+    assert_same_mean(Moments.from_values(values), t, rounding=2.5e-5, what="transmissions")
 
 
 @pytest.mark.statistical

@@ -22,7 +22,7 @@ FALSE_ALARM = 1e-3
 
 def mean_of_rounds(values: np.ndarray) -> Estimate:
     """Estimate the mean of at least two independent values (rounds,)."""
-    m = Moments.of(values)
+    m = Moments.from_values(values)
     return Estimate(float(m.mean), float(m.variance_of_mean), m.n - 1)
 
 
@@ -34,7 +34,7 @@ def mean_of_pixels(rounds: np.ndarray) -> Estimate:
     numbers of a tile. The variance of the means of rounds has this shared noise.
     """
     shared = mean_of_rounds(rounds.mean(axis=1))
-    v = Moments.of(rounds).variance_of_mean
+    v = Moments.from_values(rounds).variance_of_mean
     alone = float(v.sum()) / v.size**2
     if alone <= shared.var:
         return shared

@@ -77,7 +77,7 @@ class Contest:
 
     def variances(self, name: str, level: int = 1) -> np.ndarray:
         """Variance of one result, for each number."""
-        return Moments.of(self.results(name, level)).variance
+        return Moments.from_values(self.results(name, level)).variance
 
     def time_ratios(self, slow: str, fast: str) -> dict[str, float]:
         """Time of one method over the time of another, by the wall clock and by processor time."""

@@ -131,7 +131,7 @@ def error_figures(contest: Contest, counts: np.ndarray, scale: Callable[[np.ndar
     unit = scale(mean[counts])
     figures: dict = {}
     for (name, level), timing in contest.timings.items():
-        error = math.sqrt(Moments.of(results[name, level]).variance[counts].mean()) / unit
+        error = math.sqrt(Moments.from_values(results[name, level]).variance[counts].mean()) / unit
         figures.setdefault(name, []).append({"level": level, "seconds_median": timing.median, "relative_error": error})
     for peer in list(figures)[1:]:
         sums = (mean_of_rounds(results[name, 1][:, counts].sum(axis=1)) for name in ("mivol", peer))

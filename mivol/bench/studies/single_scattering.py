@@ -216,7 +216,7 @@ def emitter_distances(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
 
 def image_errors(contest: Contest, name: str, level: int, counts: np.ndarray) -> dict:
     """Mean, variance, relative error and time of the images of one integrator, over the counted pixels."""
-    m, spp = Moments.of(contest.results(name, level)), contest.spp[name, level]
+    m, spp = Moments.from_values(contest.results(name, level)), contest.spp[name, level]
     variance, mean = m.variance.mean(axis=-1)[counts], m.mean.mean(axis=-1)[counts]
     return {
         "spp": spp,

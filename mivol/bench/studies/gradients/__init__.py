@@ -273,7 +273,7 @@ def refine(values: Sequence[float], estimate: Callable[[int], float], percent: f
     """
     values = list(values)
     while len(values) < most:
-        m = Moments.of(np.array(values))
+        m = Moments.from_values(np.array(values))
         if math.sqrt(m.variance_of_mean) <= percent / 100 * abs(m.mean):
             break
         values.append(estimate(len(values)))
