@@ -1,4 +1,4 @@
-"""Study of tomography: every method nears the truth, and the operator has the reported properties."""
+"""Slices by several programs: every method nears the truth in the same orientation, and measured slices are centred."""
 
 from __future__ import annotations
 

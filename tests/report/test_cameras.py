@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from photo_sets import write_blender
 from scipy.spatial.transform import Rotation
 
-from mivol.photos import PhotoSurvey, survey_photos
-from mivol.photos.camera import Camera
+from mivol.photos import Camera, PhotoSurvey, survey_photos
 from mivol.photos.survey import PhotoFrame
 from mivol.report.cameras import EDGE, FAR, LABELS, MOST_POINTS, PARTS, WIDTH, list_parts, outline, plot_cameras
 from mivol.report.figures import INK

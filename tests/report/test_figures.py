@@ -13,8 +13,7 @@ from photo_sets import ring
 from PIL import Image
 from readable_figures import assert_readable
 
-from mivol.photos import PhotoSurvey
-from mivol.photos.camera import Camera
+from mivol.photos import Camera, PhotoSurvey
 from mivol.photos.survey import PhotoFrame
 from mivol.report.cameras import plot_cameras
 from mivol.report.figures import (
