@@ -680,7 +680,7 @@ def test_a_ball_under_a_constant_sky(alone):
     differences = np.array([(at(h, s) - at(-h, s)) / (2 * h) for s in seeds])
     at(0, 0)
     found = np.array([np.sum(v * vjp(scene, GRID, w, 256, s, integrator)) for s in seeds])
-    m, level = Moments.of((differences - found)[:, None]), abs(differences.mean())
+    m, level = Moments.from_values((differences - found)[:, None]), abs(differences.mean())
     # Truncation as below.
     assert_same_mean(m, rounding=2e-3 * level, what="ball")
     assert_precise(m, 0.02 * level, what="ball")
