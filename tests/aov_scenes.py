@@ -22,15 +22,25 @@ EPS = 2.0**-23
 CUBE = centred(np.eye(3))
 
 
-def see(parts, o, d, aovs, inside=None, **more):
-    """AOVs (n, names) along rays (n, 3), and those rays as the sensor sent them."""
+def shoot(parts, o, d, integrator, inside=None, spp=1, seed=0):
+    """The image (n, channels) along rays (n, 3), one pixel for each, and those rays as the sensor sent them.
+
+    ``inside`` names the medium around the sensor.
+    """
+    o, d = np.atleast_2d(o), np.atleast_2d(d)
     rays = {f"ray{i:03d}": pencil(p, w) for i, (p, w) in enumerate(zip(o, d, strict=True))}
     sensor = {"type": "batch", **rays, "film": film(len(o), 1), "sampler": {"type": "independent"}}
     if inside is not None:
         sensor["medium"] = {"type": "ref", "id": inside}
     scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
     o, d = (x[0, :, 0] for x in pixel_rays(scene.sensors()[0], 1))
-    return render(scene, {"type": "mivol", "max_depth": 1, "aovs": aovs, **more}, 1)[0, :, 3:].astype(np.float64), o, d
+    return render(scene, integrator, spp, seed)[0], o, d
+
+
+def see(parts, o, d, aovs, inside=None, **more):
+    """AOVs (n, names) along rays (n, 3), and those rays as the sensor sent them."""
+    image, o, d = shoot(parts, o, d, {"type": "mivol", "max_depth": 1, "aovs": aovs, **more}, inside)
+    return image[:, 3:].astype(np.float64), o, d
 
 
 def rays(n=8, origin=(0.2, 0.3, 4.0), seed=0, wide=0.35):

@@ -53,3 +53,28 @@ def system_matrix(geometry: Geometry, grid: VoxelGrid, views: np.ndarray | None 
 def _crossings(q: np.ndarray, e: np.ndarray, planes: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(e[:, None] == 0, np.nan, (planes - q[:, None]) / e[:, None])
+
+
+def numbers(*shape: int, seed: int = 1) -> np.ndarray:
+    """Normal float32 numbers."""
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def assert_pair_is_its_twin(a, geometry: Geometry, grid: VoxelGrid) -> scipy.sparse.csr_array:
+    """Operator and transpose against the twin, which is returned.
+
+    2e-6 of sum |A| |x| and |A|^T |y|: float32 rounding of about 20 terms and of positions of order 10 voxels.
+    """
+    twin, x, y = system_matrix(geometry, grid), numbers(*grid.shape), numbers(*a.projection_shape, seed=2)
+    for found, operator, operand, shape in ((a @ x, twin, x, a.projection_shape), (a.T @ y, twin.T, y, grid.shape)):
+        assert found.shape == shape and found.dtype == np.float32
+        expected, size = (operator @ v.ravel().astype(float) for v in (operand, np.abs(operand)))
+        assert np.abs(found.ravel() - expected).max() < 2e-6 * size.max()
+    return twin
+
+
+def assert_pair_is_adjoint(a, grid: VoxelGrid, seed: int) -> None:
+    """|<A x, y> - <x, A^T y>| <= 1e-6 |A x| |y|: the promise of a matched pair (the inner products are float64)."""
+    x, y = numbers(grid.size, seed=seed), numbers(a.shape[0], seed=seed + 100)
+    ax, aty = (a @ x).astype(float), (a.T @ y).astype(float)
+    assert abs(ax @ y - x @ aty) <= 1e-6 * np.linalg.norm(ax) * np.linalg.norm(y)

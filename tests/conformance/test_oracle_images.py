@@ -12,17 +12,15 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 import pytest
+from aov_scenes import shoot
 from false_alarms import Estimate, assert_precise, assert_same_bounded_mean, assert_same_mean, difference, fresh
 from oracle import (
     box_interval,
-    depth_twin,
     overlap,
     pixel_means,
     sphere_interval,
     tau_scale,
     tau_twin,
-    to_lattice,
-    trilinear,
 )
 from scattering_scenes import cases
 
@@ -35,10 +33,8 @@ from scenes import (
     box_of,
     camera,
     centred,
-    film,
     grid_volume,
     medium,
-    pencil,
     pixel_rays,
     render,
     rotation,
@@ -69,14 +65,7 @@ class Seen:
 
 def see(parts, o, d, integrator=None, inside=None, spp=1, seed=0):
     """What an integrator sees along rays (n, 3), one pixel for each; `inside` names the medium around the sensor."""
-    o, d = np.atleast_2d(o), np.atleast_2d(d)
-    rays = {f"ray{i:03d}": pencil(p, w) for i, (p, w) in enumerate(zip(o, d, strict=True))}
-    sensor = {"type": "batch", **rays, "film": film(len(o), 1), "sampler": {"type": "independent"}}
-    if inside is not None:
-        sensor["medium"] = {"type": "ref", "id": inside}
-    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
-    o, d = (x[0, :, 0] for x in pixel_rays(scene.sensors()[0], 1))
-    return Seen(render(scene, integrator or mivol(), spp, seed)[0], o, d)
+    return Seen(*shoot(parts, o, d, integrator or mivol(), inside, spp, seed))
 
 
 def random_grid(seed, channels=1, top=4.0):
@@ -473,61 +462,6 @@ def test_tau_and_alpha_at_any_optical_depth():
             assert image[3] == pytest.approx(tau, rel=8 * EPS)
             assert image[4] == pytest.approx(-math.expm1(-tau), rel=8 * EPS)
             assert np.all(np.abs(image[:3] - math.exp(-tau)) <= math.exp(-tau) * (tau + 1) * 8 * EPS + 1e-37)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("walled", [False, True])
-def test_aovs_against_the_twin(kind, walled):
-    to_world, values = as_float32(centred(np.eye(3))), random_grid(21)
-    parts = in_frame(kind, values, to_world)
-    o = as_float32(np.column_stack([np.random.default_rng(21).uniform(-0.3, 0.3, (6, 2)), np.full(6, 2.0)]))
-    d = as_float32(np.tile(np.array([0.04, -0.03, -1]) / np.linalg.norm([0.04, -0.03, -1]), (6, 1)))
-    o[0] = [3, 3, 2]  # misses everything
-    height = -0.13
-    if walled:
-        parts["wall"] = wall(height, {"type": "diffuse"})
-    seen = see(parts, o, d, mivol(aovs="depth,tau,alpha", max_depth=1))
-    image, o, d = seen.image, seen.o, seen.d
-    end = (height - o[:, 2]) / d[:, 2] if walled else np.full(6, math.inf)
-    end[0] = math.inf
-    assert image.shape == (6, 6)
-    tau, scale = tau_twin(values, to_world, o, d, 0, end)[:, 0], tau_scale(values, to_world, o, d, 0, end)[:, 0]
-    assert np.all(np.abs(image[:, 4] - tau) <= BOUND * scale + values.max() * 1e-6)
-    for i in range(6):
-        q, dq = to_lattice(values, to_world, o[i], d[i])
-        t0, t1 = overlap((0, end[i]), box_interval(to_world, o[i], d[i]))
-
-        def sigma(t, q=q, dq=dq, t0=t0, t1=t1):
-            return trilinear(values, q + t[:, None] * dq) * ((t >= t0) & (t <= t1))[:, None]
-
-        alpha, depth = depth_twin(sigma, [t0, t1], None if math.isinf(end[i]) else end[i], n=20_000)
-        assert image[i, 5] == pytest.approx(alpha, abs=BOUND * scale[i] + 4e-6)
-        # A quadrature in the cells may serve for the mean distance: asked to 1e-4 of the chord.
-        assert image[i, 3] == pytest.approx(depth, abs=1e-4 * max(t1 - t0, 1e-3))
-
-
-def test_rgb_tau_of_each_channel_and_their_mean():
-    to_world, values = np.eye(4), random_grid(22, 3)
-    o, d = aimed_rays(22, [0.5, 0.5, 0.5], 1.0, n=4)
-    parts = in_frame("own", values, to_world)
-    seen = see(parts, o, d, mivol(aovs="alpha,tau.R,tau.G,tau.B,tau"))
-    image, o, d = seen.image, seen.o, seen.d
-    tau = tau_twin(values, to_world, o, d)
-    scale = tau_scale(values, to_world, o, d)
-    assert image.shape == (4, 8)
-    assert np.all(np.abs(image[:, 4:7] - tau) <= BOUND * scale)
-    assert np.all(np.abs(image[:, 7] - tau.mean(axis=1)) <= BOUND * scale.mean(axis=1))
-    alpha = -np.expm1(-tau).mean(axis=1)
-    assert np.all(np.abs(image[:, 3] - alpha) <= BOUND * scale.max(axis=1) + 4 * EPS)
-
-
-def test_depth_of_a_homogeneous_medium():
-    # 1/sigma - L T/(1 - T), from the entry on.
-    sigma, to_world = 3.0, np.eye(4)
-    parts = {"sky": sky(), "box": box_of(medium("homogeneous", sigma), to_world)}
-    seen = see(parts, [0.5, 0.5, -2], [0, 0, 1], mivol(aovs="depth"))
-    T = math.exp(-sigma)
-    assert seen.image[0, 3] == pytest.approx(-seen.o[0, 2] + 1 / sigma - T / (1 - T), rel=1e-5)
 
 
 # -- Refusals ----------------------------------------------------------------------------------------------------------------
