@@ -121,7 +121,6 @@ def test_atmosphere_through_the_horizontal():
 
 
 def test_axis_aligned_rays_and_signed_zeros():
-    """Hard case 9."""
     cube, slab = analytic.box(1.0), analytic.Slab(1.0)
     for zero in (0.0, -0.0):
         assert cube.optical_depth([0.5, 0.5, -1], [zero, zero, 1]) == 1.0
@@ -131,7 +130,7 @@ def test_axis_aligned_rays_and_signed_zeros():
 
 
 def test_ray_from_far_away():
-    """From 1e6 radii the closest point is known to 1e6 eps = 2e-10 radii, the chord to 1.5 times that. Hard case 15."""
+    """From 1e6 radii the closest point is known to 1e6 eps = 2e-10 radii, the chord to 1.5 times that."""
     d = np.array([3.0, 2.0, 1.0]) / np.sqrt(14.0)
     across = np.array([2.0, -3.0, 0.0]) / np.sqrt(13.0)
     tau = analytic.sphere(1.0).optical_depth(-1e6 * d + 0.6 * across, d)

@@ -49,8 +49,8 @@ def test_chromaticity(T, variant_rgb):
 
 
 def test_luminance(variant_rgb):
-    """Freezing platinum, 2041.4 K, once defined the candela: 60 cd cm^-2. A kelvin of it, which is what it is known to, is
-    0.7 %."""
+    """Freezing platinum, 2041.4 K, once defined the candela: 60 cd cm^-2. A kelvin of it, which is what it is known to, is 0.7
+    %."""
     assert LUMENS_PER_WATT * blackbody_xyz(np.array(2041.4))[1] == pytest.approx(60e4, rel=1e-2)
 
 

@@ -27,9 +27,6 @@ CUBE_DEPTH = 0.8966336
 """E[l^2] / E[l] of lines through the unit cube: 8 / (2 pi) int prod(1 - u_i) / |u|^2 du, which Gauss-Legendre gives below."""
 
 
-# -- The table ----------------------------------------------------------------------------------------------------
-
-
 def test_no_number_of_the_table_was_changed() -> None:
     """Sums of what mivol bench depth has printed, which takes an hour: one wrong digit changes one of them."""
     sums = {key: table.sum() for key, table in TABLES.items()}
@@ -50,8 +47,8 @@ def test_more_albedo_and_more_matter_leave_out_more(key: tuple[str, str]) -> Non
 
 @pytest.mark.parametrize("key", TABLES, ids="-".join)
 def test_orders_of_scattering_are_positive(key: tuple[str, str]) -> None:
-    """1 / (1 - e) is a power series in the albedo with coefficients s_n / s_1 >= 0 that starts with 1: convex, chords
-    rise. Rounding moves 1 / (1 - e) by ROUNDING / (1 - e)^2, and a chord by two of these over its width."""
+    """1 / (1 - e) is a power series in the albedo with coefficients s_n / s_1 >= 0 that starts with 1: convex, chords rise.
+    Rounding moves 1 / (1 - e) by ROUNDING / (1 - e)^2, and a chord by two of these over its width."""
     for column in TABLES[key].T:
         x, y = np.array([0.0, *ALBEDOS]), 1 / (1 - np.array([0.0, *column]))
         slack = ROUNDING * y**2
@@ -93,8 +90,6 @@ def test_refusals() -> None:
         depth_two_error(0.5, 1.0, "sun")
 
 
-# -- Lines and their depth ----------------------------------------------------------------------------------------
-
 SIX = 2 * stats.norm.sf(6)
 """Chance of 6 standard errors of a normal mean, either way."""
 
@@ -108,8 +103,8 @@ def fresh_lines(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", FRAMES)
 def test_lines_are_even(name: str) -> None:
-    """Cauchy: their mean length is 4 V / A in any convex body. Each begins and ends on the boundary (float64: 1e-12), and
-    stays inside between."""
+    """Cauchy: their mean length is 4 V / A in any convex body. Each begins and ends on the boundary (float64: 1e-12), and stays
+    inside between."""
     box, n = Box(FRAMES[name]), 20_000
     o, d, length = sample_lines(box, n, fresh(0))
     edges = box.to_world[:3, :3].T
@@ -163,9 +158,9 @@ def test_depth_of_a_ball(variant_rgb, fresh_lines) -> None:
 
 @pytest.mark.statistical
 def test_clumps_count_for_what_they_scatter(variant_rgb, fresh_lines) -> None:
-    """The same mass in one octant: lines that miss it weigh nothing. Half the length and 8 times the extinction make the
-    depth 4 times that of the full cube; a quarter of the lines meet it, which makes the standard error 0.5 %, 6 allowed. On
-    three of its six sides the grid fades out over one of 16 voxels, which smooths squares by at most 1 / 32 each way: 3 %."""
+    """The same mass in one octant: lines that miss it weigh nothing. Half the length and 8 times the extinction make the depth
+    4 times that of the full cube; a quarter of the lines meet it, which makes the standard error 0.5 %, 6 allowed. On three of
+    its six sides the grid fades out over one of 16 voxels, which smooths squares by at most 1 / 32 each way: 3 %."""
     values = np.zeros((32, 32, 32, 1), np.float32)
     values[:16, :16, :16] = 8.0
     grid = {"type": "mivol_voxels", "data": mi.TensorXf(values)}

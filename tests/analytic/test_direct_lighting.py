@@ -138,8 +138,7 @@ def test_a_point_of_smoke_under_a_sky():
 @pytest.mark.parametrize("kind", ["envmap", "directional"])
 def test_a_sample_at_infinity_is_the_same_from_everywhere(kind):
     """Direction, density and light of a sample drawn far outside equal the values drawn at a point inside; the sample ends
-    outside.
-    """
+    outside."""
     media = media_of(scene(emitter=sun_of(kind)))
     far, near = dr.zeros(mi.Interaction3f, 64), dr.zeros(mi.Interaction3f, 64)
     far.p, near.p = mi.Point3f(300, -200, 100), mi.Point3f(0.1, 0.2, 0.3)

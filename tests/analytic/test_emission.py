@@ -25,9 +25,6 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 EPS = 2.0**-23
 
 
-# -- A cell, and a row of cells, in float64 --------------------------------------------------------------------------------
-
-
 def cell(dt, s1, s2, kind="Float64"):
     """What the code makes of cells."""
     return [rule(*(getattr(mi, kind)(np.ravel(x)) for x in (dt, s1, s2))) for rule in (share_opacity, weigh_emission_density)]
@@ -128,10 +125,7 @@ TAUS = np.append(0, np.logspace(-8, 6, 43))
 
 @pytest.mark.parametrize("ratio", [0.0, 1e-6, 0.3, 1.0, 40.0, 1e9])
 def test_cells_of_any_optical_depth(ratio):
-    """float32 weights against the float64 twin, from an optical depth of 1e-8 to 1e6: finite, never negative, and right.
-
-    Hard case 2.
-    """
+    """float32 weights against the float64 twin, from an optical depth of 1e-8 to 1e6: finite, never negative, and right."""
     dt, mean = 0.5, TAUS / 0.5
     s1 = as_float32(2 * mean / (1 + ratio))
     s2 = as_float32(s1 * ratio)
@@ -174,9 +168,6 @@ def test_derivatives_of_a_cell(scale):
     assert np.allclose(w, per * [s1, s2], rtol=1e-6)
 
 
-# -- Scenes: a constant source, whatever the density -------------------------------------------------------------------------
-
-
 EXTINCTIONS = {
     "grey": (rough(2, 0, 6), PLACE),
     "rgb": (rough(3, 0, 6, 3) * as_float32([1, 1e-3, 5]), PLACE),
@@ -193,7 +184,7 @@ NAMES = [
 @pytest.mark.slow_for("box-rgb")
 @pytest.mark.parametrize(("boundary", "extinction"), NAMES)
 def test_constant_source(boundary, extinction):
-    """C = Le (1 - T) + B T to rounding; of c = B nothing remains but B, and no gradient. Hard case 38."""
+    """C = Le (1 - T) + B T to rounding; of c = B nothing remains but B, and no gradient."""
     seen = emitting(twins.Medium(EXTINCTIONS[extinction], LE), boundary)
     C = light(seen)
     put(seen.scene, **{"emission.value.value": 0 * LE, "radiance.value": 0 * B + 1})
@@ -231,7 +222,7 @@ def _inside(o, d) -> dict:
 @pytest.mark.slow_for("ball")
 @pytest.mark.parametrize("boundary", ["box", "ball"])
 def test_camera_inside(boundary):
-    """What lies behind the camera neither dims nor adds, in a box and in a boundary that is traced. Hard case 45."""
+    """What lies behind the camera neither dims nor adds, in a box and in a boundary that is traced."""
     medium = twins.Medium((rough(5, 0, 4), PLACE), (rough(6, 0, 1, 3), PLACE), (rough(7, 0, 1, 3), PLACE))
     rng = np.random.default_rng(1)
     o, d = as_float32(rng.uniform(-0.4, 0.4, (8, 3))), rng.normal(size=(8, 3))
@@ -264,7 +255,7 @@ def test_refining_the_grid():
 
 
 def test_zero_density():
-    """No extinction: C = B and the emission density's plain integral, with a derivative of w (c - B). Hard cases 20, 21."""
+    """No extinction: C = B and the emission density's plain integral, with a derivative of w (c - B)."""
     empty = np.zeros((5, 4, 6, 1))
     source = (rough(8, 0, 1, 3), PLACE)
     seen = emitting(twins.Medium((empty, PLACE), source))
@@ -287,10 +278,7 @@ def test_zero_density():
 @pytest.mark.slow_for("1e-08")
 @pytest.mark.parametrize("tau", [1e-8, 1e-3, 1.0, 1e3, 1e6])
 def test_gradients_are_finite_at_any_optical_depth(tau):
-    """Cells of an optical depth from 1e-8 to 1e6, empty ones between them: no NaN, no infinity, and C between its sources.
-
-    Hard case 37.
-    """
+    """Cells of an optical depth from 1e-8 to 1e6, empty ones between them: no NaN, no infinity, and C between its sources."""
     values = rough(9, 0, 1) * (rough(10, 0, 1) > 0.4) * tau * 3
     medium = twins.Medium((as_float32(values), PLACE), (rough(11, 0, 1, 3), PLACE), (rough(12, 0, 1, 3), PLACE))
     seen = emitting(medium)

@@ -121,8 +121,7 @@ def test_the_density_of_directions_integrates_to_one(origin: tuple) -> None:
 @pytest.mark.statistical
 def test_points_of_a_ray_are_drawn_with_their_density() -> None:
     """The mean of t^k / density is the integral of t^k over the ray's intervals in both boxes; ``light`` sums the table along
-    the ray.
-    """
+    the ray."""
     table = table_of(two())
     o, d = mi.Point3f(-1.0, 0.25, 0.15), mi.Vector3f(1, 0, 0)
     on = dr.full(mi.Bool, True, N)

@@ -102,8 +102,7 @@ class FallingRays:
 
 def test_a_diffuse_wall_scatters_paths_that_may_scatter():
     """The weight is the reflectance, and the density the cosine over pi; the new ray leaves the wall into the medium in front
-    of it.
-    """
+    of it."""
     bench = FallingRays(DIFFUSE)
     turn = bench.turn(None, [True, True, False, True], [0.5] * 4)
     assert np.array(turn.on).tolist() == [True, True, False, True] and not np.array(turn.through).any()
@@ -117,8 +116,7 @@ def test_a_diffuse_wall_scatters_paths_that_may_scatter():
 
 def test_a_mask_transmits_rays_without_deviation_at_any_depth():
     """Random numbers above the opacity pass; the ray keeps its direction and the rest of its length, also if it may not
-    scatter.
-    """
+    scatter."""
     turn = FallingRays(MASK).turn(None, [True, True, False, False], [0.9, 0.1, 0.9, 0.1])
     assert np.array(turn.through).tolist() == [True, False, True, False]
     assert np.array(turn.on).tolist() == [True, True, True, False]

@@ -78,8 +78,7 @@ def test_depths_along_rays_are_those_of_the_twin(count: int, span: str) -> None:
 
 def test_the_depth_of_the_twin_is_the_integral_of_its_extinction() -> None:
     """By adaptive quadrature between the ends of each Gaussian. The twin loses nothing of splatting's Gaussians but the cut
-    tails.
-    """
+    tails."""
     gaussians, (o, d) = oracle.Cloud.of(cloud(3)), rays()
     for ray in range(6):
         origin, direction = o[ray : ray + 1], d[ray : ray + 1]
@@ -130,9 +129,6 @@ def test_extinctions_at_points_are_those_of_the_twin() -> None:
     np.testing.assert_allclose(np.array(value), SCALE * truth, rtol=ROUNDING, atol=8 * ROUNDING)
     (outside,) = part_of(gaussians).eval_at(mi.Float(SCALE), there.ray, mi.Float(40), there.active)
     assert not np.array(outside).any()
-
-
-# -- Derivatives -------------------------------------------------------------------------------------------------------------
 
 
 def differences(value: object, gaussians: oracle.Cloud) -> dict[str, np.ndarray]:

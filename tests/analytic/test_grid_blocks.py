@@ -35,7 +35,6 @@ def shell(n):
 @pytest.mark.parametrize("tau_shell", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("skip", [False, True])
 def test_thin_shell(tau_shell, skip):
-    """Hard case 22."""
     rng = np.random.default_rng(29)
     n = 40
     values = as_float32(shell(n) * n * tau_shell)
@@ -45,7 +44,6 @@ def test_thin_shell(tau_shell, skip):
 
 @pytest.mark.parametrize("skip", [False, True])
 def test_half_empty(skip):
-    """Hard case 22."""
     rng = np.random.default_rng(30)
     values = positive(rng, (33, 20, 41, 3))
     values[:, :, 13:] = 0
@@ -57,8 +55,7 @@ def test_half_empty(skip):
 
 
 def test_gaps_are_the_distances_between_blocks():
-    # Chebyshev distances of integers, by brute force over the blocks that hold anything: equal, not close.
-    """Hard case 22."""
+    """Chebyshev distances of integers, by brute force over the blocks that hold anything: equal, not close."""
     from mivol.transport.traversal.grid_blocks import BLOCK, REACH, bound_blocks, find_empty_distances
 
     rng = np.random.default_rng(32)
@@ -74,8 +71,7 @@ def test_gaps_are_the_distances_between_blocks():
 
 @pytest.mark.parametrize("skip", [False, True])
 def test_gradient_in_and_out_of_the_shell(skip):
-    # d tau / d sigma does not know sigma: the voxels of an empty block have the same row of A as all others.
-    """Hard case 22."""
+    """d tau / d sigma does not know sigma: the voxels of an empty block have the same row of A as all others."""
     from mivol.transport.media.grid_integral import integrate_tau
 
     values = tensor(shell(24))

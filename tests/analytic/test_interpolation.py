@@ -47,8 +47,7 @@ def test_weights_are_the_transpose():
 
 def test_the_outer_half_voxel_has_one_node():
     """A grid of (Z, Y, X) = (4, 3, 2): all weight is on the upper node before the first node, and on the lower node from the
-    last on.
-    """
+    last on."""
     lower = mi.Vector3i(mi.Int32(-1, 0, 1), mi.Int32(-1, 1, 2), mi.Int32(-1, 2, 3))
     found = np.array(fraction_from_lower(mi.Vector3f(0.25), lower, (4, 3, 2)))
     np.testing.assert_array_equal(found, [[1, 0.25, 0]] * 3)

@@ -35,7 +35,6 @@ def worst(got: mi.Float, exact: np.ndarray) -> float:
 
 
 def test_opacity_at_any_optical_depth():
-    """Hard case 1."""
     x = arguments()[:-1]
     assert worst(one_minus_exp(mi.Float(x)), -np.expm1(-x.astype(np.float64))) <= 4e-7
     assert np.array(one_minus_exp(mi.Float([0.0, 1e-8, dr.inf]))) == pytest.approx([0.0, 1e-8, 1.0], rel=4e-7, abs=0)
@@ -44,7 +43,6 @@ def test_opacity_at_any_optical_depth():
 
 
 def test_phi1():
-    """Hard case 2."""
     x = arguments()
     assert worst(phi1(mi.Float(x)), moment(0, x.astype(np.float64))) <= 4e-7
     assert phi1(mi.Float(0))[0] == 1
@@ -52,7 +50,6 @@ def test_phi1():
 
 @pytest.mark.parametrize("n", range(6))
 def test_moments(n):
-    """Hard case 2."""
     x = arguments()
     assert worst(exp_moments(mi.Float(x))[n], moment(n, x.astype(np.float64))) <= MOMENT_BOUNDS[n]
     assert exp_moments(mi.Float(0))[n][0] == pytest.approx(1 / (n + 1), rel=2e-7)

@@ -53,9 +53,8 @@ def chosen(levels: int, share: float = 0.01) -> np.ndarray:
 @pytest.mark.parametrize("levels", [1, 2])
 @pytest.mark.parametrize("ahead", DIRECTIONS)
 def test_ways_lead_through_empty_cells_only(ahead: tuple[bool, ...], levels: int) -> None:
-    """From an empty brick a way ends before the nearest non-empty brick, in all directions. Within a non-empty brick a way
-    ends with the brick if no listed cell lies ahead, and otherwise with the next cell. Listed cells have no way.
-    """
+    """From an empty brick a way ends before the nearest non-empty brick, in all directions. Within a non-empty brick a way ends
+    with the brick if no listed cell lies ahead, and otherwise with the next cell. Listed cells have no way."""
     is_listed = chosen(levels)
     index, _ = CellIndex.find(RES, levels, lambda cell: dr.gather(mi.Bool, mi.Bool(is_listed.ravel()), cell))
     free, _ = looked(index, is_listed.shape, ahead)

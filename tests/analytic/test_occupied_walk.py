@@ -16,8 +16,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 def test_pieces_of_a_ray_through_the_middle_and_of_one_that_misses() -> None:
     """Boxes of half-extent 1, 2, 4. A ray along x from -5 meets their faces at these distances; a ray at y = 1.5 misses the
-    innermost.
-    """
+    innermost."""
     grids = []
     for level in range(3):
         place = CUBE * 2.0**level

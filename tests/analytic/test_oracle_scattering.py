@@ -193,9 +193,6 @@ def test_derivative_of_the_phase_function():
     assert np.allclose(twins.hg_slope(0.0)(c), 3 * c / (4 * math.pi))
 
 
-# -- Against stock volpath, where it is right ----------------------------------------------------------------------------------
-
-
 SKY = ({"type": "constant", "radiance": 0.5}, twins.Sky(0.5, 24))
 JUDGED = {
     "point, grid, hg": lambda: (small.smoke(small.rough_grid(1), name="hg", g=0.5), [small.point([1.5, 1, 2.0])], 0),

@@ -27,7 +27,6 @@ def test_chord_of_a_ball_is_two_roots():
 
 
 def test_ray_from_inside_sees_the_rest_only():
-    """Hard case 13."""
     o, d = np.array([[0.3, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
     assert ball(1.0).integrate_lines(o, d) == pytest.approx(0.7, abs=ROUNDING)
     assert ball(1.0).integrate_lines(o, d, whole_lines=True) == pytest.approx(2.0, abs=ROUNDING)
@@ -35,7 +34,7 @@ def test_ray_from_inside_sees_the_rest_only():
 
 
 def test_chord_does_not_cancel_far_away():
-    """sqrt(B^2 - A C) has lost 12 of 16 digits 1e6 radii away; the nearest-point form keeps those of o + t d. Hard case 15."""
+    """sqrt(B^2 - A C) has lost 12 of 16 digits 1e6 radii away; the nearest-point form keeps those of o + t d."""
     o = np.array([[-1e6, 0.6, 0.0]])
     chord = ball(1.0).integrate_lines(o, np.array([[1.0, 0.0, 0.0]]))
     assert chord == pytest.approx(1.6, abs=4e-16 * 1e6 * 4)
@@ -190,8 +189,8 @@ def test_procedural_points_are_voxel_centres(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_procedural_volumes_are_the_same_object_at_every_resolution() -> None:
-    """Fine voxels averaged over coarse ones against coarse voxels: they differ by the curvature inside a voxel only; with
-    two axes exchanged they would differ by the object's own contrast. And another seed is another object."""
+    """Fine voxels averaged over coarse ones against coarse voxels: they differ by the curvature inside a voxel only; with two
+    axes exchanged they would differ by the object's own contrast. And another seed is another object."""
     coarse = make_procedural("tangle", (8, 10, 12), seed=1, peak=2.0)[..., 0]
     fine = make_procedural("tangle", (24, 30, 36), seed=1, peak=2.0)[..., 0]
     mean = fine.reshape(8, 3, 10, 3, 12, 3).mean(axis=(1, 3, 5))

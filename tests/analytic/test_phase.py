@@ -394,8 +394,7 @@ def test_droplets_of_a_cloud(twin, monkeypatch):
 
 def test_ends_of_a_lognormal_distribution():
     """Each end leaves out the fraction CUT: of the area r^2 n(r) below, and of the light of small particles, r^6 n(r),
-    above.
-    """
+    above."""
     median, s = 0.3, np.log(1.8)
     low, high = np.log(mie._ends_of_lognormal(median, s))
 
@@ -446,8 +445,7 @@ def test_particles_that_cannot_be_are_refused(twin, call):
 
 def test_named_media_are_the_published_ones():
     """A few numbers of each table; the scattering coefficients of the second table as printed, computed from the reduced
-    ones.
-    """
+    ones."""
     sigma_a, sigma_s, g = named_medium("Skim milk")
     assert (sigma_a, sigma_s, g) == ((0.0014, 0.0025, 0.0142), (0.70, 1.22, 1.90), (0.0, 0.0, 0.0))
     sigma_a, sigma_s, g = named_medium("lowfat_milk")

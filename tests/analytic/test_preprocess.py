@@ -22,8 +22,8 @@ READINGS = np.array([[[50.0, 61, 9, 119, 30]], [[5, 70, 8, 120, 40]]])
 
 
 def test_a_detector_is_calibrated_by_living_pixels() -> None:
-    """Darks of 12 that vary by 4; flats that add 98, 88 and 78 and vary by 200; the second pixel is saturated in a
-    flat, the third is dead."""
+    """Darks of 12 that vary by 4; flats that add 98, 88 and 78 and vary by 200; the second pixel is saturated in a flat, the
+    third is dead."""
     found = preprocess.calibrate(READINGS, FLATS, DARKS, 120.5)
     assert found.dark.tolist() == [[12, 13, 12, 12, 12]]
     np.testing.assert_array_equal(found.light, [[98, np.nan, np.nan, 88, 78]])

@@ -120,7 +120,6 @@ def test_constant_colour_and_no_nan_at_any_depth(variant_rgb: str, tau: float) -
 
 
 def test_nothing_is_derived_behind_an_opaque_wall(variant_rgb: str) -> None:
-    """Hard case 37."""
     density, sh = make((4, 4, 40), basis=1)
     density = np.abs(density) + 1
     density[:, :, 10:20] = 1e4
@@ -133,7 +132,6 @@ def test_nothing_is_derived_behind_an_opaque_wall(variant_rgb: str) -> None:
 
 
 def test_the_background_of_the_same_colour(variant_rgb: str) -> None:
-    """Hard case 38."""
     density, sh = make(basis=1)
     field = SphericalGrid.from_dense(density, np.zeros_like(sh), CUBE)
     o, d = aim(20, CUBE)
@@ -164,7 +162,6 @@ def test_the_brightest_weight_of_a_cell(variant_rgb: str) -> None:
 
 
 def test_camera_inside(variant_rgb: str) -> None:
-    """Hard case 45."""
     field = SphericalGrid.from_dense(np.full((4, 4, 4), 2.0), np.zeros((4, 4, 4, 1, 3)), CUBE)
     colour, T, distance = see(field, [[0.5, 0.1, 0.2]], [[1, 0, 0]])
     # 0.5 of matter ahead at extinction 2; the mean distance of exponential emission over it.

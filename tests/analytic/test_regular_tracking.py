@@ -55,8 +55,7 @@ def fly(
 @pytest.mark.parametrize("case", ["all of the ray", "part of the ray", "rgb", "empty blocks skipped"])
 def test_the_depth_to_a_collision_is_the_goal(case):
     """The optical depth up to the collision is the goal; an interval with less has no collision. ``rgb`` follows one channel in
-    each lane.
-    """
+    each lane."""
     (o, d), goal = aimed(3, N), goals()
     t0, t1, channel = np.zeros(N), np.full(N, np.inf), np.zeros(N, int)
     values = rough_grid(1)

@@ -139,8 +139,6 @@ def test_refusals():
         mi.render(close_up({"smoke": box, "emitter": emitter}), integrator=mi.load_dict(mivol(shadows="soft")), spp=1)
 
 
-# -- Cells that no light crosses ---------------------------------------------------------------------------------------------
-
 DEEP_CELLS = {
     "grid": lambda tau: grid_volume("gridvolume", np.full((4, 4, 4, 1), 4 * tau)),
     "layers": lambda tau: grid_volume("gridvolume", 4 * tau * LAYERS * np.ones((4, 4, 4, 1))),
@@ -168,9 +166,6 @@ def test_deep_cells_lose_no_light(name, tau):
     # fourth order of that: 0.25^4 / 4320 (the Gauss rule's), which leaves room for float32 sums of 700 pieces: 700 ulp, 1e-4.
     rounding = 4 * tau * np.spacing(np.float32(0.25)) / 2 / mu
     assert np.abs(found / truth - 1).max() <= 1e-4 + rounding
-
-
-# -- How many pieces ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

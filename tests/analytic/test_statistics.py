@@ -145,8 +145,8 @@ def test_degrees_of_freedom_of_sums():
 
 @pytest.mark.statistical
 def test_false_alarms_of_pooled_variances(seed):
-    """Tiles of 16 pixels of unequal variance, 4 batches each: Student's t of their effective degrees of freedom keeps the
-    rate, on the side of caution (0.035 for 0.05), where those of one pixel, 3, would give 0.001."""
+    """Tiles of 16 pixels of unequal variance, 4 batches each: Student's t of their effective degrees of freedom keeps the rate,
+    on the side of caution (0.035 for 0.05), where those of one pixel, 3, would give 0.001."""
     rng = np.random.default_rng(seed)
     sigma = rng.uniform(0.2, 3, (8, 8, 1))
     runs, hits = 2000, 0

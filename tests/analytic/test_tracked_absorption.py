@@ -91,8 +91,7 @@ BOUNDARIES = {"a box": "cube", "a traced sphere": "sphere"}
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
     """Rationale: exp(-sigma chord) is known, and the estimator does not know the chord. Expected: means and derivatives by the
-    extinction agree. A loose majorant costs look-ups and changes no mean.
-    """
+    extinction agree. A loose majorant costs look-ups and changes no mean."""
     chord = 2 * np.sqrt(0.8**2 - 0.5**2)
     found = scene([0, -4, 0.5], [0, 0, 0.5], fog=shape(BOUNDARIES[boundary], fog(radius=0.8, slack=slack)))
     image, tangent, _ = follow(found, ("sigma_t.sigma",))
@@ -134,8 +133,7 @@ def test_several_media_along_a_ray() -> None:
 @pytest.mark.statistical
 def test_a_boundary_that_is_entered_twice() -> None:
     """One medium in two spheres on a diagonal of the field's box. The nearer sphere lies in the box and beyond the ball, and
-    each sphere has points of the derivative in proportion to its length.
-    """
+    each sphere has points of the derivative in proportion to its length."""
     diagonal = np.ones(3) / np.sqrt(3)
     medium = {**fog(1.1, radius=1.0), "id": "fog"}
     found = scene(

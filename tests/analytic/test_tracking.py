@@ -105,7 +105,7 @@ def assert_means(found: np.ndarray, T: np.ndarray, variance: np.ndarray, count: 
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(FIELDS, ["empty", "one voxel", "a sheet of voxels", "one dense voxel", "tau 1e-3"]))
 def test_estimates_have_the_exact_mean(name):
-    """The mean of each ray, and the mean of all rays together, which detects a bias sqrt(32) times smaller. Hard case 1."""
+    """The mean of each ray, and the mean of all rays together, which detects a bias sqrt(32) times smaller."""
     found, T = estimates(grid(FIELDS[name]()))
     assert found.min() >= 0 and found.max() <= 1
     variance = T * (1 - T)
@@ -147,9 +147,6 @@ def test_variance_is_as_derived():
     assert_same_mean(Moments.from_values((found - T) ** 2), variance, rounding=1e-5 * variance, what="variances")
 
 
-# -- Pictures ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(["rough", "rgb"], ["rough"]))
@@ -166,8 +163,7 @@ def test_pictures_have_the_same_mean(name):
 
 def test_gradients_have_exact_shadows():
     """Gradients are equal up to the order of sums for both kinds of shadows in images; estimates would change them by per
-    cents.
-    """
+    cents."""
     scene = close_up({"smoke": smoke(rough_grid(1))[0], "sky": scenes.sky(0.3)}, res=4)
     params, key, found = mi.traverse(scene), "smoke.interior_medium.sigma_t.data", []
     for shadows in ("exact", "estimated"):
@@ -298,9 +294,6 @@ def test_lanes_that_are_off_and_vacuum_have_no_collision():
         np.array(delta_tracking_in_blocks(part, mi.Float(SCALE), ray_interval(on=False), lane_generators(4))[0])
     ).all()
     assert np.isinf(np.array(delta_tracking_in_blocks(empty, mi.Float(SCALE), ray_interval(), lane_generators(4))[0])).all()
-
-
-# -- A field of which no more than a majorant is known ------------------------------------------------------------------
 
 
 def ball(slack: float, sigma: float = 0.6) -> BoundedExtinction:

@@ -38,9 +38,8 @@ def test_one_interval_is_shared_out_evenly():
 
 
 def test_three_intervals_are_shared_out_by_their_lengths():
-    """1, 0 (outside) and 0.5: two thirds of the numbers keep the first interval, and each of the N points has 1/N of the
-    length 1.5.
-    """
+    """1, 0 (outside) and 0.5: two thirds of the numbers keep the first interval, and each of the N points has 1/N of the length
+    1.5."""
     t, total = bounded_points((1, 2), (4, 5), (2.5, 7))
     assert total == 1.5
     along = np.sort(np.where(t < 2.25, t - 1, t - 1.5))

@@ -29,8 +29,8 @@ def means(values: np.ndarray, light: Light, seed: int, spp: int) -> tuple[float,
 @pytest.mark.parametrize("name", DEEP_LIGHTS)
 def test_the_derivative_is_that_of_the_same_paths(variant_rgb: str, name: str) -> None:
     """Up to a quarter of the majorant collisions are as likely whatever the extinction is: equal seeds give the same paths, and
-    light is a smooth function of the extinction. With n <= 5 scatterings and about as many points looked at in between, it is
-    a polynomial of degree 10 or so in a factor of it; a difference over 2 % errs by less than 10^3 / 6 0.02^2 = 7 %, one of
+    light is a smooth function of the extinction. With n <= 5 scatterings and about as many points looked at in between, it is a
+    polynomial of degree 10 or so in a factor of it; a difference over 2 % errs by less than 10^3 / 6 0.02^2 = 7 %, one of
     fourth order by 10^5 / 30 0.02^4 = 0.1 %. Sums of float32 are divided by 0.12: 6e-8 of a mean that is at most 20 times as
     large as its derivative."""
     values, h, light = 0.08 * NOISE, 0.02, replace(DEEP_LIGHTS[name], depth=6)

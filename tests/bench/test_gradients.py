@@ -71,9 +71,6 @@ def make_contest(gradients: dict[str, np.ndarray], times: dict[str, tuple[float,
     return Contest(timings, dict.fromkeys(timings, 1))
 
 
-# -- Gradients --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_density_0_tells_a_biased_estimator_from_mivol(variant_rgb: str) -> None:
     """At density 0 free flights never stop, so their derivative is exactly 0. mivol's is known to 5 %, and its seeds are
@@ -88,8 +85,8 @@ def test_density_0_tells_a_biased_estimator_from_mivol(variant_rgb: str) -> None
 
 
 def test_gradients_of_a_mean_and_of_a_loss(variant_rgb: str) -> None:
-    """For the image less 3 as target, the derivative of the squared difference is 6 times that of the mean. The sum over
-    voxels is known to a few percent by 64 samples of 16 pixels, and its seeds are fixed: 4 to 8 tells 6 from 1, 3 and 12."""
+    """For the image less 3 as target, the derivative of the squared difference is 6 times that of the mean. The sum over voxels
+    is known to a few percent by 64 samples of 16 pixels, and its seeds are fixed: 4 to 8 tells 6 from 1, 3 and 12."""
     gradient = LIGHTS["constant light"].gradients(np.full((2, 2, 2), 0.5, np.float32), 4)[MIVOL]
     image = mi.render(gradient.scene, integrator=gradient.integrator, spp=256, seed=1)
     mean, loss = np.array(gradient.of_mean(3, 64)), np.array(gradient.of_loss(image - 3, 3, 64))
@@ -113,9 +110,6 @@ def test_a_region_has_its_own_variance_and_derivative() -> None:
     assert dense["standard_error_percent"] == pytest.approx(100 * math.sqrt((8**2 + 16**2) / 5) / 40)
     assert empty["standard_error_percent"] == pytest.approx(100 * math.sqrt((4**2 + 4**2) / 5) / 20)
     assert figures[PEER]["samples_per_second_median"] == pytest.approx(4 * 4 * 1 / 3)
-
-
-# -- Cases and truths -------------------------------------------------------------------------------------------------------
 
 
 def test_cases_change_where_they_say() -> None:
@@ -179,9 +173,6 @@ def test_a_row_of_the_table_of_biases(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (row[MIVOL]["variance"], row[PEER]["variance"]) == pytest.approx((4 / 3, 12))
     assert row["its_standard_error"] == pytest.approx(math.sqrt(1 / 3))
     assert row["variance_x_time"] == pytest.approx(27)
-
-
-# -- Tutorial ---------------------------------------------------------------------------------------------------------------
 
 
 def test_the_smoke_stands_as_in_the_tutorial(variant_rgb: str, data_dir: Path) -> None:
@@ -260,9 +251,6 @@ def test_mivol_learns_in_the_tutorial(variant_rgb: str, monkeypatch: pytest.Monk
     assert loss[-1] < 0.5 * loss[0]
     assert abs(answer["references"]["z_against_volpath"]) <= answer["references"]["z_bound"]
     assert all(len(run["loss"]) == len(run["seconds"]) == 4 for run in answer["runs"].values())
-
-
-# -- Bars -------------------------------------------------------------------------------------------------------------------
 
 
 def test_every_figure_has_its_bar() -> None:

@@ -26,8 +26,8 @@ def test_unlimited_depth_is_judged_by_the_median() -> None:
 
 
 def test_the_milk_is_the_measured_one() -> None:
-    """Skim milk scatters 0.70, 1.22 and 1.90 times per millimetre and absorbs 0.0014, 0.0025 and 0.0142 times; the edge of 2
-    is 40 mm long."""
+    """Skim milk scatters 0.70, 1.22 and 1.90 times per millimetre and absorbs 0.0014, 0.0025 and 0.0142 times; the edge of 2 is
+    40 mm long."""
     sigma_s, sigma_a = np.array([0.7, 1.22, 1.9]) * 20, np.array([0.0014, 0.0025, 0.0142]) * 20
     (light,) = CONTESTS["milk"].values()
     np.testing.assert_allclose(study.milk().values, sigma_s + sigma_a)

@@ -108,8 +108,8 @@ def test_random_peers_have_the_exact_mean(variant_rgb: str, seed: int) -> None:
 
 @pytest.mark.slow
 def test_walks_count_what_they_cross(variant_rgb: str) -> None:
-    """Where most blocks are empty most cells are not visited: a jump over a block is a step that visits none. The counts do
-    not depend on the order of rays."""
+    """Where most blocks are empty most cells are not visited: a jump over a block is a step that visits none. The counts do not
+    depend on the order of rays."""
     for name, grid in study.measure_grids(TINY).items():
         for order in ("camera order", "random order"):
             every, skipped = grid[f"{order}, every cell"], grid[f"{order}, empty blocks skipped"]

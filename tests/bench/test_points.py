@@ -180,8 +180,7 @@ def test_gains_are_found_where_photographs_differ(variant_rgb: str, monkeypatch:
 
 
 def write_captures(folder: Path, side: int, alpha: bool) -> Path:
-    """Ten views of coloured Gaussians: with alpha, two of them the test split; or every other one half as
-    bright."""
+    """Ten views of coloured Gaussians: with alpha, two of them the test split; or every other one half as bright."""
     cloud = Gaussians(**make_start_cloud(np.random.default_rng(2).uniform(-0.5, 0.5, (80, 3)), [], 0))
     cloud.opacity_logits[:] = 3
     cloud.harmonics[:, 0] = np.sin(5 * cloud.means)

@@ -93,8 +93,8 @@ def test_a_bias_of_six_standard_errors_is_seen() -> None:
 
 
 def test_equal_error_weighs_variance_and_time() -> None:
-    """Twice the deviation and three times the processor time: 12. Pixels without noise do not count. If a quarter of the
-    others has ten times the deviation, the mean shows it and the median does not."""
+    """Twice the deviation and three times the processor time: 12. Pixels without noise do not count. If a quarter of the others
+    has ten times the deviation, the mean shows it and the median does not."""
     swing, counts = swings(8, 400), np.ones((400, 1), bool)
     swing[:, 200:] = 0
     times = {"slow": 3.0, "fast": 1.0}

@@ -149,8 +149,8 @@ def test_pixels_that_share_their_noise_are_not_taken_for_many() -> None:
 
 
 def test_the_noisiest_pixels_have_the_degrees_of_freedom() -> None:
-    """Rounds alternate in sign so that their means hide the noise: 50 equal pixels of 6 rounds have 250 degrees of freedom,
-    one pixel that outweighs 49 others has 5."""
+    """Rounds alternate in sign so that their means hide the noise: 50 equal pixels of 6 rounds have 250 degrees of freedom, one
+    pixel that outweighs 49 others has 5."""
     signs = np.where(np.add.outer(np.arange(6), np.arange(50)) % 2, 1.0, -1.0)
     equal = mean_of_pixels(10 + signs)
     assert equal.var == pytest.approx(6 / 5 / 6 / 50)

@@ -170,12 +170,6 @@ def test_forward_against_finite_differences(name):
         assert np.all(error <= 1e-3 * np.abs(difference[..., c]).max() + 5e-5), aov
 
 
-# -- One cell, in float64 -----------------------------------------------------------------------------------------------------
-
-
-# -- One ray along a column of voxels -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("passes", [1, 3])
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])

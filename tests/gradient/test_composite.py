@@ -65,10 +65,9 @@ BALL = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.9}
 @pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("boundary", [None, BALL], ids=["box", "traced"])
 def test_every_voxel_has_its_gradient(name, boundary):
-    # Each voxel by itself, also those whose gradient is e^-50 of the largest: where it changes its sign it is a difference
-    # of two numbers of the size of its neighbours'. The scheme errs by the sixth power of a cell's optical depth, at most
-    # 1.6 here and where the extinction jumps: 3e-4.
-    """Hard case 37."""
+    """Each voxel by itself, also those whose gradient is e^-50 of the largest: where it changes its sign it is a difference of
+    two numbers of the size of its neighbours'. The scheme errs by the sixth power of a cell's optical depth, at most 1.6 here
+    and where the extinction jumps: 3e-4."""
     sigma = PROFILES[name]
     got = vjp(column(sigma, boundary), mivol("depth"), [f"box.{DATA}"], np.ones((1, 1, 1)), 1)[f"box.{DATA}"].ravel()
     exact = depth_gradient(as_float32(sigma), START)
@@ -81,9 +80,8 @@ def test_every_voxel_has_its_gradient(name, boundary):
 @pytest.mark.slow_for("ball")
 @pytest.mark.parametrize("shape", ["box", "ball"])
 def test_media_hidden_behind_another(shape):
-    # A homogeneous medium of optical depth 50 hides two more: d depth / d sigma = T (m' - ...) with T = e^-50. Of boxes it
-    # is a sum and right to 1e-4; of balls the last digits of N are clamped to T times the distances left: at most 5 T.
-    """Hard case 37."""
+    """A homogeneous medium of optical depth 50 hides two more: d depth / d sigma = T (m' - ...) with T = e^-50. Of boxes it is
+    a sum and right to 1e-4; of balls the last digits of N are clamped to T times the distances left: at most 5 T."""
 
     def at(z: float, sigma: float) -> dict:
         inside = medium("homogeneous", sigma)

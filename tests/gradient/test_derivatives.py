@@ -249,8 +249,7 @@ def find_baselines(
     emitter: dict, *interiors: dict, depth: int = 3, at: tuple = (0, MISSED, 0.5, MISSED), seen: tuple = (0.5,) * 4
 ) -> Baseline | None:
     """The baseline for boxes with these media, 5 apart, the first at [-1, 1]^3, and for rays passing x = ``at``, seen at
-    (``seen``, 0.5) on the film.
-    """
+    (``seen``, 0.5) on the film."""
     boxes = {f"box{k}": box_of(interior, PLACE + 5 * k * np.eye(4, k=3)) for k, interior in enumerate(interiors)}
     scene = mi.load_dict({"type": "scene", **boxes, "emitter": emitter, "sensor": camera([0, -1, 6], [0, 0, 0])})
     survey, settings = survey_scene(scene), Settings(max_depth=depth)
@@ -279,8 +278,7 @@ def test_baseline_in_a_white_furnace_is_the_light_of_the_sky():
 def test_collisions_count_as_their_derivatives_weigh():
     """A white box of sigma 3 and a black box of 0.5, kappa = 0.6 / 2. Half of the paths fly to each box, and collide with
     probabilities of 1 - exp(-2 sigma). 2048 paths determine the second probability to 1.7 %; the paths are the same in each
-    run.
-    """
+    run."""
     sigma, light = np.array([3.0, 0.5]), np.array([0.5, 0.0])
     weight = (1 - np.exp(-2 * sigma)) / (sigma + 0.3) ** 2
     boxes = [medium("homogeneous", s, albedo) for s, albedo in zip(sigma, (1.0, 0.0), strict=True)]

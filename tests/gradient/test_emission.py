@@ -105,9 +105,6 @@ def test_a_texture_need_not_be_told(kind):
     assert np.abs(found[0] - found[1]).max() <= 1e-5 * np.abs(found[1]).max() > 0
 
 
-# -- Several passes --------------------------------------------------------------------------------------------------------
-
-
 def picture(medium: dict, **more) -> mi.Scene:
     view = camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=6, fov=40.0)
     return mi.load_dict({"type": "scene", "box": box_of(medium, PLACE), "sky": colours(B), "sensor": view, **more})
@@ -206,8 +203,6 @@ def test_parameter_of_a_parameter():
     assert np.abs(np.array(dr.grad(image)) - truth).max() <= 2e-4 * np.abs(truth).max()
 
 
-# -- Walls -----------------------------------------------------------------------------------------------------------------
-
 CORRIDOR = affine(np.diag([6.0, 1, 1]), (-3, -0.5, -0.5))
 
 
@@ -226,8 +221,6 @@ def test_no_phantom_gradient_behind_a_wall(wall, depth):
     """Hidden voxels get their e^-50 (or their 0), where what is left of a subtraction would be 1e-7.
 
     At depth 3 the light from behind the field is what a replay has left: before a black floor it is 0.
-
-    Hard case 37.
     """
     medium, bright = corridor(wall), np.full(3, 5.0)
     more = {"floor": _floor()} if depth == 3 else {}
@@ -264,9 +257,6 @@ def twins_tau(medium: twins.Medium, o, d, end: float) -> float:
 def _floor() -> dict:
     turn = mi.ScalarTransform4f().look_at([5, 0, 0], [0, 0, 0], [0, 0, 1]).scale(50)
     return {"type": "rectangle", "to_world": turn, "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}}
-
-
-# -- Surfaces --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -220,8 +220,7 @@ class _Aside(Light):
 @pytest.mark.statistical
 def test_what_no_camera_ray_meets():
     """The empty half beside the visible half: light passes it after a scattering event, so only later probes find its
-    derivative. The reference is a path tracer with forward derivatives.
-    """
+    derivative. The reference is a path tracer with forward derivatives."""
     left = np.broadcast_to(np.arange(8) < 4, (8, 8, 8))
     values, direction = np.where(left, 2.0, 0), np.where(left, 0.0, 1.0)
     light = _Aside(constant_light, depth=4)
@@ -236,8 +235,7 @@ def test_what_no_camera_ray_meets():
 
 def test_probes_are_kept_in_proportion_to_their_gain():
     """The first probe comes from the first flight. Of later flights with gains 1 and 3, 1/4 and 3/4 of evenly spread lanes keep
-    the probe, with a total of 4. Flights of paths that may not scatter any more, and lanes without a point, keep none.
-    """
+    the probe, with a total of 4. Flights of paths that may not scatter any more, and lanes without a point, keep none."""
     n, never = 64, dr.full(mi.Bool, False, 64)
     ray = FineRay.from_ray(mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0), mi.Vector3f(0, 0, 1)))
     on, zero = ~never, dr.zeros(mi.UInt32, n)

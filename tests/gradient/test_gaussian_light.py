@@ -105,9 +105,6 @@ def test_flights_bring_the_light_that_is_composited(nested: bool) -> None:
     assert_precise(flown, 0.05, what="radiance")
 
 
-# -- Derivatives -------------------------------------------------------------------------------------------------------------
-
-
 def followed(found: mi.Scene) -> dict[str, object]:
     """The parameters of Gaussians and fog, with derivatives enabled."""
     params = mi.traverse(found)
@@ -149,8 +146,7 @@ def test_forward_is_the_transpose_of_reverse(nested: bool, whole_paths: None) ->
 @pytest.mark.parametrize("nested", [False, True])
 def test_derivatives_are_those_of_what_is_composited(nested: bool) -> None:
     """Derivative of the sum of all pixels along one change of all parameters; compositing gives the exact one, with the same
-    floor.
-    """
+    floor."""
     rng, found = np.random.default_rng(2), []
     weight = np.full((SIDE, SIDE, 3), 1 / 192)
     change: dict[str, np.ndarray] = {}

@@ -178,9 +178,8 @@ def test_inactive_lanes_receive_and_give_nothing(seed):
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 2, 2)])
 def test_a_million_rays_into_few_voxels(seed, shape):
-    # The row sums are the chords; a naive float32 accumulator of 1e6 terms of one sign drifts by 1e-4 and stalls at
-    # 2^24 of its unit. Asked: 1e-5, far below the 1 % that would harm; a sum in blocks reaches 1e-6.
-    """Hard case 42."""
+    """The row sums are the chords; a naive float32 accumulator of 1e6 terms of one sign drifts by 1e-4 and stalls at 2^24 of
+    its unit. Asked: 1e-5, far below the 1 % that would harm; a sum in blocks reaches 1e-6."""
     rng = np.random.default_rng([seed, 42])
     n = 1_000_000
     o = as_float32(np.column_stack([np.full(n, -1.0), rng.uniform(0, 1, (n, 2))]))

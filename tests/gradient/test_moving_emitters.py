@@ -58,8 +58,7 @@ TURNED = {
 @pytest.mark.parametrize("kind", small.cases(TURNED, ["spot"]))
 def test_direction_of_an_emitter(kind):
     """A rotating sun moves its shadows; a rotating spot moves its cone only. Rotation by an angle about a perpendicular axis
-    [rad].
-    """
+    [rad]."""
     box, m = smoke(rough_grid(10), 0.7, "own", PLACE, "hg", 0.4)
     axis, across = np.array([-0.3, 0.6, -0.74]), np.array([0.8, 0.6, 0.0])
     axis = axis / np.linalg.norm(axis)

@@ -57,7 +57,7 @@ def test_slope_of_hg_by_g(g):
 
 
 def test_slope_of_hg_at_zero():
-    """dp/dg = 3 cos / (4 pi) at g = 0, where a fallback to an isotropic one has none. Hard case 48."""
+    """dp/dg = 3 cos / (4 pi) at g = 0, where a fallback to an isotropic one has none."""
     (got,) = slopes(eval_hg, 0.0)
     m, p = oracle.turns(ANGLES)
     assert np.max(np.abs(got - 3 * (p - m) / 2 / (4 * np.pi))) <= 4 * EPS

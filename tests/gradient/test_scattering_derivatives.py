@@ -610,8 +610,7 @@ def shadow_ray(x: float, value: list[float], on: list[bool]) -> SimpleNamespace:
 
 def test_each_has_its_light_as_probability() -> None:
     """Light of 3 and 1: the first ray for a chance below 3/4, with 4/3 of its value; else the second with 4 times its value.
-    Without light, none.
-    """
+    Without light, none."""
     probe = SimpleNamespace(
         chance=mi.Float([0.0, 0.74, 0.76, 0.99]),
         direct=[shadow_ray(1.0, [0.5, 1.0, 1.5], [True] * 4), shadow_ray(2.0, [0.25, 0.25, 0.5], [True, True, True, False])],

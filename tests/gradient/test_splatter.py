@@ -78,8 +78,7 @@ def test_pictures_and_derivatives(splatter: Splatter) -> None:
 
 def test_the_derivatives_are_those_of_one_function(splatter: Splatter) -> None:
     """Reverse against forward: along a direction of all parameters at once, the oracle changes by the dot product of the
-    direction with the gradient. The bound of rounding is shared by all numbers, and grows as the root of their count.
-    """
+    direction with the gradient. The bound of rounding is shared by all numbers, and grows as the root of their count."""
     arrays, camera = cloud(8, 2, SIZES[8], seed=8), looking(WIDTH, HEIGHT)
     picture, kept = splatter.forward(tensors(arrays), camera)
     _, frozen = oracle_splats.draw(arrays, camera)
@@ -98,9 +97,8 @@ def test_the_derivatives_are_those_of_one_function(splatter: Splatter) -> None:
 
 
 def test_small_gaussians_are_splatted_as_they_are_ray_traced(variant_rgb: str) -> None:
-    """The perspective is linearised over a Gaussian, with an error proportional to its size over its distance. The error
-    halves with the size, to a tenth (the next term of the expansion), in an image magnified as much as the Gaussian shrinks.
-    """
+    """The perspective is linearised over a Gaussian, with an error proportional to its size over its distance. The error halves
+    with the size, to a tenth (the next term of the expansion), in an image magnified as much as the Gaussian shrinks."""
     splatter = Splatter(32, 32, 0, low_pass=1e-6)
     arrays = {
         "means": np.array([[0.3, -0.2, 0.1]]),

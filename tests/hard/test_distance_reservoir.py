@@ -28,9 +28,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize("peak", [20.0, 2000.0])
 def test_one_dense_voxel(peak):
-    """One voxel 10 or 1000 times denser than the rest, beside the rays and between some rays and the emitter: the same law.
-    Hard case 31.
-    """
+    """One voxel 10 or 1000 times denser than the rest, beside the rays and between some rays and the emitter: the same law."""
     values = rough_grid(6)
     values[-1, -1, -1] = peak
     box, m = smoke(values, 0.8, "own")
@@ -39,9 +37,8 @@ def test_one_dense_voxel(peak):
 
 
 def test_noise_does_not_follow_the_majorant():
-    """Rays far from the dense voxel have the same radiance with and without the voxel, to the last digits, with the same noise.
-    Hard case 31.
-    """
+    """Rays far from the dense voxel have the same radiance with and without the voxel, to the last digits, with the same
+    noise."""
     values = rough_grid(6)
     o = as_float32(np.stack([np.full(4, -3.0), np.linspace(-0.8, 0.0, 4), np.full(4, -0.5)], axis=1))
     images = []
@@ -57,7 +54,7 @@ def test_noise_does_not_follow_the_majorant():
 @pytest.mark.statistical
 @pytest.mark.parametrize("ratio", [(1e-3, 1.0, 10.0), (0.0, 1.0, 2.0), (8.0, 8.0, 8e-4)])
 def test_channels_of_very_different_extinction(ratio):
-    """Each channel equals its own grey image, at ratios of 1e4 and with a channel of vacuum. Hard case 32."""
+    """Each channel equals its own grey image, at ratios of 1e4 and with a channel of vacuum."""
     values = as_float32(rough_grid(7, 1.0) * np.array(ratio))
     interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "hg", "g": 0.4})
     emitter = point([1.5, 1, 2.0])

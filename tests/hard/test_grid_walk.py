@@ -32,8 +32,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.parametrize("zero", [0.0, -0.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_axis_aligned_row_sums(axis, zero):
-    # Through voxel centres tau is the voxel's edge times the sum of the row: 8 terms, 8 roundings at most.
-    """Hard case 9."""
+    """Through voxel centres tau is the voxel's edge times the sum of the row: 8 terms, 8 roundings at most."""
     rng = np.random.default_rng(9)
     values = as_float32(rng.uniform(0.1, 1, (8, 8, 8)))
     index = list(itertools.product(range(8), repeat=2))
@@ -48,7 +47,6 @@ def test_axis_aligned_row_sums(axis, zero):
 
 
 def test_axis_aligned_off_centre():
-    """Hard case 9."""
     rng = np.random.default_rng(10)
     values = positive(rng, (5, 7, 6, 3))
     for axis, sign, zero in itertools.product(range(3), (1.0, -1.0), (0.0, -0.0)):
@@ -59,7 +57,6 @@ def test_axis_aligned_off_centre():
 
 
 def test_in_a_coordinate_plane():
-    """Hard case 9."""
     rng = np.random.default_rng(11)
     values = positive(rng, (5, 7, 6))
     for axis, zero in itertools.product(range(3), (0.0, -0.0)):
@@ -72,7 +69,6 @@ def test_in_a_coordinate_plane():
 @pytest.mark.slow_for("-1e-45", "1e-30", "1e-38")
 @pytest.mark.parametrize("tiny", [1e-7, 1e-16, -1e-16, 1e-30, 1e-38, -1e-38, 1e-41, -1e-45])
 def test_nearly_axis_aligned(tiny):
-    """Hard case 10."""
     rng = np.random.default_rng(12)
     values = positive(rng, (4, 6, 5))
     for axis in range(3):
@@ -90,8 +86,7 @@ def test_nearly_axis_aligned(tiny):
 
 
 def test_a_tilt_of_1e_7_counts_from_far_away():
-    # 1e-7 over 1e6 lengths is a tenth of the box: rays that start beside it and hit, or start level with it and miss.
-    """Hard case 10."""
+    """1e-7 over 1e6 lengths is a tenth of the box: rays that start beside it and hit, or start level with it and miss."""
     rng = np.random.default_rng(40)
     values = as_float32(rng.uniform(0.5, 1, (4, 6, 5)))
     for axis in range(3):
@@ -105,8 +100,7 @@ def test_a_tilt_of_1e_7_counts_from_far_away():
 
 
 def test_in_cell_faces_and_edges():
-    # Cells meet in the planes through voxel centres; 8 voxels, so those planes are exact in binary.
-    """Hard case 11."""
+    """Cells meet in the planes through voxel centres; 8 voxels, so those planes are exact in binary."""
     rng = np.random.default_rng(13)
     values = positive(rng, (8, 8, 8))
     for axis in range(3):
@@ -122,8 +116,7 @@ def test_in_cell_faces_and_edges():
 
 
 def test_midway_between_rows():
-    # On the plane between two rows of voxels: half of each, to the 8 roundings of the sum.
-    """Hard case 11."""
+    """On the plane between two rows of voxels: half of each, to the 8 roundings of the sum."""
     rng = np.random.default_rng(14)
     values = as_float32(rng.uniform(0.1, 1, (8, 8, 8)))
     o = np.array([[-1, j / 8, (k + 0.5) / 8] for j in range(1, 8) for k in range(8)])
@@ -134,7 +127,6 @@ def test_midway_between_rows():
 
 @pytest.mark.parametrize("n", [1, 2, 8, 16])
 def test_diagonals_through_corners(n):
-    """Hard case 11."""
     rng = np.random.default_rng(15)
     values = positive(rng, (n, n, n))
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -147,7 +139,6 @@ def test_diagonals_through_corners(n):
 
 
 def test_grazing_from_outside():
-    """Hard case 12."""
     ones = np.ones((4, 4, 4))
     corner = np.array([[2.0, 0, 0.5], [2, 0, 1], [0, 2, 0], [0.5, 2, 0]])  # x + y = 2 touches the edge x = y = 1
     d = np.array([[-1.0, 1, 0], [-1, 1, 0], [1, -1, 0], [0, -1, 1]]) / math.sqrt(2)
@@ -165,8 +156,7 @@ def test_grazing_from_outside():
 
 
 def test_chord_across_a_corner():
-    # From 0.1 to one float32 step inside the edge: the chord is sqrt(2) times the depth, in float64.
-    """Hard case 12."""
+    """From 0.1 to one float32 step inside the edge: the chord is sqrt(2) times the depth, in float64."""
     depths = 2.0 ** -np.arange(3, 23)
     o = np.array([[2 - h, 0, 0.5] for h in depths])
     d = np.array([-1.0, 1, 0]) / math.sqrt(2)
@@ -174,8 +164,7 @@ def test_chord_across_a_corner():
 
 
 def test_planes_that_coincide():
-    # Rays through the edges and corners of cells reach two or three planes at once: each unit of length still once.
-    """Hard case 44."""
+    """Rays through the edges and corners of cells reach two or three planes at once: each unit of length still once."""
     rng = np.random.default_rng(35)
     values = positive(rng, (8, 8, 8))
     nodes = (rng.integers(0, 8, (96, 3)) + 0.5) / 8
@@ -197,11 +186,8 @@ def lattice_step(n):
 @pytest.mark.slow_for("filled0")
 @pytest.mark.parametrize("filled", [slice(250, 256), slice(255, 256)])
 def test_the_end_is_where_it_is_after_256_cells(filled):
-    """Rationale: a wall, or the box, ends a ray in the only filled cells, after 250 empty cells.
-    Expected: the end is as accurate as a float32 position on this lattice, better than a running difference of 600 steps.
-
-    Hard case 14.
-    """
+    """Rationale: a wall, or the box, ends a ray in the only filled cells, after 250 empty cells. Expected: the end is as
+    accurate as a float32 position on this lattice, better than a running difference of 600 steps."""
     rng = np.random.default_rng(38)
     n, rays = 256, 100
     values = np.zeros((160, 160, n), dtype=np.float32)
@@ -219,9 +205,8 @@ def test_the_end_is_where_it_is_after_256_cells(filled):
 
 
 def test_along_the_edge_of_the_support():
-    # Rays that graze a diagonal sheet for 256 cells: a position errs by the float32 step of the lattice, always to one
-    # side, and the gradient turns that into optical depth.
-    """Hard case 52."""
+    """Rays that graze a diagonal sheet for 256 cells: a position errs by the float32 step of the lattice, always to one side,
+    and the gradient turns that into optical depth."""
     rng = np.random.default_rng(39)
     n, rays = 256, 100
     x = np.arange(n)

@@ -26,7 +26,6 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def test_origin_inside_or_on_a_face():
-    """Hard case 13."""
     rng = np.random.default_rng(16)
     values = positive(rng, (6, 5, 8))
     o, d = rng.uniform(0, 1, (64, 3)), rng.normal(size=(64, 3))
@@ -44,8 +43,7 @@ def test_origin_inside_or_on_a_face():
 
 @pytest.mark.parametrize("power", [2, 3, 4, 5, 6])
 def test_origin_far_away(power):
-    # A float32 origin there is a coarse one, but it is a point like any other: through the middle, exactly.
-    """Hard case 15."""
+    """A float32 origin there is a coarse one, but it is a point like any other: through the middle, exactly."""
     rng = np.random.default_rng(20)
     values = positive(rng, (24, 24, 24))
     n = 64
@@ -62,7 +60,6 @@ def test_origin_far_away(power):
 
 
 def test_box_far_from_the_origin_of_the_world():
-    """Hard case 15."""
     rng = np.random.default_rng(21)
     values = positive(rng, (8, 8, 8))
     to_world = centred(100 * rotation([1, 1, 0], 0.5), (1e5, -2e5, 3e4))
@@ -71,7 +68,6 @@ def test_box_far_from_the_origin_of_the_world():
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
 def test_scene_scale(scale):
-    """Hard case 16."""
     rng = np.random.default_rng(22)
     values = positive(rng, (7, 6, 5))
     o, d = random_rays(rng, centred(np.eye(3)), 64)
@@ -82,16 +78,14 @@ def test_scene_scale(scale):
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("skip", [False, True])
 def test_frames(name, skip):
-    """Hard case 17."""
     rng = np.random.default_rng(23)
     values = positive(rng, (12, 5, 9, 3))
     assert_tau(values, FRAMES[name], *random_rays(rng, FRAMES[name], 64), skip=skip)
 
 
 def test_change_of_frame_changes_nothing():
-    # The same rays and the same field, turned, mirrored and moved together; both errors count, and the rounding of the
-    # moved ray to float32 (positions of up to 8 voxels by EPS) is below the third.
-    """Hard case 17."""
+    """The same rays and the same field, turned, mirrored and moved together; both errors count, and the rounding of the moved
+    ray to float32 (positions of up to 8 voxels by EPS) is below the third."""
     rng = np.random.default_rng(24)
     values = positive(rng, (8, 8, 8))
     o, d = random_rays(rng, centred(np.eye(3)), 128)
@@ -105,7 +99,6 @@ def test_change_of_frame_changes_nothing():
 
 
 def test_length_is_world_length():
-    """Hard case 17."""
     rng = np.random.default_rng(25)
     for to_world in FRAMES.values():
         o, d = random_rays(rng, to_world, 32)
@@ -127,14 +120,12 @@ def test_length_is_world_length():
     ],
 )
 def test_degenerate_frames_are_refused(matrix, named):
-    """Hard case 49."""
     with pytest.raises(ValueError, match=named):
         make_lattice(np.ones((2, 2, 2)), matrix)
 
 
 @pytest.mark.parametrize("shape", [(0, 2, 2, 1), (2, 2, 2), (2, 2)])
 def test_empty_or_flat_grids_are_refused(shape):
-    """Hard case 49."""
     from mivol.transport.traversal.lattice import Lattice
 
     with pytest.raises(ValueError, match="shape"):
@@ -144,7 +135,6 @@ def test_empty_or_flat_grids_are_refused(shape):
 @pytest.mark.slow_for("shape2", "shape4", "shape5", "shape6")
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 7), (1, 7, 1), (7, 1, 1), (1, 5, 6), (5, 1, 6), (5, 6, 1)])
 def test_single_voxels(shape):
-    """Hard case 18."""
     rng = np.random.default_rng(26)
     values = as_float32(rng.uniform(0.1, 1, shape))
     o, d = random_rays(rng, FRAMES["stretched"], 48)

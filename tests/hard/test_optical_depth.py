@@ -1,4 +1,4 @@
-"""Line integrals of grids in hard cases; docstrings give the number in the list of hard cases.
+"""Line integrals of grids in hard cases.
 
 The judge is the float64 twin with the same float32 rays and voxels. The bound is
 |error| <= 2e-6 * integral of (sigma + h |grad sigma|), h a voxel: about 16 float32 roundings of the value and of the
@@ -30,31 +30,17 @@ from scenes import (
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
-# -- 1: any optical depth -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("power", [-8, -4, 0, 2, 4])
 def test_any_optical_depth(power):
-    """Hard case 1."""
     rng = np.random.default_rng(1)
     values = as_float32(10.0**power * rng.uniform(0.5, 1, (6, 6, 6)))
     fast = assert_tau(values, np.eye(4), *random_rays(rng, np.eye(4), 64))
     assert fast.max() > 0.5 * 10.0**power
 
 
-# -- 9, 10: along an axis -------------------------------------------------------------------------------------------
-
-
-# -- 11, 12: faces, edges, corners ------------------------------------------------------------------------------------
-
-
-# -- 13, 14, 45: where the ray begins and ends ------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("True")
 @pytest.mark.parametrize("skip", [False, True])
 def test_where_the_segment_ends(skip):
-    """Hard case 14."""
     rng = np.random.default_rng(17)
     values = positive(rng, (6, 5, 8))
     o, d = random_rays(rng, np.eye(4), 64, away=0.3)
@@ -66,7 +52,6 @@ def test_where_the_segment_ends(skip):
 
 
 def test_segments_within_one_cell():
-    """Hard case 14."""
     rng = np.random.default_rng(18)
     values = as_float32(rng.uniform(0.5, 1, (4, 4, 4)))
     o, d = rng.uniform(0.3, 0.6, (64, 3)), rng.normal(size=(64, 3))
@@ -76,7 +61,6 @@ def test_segments_within_one_cell():
 
 
 def test_inactive_and_broken_rays():
-    """Hard case 14."""
     from mivol.transport.media.grid_integral import integrate_tau
 
     lattice = make_lattice(np.ones((4, 4, 4)), np.eye(4))
@@ -89,7 +73,6 @@ def test_inactive_and_broken_rays():
 
 @pytest.mark.parametrize("sigma", [1.0, 1e3])
 def test_camera_inside_a_dense_medium(sigma):
-    """Hard case 45."""
     values = np.full((16, 16, 16), sigma)
     rng = np.random.default_rng(19)
     d = rng.normal(size=(64, 3))
@@ -98,16 +81,9 @@ def test_camera_inside_a_dense_medium(sigma):
     assert tau_fast(values, centred(2 * np.eye(3)), [0, 0, 0], [0, 1, 0])[0, 0] == pytest.approx(sigma, rel=16 * EPS)
 
 
-# -- 15, 16, 17: frames -----------------------------------------------------------------------------------------------
-
-
-# -- 18, 19, 20, 22, 50: grids ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("17")
 @pytest.mark.parametrize("n", [2, 3, 17])
 def test_checkerboard(n):
-    """Hard case 19."""
     rng = np.random.default_rng(27)
     values = 50.0 * (np.indices((n, n, n)).sum(axis=0) % 2)
     for skip in (False, True):
@@ -116,7 +92,6 @@ def test_checkerboard(n):
 
 @pytest.mark.parametrize("skip", [False, True])
 def test_empty_grid(skip):
-    """Hard case 20."""
     rng = np.random.default_rng(28)
     fast = tau_fast(np.zeros((20, 9, 17, 3)), np.eye(4), *random_rays(rng, np.eye(4), 64), skip=skip)
     assert fast.shape == (64, 3)
@@ -124,8 +99,7 @@ def test_empty_grid(skip):
 
 
 def test_outer_half_voxel():
-    # Between the outermost voxel centres and the faces the field is constant in that direction.
-    """Hard case 50."""
+    """Between the outermost voxel centres and the faces the field is constant in that direction."""
     rng = np.random.default_rng(31)
     values = as_float32(rng.uniform(0.1, 1, (8, 4, 6)))
     assert_tau(
@@ -140,11 +114,7 @@ def test_outer_half_voxel():
     assert_tau(values, np.eye(4), o, d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
-# -- 41, 43, 44, 52: rounding -----------------------------------------------------------------------------------------
-
-
 def test_long_rays():
-    """Hard case 41."""
     rng = np.random.default_rng(32)
     for shape in ((1024, 2, 2), (2, 1024, 2), (2, 2, 1024)):
         values = positive(rng, shape)
@@ -162,8 +132,7 @@ def test_long_rays():
 
 
 def test_the_same_twice():
-    # Forward there is no sum across lanes, so no order: bit for bit the same, alone or among others.
-    """Hard case 43."""
+    """Forward there is no sum across lanes, so no order: bit for bit the same, alone or among others."""
     rng = np.random.default_rng(33)
     values = positive(rng, (9, 9, 9))
     o, d = random_rays(rng, np.eye(4), 4096)
@@ -173,7 +142,6 @@ def test_the_same_twice():
 
 
 def test_gradients_bitwise_with_one_thread(cpu_back_end, two_threads):
-    """Hard case 43."""
     rng = np.random.default_rng(34)
     o, d = random_rays(rng, np.eye(4), 100_000)
     threads = dr.thread_count()
@@ -192,7 +160,6 @@ def test_gradients_bitwise_with_one_thread(cpu_back_end, two_threads):
 @pytest.mark.slow_for("True")
 @pytest.mark.parametrize("skip", [False, True])
 def test_256_cubed_against_the_twin(skip):
-    """Hard case 52."""
     rng = np.random.default_rng(36)
     values = np.zeros((256, 256, 256), dtype=np.float32)
     values[40:210, 60:250, 10:230] = rng.uniform(0, 1, (170, 190, 220)).astype(np.float32)
@@ -201,8 +168,7 @@ def test_256_cubed_against_the_twin(skip):
 
 
 def test_smooth_fields_against_the_twin():
-    # A smooth field leaves no random sign to cancel what a systematic error of position would do.
-    """Hard case 52."""
+    """A smooth field leaves no random sign to cancel what a systematic error of position would do."""
     n = 128
     c = (np.arange(n) + 0.5) / n - 0.5
     r2 = c[:, None, None] ** 2 + c[None, :, None] ** 2 + c[None, None, :] ** 2

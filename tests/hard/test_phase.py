@@ -1,4 +1,4 @@
-"""Hard cases 5 to 8, 25 and 48 of physics.md, through the plugins: what float32 and optimisers do to phase functions."""
+"""Hard cases of phase functions, through the plugins: what float32 and optimisers do to them."""
 
 from __future__ import annotations
 
@@ -35,10 +35,7 @@ def sample(phase: dict, n: int = N) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @pytest.mark.parametrize("g", [1e-7, 1e-6, 1e-5, 1e-4, 1e-3, -1e-7, -1e-4])
 def test_small_asymmetry_keeps_its_mean_cosine(g):
-    """The mean cosine of samples is g, where a quotient by 2 g gives -0.41 at 1e-7, and a threshold at 1e-3 gives 0.
-
-    Hard case 5.
-    """
+    """The mean cosine of samples is g, where a quotient by 2 g gives -0.41 at 1e-7, and a threshold at 1e-3 gives 0."""
     wo, _, _ = sample({"type": "mivol_hg", "g": g})
     # Midpoints are exact for a cosine linear in u, and its curvature is of size g. Roundings of the 65536 cosines average out,
     # except that of 1 - g, the same in all: eps/4, squared.
@@ -46,7 +43,7 @@ def test_small_asymmetry_keeps_its_mean_cosine(g):
 
 
 def test_stock_is_wrong_there():
-    """Why stock hg is not the judge of small g: physics.md section 6. Hard case 5."""
+    """Why stock hg is not the judge of small g: physics.md section 6."""
     wo, _, _ = sample({"type": "hg", "g": 1e-7})
     assert -wo[:, 2].mean() < -0.3
 
@@ -54,7 +51,7 @@ def test_stock_is_wrong_there():
 @pytest.mark.parametrize("kind", [{"type": "mivol_hg"}, {"type": "mivol_draine", "alpha": 2.0}])
 @pytest.mark.parametrize("g", [0.999, 0.9999, 0.99999, -0.9999, -0.99999, 1 - 2.0**-24])
 def test_needle_lobes(g, kind):
-    """Density of a sample = value in its direction, to what the rounding of the direction allows; never NaN. Hard case 6."""
+    """Density of a sample = value in its direction, to what the rounding of the direction allows; never NaN."""
     phase = {**kind, "g": g}
     wo, _, pdf = sample(phase, 4096)
     directions = mi.Vector3f(wo.T.astype(np.float32))
@@ -71,7 +68,7 @@ def test_needle_lobes(g, kind):
 
 @pytest.mark.parametrize("g", [0.9999, -0.9999, 0.99999])
 def test_gradients_of_needle_lobes_are_finite(g):
-    """Reverse mode at the peak, beside it, and far from it. Hard case 6."""
+    """Reverse mode at the peak, beside it, and far from it."""
     m, p = oracle.turns(np.array([0, 1e-6, 1e-4, 1e-2, 1, 3, np.pi]))
     phase = mi.load_dict({"type": "mivol_hg", "g": g})
     params = mi.traverse(phase)
@@ -89,7 +86,7 @@ def test_gradients_of_needle_lobes_are_finite(g):
 @pytest.mark.parametrize("kind", [{"type": "mivol_hg"}, {"type": "mivol_draine", "alpha": 7.0}])
 @pytest.mark.parametrize("g", [1e-7, 0.3, 0.99])
 def test_negative_asymmetry_is_the_mirror_image(g, kind):
-    """Values at mirrored turns are equal to the last bit, and so are samples at mirrored random numbers. Hard case 7."""
+    """Values at mirrored turns are equal to the last bit, and so are samples at mirrored random numbers."""
     forward, back = (mi.load_dict({**kind, "g": s * g}) for s in (1, -1))
     ctx, mei = mi.PhaseFunctionContext(), interaction(257)
     u = mi.Float(((np.arange(257) + 0.5) / 257 * 2**20).round().astype(np.float32) / 2**20)  # 1 - u is exact
@@ -105,7 +102,7 @@ def test_negative_asymmetry_is_the_mirror_image(g, kind):
 
 
 def test_ends_of_rayleigh():
-    """u = 0, 1/2 and 1 give cosines -1, 0 and 1, with values 3/(8 pi), 3/(16 pi), 3/(8 pi). Hard case 8."""
+    """u = 0, 1/2 and 1 give cosines -1, 0 and 1, with values 3/(8 pi), 3/(16 pi), 3/(8 pi)."""
     phase = mi.load_dict({"type": "mivol_rayleigh"})
     u = mi.Point2f(mi.Float(0, 0.5, 1), 0.3)
     wo, weight, pdf = phase.sample(mi.PhaseFunctionContext(), interaction(3), 0.5, u)
@@ -113,9 +110,6 @@ def test_ends_of_rayleigh():
     assert -np.array(wo)[2] == pytest.approx([-1, 0, 1], abs=3 * EPS)
     assert np.array(pdf) * 8 * np.pi / 3 == pytest.approx([1, 0.5, 1], rel=4 * EPS)
     assert np.array_equal(np.array(weight).ravel(), np.ones(3))
-
-
-# -- 25: what an optimiser's step leaves behind ----------------------------------------------------------------------------
 
 
 def volume(value: float) -> dict:
@@ -142,7 +136,6 @@ OVERSHOOTS = {
 
 @pytest.mark.parametrize("case", OVERSHOOTS)
 def test_overshoot_is_refused_when_it_is_handed_in(case):
-    """Hard case 25."""
     given, key, bad, words = OVERSHOOTS[case]
     params = mi.traverse(mi.load_dict(given))
     params[key] = mi.Float(bad)
@@ -152,7 +145,6 @@ def test_overshoot_is_refused_when_it_is_handed_in(case):
 
 @pytest.mark.parametrize("given", [{"type": "mivol_hg"}, {"type": "mivol_draine"}])
 def test_overshoot_of_a_grid_names_the_voxel(given):
-    """Hard case 25."""
     params = mi.traverse(mi.load_dict({**given, "g": volume(0.5)}))
     wrong = np.full((2, 2, 2, 1), 0.5, np.float32)
     wrong[1, 0, 1] = -1.5
@@ -174,16 +166,12 @@ def test_overshoot_of_a_grid_names_the_voxel(given):
     ],
 )
 def test_values_outside_are_refused_at_load(bad):
-    """Hard case 25."""
     with pytest.raises(Exception, match="expected"):
         mi.load_dict(bad)
 
 
 def test_inside_a_recording_an_overshoot_is_projected():
-    """dr.freeze cannot read: g = 1.5 renders as the largest g below 1, a negative weight as 0, and nothing is NaN.
-
-    Hard case 25.
-    """
+    """dr.freeze cannot read: g = 1.5 renders as the largest g below 1, a negative weight as 0, and nothing is NaN."""
     phase = {"type": "mivol_mixture", "a": {"type": "mivol_hg", "g": 0.5}, "b": {"type": "mivol_rayleigh"}}
     fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.9, "phase": phase}
     parts = {"box": box_of(fog, np.eye(4)), "sky": sky(), "sensor": camera((0.5, -3, 0.5), (0.5, 0.5, 0.5), 4)}
@@ -207,10 +195,7 @@ def test_inside_a_recording_an_overshoot_is_projected():
 
 
 def test_values_of_unknown_volumes_are_projected():
-    """A grid under another plugin's own key cannot be read when it is handed in; what it gives is moved into the domain.
-
-    Hard case 25.
-    """
+    """A grid under another plugin's own key cannot be read when it is handed in; what it gives is moved into the domain."""
     phase = mi.load_dict({"type": "mivol_hg", "g": volume(0.5)})
     grid = phase.parameters["g"]
     inner = mi.traverse(grid)
@@ -222,14 +207,8 @@ def test_values_of_unknown_volumes_are_projected():
     assert np.all(np.array(wo)[2] < -0.999)
 
 
-# -- 48 ------------------------------------------------------------------------------------------------------------------
-
-
 def test_gradient_of_an_image_by_g_at_zero():
-    """Single scattering of an emitter behind thin fog: dL/dg = L 3 cos at g = 0, straight from the closed form of p.
-
-    Hard case 48.
-    """
+    """Single scattering of an emitter behind thin fog: dL/dg = L 3 cos at g = 0, straight from the closed form of p."""
     fog = {"type": "homogeneous", "sigma_t": 0.01, "albedo": 1.0, "phase": {"type": "mivol_hg", "g": 0.0}}
     parts = {
         "box": box_of(fog, np.eye(4)),

@@ -1,32 +1,4 @@
-"""Hard cases of radiance fields: what the tutorial's integrator does badly (its defects 1 to 16), each shown to be right here.
-
-========  ==================================================  ==========================================================
-defect    what goes wrong there                               shown by
-========  ==================================================  ==========================================================
-1         opacity capped by the learning rate                 here
-2         an empty box costs what a full one does             here; ``analytic/test_radiance_field::test_cells_know_the_way...``
-3         wrong steps in other boxes, a last one too long     here; ``analytic/test_radiance_field::test_agrees_with_the_twin``
-4         NaN where the transmittance underflows              here; ``...::test_constant_colour_and_no_nan_at_any_depth``
-5         colours outside [0, 1] lose their derivative        here
-6         an all-negative density is dead                     here
-7         no background, alpha always 1                       here; ``optim/test_radiance_problem::test_backgrounds...``
-8         dense storage; no priors, no pruning                here; ``analytic/test_radiance_field::test_sparse_is_dense``,
-                                                              ``optim/test_decoupled_priors::test_priors_move...``
-9         harmonics read where nothing is; one degree         here
-10        rays end at a transmittance of exactly 0            here; ``analytic/test_radiance_field::test_a_ray_that_stops...``
-11        no forward mode                                     ``conformance/test_spherical_volume::test_derivatives_...``
-12        texture units round weights on a GPU                does not arise: nodes are gathered, no texture is read
-13        another field after refinement                      ``analytic/test_spherical_grid::test_a_field_on_finer...``
-14        images of one size, jitter inside pixels            here; ``optim/test_ray_batches::test_views_know_their...``
-15        nothing to stop, resume, measure or look at         ``optim/test_radiance_problem::test_a_fit_that...``,
-                                                              ``experiments/test_photo_fit``
-16        a camera inside sees what is behind it              here; ``analytic/test_radiance_field::test_camera_inside``
-========  ==================================================  ==========================================================
-
-Of the hard cases by number, 2 (cells of any optical depth), 38 (a source like the background) and 45 (a camera inside) are in
-``analytic/test_emission``, ``analytic/test_numerics`` and ``analytic/test_radiance_field``; 37 (a wall) is there for a wall
-that nothing passes, and here for one that leaves exp(-50).
-"""
+"""Hard cases of radiance fields: opaque and empty voxels, underflow, overflowing colours, sparse storage, inner cameras, walls."""
 
 from __future__ import annotations
 
@@ -102,16 +74,11 @@ def seen_by(scene: Pencils, **more) -> np.ndarray:
     return np.array(mi.render(scene.scene, integrator=integrator, spp=1), dtype=np.float64)[0]
 
 
-# -- 1: opacity ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", PRESETS)
 def test_rates_of_a_stage_reach_opaque_voxels(name: str) -> None:
     """The density can climb to an optical depth of 4.6 (alpha 0.99) in one voxel of the last stage within that stage.
 
     The tutorial's 420 steps of 0.05 make a voxel of 1/128 opaque to 15 %.
-
-    Defect 1.
     """
     plan = PRESETS[name]
     last = plan.stages[-1]
@@ -132,7 +99,7 @@ def plain_view(back: np.ndarray, side: int = 16) -> Photo:
 
 
 def test_a_short_fit_makes_matter_opaque() -> None:
-    """40 steps from a fog of an optical depth of 0.1 to something that hides all, in a box of any size. Defect 1."""
+    """40 steps from a fog of an optical depth of 0.1 to something that hides all, in a box of any size."""
     half = 0.02
     photos = [plain_view(4 * half * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [-0.6, -0.6, -0.6])]
     plan = RadiancePlan((RadianceStage(8, 40, 1, 4, 16),), degree=0, delay=0.0)
@@ -145,9 +112,6 @@ def test_a_short_fit_makes_matter_opaque() -> None:
     assert np.array(problem.field.density).max() * 2 * half / 8 > 2.5
 
 
-# -- 2: what is empty ------------------------------------------------------------------------------------------------------
-
-
 def visited(field: SphericalGrid, o, d) -> np.ndarray:
     """How many cells each ray visits."""
     rays, cells = rays_of(o, d), find_occupied_cells(field)
@@ -157,7 +121,7 @@ def visited(field: SphericalGrid, o, d) -> np.ndarray:
 
 
 def test_only_occupied_cells_are_visited() -> None:
-    """As many visits as a ray crosses cells with a corner above 0, counted from sorted crossings in float64. Defect 2."""
+    """As many visits as a ray crosses cells with a corner above 0, counted from sorted crossings in float64."""
     density = np.random.default_rng(4).normal(-1.2, 1, (9, 8, 10)).astype(np.float32)
     field = SphericalGrid.from_dense(density, np.zeros((*density.shape, 1, 3)), TO_WORLD)
     o, d = aim(40)
@@ -179,10 +143,7 @@ def test_only_occupied_cells_are_visited() -> None:
 
 @pytest.mark.parametrize(("density", "reads"), [(-1.0, math.ceil(61 / (4 * REACH))), (1.0, 61)])
 def test_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reads of the map of bricks along a row of 60 voxels: one a cell where it is full, one in 15 bricks where it is empty.
-
-    Defect 2.
-    """
+    """Reads of the map of bricks along a row of 60 voxels: one a cell where it is full, one in 15 bricks where it is empty."""
     field = even(density, res=(1, 1, 60))
     ray, cells = rays_of([-3, 0.1, 0.2], [1, 0, 0]), find_occupied_cells(field)
     segment = clip_to_grid(cells, ray.o, ray.d, 0, ray.t_max)
@@ -199,11 +160,8 @@ def test_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: 
     assert len(count) == reads
 
 
-# -- 3: other boxes, and where a ray ends ------------------------------------------------------------------------------
-
-
 def test_a_ray_that_ends_inside_a_cell() -> None:
-    """c (1 - exp(-sigma L)) for the length L up to its end, in a sheared box with voxels of three lengths. Defect 3."""
+    """c (1 - exp(-sigma L)) for the length L up to its end, in a sheared box with voxels of three lengths."""
     o, d = aim(60)
     sigma, (entry, whole) = 3.0, entries(TO_WORLD, o, d)
     field, ray = even(sigma, 1.0, TO_WORLD), rays_of(o, d)
@@ -224,16 +182,10 @@ def test_a_ray_that_ends_inside_a_cell() -> None:
     assert all(kind.any() for kind in (share == 0, share == 1, (share > 0) & (share < 1)))
 
 
-# -- 4: transmittances that underflow ----------------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("3000.0")
 @pytest.mark.parametrize("most", [3e3, 1e5])
 def test_no_nan_where_transmittance_underflows(most: float) -> None:
-    """A random grid 16^3, optical depths up to 190 and 6000 a step: derivatives of fields and of scenes, against the twin.
-
-    Defect 4.
-    """
+    """A random grid 16^3, optical depths up to 190 and 6000 a step: derivatives of fields and of scenes, against the twin."""
     rng = np.random.default_rng(0)
     density = rng.uniform(0, most, (16, 16, 16)).astype(np.float32)
     sh = rng.normal(0, 0.4, (16, 16, 16, 1, 3)).astype(np.float32)
@@ -266,7 +218,7 @@ def test_no_nan_where_transmittance_underflows(most: float) -> None:
 
 
 def test_a_fit_goes_on_from_an_opaque_field() -> None:
-    """A step from densities up to 1e5 leaves finite values and a finite state. Defect 4."""
+    """A step from densities up to 1e5 leaves finite values and a finite state."""
     photos = [plain_view(4 * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0])]
     plan = RadiancePlan((RadianceStage(16, 4, 1, 2, 16),), degree=0)
     problem = RadianceProblem(RayBatches.from_photos(photos), np.array([[-1.0] * 3, [1.0] * 3]), plan)
@@ -282,16 +234,10 @@ def test_a_fit_goes_on_from_an_opaque_field() -> None:
     assert np.any(state["roots/density"] > 0) and np.any(state["roots/harmonics"] > 0)
 
 
-# -- 5: colours --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("10.0-True")
 @pytest.mark.parametrize(("sh", "clamp"), [(10.0, True), (0.3, True), (-2.0, True), (-2.0, False)])
 def test_colours_keep_their_derivatives(sh: float, clamp: bool) -> None:
-    """Above 1 as between 0 and 1: Y_0 alpha; below 0, where black is shown, the density still knows the background.
-
-    Defect 5.
-    """
+    """Above 1 as between 0 and 1: Y_0 alpha; below 0, where black is shown, the density still knows the background."""
     field, behind = even(1.5, sh, clamp=clamp), 0.25
     o, d = aim(10, CUBE)
     L = lengths(CUBE, o, d)
@@ -310,16 +256,10 @@ def test_colours_keep_their_derivatives(sh: float, clamp: bool) -> None:
     assert abs(density.sum()) > 0.1
 
 
-# -- 6: densities below 0 ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("exp", "softplus")
 @pytest.mark.parametrize("name", ["relu", "softplus", "exp"])
 def test_negative_densities(name: str) -> None:
-    """Softplus and exp have an extinction and a derivative everywhere; a ReLU has neither below 0, and a fit begins above.
-
-    Defect 6.
-    """
+    """Softplus and exp have an extinction and a derivative everywhere; a ReLU has neither below 0, and a fit begins above."""
     raw = -3.0
     field = even(raw, 1.0, activation=name)
     o, d = aim(10, CUBE)
@@ -337,7 +277,6 @@ def test_negative_densities(name: str) -> None:
 
 
 def test_a_fit_begins_above_zero() -> None:
-    """Defect 6."""
     for plan in PRESETS.values():
         small = RadiancePlan((RadianceStage(8, 1, 1, 1, 1),), degree=plan.degree, start=plan.start)
         batches = RayBatches.from_photos([plain_view(np.array([4.0, 0, 0]))])
@@ -345,14 +284,8 @@ def test_a_fit_begins_above_zero() -> None:
         assert dr.all(field.density > 0) and field.activation in ACTIVATIONS
 
 
-# -- 7: background and alpha -------------------------------------------------------------------------------------------
-
-
 def test_background_and_alpha_have_their_derivatives() -> None:
-    """An empty volume is not there; through a fog the sky is seen, and alpha = 1 - exp(-sigma L) has its derivative.
-
-    Defect 7.
-    """
+    """An empty volume is not there; through a fog the sky is seen, and alpha = 1 - exp(-sigma L) has its derivative."""
     o, d = aim(8, CUBE)
     empty = seen_by(in_a_scene(even(-1.0), o, d, 0.25), aovs="alpha")
     assert (empty[:, :3] == 0.25).all() and (empty[:, 3] == 0).all()
@@ -374,14 +307,8 @@ def test_background_and_alpha_have_their_derivatives() -> None:
     assert density.sum() == pytest.approx(3 * (0.25 + Y0) * np.sum(L * T), rel=1e-5)
 
 
-# -- 8: memory -----------------------------------------------------------------------------------------------------------
-
-
 def test_memory_goes_with_what_is_there() -> None:
-    """Values, derivatives, squares and tables of a thin shell in 64^3: a twentieth of the tutorial's 16 bytes a coefficient.
-
-    Defect 8.
-    """
+    """Values, derivatives, squares and tables of a thin shell in 64^3: a twentieth of the tutorial's 16 bytes a coefficient."""
     n = 64
     g = (np.arange(n) + 0.5) / n * 2 - 1
     z, y, x = np.meshgrid(g, g, g, indexing="ij")
@@ -405,14 +332,8 @@ def test_memory_goes_with_what_is_there() -> None:
     assert see(field, [3, 0, 0], [-1, 0, 0])[1] < 1
 
 
-# -- 9: colours are read where there is something -------------------------------------------------------------------------
-
-
 def test_no_colour_is_read_where_nothing_is() -> None:
-    """Harmonics are NaN but at the corners of cells with extinction on the ray: neither light nor derivatives see it.
-
-    Defect 9.
-    """
+    """Harmonics are NaN but at the corners of cells with extinction on the ray: neither light nor derivatives see it."""
     density = np.full((4, 4, 30), -1.0, np.float32)
     density[:, :, 12:14] = 2.0
     # A corner of cells 20 and 21 is above 0, off the ray, whose points in them are below.
@@ -446,7 +367,7 @@ def harmonics(d: np.ndarray, degree: int) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", range(MAX_DEGREE + 1))
 def test_any_degree(degree: int) -> None:
-    """0.5 + Y . k from opaque matter of the same coefficients everywhere, and the same after a degree is added. Defect 9."""
+    """0.5 + Y . k from opaque matter of the same coefficients everywhere, and the same after a degree is added."""
     k = np.random.default_rng(degree).normal(0, 0.1, (basis_size(degree), 3))
     o, d = aim(20, CUBE)
     field = SphericalGrid.from_dense(np.full((2, 2, 2), 200.0), np.broadcast_to(k, (2, 2, 2, *k.shape)), CUBE)
@@ -458,14 +379,8 @@ def test_any_degree(degree: int) -> None:
         np.testing.assert_allclose(see(field.with_degree(degree + 1), o, d)[0], opacity[:, None] * expected, atol=5e-6)
 
 
-# -- 10: rays that end early ----------------------------------------------------------------------------------------------
-
-
 def test_a_ray_stops_in_the_cell_that_hides_enough() -> None:
-    """At the first plane behind which less than ``stop`` of the light is left, and there its transmittance is the true one.
-
-    Defect 10.
-    """
+    """At the first plane behind which less than ``stop`` of the light is left, and there its transmittance is the true one."""
     n, sigma, stop = 40, 6.0, 0.01
     seen = followed(even(sigma, res=(1, 1, n)), [-3, 0.1, 0.1], [1, 0, 0], stop)
     # Planes: the outer half voxel, then one voxel after the other.
@@ -477,14 +392,8 @@ def test_a_ray_stops_in_the_cell_that_hides_enough() -> None:
     assert 0 < 0.5 * -math.expm1(-2 * sigma) - float(seen.colour.x[0]) < 0.5 * stop
 
 
-# -- 14: photographs of any size ----------------------------------------------------------------------------------------
-
-
 def test_photographs_of_different_sizes_without_jitter() -> None:
-    """Each ray goes through the middle of the pixel whose value it is compared with, whatever the photograph's size.
-
-    Defect 14.
-    """
+    """Each ray goes through the middle of the pixel whose value it is compared with, whatever the photograph's size."""
     rng, photos = np.random.default_rng(0), []
     for width, height in ((20, 12), (9, 30), (17, 16)):
         camera = plain_view(rng.normal(size=3) * 3).camera
@@ -512,15 +421,9 @@ def test_photographs_of_different_sizes_without_jitter() -> None:
     assert np.any(np.array(batches[0].rays.d) != np.array(batches[1].rays.d))
 
 
-# -- 16: a camera inside ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_camera_inside_sees_nothing_behind_it() -> None:
-    """Matter behind the camera only: radiance 0, alpha 0 and no derivative, exactly; turned round it is all there.
-
-    Defect 16.
-    """
+    """Matter behind the camera only: radiance 0, alpha 0 and no derivative, exactly; turned round it is all there."""
     density = np.full((6, 6, 8), -1.0, np.float32)
     density[:, :, :3] = 40.0
     field = SphericalGrid.from_dense(density, np.zeros((6, 6, 8, 1, 3)), CUBE)
@@ -535,14 +438,8 @@ def test_a_camera_inside_sees_nothing_behind_it() -> None:
     assert (np.abs(see(field, o, -ahead)[0] - 0.5) < 1e-6).all()
 
 
-# -- 37: behind a wall ---------------------------------------------------------------------------------------------------
-
-
 def test_what_a_wall_of_depth_50_leaves() -> None:
-    """Hidden nodes get their e^-50 to float32's digits, before a bright background, where a remainder would be 1e-7.
-
-    Hard case 37.
-    """
+    """Hidden nodes get their e^-50 to float32's digits, before a bright background, where a remainder would be 1e-7."""
     rng = np.random.default_rng(3)
     density = rng.uniform(0.2, 2, (1, 1, 24))
     density[..., 9] = 50 / (2 / 24)

@@ -1,4 +1,4 @@
-"""Hard cases of single scattering, by number, each against a closed form or the float64 twin."""
+"""Hard cases of single scattering, each against a closed form or the float64 twin."""
 
 from __future__ import annotations
 
@@ -45,15 +45,12 @@ def set_grid(scene: mi.Scene, values: np.ndarray, key: str = GRID) -> None:
     params.update()
 
 
-# -- Density and albedo at the ends of their domains ---------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["stock"]))
 @pytest.mark.parametrize("lit", ["point", "sky"])
 def test_derivative_of_no_density(lit, kind):
-    """d L / d sigma_k = integral of w_k (albedo L_s - B): not 0, and of either sign. Hard case 21."""
+    """d L / d sigma_k = integral of w_k (albedo L_s - B): not 0, and of either sign."""
     values, albedo = 0 * rough_grid(1), 0.6
     emitter = point([1.5, 1, 2.0]) if lit == "point" else ({"type": "constant", "radiance": 0.5}, twins.Sky(0.5, 4))
     box, m = smoke(values, albedo, kind)
@@ -69,7 +66,7 @@ def test_derivative_of_no_density(lit, kind):
 
 
 def test_picture_of_no_density():
-    """Exactly the background; no NaN from 0/0. Hard case 21."""
+    """Exactly the background; no NaN from 0/0."""
     box, _ = smoke(0 * rough_grid(1), 1.0)
     seen = pencils({"smoke": box, "sky": scenes.sky(0.7), "bulb": point([0.1, 0.2, 0.3])[0]}, *aimed(1, 6))
     assert np.all(np.abs(scenes.render(seen.scene, mivol(), 16) - as_float32(0.7)) <= 4 * EPS)
@@ -79,7 +76,7 @@ def test_picture_of_no_density():
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["own"]))
 def test_albedo_0(kind):
-    """L = T B without noise; the derivative with respect to the albedo is the integral of T sigma L_s, not 0. Hard case 23."""
+    """L = T B without noise; the derivative with respect to the albedo is the integral of T sigma L_s, not 0."""
     values = rough_grid(2)
     box, _ = smoke(values, 0.0, kind)
     emitter = point([1.5, 1, 2.0])
@@ -100,9 +97,7 @@ def test_albedo_0(kind):
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [-0.1, 1.2, math.nan])
 def test_albedo_outside_its_domain(value, kind):
-    """An optimizer's overshoot is refused with a sentence naming the albedo, and not rendered with a gain of energy. Hard case
-    25.
-    """
+    """An optimizer's overshoot is refused with a sentence naming the albedo, and not rendered with a gain of energy."""
     box, _ = smoke(rough_grid(3), 0.8, kind)
     seen = pencils({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, *aimed(3, 2))
     params = mi.traverse(seen.scene)
@@ -115,7 +110,7 @@ def test_albedo_outside_its_domain(value, kind):
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [-0.1, 1.2, math.inf])
 def test_albedo_grid_outside_its_domain(value, kind):
-    """One voxel of an albedo grid. Hard case 25."""
+    """One voxel of an albedo grid."""
     medium_type, volume_type = small.KINDS[kind]
     albedo = grid_volume(volume_type, np.full((2, 3, 4, 1), 0.5), PLACE)
     box = box_of(medium(medium_type, grid_volume(volume_type, rough_grid(3), PLACE), albedo), PLACE)
@@ -131,7 +126,7 @@ def test_albedo_grid_outside_its_domain(value, kind):
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_density_that_is_no_number(value, kind):
-    """A voxel of NaN or infinity is refused and named by its indices; rendering works again after a step back. Hard case 26."""
+    """A voxel of NaN or infinity is refused and named by its indices; rendering works again after a step back."""
     values = rough_grid(4)
     box, _ = smoke(values, 0.8, kind)
     seen = pencils({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, *aimed(4, 2))
@@ -145,14 +140,11 @@ def test_density_that_is_no_number(value, kind):
     assert np.array_equal(scenes.render(seen.scene, mivol(), 4, seed=1), before)
 
 
-# -- Majorants, of which there are none ----------------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("own")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["stock"]))
 def test_density_that_has_grown(kind):
-    """An optimizer has raised the values tenfold: bounds of the old values must not be used. Hard case 30."""
+    """An optimizer has raised the values tenfold: bounds of the old values must not be used."""
     values = rough_grid(5, 0.5)
     box, m = smoke(values, 0.8, kind)
     emitter = point([1.5, 1, 2.0])
@@ -168,14 +160,11 @@ def test_density_that_has_grown(kind):
     holds_twin(seen, m, emitter[1])
 
 
-# -- Emitters: inside, far away, along the ray ---------------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("0.001")
 @pytest.mark.statistical
 @pytest.mark.parametrize("h", [1e-3, 0.03, 0.4])
 def test_point_light_beside_the_ray(h):
-    """Close to the ray the radiance grows as 1/h: equal angles keep the noise constant. Hard case 33."""
+    """Close to the ray the radiance grows as 1/h: equal angles keep the noise constant."""
     values = rough_grid(8)
     box, m = smoke(values, 0.8, "own")
     emitter = point([0.1, as_float32(0.2 + h), 0.3])
@@ -188,7 +177,7 @@ def test_point_light_beside_the_ray(h):
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 def test_point_light_on_the_ray(kind):
-    """The integral diverges: the pixel must be finite, and its neighbours right. Hard case 33."""
+    """The integral diverges: the pixel must be finite, and its neighbours right."""
     values = rough_grid(8)
     box, m = smoke(values, 0.8, "own") if kind == "grid" else fog(0.7, 0.8)
     emitter = point([0.1, 0.2, 0.3])
@@ -204,7 +193,7 @@ def test_point_light_on_the_ray(kind):
 @pytest.mark.statistical
 @pytest.mark.parametrize("where", ["node", "face", "edge", "border"])
 def test_point_light_at_a_special_place(where):
-    """A point light at a voxel's centre, on a face and an edge between cells, and on the border of the grid. Hard case 33."""
+    """A point light at a voxel's centre, on a face and an edge between cells, and on the border of the grid."""
     values = rough_grid(9, 1.0, (4, 4, 4))
     step = 0.5  # voxel centres of [-1, 1]^3 in 4: -0.75, -0.25, 0.25, 0.75
     place = {
@@ -223,9 +212,7 @@ def test_point_light_at_a_special_place(where):
 @pytest.mark.statistical
 @pytest.mark.parametrize("away", [1e3, 1e5])
 def test_point_light_far_away_is_a_sun(away):
-    """Irradiance I / r^2 from one direction, up to the parallax 1/r; the angle of a cell is not computed as a difference. Hard
-    case 34.
-    """
+    """Irradiance I / r^2 from one direction, up to the parallax 1/r; the angle of a cell is not computed as a difference."""
     values = rough_grid(10)
     box, m = smoke(values, 0.8, "own", name="hg", g=0.5)
     towards = np.array([0.48, -0.6, 0.64])
@@ -240,7 +227,7 @@ def test_point_light_far_away_is_a_sun(away):
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 @pytest.mark.parametrize("tilt", [0.0, 1e-6, 1e-3])
 def test_light_along_the_camera_ray(tilt, kind):
-    """mu -> mu0 in transmission: alpha p E0 (tau/mu) e^{-tau/mu}, without 0/0. Hard case 35."""
+    """mu -> mu0 in transmission: alpha p E0 (tau/mu) e^{-tau/mu}, without 0/0."""
     sigma = 1.3
     frame = as_float32(scenes.affine(np.diag([400.0, 400, 1]), (-200, -200, 0)))
     build = fog(sigma, 0.8, frame) if kind == "homogeneous" else smoke(np.full((3, 2, 2, 1), sigma), 0.8, "own", frame)
@@ -259,9 +246,7 @@ def test_light_along_the_camera_ray(tilt, kind):
 @pytest.mark.statistical
 @pytest.mark.parametrize("direction", [[0, 0, -1.0], [0, -1.0, 0], [1.0, 0, 0]])
 def test_shadow_rays_along_the_faces_of_cells(direction):
-    """Camera rays in planes between cells, through voxel centres, and light along other such planes: T is continuous. Hard case
-    36.
-    """
+    """Camera rays in planes between cells, through voxel centres, and light along other such planes: T is continuous."""
     values = rough_grid(11, 2.0, (4, 4, 4))
     box, m = smoke(values, 0.8, "own")
     emitter = sun(direction)
@@ -273,9 +258,7 @@ def test_shadow_rays_along_the_faces_of_cells(direction):
 
 @pytest.mark.statistical
 def test_no_light_is_lost_where_shadow_rays_start():
-    """Dense smoke of voxels 1e-3 wide: Mitsuba's offset of 1e-4 at the start of a shadow ray would cause an error of 10 %. Hard
-    case 36.
-    """
+    """Dense smoke of voxels 1e-3 wide: Mitsuba's offset of 1e-4 at the start of a shadow ray would cause an error of 10 %."""
     scale = 2e-3
     values = as_float32(rough_grid(12, 2.0) / scale)
     frame = as_float32(centred(scale * np.eye(3)))
@@ -286,16 +269,11 @@ def test_no_light_is_lost_where_shadow_rays_start():
     holds_twin(seen, m, emitter[1], spp=4096)
 
 
-# -- Depth ---------------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow_for("grid")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 def test_depth_2_is_one_scattering(kind):
-    """Depth 1: exactly the background through the medium; depth 2: single scattering in addition, by its closed form. Hard case
-    46.
-    """
+    """Depth 1: exactly the background through the medium; depth 2: single scattering in addition, by its closed form."""
     sigma, depth = 2.2, 0.4
     build = fog(sigma, 1.0, np.eye(4)) if kind == "homogeneous" else smoke(np.full((4, 3, 2, 1), sigma), 1.0, "own", np.eye(4))
     seen = pencils({"cube": build[0], "sun": sun([0, 0, -1.0], 3.0)[0]}, [-2, 0.3, 1 - depth], [1.0, 0, 0])
@@ -310,7 +288,7 @@ def test_depth_2_is_one_scattering(kind):
 
 
 def test_surfaces_shine_on_the_medium_only_directly():
-    """A white floor lit by an emitter lights the smoke above at depth 3, not at 2; an area light does at 2. Hard case 46."""
+    """A white floor lit by an emitter lights the smoke above at depth 3, not at 2; an area light does at 2."""
     box, _ = smoke(rough_grid(13), 0.9)
     turn, ray = mi.ScalarTransform4f, ([-5, 0.1, 0.2], [1.0, 0, 0])
     floor = {"type": "rectangle", "to_world": turn().translate([0, 0, -1.2]).scale(3)}

@@ -67,8 +67,7 @@ def test_the_median_depth_is_that_of_the_splat_at_which_half_of_the_light_is_los
 
 def disc_picture(radius: float, depth: float = 0.0, beside: float = 0.0, opacity: float = 20.0) -> np.ndarray:
     """Alpha of a disc of a radius [pixel at the origin], at a distance behind the origin and an offset of pixels from the
-    axis.
-    """
+    axis."""
     arrays = stack([opacity], [depth], scale=radius / SIDE)
     arrays["means"][0, 0] = beside / SIDE * (1 + depth)
     splatter = Splatter(SIDE, SIDE, 2, compensated=True, discs=True)
@@ -91,10 +90,9 @@ def test_a_disc_covers_its_area_and_nothing_else(variant_rgb: str) -> None:
 
 
 def test_the_light_of_a_small_disc_falls_with_the_square_of_its_distance(variant_rgb: str) -> None:
-    """Radii of 2 to 0.25 pixels. The smallest disc is drawn with a radius of 0.6, whose border is not straight in any pixel:
-    an error of a quarter of its area, at every place in a pixel. Without the widened radius one pixel or none would show the
-    disc.
-    """
+    """Radii of 2 to 0.25 pixels. The smallest disc is drawn with a radius of 0.6, whose border is not straight in any pixel: an
+    error of a quarter of its area, at every place in a pixel. Without the widened radius one pixel or none would show the
+    disc."""
     for depth in (0.0, 1.0, 3.0, 7.0):
         for beside in (0.0, 0.25, 0.5):
             area = np.pi * (2 / (1 + depth)) ** 2
@@ -113,8 +111,7 @@ def test_nearer_discs_hide_those_behind_and_have_no_derivatives(variant_rgb: str
 def test_derivatives_at_an_opacity_of_one(splatter: Splatter) -> None:
     """In the pixel of alpha 1 everything behind is hidden, and yet the derivative by the place of the front splat depends on
     the hidden colour. A logit of 20 is an opacity of 1 in float32; the splat of logit 30 behind it is hidden, and hides the
-    third.
-    """
+    third."""
     compare_derivatives(splatter, stack([20.0, 30.0, 0.0], [0.0, 0.3, 0.6]))
 
 
@@ -166,8 +163,7 @@ def test_opacities_of_zero_and_one_by_infinite_logits(splatter: Splatter) -> Non
 def test_tiny_and_huge_scales(splatter: Splatter, camera: Camera, scale: float) -> None:
     """A tiny Gaussian is as wide as the low-pass filter, a huge one has the alpha of its opacity in every pixel. A huge
     covariance is a sum of squares up to (1e3 * 22 pixels)^2, in which the low-pass filter disappears without effect: alpha
-    changes by 1e-9 across the image.
-    """
+    changes by 1e-9 across the image."""
     arrays = cloud(20, 2, scale, seed=4)
     picture, kept = splatter.forward(tensors(arrays), camera)
     truth, _ = oracle_splats.draw(arrays, camera)
@@ -177,9 +173,8 @@ def test_tiny_and_huge_scales(splatter: Splatter, camera: Camera, scale: float) 
 
 
 def test_needles(splatter: Splatter, camera: Camera) -> None:
-    """A million times as long as thick. Products of their covariance would cancel to 1e-7 and are not formed. The exponent is
-    a sum of terms up to 24^2 / 0.6 = 1000, each rounded by a few 2^-24, that cancel: 3e-4.
-    """
+    """A million times as long as thick. Products of their covariance would cancel to 1e-7 and are not formed. The exponent is a
+    sum of terms up to 24^2 / 0.6 = 1000, each rounded by a few 2^-24, that cancel: 3e-4."""
     arrays = cloud(20, 2, 1.0, seed=6)
     arrays["log_scales"] = np.log(np.full((20, 3), [300.0, 3e-4, 3e-4], np.float32))
     picture, kept = splatter.forward(tensors(arrays), camera)
@@ -204,8 +199,7 @@ def test_nothing_behind_the_camera_is_drawn(splatter: Splatter, camera: Camera) 
 
 def test_layers_without_end(splatter: Splatter) -> None:
     """The last of 200 veils is visible, and learns. Mitsuba's ``volprim_rf_basic`` ends a ray after 64 Gaussians and at a
-    hundredth of its light. The derivative by the colour of the last veil is Y_0 times its weight, a fiftieth of the light.
-    """
+    hundredth of its light. The derivative by the colour of the last veil is Y_0 times its weight, a fiftieth of the light."""
     n = 200
     arrays = stack([-3.9] * n, [0.002 * k for k in range(n)], scale=0.5)
     picture, kept = splatter.forward(tensors(arrays), straight())
@@ -222,8 +216,7 @@ def test_layers_without_end(splatter: Splatter) -> None:
 @pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
 def test_the_unit_of_length_is_free(variant_rgb: str, unit: float) -> None:
     """Scaling everything by a length, near plane included, gives the same image and divides the derivative by places.
-    Logarithms of scales up to 12 are rounded by 12 * 2^-24 = 7e-7, and alpha by at most 11 times this error (q <= 2 ln 255).
-    """
+    Logarithms of scales up to 12 are rounded by 12 * 2^-24 = 7e-7, and alpha by at most 11 times this error (q <= 2 ln 255)."""
     arrays, camera = cloud(50, 2, 0.15, seed=4), looking(SIDE, SIDE)
     truth, _ = oracle_splats.draw(arrays, camera)
     pose = camera.to_world.copy()
@@ -246,8 +239,7 @@ def test_the_camera_inside_gaussians(splatter: Splatter, camera: Camera) -> None
     """Means close in front of the camera and beside it, with scales reaching across its plane, are drawn with the perspective
     linearised at the border of the image (as in the float64 twin). Mitsuba's ``volprim_rf_basic`` drops every Gaussian around
     the origin of a ray. Centres are up to 130 pixels away and rounded three times (2e-5 pixels), and an ellipse is at least 7
-    pixels wide: the error of alpha is 3.3 / 7 of 2e-5, 1e-5.
-    """
+    pixels wide: the error of alpha is 3.3 / 7 of 2e-5, 1e-5."""
     rng = np.random.default_rng(7)
     arrays = cloud(20, 2, 0.2, seed=4)
     right, down = camera.to_world[:3, 0], -camera.to_world[:3, 1]
@@ -262,8 +254,7 @@ def test_the_camera_inside_gaussians(splatter: Splatter, camera: Camera) -> None
 
 def test_a_black_channel_has_no_derivative_and_the_rest_has(splatter: Splatter) -> None:
     """A colour below 0 is 0, with a derivative of 0: in the red of a Gaussian only. In front of a grey Gaussian, opacity and
-    size of a black Gaussian are learnt from the hidden light.
-    """
+    size of a black Gaussian are learnt from the hidden light."""
     arrays = stack([0.0, 1.0], [0.0, 0.3])
     arrays["harmonics"][0, 0] = [-1.8, -1.7, 0.4]
     picture, kept = splatter.forward(tensors(arrays), straight())
@@ -321,8 +312,7 @@ def test_a_quaternion_of_no_direction_is_refused(splatter: Splatter, camera: Cam
 @pytest.mark.parametrize("length", [1e-29, 1e-20, 1e20, 1e30])
 def test_quaternions_of_any_length(splatter: Splatter, camera: Camera, length: float) -> None:
     """A rotation depends on the direction of its quaternion; squares of these lengths are 0 or infinite in float32. Scaling
-    rounds components by 2^-24, relative. The derivative shrinks as the quaternion grows.
-    """
+    rounds components by 2^-24, relative. The derivative shrinks as the quaternion grows."""
     arrays = cloud(20, 2, 0.1, seed=4)
     arrays["quaternions"] /= np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True)
     scaled = arrays | {"quaternions": arrays["quaternions"] * np.float32(length)}
@@ -337,8 +327,7 @@ def test_quaternions_of_any_length(splatter: Splatter, camera: Camera, length: f
 
 def test_lists_that_do_not_fit_are_refused_with_their_size(splatter: Splatter, monkeypatch: pytest.MonkeyPatch) -> None:
     """The refusal comes before the lists are made. A Gaussian in a tile takes 80 bytes: an entry, its sorting, and T of 64
-    pixels / 4.
-    """
+    pixels / 4."""
     monkeypatch.setattr(module, "available_memory", lambda: 15 << 20)
     made = []
     monkeypatch.setattr(splatter, "_write", lambda *args: made.append(args))

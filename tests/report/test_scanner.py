@@ -40,8 +40,8 @@ def directions(views: NDArray) -> NDArray:
 
 
 def corners(geometry: ConeBeam | ParallelBeam, views: NDArray, depth: NDArray) -> NDArray:
-    """(views, 4, 3) where the corners of the detector lie, found by rays alone: rays of pixel centres meet the plane that is
-    so deep along the beam, and the corners are half a pixel beyond the outermost of these points."""
+    """(views, 4, 3) where the corners of the detector lie, found by rays alone: rays of pixel centres meet the plane that is so
+    deep along the beam, and the corners are half a pixel beyond the outermost of these points."""
     o, d = geometry.rays(views)
     along = directions(views)[:, None, None]
     points = o + d * ((depth[:, None, None] - (o * along).sum(3)) / (d * along).sum(3))[..., None]

@@ -104,8 +104,6 @@ def test_frames_of_odd_sizes_repeat_their_last_row_and_column(shape: tuple[int, 
     np.testing.assert_array_equal(padded, np.pad(frame, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge"))
 
 
-# -- A turning volume ---------------------------------------------------------------------------------------------
-
 SIDE = 16
 
 
