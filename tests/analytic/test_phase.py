@@ -148,7 +148,7 @@ def test_hg_values(g):
 
 @pytest.mark.parametrize("g", [0.0, 1e-7, 1e-3, 0.5, -0.5, 0.9, -0.9])
 def test_moments_of_hg(g):
-    """Normalised, mean cosine g, <cos^2> = (1 + 2 g^2)/3, <cos^3> = (3 g + 2 g^3)/5; physics.md 4.9."""
+    """Normalised, mean cosine g, <cos^2> = (1 + 2 g^2)/3, <cos^3> = (3 g + 2 g^3)/5."""
     # 400 nodes: the error falls as the ellipse of convergence, (1/g)^800, < 1e-36. Left are the roundings of the values, and
     # those of the node in the peak, eps/2 of 1 - c = (1 - g), with slope 3/(1 - g)^2.
     tolerance = 10 * EPS / (1 - abs(g))
@@ -174,7 +174,7 @@ def test_inversion_of_hg(g):
     m, p = as64(turn.below_one), as64(turn.above_minus_one)
     assert np.all(np.isfinite(m) & np.isfinite(p) & (m >= 0) & (p >= 0))
     below, above = oracle.hg_below(m, p, f32(g))
-    # m and p are right to 4e-7 of themselves (physics.md 2.7). A chance has the slope 1 (d log / d log) in the one that is
+    # m and p are right to 4e-7 of themselves. A chance has the slope 1 (d log / d log) in the one that is
     # small with it, and at most 1/2 and 1/2 in the other, through q: 8e-7 of the chance.
     small = U < 0.5
     assert np.all(np.abs(below[small] - U[small]) <= 8e-7 * U[small])

@@ -43,7 +43,7 @@ def test_small_asymmetry_keeps_its_mean_cosine(g):
 
 
 def test_stock_is_wrong_there():
-    """Why stock hg is not the judge of small g: physics.md section 6."""
+    """Stock hg cannot be the judge of small g."""
     wo, _, _ = sample({"type": "hg", "g": 1e-7})
     assert -wo[:, 2].mean() < -0.3
 

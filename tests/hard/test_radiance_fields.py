@@ -1,4 +1,4 @@
-"""Hard cases of radiance fields: opaque and empty voxels, underflow, overflowing colours, sparse storage, inner cameras, walls."""
+"""Hard cases of radiance fields: opaque and empty voxels, underflow, overflowing colours, sparse storage, cameras inside."""
 
 from __future__ import annotations
 
