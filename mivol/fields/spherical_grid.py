@@ -32,7 +32,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -255,7 +254,9 @@ class SphericalGrid:
         rows = [np.concatenate(part) for part in zip(*values, strict=True)]
         return first.with_rows(*rows, mi.UInt32(np.concatenate(nodes).astype(np.uint32)), levels=len(grids))
 
-    def with_rows(self, density: np.ndarray, sh: np.ndarray, nodes: mi.UInt32 | None, **changes: Any) -> SphericalGrid:
+    def with_rows(
+        self, density: np.ndarray, sh: np.ndarray, nodes: mi.UInt32 | None, **changes: np.ndarray | str | float
+    ) -> SphericalGrid:
         """Make a field in the same box with other rows.
 
         Args:
