@@ -162,7 +162,9 @@ class Tabulated(AnglePhase):
     def refresh(self) -> None:
         values = self.parameters["values"]
         if dr.width(values) != len(self.table.values):
-            raise MivolError(f"values of {self._name()} became {dr.width(values)}; its {len(self.table.values)} cosines stay.")
+            raise MivolError(
+                f"found {dr.width(values)} values of {self._name()}, expected {len(self.table.values)}, one for each cosine."
+            )
         if not is_recording():
             check_values(np.array(dr.detach(values), dtype=np.float64), f"values of {self._name()}")
         self.values, self.integral, self.cumulative = self.nodes.normalise(values)

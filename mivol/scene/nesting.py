@@ -215,12 +215,12 @@ def _describe_fault(a: mi.Shape, b: mi.Shape) -> str:
     if a is b:
         return (
             f"pieces of {one} overlap, or their surfaces coincide in part (Mitsuba makes one mesh of all with the same medium "
-            "and BSDF), so that it is open where its medium ends: leave a gap of a thousandth of the scene between them, or "
+            "and BSDF), so the end of its medium is undetermined: leave a gap of a thousandth of the scene between them, or "
             "make one surface of them."
         )
     return (
-        f"{one} and {two} overlap, or parts of their surfaces coincide, and do not agree which medium is where: if one lies "
-        "inside the other, give it the medium of the outer one as its exterior "
+        f"{one} and {two} overlap, or parts of their surfaces coincide, and disagree about the medium between them: if one "
+        "lies inside the other, give the inner shape the medium of the outer shape as its exterior "
         '(<ref name="exterior" id="..."/>, beside the interior), with a gap of a thousandth of the scene between their '
         "surfaces; else move them apart."
     )

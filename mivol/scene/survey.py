@@ -206,8 +206,8 @@ def _split_levels(boundary: Boundary) -> list[Boundary]:
         return [boundary]
     if boundary.box is None:
         raise MivolError(
-            f"the medium in {boundary.name} is a nested field, whose levels are boxes, and {boundary.shape} is none that rays "
-            "are cut to: give it a cube of its own with a null BSDF, which overlaps no other medium's shape."
+            f"the medium in {boundary.name} is a nested field, whose levels are boxes, but {boundary.shape} is not a "
+            "separate box: give the medium a cube with a null BSDF that overlaps no other medium's shape."
         )
     boxes = [Box(field.level_to_world(level)) for level in range(field.levels)]
     return [

@@ -227,7 +227,7 @@ def _nearest_column(pair: MirroredRows, beam: ConeBeam, alpha: np.ndarray) -> fl
         correlation = np.sum(w * here * there) / np.sqrt(here_energy * there_energy)
         best, found = max((best, found), (correlation, float(column)))
     if best < MIN_CORRELATION:
-        raise MivolError("found no lines of a structure that both of their ends show, expected some: check the angles.")
+        raise MivolError("found no structure visible from both ends of its lines, expected some: check the angles.")
     return found
 
 

@@ -72,7 +72,7 @@ def _parallel_weights(projector: Projector) -> np.ndarray:
         gap = np.degrees(widest_gap(angles, np.pi)[0])
         raise MivolError(
             f"found views with a gap of {gap:.1f} degrees among the directions of half a turn, expected them all around: "
-            "choose an iterative solver (and give the angles in the unit that is asked for: radians here, degrees in files)."
+            "choose an iterative solver (angles are radians here, and degrees in files)."
         )
     if covers_circle(angles, 2 * np.pi):
         return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_weights(u)

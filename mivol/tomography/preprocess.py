@@ -90,7 +90,8 @@ def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, satura
     if 2 * alive.sum() <= alive.size:
         pixel = tuple(map(int, np.argwhere(~alive)[0]))
         raise MivolError(
-            f"Found no light, or too much, at detector pixel {pixel} and at half of all or more, expected flats above darks."
+            f"Found no light, or too much, at detector pixel {pixel} and at half of all pixels or more, "
+            "expected flats above darks."
         )
     dark_variance = float(darks.var(0, ddof=1)[alive].mean())
     gain = max(float(flats.var(0, ddof=1)[alive].mean()) - dark_variance, 0.0) / float(light[alive].mean())

@@ -130,7 +130,7 @@ def quantise(image: np.ndarray, space: str = "srgb") -> np.ndarray:
     """
     values = np.asarray(image, np.float64)
     if values.ndim != 3 or values.shape[2] != 3 or values.size == 0:
-        raise MivolError(f"an image of shape {values.shape} cannot be judged; give (height, width, 3).")
+        raise MivolError(f"found an image of shape {values.shape}, expected (height, width, 3).")
     if (space, "srgb") not in CONVERSIONS:
         raise MivolError(f'the values of an image are "srgb" or "linear", found "{space}": choose one of both.')
     if np.isnan(values).any():
@@ -205,5 +205,5 @@ def average_scores(images: Iterable[ImageScore]) -> MeanScore:
     """
     scores = tuple(images)
     if not scores:
-        raise MivolError("there is no image to judge; hold some out.")
+        raise MivolError("found no image to score, expected at least one: hold views out.")
     return MeanScore(scores)

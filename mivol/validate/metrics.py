@@ -24,7 +24,7 @@ def psnr(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> flo
     """
     peak = float(np.max(truth)) if peak is None else peak
     if not peak > 0:
-        raise MivolError(f"a peak of {peak} leaves no signal to compare the noise with; give the largest value expected.")
+        raise MivolError(f"a peak of {peak} leaves no signal; give the largest expected value, above 0.")
     error = _rmse(image, truth)
     return float("inf") if error == 0 else float(20 * np.log10(peak / error))
 

@@ -387,7 +387,7 @@ def _check_trust(scene: mi.Scene, sensor: mi.Sensor, accept: bool) -> tuple[Doub
     doubts: Sequence[Doubt] = find_doubts(scene, [sensor])
     fatal = [d for d in doubts if d.fatal]
     if fatal and not accept:
-        raise MivolError(f"Mitsuba {mi.__version__} is no reference here: {fatal[0].sentence}")
+        raise MivolError(f"Mitsuba {mi.__version__} cannot be the reference for this scene: {fatal[0].sentence}")
     for doubt in doubts:
         warnings.warn(doubt.sentence, RuntimeWarning, stacklevel=3)
     return tuple(doubts)

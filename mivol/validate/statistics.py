@@ -282,7 +282,7 @@ def _check_estimates(a: Estimate, b: Estimate) -> tuple[Estimate, Estimate]:
         bad = ~np.isfinite(array) | (array < 0 if "variance" in name else False)
         if bad.any():
             where = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise MivolError(f"the {name} is {array[where]} at {where}; nothing can be tested with it.")
+            raise MivolError(f"the {name} is {array[where]} at {where}: a test needs finite means and variances of at least 0.")
     return Estimate(arrays[0], arrays[2], a.dof), Estimate(arrays[1], arrays[3], b.dof)
 
 
@@ -319,7 +319,7 @@ def required_batches(wanted_bias: float, variance: float, *, level: Significance
         level, power: as in :func:`smallest_detectable_bias`.
     """
     if not wanted_bias > 0:
-        raise MivolError(f"a bias of {wanted_bias} cannot be looked for; give one above 0.")
+        raise MivolError(f"found a wanted bias of {wanted_bias}, expected a number above 0.")
     one = float(smallest_detectable_bias(variance, level=level, power=power))
     return max(1, int(np.ceil((one / wanted_bias) ** 2)))
 
@@ -384,7 +384,7 @@ def bounded_p_value(mean: np.ndarray, n: int, truth: np.ndarray, bounds: tuple[f
     low, high = bounds
     scale = high - low
     if not scale > 0:
-        raise MivolError(f"samples between {low} and {high} leave nothing to test; give low below high.")
+        raise MivolError(f"found samples between {low} and {high}, expected the lower bound below the upper bound.")
     # 1e-6 of the range is forgiven at both ends: a float32 mean of up to 2^20 terms is rounded by that much.
     x = (np.asarray(mean, dtype=np.float64) - low) / scale
     p = (np.asarray(truth, dtype=np.float64) - low) / scale

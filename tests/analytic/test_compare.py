@@ -187,10 +187,10 @@ def test_scores_of_unlike_images_are_refused(monkeypatch: pytest.MonkeyPatch) ->
         "has shape": lambda: score_image(TRUTH[:5], TRUTH),
         "NaN at row 2, column 3": lambda: score_image(nan, TRUTH),
         'no metric "lpips"': lambda: score_image(TRUTH, TRUTH, metrics=["lpips"]),
-        "give \\(height, width, 3\\)": lambda: quantise(TRUTH[..., 0]),
+        "expected \\(height, width, 3\\)": lambda: quantise(TRUTH[..., 0]),
         '"srgb" or "linear"': lambda: quantise(TRUTH, "hsv"),
         "leaves no pixel": lambda: score_image(TRUTH, TRUTH, mask=np.zeros((24, 20), bool)),
-        "no image to judge": lambda: average_scores([]),
+        "found no image to score": lambda: average_scores([]),
     }
     for message, call in cases.items():
         with pytest.raises(MivolError, match=message):

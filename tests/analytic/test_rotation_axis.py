@@ -272,7 +272,7 @@ def test_pixels_that_are_not_used_tell_nothing() -> None:
 REFUSED = {
     "no row in the plane": (beam_of(0.0, detector_offset=(1.0, 0.0)), "no row of the detector in the plane"),
     "three views": (beam_of(0.0, views=3), "3 different view angles"),
-    "no line twice": (beam_of(0.0, arc=140.0), "no lines of a structure that both of their ends show"),
+    "no line twice": (beam_of(0.0, arc=140.0), "no structure visible from both ends of its lines"),
 }
 
 

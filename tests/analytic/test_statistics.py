@@ -229,7 +229,7 @@ def test_refusals():
         (lambda: Significance(0, 3), "alpha = 0"),
         (lambda: Significance(0.1, 0), "over 0 comparisons"),
         (lambda: Significance(0.1, 3, "sidek"), "sidak"),
-        (lambda: required_batches(0, 1), "a bias of 0"),
+        (lambda: required_batches(0, 1), "a wanted bias of 0"),
         (lambda: smallest_detectable_bias(1.0, power=1), "power = 1"),
     ]
     for call, words in cases:
@@ -302,7 +302,7 @@ def test_bounded_p_value_at_the_ends():
     assert bounded_p_value(3.0, 100, 3.0, (2, 7)) == 1
     with pytest.raises(MivolError, match="outside the bounds"):
         bounded_p_value(np.array([1.5]), 10, np.array([0.5]))
-    with pytest.raises(MivolError, match="low below high"):
+    with pytest.raises(MivolError, match="expected the lower bound below"):
         bounded_p_value(0.0, 10, 0.0, (1, 1))
 
 

@@ -163,11 +163,11 @@ def test_where_a_nested_field_cannot_stand(tmp_path: Path) -> None:
     """In anything but a cube of its own; and no lamp is moved by derivatives among its levels."""
     field = rough(2)
     interior = boxed(field, tmp_path)["interior"]
-    with refused("the medium in ball is a nested field, whose levels are boxes, and Sphere is none .* give it a cube"):
+    with refused("the medium in ball is a nested field, .* but Sphere is not a separate box: give the medium a cube"):
         mi.render(scene(field, tmp_path, box=ball_of(interior, (0, 0, 0), 2.0) | {"id": "ball"}), spp=1)
     field_medium, ref = interior | {"id": "field"}, {"type": "ref", "id": "field"}
     fog = ball_of(medium("homogeneous", 0.5), (0.1, 0.2, 0.3), 0.3) | {"exterior": ref}
-    with refused("which overlaps no other medium's shape"):
+    with refused("that overlaps no other medium's shape"):
         parts = {"a": field_medium, "box": box_of(ref, field.level_to_world(1)), "fog": fog}
         mi.render(scene(field, tmp_path, **parts), spp=1)
     lamp = {"type": "point", "position": [0, 0, 3], "intensity": 1.0}

@@ -204,7 +204,7 @@ def test_means_that_cannot_be_compared() -> None:
     says = refusal_of(p_value, one, Estimate(np.zeros((2, 3)), np.ones((2, 3)), 5))
     assert says == "images of shape (2, 2) and (2, 3) cannot be compared; render both at one size."
     for wanted in (0.0, -1.0, np.nan):
-        assert refusal_of(required_batches, wanted, 1.0) == f"a bias of {wanted} cannot be looked for; give one above 0."
+        assert refusal_of(required_batches, wanted, 1.0) == f"found a wanted bias of {wanted}, expected a number above 0."
     assert required_batches(1e9, 1.0) == 1
 
 

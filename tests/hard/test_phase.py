@@ -130,7 +130,7 @@ OVERSHOOTS = {
     "a weight below 0": ({"type": "mivol_mixture", **LOBES}, "weight_a", -0.5, "weight_a of mivol_mixture"),
     "a table below 0": ({"type": "mivol_tabulated", "values": "1, 2, 3"}, "values", [1.0, -0.1, 2.0], "-0.1.* at 1"),
     "a table of zeros": ({"type": "mivol_tabulated", "values": "1, 2, 3"}, "values", [0.0, 0.0, 0.0], "0 everywhere"),
-    "another length": ({"type": "mivol_tabulated", "values": "1, 2, 3"}, "values", [1.0, 1.0], "3 cosines"),
+    "another length": ({"type": "mivol_tabulated", "values": "1, 2, 3"}, "values", [1.0, 1.0], "expected 3, one for"),
 }
 
 
