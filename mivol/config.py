@@ -64,14 +64,14 @@ DetectorSize = Annotated[tuple[Count, Count], setting("pixel", "(rows, columns) 
 CheckpointSteps = Annotated[int, setting("step", "steps between two checkpoints", ge=1)]
 
 
-def check_word(word: str, known: Sequence[str] | dict[str, Any], what: str) -> None:
+def check_word(word: str, known: Sequence[str] | dict[str, Any], subject: str) -> None:
     """Refuse a word that is not among the known ones, and offer the nearest.
 
     Raises:
         ValueError: with the word.
     """
     if word not in known:
-        raise ValueError(f'unknown {what} "{word}": {suggest_name(word, list(known))}'.rstrip("."))
+        raise ValueError(f'unknown {subject} "{word}": {suggest_name(word, list(known))}'.rstrip("."))
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -105,7 +105,7 @@ def entry_kind(kind: Any) -> Any:
 
 def explain_error(raw: Any, message: str) -> str:
     """Rewrite a message of msgspec as: key = value: expected."""
-    what, _, place = message.partition(" - at `$")
+    fault, _, place = message.partition(" - at `$")
     steps = re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", place.rstrip("`"))
     dotted = ".".join(word or number for word, number in steps)
     value = raw
@@ -115,12 +115,12 @@ def explain_error(raw: Any, message: str) -> str:
         except (KeyError, IndexError, TypeError, ValueError):
             value = None
             break
-    if what.startswith("Object missing required field"):
-        missing = f"{dotted}.{what.split('`')[1]}".lstrip(".")
+    if fault.startswith("Object missing required field"):
+        missing = f"{dotted}.{fault.split('`')[1]}".lstrip(".")
         return f'the key "{missing}" is missing: give it.'
-    what = f"{what[0].lower()}{what[1:]}".rstrip(".") + "." * (what[-1] != "?")
+    fault = f"{fault[0].lower()}{fault[1:]}".rstrip(".") + "." * (fault[-1] != "?")
     plain = value is not None and not isinstance(value, dict)
-    return f"{dotted or 'the file'}{f' = {value!r}' if plain else ''}: {what}"
+    return f"{dotted or 'the file'}{f' = {value!r}' if plain else ''}: {fault}"
 
 
 class Setting(NamedTuple):

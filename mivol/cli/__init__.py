@@ -50,7 +50,7 @@ def describe_error(error: MivolError | OSError | MemoryError) -> str:
     return str(error)
 
 
-def parse(given: Sequence[str]) -> argparse.Namespace:
+def parse(words: Sequence[str]) -> argparse.Namespace:
     """Parse a command; wrong arguments end the process.
 
     Returns:
@@ -58,11 +58,11 @@ def parse(given: Sequence[str]) -> argparse.Namespace:
         ``rest``.
     """
     known = parser()
-    arguments, rest = known.parse_known_args(given)
+    arguments, rest = known.parse_known_args(words)
     arguments.rest = rest
     if rest and arguments.verb is not bench:
         known.error(f"unrecognized arguments: {' '.join(rest)}")
-    arguments.command = shlex.join(["mivol", *given])
+    arguments.command = shlex.join(["mivol", *words])
     return arguments
 
 

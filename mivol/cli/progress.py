@@ -28,19 +28,19 @@ class TerminalProgress:
         for line in lines:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
 
-    def track(self, items: Sequence[T], what: str) -> Iterator[T]:
+    def track(self, items: Sequence[T], label: str) -> Iterator[T]:
         """Yield the items with a progress bar; without a terminal, print one line at the end."""
         console, start = Console(stderr=True), time.monotonic()
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, auto_refresh=False, disable=not console.is_terminal) as bar:
-            task = bar.add_task(what, total=len(items))
+            task = bar.add_task(label, total=len(items))
             for item in items:
                 bar.refresh()
                 yield item
                 bar.advance(task)
             bar.refresh()
         if not console.is_terminal:
-            console.print(f"{what}: {len(items)} in {time.monotonic() - start:.1f} s", soft_wrap=True)
+            console.print(f"{label}: {len(items)} in {time.monotonic() - start:.1f} s", soft_wrap=True)
 
     def watch(self, iterations: int) -> Display:
         """Return a progress bar of the iterations, with the newest loss and errors."""
@@ -61,7 +61,7 @@ class Display:
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         self.bar = Progress(*columns, console=self.console, auto_refresh=False, disable=not self.console.is_terminal)
         self.iterations = iterations
-        self.said = 0
+        self.printed = 0
         self.logged = 0
         self.drawn = 0.0
         self.newest: Fit | None = None
@@ -91,6 +91,6 @@ class Display:
             if time.monotonic() - self.drawn > 0.1:
                 self.bar.refresh()
                 self.drawn = time.monotonic()
-        elif len(fit.evaluations) > self.said:
+        elif len(fit.evaluations) > self.printed:
             self.console.print(f"iteration {fit.next_iteration} of {self.iterations}: {figures(fit)}", soft_wrap=True)
-            self.said = len(fit.evaluations)
+            self.printed = len(fit.evaluations)

@@ -76,10 +76,10 @@ def draw_scanner(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held_out
     for part in PARTS:
         plot_scanner(geometry, grid, held_out, folder / f"scanner_{part}.png", part)
     count = geometry.shape[0]
-    shown = sum(map(len, select_views(count, held_out)))
-    what = "Which way the light goes" if geometry.whole_lines else "Where the source stands"
+    drawn = sum(map(len, select_views(count, held_out)))
+    title = "Which way the light goes" if geometry.whole_lines else "Where the source stands"
     captions = {
-        "side": f"{what} in {f'{shown} of ' * (shown < count)}{count} views, some detectors, and the box of the voxels",
+        "side": f"{title} in {f'{drawn} of ' * (drawn < count)}{count} views, some detectors, and the box of the voxels",
         "plan": CAPTIONS["plan"],
     }
     return [Image(path=f"scanner_{part}.png", role="picture", caption=captions[part]) for part in PARTS]

@@ -258,10 +258,10 @@ def run_example(
     example, progress = find_example(name), progress or NullProgress()
     source = example.source(name)
     # Before anything is made for it: what the changes ask for may be refused.
-    wanted = config.load(source / example.file, (f"output=runs/{name}", *changes)).output
-    folder = folder or Path(wanted)
-    given = (*prepare(name, example, source, folder, progress), *changes)
-    experiment = config.load(source / example.file, given)
+    output = config.load(source / example.file, (f"output=runs/{name}", *changes)).output
+    folder = folder or Path(output)
+    all_changes = (*prepare(name, example, source, folder, progress), *changes)
+    experiment = config.load(source / example.file, all_changes)
     return run_experiment(RunContext(experiment, source, folder, progress=progress, command=command))
 
 
@@ -282,11 +282,11 @@ def prepare(name: str, example: Example, source: Path, folder: Path, progress: P
         return [f"{setting}={to_toml_string(readings / file)}" for setting, file in SCAN_FILES.items()]
     if example.stand_in is None or find_local_file(example.stand_in.data) is not None:
         return []
-    wanted = example.stand_in
+    stand_in = example.stand_in
     progress.say([
-        f'the public data set "{wanted.data}" is not on this machine: {wanted.says} (mivol fetch {wanted.data} brings it)'
+        f'the public data set "{stand_in.data}" is not on this machine: {stand_in.says} (mivol fetch {stand_in.data} brings it)'
     ])  # fmt: skip
-    return wanted.make(folder)
+    return stand_in.make(folder)
 
 
 def to_toml_string(path: Path) -> str:

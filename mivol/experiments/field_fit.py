@@ -111,8 +111,8 @@ def judge_view(
     problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]
 ) -> tuple[FieldView, ImageScore]:
     """Render a photograph's view of the field, and measure it."""
-    seen = render_view(problem.field, photo.camera, find_background(problem, photo))
-    return seen, score_image(seen.image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
+    view = render_view(problem.field, photo.camera, find_background(problem, photo))
+    return view, score_image(view.image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
 
 def find_background(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:
@@ -143,18 +143,18 @@ def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
     write_volume(folder / f"{name}.vol", sigma, field.to_world)
     write_volume(folder / f"{name}.npz", sigma, field.to_world)
     size = tuple(float(edge) for edge in np.abs(np.diag(field.to_world)[:3]))
-    said = f"level {level}, of {2**level} times the extent" if level else ""
-    return Volume(path=f"{name}.npz", role="reconstruction", size=size, caption=said)
+    caption = f"level {level}, of {2**level} times the extent" if level else ""
+    return Volume(path=f"{name}.npz", role="reconstruction", size=size, caption=caption)
 
 
-def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
+def write_geometry(folder: Path, view: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
     """Write distance and normals of a view as colours."""
     near, far = near_far
-    normals = normals_from_depth(seen.depth, camera)
+    normals = normals_from_depth(view.depth, camera)
     distances = f"from light, {near:.3g} [length], to dark, {far:.3g} [length]"
     pictures = {
-        "distance": (depth_pixels(seen.depth, near_far, seen.opacity), distances),
-        "normals": (normal_pixels(normals, seen.opacity), "x, y, z from -1 to 1 as red, green, blue"),
+        "distance": (depth_pixels(view.depth, near_far, view.opacity), distances),
+        "normals": (normal_pixels(normals, view.opacity), "x, y, z from -1 to 1 as red, green, blue"),
     }
     written = []
     for name, (pixels, scale) in pictures.items():

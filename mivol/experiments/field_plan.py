@@ -49,22 +49,22 @@ def make_plan(settings: FieldExperiment) -> RadiancePlan:
     Raises:
         MivolError: an unknown preset.
     """
-    wanted = settings.field
-    if wanted.preset not in PRESETS:
-        raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {suggest_name(wanted.preset, list(PRESETS))}')
-    plan = set_background(PRESETS[wanted.preset], settings.photos.background)
+    options = settings.field
+    if options.preset not in PRESETS:
+        raise MivolError(f'field.preset = "{options.preset}" is unknown: {suggest_name(options.preset, list(PRESETS))}')
+    plan = set_background(PRESETS[options.preset], settings.photos.background)
     names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure")
-    given = {name: getattr(wanted, name) for name in names}
+    given = {name: getattr(options, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
-    stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
-    plan = replace(plan, stages=tuple(stages), epochs=plan.epochs * wanted.effort)
-    if wanted.degree is not None:
+    stages = [replace(stage, steps=max(1, round(stage.steps * options.effort))) for stage in plan.stages]
+    plan = replace(plan, stages=tuple(stages), epochs=plan.epochs * options.effort)
+    if options.degree is not None:
         plan = replace(plan, few_degree=None)
-    if wanted.matte is not None:
+    if options.matte is not None:
         plan = replace(plan, few_matte=None)
-    if wanted.levels is not None:
-        plan = replace(plan, levels=wanted.levels, fewer_levels=False)
-    return plan if wanted.longest is None else replace(plan.with_longest(wanted.longest), cubic=False)
+    if options.levels is not None:
+        plan = replace(plan, levels=options.levels, fewer_levels=False)
+    return plan if options.longest is None else replace(plan.with_longest(options.longest), cubic=False)
 
 
 def set_background(plan: RadiancePlan, background: str | tuple[float, float, float]) -> RadiancePlan:
@@ -175,9 +175,9 @@ def explain_points_outside(plan: RadiancePlan, photos: Photos) -> list[PlanLine]
 
 def explain_depths(plan: RadiancePlan, batches: RayBatches) -> list[PlanLine]:
     """Return a line if reconstructed points give depths of rays."""
-    found = sum(map(len, batches.points))
-    choice = f"{found} points that photographs found say where their rays end, with a weight of {plan.depth:g}"
-    return [PlanLine(choice=choice, reason="a model of COLMAP names them; field.depth")] if plan.depth and found else []
+    point_count = sum(map(len, batches.points))
+    choice = f"{point_count} points that photographs found say where their rays end, with a weight of {plan.depth:g}"
+    return [PlanLine(choice=choice, reason="a model of COLMAP names them; field.depth")] if plan.depth and point_count else []
 
 
 def explain_near_cameras(plan: RadiancePlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:
@@ -196,9 +196,9 @@ def explain_steps(plan: RadiancePlan) -> PlanLine:
     return PlanLine(choice=f"{steps} steps in these stages", reason=reason)
 
 
-def explain_sizes(plan: RadiancePlan, held: tuple[int, int]) -> PlanLine:
-    """Return the sizes of the photographs in the stages; ``held`` is their size in memory."""
-    width, height = held
+def explain_sizes(plan: RadiancePlan, stored_size: tuple[int, int]) -> PlanLine:
+    """Return the sizes of the photographs in the stages; ``stored_size`` is their size in memory."""
+    width, height = stored_size
     if all(stage.shrink == 1 for stage in plan.stages):
         reason = "their pixels are not much finer than voxels"
         return PlanLine(choice=f"photographs at {width} x {height} in all stages", reason=reason)
@@ -222,9 +222,9 @@ def explain_background(plan: RadiancePlan, photos: Photos) -> PlanLine:
     if photos.views[0].alpha is not None:
         return PlanLine(choice="nothing behind the box", reason="alpha says what is there")
     edges = [view.image[at] for view in photos.views for at in (0, -1, (slice(None), 0), (slice(None), -1))]
-    most, believed = (
+    edge_colour, assumed_colour = (
         "(" + ", ".join(f"{c:.2g}" for c in colour) + ")"
         for colour in (np.median(np.concatenate(edges), axis=0), photos.views[0].background)
     )
-    reason = f'photos.background; the edges of the photographs show {most} mostly, and "sky" would learn it'
-    return PlanLine(choice=f"the colour {believed} behind the box", reason=reason)
+    reason = f'photos.background; the edges of the photographs show {edge_colour} mostly, and "sky" would learn it'
+    return PlanLine(choice=f"the colour {assumed_colour} behind the box", reason=reason)

@@ -82,17 +82,17 @@ def plan_film(show: ShowSettings, photos: Photos) -> Film:
     cameras = [view.camera for view in photos.views]
     try:
         if show.way == "turntable":
-            found = turntable(cameras, photos.box, show.frames)
+            film_cameras = turntable(cameras, photos.box, show.frames)
         elif show.way == "views":
-            found = interpolate_cameras(cameras, show.frames)
+            film_cameras = interpolate_cameras(cameras, show.frames)
         else:
-            found = follow_keyframes(cameras, show.keyframes, show.frames)
+            film_cameras = follow_keyframes(cameras, show.keyframes, show.frames)
     except MivolError as error:
         if show.way == "keyframes":
             raise
         return Film((), notes=(f"There is no film: {error}",))
-    small = tuple(_small(camera) for camera in found)
-    return Film(small, show.way, found[0].size[0] / small[0].size[0])
+    small = tuple(_small(camera) for camera in film_cameras)
+    return Film(small, show.way, film_cameras[0].size[0] / small[0].size[0])
 
 
 def film_of_volume(run: RunFolder, values: NDArray, size: Sequence[float], upright: str, quantity: str) -> list[Image]:
@@ -112,9 +112,9 @@ def film_of_volume(run: RunFolder, values: NDArray, size: Sequence[float], uprig
         return []
     run.make("film")
     write_video(run.path / "film/volume.webp", frames, fps=len(frames) / SECONDS)
-    white = f"white is {largest:.3g} ({quantity} times length)"
-    said = f"The volume from {len(frames)} sides: integrals along parallel rays, {white}"
-    return [Image(path="film/volume.webp", role="film", caption=said)]
+    scale = f"0 (black) to {largest:.3g} (white) [{quantity} times length]"
+    caption = f"The volume from {len(frames)} sides: integrals along parallel rays, {scale}"
+    return [Image(path="film/volume.webp", role="film", caption=caption)]
 
 
 def _small(camera: Camera) -> Camera:

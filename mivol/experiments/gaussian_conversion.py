@@ -139,11 +139,11 @@ def field_psnr(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> floa
         edge: edge of a view [pixel].
     """
     splatter, reals = Splatter(edge, edge, cloud.degree), to_tensors(cloud)
-    truth, seen = [], []
+    truth, images = [], []
     for camera in cameras_around(field.to_world, edge):
         truth.append(np.array(splatter.forward(reals, camera, derivatives=False)[0])[..., :3])
-        seen.append(render_view(field, camera, np.zeros(3)).image)
-    return psnr(np.stack(seen), np.stack(truth), 1.0)
+        images.append(render_view(field, camera, np.zeros(3)).image)
+    return psnr(np.stack(images), np.stack(truth), 1.0)
 
 
 def cameras_around(to_world: np.ndarray, edge: int, views: int = VIEWS) -> list[Camera]:
@@ -152,12 +152,12 @@ def cameras_around(to_world: np.ndarray, edge: int, views: int = VIEWS) -> list[
     radius = 0.5 * float(np.linalg.norm(to_world[:3, :3].sum(axis=1)))
     distance = radius / math.sin(math.radians(ANGLE) / 2)
     focal = edge / (2 * math.tan(math.radians(ANGLE) / 2))
-    like = Camera(intrinsics(focal, focal, edge / 2, edge / 2), (edge, edge), np.eye(4))
+    template = Camera(intrinsics(focal, focal, edge / 2, edge / 2), (edge, edge), np.eye(4))
     height = 1 - (2 * np.arange(views) + 1) / views
     turn = math.pi * (3 - math.sqrt(5)) * np.arange(views)
     flat = np.sqrt(1 - height**2)
     towards = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
-    return [aim_camera(like, middle + distance * one, middle, np.array([0.0, 0, 1])) for one in towards]
+    return [aim_camera(template, middle + distance * one, middle, np.array([0.0, 0, 1])) for one in towards]
 
 
 FUSED = 64
@@ -241,16 +241,16 @@ def measure_mesh_error(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.n
         edge: edge of a view [pixel].
     """
     scene = mi.load_dict({"type": "scene", "mesh": _shape_of(mesh)})
-    apart, missed, invented = [], [], []
+    distances, missed, invented = [], [], []
     for view in _splat_depths(cloud, cameras_around(box_to_world(low, high), edge)):
-        met = _depth_in(scene, view.camera)
-        is_there = np.isfinite(view.depth)
-        both = is_there & np.isfinite(met)
-        apart.append(np.abs(met[both] - view.depth[both]))
-        missed.append(~np.isfinite(met[is_there]))
-        invented.append(np.isfinite(met[~is_there]))
-    all_apart = np.concatenate(apart)
-    median, most = np.quantile(all_apart, [0.5, 0.9]) if len(all_apart) else (math.inf, math.inf)
+        mesh_depth = _depth_in(scene, view.camera)
+        is_opaque = np.isfinite(view.depth)
+        both = is_opaque & np.isfinite(mesh_depth)
+        distances.append(np.abs(mesh_depth[both] - view.depth[both]))
+        missed.append(~np.isfinite(mesh_depth[is_opaque]))
+        invented.append(np.isfinite(mesh_depth[~is_opaque]))
+    all_distances = np.concatenate(distances)
+    median, most = np.quantile(all_distances, [0.5, 0.9]) if len(all_distances) else (math.inf, math.inf)
     return MeshLoss(float(median), float(most), *(float(np.concatenate(part).mean()) for part in (missed, invented)))
 
 

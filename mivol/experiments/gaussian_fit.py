@@ -96,23 +96,23 @@ class GaussianFit(PhotoFit):
 def judge_view(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, ImageScore]:
     """Render a photograph's view of the Gaussians (H, W, 3), and measure it; distorted photographs are undistorted first."""
     photo = rectify(photo)
-    seen = render_gaussians(problem, photo.camera, photo.background, problem.plan.low_pass)
-    return seen, score_image(seen, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
+    image = render_gaussians(problem, photo.camera, photo.background, problem.plan.low_pass)
+    return image, score_image(image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
 
 def render_gaussians(problem: GaussianProblem, camera: Camera, behind: NDArray, low_pass: float) -> NDArray:
     """Render the Gaussians through a pinhole, (H, W, 3), over a colour (3,)."""
     splatter = problem.splatter_for(camera.size, low_pass)
-    seen = np.array(splatter.forward(problem.values(), camera, derivatives=False)[0])
-    return seen[..., :3] + (1 - seen[..., 3:]) * np.asarray(behind, np.float32)
+    rgba = np.array(splatter.forward(problem.values(), camera, derivatives=False)[0])
+    return rgba[..., :3] + (1 - rgba[..., 3:]) * np.asarray(behind, np.float32)
 
 
-def tabulate_gaussians(found: Gaussians, bytes_: int) -> Table:
+def tabulate_gaussians(gaussians: Gaussians, bytes_: int) -> Table:
     """Table of the size and the typical shape of the Gaussians."""
-    opacity, scale = found.opacities(), found.scales()
+    opacity, scale = gaussians.opacities(), gaussians.scales()
     rows = (
-        ("Gaussians", f"{found.count}"),
-        ("harmonics", f"degree {found.degree}"),
+        ("Gaussians", f"{gaussians.count}"),
+        ("harmonics", f"degree {gaussians.degree}"),
         ("file", f"{bytes_ / 2**20:.2f} MiB"),
         ("opacity: median", f"{np.median(opacity):.3g}"),
         ("longest axis: median [length]", f"{np.median(scale.max(axis=1)):.3g}"),
@@ -150,18 +150,18 @@ def make_gaussian_plan(settings: GaussianExperiment) -> GaussianPlan:
     Raises:
         MivolError: an unknown preset or density control.
     """
-    wanted = settings.gaussians
-    if wanted.preset not in PRESETS:
-        raise MivolError(f'gaussians.preset = "{wanted.preset}" is unknown: {suggest_name(wanted.preset, list(PRESETS))}')
-    if wanted.control is not None and wanted.control not in CONTROLS:
-        raise MivolError(f'gaussians.control = "{wanted.control}" is unknown: {suggest_name(wanted.control, list(CONTROLS))}')
-    given = {name: getattr(wanted, name) for name in ("start", "most", "control", "ssim")}
-    told = {name: value for name, value in given.items() if value is not None}
-    plan = replace(PRESETS[wanted.preset], mip=wanted.mip, exposure=wanted.exposure, **told)
-    if wanted.degree is not None:
-        stages = [replace(stage, degree=min(stage.degree, wanted.degree)) for stage in plan.stages]
-        plan = replace(plan, stages=(*stages[:-1], replace(stages[-1], degree=wanted.degree)))
-    return plan.scaled(wanted.effort)
+    options = settings.gaussians
+    if options.preset not in PRESETS:
+        raise MivolError(f'gaussians.preset = "{options.preset}" is unknown: {suggest_name(options.preset, list(PRESETS))}')
+    if options.control is not None and options.control not in CONTROLS:
+        raise MivolError(f'gaussians.control = "{options.control}" is unknown: {suggest_name(options.control, list(CONTROLS))}')
+    given = {name: getattr(options, name) for name in ("start", "most", "control", "ssim")}
+    overrides = {name: value for name, value in given.items() if value is not None}
+    plan = replace(PRESETS[options.preset], mip=options.mip, exposure=options.exposure, **overrides)
+    if options.degree is not None:
+        stages = [replace(stage, degree=min(stage.degree, options.degree)) for stage in plan.stages]
+        plan = replace(plan, stages=(*stages[:-1], replace(stages[-1], degree=options.degree)))
+    return plan.scaled(options.effort)
 
 
 def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> GaussianStart:

@@ -40,8 +40,8 @@ def select_shown_views(count: int, shown: int) -> frozenset[int]:
 
 def describe_quality(quality: ImageScore, fitted: float | None = None) -> str:
     """Caption of a view: its metrics, and its PSNR [dB] after colour correction if given."""
-    found = [format_metric(name, value) for name, value in quality.values.items()]
-    return ", ".join(found if fitted is None else [*found, f"{fitted:.2f} dB with its colours fitted"])
+    metrics = [format_metric(name, value) for name, value in quality.values.items()]
+    return ", ".join(metrics if fitted is None else [*metrics, f"{fitted:.2f} dB with its colours fitted"])
 
 
 def format_metric(metric: str, value: float) -> str:
@@ -92,8 +92,8 @@ class JudgedViews:
         if self._worst is None:
             return []
         photo, worst, image, caption = self._worst
-        said = f"the worst of {self.count}: {caption}"
-        self._images[worst] = write_view(self.folder, photo, worst, image, self.space, said)
+        worst_caption = f"the worst of {self.count}: {caption}"
+        self._images[worst] = write_view(self.folder, photo, worst, image, self.space, worst_caption)
         whole = [n for n in sorted(select_shown_views(self.count, self.shown)) if n != worst]
         small = sorted(self._images.keys() - {worst, *whole}, key=self._psnr.__getitem__)
         return [one for number in (worst, *whole, *small) for one in self._images[number]]
@@ -122,9 +122,9 @@ def write_view(
         path = f"views/{number:03d}_{role}.png"
         codes = CONVERSIONS[space, "srgb"](np.clip(values, 0, 1))
         write_png(folder / path, CONVERSIONS["srgb", "linear"](codes if edge is None else _shrunk(codes, edge)))
-        said = caption if role == "render" else ""
+        text = caption if role == "render" else ""
         small = edge is not None
-        written.append(Image(path=path, role=role, view=photo.name, held_out=True, quantity=CODES, caption=said, small=small))
+        written.append(Image(path=path, role=role, view=photo.name, held_out=True, quantity=CODES, caption=text, small=small))
     return written
 
 
@@ -146,21 +146,21 @@ def describe_views(views: Iterable[Photo]) -> str:
 
 def judge_colour_fitted(image: NDArray, photo: Photo, space: str) -> float:
     """PSNR [dB] of a view after a fit of its colours to the photograph, for screen colours."""
-    shown, wanted = (CONVERSIONS[space, "srgb"](values) for values in (image, photo.image))
-    return score_image(fit_colours(shown, wanted, photo.mask), wanted, mask=photo.mask).values["psnr"]
+    render_codes, photo_codes = (CONVERSIONS[space, "srgb"](values) for values in (image, photo.image))
+    return score_image(fit_colours(render_codes, photo_codes, photo.mask), photo_codes, mask=photo.mask).values["psnr"]
 
 
-def tabulate_views(camera: Camera, found: Sequence[ImageScore], fitted: Sequence[float] = ()) -> Table:
+def tabulate_views(camera: Camera, scores: Sequence[ImageScore], fitted: Sequence[float] = ()) -> Table:
     """Table of all judged views with their metrics, the worst first.
 
     Args:
         camera: camera of the first view, for the size in the title.
-        found: metrics of each view.
+        scores: metrics of each view.
         fitted: PSNR [dB] of each view after colour correction; may be empty.
     """
-    metrics = list(found[0].values)
+    metrics = list(scores[0].values)
     head = ("view", *(METRICS[name].label for name in metrics))
-    rows = [(one.name, *(f"{one.values[name]:.{METRICS[name].digits}f}" for name in metrics)) for one in found]
+    rows = [(one.name, *(f"{one.values[name]:.{METRICS[name].digits}f}" for name in metrics)) for one in scores]
     if fitted:
         head += ("PSNR [dB], colours fitted to the photograph's",)
         rows = [(*row, f"{value:.2f}") for row, value in zip(rows, fitted, strict=True)]

@@ -27,39 +27,39 @@ def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos |
         MivolError: as :func:`mivol.photos.load_photos`, metrics for larger photographs, or an unknown word for the box or the
             background.
     """
-    wanted = settings.photos
-    if isinstance(wanted.box, str) and wanted.box not in BOXES:
-        raise MivolError(f'photos.box = "{wanted.box}" is unknown: {suggest_name(wanted.box, list(BOXES))}')
-    box = "middle" if wanted.background == "nested" and wanted.box == "found" else wanted.box
+    photo_settings = settings.photos
+    if isinstance(photo_settings.box, str) and photo_settings.box not in BOXES:
+        raise MivolError(f'photos.box = "{photo_settings.box}" is unknown: {suggest_name(photo_settings.box, list(BOXES))}')
+    box = "middle" if photo_settings.background == "nested" and photo_settings.box == "found" else photo_settings.box
     options: dict[str, Any] = {
-        "scale": wanted.scale,
-        "largest": wanted.largest,
-        "held_out": wanted.held_out,
-        "space": wanted.space,
-        "stored": wanted.stored,
+        "scale": photo_settings.scale,
+        "largest": photo_settings.largest,
+        "held_out": photo_settings.held_out,
+        "space": photo_settings.space,
+        "stored": photo_settings.stored,
         "box": SEARCHED.get(box) if isinstance(box, str) else np.array(box, np.float64),
     }
     if isinstance(settings, GaussianExperiment):
-        if wanted.space == "linear":
+        if photo_settings.space == "linear":
             raise MivolError('photos.space = "linear" was asked for; Gaussians are fitted to code values: "srgb" is expected.')
         options["space"] = "srgb"
-    path = base / wanted.path
-    surveyed = {"held_out": wanted.held_out, "box": options["box"]}
+    path = base / photo_settings.path
+    surveyed = {"held_out": photo_settings.held_out, "box": options["box"]}
     fitted = survey_photos(path, split="train", **surveyed)
-    is_judged = wanted.judged != "held_out" or wanted.held_out > 0
-    others = survey_photos(path, split=wanted.judged, **surveyed).frames if is_judged else ()
+    is_judged = photo_settings.judged != "held_out" or photo_settings.held_out > 0
+    others = survey_photos(path, split=photo_settings.judged, **surveyed).frames if is_judged else ()
     # Before any is read: a background that is asked for would be the first of two answers.
     has_alpha = check_alpha([*fitted.frames, *others])
     check_background(settings, has_alpha)
     if has_alpha:
-        options["background"] = wanted.background or None
-    photos = _put_over(load_photos(path, split="train", **options), wanted.background)
+        options["background"] = photo_settings.background or None
+    photos = _put_over(load_photos(path, split="train", **options), photo_settings.background)
     white = find_white(photos) if photos.space == "linear" else 1.0
     if not is_judged:
         return divide_by_white(photos, white), None
-    judged = load_photos(path, split=wanted.judged, **options | {"space": photos.space})
+    judged = load_photos(path, split=photo_settings.judged, **options | {"space": photos.space})
     check_metrics(settings.show.metrics, *np.min([view.camera.size for view in judged.views], axis=0))
-    return divide_by_white(photos, white), divide_by_white(_put_over(judged, wanted.background), white)
+    return divide_by_white(photos, white), divide_by_white(_put_over(judged, photo_settings.background), white)
 
 
 def check_background(settings: PhotoExperiment, has_alpha: bool) -> None:
@@ -132,8 +132,8 @@ def add_box(settings: PhotoExperiment, photos: Photos) -> Photos:
     Raises:
         MivolError: as :meth:`mivol.photos.Photos.silhouette_box`.
     """
-    wanted = settings.photos.box
-    return BOXES[wanted](photos) if isinstance(wanted, str) else photos
+    box = settings.photos.box
+    return BOXES[box](photos) if isinstance(box, str) else photos
 
 
 def _find_box(photos: Photos) -> Photos:
@@ -163,23 +163,23 @@ SEARCHED = {"middle": "middle"}
 def describe_photos(photos: Photos, judged: Photos | None = None) -> list[str]:
     """Return notes on the photographs for the report."""
     if photos.space == "linear":
-        found = [
+        notes = [
             f"Colours are radiance, as in the photographs' files; an error weighs as the slope of log(y + {EPSILON:g}) says "
             f"(Mildenhall et al. 2022), where y = 1 is the radiance {photos.white:g} and shown white. Pictures, films and "
             "figures are tone-mapped: the sRGB curve of y, from 0 to 1."
         ]
     else:
-        found = ["Colours are srgb code values; in a scene mivol_sh and mivol_gaussians show the radiance that they stand for."]
+        notes = ["Colours are srgb code values; in a scene mivol_sh and mivol_gaussians show the radiance that they stand for."]
     if "linear" in photos.stored and photos.space == "srgb":
-        found.append("The light of photographs of radiance was encoded; what is above 1 counts as 1.")
+        notes.append("The light of photographs of radiance was encoded; what is above 1 counts as 1.")
     if "srgb" in photos.stored and photos.space == "linear":
-        found.append("Code values were decoded by the sRGB curve.")
+        notes.append("Code values were decoded by the sRGB curve.")
     if judged is not None:
         width, height = judged.views[0].camera.size
-        found.append(
+        notes.append(
             f"{len(judged.views)} views are judged, the first at {width} x {height} pixels; PSNR is the mean over them, of "
             "sRGB codes of 8 bits, with the peak 1."
         )
     if photos.skipped:
-        found.append(f"{len(photos.skipped)} photographs are listed and not there: {', '.join(photos.skipped[:5])} ...")
-    return found
+        notes.append(f"{len(photos.skipped)} photographs are listed and not there: {', '.join(photos.skipped[:5])} ...")
+    return notes

@@ -72,33 +72,33 @@ def describe_beam(settings: config.ScanExperiment) -> str:
 
 def make_geometry(settings: config.ScanExperiment, base: Path) -> FlatDetector:
     """Return beam and detector of computed projections."""
-    wanted = settings.scan
-    angles = np.arange(0) if isinstance(wanted, Table | Matrices) else even_angles(wanted)
-    return make_beam(settings, base, angles, wanted.detector)
+    scan = settings.scan
+    angles = np.arange(0) if isinstance(scan, Table | Matrices) else even_angles(scan)
+    return make_beam(settings, base, angles, scan.detector)
 
 
-def even_angles(wanted: Detector) -> np.ndarray:
+def even_angles(scan: Detector) -> np.ndarray:
     """Angles [rad] spread evenly over the arc."""
-    return np.radians(wanted.arc) * np.arange(wanted.views) / wanted.views
+    return np.radians(scan.arc) * np.arange(scan.views) / scan.views
 
 
 def make_beam(
     settings: config.ScanExperiment, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
 ) -> FlatDetector:
     """Return the beam of the settings, with these angles [rad] and pixels; a given ``axis_offset`` replaces the settings'."""
-    wanted = settings.scan
-    if isinstance(wanted, Table):
-        return PanelViews(read_columns(base / wanted.file, COLUMNS), detector)
-    if isinstance(wanted, Matrices):
-        matrices = read_columns(base / wanted.file, COLUMNS).reshape(-1, 3, 4)
-        return panels_from_matrices(matrices, detector, settings.grid.centre, wanted.first_pixel)
+    scan = settings.scan
+    if isinstance(scan, Table):
+        return PanelViews(read_columns(base / scan.file, COLUMNS), detector)
+    if isinstance(scan, Matrices):
+        matrices = read_columns(base / scan.file, COLUMNS).reshape(-1, 3, 4)
+        return panels_from_matrices(matrices, detector, settings.grid.centre, scan.first_pixel)
     offsets = {
-        "axis_offset": wanted.axis_offset if axis_offset is None else axis_offset,
-        "detector_offset": wanted.detector_offset,
+        "axis_offset": scan.axis_offset if axis_offset is None else axis_offset,
+        "detector_offset": scan.detector_offset,
     }
-    if isinstance(wanted, Cone):
-        return ConeBeam(angles, detector, wanted.source_to_axis, wanted.source_to_detector, wanted.pitch, **offsets)
-    return ParallelBeam(angles, detector, wanted.pitch, **offsets)
+    if isinstance(scan, Cone):
+        return ConeBeam(angles, detector, scan.source_to_axis, scan.source_to_detector, scan.pitch, **offsets)
+    return ParallelBeam(angles, detector, scan.pitch, **offsets)
 
 
 def make_grid(settings: config.ScanExperiment, base: Path) -> VoxelGrid:
@@ -107,8 +107,8 @@ def make_grid(settings: config.ScanExperiment, base: Path) -> VoxelGrid:
     Raises:
         MivolError: neither a table ``grid`` nor a grid in the data.
     """
-    wanted = settings.grid
-    return nikon_grid(settings.data, base) if wanted is None else VoxelGrid(wanted.shape, wanted.voxel_size, wanted.centre)
+    voxels = settings.grid
+    return nikon_grid(settings.data, base) if voxels is None else VoxelGrid(voxels.shape, voxels.voxel_size, voxels.centre)
 
 
 def make_data(settings: config.ScanExperiment, base: Path, grid: VoxelGrid) -> Projections:
@@ -139,8 +139,8 @@ def check_rays(settings: config.ScanExperiment) -> None:
     """
     rows, columns = settings.scan.detector
     views = getattr(settings.scan, "views", 1)
-    what = f"a scan of {views} x {rows} x {columns} rays"
-    check_memory(RAY_BYTES * views * rows * columns, what, "give scan.detector or scan.views fewer of them")
+    subject = f"a scan of {views} x {rows} x {columns} rays"
+    check_memory(RAY_BYTES * views * rows * columns, subject, "give scan.detector or scan.views fewer of them")
 
 
 def check_hits(projector: Projector) -> None:
@@ -160,24 +160,24 @@ def check_hits(projector: Projector) -> None:
 
 
 def project_ellipsoids(
-    wanted: Ellipsoids, base: Path, geometry: FlatDetector, grid: VoxelGrid
+    settings: Ellipsoids, base: Path, geometry: FlatDetector, grid: VoxelGrid
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return exact line integrals, and the phantom averaged over voxels."""
-    phantom = shepp_logan(wanted.table, wanted.half_width)
+    phantom = shepp_logan(settings.table, settings.half_width)
     # Two sub-points an edge err by 0.06 of a head of 128^3, four by 0.015: less than what is judged by them.
-    return wanted.scale * phantom.project(geometry), wanted.scale * phantom.voxelise(grid, 4)
+    return settings.scale * phantom.project(geometry), settings.scale * phantom.voxelise(grid, 4)
 
 
-def project_volume(wanted: Known, base: Path, geometry: FlatDetector, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+def project_volume(known: Known, base: Path, geometry: FlatDetector, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """Return line integrals of a volume file, and the volume.
 
     Raises:
         MivolError: several channels, or another shape than the grid.
     """
-    values = read_volume(resolve_path(base, wanted.file)).values
+    values = read_volume(resolve_path(base, known.file)).values
     if values.shape != (*grid.shape, 1):
-        raise MivolError(f"{wanted.file} has shape {values.shape}, grid.shape is {grid.shape} of one channel: make them equal.")
-    truth = wanted.scale * values[..., 0]
+        raise MivolError(f"{known.file} has shape {values.shape}, grid.shape is {grid.shape} of one channel: make them equal.")
+    truth = known.scale * values[..., 0]
     return Projector(geometry, grid) @ truth, truth
 
 
@@ -203,25 +203,25 @@ def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
     Raises:
         MivolError: an unreadable file, or files of different sizes.
     """
-    wanted, found = settings.data, read_scan(settings, base)
-    notes, angles = list(found.notes), found.angles
+    data, readings = settings.data, read_scan(settings, base)
+    notes, angles = list(readings.notes), readings.angles
     if angles is not None:
         notes += note_order(angles)
-    y, weights = to_line_integrals(normalise_air(found.transmission, wanted.air) if wanted.air else found.transmission)
+    y, weights = to_line_integrals(normalise_air(readings.transmission, data.air) if data.air else readings.transmission)
     offset = None
     if isinstance(settings.scan, Parallel | Cone):
-        offset, said = resolve_axis(settings, base, y, weights, angles)
-        notes += said
+        offset, axis_notes = resolve_axis(settings, base, y, weights, angles)
+        notes += axis_notes
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
-    geometry = found.geometry
+    geometry = readings.geometry
     if geometry is None:
         geometry = make_beam(settings, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
-    quanta = count_measured_quanta(settings, found) if ALL_SOLVERS[settings.solve.solver].problem is PoissonCounts else None
-    return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=found.intensity is not None)
+    quanta = count_measured_quanta(settings, readings) if ALL_SOLVERS[settings.solve.solver].problem is PoissonCounts else None
+    return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=readings.intensity is not None)
 
 
 def resolve_axis(
@@ -231,12 +231,12 @@ def resolve_axis(
 
     An offset in the settings holds, unless they also have ``data.find_axis = true``.
     """
-    wanted, given = settings.data.find_axis, settings.scan.axis_offset
-    if wanted or (wanted is None and not given):
-        offset, said = find_rotation_axis(settings, base, y, weights, angles)
-        return offset, [said]
-    if wanted is None:
-        return None, [f"the rotation axis is where scan.axis_offset has it, {given:g}: data.find_axis = true looks for it"]
+    search, known = settings.data.find_axis, settings.scan.axis_offset
+    if search or (search is None and not known):
+        offset, note = find_rotation_axis(settings, base, y, weights, angles)
+        return offset, [note]
+    if search is None:
+        return None, [f"the rotation axis is where scan.axis_offset has it, {known:g}: data.find_axis = true looks for it"]
     return None, []
 
 
@@ -261,21 +261,21 @@ def find_rotation_axis(
     return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
 
 
-def count_measured_quanta(settings: config.ScanExperiment, found: ScanReadings) -> Quanta:
+def count_measured_quanta(settings: config.ScanExperiment, readings: ScanReadings) -> Quanta:
     """Return the numbers of quanta of a measured scan; named air columns correct the brightness of the light without an object.
 
     Raises:
         MivolError: data without flats and darks, or with a drift, which only line integrals have.
     """
-    if found.intensity is None or settings.data.drift:
+    if readings.intensity is None or settings.data.drift:
         raise MivolError(
             "ml-tr needs counts of quanta, found line integrals, transmissions or a drift: give readings with flats and darks, "
             "and no data.drift, or choose pcg."
         )
-    quanta = count_quanta(*found.intensity, settings.data.saturation)
+    quanta = count_quanta(*readings.intensity, settings.data.saturation)
     if not settings.data.air:
         return quanta
-    return replace(quanta, blank=quanta.blank * fit_air(found.transmission.value, settings.data.air))
+    return replace(quanta, blank=quanta.blank * fit_air(readings.transmission.value, settings.data.air))
 
 
 def held_out_views(settings: config.ScanExperiment, count: int) -> np.ndarray:

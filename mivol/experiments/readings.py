@@ -46,15 +46,15 @@ def read_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
     Raises:
         MivolError: an unreadable file, or files of different sizes.
     """
-    wanted = settings.data
-    if isinstance(wanted, Nikon):
-        transmission, geometry, notes = read_nikon_scan(wanted, base)
+    data = settings.data
+    if isinstance(data, Nikon):
+        transmission, geometry, notes = read_nikon_scan(data, base)
         return ScanReadings(transmission, geometry=geometry, notes=tuple(notes))
-    if isinstance(wanted, Measured):
-        scan = read_projections(resolve_path(base, wanted.file), wanted.group)
+    if isinstance(data, Measured):
+        scan = read_projections(resolve_path(base, data.file), data.group)
         fields = scan.projections, scan.flats, scan.darks
         check_unit(np.degrees(scan.angles), "degree", "write theta in degrees")
-        return ScanReadings(correct_transmission(*fields, wanted.saturation), scan.angles, intensity=fields)
+        return ScanReadings(correct_transmission(*fields, data.saturation), scan.angles, intensity=fields)
     return read_stack_scan(settings, base)
 
 
@@ -64,18 +64,18 @@ def read_stack_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings
     Raises:
         MivolError: as :func:`read_scan`.
     """
-    wanted: Stack = settings.data
+    data: Stack = settings.data
 
     def stack(name: str) -> np.ndarray:
-        values = read_stack(base / name, wanted.dataset or None)
-        return values[:, ::-1] if wanted.first_row == "highest" else values
+        values = read_stack(base / name, data.dataset or None)
+        return values[:, ::-1] if data.first_row == "highest" else values
 
-    readings = stack(wanted.file)
-    fields = (readings, stack(wanted.flats), stack(wanted.darks)) if wanted.reading == "intensity" else None
+    readings = stack(data.file)
+    fields = (readings, stack(data.flats), stack(data.darks)) if data.reading == "intensity" else None
     if fields:
-        transmission = correct_transmission(*fields, wanted.saturation)
+        transmission = correct_transmission(*fields, data.saturation)
     else:
-        transmission = assume_quantum_noise(np.exp(-readings.astype(float)) if wanted.reading == "line_integral" else readings)
+        transmission = assume_quantum_noise(np.exp(-readings.astype(float)) if data.reading == "line_integral" else readings)
     return ScanReadings(transmission, read_angles(settings, base, len(readings)), intensity=fields)
 
 
@@ -85,15 +85,15 @@ def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.n
     Raises:
         MivolError: different numbers of angles and views, or angles in another unit.
     """
-    wanted: Stack = settings.data
+    data: Stack = settings.data
     if isinstance(settings.scan, Table | Matrices):
         return None
-    if not wanted.angles:
+    if not data.angles:
         return np.radians(settings.scan.arc) * np.arange(views) / views
-    angles = read_columns(base / wanted.angles, 1)[:, 0]
+    angles = read_columns(base / data.angles, 1)[:, 0]
     if len(angles) != views:
-        raise MivolError(f"{wanted.angles} has {len(angles)} angles for {views} projections: give one for each.")
-    return to_radians(angles, wanted.angle_unit)
+        raise MivolError(f"{data.angles} has {len(angles)} angles for {views} projections: give one for each.")
+    return to_radians(angles, data.angle_unit)
 
 
 def to_radians(angles: np.ndarray, unit: str) -> np.ndarray:
@@ -132,17 +132,17 @@ def note_order(angles: np.ndarray) -> list[str]:
     return [f"the angles turn back {len(back)} times ({turned}): they are taken as they are"]
 
 
-def read_nikon_scan(wanted: Nikon, base: Path) -> tuple[Transmission, ConeBeam | PanelViews, list[str]]:
+def read_nikon_scan(settings: Nikon, base: Path) -> tuple[Transmission, ConeBeam | PanelViews, list[str]]:
     """Read a Nikon scan: transmission, geometry and notes.
 
     Raises:
         MivolError: as :mod:`mivol.files.nikon`.
     """
-    scan = read_nikon(base / wanted.file)
-    angles = read_nikon_angles(base / wanted.angles, len(scan.images)) if wanted.angles else scan.angles
+    scan = read_nikon(base / settings.file)
+    angles = read_nikon_angles(base / settings.angles, len(scan.images)) if settings.angles else scan.angles
     geometry = geometry_from_nikon(scan, angles)
     return (
-        assume_quantum_noise(read_nikon_transmission(scan, wanted.saturation)),
+        assume_quantum_noise(read_nikon_transmission(scan, settings.saturation)),
         geometry,
         describe_nikon_settings(scan, geometry),
     )
@@ -158,13 +158,13 @@ def describe_nikon_settings(scan: NikonScan, geometry: ConeBeam | PanelViews) ->
     return notes
 
 
-def nikon_grid(wanted: Nikon, base: Path) -> VoxelGrid:
+def nikon_grid(settings: Nikon, base: Path) -> VoxelGrid:
     """Return the voxels of the settings file, centred on the axis.
 
     Raises:
         MivolError: a settings file without voxels.
     """
-    scan = read_nikon(base / wanted.file)
+    scan = read_nikon(base / settings.file)
     if scan.shape is None:
         raise refusal(scan.path, "no VoxelsX, Y, Z and VoxelSizeX, Y, Z above 0", "a grid", "give a table [grid]")
     return VoxelGrid(scan.shape, np.asarray(scan.voxel_size))

@@ -143,21 +143,21 @@ def render_views(
     references: References, context: RunContext, settings: SceneExperiment, loaded: LoadedScene, sensors: Sequence[Any]
 ) -> None:
     """Render references by Mitsuba's path tracer, cached in ``references/`` for other fits of the same views."""
-    cache, wanted = context.folder / "references", settings.reference
+    cache, reference_settings = context.folder / "references", settings.reference
     cache.mkdir(exist_ok=True)
-    depth = settings.fit.max_depth if wanted.max_depth is None else wanted.max_depth
+    depth = settings.fit.max_depth if reference_settings.max_depth is None else reference_settings.max_depth
     options = {
-        "max_depth": depth, "target_se": wanted.standard_error or None, "max_spp": wanted.spp,
-        "seed": wanted.seed, "progress": False,
+        "max_depth": depth, "target_se": reference_settings.standard_error or None, "max_spp": reference_settings.spp,
+        "seed": reference_settings.seed, "progress": False,
     }  # fmt: skip
     for sensor in context.progress.track(sensors, "references"):
         render = render_reference(loaded, cache, sensor=sensor, **options)
         references.add(sensor, render.mean, standard_error(render))
 
 
-def standard_error(made: ReferenceResult) -> np.ndarray:
+def standard_error(reference: ReferenceResult) -> np.ndarray:
     """Standard error of each pixel's mean, with an allowance for light that no sample has found."""
-    return np.sqrt(made.variance_with_unseen(float(made.mean.max())))
+    return np.sqrt(reference.variance_with_unseen(float(reference.mean.max())))
 
 
 def read_references(
@@ -168,31 +168,31 @@ def read_references(
     Raises:
         MivolError: different numbers of files and views, or a file of another scene.
     """
-    wanted, seen = settings.reference, References(held_out)
-    if len(wanted.paths) != len(sensors):
-        raise MivolError(f"found {len(wanted.paths)} reference files for {len(sensors)} views: give one for each.")
-    of = load_scene(base / wanted.scene).content_hash if wanted.scene else loaded.content_hash
-    for name, sensor in zip(wanted.paths, sensors, strict=True):
+    reference_settings, references = settings.reference, References(held_out)
+    if len(reference_settings.paths) != len(sensors):
+        raise MivolError(f"found {len(reference_settings.paths)} reference files for {len(sensors)} views: give one for each.")
+    scene_hash = load_scene(base / reference_settings.scene).content_hash if reference_settings.scene else loaded.content_hash
+    for name, sensor in zip(reference_settings.paths, sensors, strict=True):
         channels, header = read_exr(base / name)
         if "mivol_reference" in header:
-            made = read_reference(base / name, of)
-            seen.add(sensor, made.mean, standard_error(made))
+            reference = read_reference(base / name, scene_hash)
+            references.add(sensor, reference.mean, standard_error(reference))
         else:
-            seen.add(sensor, select_colours(base / name, stack_layers(channels)))
-    return seen
+            references.add(sensor, select_colours(base / name, stack_layers(channels)))
+    return references
 
 
-def select_colours(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:
+def select_colours(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
     """Return the channels that the variant renders: colours (height, width, 3), or luminance (height, width, 1).
 
     Raises:
         MivolError: channels of other names.
     """
-    name, wanted = ("Y", "Y (luminance)") if "mono" in mi.variant() else ("", "R, G and B")
-    if name not in found:
-        there = ", ".join(one or "R, G, B" for one in sorted(found))
-        raise MivolError(f"{path}: found the channels {there}, expected {wanted}; write the picture with these.")
-    return found[name][..., None] if found[name].ndim == 2 else found[name][..., :3]
+    name, expected = ("Y", "Y (luminance)") if "mono" in mi.variant() else ("", "R, G and B")
+    if name not in channels:
+        names = ", ".join(one or "R, G, B" for one in sorted(channels))
+        raise MivolError(f"{path}: found the channels {names}, expected {expected}; write the picture with these.")
+    return channels[name][..., None] if channels[name].ndim == 2 else channels[name][..., :3]
 
 
 VOXEL_BYTES = 9 * 8
@@ -210,10 +210,10 @@ def make_truth(settings: SceneExperiment, base: Path, scene: mi.Scene) -> np.nda
     find(settings.truth.key, mi.traverse(scene))
     if settings.truth.file:
         return read_volume(resolve_path(base, settings.truth.file)).values
-    wanted = settings.truth
-    said = " x ".join(str(n) for n in wanted.shape)
-    check_memory(VOXEL_BYTES * math.prod(wanted.shape), f"a truth of {said} voxels", "give truth.shape fewer voxels")
-    return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
+    truth_settings = settings.truth
+    shape = " x ".join(str(n) for n in truth_settings.shape)
+    check_memory(VOXEL_BYTES * math.prod(truth_settings.shape), f"a truth of {shape} voxels", "give truth.shape fewer voxels")
+    return make_procedural(truth_settings.procedural, truth_settings.shape, truth_settings.seed, truth_settings.peak)
 
 
 def check_truth(settings: SceneExperiment) -> None:
@@ -222,7 +222,7 @@ def check_truth(settings: SceneExperiment) -> None:
     Raises:
         MivolError: with the key.
     """
-    if settings.truth is not None and settings.truth.key not in [sought.key for sought in settings.parameter]:
+    if settings.truth is not None and settings.truth.key not in [parameter.key for parameter in settings.parameter]:
         raise MivolError(
             f"truth.key is {settings.truth.key}, which is no parameter of the fit, so the references would show another volume "
             "than the renders: look for it too, or put what is known into the scene (scene.define) and take the truth out."

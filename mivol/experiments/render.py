@@ -140,8 +140,8 @@ def render_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov:
     """
     camera = make_camera(look_at, up, fov, size)
     field, sky = read_field(path), sky_beside(path)
-    seen = render_view(field, camera, np.zeros(3) if sky is None else sky).image
-    return np.maximum(seen, 0) if field.space == "linear" else decode_srgb(seen)
+    image = render_view(field, camera, np.zeros(3) if sky is None else sky).image
+    return np.maximum(image, 0) if field.space == "linear" else decode_srgb(image)
 
 
 def sky_beside(path: Path) -> Sky | None:
@@ -161,12 +161,12 @@ def make_camera(look_at: Sequence[float], up: Sequence[float], fov: float, size:
         MivolError: a view along ``up``, infinite numbers or NaN, or an invalid angle or size.
     """
     if not np.isfinite([*look_at, *up]).all() or not 0 < fov < 180 or min(size) < 1:
-        found = f"--look-at {list(look_at)} --up {list(up)} --fov {fov:g} --size {list(size)}"
-        raise MivolError(f"{found} is no camera: give finite numbers, an angle between 0 and 180 and at least one pixel.")
+        options = f"--look-at {list(look_at)} --up {list(up)} --fov {fov:g} --size {list(size)}"
+        raise MivolError(f"{options} is no camera: give finite numbers, an angle between 0 and 180 and at least one pixel.")
     width, height = size
     focal = width / (2 * math.tan(math.radians(fov) / 2))
-    like = Camera(intrinsics(focal, focal, width / 2, height / 2), size, np.eye(4))
-    return aim_camera(like, np.array(look_at[:3]), np.array(look_at[3:]), np.array(up), "--look-at")
+    template = Camera(intrinsics(focal, focal, width / 2, height / 2), size, np.eye(4))
+    return aim_camera(template, np.array(look_at[:3]), np.array(look_at[3:]), np.array(up), "--look-at")
 
 
 DRAWN_AS = ("discs", "splats")
@@ -226,18 +226,18 @@ def render_points(
     is_cloud = not is_gaussian_file(check_file(path))
     if not is_cloud and look != PointLook():
         raise MivolError(f"{path} holds Gaussians, which have shapes of their own: leave out how points are drawn.")
-    held = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)
-    camera = make_camera(look_at or frame_points(held.means, up, fov, size), up, fov, size)
-    return decode_srgb(splat_points(held, camera, is_cloud, is_cloud and look.drawn_as == "discs"))
+    gaussians = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)
+    camera = make_camera(look_at or frame_points(gaussians.means, up, fov, size), up, fov, size)
+    return decode_srgb(splat_points(gaussians, camera, is_cloud, is_cloud and look.drawn_as == "discs"))
 
 
 def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
     """Round Gaussians of one radius at the points; points without colours are coloured by their local density."""
-    made = points_to_gaussians(cloud, look.opacity)
+    gaussians = points_to_gaussians(cloud, look.opacity)
     if cloud.colours is None:
-        made = points_to_gaussians(replace(cloud, colours=density_colours(made.scales()[:, 0])), look.opacity)
-    radius = 0.5 * float(np.median(made.scales())) if look.radius is None else look.radius
-    return replace(made, log_scales=np.full((made.count, 3), math.log(radius)))
+        gaussians = points_to_gaussians(replace(cloud, colours=density_colours(gaussians.scales()[:, 0])), look.opacity)
+    radius = 0.5 * float(np.median(gaussians.scales())) if look.radius is None else look.radius
+    return replace(gaussians, log_scales=np.full((gaussians.count, 3), math.log(radius)))
 
 
 def density_colours(distances: np.ndarray) -> np.ndarray:
@@ -259,7 +259,7 @@ def frame_points(places: np.ndarray, up: Sequence[float], fov: float, size: tupl
     return [*(middle + towards * radius / math.sin(half)), *middle]
 
 
-def splat_points(held: Gaussians, camera: Camera, compensated: bool, discs: bool) -> np.ndarray:
+def splat_points(gaussians: Gaussians, camera: Camera, compensated: bool, discs: bool) -> np.ndarray:
     """Code values (height, width, 3) over black."""
-    splatter = Splatter(*camera.size, held.degree, compensated=compensated, discs=discs)
-    return np.array(splatter.forward(to_tensors(held), camera, derivatives=False)[0])[..., :3]
+    splatter = Splatter(*camera.size, gaussians.degree, compensated=compensated, discs=discs)
+    return np.array(splatter.forward(to_tensors(gaussians), camera, derivatives=False)[0])[..., :3]

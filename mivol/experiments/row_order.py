@@ -60,34 +60,32 @@ def compare_rows(geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights
         y: line integrals (views, rows, cols).
         weights: weights; 0 for unused pixels.
     """
-    small, seen = _coarse(geometry, y, weights)
+    small, mask = _coarse(geometry, y, weights)
     shape = tuple(min(n, EDGE) for n in grid.shape)
     edges = tuple(float(e) for e in grid.extent / np.array(shape[::-1]))
     projector = Projector(small.geometry, VoxelGrid(shape, edges, grid.centre))
-    ways = [_residuals(projector, small.y[:, way], seen[:, way]) for way in (slice(None), slice(None, None, -1))]
-    more, size = ways[0] - ways[1], float(np.sum(seen * small.y**2)) or 1.0
+    ways = [_residuals(projector, small.y[:, way], mask[:, way]) for way in (slice(None), slice(None, None, -1))]
+    more, size = ways[0] - ways[1], float(np.sum(mask * small.y**2)) or 1.0
     error = float(np.hypot(np.std(more) / np.sqrt(max(len(more) - 1, 1)), ROUNDING * np.mean(ways))) or 1.0
     as_read, upside_down = (float(np.sqrt(way.sum() / size)) for way in ways)
     return RowOrder(as_read, upside_down, float(more.mean()) / error)
 
 
-def note_rows(
-    wanted: config.Readings, geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights: np.ndarray
-) -> list[str]:
+def note_rows(data: config.Readings, geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights: np.ndarray) -> list[str]:
     """Return a note with a remedy if the rows of measured projections seem to be upside down."""
     if not can_tell(geometry, grid):
         return []
-    found = compare_rows(geometry, grid, y, weights)
-    if not found.excess > LIMIT:
+    order = compare_rows(geometry, grid, y, weights)
+    if not order.excess > LIMIT:
         return []
     way_out = "turn the sign of the geometry's steps along v"
-    if isinstance(wanted, Stack):
-        way_out = f'set data.first_row = "{"lowest" if wanted.first_row == "highest" else "highest"}"'
+    if isinstance(data, Stack):
+        way_out = f'set data.first_row = "{"lowest" if data.first_row == "highest" else "highest"}"'
     if isinstance(geometry, ConeBeam) and geometry.detector_offset[0]:
         way_out += ", or turn the sign of scan.detector_offset along v"
     return [
-        f"the detector's rows seem to be upside down: a small reconstruction misses {found.as_read:.1%} of the projections as "
-        f"they are read, and {found.upside_down:.1%} upside down: {way_out}"
+        f"the detector's rows seem to be upside down: a small reconstruction misses {order.as_read:.1%} of the projections as "
+        f"they are read, and {order.upside_down:.1%} upside down: {way_out}"
     ]
 
 
@@ -124,8 +122,8 @@ def _blocks(pixels: int) -> tuple[int, int, int]:
     return size, pixels // size, (pixels - pixels // size * size) // 2
 
 
-def _residuals(projector: Projector, y: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _residuals(projector: Projector, y: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Squared residuals (views,) after a few iterations."""
-    problem = LeastSquares(projector, y, seen, nonnegative=False)
+    problem = LeastSquares(projector, y, mask, nonnegative=False)
     *_, state = itertools.islice(SOLVERS["cgls"].run(problem), ITERATIONS)
-    return np.sum(seen * (y - projector @ state.x.reshape(projector.grid.shape)) ** 2, axis=(1, 2))
+    return np.sum(mask * (y - projector @ state.x.reshape(projector.grid.shape)) ** 2, axis=(1, 2))

@@ -105,9 +105,9 @@ class RunFolder:
 
     def _holds_a_run(self) -> bool:
         """Whether an earlier run has taken a step or finished here, or was being moved when its process was killed."""
-        there = {name for name in KEPT if (self.path / name).exists()}
-        if there != {RECORD}:
-            return bool(there)
+        present = {name for name in KEPT if (self.path / name).exists()}
+        if present != {RECORD}:
+            return bool(present)
         with suppress(MivolError):
             return read_record(self.path).status == "finished"
         return False
@@ -123,10 +123,10 @@ class RunFolder:
         coming, going = self.path / f".{EARLIER}.coming", self.path / f".{EARLIER}.going"
         for stale in (coming, going):
             shutil.rmtree(stale, ignore_errors=True)
-        there = [name for name in KEPT if (self.path / name).exists()]
-        if RECORD in there:
-            self._copy_to_earlier(there, coming, going)
-        for name in there:
+        present = [name for name in KEPT if (self.path / name).exists()]
+        if RECORD in present:
+            self._copy_to_earlier(present, coming, going)
+        for name in present:
             (self.path / name).unlink()
 
     def _copy_to_earlier(self, names: list[str], coming: Path, going: Path) -> None:
@@ -230,8 +230,8 @@ class BestIterate:
         if self.run.is_resumed and self.run.best.exists():
             about = checkpoint.read(self.run.best, {})[1]
             self.judge, self.iteration, self.value = about["judge"], about["iteration"], about["value"]
-            told = [row[self.judge] for row in read_metrics(self.run.path) if row.get(self.judge) is not None]
-            self.newest = told[-1] if told else self.value
+            earlier_errors = [row[self.judge] for row in read_metrics(self.run.path) if row.get(self.judge) is not None]
+            self.newest = earlier_errors[-1] if earlier_errors else self.value
 
     def see(self, iteration: int, errors: Mapping[str, float], values: Mapping[str, Any] | None = None) -> None:
         """Judge an iterate, and keep the best.

@@ -189,12 +189,12 @@ def make_problem(
     Raises:
         MivolError: ML-TR without counts.
     """
-    wanted = settings.solve
+    solve = settings.solve
     a = projector.subset(kept)
-    prior = make_prior(wanted, a, data, kept)
-    x0 = start_volume(wanted, a, data, kept)
-    if ALL_SOLVERS[wanted.name].problem is LeastSquares:
-        least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, wanted.nonnegative, prior)
+    prior = make_prior(solve, a, data, kept)
+    x0 = start_volume(solve, a, data, kept)
+    if ALL_SOLVERS[solve.name].problem is LeastSquares:
+        least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, solve.nonnegative, prior)
         return ProjectionProblem(least_squares, times=view_times(data)[kept] if getattr(settings.data, "drift", 0) else None)
     if data.quanta is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
@@ -215,17 +215,17 @@ def subtract_drift(problem: ProjectionProblem, data: Projections, held_out: np.n
     return replace(data, y=data.y - drift.eval(view_times(data)))
 
 
-def start_volume(wanted: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
+def start_volume(solve: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
     """Return the first volume of an iterative solver, nonnegative if requested; None means an empty volume.
 
     Raises:
         MivolError: geometries that filtered back-projection refuses.
     """
-    if wanted.start == "empty" or wanted.name in DIRECT:
+    if solve.start == "empty" or solve.name in DIRECT:
         return None
     method = filtered_backprojection if isinstance(a.geometry, ParallelBeam) else feldkamp
-    x = method(a, interpolate_gaps(data.y[kept], data.weights[kept]), wanted.window, wanted.cutoff)
-    return np.maximum(x, 0) if wanted.nonnegative else x
+    x = method(a, interpolate_gaps(data.y[kept], data.weights[kept]), solve.window, solve.cutoff)
+    return np.maximum(x, 0) if solve.nonnegative else x
 
 
 def expected_noise(settings: config.ScanExperiment, problem: ProjectionProblem, data: Projections) -> float | None:
@@ -241,11 +241,11 @@ def expected_noise(settings: config.ScanExperiment, problem: ProjectionProblem, 
 
 def make_solver(settings: config.ScanExperiment, noise: float | None) -> LinearSolve:
     """Return the solver with its settings; it stops at the noise if requested."""
-    wanted = settings.solve
-    shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
-    if wanted.discrepancy:
-        shared["stop_norm"] = wanted.discrepancy * noise
-    return LinearSolve(solver=wanted.name, drift=getattr(settings.data, "drift", 0), **shared)
+    solve = settings.solve
+    shared = {name: getattr(solve, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
+    if solve.discrepancy:
+        shared["stop_norm"] = solve.discrepancy * noise
+    return LinearSolve(solver=solve.name, drift=getattr(settings.data, "drift", 0), **shared)
 
 
 def data_norm(task: LeastSquares | PoissonCounts) -> float:

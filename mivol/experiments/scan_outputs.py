@@ -38,8 +38,8 @@ def write_outputs(
     record.images += film_of_volume(run, volume[..., None], tuple(float(edge) for edge in grid.extent), "z", "sigma_t")
     middle = data.y.shape[1] // 2
     noise = line_noise(data)
-    said = f"row {middle + 1} of {data.y.shape[1]}"
-    record.images += write_pair(run.path, SINOGRAM, Pair(data.y[:, middle], predicted[:, middle], noise[:, middle]), said)
+    caption = f"row {middle + 1} of {data.y.shape[1]}"
+    record.images += write_pair(run.path, SINOGRAM, Pair(data.y[:, middle], predicted[:, middle], noise[:, middle]), caption)
     if data.y.shape[1] > 1:
         for view in held_out[:4]:
             pair = Pair(*(part[view, ::-1] for part in (data.y, predicted, noise)))
@@ -90,9 +90,9 @@ def write_pair(folder: Path, name: str, pair: Pair, caption: str = "", held_out:
 
 def write_grids(folder: Path, grid: VoxelGrid, x: np.ndarray, truth: np.ndarray | None) -> list[Volume]:
     """Write the reconstruction as .vol and .npz, and the truth if known."""
-    found, size = [], tuple(float(edge) for edge in grid.extent)
+    volumes, size = [], tuple(float(edge) for edge in grid.extent)
     for role, values in {"reconstruction": x, **({"truth": truth} if truth is not None else {})}.items():
         write_volume(folder / f"volumes/{role}.vol", values, grid.to_world)
         write_volume(folder / f"volumes/{role}.npz", values, grid.to_world)
-        found.append(Volume(path=f"volumes/{role}.npz", role=role, size=size, profiles=True))
-    return found
+        volumes.append(Volume(path=f"volumes/{role}.npz", role=role, size=size, profiles=True))
+    return volumes

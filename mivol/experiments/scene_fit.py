@@ -75,11 +75,11 @@ class SceneFit(FitKind):
 
     def describe_run(self) -> dict[str, Any]:
         settings = self.settings
-        priors = [prior for sought in settings.parameter for prior in sought.prior]
+        priors = [prior for parameter in settings.parameter for prior in parameter.prior]
         strategies = [settings.optimiser, settings.loss, *priors]
-        keys = ", ".join(sought.key for sought in settings.parameter)
-        emission = ["nimier_david_2022"] if any(sought.start_fit for sought in settings.parameter) else []
-        method = f"{settings.fit.integrator}, {settings.optimiser.label()} on {settings.loss.label()}; looked for: {keys}"
+        keys = ", ".join(parameter.key for parameter in settings.parameter)
+        emission = ["nimier_david_2022"] if any(parameter.start_fit for parameter in settings.parameter) else []
+        method = f"{settings.fit.integrator}, {settings.optimiser.label()} on {settings.loss.label()}; parameter: {keys}"
         return {
             "method": method,
             "seeds": {"fit": settings.seed, "references": getattr(settings.reference, "seed", 0)},
@@ -97,10 +97,10 @@ class SceneFit(FitKind):
         self.settings, self.depth_plan = resolve_depth(self.settings, self.loaded, self.truth)
         for line in self.depth_plan:
             say(f"  depth     {line.choice}, because {line.reason}")
-        check_names([sought.key for sought in self.settings.parameter])
+        check_names([parameter.key for parameter in self.settings.parameter])
         self.starts = make_starts(self.settings, self.context.base, scene)
         for start in self.starts:
-            say(f"  sought    {describe_start(start)}")
+            say(f"  parameter {describe_start(start)}")
         check_truth(self.settings)
         self.integrator = make_integrator(self.settings)
 
@@ -130,13 +130,13 @@ class SceneFit(FitKind):
         if self.context.resume and run.checkpoint.exists():
             return []
         notes = []
-        for sought in self.settings.parameter:
-            if sought.start_fit == "emission":
-                place = grid_to_world(sought.key, self.problem.scene)
-                start = find_emissive_start(self.problem, sought.key, place, self.settings.optimiser, self.settings.seed)
-                set_parameter(self.problem.params, sought.key, start.value)
+        for parameter in self.settings.parameter:
+            if parameter.start_fit == "emission":
+                place = grid_to_world(parameter.key, self.problem.scene)
+                start = find_emissive_start(self.problem, parameter.key, place, self.settings.optimiser, self.settings.seed)
+                set_parameter(self.problem.params, parameter.key, start.value)
                 self.problem.set_reals(self.problem.initial_reals())
-                notes.append(f"{sought.key} {start.description}")
+                notes.append(f"{parameter.key} {start.description}")
         self.context.progress.say(notes)
         return notes
 
@@ -178,9 +178,9 @@ class SceneFit(FitKind):
         spp = min(settings.fit.spp, REHEARSAL_SPP)
         cheap = msgspec.structs.replace(settings, fit=msgspec.structs.replace(settings.fit, spp=spp))
         problem = make_problem(cheap, scene, self.integrator, self.starts, self.references)
-        for sought in settings.parameter:
-            if sought.start_fit == "emission":
-                check_given_start(sought.key, np.asarray(problem.values()[sought.key]))
+        for parameter in settings.parameter:
+            if parameter.start_fit == "emission":
+                check_given_start(parameter.key, np.asarray(problem.values()[parameter.key]))
         settings.optimiser.begin(problem)
         problem.rehearse()
         params = mi.traverse(scene)

@@ -53,9 +53,9 @@ class SceneOutputs:
         self.run.make("views", "volumes")
         for number, view in enumerate((*self.references.fitted, *self.references.held_out)):
             record.images += self.write_view(view, number)
-        for sought in self.settings.parameter:
-            record.volumes += self.write_grid(sought)
-            record.images += self.write_image(sought.key)
+        for parameter in self.settings.parameter:
+            record.volumes += self.write_grid(parameter)
+            record.images += self.write_image(parameter.key)
         views = {"train": self.references.fitted, "held_out": self.references.held_out}
         record.images += draw_view_cameras(self.run.path, fit.problem.scene, views)
         self.run.write_curves()
@@ -97,33 +97,33 @@ class SceneOutputs:
         about = {"view": view.name, "held_out": any(view is other for other in self.references.held_out)}
         return [Image(path=f"{stem}.exr", role=role, layer=layer_name(*part), **about) for role, part in parts.items()]
 
-    def write_grid(self, sought: Sought) -> list[Volume]:
+    def write_grid(self, parameter: Sought) -> list[Volume]:
         """Write a fitted grid as .npz and .vol at its place in the scene, and as a film, and the truth if known.
 
         A .vol holds only boxes along the axes. For a rotated grid it has the unit cube, which the scene places.
         """
-        value = np.asarray(self.fit.values()[sought.key])
+        value = np.asarray(self.fit.values()[parameter.key])
         if value.ndim != GRID:
             return []
-        place = grid_to_world(sought.key, self.fit.problem.scene)
+        place = grid_to_world(parameter.key, self.fit.problem.scene)
         is_along_axes = np.array_equal(place[:3, :3], np.diag(np.abs(np.diagonal(place)[:3])))
-        quantity = next((word for word in ("sigma_t", "sigma_a", "sigma_s", "albedo") if word in sought.key), "value")
+        quantity = next((word for word in ("sigma_t", "sigma_a", "sigma_s", "albedo") if word in parameter.key), "value")
         grids = {"reconstruction": value}
-        if self.truth is not None and self.settings.truth.key == sought.key:
+        if self.truth is not None and self.settings.truth.key == parameter.key:
             grids["truth"] = self.truth
-        found = []
-        unit = find_unit(sought)
+        volumes = []
+        unit = find_unit(parameter)
         for role, grid in grids.items():
-            stem = f"volumes/{sought.key.replace('.', '_')}_{role}"
+            stem = f"volumes/{parameter.key.replace('.', '_')}_{role}"
             write_volume(self.run.path / f"{stem}.vol", grid, place if is_along_axes else np.eye(4))
-            write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": unit})
-            about = {"quantity": quantity, "unit": unit, "size": box_edges(place), "caption": sought.key}
-            found.append(Volume(path=f"{stem}.npz", role=role, **about))
+            write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": parameter.key, "unit": unit})
+            about = {"quantity": quantity, "unit": unit, "size": box_edges(place), "caption": parameter.key}
+            volumes.append(Volume(path=f"{stem}.npz", role=role, **about))
         self.run.record.images += film_of_volume(self.run, value, box_edges(place), "y", quantity)
         if not self.best.is_newest:
-            stem = f"volumes/{sought.key.replace('.', '_')}_best"
-            write_volume(self.run.path / f"{stem}.npz", self.best.read()[sought.key], place)
-        return found
+            stem = f"volumes/{parameter.key.replace('.', '_')}_best"
+            write_volume(self.run.path / f"{stem}.npz", self.best.read()[parameter.key], place)
+        return volumes
 
     def write_image(self, key: str) -> list[Image]:
         """Write a fitted image (texture, sky) as .exr of linear values and as .png.

@@ -78,10 +78,10 @@ class Problem(SceneProblem):
         seed: int = 0,
     ) -> None:
         loaded = load_scene(scene).scene
-        looked_from = list(loaded.sensors() if sensors is None else sensors)
-        sought = make_parameters(parameters)
-        views = make_views(references, looked_from)
-        super().__init__(loaded, views, sought, integrator or choose_own_integrator(loaded), loss, spp, seed=seed)
+        image_sensors = list(loaded.sensors() if sensors is None else sensors)
+        fit_parameters = make_parameters(parameters)
+        views = make_views(references, image_sensors)
+        super().__init__(loaded, views, fit_parameters, integrator or choose_own_integrator(loaded), loss, spp, seed=seed)
 
 
 def choose_own_integrator(scene: mi.Scene) -> mi.Integrator:
@@ -105,8 +105,8 @@ def make_parameters(parameters: Sequence[str | Parameter]) -> list[Parameter]:
         raise MivolError(f"parameters: found a single {type(parameters).__name__}, expected a list of them; put it in a list.")
     strange = next((one for one in parameters if not isinstance(one, str | Parameter)), None)
     if strange is not None:
-        found = type(strange).__name__
-        raise MivolError(f"parameters: found {found} in the list, expected keys of mi.traverse(scene) or mivol.Parameter.")
+        kind = type(strange).__name__
+        raise MivolError(f"parameters: found {kind} in the list, expected keys of mi.traverse(scene) or mivol.Parameter.")
     return [Parameter(one) if isinstance(one, str) else one for one in parameters]
 
 
@@ -135,12 +135,12 @@ def make_views(references: Sequence[Reference] | SceneSource | mi.Scene, sensors
         own = scene.integrator()
         integrator = choose_own_integrator(scene) if own is None or list(own.aov_names()) else own
         with dr.suspend_grad():
-            seen = [mi.render(scene, sensor=sensor, integrator=integrator, seed=n) for n, sensor in enumerate(sensors)]
+            images = [mi.render(scene, sensor=sensor, integrator=integrator, seed=n) for n, sensor in enumerate(sensors)]
     else:
-        seen = [to_image_tensor(one) for one in references]
-    if len(seen) != len(sensors):
-        raise MivolError(f"found {len(seen)} references for {len(sensors)} sensors: give one for each (sensors=...).")
-    return [View(f"view {number}", sensor, one) for number, (sensor, one) in enumerate(zip(sensors, seen, strict=True))]
+        images = [to_image_tensor(one) for one in references]
+    if len(images) != len(sensors):
+        raise MivolError(f"found {len(images)} references for {len(sensors)} sensors: give one for each (sensors=...).")
+    return [View(f"view {number}", sensor, one) for number, (sensor, one) in enumerate(zip(sensors, images, strict=True))]
 
 
 def to_image_tensor(reference: Reference) -> mi.TensorXf:

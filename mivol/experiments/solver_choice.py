@@ -36,36 +36,36 @@ MOST_UNKNOWNS = 1 << 24
 and a solver keeps about ten fields of this size."""
 
 
-def tv_strength(wanted: config.SolveSettings) -> float:
+def tv_strength(settings: config.SolveSettings) -> float:
     """Value of ``solve.tv``; if absent, 1 for "auto" in units of the noise, else 0."""
-    if wanted.tv is not None:
-        return wanted.tv
-    return 1.0 if wanted.name == AUTO and wanted.tv_unit == "noise" else 0.0
+    if settings.tv is not None:
+        return settings.tv
+    return 1.0 if settings.name == AUTO and settings.tv_unit == "noise" else 0.0
 
 
-def resolve_solver(wanted: config.SolveSettings, walk: Projector) -> tuple[config.SolveSettings, list[PlanLine]]:
+def resolve_solver(settings: config.SolveSettings, walk: Projector) -> tuple[config.SolveSettings, list[PlanLine]]:
     """Put values in place of all open settings.
 
     Args:
-        wanted: settings of a file.
+        settings: settings of a file.
         walk: projector of the fitted views, through the requested voxels.
 
     Returns:
         Complete settings, and their reasons.
     """
-    name = wanted.solver
-    start, start_line = resolve_start(wanted, walk)
-    parts, parts_line = resolve_supersampling(wanted, walk)
-    settled = msgspec.structs.replace(wanted, name=name, tv=tv_strength(wanted), start=start, supersampling=parts)
+    name = settings.solver
+    start, start_line = resolve_start(settings, walk)
+    parts, parts_line = resolve_supersampling(settings, walk)
+    settled = msgspec.structs.replace(settings, name=name, tv=tv_strength(settings), start=start, supersampling=parts)
     by_table = "the least error of few, noisy and many views in the table of docs/benchmarks.md"
-    reason = by_table if wanted.name == AUTO else ALL_SOLVERS[name].promises
+    reason = by_table if settings.name == AUTO else ALL_SOLVERS[name].promises
     return settled, [PlanLine(choice=f"solver: {name}", reason=reason), *start_line, *parts_line]
 
 
-def resolve_start(wanted: config.SolveSettings, walk: Projector) -> tuple[str, list[PlanLine]]:
+def resolve_start(settings: config.SolveSettings, walk: Projector) -> tuple[str, list[PlanLine]]:
     """Return the first volume, and the reason of an automatic choice."""
-    if wanted.start is not None or wanted.name != AUTO:
-        return wanted.start or "empty", []
+    if settings.start is not None or settings.name != AUTO:
+        return settings.start or "empty", []
     try:
         check_directions(walk)
     except MivolError as error:
@@ -73,10 +73,10 @@ def resolve_start(wanted: config.SolveSettings, walk: Projector) -> tuple[str, l
     return "filtered", [PlanLine(choice="start: filtered back-projection", reason="half of the iterations are saved")]
 
 
-def resolve_supersampling(wanted: config.SolveSettings, walk: Projector) -> tuple[int, list[PlanLine]]:
+def resolve_supersampling(settings: config.SolveSettings, walk: Projector) -> tuple[int, list[PlanLine]]:
     """Return the unknowns along an edge of a voxel, and the reason of an automatic choice."""
-    if wanted.supersampling is not None or wanted.name != AUTO:
-        return wanted.supersampling or 1, []
+    if settings.supersampling is not None or settings.name != AUTO:
+        return settings.supersampling or 1, []
     unknowns = subdivide_grid(walk.grid, 2, walk.geometry).size
     if unknowns > MOST_UNKNOWNS:
         reason = f"twice as many along each edge were {unknowns / 2**20:.4g} Mi, of at most {MOST_UNKNOWNS >> 20} Mi"
@@ -95,8 +95,8 @@ def check_grid(settings: config.ScanExperiment, grid: VoxelGrid) -> None:
         MivolError: with their number.
     """
     fields = FIELDS_OF_ONE_STEP if settings.solve.solver in DIRECT else FIELDS
-    what = f"a reconstruction of {' x '.join(str(n) for n in grid.shape)} unknowns"
-    check_memory(4 * fields * math.prod(grid.shape), what, "give grid.shape fewer voxels, or set solve.supersampling = 1")
+    subject = f"a reconstruction of {' x '.join(str(n) for n in grid.shape)} unknowns"
+    check_memory(4 * fields * math.prod(grid.shape), subject, "give grid.shape fewer voxels, or set solve.supersampling = 1")
 
 
 BY_SUBSETS = ("sart", "os-sart")
@@ -121,30 +121,30 @@ class Storage:
             problem.linear_problem = replace(problem.linear_problem, A=store_matrix(problem.linear_problem.A))
 
 
-def choose_storage(wanted: config.SolveSettings, walk: Projector) -> Storage:
+def choose_storage(settings: config.SolveSettings, walk: Projector) -> Storage:
     """Estimate memory and time, and choose; nothing is stored yet.
 
     Args:
-        wanted: settings of the solver.
+        settings: settings of the solver.
         walk: projector of the fitted views.
 
     Raises:
         MivolError: requested rows that the solver cannot use, that do not exist, or that need more memory than allowed.
     """
-    if wanted.storage == "walk":
+    if settings.storage == "walk":
         return plan_walk("as asked for")
-    if wanted.name in DIRECT:
-        return refuse_matrix(wanted, f"{wanted.name} takes one step, without a matrix")
+    if settings.name in DIRECT:
+        return refuse_matrix(settings, f"{settings.name} takes one step, without a matrix")
     size = matrix_bytes(walk)
     if size is None:
-        return refuse_matrix(wanted, "only a parallel beam, or a fan of one row, has layers of rays that share a matrix")
-    rows, said = walk.projection_shape[1], f"{size / 2**20:.3g} MiB, of at most {wanted.memory:.3g} GiB"
-    if size > wanted.memory * 2**30:
-        return refuse_matrix(wanted, f"the rows of a layer take {said} (solve.memory)")
-    if wanted.storage == "auto" and not is_worth_storing(rows, wanted.iterations, wanted.name in BY_SUBSETS):
-        return plan_walk(f"{wanted.iterations} iterations on {rows} rows of the detector do not pay for storing {said}")
+        return refuse_matrix(settings, "only a parallel beam, or a fan of one row, has layers of rays that share a matrix")
+    rows, use = walk.projection_shape[1], f"{size / 2**20:.3g} MiB, of at most {settings.memory:.3g} GiB"
+    if size > settings.memory * 2**30:
+        return refuse_matrix(settings, f"the rows of a layer take {use} (solve.memory)")
+    if settings.storage == "auto" and not is_worth_storing(rows, settings.iterations, settings.name in BY_SUBSETS):
+        return plan_walk(f"{settings.iterations} iterations on {rows} rows of the detector do not pay for storing {use}")
     shared = "" if rows == 1 else f", shared by the {rows} rows of the detector"
-    return Storage(True, PlanLine(choice="storage: the exact integrals of a layer, kept as sparse rows", reason=said + shared))
+    return Storage(True, PlanLine(choice="storage: the exact integrals of a layer, kept as sparse rows", reason=use + shared))
 
 
 def plan_walk(reason: str) -> Storage:
@@ -152,13 +152,13 @@ def plan_walk(reason: str) -> Storage:
     return Storage(False, PlanLine(choice="storage: none, each product walks through the grid", reason=reason))
 
 
-def refuse_matrix(wanted: config.SolveSettings, reason: str) -> Storage:
+def refuse_matrix(settings: config.SolveSettings, reason: str) -> Storage:
     """Choose to store nothing, unless stored rows were requested.
 
     Raises:
         MivolError: stored rows were requested.
     """
-    if wanted.storage == "matrix":
+    if settings.storage == "matrix":
         raise MivolError(f"solve.storage = matrix cannot be had: {reason}: choose auto or walk.")
     return plan_walk(reason)
 
@@ -167,25 +167,25 @@ PLAIN_ITERATIONS = {"filtered": 5, "empty": 20}
 """Iterations without a prior after which the residual of noiseless views is the misfit of the voxels, by the first volume."""
 
 
-def make_prior(wanted: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> SmoothedTV | None:
+def make_prior(settings: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> SmoothedTV | None:
     """Return the total variation in the requested unit, with weights as inverse variances; None without total variation."""
-    if not wanted.tv:
+    if not settings.tv:
         return None
-    if wanted.tv_unit == "length":
-        return SmoothedTV(a.grid.shape, wanted.tv, wanted.delta, a.grid.voxel_size)
-    return scale_tv_to_noise(a, data.y[kept], data.weights[kept], wanted.tv, wanted.delta)
+    if settings.tv_unit == "length":
+        return SmoothedTV(a.grid.shape, settings.tv, settings.delta, a.grid.voxel_size)
+    return scale_tv_to_noise(a, data.y[kept], data.weights[kept], settings.tv, settings.delta)
 
 
-def estimate_noise(problem: ProjectionProblem, wanted: config.SolveSettings, data: Projections) -> list[PlanLine]:
+def estimate_noise(problem: ProjectionProblem, settings: config.SolveSettings, data: Projections) -> list[PlanLine]:
     """If the prior needs an unknown noise, take the residual of a few iterations without a prior, and continue from there.
 
     The variances are then ``s^2 / w``, and s is found. Least squares with weights w need ``s^2`` times the strength for ``w /
     s^2``, which is 1/s of the strength that balances noise of variance 1 / w: the prior becomes s times as strong.
     """
     task = problem.linear_problem
-    if task.prior is None or wanted.tv_unit == "length" or data.is_noise_known:
+    if task.prior is None or settings.tv_unit == "length" or data.is_noise_known:
         return []
-    n = PLAIN_ITERATIONS[wanted.start]
+    n = PLAIN_ITERATIONS[settings.start]
     *_, state = (None, *itertools.islice(projected_cg(replace(task, prior=None)), n))
     if state is None:
         return []
@@ -209,7 +209,7 @@ def explain_prior(prior: SmoothedTV | None, state: SolverState) -> list[PlanLine
     ]
 
 
-def check_noise(asked: str, data: Projections) -> None:
+def check_noise(setting: str, data: Projections) -> None:
     """Refuse a setting that needs the size of an unknown noise.
 
     Raises:
@@ -217,6 +217,6 @@ def check_noise(asked: str, data: Projections) -> None:
     """
     if not data.is_noise_known:
         raise MivolError(
-            f"{asked} needs the noise of the projections, which these do not have: give readings with flats and darks, or "
+            f"{setting} needs the noise of the projections, which these do not have: give readings with flats and darks, or "
             "simulate with photons."
         )

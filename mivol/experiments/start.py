@@ -42,7 +42,7 @@ def make_starts(settings: SceneExperiment, base: Path, scene: mi.Scene) -> list[
     Raises:
         MivolError: as :func:`make_start`, refined grids beyond the memory, or an upsample event without a grid.
     """
-    starts = [make_start(sought, base, scene) for sought in settings.parameter]
+    starts = [make_start(entry, base, scene) for entry in settings.parameter]
     grids = [start for start in starts if start.value.ndim == GRID]
     if any(isinstance(event, Upsample) for event in settings.event):
         check_for_grids(len(grids))
@@ -66,46 +66,46 @@ def check_grid(key: str, shape: Sequence[int], way_out: str) -> None:
     Raises:
         MivolError: with its shape and size.
     """
-    said = " x ".join(str(n) for n in shape)
-    check_memory(NUMBER_BYTES * math.prod(shape), f"{key} of {said} numbers, with its derivative and the optimiser,", way_out)
+    size = " x ".join(str(n) for n in shape)
+    check_memory(NUMBER_BYTES * math.prod(shape), f"{key} of {size} numbers, with its derivative and the optimiser,", way_out)
 
 
-def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
+def make_start(settings: Sought, base: Path, scene: mi.Scene) -> Start:
     """Return a parameter with its first value; the scene is not changed.
 
     Raises:
         MivolError: an unknown parameter, a value outside its domain, an unreadable file, or a grid beyond the memory.
     """
     params = mi.traverse(scene)
-    now = as_tensor(params[find(sought.key, params)])
+    start_value = as_tensor(params[find(settings.key, params)])
     # A copy: the scene may give the memory behind a view to another tensor when its parameter changes.
-    value = np.array(now)
-    if now.ndim < GRID and (sought.shape or sought.start_file):
+    value = np.array(start_value)
+    if start_value.ndim < GRID and (settings.shape or settings.start_file):
         raise MivolError(
-            f"{sought.key} is no grid of voxels but has the shape {now.shape}: give start, and neither shape nor start_file."
+            f"{settings.key} has the shape {start_value.shape}, not a grid of voxels: give start, but neither shape nor start_file."
         )
-    if sought.start_file:
-        value = read_volume(place_in(base, sought.start_file)).values
-    elif sought.start is not None:
-        shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
-        check_grid(sought.key, shape, "give parameter.shape fewer voxels")
-        value = np.full(shape, check_start(sought, shape), dtype=np.float32)
-    extent = box_edges(grid_to_world(sought.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
-    parameter = Parameter(sought.key, find_unit(sought), sought.domain, sought.map, sought.lr, extent, sought.prior)
+    if settings.start_file:
+        value = read_volume(place_in(base, settings.start_file)).values
+    elif settings.start is not None:
+        shape = (*settings.shape, start_value.shape[3]) if settings.shape else start_value.shape
+        check_grid(settings.key, shape, "give parameter.shape fewer voxels")
+        value = np.full(shape, check_start(settings, shape), dtype=np.float32)
+    extent = box_edges(grid_to_world(settings.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
+    parameter = Parameter(settings.key, find_unit(settings), settings.domain, settings.map, settings.lr, extent, settings.prior)
     parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
     return Start(parameter, value)
 
 
-def check_start(sought: Sought, shape: Sequence[int]) -> Any:
+def check_start(settings: Sought, shape: Sequence[int]) -> Any:
     """Return the first value in the settings: one number, or one number per channel.
 
     Raises:
         MivolError: another count of numbers.
     """
-    given = np.size(sought.start)
+    given = np.size(settings.start)
     if given not in (1, shape[-1]):
-        raise MivolError(f"{sought.key} starts from {given} numbers and has {shape[-1]}: give one for all, or one for each.")
-    return sought.start
+        raise MivolError(f"{settings.key} starts from {given} numbers and has {shape[-1]}: give one for all, or one for each.")
+    return settings.start
 
 
 def grid_to_world(key: str, scene: mi.Scene) -> np.ndarray:
@@ -137,6 +137,6 @@ of
 the factors has the unit."""
 
 
-def find_unit(sought: Sought) -> str:
+def find_unit(settings: Sought) -> str:
     """Unit of a parameter: the unit in the settings, else the unit of the last word of the key with an entry, else ""."""
-    return sought.unit or next((UNITS[word] for word in reversed(sought.key.split(".")) if word in UNITS), "")
+    return settings.unit or next((UNITS[word] for word in reversed(settings.key.split(".")) if word in UNITS), "")

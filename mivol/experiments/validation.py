@@ -144,9 +144,9 @@ class Verdict:
     @property
     def text(self) -> str:
         """All results in lines."""
-        said = [f"Doubt: {doubt.sentence}" for doubt in self.doubts]
-        said += [self.comparison.text, f"relMSE {self.rel_mse:.3g}.", *(slope.text for slope in self.slopes), self.words]
-        return "\n".join([*said, *(str(path) for path in self.files)])
+        lines = [f"Doubt: {doubt.sentence}" for doubt in self.doubts]
+        lines += [self.comparison.text, f"relMSE {self.rel_mse:.3g}.", *(slope.text for slope in self.slopes), self.words]
+        return "\n".join([*lines, *(str(path) for path in self.files)])
 
 
 def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> Verdict:
@@ -165,8 +165,8 @@ def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> V
         find(key, mi.traverse(scene))
     folder.mkdir(parents=True, exist_ok=True)
     depth = read_settings(scene).max_depth if settings.max_depth is None else settings.max_depth
-    ours = mi.load_dict({"type": "mivol", "max_depth": depth})
-    image = render_batches(scene, camera, ours, settings)
+    integrator = mi.load_dict({"type": "mivol", "max_depth": depth})
+    image = render_batches(scene, camera, integrator, settings)
     doubts = tuple(find_doubts(scene, [camera]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # doubts are part of the verdict
@@ -177,7 +177,7 @@ def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> V
     estimate = Estimate.from_result(image)
     # Our spread of a pixel that saw nothing is 0, and so may be volpath's: one missed event a pixel is allowed for.
     compared = compare(estimate, reference, alpha=ALPHA, samples_seen=float(reference.mean.max()), correlated=27)
-    slopes = check_gradients(scene, camera, ours, settings)
+    slopes = check_gradients(scene, camera, integrator, settings)
     floor = 1e-2 * float(np.mean(reference.mean**2)) or 1.0
     rel_mse = float(np.mean((estimate.mean - reference.mean) ** 2 / (reference.mean**2 + floor)))
     verdict = Verdict(compared, rel_mse, slopes, doubts)
@@ -195,14 +195,14 @@ def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator
 # -- Gradients ----------------------------------------------------------------------------------------------------
 
 
-def check_gradients(scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, settings: Validation) -> tuple[Slope, ...]:
+def check_gradients(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, settings: Validation) -> tuple[Slope, ...]:
     """Check the derivative of the mean radiance along one random direction of each parameter."""
     level = Significance(ALPHA, max(len(settings.parameters), 1))
-    return tuple(check_gradient(scene, camera, ours, key, settings, level) for key in settings.parameters)
+    return tuple(check_gradient(scene, camera, integrator, key, settings, level) for key in settings.parameters)
 
 
 def check_gradient(
-    scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, key: str, settings: Validation, level: Significance
+    scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, key: str, settings: Validation, level: Significance
 ) -> Slope:
     """Check one direction of one parameter: each value times a random number from 0 to 2, so that no step passes 0 and the
     effects
@@ -212,7 +212,7 @@ def check_gradient(
     direction = np.random.default_rng([settings.seed, len(key)]).uniform(0.0, 2.0, start.shape) * start
     if not direction.any():
         raise MivolError(f"{key} is 0 everywhere, where a central difference would step below 0: put values into the scene.")
-    mean = MeanRadiance(scene, camera, ours, key, math.ceil(settings.spp / BATCHES))
+    mean = MeanRadiance(scene, camera, integrator, key, math.ceil(settings.spp / BATCHES))
     slopes, near, far = Moments.empty(), Moments.empty(), Moments.empty()
     for batch in range(BATCHES):
         seeds = [derive_seed(settings.seed, GRADIENT, batch, which) for which in range(4)]

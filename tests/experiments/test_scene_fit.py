@@ -96,7 +96,7 @@ OPTIMIZE_REFUSED = {
     ),
     "voxels of a number": (
         ['parameter=[{key="cube.interior_medium.albedo.value.value", shape=[3,3,3], start=0.0}]'],
-        "is no grid of voxels",
+        "not a grid of voxels",
     ),
     "a prior of a number": (
         ['parameter=[{key="cube.interior_medium.albedo.value.value", prior=[{name="tv"}]}]'],
