@@ -82,8 +82,8 @@ def make_start(settings: Sought, base: Path, scene: mi.Scene) -> Start:
     value = np.array(start_value)
     if start_value.ndim < GRID and (settings.shape or settings.start_file):
         raise MivolError(
-            f"{settings.key} has the shape {start_value.shape}, which is not a grid of voxels: give start, but neither shape nor "
-            "start_file."
+            f"{settings.key} has the shape {start_value.shape}, which is not a grid of voxels: give start, but neither shape "
+            "nor start_file."
         )
     if settings.start_file:
         value = read_volume(place_in(base, settings.start_file)).values
