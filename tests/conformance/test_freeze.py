@@ -18,19 +18,21 @@ GRID, SCALE = "box.interior_medium.sigma_t.data", "box.interior_medium.scale"
 PLACE = scenes.centred(2 * np.eye(3))
 
 
-def build(kind: str, floor: bool) -> tuple[mi.Scene, np.ndarray]:
-    values = np.random.default_rng(1).uniform(0.1, 1.0, (4, 5, 6, 1)).astype(np.float32)
+VALUES = np.random.default_rng(1).uniform(0.1, 1.0, (4, 5, 6, 1)).astype(np.float32)
+
+
+def build(kind: str, floor: bool = False, sigma_t: object = None, albedo: float = 0.0) -> mi.Scene:
     volume = "mivol_voxels" if kind == "mivol_medium" else "gridvolume"
     parts = {
         "type": "scene",
-        "box": box_of(medium(kind, grid_volume(volume, values, PLACE)), PLACE),
+        "box": box_of(medium(kind, grid_volume(volume, VALUES, PLACE) if sigma_t is None else sigma_t, albedo), PLACE),
         "sky": sky(),
         "sensor": camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0),
     }
     if floor:
         down = mi.ScalarTransform4f().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(5)
         parts["floor"] = {"type": "rectangle", "to_world": down, "bsdf": {"type": "diffuse"}}
-    return mi.load_dict(parts), values
+    return mi.load_dict(parts)
 
 
 def times(values: np.ndarray, factor: float) -> mi.TensorXf:
@@ -40,31 +42,37 @@ def times(values: np.ndarray, factor: float) -> mi.TensorXf:
     return grid
 
 
+def shoot(scene: mi.Scene, integrator: mi.Integrator, seed: mi.UInt32) -> mi.TensorXf:
+    return mi.render(scene, integrator=integrator, spp=4, seed=seed)
+
+
+def follow(scene: mi.Scene, depth: int, key: str, values: list) -> list[np.ndarray]:
+    """The images of a recording whose parameter changes between calls.
+
+    Every call gives the image that an ordinary render gives, to the last bit, with fewer recordings than calls.
+    """
+    integrator, params, images = mi.load_dict({"type": "mivol", "max_depth": depth}), mi.traverse(scene), []
+    # A recording cannot read whether the medium scatters; an earlier render has.
+    mi.render(scene, integrator=integrator, spp=1)
+    frozen = dr.freeze(shoot)
+    for call, value in enumerate(values):
+        if value is not None:
+            params[key] = value
+            params.update()
+        images.append(np.array(frozen(scene, integrator, mi.UInt32(call))))
+        assert np.array_equal(images[-1], np.array(shoot(scene, integrator, mi.UInt32(call))))
+    assert frozen.n_recordings < len(values)
+    return images
+
+
 @pytest.mark.slow_for("heterogeneous-True-3", "mivol_medium-True-3")
 @pytest.mark.parametrize("depth", [1, 3])
 @pytest.mark.parametrize("floor", [False, True])
 @pytest.mark.parametrize("kind", ["heterogeneous", "mivol_medium"])
 def test_values_that_change_between_calls(kind, floor, depth):
-    """Every call gives the image that an ordinary render gives, to the last bit, with fewer recordings than calls."""
     if kind == "mivol_medium":
         skip_recorded_grids_on_a_gpu()
-    scene, values = build(kind, floor)
-    integrator = mi.load_dict({"type": "mivol", "max_depth": depth})
-    params = mi.traverse(scene)
-
-    def shoot(scene: mi.Scene, integrator: mi.Integrator, seed: mi.UInt32) -> mi.TensorXf:
-        return mi.render(scene, integrator=integrator, spp=4, seed=seed)
-
-    # A recording cannot read whether the medium scatters; an earlier render has.
-    mi.render(scene, integrator=integrator, spp=1)
-    frozen = dr.freeze(shoot)
-    for call in range(6):
-        fresh = times(values, 1 + call)
-        params[GRID] = fresh
-        params.update()
-        replayed = np.array(frozen(scene, integrator, mi.UInt32(call)))
-        assert np.array_equal(replayed, np.array(shoot(scene, integrator, mi.UInt32(call))))
-    assert frozen.n_recordings < 6
+    follow(build(kind, floor), depth, GRID, [times(VALUES, 1 + call) for call in range(6)])
 
 
 @pytest.mark.slow_for("heterogeneous")
@@ -73,47 +81,26 @@ def test_light_that_scatters_many_times(kind):
     """The majorants of a grid are made in the recording, also of an array that an ordinary render has read before."""
     if kind == "mivol_medium":
         skip_recorded_grids_on_a_gpu()
-    volume = "mivol_voxels" if kind == "mivol_medium" else "gridvolume"
-    values = np.random.default_rng(1).uniform(0.1, 1.0, (4, 5, 6, 1)).astype(np.float32)
-    parts = {"type": "scene", "box": box_of(medium(kind, grid_volume(volume, values, PLACE), 0.7), PLACE), "sky": sky()}
-    scene = mi.load_dict(parts | {"sensor": camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)})
-    integrator, params = mi.load_dict({"type": "mivol", "max_depth": 4}), mi.traverse(scene)
-
-    def shoot(scene: mi.Scene, integrator: mi.Integrator, seed: mi.UInt32) -> mi.TensorXf:
-        return mi.render(scene, integrator=integrator, spp=4, seed=seed)
-
-    mi.render(scene, integrator=integrator, spp=1)
-    frozen = dr.freeze(shoot)
-    for call in range(6):
-        replayed = np.array(frozen(scene, integrator, mi.UInt32(call)))
-        assert np.array_equal(replayed, np.array(shoot(scene, integrator, mi.UInt32(call))))
-        params[GRID] = times(values, 2 + 3 * call)
-        params.update()
-    assert frozen.n_recordings < 6
+    follow(build(kind, albedo=0.7), 4, GRID, [None, *(times(VALUES, 2 + 3 * call) for call in range(5))])
 
 
 def test_scale_that_changes_between_calls():
     """The scale of mivol_medium is an array, so that a recording follows it; stock media keep a Python number."""
     skip_recorded_grids_on_a_gpu()
-    scene, _ = build("mivol_medium", False)
-    integrator = mi.load_dict({"type": "mivol"})
-    params = mi.traverse(scene)
-    mi.render(scene, integrator=integrator, spp=1)
-    frozen = dr.freeze(lambda scene, integrator, seed: mi.render(scene, integrator=integrator, spp=4, seed=seed))
-    means = []
-    for call in range(4):
-        params[SCALE] = dr.opaque(mi.Float, 0.5 * (1 + call))
-        params.update()
-        means.append(np.array(frozen(scene, integrator, mi.UInt32(0))).mean())
-        assert means[-1] == np.array(mi.render(scene, integrator=integrator, spp=4, seed=0)).mean()
-    assert np.all(np.diff(means) < -0.01)
+    images = follow(build("mivol_medium"), 6, SCALE, [dr.opaque(mi.Float, 0.5 * (1 + call)) for call in range(4)])
+    assert np.all(np.diff([image.mean() for image in images]) < -0.01)
+
+
+def test_constant_that_changes_between_calls():
+    """A homogeneous extinction is an array too: it is neither read nor baked into the recording."""
+    values = [dr.opaque(mi.Float, 0.25 * (1 + call)) for call in range(4)]
+    follow(build("mivol_medium", sigma_t=0.5), 6, "box.interior_medium.sigma_t.value.value", values)
 
 
 @pytest.mark.slow
 def test_gradient_step():
     """The update of the grid, the render and the reverse pass in one recording."""
-    skip_recorded_grids_on_a_gpu()
-    scene, values = build("mivol_medium", True)
+    scene = build("mivol_medium", True)
     integrator = mi.load_dict({"type": "mivol", "max_depth": 2})
     params = mi.traverse(scene)
 
@@ -129,9 +116,9 @@ def test_gradient_step():
     mi.render(scene, integrator=integrator, spp=1)
     frozen = dr.freeze(step)
     for call in range(3):
-        x = times(values, 1 + call)
+        x = times(VALUES, 1 + call)
         replayed = np.array(frozen(scene, integrator, params, x, mi.UInt32(call)))
-        fresh = mi.TensorXf(values * (1 + call))
+        fresh = mi.TensorXf(VALUES * (1 + call))
         plain = np.array(step(scene, integrator, params, fresh, mi.UInt32(call)))
         # The order of sums over threads is not fixed: float32 sums of some thousand terms.
         assert np.abs(replayed - plain).max() <= 1e-5 * np.abs(plain).max()
@@ -142,8 +129,7 @@ def test_gradient_step():
 def test_gradient_step_of_scattered_light(emitter):
     """Density, albedo and asymmetry of a medium that turns light once, in one recording: what an ordinary step gives."""
     skip_recorded_grids_on_a_gpu()
-    values = np.random.default_rng(1).uniform(0.1, 1.0, (4, 5, 6, 1)).astype(np.float32)
-    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "mivol_hg", "g": 0.3})
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", VALUES, PLACE), 0.8, phase={"type": "mivol_hg", "g": 0.3})
     bulb = {"type": "point", "position": [1.5, 1.0, 2.0], "intensity": 3.0}
     sensor = camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)
     shine = {"sky": sky, "bulb": lambda: bulb}[emitter]()
@@ -164,7 +150,7 @@ def test_gradient_step_of_scattered_light(emitter):
         return [dr.grad(value) for value in at]
 
     def start(call: int) -> list:
-        at = [times(values, 1 + call), mi.Float(0.8 - 0.1 * call), mi.Float(0.3 + 0.1 * call)]
+        at = [times(VALUES, 1 + call), mi.Float(0.8 - 0.1 * call), mi.Float(0.3 + 0.1 * call)]
         dr.make_opaque(at)
         return at
 
@@ -185,35 +171,13 @@ def test_gradient_step_of_scattered_light(emitter):
 def test_grids_that_cannot_be_followed_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU Dr.Jit would abort the process."""
     monkeypatch.setattr(Voxels, "freezable_texture", None)
-    scene, _ = build("mivol_medium", False)
+    scene = build("mivol_medium")
     integrator = mi.load_dict({"type": "mivol"})
-    frozen = dr.freeze(lambda scene, integrator, seed: mi.render(scene, integrator=integrator, spp=4, seed=seed))
+    frozen = dr.freeze(shoot)
     with pytest.raises(RuntimeError) as caught:
         frozen(scene, integrator, mi.UInt32(0))
     assert isinstance(caught.value.__cause__, MivolError) and "dr.freeze records mivol_voxels" in str(caught.value.__cause__)
     assert np.isfinite(np.array(mi.render(scene, integrator=integrator, spp=4))).all()
-
-
-def test_constant_that_changes_between_calls():
-    """A homogeneous extinction is an array too: it is neither read nor baked into the recording."""
-    parts = {
-        "type": "scene",
-        "box": box_of(medium("mivol_medium", 0.5), PLACE),
-        "sky": sky(),
-        "sensor": camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0),
-    }
-    scene = mi.load_dict(parts)
-    integrator = mi.load_dict({"type": "mivol"})
-    params = mi.traverse(scene)
-    key = "box.interior_medium.sigma_t.value.value"
-    mi.render(scene, integrator=integrator, spp=1)
-    frozen = dr.freeze(lambda scene, integrator, seed: mi.render(scene, integrator=integrator, spp=4, seed=seed))
-    for call in range(4):
-        params[key] = dr.opaque(mi.Float, 0.25 * (1 + call))
-        params.update()
-        replayed = np.array(frozen(scene, integrator, mi.UInt32(0)))
-        assert np.array_equal(replayed, np.array(mi.render(scene, integrator=integrator, spp=4, seed=0)))
-    assert frozen.n_recordings < 4
 
 
 def test_a_recording_reads_no_numbers(monkeypatch):
@@ -223,9 +187,7 @@ def test_a_recording_reads_no_numbers(monkeypatch):
     from mivol.plugins import media
     from mivol.scene import readings
 
-    box = box_of(medium("mivol_medium", 0.5), PLACE)
-    view = camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)
-    scene = mi.load_dict({"type": "scene", "box": box, "sky": sky(), "sensor": view})
+    scene = build("mivol_medium", sigma_t=0.5)
     integrator, params, read = mi.load_dict({"type": "mivol"}), mi.traverse(scene), []
     for module in (media, readings):
         monkeypatch.setattr(module, "check_constant", lambda value, name, owner: read.append(name))

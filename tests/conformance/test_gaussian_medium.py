@@ -6,6 +6,7 @@ tracks against a majorant of the same extinction and shares no estimator with mi
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -14,61 +15,30 @@ import numpy as np
 import oracle_gaussians as oracle
 import pytest
 from false_alarms import Estimate, assert_precise, assert_same_mean, fresh
-from gaussian_scenes import SIDE, camera_rays, render
-from scipy.special import logit
+from gaussian_scenes import SIDE, boxed, camera_rays, cloud, pinhole, render, tensors_of
 
 from mivol.errors import MivolError
 from mivol.experiments.script import explain
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS
-from mivol.photos.camera import Camera, intrinsics
 from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.splatting import Splatter, to_tensors
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-SKY, SCALE, EYE = 0.8, 1.3, np.array([0.4, 0.3, 5.0])
+SKY, SCALE = 0.8, 1.3
 
 POINT = {"type": "point", "position": [1.5, 2.0, 2.5], "intensity": 10.0}
 
 
-def cloud(count: int, seed: int = 0) -> Gaussians:
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        means=rng.uniform(-0.5, 0.5, (count, 3)),
-        log_scales=np.log(rng.uniform(0.08, 0.3, (count, 3))),
-        quaternions=rng.normal(size=(count, 4)),
-        opacity_logits=logit(rng.uniform(0.2, 0.95, count)),
-        harmonics=np.zeros((count, 1, 3)),
-    )
-
-
 def volume(gaussians: Gaussians, **more: object) -> dict:
-    return {
-        "type": "mivol_gaussians",
-        **{name: mi.TensorXf(getattr(gaussians, name)) for name in EXTINCTION_PARAMETERS},
-        **more,
-    }
+    return tensors_of(gaussians, EXTINCTION_PARAMETERS, **more)
 
 
 def scene(sigma_t: dict, albedo: object = 0.0, emitter: dict | None = None, fov: float = 25.0, **medium: object) -> mi.Scene:
-    """A cube of edge 4 with Gaussians in it, before a camera whose box filter sees the middles of pixels at one sample."""
-    film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
-    target = mi.ScalarTransform4f().look_at(EYE.tolist(), [0, 0, 0], [0, 1, 0])
     inside = {"type": "mivol_medium", "sigma_t": sigma_t, "albedo": albedo, "scale": SCALE, **medium}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "cloud": {
-                "type": "cube",
-                "to_world": mi.ScalarTransform4f().scale(2),
-                "bsdf": {"type": "null"},
-                "interior": inside,
-            },
-            "light": emitter or {"type": "constant", "radiance": SKY},
-            "sensor": {"type": "perspective", "fov": fov, "to_world": target, "film": film, "sampler": {"type": "independent"}},
-        }
-    )
+    light = emitter or {"type": "constant", "radiance": SKY}
+    return boxed(inside, {"type": "perspective", "fov": fov}, light=light)
 
 
 # -- Absorption --------------------------------------------------------------------------------------------------------------
@@ -128,25 +98,13 @@ def test_a_picture_has_derivatives_by_every_parameter() -> None:
 def test_what_rays_lose_is_what_small_splats_hide() -> None:
     """Splatting takes the projection of a Gaussian for affine over its extent. With s = extent over distance the alphas of both
     differ by about s, and by half as much for half of it; the low-pass filter is made small."""
-    gaussians, errors = cloud(30), []
+    gaussians, errors = cloud(30, degree=0), []
     for shrink in (0.5, 0.25, 0.125):
-        small = Gaussians(
-            gaussians.means * shrink,
-            gaussians.log_scales + np.log(shrink),
-            gaussians.quaternions,
-            gaussians.opacity_logits,
-            gaussians.harmonics,
-        )
-        focal = 8.0 * SIDE / shrink
-        pose = np.diag([1.0, 1.0, 1.0, 1.0])
-        pose[2, 3] = 8.0
-        camera = Camera(intrinsics(focal, focal, SIDE / 2, SIDE / 2), (SIDE, SIDE), pose)
+        log_scales = gaussians.log_scales + np.float32(np.log(shrink))
+        small = replace(gaussians, means=gaussians.means * np.float32(shrink), log_scales=log_scales)
+        camera, o, d = pinhole(SIDE, 8.0 * SIDE / shrink, 8.0)
         splatter = Splatter(SIDE, SIDE, 0, low_pass=1e-6, least_alpha=1e-6)
         drawn = np.array(splatter.forward(to_tensors(small), camera, derivatives=False)[0])[..., 3]
-        grid = (np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), -1).reshape(-1, 2) + 0.5 - SIDE / 2) / focal
-        d = np.column_stack([grid[:, 0], -grid[:, 1], -np.ones(len(grid))])
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        o = np.broadcast_to(pose[:3, 3], d.shape)
         tau = oracle.optical_depth(oracle.Cloud.of(small), o, d, np.zeros(len(o)), np.full(len(o), np.inf))
         assert drawn.max() > 0.8
         errors.append(np.abs(drawn.ravel() + np.expm1(-tau)).max())
@@ -250,9 +208,7 @@ def test_a_file_is_its_tensors_and_an_update_moves_them(tmp_path: Path) -> None:
     params = mi.traverse(read)
     params["cloud.interior_medium.sigma_t.means"] = mi.TensorXf(gaussians.means + np.float32(0.2))
     params.update()
-    moved = Gaussians(
-        gaussians.means + np.float32(0.2), *(getattr(gaussians, n) for n in (*EXTINCTION_PARAMETERS[1:], "harmonics"))
-    )
+    moved = replace(gaussians, means=gaussians.means + np.float32(0.2))
     np.testing.assert_allclose(render(read), render(scene(volume(moved))), rtol=1e-5)
     assert np.abs(render(read) - given).max() > 0.05
 

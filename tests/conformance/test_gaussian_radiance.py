@@ -14,62 +14,26 @@ import mitsuba as mi
 import numpy as np
 import oracle_gaussians as oracle
 import pytest
-from gaussian_scenes import SIDE, camera_rays, render
+from gaussian_scenes import SIDE, boxed, camera_rays, cloud, pinhole, render, tensors_of
 from scipy.special import logit
 
 from mivol.errors import MivolError
 from mivol.experiments.script import explain
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS, GaussianField
-from mivol.photos.camera import Camera, intrinsics
 from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.splatting import Splatter, to_tensors
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-EYE = np.array([0.4, 0.3, 5.0])
-
 ROUNDING = 1e-4
 """Of light in float32, relative to colours of at most 2: a depth of one Gaussian is known to 2e-5
 (test_gaussian_extinction.py), and a ray meets a few dozen, whose errors add up as a random walk."""
 
 
-def cloud(count: int, seed: int = 0, degree: int = 2) -> Gaussians:
-    """Flat and long, faint and nearly opaque ones; some channels are black."""
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        means=rng.uniform(-0.5, 0.5, (count, 3)),
-        log_scales=np.log(rng.uniform(0.08, 0.3, (count, 3))),
-        quaternions=rng.normal(size=(count, 4)),
-        opacity_logits=logit(rng.uniform(0.2, 0.95, count)),
-        harmonics=0.6 * rng.normal(size=(count, (degree + 1) ** 2, 3)),
-    )
-
-
 def shown(gaussians: Gaussians, **more: object) -> dict:
     """A medium that shows them."""
-    tensors = {name: mi.TensorXf(getattr(gaussians, name)) for name in (*EXTINCTION_PARAMETERS, HARMONICS)}
-    return {"type": "mivol_medium", "emission": {"type": "mivol_gaussians", **tensors, **more}}
-
-
-def scene(medium: dict, sensor: dict | None = None, **more: object) -> mi.Scene:
-    """A cube of edge 4 that holds the medium, before a camera whose box filter sees the middles of pixels at one sample."""
-    film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
-    target = mi.ScalarTransform4f().look_at(EYE.tolist(), [0, 0, 0], [0, 1, 0])
-    camera = sensor or {"type": "perspective", "fov": 25.0, "to_world": target}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "cloud": {
-                "type": "cube",
-                "to_world": mi.ScalarTransform4f().scale(2),
-                "bsdf": {"type": "null"},
-                "interior": medium,
-            },
-            "sensor": {**camera, "film": film, "sampler": {"type": "independent"}},
-            **more,
-        }
-    )
+    return {"type": "mivol_medium", "emission": tensors_of(gaussians, (*EXTINCTION_PARAMETERS, HARMONICS), **more)}
 
 
 def twin(
@@ -82,6 +46,13 @@ def twin(
     return oracle.composite(oracle.Cloud.of(gaussians), colour, rays, span)
 
 
+def assert_as_twin(gaussians: Gaussians, found: mi.Scene, seed: int = 0, atol: float = ROUNDING, **space: str) -> np.ndarray:
+    """A picture against the twin along the same rays; its light."""
+    light, _ = twin(gaussians, camera_rays(found, seed), **space)
+    np.testing.assert_allclose(render(found, seed=seed).reshape(-1, 3), light, rtol=ROUNDING, atol=atol)
+    return light
+
+
 # -- What is seen ------------------------------------------------------------------------------------------------------------
 
 
@@ -90,7 +61,7 @@ def test_colours_are_composited_in_the_order_of_peaks(degree: int) -> None:
     """Before a sky, with the opacity as an AOV. Half of the colours are below 0 somewhere."""
     gaussians = cloud(40, degree=degree)
     for space in ("srgb", "linear"):
-        found = scene(shown(gaussians, space=space), sky={"type": "constant", "radiance": 0.8})
+        found = boxed(shown(gaussians, space=space), sky={"type": "constant", "radiance": 0.8})
         seen = render(found, seed=3, aovs="alpha")
         light, T = twin(gaussians, camera_rays(found, 3), space=space)
         assert light.max() > 0.3 and T.min() < 0.05
@@ -101,7 +72,7 @@ def test_colours_are_composited_in_the_order_of_peaks(degree: int) -> None:
 def test_a_placement_turns_colours_with_the_cloud() -> None:
     gaussians = cloud(20)
     place = mi.ScalarTransform4f().translate([0.1, -0.2, 0.3]).rotate([0.6, 0, 0.8], 40).scale([0.8, 0.8, -0.8])
-    found = scene(shown(gaussians, to_world=place))
+    found = boxed(shown(gaussians, to_world=place))
     o, d = camera_rays(found, 3)
     back = np.linalg.inv(np.array(place.matrix, np.float64))
     local = d @ back[:3, :3].T
@@ -121,9 +92,7 @@ def test_layers_behind_each_other_are_sorted_whatever_a_list_holds() -> None:
         np.full(n, logit(0.02)),
         rng.uniform(-1, 1, (n, 1, 3)),
     )
-    found = scene(shown(layers))
-    light, _ = twin(layers, camera_rays(found, 0))
-    np.testing.assert_allclose(render(found).reshape(-1, 3), light, rtol=ROUNDING, atol=ROUNDING)
+    assert_as_twin(layers, boxed(shown(layers)))
 
 
 def test_of_equal_peaks_the_lower_number_is_in_front() -> None:
@@ -133,22 +102,17 @@ def test_of_equal_peaks_the_lower_number_is_in_front() -> None:
     harmonics[range(n), 0, [0, 1, *[2] * (n - 2)]] = 2.0
     same = np.zeros((n, 3)), np.full((n, 3), np.log(0.2)), np.tile([1.0, 0, 0, 0], (n, 1)), np.full(n, logit(0.7))
     gaussians = Gaussians(*same, harmonics)
-    found = scene(shown(gaussians, space="linear"))
-    light, _ = twin(gaussians, camera_rays(found, 0), space="linear")
-    seen = render(found).reshape(-1, 3)
-    np.testing.assert_allclose(seen, light, rtol=ROUNDING, atol=ROUNDING)
-    middle = np.argmax(seen.sum(axis=1))
-    assert seen[middle, 0] > 2 * seen[middle, 1] > 4 * seen[middle, 2] * 0.9
+    light = assert_as_twin(gaussians, boxed(shown(gaussians, space="linear")), space="linear")
+    red, green, blue = light[np.argmax(light.sum(axis=1))]
+    assert red > 2 * green > 4 * blue * 0.9
 
 
 def test_a_camera_may_stand_inside_and_look_anywhere() -> None:
     """At the middle of the cloud, 150 degrees wide: half of the Gaussians are behind it, and some across its place."""
     gaussians = cloud(40)
     wide = {"type": "perspective", "fov": 150.0, "near_clip": 1e-3}
-    found = scene(shown(gaussians), wide)
-    light, _ = twin(gaussians, camera_rays(found, 5))
-    assert light.max() > 0.3
-    np.testing.assert_allclose(render(found, seed=5).reshape(-1, 3), light, rtol=ROUNDING, atol=2 * ROUNDING)
+    wide["to_world"] = mi.ScalarTransform4f()
+    assert assert_as_twin(gaussians, boxed(shown(gaussians), wide), 5, 2 * ROUNDING).max() > 0.3
 
 
 def test_extremes_are_drawn() -> None:
@@ -156,10 +120,7 @@ def test_extremes_are_drawn() -> None:
     gaussians = cloud(6)
     gaussians.opacity_logits[:3] = [np.inf, -np.inf, 60]
     gaussians.log_scales[3] = np.log(1e-6)
-    found = scene(shown(gaussians))
-    seen = render(found).reshape(-1, 3)
-    light, _ = twin(gaussians, camera_rays(found, 0))
-    np.testing.assert_allclose(seen, light, rtol=ROUNDING, atol=ROUNDING)
+    assert_as_twin(gaussians, boxed(shown(gaussians)))
 
 
 def test_a_surface_among_them_hides_what_is_behind_it() -> None:
@@ -167,7 +128,7 @@ def test_a_surface_among_them_hides_what_is_behind_it() -> None:
     gaussians = cloud(40)
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(1.5), "light": {"type": "area", "radiance": 2.0}}
     medium = shown(gaussians)
-    found = scene(medium, wall=wall)
+    found = boxed(medium, wall=wall)
     rays = camera_rays(found, 1)
     light, T = twin(gaussians, rays, end=-rays[0][:, 2] / rays[1][:, 2])
     np.testing.assert_allclose(render(found, seed=1).reshape(-1, 3), light + 2 * T[:, None], rtol=ROUNDING, atol=ROUNDING)
@@ -181,7 +142,7 @@ def test_a_mirror_shows_their_other_side() -> None:
         "to_world": mi.ScalarTransform4f().translate([0, 0, -0.1]).scale(1.8),
         "bsdf": {"type": "conductor", "material": "none"},
     }
-    found = scene(shown(gaussians), mirror=mirror)
+    found = boxed(shown(gaussians), mirror=mirror)
     o, d = camera_rays(found, 1)
     end = -(o[:, 2] + 0.1) / d[:, 2]
     light, T = twin(gaussians, (o, d), end=end)
@@ -199,7 +160,7 @@ def test_other_media_dim_them_and_shine_through_them() -> None:
         place = mi.ScalarTransform4f().translate([0, 0, (low + high) / 2]).scale([4, 4, (high - low) / 2])
         glow = {"type": "mivol_medium", "sigma_t": 0.7, "emission": 0.5}
         boxes[name] = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": glow}
-    found = scene(shown(gaussians), **boxes)
+    found = boxed(shown(gaussians), **boxes)
     o, d = camera_rays(found, 2)
     light, T = twin(gaussians, (o, d))
     own = {name: np.exp(-0.7 * (high - low) / -d[:, 2]) for name, (low, high) in spans.items()}
@@ -211,9 +172,7 @@ def test_other_media_dim_them_and_shine_through_them() -> None:
 def test_they_are_seen_through_a_boundary_that_has_to_be_traced() -> None:
     gaussians = cloud(20)
     ball = {"type": "sphere", "radius": 3.0, "bsdf": {"type": "null"}, "interior": shown(gaussians)}
-    found = scene({}, cloud=ball)
-    light, _ = twin(gaussians, camera_rays(found, 2))
-    np.testing.assert_allclose(render(found, seed=2).reshape(-1, 3), light, rtol=ROUNDING, atol=ROUNDING)
+    assert_as_twin(gaussians, boxed({}, cloud=ball), 2)
 
 
 def test_small_ones_look_as_splatted() -> None:
@@ -221,17 +180,12 @@ def test_small_ones_look_as_splatted() -> None:
     differ by the extent of a Gaussian over its distance to the others or to the camera, so a quarter of it leaves less than
     half."""
     gaussians, errors, side = cloud(60), [], 48
-    focal, pose = 4.0 * side, np.eye(4)
-    pose[2, 3] = 5.0
-    camera = Camera(intrinsics(focal, focal, side / 2, side / 2), (side, side), pose)
-    grid = (np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2) + 0.5 - side / 2) / focal
-    d = np.column_stack([grid[:, 0], -grid[:, 1], -np.ones(len(grid))])
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    camera, *along = pinhole(side, 4.0 * side, 5.0)
     for shrink in (1.0, 0.25, 0.0625):
         small = replace(gaussians, log_scales=gaussians.log_scales + np.float32(np.log(shrink)))
         splatter = Splatter(side, side, 2, low_pass=1e-6, least_alpha=1e-6)
         drawn = np.array(splatter.forward(to_tensors(small), camera, derivatives=False)[0])[..., :3].reshape(-1, 3)
-        light, _ = twin(small, (np.broadcast_to(pose[:3, 3], d.shape), d), space="linear")
+        light, _ = twin(small, along, space="linear")
         errors.append(np.sqrt(((drawn - light) ** 2).mean() / (light**2).mean()))
     assert errors[0] < 0.3
     assert errors[1] < 0.5 * errors[0] and errors[2] < 0.5 * errors[1]
@@ -261,7 +215,7 @@ def test_derivatives_by_every_parameter_are_finite_differences_of_the_twin(count
         "to_world": mi.ScalarTransform4f().translate([0, 0, -0.1]).scale(2),
         "light": {"type": "area", "radiance": 0.7},
     }
-    found = scene(shown(gaussians), wall=wall)
+    found = boxed(shown(gaussians), wall=wall)
     o, d = camera_rays(found, 5)
     span = np.zeros(len(o)), -(o[:, 2] + 0.1) / d[:, 2]
     cloud64, harmonics = oracle.Cloud.of(gaussians), gaussians.harmonics.astype(np.float64)
@@ -295,7 +249,7 @@ def test_derivatives_by_every_parameter_are_finite_differences_of_the_twin(count
 
 def test_derivatives_list_nothing_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Transport reads the numbers where they stand: a step of a fit lists Gaussians once, when it moves them."""
-    found = scene(shown(cloud(3)))
+    found = boxed(shown(cloud(3)))
     params, _ = every(found)
     monkeypatch.setattr(GaussianField, "refresh", lambda self: pytest.fail("listed anew"))
     ones = mi.TensorXf(np.ones((SIDE, SIDE, 3), np.float32))
@@ -312,7 +266,7 @@ def test_what_is_hidden_has_the_small_derivative_that_it_has() -> None:
         np.full(n, 40.0),
         np.full((n, 1, 3), 0.5),
     )
-    found = scene(shown(layers, space="linear"), {"type": "perspective", "fov": 0.01, "to_world": facing()})
+    found = boxed(shown(layers, space="linear"), {"type": "perspective", "fov": 0.01, "to_world": facing()})
     params, keys = every(found)
     ones = mi.TensorXf(np.ones((SIDE, SIDE, 3), np.float32))
     mi.load_dict({"type": "mivol", "max_depth": 1}).render_backward(found, params, ones, spp=1)
@@ -338,7 +292,7 @@ def test_a_swap_of_the_order_changes_a_picture_by_what_is_said() -> None:
             logit([0.6, 0.3]),
             np.array([[[1.0, 1, 1]], [[-1.0, -1, -1]]]),
         )
-        found = scene(shown(pair, space="linear"), {"type": "perspective", "fov": 0.01, "to_world": facing()})
+        found = boxed(shown(pair, space="linear"), {"type": "perspective", "fov": 0.01, "to_world": facing()})
         seen.append(render(found).mean())
     jump = 0.6 * 0.3 * 2 * oracle.harmonics_along(np.array([[0, 0, -1.0]]))[0, 0]
     assert seen[0] - seen[1] == pytest.approx(jump, rel=1e-3)
@@ -350,13 +304,13 @@ def test_a_swap_of_the_order_changes_a_picture_by_what_is_said() -> None:
 def test_a_file_is_its_tensors_and_an_update_recolours_them(tmp_path: Path) -> None:
     gaussians = cloud(5)
     write_gaussians(tmp_path / "cloud.ply", gaussians)
-    given = render(scene(shown(gaussians)))
-    read = scene({"type": "mivol_medium", "emission": {"type": "mivol_gaussians", "filename": str(tmp_path / "cloud.ply")}})
+    given = render(boxed(shown(gaussians)))
+    read = boxed({"type": "mivol_medium", "emission": {"type": "mivol_gaussians", "filename": str(tmp_path / "cloud.ply")}})
     np.testing.assert_array_equal(render(read), given)
     params = mi.traverse(read)
     params["cloud.interior_medium.emission.harmonics"] = mi.TensorXf(-gaussians.harmonics)
     params.update()
-    other = scene(shown(replace(gaussians, harmonics=-gaussians.harmonics)))
+    other = boxed(shown(replace(gaussians, harmonics=-gaussians.harmonics)))
     np.testing.assert_allclose(render(read), render(other), rtol=1e-5)
     assert np.abs(render(read) - given).max() > 0.05
 
@@ -365,13 +319,13 @@ def test_a_blur_widens_each() -> None:
     """Round ones of standard deviation s become those of sqrt(s^2 + b^2); a to_world scales the blur with them."""
     gaussians = replace(cloud(8), log_scales=np.full((8, 3), np.log(0.09), np.float32))
     wide = replace(gaussians, log_scales=np.full((8, 3), np.log(0.15), np.float32))
-    blurred = render(scene(shown(gaussians, blur=0.12)))
-    np.testing.assert_allclose(blurred, render(scene(shown(wide))), rtol=1e-4, atol=1e-5)
-    assert np.abs(blurred - render(scene(shown(gaussians)))).max() > 0.05
+    blurred = render(boxed(shown(gaussians, blur=0.12)))
+    np.testing.assert_allclose(blurred, render(boxed(shown(wide))), rtol=1e-4, atol=1e-5)
+    assert np.abs(blurred - render(boxed(shown(gaussians)))).max() > 0.05
 
 
 def test_a_plan_says_what_is_done_with_them() -> None:
-    text = explain(scene(shown(cloud(5))))
+    text = explain(boxed(shown(cloud(5))))
     assert "grey extinction, 5 Gaussians, albedo 0" in text
     assert "in the order of their peaks along each ray" in text
     assert "because cloud: colours" in text
@@ -403,4 +357,4 @@ def test_what_they_cannot_be_is_refused_by_name() -> None:
         with pytest.raises((MivolError, RuntimeError), match=sentence):
             mi.load_dict({**gaussians, **setting})
     with pytest.raises(MivolError, match="aovs asks for depth: ask for tau and alpha only"):
-        render(scene(shown(cloud(2))), aovs="depth")
+        render(boxed(shown(cloud(2))), aovs="depth")
