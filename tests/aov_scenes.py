@@ -7,14 +7,7 @@ import math
 import mitsuba as mi
 import numpy as np
 
-from scenes import (
-    as_float32,
-    centred,
-    film,
-    pencil,
-    pixel_rays,
-    render,
-)
+from scenes import as_float32, centred, film, pencil, pixel_rays, render
 
 EPS = 2.0**-23
 

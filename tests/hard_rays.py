@@ -7,10 +7,7 @@ import math
 import numpy as np
 from oracle import tau_scale, tau_twin
 
-from scenes import (
-    as_float32,
-    tau_fast,
-)
+from scenes import as_float32, tau_fast
 
 BOUND = 2e-6
 """Error asked for, relative to the integral of sigma + h |grad sigma|."""

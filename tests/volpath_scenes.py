@@ -5,17 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import scattering_scenes as small
-from scattering_scenes import (
-    PLACE,
-    assert_same_images,
-    close_up,
-    moments,
-    point,
-    rough_grid,
-    spot,
-    sun,
-    volpath,
-)
+from scattering_scenes import PLACE, assert_same_images, close_up, moments, point, rough_grid, spot, sun, volpath
 
 import scenes
 from mivol.validate.moments import Moments

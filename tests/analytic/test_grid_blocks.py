@@ -12,15 +12,7 @@ from hard_rays import BOUND, assert_tau, positive
 from oracle import tau_gradient_twin
 
 from mivol.transport.traversal.grid_blocks import coarsen_grid, find_block_ranges, find_empty_distances
-from scenes import (
-    FRAMES,
-    as_float32,
-    centred,
-    make_lattice,
-    random_rays,
-    tensor,
-    to_lanes,
-)
+from scenes import FRAMES, as_float32, centred, make_lattice, random_rays, tensor, to_lanes
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

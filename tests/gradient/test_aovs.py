@@ -12,18 +12,7 @@ from scattering_scenes import cases
 from mivol.scene import plan
 from mivol.transport.line_integrals.aovs import integrate_distance_in_cell
 from mivol.transport.media.compositing import CellIntegral
-from scenes import (
-    as_float32,
-    ball_of,
-    box_of,
-    camera,
-    centred,
-    grid_volume,
-    medium,
-    pencil,
-    rotation,
-    sky,
-)
+from scenes import as_float32, ball_of, box_of, camera, centred, grid_volume, medium, pencil, rotation, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

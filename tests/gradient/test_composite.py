@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 from aov_gradients import DATA, VALUE, mivol, vjp
 
-from scenes import (
-    as_float32,
-    ball_of,
-    box_of,
-    centred,
-    grid_volume,
-    medium,
-    pencil,
-)
+from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, pencil
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

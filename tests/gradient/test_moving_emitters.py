@@ -11,14 +11,7 @@ import oracle_scattering as twins
 import pytest
 import scattering_scenes as small
 from false_alarms import assert_precise, assert_same_mean, fresh
-from scattering_gradients import (
-    BATCHES,
-    assert_gradient,
-    gradients,
-    twin_difference,
-    vjp,
-    weights,
-)
+from scattering_gradients import BATCHES, assert_gradient, gradients, twin_difference, vjp, weights
 from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes

@@ -17,14 +17,7 @@ from oracle import tau_scale, tau_twin
 
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.grid_walk import walk_box_cells
-from scenes import (
-    FRAMES,
-    affine,
-    as_float32,
-    random_rays,
-    tau_fast,
-    to_lanes,
-)
+from scenes import FRAMES, affine, as_float32, random_rays, tau_fast, to_lanes
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

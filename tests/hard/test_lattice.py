@@ -11,16 +11,7 @@ import pytest
 from hard_rays import BOUND, assert_tau, positive
 from oracle import box_interval, overlap, tau_scale
 
-from scenes import (
-    FRAMES,
-    affine,
-    as_float32,
-    centred,
-    make_lattice,
-    random_rays,
-    rotation,
-    tau_fast,
-)
+from scenes import FRAMES, affine, as_float32, centred, make_lattice, random_rays, rotation, tau_fast
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -16,16 +16,7 @@ import pytest
 from hard_rays import EPS, assert_tau, positive
 
 from mivol.threads import set_thread_count
-from scenes import (
-    affine,
-    as_float32,
-    centred,
-    make_lattice,
-    random_rays,
-    tau_and_row,
-    tau_fast,
-    to_lanes,
-)
+from scenes import affine, as_float32, centred, make_lattice, random_rays, tau_and_row, tau_fast, to_lanes
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -12,15 +12,7 @@ from PIL import Image
 
 from mivol.errors import MivolError
 from mivol.photos import Camera, intrinsics, pixel_centres, rays
-from mivol.report.pixel_scale import (
-    EDGE,
-    GAP,
-    depth_pixels,
-    is_preview_due,
-    normal_pixels,
-    normals_from_depth,
-    write_preview,
-)
+from mivol.report.pixel_scale import EDGE, GAP, depth_pixels, is_preview_due, normal_pixels, normals_from_depth, write_preview
 
 
 def test_normals_of_a_sphere(artefacts: Path) -> None:
