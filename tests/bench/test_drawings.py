@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -39,20 +40,7 @@ def contest(names: dict, stocks: tuple[str, ...]) -> dict:
     return answer
 
 
-@pytest.mark.slow
-def test_single_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
-    answer = contest(single_scattering.LIGHTS, single_scattering.PEERS)
-    figure = drawn(single_scattering, monkeypatch, {"smoke": answer, "cloud": answer}, Path())
-    assert_readable(figure)
-
-
-def test_multiple_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
-    lights = multiple_scattering.CONTESTS["smoke"]
-    figure = drawn(multiple_scattering, monkeypatch, {"smoke": contest(lights, single_scattering.PEERS)}, Path())
-    assert_readable(figure)
-
-
-def test_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+def of_gradients() -> dict:
     smoke = {
         light: {what: {"sigma_t >= 1": {"variance_x_time": 10.0 * k + i}} for i, what in enumerate(("mean", "L2"))}
         for k, light in enumerate(CONTESTS["smoke"][1], 4)
@@ -60,11 +48,10 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
     one = {name: {"bias_percent": 2.0 + k, "known_to_percent": 0.1 + k} for k, name in enumerate(INTEGRATORS)}
     estimators = {light: {"dense": one, "density 0": one} for light in CONTESTS["smoke"][1]}
     runs = {name: {"seconds": [1.0, 2.0 + k], "loss": [0.5, 0.0]} for k, name in enumerate(INTEGRATORS)}
-    answers = {"smoke": smoke, "estimators": estimators, "tutorial": {"runs": runs}}
-    assert_readable(drawn(gradients, monkeypatch, answers, Path()))
+    return {"smoke": smoke, "estimators": estimators, "tutorial": {"runs": runs}}
 
 
-def test_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+def of_depth() -> dict:
     cells = [
         Cell("cube", light, phase, albedo, tau, 1.0, 2.0, albedo * tau / (4 + tau), 0.01 * k, 1.0)
         for k, (light, phase) in enumerate(TABLES, 1)
@@ -72,49 +59,49 @@ def test_depth(monkeypatch: pytest.MonkeyPatch) -> None:
         for tau in (0.1, 1.0, 10.0)
     ]
     beside = [Cell(*place, "isotropic", 0.5, 2.0, 1.0, 2.0, 0.2 + 0.1 * k, 0.01, 1.0) for k, place in enumerate(depth.MARKERS)]
-    answers = {"table": {"cells": [asdict(c) for c in cells]}, "beside": {"cells": [asdict(c) for c in beside]}}
-    assert_readable(drawn(depth, monkeypatch, answers, Path()))
+    return {"table": {"cells": [asdict(c) for c in cells]}, "beside": {"cells": [asdict(c) for c in beside]}}
 
 
-def test_media_light(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ratio of 0 has no logarithm: its number stands where a bar would begin."""
-    ratios = {"fire": 0.0, "fog": 37.2, "room": 0.998}
-    answers = {name: {"variance_x_time_median_over_pixels": ratio} for name, ratio in ratios.items()}
-    assert_readable(drawn(media_light, monkeypatch, answers, Path()))
-
-
-def test_still_life(monkeypatch: pytest.MonkeyPatch) -> None:
-    ramp = np.linspace(0, 1, 3 * 4 * 3).reshape(3, 4, 3)
-    fits = {"SH 2": {"photograph": ramp, "view": ramp * 1.5, "psnr": 20.125, "views": 8}}
-    figure = drawn(still_life, monkeypatch, {"degree": fits, "few": fits}, Path())
-    assert_readable(figure)
-
-
-def test_tomography(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The slice is three eighths up, and white is 0.6 of the truth's brightest thousandth."""
+def of_tomography() -> dict:
     truth = np.arange(8.0 * 3 * 4).reshape(8, 3, 4)
     curves = {"SIRT": {"nrmse": [0.5, 0.25], "seconds": [3.0, 6.0]}}
-    answer = {"object": "head", "truth": truth, "curves": curves, "volumes": {"SIRT": truth / 2}}
-    figure = drawn(tomography, monkeypatch, {"solvers": answer}, Path("a.png"))
-    assert_readable(figure)
+    return {"solvers": {"object": "head", "truth": truth, "curves": curves, "volumes": {"SIRT": truth / 2}}}
 
 
-def test_radiance_field(monkeypatch: pytest.MonkeyPatch) -> None:
+def of_radiance_fields() -> dict:
     ratios = {kind: {"ratio_of_processor_time": k + 2.0} for k, kind in enumerate(("camera", "pixels", "any"))}
     curves = {"ours": [(1.0, 20.0), (2.0, 25.0)], "peer": [(10.0, 18.0), (20.0, 23.0)], "peer_psnr": 24.0}
-    answers = {
+    return {
         "step": {"fog": ratios, "shell": ratios},
         "memory": {"peak_bytes": [2**20, 4 * 2**20], "field_bytes": 3 * 2**20, "bytes_per_ray": 100.4},
         "locality": {name: {"processor_seconds": t, "steps": 100, "psnr": 10 * t} for name, t in (("tiles", 3), ("pixels", 5))},
         "fit": {"fog": curves},
     }
-    assert_readable(drawn(radiance_field, monkeypatch, answers, Path()))
 
 
-def test_random_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
-    trials = {"1": {"z": -2.0, "z_bound": 4.0}, "2": {"z": None, "z_bound": 4.0}, "3": {"z": 5.0, "z_bound": 4.0}}
-    figure = drawn(random_scenes, monkeypatch, {"trials": {"trials": trials}}, Path())
-    assert_readable(figure)
+RAMP = np.linspace(0, 1, 3 * 4 * 3).reshape(3, 4, 3)
+FITS = {"SH 2": {"photograph": RAMP, "view": RAMP * 1.5, "psnr": 20.125, "views": 8}}
+TRIALS = {str(k): {"z": z, "z_bound": 4.0} for k, z in enumerate((-2.0, None, 5.0), 1)}
+ANSWERS = {
+    single_scattering: lambda: dict.fromkeys(("smoke", "cloud"), contest(single_scattering.LIGHTS, single_scattering.PEERS)),
+    multiple_scattering: lambda: {"smoke": contest(multiple_scattering.CONTESTS["smoke"], single_scattering.PEERS)},
+    gradients: of_gradients,
+    depth: of_depth,
+    # A ratio of 0 has no logarithm: its number stands where a bar would begin.
+    media_light: lambda: {
+        name: {"variance_x_time_median_over_pixels": ratio} for name, ratio in (("fire", 0.0), ("fog", 37.2), ("room", 0.998))
+    },
+    still_life: lambda: {"degree": FITS, "few": FITS},
+    tomography: of_tomography,
+    radiance_field: of_radiance_fields,
+    random_scenes: lambda: {"trials": {"trials": TRIALS}},
+}
+
+
+@pytest.mark.slow_for("single_scattering")
+@pytest.mark.parametrize("study", ANSWERS, ids=lambda study: study.__name__.rpartition(".")[-1])
+def test_figures_are_readable(monkeypatch: pytest.MonkeyPatch, study: ModuleType) -> None:
+    assert_readable(drawn(study, monkeypatch, ANSWERS[study](), Path("a.png")))
 
 
 def test_optical_depth(monkeypatch: pytest.MonkeyPatch) -> None:

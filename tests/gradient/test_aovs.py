@@ -203,42 +203,30 @@ def test_derivatives_of_a_cell(size):
             assert np.array(slope) == pytest.approx(difference, abs=2e-5 * np.abs(difference).max())
 
 
+WALL = {"type": "rectangle", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
+SLABS = {
+    # Depth behind the entry: 1/s - 1/(e^s - 1).
+    "alone": (lambda s: -1 / s**2 + np.exp(s) / np.expm1(s) ** 2, 1),
+    # Entered at 1, left at 2, with a wall at 3.5: 1 + (1 - e^-s)/s + 1.5 e^-s, since the slab dims the wall.
+    "before a wall": (lambda s: ((1 + s) * np.exp(-s) - 1) / s**2 - 1.5 * np.exp(-s), 3),
+}
+"""Derivative of the depth by the extinction, and the size of the depths."""
+
+
 @pytest.mark.parametrize("sigma", [0.7, 4.0])
-def test_derivatives_of_a_slab(sigma: float) -> None:
-    """The depth behind the entry is 1/s - 1/(e^s - 1): forward and in reverse -1/s^2 + e^s/(e^s - 1)^2."""
+@pytest.mark.parametrize("name", SLABS)
+def test_derivatives_of_a_slab(name: str, sigma: float) -> None:
+    """In reverse and forward."""
+    derivative, level = SLABS[name]
     box = box_of(medium("homogeneous", sigma), np.eye(4))
-    scene = mi.load_dict({"type": "scene", "box": box, "sensor": pencil([0.3, 0.4, -1], [0, 0, 1])})
-    slope = -1 / sigma**2 + np.exp(sigma) / np.expm1(sigma) ** 2
-    key, integrator = f"box.{VALUE}", mivol("depth")
+    wall = {"wall": WALL | {"to_world": mi.ScalarTransform4f().translate([0.5, 0.5, 2.5]).scale(2)}} if level == 3 else {}
+    scene = mi.load_dict({"type": "scene", "box": box, "sensor": pencil([0.3, 0.4, -1], [0, 0, 1]), **wall})
+    key, integrator, slope = f"box.{VALUE}", mivol("depth"), derivative(sigma)
     found = vjp(scene, integrator, [key], np.ones((1, 1, 1)), 1)[key]
-    # Differences of numbers of size 1, each of some roundings.
-    assert found.sum() == pytest.approx(slope, abs=32 * 2.0**-23)
+    # Differences of numbers of size `level`, each of some roundings.
+    assert found.sum() == pytest.approx(slope, abs=level * 32 * 2.0**-23)
     params = mi.traverse(scene)
     dr.enable_grad(params[key])
     dr.set_grad(params[key], 0.5)
     tangent = np.array(integrator.render_forward(scene, params, seed=1, spp=1))
-    assert tangent[0, 0, 3] == pytest.approx(0.5 * slope, abs=32 * 2.0**-23)
-
-
-@pytest.mark.parametrize("sigma", [0.7, 4.0])
-def test_derivatives_of_a_slab_before_a_wall(sigma: float) -> None:
-    """Entered at 1 and left at 2, with a wall at 3.5: 1 + (1 - e^-s)/s + 1.5 e^-s, since the slab dims what is behind it."""
-    place = mi.ScalarTransform4f().translate([0.5, 0.5, 2.5]).scale(2)
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "box": box_of(medium("homogeneous", sigma), np.eye(4)),
-            "wall": {"type": "rectangle", "to_world": place, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}},
-            "sensor": pencil([0.3, 0.4, -1], [0, 0, 1]),
-        }
-    )
-    slope = ((1 + sigma) * np.exp(-sigma) - 1) / sigma**2 - 1.5 * np.exp(-sigma)
-    key, integrator = f"box.{VALUE}", mivol("depth")
-    found = vjp(scene, integrator, [key], np.ones((1, 1, 1)), 1)[key]
-    # Differences of numbers of size 3, each of some roundings.
-    assert found.sum() == pytest.approx(slope, abs=3 * 32 * 2.0**-23)
-    params = mi.traverse(scene)
-    dr.enable_grad(params[key])
-    dr.set_grad(params[key], 0.5)
-    tangent = np.array(integrator.render_forward(scene, params, seed=1, spp=1))
-    assert tangent[0, 0, 3] == pytest.approx(0.5 * slope, abs=3 * 32 * 2.0**-23)
+    assert tangent[0, 0, 3] == pytest.approx(0.5 * slope, abs=level * 32 * 2.0**-23)

@@ -223,56 +223,76 @@ def test_two_media():
         assert_gradient(sums(seen, key, w, 2048, along), np.array([truth]), key, 0.08, rounding=2e-3)
 
 
-def scalar(parts: dict, key: str, light: Callable[[float, np.ndarray, np.ndarray], np.ndarray], x: float) -> None:
-    """A number's derivative of the sum of weighted pencils against a difference of the twin's `light(x, o, d)` (n, C)."""
-    seen = pencils(parts, *aimed(3, 6))
-    w, rows = weights(6)
-    truth = twin_difference(lambda y: rows @ light(y, seen.o, seen.d)[:, 0], float(as_float32(x)))
-    # Some of these are small differences of what turns towards the camera and what is turned away.
-    assert_gradient(sums(seen, key, w, 2048), np.array([truth]), key, 0.08)
-
-
 def sums(seen: Pencils, key: str, w: np.ndarray, spp: int, v: object = 1.0) -> np.ndarray:
     """The derivative along v, (BATCHES, 1): by default all entries move together, as the channels of a grey parameter do."""
     return np.stack([[np.sum(v * g)] for g in gradients(seen, key, w, spp)])
 
 
-EMITTER = lambda: point([1.5, 1, 2.0])  # noqa: E731
+F7, F9, F3, F6 = (float(as_float32(x)) for x in (0.7, 0.9, 0.3, 0.6))
+TWO_COEFFICIENTS = {"type": "mivol_medium", "sigma_a": F3, "sigma_s": F6, "phase": {"type": "rayleigh"}}
+BLEND = {"type": "blendphase", "weight": 0.3, "a": {"type": "hg", "g": 0.7}, "b": {"type": "rayleigh"}}
 
 
-@pytest.mark.slow
-@pytest.mark.statistical
-def test_homogeneous_extinction_and_albedo():
-    emitter = EMITTER()
-    parts = {"smoke": fog(0.9, 0.7, name="hg", g=0.3)[0], "emitter": emitter[0]}
-
-    def by_sigma(x, o, d):
-        return twins.radiance([twins.Medium(twins.Box(x, PLACE), float(as_float32(0.7)), twins.hg(0.3))], [emitter[1]], o, d)
-
-    def by_albedo(x, o, d):
-        return twins.radiance([twins.Medium(twins.Box(float(as_float32(0.9)), PLACE), x, twins.hg(0.3))], [emitter[1]], o, d)
-
-    scalar(parts, MEDIUM + "sigma_t.value.value", by_sigma, 0.9)
-    scalar(parts, MEDIUM + "albedo.value.value", by_albedo, 0.7)
+def grid_twin(seed: int, albedo: float = 0.7, phase: Callable = twins.isotropic, scale: float = 1.0) -> twins.Medium:
+    return twins.Medium(twins.Grid(rough_grid(seed), PLACE, scale), albedo, phase)
 
 
-@pytest.mark.slow_for("0.7-stock")
-@pytest.mark.statistical
-@pytest.mark.parametrize(
-    ("albedo", "kind"),
-    small.cases(
-        [(a, k) for a in (0.0, 0.7, 1.0) for k in small.KINDS], [(0.0, "stock"), (0.7, "own"), (1.0, "stock"), (1.0, "own")]
+def smoke_of(seed: int, kind: str = "own", **more: object) -> dict:
+    medium_type, volume_type = small.KINDS[kind]
+    return box_of(medium(medium_type, grid_volume(volume_type, rough_grid(seed), PLACE), 0.7, **more), PLACE)
+
+
+def of_absorption(a: float, s: float) -> list[twins.Medium]:
+    return [twins.Medium(twins.Box(a, PLACE), 0.0), twins.Medium(twins.Box(s, PLACE), 1.0, twins.rayleigh)]
+
+
+NUMBERS = {
+    "fog, sigma_t": lambda: (
+        fog(0.9, 0.7, name="hg", g=0.3)[0], "sigma_t.value.value", 0.9,
+        lambda x: [twins.Medium(twins.Box(x, PLACE), F7, twins.hg(0.3))],
     ),
-)
-def test_albedo(albedo, kind):
-    """At albedo 0 nothing turns, and the derivative is not 0."""
-    emitter, values = EMITTER(), rough_grid(2)
-    parts = {"smoke": smoke(values, albedo, kind)[0], "emitter": emitter[0]}
+    "fog, albedo": lambda: (
+        fog(0.9, 0.7, name="hg", g=0.3)[0], "albedo.value.value", 0.7,
+        lambda x: [twins.Medium(twins.Box(F9, PLACE), x, twins.hg(0.3))],
+    ),
+    "sigma_a": lambda: (box_of(TWO_COEFFICIENTS, PLACE), "sigma_a.value.value", F3, lambda x: of_absorption(x, F6)),
+    "sigma_s": lambda: (box_of(TWO_COEFFICIENTS, PLACE), "sigma_s.value.value", F6, lambda x: of_absorption(F3, x)),
+    "scale": lambda: (smoke_of(6, scale=1.5), "scale", 1.5, lambda x: [grid_twin(6, scale=x)]),
+    "weight of a blend": lambda: (
+        smoke_of(8, "stock", phase=BLEND), "phase_function.weight.value.value", 0.3,
+        lambda x: [grid_twin(8, phase=lambda c: (1 - x) * twins.hg(0.7)(c) + x * twins.rayleigh(c))],
+    ),
+    # g = 0, where hg.g is a maximum of nothing
+    **{
+        f"g = {g}": lambda g=g: (
+            smoke(rough_grid(7), 0.7, "own", PLACE, "hg", g)[0], "phase_function.g", g,
+            lambda x: [grid_twin(7, phase=twins.hg(x))],
+        ) for g in (-0.6, 0.0, 0.4, 0.9)
+    },
+    # at albedo 0 nothing turns, and the derivative is not 0
+    **{
+        f"albedo {a}, {kind}": lambda a=a, kind=kind: (
+            smoke(rough_grid(2), a, kind)[0], "albedo.value.value", a, lambda x: [grid_twin(2, x)],
+        ) for a in (0.0, 0.7, 1.0) for kind in small.KINDS
+    },
+}  # fmt: skip
+"""Box of a medium, key of its parameter, value, and the twin's media as a function of the value."""
 
-    def light(x, o, d):
-        return twins.radiance([twins.Medium(twins.Grid(values, PLACE), x)], [emitter[1]], o, d)
 
-    scalar(parts, MEDIUM + "albedo.value.value", light, albedo)
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", small.cases(NUMBERS, [name for name in NUMBERS if name != "albedo 0.0, own"]))
+def test_derivative_by_a_number(name):
+    box, key, x, media = NUMBERS[name]()
+    seen, emitter, w, rows = lit(box, "point")
+    truth = twin_difference(lambda y: rows @ twins.radiance(media(y), [emitter], seen.o, seen.d)[:, 0], float(as_float32(x)))
+    # Some of these are small differences of what turns towards the camera and what is turned away.
+    assert_gradient(sums(seen, MEDIUM + key, w, 2048), np.array([truth]), name, 0.08)
+
+
+def lit(box: dict, emitter: str) -> tuple[Pencils, twins.Emitter, np.ndarray, np.ndarray]:
+    """Six pencils through a box under an emitter, the emitter's twin, and weights."""
+    stock, twin = EMITTERS[emitter]()
+    return pencils({"smoke": box, "emitter": stock}, *aimed(3, 6)), twin, *weights(6)
 
 
 @pytest.mark.slow_for("own-0.0", "stock-1.0")
@@ -282,7 +302,7 @@ def test_albedo(albedo, kind):
 )
 def test_albedo_grid(kind, top):
     """Voxel by voxel: the integral of w_k T sigma L_s; also where the albedo is 0 everywhere."""
-    emitter, values, albedo = EMITTER(), rough_grid(3), rough_grid(4, top, (2, 3, 4))
+    emitter, values, albedo = EMITTERS["point"](), rough_grid(3), rough_grid(4, top, (2, 3, 4))
     medium_type, volume_type = small.KINDS[kind]
     interior = medium(medium_type, grid_volume(volume_type, values, PLACE), grid_volume(volume_type, albedo, PLACE))
     seen = pencils({"smoke": box_of(interior, PLACE), "emitter": emitter[0]}, *aimed(3, 6))
@@ -297,25 +317,9 @@ def test_albedo_grid(kind, top):
 
 @pytest.mark.slow
 @pytest.mark.statistical
-def test_absorption_and_scattering():
-    """sigma_a dims, sigma_s turns and dims; both numbers of one medium."""
-    emitter, a, s = EMITTER(), float(as_float32(0.3)), float(as_float32(0.6))
-    interior = {"type": "mivol_medium", "sigma_a": a, "sigma_s": s, "phase": {"type": "rayleigh"}}
-    parts = {"smoke": box_of(interior, PLACE), "emitter": emitter[0]}
-
-    def light(a, s, o, d):
-        media = [twins.Medium(twins.Box(a, PLACE), 0.0), twins.Medium(twins.Box(s, PLACE), 1.0, twins.rayleigh)]
-        return twins.radiance(media, [emitter[1]], o, d)
-
-    scalar(parts, MEDIUM + "sigma_a.value.value", lambda x, o, d: light(x, s, o, d), a)
-    scalar(parts, MEDIUM + "sigma_s.value.value", lambda x, o, d: light(a, x, o, d), s)
-
-
-@pytest.mark.slow
-@pytest.mark.statistical
 def test_scattering_grid():
     """sigma_s on a grid, also where it is 0: what turns is its own, not a share of sigma_t."""
-    emitter = EMITTER()
+    emitter = EMITTERS["point"]()
     absorb, scatter = rough_grid(5, 1.0, (2, 3, 4)), DENSITIES["half empty"]()
     interior = {
         "type": "mivol_medium",
@@ -335,33 +339,6 @@ def test_scattering_grid():
 
     along = sums(seen, MEDIUM + "sigma_s.data", w, 512, v)
     assert_gradient(along, np.array([twin_difference(light, 0.0)]), "sigma_s")
-
-
-@pytest.mark.slow
-@pytest.mark.statistical
-def test_scale():
-    emitter, values = EMITTER(), rough_grid(6)
-    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.7, scale=1.5)
-    parts = {"smoke": box_of(interior, PLACE), "emitter": emitter[0]}
-
-    def light(x, o, d):
-        return twins.radiance([twins.Medium(twins.Grid(values, PLACE, x), 0.7)], [emitter[1]], o, d)
-
-    scalar(parts, MEDIUM + "scale", light, 1.5)
-
-
-@pytest.mark.slow
-@pytest.mark.statistical
-@pytest.mark.parametrize("g", small.cases([-0.6, 0.0, 0.4, 0.9], [-0.6, 0.0, 0.4]))
-def test_asymmetry_of_the_phase_function(g):
-    """hg.g, also at 0 where it is a maximum of nothing."""
-    emitter, values = EMITTER(), rough_grid(7)
-    parts = {"smoke": smoke(values, 0.7, "own", PLACE, "hg", g)[0], "emitter": emitter[0]}
-
-    def light(x, o, d):
-        return twins.radiance([twins.Medium(twins.Grid(values, PLACE), 0.7, twins.hg(x))], [emitter[1]], o, d)
-
-    scalar(parts, MEDIUM + "phase_function.g", light, g)
 
 
 def panorama() -> tuple[dict, twins.Sky]:
@@ -404,21 +381,6 @@ def test_density_under_a_sky_that_is_not_constant():
         behind, _ = twins.radiance_gradient(m, [], o, d, weight, background=1 + d[2])
         truth += behind
     assert_gradient(gradients(seen, GRID, w, 2048), truth[..., None], "panorama", rounding=5e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.statistical
-def test_weight_of_a_blend():
-    emitter, values = EMITTER(), rough_grid(8)
-    blend = {"type": "blendphase", "weight": 0.3, "a": {"type": "hg", "g": 0.7}, "b": {"type": "rayleigh"}}
-    interior = medium("heterogeneous", grid_volume("gridvolume", values, PLACE), 0.7, phase=blend)
-    parts = {"smoke": box_of(interior, PLACE), "emitter": emitter[0]}
-
-    def light(x, o, d):
-        p = lambda c: (1 - x) * twins.hg(0.7)(c) + x * twins.rayleigh(c)  # noqa: E731
-        return twins.radiance([twins.Medium(twins.Grid(values, PLACE), 0.7, p)], [emitter[1]], o, d)
-
-    scalar(parts, MEDIUM + "phase_function.weight.value.value", light, 0.3)
 
 
 MICROFLAKES = [[0.3, 0.8, 0.2, 0.05, 0.02, -0.03]]
@@ -476,17 +438,10 @@ def test_extinction_of_microflakes(key):
 )
 def test_power_of_an_emitter(name, key):
     """Linear: the derivative is the picture of an emitter of 1."""
-    emitter = EMITTERS[name]()
-    values = rough_grid(9)
-    parts = {"smoke": smoke(values, 0.7)[0], "emitter": emitter[0]}
-    one = {"point": {"intensity": 1.0}, "spot": {"intensity": 1.0}, "sun": {"irradiance": 1.0}}[name]
-    unit = type(emitter[1])(**{**vars(emitter[1]), **one})
-    m = twins.Medium(twins.Grid(values, PLACE), 0.7)
-
-    def light(x, o, d):
-        return x * twins.radiance([m], [unit], o, d)
-
-    scalar(parts, f"emitter.{key}.value", light, 1.0)
+    seen, twin, w, rows = lit(smoke(rough_grid(9), 0.7)[0], name)
+    unit = type(twin)(**{**vars(twin), key: 1.0})
+    truth = rows @ twins.radiance([grid_twin(9)], [unit], seen.o, seen.d)[:, 0]
+    assert_gradient(sums(seen, f"emitter.{key}.value", w, 2048), np.array([truth]), name, 0.08)
 
 
 @pytest.mark.statistical
