@@ -53,7 +53,9 @@ for
 Henyey-Greenstein with g = 0.8 under a sun: variance x time is 2 to 4 times smaller."""
 
 SUCCESSIVE_PATHS, MIN_SUCCESSIVE_SCATTERINGS = 16, 16
-"""Paths per lane walked one after the other."""
+"""Paths per lane walked one after the other, and the number of scatterings from which successive paths pay. Measured processor
+time of 1 path per lane over 16, on 2 cores, at depths 6, 16, 64 and unlimited: smoke 1.0, 1.0, 1.1; a cloud of albedo 0.999
+0.9, 1.2, 1.5, 1.4; a white box of optical depth 64 0.8, 1.0, 1.35, 2.2."""
 
 MIN_FILLED_SHARE = 0.25
 """Share of occupied blocks above which a grid counts as filled."""

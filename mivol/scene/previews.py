@@ -168,7 +168,7 @@ def _render_depth_preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurve
 
 
 DRAW_SIDE, DRAW_SAMPLES, DRAW_SEED = 24, 48, 0xD3A4
-"""Cells along an edge of the preview, samples per cell, and seed."""
+"""Cells along an edge of the emission preview, samples per cell, and seed."""
 
 
 def measure_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
