@@ -3,7 +3,7 @@
     python scenes/still_life/photographs.py --size 320                      # photographs of a still life
     mivol optimize scenes/still_life/fit.toml --set field.longest=128       # the radiance field: runs/still_life/fit
     python scenes/knot/render.py                                            # the Gaussians: runs/knot/knot.ply
-    python scenes/showcase/render.py [-o runs/showcase]                     # image.png, tangent.png
+    python scenes/showcase/render.py [-o runs/showcase]                     # image.png, tangent.png, showcase.jpg
 
 ``tangent.png`` shows a derivative of the image: how each pixel changes when the smoke becomes denser (red: brighter, blue:
 darker). It is computed by forward differentiation of the same paths, through the smoke, its shadow, the glass and the table.
@@ -20,6 +20,7 @@ from mivol.files import write_exr, write_png
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from PIL import Image
 from scipy.ndimage import map_coordinates
 
 XML = Path(__file__).parent / "scene.xml"
@@ -49,7 +50,17 @@ def main() -> None:
     tangent = differentiate_by_density(scene, args.tangent_spp)
     write_exr(args.output / "tangent.exr", {"": tangent})
     write_png(args.output / "tangent.png", colour_by_sign(tangent, image))
-    print(args.output / "image.png", args.output / "tangent.png")
+    join_side_by_side(args.output)
+    print(args.output / "showcase.jpg")
+
+
+def join_side_by_side(folder: Path) -> None:
+    """Write showcase.jpg, the picture of the README: the image on the left, its derivative on the right."""
+    left, right = (Image.open(folder / f"{name}.png").convert("RGB") for name in ("image", "tangent"))
+    pair = Image.new("RGB", (left.width + right.width + 8, left.height), "white")
+    pair.paste(left, (0, 0))
+    pair.paste(right, (left.width + 8, 0))
+    pair.save(folder / "showcase.jpg", quality=88)
 
 
 def differentiate_by_density(scene: mi.Scene, spp: int) -> np.ndarray:
