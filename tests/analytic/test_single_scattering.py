@@ -16,8 +16,8 @@ import numpy as np
 import oracle_scattering as twins
 import pytest
 import scattering_scenes as small
-from false_alarms import Estimate, assert_precise, assert_same_mean, difference
-from scattering_scenes import PLACE, aimed, assert_twin, fog, mivol, moments, pencils, point, rough_grid, smoke, spot, sun
+from false_alarms import assert_precise, assert_same_mean
+from scattering_scenes import PLACE, aimed, assert_twin, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
@@ -28,7 +28,6 @@ from mivol.transport.estimators.single_scattering.scattering_derivatives import 
     event_sigma_t,
 )
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.validate.statistics import effective_dof
 from scenes import affine, as_float32, ball_of, box_of, camera, centred, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -230,14 +229,17 @@ def test_collimated_slab(mu, mu0, kind):
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["homogeneous", "grid"])
 def test_cube_lit_from_above_seen_from_the_side(kind):
-    """alpha p E0 e^{-sigma y} (1 - e^{-sigma D}) at each depth y."""
+    """alpha p E0 e^{-sigma y} (1 - e^{-sigma D}) at each depth y, where a second scattering would add 30 % and more; nothing at
+    max_depth 1."""
     sigma, depths = 2.2, np.array([0.1, 0.45, 0.9])
     build = fog(sigma, 0.6, np.eye(4)) if kind == "homogeneous" else smoke(np.full((4, 3, 2, 1), sigma), 0.6, "own", np.eye(4))
     o = np.stack([np.full(3, -2.0), np.full(3, 0.3), 1 - depths], axis=1)
     seen = pencils({"cube": build[0], "sun": sun([0, 0, -1.0], 3.0)[0]}, o, [1.0, 0, 0])
+    assert not scenes.render(seen.scene, mivol(max_depth=1), 16).any()
     m = seen.moments(mivol(), 4096)
     truth = [[twins.cube_from_the_side(0.6, 1 / (4 * math.pi), 3.0, sigma, 1 - z, 1.0)] * 3 for z in seen.o[:, 2]]
     assert_same_mean(m, np.array(truth), rounding=1e-5 * truth[0][0], what="cube")
+    assert_precise(m, 0.01 * np.array(truth))
 
 
 @pytest.mark.statistical
@@ -251,32 +253,6 @@ def test_ball_in_a_constant_sky(sigma):
     truth = np.repeat([[twins.ball_in_sky(0.9, sigma, 1.0, b)] for b in seen.o[:, 1]], 3, axis=1)
     # Shadow rays leave Mitsuba's sphere at float32 distances; sigma times 1e-5 of a length.
     assert_same_mean(m, truth, rounding=1e-5 * max(sigma, 1), what="ball")
-
-
-@pytest.mark.statistical
-@pytest.mark.slow
-def test_reciprocity():
-    """The light of an emitter at a passing b, from all sides, equals the light of an emitter at b passing a (fluence).
-
-    Both cameras see the whole box; a pixel is weighted by its share of the sphere, to second order in its size (1e-4).
-    """
-    a, b = np.array([-3.0, 0.3, 0.5]), np.array([1.5, 2.5, 1.0])
-    box, _ = smoke(rough_grid(13), 0.9, "own", name="hg", g=0.5)
-    fluences = []
-    for eye, emitter in ((a, b), (b, a)):
-        fov, res = 75.0, 32
-        sensor = scenes.camera(eye, (0, 0, 0), res=res, fov=fov)
-        scene = mi.load_dict({"type": "scene", "smoke": box, "emitter": point(emitter)[0], "sensor": sensor})
-        half = math.tan(math.radians(fov / 2))
-        x = (np.arange(res) + 0.5) / res * 2 * half - half
-        solid = (2 * half / res) ** 2 / (1 + x[:, None] ** 2 + x[None] ** 2) ** 1.5
-        m = moments(scene, mivol(), 64)
-        assert not m.mean[0].any() and not m.mean[-1].any() and not m.mean[:, 0].any(), "the box is not all seen"
-        var = m.variance_of_mean[..., 0] * solid**2
-        fluences.append(Estimate(np.sum(m.mean[..., 0] * solid), var.sum(), effective_dof(var, m.n - 1)))
-    one, two = fluences
-    assert_same_mean(one, two, rounding=2e-4 * one.mean, what="fluences")
-    assert_precise(difference(one, two), 5e-3 * one.mean, what="fluences")
 
 
 @pytest.mark.statistical

@@ -149,35 +149,18 @@ def test_a_boundary_that_is_entered_twice() -> None:
 
 @pytest.mark.slow
 @pytest.mark.statistical
-def test_surfaces_behind_are_lit_through_the_field() -> None:
-    """Rationale: shadow rays meet the field as camera rays do. Expected: the means of a homogeneous sphere in its place, of
-    images, of derivatives by the extinction, and of the film over two passes."""
-    floor = {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().translate([0, 1.2, 0]).rotate([1, 0, 0], 90).scale(3),
-        "bsdf": {"type": "diffuse", "reflectance": 0.6},
-    }
+@pytest.mark.parametrize(("albedo", "depth"), [({}, 2), ({"albedo": 0.6}, 4)])
+def test_a_ball_is_a_homogeneous_sphere(albedo: dict, depth: int, whole_paths: None) -> None:
+    """In front of a floor, whose shadow rays meet the field as camera rays do; and scattering: images and derivatives by the
+    extinction have the means of a homogeneous sphere in the ball's place, over two passes."""
+    place = mi.ScalarTransform4f().translate([0, 1.2, 0]).rotate([1, 0, 0], 90).scale(3)
+    floor = {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": 0.6}}
+    parts = {"floor": floor} if depth == 2 else {}
     emitter = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
-    constant = {"type": "mivol_medium", "sigma_t": 1.5, "scale": SCALE}
-    known = shape("sphere", constant, radius=0.8)
+    known = shape("sphere", {"type": "mivol_medium", "sigma_t": 1.5, "scale": SCALE, **albedo}, radius=0.8)
     seen = [
-        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=own, floor=floor, emitter=emitter), (key,), 2)
-        for own, key in ((shape("cube", fog(radius=0.8)), "sigma_t.sigma"), (known, "sigma_t.value.value"))
-    ]
-    for ours, truth, what in zip(*(s[:2] for s in seen), ("the radiance", "the derivative"), strict=True):
-        assert_same_mean(of_batches(ours[..., 0]), of_batches(truth[..., 0]), what=what)
-
-
-@pytest.mark.slow
-@pytest.mark.statistical
-def test_a_ball_that_scatters_any_number_of_times(whole_paths: None) -> None:
-    """Expected: the means of a homogeneous sphere in its place, which flights see exactly, of images and derivatives."""
-    emitter = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
-    own = shape("cube", {**fog(radius=0.8), "albedo": 0.6})
-    known = shape("sphere", {"type": "mivol_medium", "sigma_t": 1.5, "scale": SCALE, "albedo": 0.6}, radius=0.8)
-    seen = [
-        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=ball, emitter=emitter), (key,), 4)
-        for ball, key in ((own, "sigma_t.sigma"), (known, "sigma_t.value.value"))
+        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=ball, emitter=emitter, **parts), (key,), depth)
+        for ball, key in ((shape("cube", {**fog(radius=0.8), **albedo}), "sigma_t.sigma"), (known, "sigma_t.value.value"))
     ]
     for ours, truth, what in zip(*(s[:2] for s in seen), ("the radiance", "the derivative"), strict=True):
         assert_same_mean(of_batches(ours[..., 0]), of_batches(truth[..., 0]), what=what)
