@@ -11,6 +11,9 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from mivol.photos import Camera
+from mivol.photos.camera_path import aim_camera
+
 
 def look_at(origin: np.ndarray, target: np.ndarray = (0.0, 0.0, 0.0), up: np.ndarray = (0.0, 0.0, 1.0)) -> np.ndarray:
     """(4, 4) camera to world with x right, y up, looking along -z."""
@@ -27,6 +30,16 @@ def ring(n: int, distance: float = 4.0, height: float = 1.0) -> list[np.ndarray]
     """Poses on a circle about z, all looking at the origin."""
     angles = 2 * np.pi * np.arange(n) / n
     return [look_at(np.array([distance * np.cos(a), distance * np.sin(a), height])) for a in angles]
+
+
+def orbit(name: str, count: int, height: float, like: Camera) -> dict[str, Camera]:
+    """Cameras by name on a sphere of radius 3.5, all around the origin, up to a share of the height of the poles."""
+    cameras = {}
+    for n in range(count):
+        turn, z = 2.4 * n, height * (2 * (n + 0.5) / count - 1)
+        origin = 3.5 * np.array([*(np.sqrt(1 - z**2) * np.array([np.cos(turn), np.sin(turn)])), z])
+        cameras[name.format(n)] = aim_camera(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name.format(n))
+    return cameras
 
 
 def pixels(width: int, height: int, seed: int = 0, alpha: bool = True) -> np.ndarray:

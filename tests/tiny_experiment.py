@@ -102,3 +102,25 @@ def without_memory(sentence: str) -> str:
 def files_of(folder: Path) -> set[str]:
     """All files below a folder, relative to it."""
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def resume_stopped_fit(path: Path, problem: type, change: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The iterations of a fit that Ctrl-C stopped in iteration 45 and that goes on; with another setting it does not."""
+    whole, started = problem.loss_and_gradient, []
+
+    def stop(self: object, reals: object, iteration: int, views: int) -> object:
+        if iteration == 45:
+            raise KeyboardInterrupt
+        return whole(self, reals, iteration, views)
+
+    def note(self: object, reals: object, iteration: int, views: int) -> object:
+        started.append(iteration)
+        return whole(self, reals, iteration, views)
+
+    fit = ["optimize", path, "-o", path.parent / "run"]
+    monkeypatch.setattr(problem, "loss_and_gradient", stop)
+    assert run(*fit) == 130
+    monkeypatch.setattr(problem, "loss_and_gradient", note)
+    assert run(*fit, "--resume") == 0
+    assert run(*fit, "--resume", "--set", change) == 1
+    return started

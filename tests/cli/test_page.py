@@ -96,14 +96,19 @@ def page(run_folder) -> Page:
     return Page(write_page(run_folder).read_text(encoding="utf-8"))
 
 
+def page_of(folder: Path, title: str = "A run", **fields) -> Page:
+    """Return the page of a record that is written to a folder."""
+    write_record(RunRecord.new(title, **fields), folder)
+    return Page(write_page(folder).read_text(encoding="utf-8"))
+
+
 def one_view(folder: Path, reference: np.ndarray, render: np.ndarray, **fields) -> Page:
     """Return the page of a run with one held-out view."""
     images = []
     for role, values in (("reference", reference), ("render", render)):
         write_exr(folder / f"{role}.exr", {"Y" if values.ndim == 2 else "": values})
         images.append(Image(path=f"{role}.exr", role=role, view="one", held_out=True))
-    write_record(RunRecord.new("One view", images=images, **fields), folder)
-    return Page(write_page(folder).read_text(encoding="utf-8"))
+    return page_of(folder, "One view", images=images, **fields)
 
 
 def test_page_loads_nothing(run_folder, page):
@@ -129,9 +134,7 @@ def test_small_held_out_views_are_scrollable(tmp_path):
             here = {"view": view, "held_out": True, "caption": said, "small": view != "large"}
             images.append(Image(path=f"{view}_{role}.png", role=role, **here))
     results = {"held_out_psnr": 24.0, "psnr_colour_fitted": 25.0}
-    record = RunRecord.new("Views", images=images, judged="3 views at 2 x 2 pixels", results=results)
-    write_record(record, tmp_path)
-    page = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    page = page_of(tmp_path, "Views", images=images, judged="3 views at 2 x 2 pixels", results=results)
     text = page.text.replace("\u00a0", " ").replace("\u2011", "-")
     assert "The other 2 held-out views" in text and text.count("of one") == 2 and text.count("of two") == 1
     assert "24.0 dB PSNR on held-out views (3 views at 2 x 2 pixels; 25.0 dB after colour correction)" in text
@@ -142,8 +145,7 @@ def test_views_beyond_four_are_folded(tmp_path):
     """The first four views are visible, the others are folded."""
     write_png(tmp_path / "a.png", np.full((2, 2, 3), 0.5))
     images = [Image(path="a.png", role="reference", view=f"view {k}", held_out=True) for k in range(6)]
-    write_record(RunRecord.new("V", images=images), tmp_path)
-    assert "2 more views" in Page(write_page(tmp_path).read_text(encoding="utf-8")).text
+    assert "2 more views" in page_of(tmp_path, "V", images=images).text
 
 
 @pytest.mark.parametrize(
@@ -154,9 +156,7 @@ def test_the_page_defines_psnr(tmp_path, quantity, definition):
     """Photographs and radiance have different definitions, and the page gives only the definition in use."""
     write_png(tmp_path / "a.png", np.full((2, 2, 3), 0.5))
     images = [Image(path="a.png", role=role, view="a", held_out=True, quantity=quantity) for role in ("reference", "render")]
-    record = RunRecord.new("V", images=images, judged="1 view at 2 x 2 pixels", results={"held_out_psnr": 24.0})
-    write_record(record, tmp_path)
-    text = Page(write_page(tmp_path).read_text(encoding="utf-8")).text
+    text = page_of(tmp_path, "V", images=images, judged="1 view at 2 x 2 pixels", results={"held_out_psnr": 24.0}).text
     assert definition in text and text.count("PSNR compares") + text.count("peak of PSNR") == 1
 
 
@@ -331,8 +331,7 @@ def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):
         Image(path="render.exr", role="render", view="a"),
     ]
     volumes = [Volume(path="sigma_t.npz", role="reconstruction")]
-    write_record(RunRecord.new("Layers", images=images, volumes=volumes), tmp_path)
-    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    found = page_of(tmp_path, "Layers", images=images, volumes=volumes)
     expected = pixel_scale.to_pixels(np.array([[3.0]]), pixel_scale.Scale("signed", -4.0, 4.0))[0, 0]
     # float32 moves z by 1e-6 of 8, at most one of the map's 256 entries, which are under 5 levels apart.
     assert np.abs(dict(found.pictures())["z-image"][0, 0] - expected).max() <= 5
@@ -355,8 +354,7 @@ def test_projections_are_measured_and_modelled(tmp_path):
     volumes = [Volume(path="found.npz", role="reconstruction", profiles=True)]
     (tmp_path / "film.mp4").write_bytes(b"mp4")
     film = Image(path="film.mp4", role="film")
-    write_record(RunRecord.new("A scan", images=[film, *images], volumes=volumes), tmp_path)
-    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    found = page_of(tmp_path, "A scan", images=[film, *images], volumes=volumes)
     sections = [attributes["id"] for tag, attributes in found.tags if tag == "section" and "id" in attributes]
     assert sections[:3] == ["sinogram", "views", "volume"]
     names = [name for name, _ in found.pictures()]
@@ -381,8 +379,7 @@ def test_each_volume_is_shown_beside_its_own_truth(tmp_path):
         Volume(path="true.npz", role="truth", caption="a.sigma_t.data"),
         Volume(path="albedo.npz", role="reconstruction", quantity="albedo", caption="a.albedo.data"),
     ]
-    write_record(RunRecord.new("Two", volumes=volumes), tmp_path)
-    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    found = page_of(tmp_path, "Two", volumes=volumes)
     assert "a.sigma_t.data" in found.text and "a.albedo.data" in found.text
     shown = [attributes["alt"] for tag, attributes in found.tags if tag == "img"]
     assert [shown.count(role) for role in ("Truth", "Reconstruction")] == [3, 3] and sum("xy" in alt for alt in shown) == 1
@@ -393,8 +390,7 @@ def test_each_volume_is_shown_beside_its_own_truth(tmp_path):
 
 def test_text_of_a_record_is_escaped(tmp_path):
     plan = [PlanLine(choice="<img src=x onerror=alert(1)>", reason="a < b & c")]
-    write_record(RunRecord.new("<script>alert(1)</script>", plan=plan, config={"a": "</pre><b>"}), tmp_path)
-    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    found = page_of(tmp_path, "<script>alert(1)</script>", plan=plan, config={"a": "</pre><b>"})
     assert "script" not in {tag for tag, _ in found.tags}
     assert not any("onerror" in attributes for _, attributes in found.tags)
     assert "<script>alert(1)</script>" in found.text and "</pre><b>" in found.text
@@ -403,8 +399,7 @@ def test_text_of_a_record_is_escaped(tmp_path):
 
 @pytest.mark.parametrize("status", ["running", "stopped"])
 def test_page_of_an_empty_run(tmp_path, status):
-    write_record(RunRecord.new("Nothing yet", status=status), tmp_path)
-    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    found = page_of(tmp_path, "Nothing yet", status=status)
     assert "Nothing yet" in found.text and found.pictures() == []
     assert {"running": "Still running", "stopped": "Stopped"}[status] in found.text
 

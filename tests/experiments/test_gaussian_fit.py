@@ -9,7 +9,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from tiny_experiment import assert_explained
+from photo_sets import orbit
+from tiny_experiment import assert_explained, resume_stopped_fit
 
 from mivol import config
 from mivol.cli import main
@@ -19,9 +20,7 @@ from mivol.files import write_png
 from mivol.optim.gaussians.gaussian_plan import PRESETS
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.gaussians.gaussian_start import find_start_points, make_start_cloud
-from mivol.optim.problem import Reals
 from mivol.photos import Camera, intrinsics, load_photos
-from mivol.photos.camera_path import aim_camera
 from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.points import read_gaussians
@@ -42,14 +41,11 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud["log_scales"] -= 0.7
     cloud["harmonics"][:, 0] = 1.5 * np.sin(4 * cloud["means"])
     tensors, splatter = {name: mi.TensorXf(array) for name, array in cloud.items()}, Splatter(SIZE, SIZE, 0)
-    folder, cameras = tmp_path_factory.mktemp("photographs"), {}
+    folder = tmp_path_factory.mktemp("photographs")
     like = Camera(intrinsics(55, 55, SIZE / 2, SIZE / 2), (SIZE, SIZE), np.eye(4))
-    for n in range(VIEWS):
-        turn, height = 2.4 * n, 1.6 * (n + 0.5) / VIEWS - 0.8
-        origin = 3.5 * np.array([*(np.sqrt(1 - height**2) * np.array([np.cos(turn), np.sin(turn)])), height])
-        name = f"view_{n:02d}.png"
-        cameras[name] = aim_camera(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name)
-        seen = np.clip(np.array(splatter.forward(tensors, cameras[name], derivatives=False)[0]), 0, 1)
+    cameras = orbit("view_{:02d}.png", VIEWS, 0.8, like)
+    for name, camera in cameras.items():
+        seen = np.clip(np.array(splatter.forward(tensors, camera, derivatives=False)[0]), 0, 1)
         colour = seen[..., :3] / np.maximum(seen[..., 3:], 1e-6)
         write_png(folder / name, np.concatenate([decode_srgb(np.clip(colour, 0, 1)), seen[..., 3:]], axis=2))
     write_transforms(folder / "transforms.json", cameras, ["view_03.png", "view_08.png"])
@@ -87,7 +83,7 @@ def test_photographs_become_gaussians_and_a_page(photographs: Path, tmp_path: Pa
     assert main(["optimize", str(toml(tmp_path, photographs)), "-o", str(tmp_path / "run")]) == 0
     said = capsys.readouterr()
     assert said.out.strip().endswith("report.html")
-    for text in ("where no view sees through", "counted before it is taken", "alpha says what is there"):
+    for text in ("that no view shows as transparent", "counted before it is taken", "alpha says what is there"):
         assert text in said.err
     record = json.loads((tmp_path / "run/run.json").read_text())
     assert record["results"]["held_out_psnr"] > 18
@@ -127,24 +123,8 @@ def test_the_best_gaussians_are_kept_beside_the_last(
 @pytest.mark.slow
 def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle keeps what was done; the resumed fit begins there and ends with all steps."""
-    path, started = toml(tmp_path, photographs), []
-    whole = GaussianProblem.loss_and_gradient
-
-    def stops(problem: GaussianProblem, reals: Reals, iteration: int, views: int) -> object:
-        if iteration == 45 and not started:
-            raise KeyboardInterrupt
-        return whole(problem, reals, iteration, views)
-
-    def notes(problem: GaussianProblem, reals: Reals, iteration: int, views: int) -> object:
-        started.append(iteration)
-        return whole(problem, reals, iteration, views)
-
-    monkeypatch.setattr(GaussianProblem, "loss_and_gradient", stops)
-    assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 130
-    monkeypatch.setattr(GaussianProblem, "loss_and_gradient", notes)
-    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume"]) == 0
+    started = resume_stopped_fit(toml(tmp_path, photographs), GaussianProblem, "gaussians.degree=2", monkeypatch)
     assert started == list(range(45, 100))
-    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume", "--set", "gaussians.degree=2"]) == 1
 
 
 def test_what_the_file_says_overrides_the_preset() -> None:

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from photo_sets import write_blender
+from photo_sets import orbit, write_blender
 from PIL import Image
-from tiny_experiment import assert_explained
+from tiny_experiment import assert_explained, resume_stopped_fit
 
 from mivol import config
 from mivol.cli import main
@@ -28,9 +28,7 @@ from mivol.files import read_exr, write_exr, write_png
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS, PRESETS, RadiancePlan, RadianceStage, scale_longest
 from mivol.optim.photographs.radiance_problem import RadianceProblem
-from mivol.optim.problem import Reals
 from mivol.photos import Camera, Photos, intrinsics
-from mivol.photos.camera_path import aim_camera
 from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.validate.images import score_image
@@ -58,17 +56,19 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import mivol.plugins  # noqa: F401
 
     mi.set_variant("llvm_ad_rgb")
-    folder, truth, cameras = tmp_path_factory.mktemp("photographs"), ball(), {}
-    like = Camera(intrinsics(60, 60, SIZE / 2, SIZE / 2), (SIZE, SIZE), np.eye(4))
-    for n in range(VIEWS):
-        turn, height = 2.4 * n, 2 * (n + 0.5) / VIEWS - 1
-        origin = 3.5 * np.array([*(np.sqrt(1 - height**2) * np.array([np.cos(turn), np.sin(turn)])), height])
-        name = f"view_{n}.png"
-        cameras[name] = aim_camera(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name)
-        image = render_view(truth, cameras[name], np.ones(3)).image
-        write_png(folder / name, decode_srgb(np.clip(image, 0, 1)))
+    folder, truth = tmp_path_factory.mktemp("photographs"), ball()
+    cameras = orbit("view_{}.png", VIEWS, 1.0, Camera(intrinsics(60, 60, SIZE / 2, SIZE / 2), (SIZE, SIZE), np.eye(4)))
+    for name, camera in cameras.items():
+        write_png(folder / name, decode_srgb(np.clip(render_view(truth, camera, np.ones(3)).image, 0, 1)))
     write_transforms(folder / "transforms.json", cameras, ["view_3.png", "view_8.png"])
     return folder
+
+
+@pytest.fixture(scope="module")
+def photos(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Photos:
+    """The photographs that the experiment fits."""
+    folder = tmp_path_factory.mktemp("experiment")
+    return photo_data.read_photos(config.load(toml(folder, photographs)), folder)[0]
 
 
 def toml(folder: Path, photographs: Path, more: str = "") -> Path:
@@ -200,27 +200,10 @@ def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle keeps what was done; the resumed fit ends with all steps, and says nothing twice."""
-    path = toml(tmp_path, photographs)
-    whole = RadianceProblem.loss_and_gradient
-
-    def stops(problem: RadianceProblem, reals: Reals, iteration: int, views: int) -> object:
-        if iteration == 45:
-            raise KeyboardInterrupt
-        return whole(problem, reals, iteration, views)
-
-    def notes(problem: RadianceProblem, reals: Reals, iteration: int, views: int) -> object:
-        started.append(iteration)
-        return whole(problem, reals, iteration, views)
-
-    monkeypatch.setattr(RadianceProblem, "loss_and_gradient", stops)
-    assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 130
-    started: list[int] = []
-    monkeypatch.setattr(RadianceProblem, "loss_and_gradient", notes)
-    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume"]) == 0
+    started = resume_stopped_fit(toml(tmp_path, photographs), RadianceProblem, "field.degree=1", monkeypatch)
     assert started[0] == 45
     rows = [json.loads(line)["iteration"] for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     assert rows == sorted(set(rows))
-    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume", "--set", "field.degree=1"]) == 1
 
 
 def test_what_the_file_says_overrides_the_preset(tmp_path: Path) -> None:
@@ -317,20 +300,17 @@ def test_random_backgrounds_have_a_colour_a_photograph(tmp_path: Path) -> None:
     assert at.any() and np.array_equal(view.image[at], np.broadcast_to(view.background, view.image[at].shape))
 
 
-def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Path) -> None:
+def test_photographs_are_shrunk_to_half_a_voxel(photos: Photos) -> None:
     """Pixels of 3.5 / 60 = 0.058 at the ball: half a voxel of 2 / 4 holds 4.3, of 2 / 8 two, of 2 / 11 1.6, of 2 / 13 1.3.
 
     The nearest power of two is taken, in octaves: 2 for 1.6 and 1 for 1.3. Of 48 pixels at least 16 stay, so 4 becomes 2.
     """
-    chosen = config.load(toml(tmp_path, photographs))
-    photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = RadiancePlan((RadianceStage(4, 1), RadianceStage(8, 1), RadianceStage(11, 1), RadianceStage(13, 1, shrink=4)))
     assert [stage.shrink for stage in field_plan.adapt_plan(plan, photos).stages] == [2, 2, 2, 1]
 
 
-def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path: Path) -> None:
+def test_stages_look_at_each_pixel_so_often_at_most(photos: Photos, photographs: Path, tmp_path: Path) -> None:
     """20 epochs of V photographs: of 24 x 24 by 2 tiles of 16 pixels of 3 of them, and of 48 x 48 by one tile of each."""
-    photos, _ = photo_data.read_photos(config.load(toml(tmp_path, photographs)), tmp_path)
     count = len(photos.views)
     stages = (
         RadianceStage(11, 10_000, views=3, tiles=2),
@@ -350,14 +330,12 @@ def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path:
     assert field_plan.explain_steps(RadiancePlan(stages)).reason == "field.effort"
 
 
-def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
+def test_a_long_box_has_as_many_nodes_as_a_cube(photos: Photos, photographs: Path, tmp_path: Path) -> None:
     """A box of 2 x 0.5 x 0.25 with 8 nodes along it has 8 x 2 x 1; with 8 / (2^-2 2^-3)^(1/3) = 25.4 it has 8^3.
 
     Voxels are no smaller than two pixels of 0.058 for that (17 along 2), or what the plan says (one and a half: 22); never
     smaller than a pixel (34), for a few nodes more than that (16); and as they are where a file says so.
     """
-    chosen = config.load(toml(tmp_path, photographs))
-    photos, _ = photo_data.read_photos(chosen, tmp_path)
     slab = np.array([[-1, -0.25, -0.125], [1, 0.25, 0.125]])
     assert scale_longest(8, slab) == 25 and scale_longest(8, photos.box) == 8
     long = replace(photos, survey=replace(photos.survey, box=slab))
@@ -384,10 +362,8 @@ def test_few_photographs_are_smoothed_each_step(photographs: Path, tmp_path: Pat
     assert field_plan.adapt_plan(plan, many).tv_every == 4
 
 
-def test_colours_of_few_photographs_do_not_decay(photographs: Path, tmp_path: Path) -> None:
+def test_colours_of_few_photographs_do_not_decay(photos: Photos) -> None:
     """The preset for captures asks few for less than many, of the degree too; what the file says holds for both."""
-    chosen = config.load(toml(tmp_path, photographs))
-    photos, _ = photo_data.read_photos(chosen, tmp_path)
     many = replace(photos, views=photos.views * (FEW_PHOTOGRAPHS // len(photos.views) + 1))
 
     def found(**field: float) -> list[tuple[float, int]]:
@@ -401,10 +377,9 @@ def test_colours_of_few_photographs_do_not_decay(photographs: Path, tmp_path: Pa
     assert found(preset="cpu") == [(12, 2), (12, 2)]
 
 
-def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Path) -> None:
+def test_nested_boxes_are_those_that_points_need(photos: Photos, photographs: Path, tmp_path: Path) -> None:
     """Points up to 3 half edges from the middle need 3 boxes of 5; the plan says what is left out, and where cameras stand."""
     chosen = config.load(toml(tmp_path, photographs))
-    photos, _ = photo_data.read_photos(chosen, tmp_path)
     half = (photos.box[1] - photos.box[0]) / 2
     points = photos.box.mean(axis=0) + half * np.concatenate([np.tile([0, 3, 0], (997, 1)), np.tile([0, 0, 4.5], (3, 1))])
     plan = replace(field_plan.make_plan(chosen), levels=5, near=1.0)
