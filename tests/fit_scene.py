@@ -16,11 +16,7 @@ def absorbing_scene(values: np.ndarray) -> mi.Scene:
     """A cube [-1, 1]^3 of stock ``heterogeneous`` matter with albedo 0, over a stock grid (Z, Y, X, 1)."""
     place = mi.ScalarTransform4f().translate(-1).scale(2)
     grid = mi.VolumeGrid(np.ascontiguousarray(values, dtype=np.float32))
-    medium = {
-        "type": "heterogeneous",
-        "albedo": 0.0,
-        "sigma_t": {"type": "gridvolume", "grid": grid, "to_world": place},
-    }
+    medium = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": {"type": "gridvolume", "grid": grid, "to_world": place}}
     return mi.load_dict(
         {
             "type": "scene",

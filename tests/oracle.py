@@ -122,8 +122,7 @@ def trilinear_slope(values: np.ndarray, q: np.ndarray) -> np.ndarray:
     step = 1e-3
     inside = np.floor(q) + np.clip(q - np.floor(q), step, 1 - step)
     slopes = [
-        (trilinear(values, inside + step * axis) - trilinear(values, inside - step * axis)) / (2 * step)
-        for axis in np.eye(3)
+        (trilinear(values, inside + step * axis) - trilinear(values, inside - step * axis)) / (2 * step) for axis in np.eye(3)
     ]
     return np.sqrt(sum(s * s for s in slopes))
 
@@ -131,9 +130,7 @@ def trilinear_slope(values: np.ndarray, q: np.ndarray) -> np.ndarray:
 # -- Optical depth ---------------------------------------------------------------------------------------------------
 
 
-def crossings(
-    values: np.ndarray, to_world: np.ndarray, o: np.ndarray, d: np.ndarray, t0: float, t1: float
-) -> np.ndarray:
+def crossings(values: np.ndarray, to_world: np.ndarray, o: np.ndarray, d: np.ndarray, t0: float, t1: float) -> np.ndarray:
     """Sorted t at which the ray enters the box, crosses a plane through voxel centres, or leaves; cut to [t0, t1]."""
     n = np.array(grid_shape(values))
     q, dq = to_lattice(values, to_world, o, d)

@@ -115,12 +115,7 @@ def tau_fast(
 
 
 def tau_and_row(
-    shape: tuple[int, ...],
-    to_world: np.ndarray,
-    o: np.ndarray,
-    d: np.ndarray,
-    t_max: float = math.inf,
-    skip: bool = False,
+    shape: tuple[int, ...], to_world: np.ndarray, o: np.ndarray, d: np.ndarray, t_max: float = math.inf, skip: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Optical depth through a grid of ones, and the sum over rays of its gradient (Z, Y, X), by the code under test."""
     from mivol.transport.media.grid_integral import integrate_tau
@@ -159,12 +154,7 @@ def medium(kind: str, sigma_t: object, albedo: object = 0.0, **more: object) -> 
 def box_of(interior: dict, to_world: np.ndarray) -> dict:
     """The unit cube, placed, as an invisible boundary with a medium inside."""
     half = affine(0.5 * np.eye(3), np.full(3, 0.5))  # Mitsuba's cube is [-1, 1]^3
-    return {
-        "type": "cube",
-        "to_world": transform(np.asarray(to_world) @ half),
-        "bsdf": {"type": "null"},
-        "interior": interior,
-    }
+    return {"type": "cube", "to_world": transform(np.asarray(to_world) @ half), "bsdf": {"type": "null"}, "interior": interior}
 
 
 def ball_of(interior: dict, centre: np.ndarray, radius: float) -> dict:

@@ -1,7 +1,7 @@
 """The shape of the code: sizes of functions and files, parameters, circles of imports. Prints JSON.
 
-    tests/shape.py              of this checkout
-    tests/shape.py OTHER        of another one
+tests/shape.py              of this checkout
+tests/shape.py OTHER        of another one
 """
 
 from __future__ import annotations

@@ -265,11 +265,7 @@ SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
         ("transforms.json",),
         mivol.load_photos,
     ),
-    "colmap": (
-        write_colmap,
-        ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
-        mivol.load_photos,
-    ),
+    "colmap": (write_colmap, ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"), mivol.load_photos),
     "colmap text": (
         lambda folder: write_colmap(folder, encoding="txt"),
         ("sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"),

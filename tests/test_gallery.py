@@ -42,9 +42,7 @@ def test_a_missing_picture_and_an_old_page_are_said(
     assert "--draw demo" in said and "--write" not in said
 
 
-def test_an_example_is_run_without_public_data(
-    gallery: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_example_is_run_without_public_data(gallery: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it writes becomes a JPEG of HEIGHT pixels."""
     ran = []
 

@@ -25,7 +25,7 @@ INSIDE = {
 directly in the outer room. The latter import no inner room."""
 STARTS_THREADS = {"threading", "multiprocessing", "subprocess", "concurrent", "_thread", "asyncio"}
 STARTS_NOTHING = {
-    *("subprocess.SubprocessError", "subprocess.TimeoutExpired", "threading.current_thread", "threading.main_thread"),
+    *("subprocess.SubprocessError", "subprocess.TimeoutExpired", "threading.current_thread", "threading.main_thread")
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -86,10 +86,7 @@ def test_a_cell_costs_four_corners_and_the_first_one_eight(monkeypatch: pytest.M
 
     monkeypatch.setattr(Exact, "_value", counted(value, read))
     monkeypatch.setattr(Exact, "_write", counted(write, written))
-    with (
-        dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
-        dr.scoped_set_flag(dr.JitFlag.SymbolicConditionals, False),
-    ):
+    with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False), dr.scoped_set_flag(dr.JitFlag.SymbolicConditionals, False):
         source = make_exact(field, rays.d, slope=True)
         seen = render_rays(cells, source, make_model(field), rays)
         # Seven cells: half a voxel before the first node, five between nodes, half a voxel behind the last one.

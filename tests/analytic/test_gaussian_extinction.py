@@ -57,12 +57,7 @@ def part_of(gaussians: Gaussians, scale: float = SCALE) -> GaussianExtinction:
     return GaussianExtinction("sigma_t", GaussianField.from_gaussians(gaussians, np.eye(4)), mi.Float(scale))
 
 
-SPANS = {
-    "through": (0.0, np.inf),
-    "up to the middle": (0.0, 2.0),
-    "a piece": (1.7, 2.2),
-    "from the middle on": (2.0, np.inf),
-}
+SPANS = {"through": (0.0, np.inf), "up to the middle": (0.0, 2.0), "a piece": (1.7, 2.2), "from the middle on": (2.0, np.inf)}
 
 
 @pytest.mark.parametrize("span", SPANS)

@@ -63,7 +63,7 @@ def test_the_pair_is_adjoint(head: study.Scan) -> None:
 def test_costs(head: study.Scan) -> None:
     result = study.measure_costs(head)
     assert set(result) == {
-        *("seconds_A", "seconds_AT", "rays_per_second_A", "AT_over_A", "adjoint_mismatch", "voxels_own_error"),
+        *("seconds_A", "seconds_AT", "rays_per_second_A", "AT_over_A", "adjoint_mismatch", "voxels_own_error")
     }
     assert result["rays_per_second_A"] == pytest.approx(24 * 16 * 16 / result["seconds_A"])
     assert 0 < result["voxels_own_error"] < 0.3

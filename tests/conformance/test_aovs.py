@@ -15,18 +15,7 @@ from oracle import box_interval, depth_twin, overlap, sphere_interval, tau_scale
 
 from mivol.errors import MivolError
 from mivol.transport.line_integrals import aovs
-from scenes import (
-    as_float32,
-    ball_of,
-    box_of,
-    camera,
-    centred,
-    grid_volume,
-    medium,
-    render,
-    rotation,
-    sky,
-)
+from scenes import as_float32, ball_of, box_of, camera, centred, grid_volume, medium, render, rotation, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -97,10 +86,7 @@ SCENES = {
                 CUBE,
             )
         },
-        [
-            grid_field(grid(4), SMALL),
-            constant_field(as_float32(RGB), in_box(CUBE)),
-        ],
+        [grid_field(grid(4), SMALL), constant_field(as_float32(RGB), in_box(CUBE))],
     ),
     "two boxes, the near one last, and balls": lambda: (
         {

@@ -210,11 +210,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     "les outside": ("a.txt", lambda: made.les([(4, 0, 0, 1, 1)]), ("[4, 0, 0]", "[4, 3, 2]")),
     "les radius": ("a.txt", lambda: made.les([(0, 0, 0, 1, 0)]), ("radius 0",)),
     "les cut": ("a.txt", lambda: made.les([(0, 0, 0, 1, 1)])[:-4], ("3 numbers", "5")),
-    "les uneven": (
-        "a.csv",
-        lambda: made.les([], size="4,3,3", altitudes="0.4,0.44,0.52"),
-        ("uneven",),
-    ),
+    "les uneven": ("a.csv", lambda: made.les([], size="4,3,3", altitudes="0.4,0.44,0.52"), ("uneven",)),
     "les huge": ("a.csv", lambda: made.les([(0, 0, 0, 1, 1)], size="90000000,90000,2"), ("1073741824 cells",)),
 }
 

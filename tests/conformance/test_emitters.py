@@ -7,17 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scattering_scenes as small
-from scattering_scenes import (
-    close_up,
-    mivol,
-    moments,
-    rough_grid,
-    smoke,
-)
-from volpath_scenes import (
-    EMITTERS,
-    same,
-)
+from scattering_scenes import close_up, mivol, moments, rough_grid, smoke
+from volpath_scenes import EMITTERS, same
 
 from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, SceneEmitters, make_ball_sampler
 from mivol.transport.traversal.random_numbers import Strata

@@ -14,14 +14,7 @@ import numpy as np
 import pytest
 from aov_scenes import shoot
 from false_alarms import Estimate, assert_precise, assert_same_bounded_mean, assert_same_mean, difference, fresh
-from oracle import (
-    box_interval,
-    overlap,
-    pixel_means,
-    sphere_interval,
-    tau_scale,
-    tau_twin,
-)
+from oracle import box_interval, overlap, pixel_means, sphere_interval, tau_scale, tau_twin
 from scattering_scenes import cases
 
 from mivol.validate.moments import Moments

@@ -194,8 +194,10 @@ def test_derivatives_by_parameters_are_differences_of_values(variant, name):
 def test_xml(variant, tmp_path):
     (tmp_path / "drops.csv").write_text("angle,value\n0,3\n90,1\n180,2\n")
     scenes = {
-        **{kind: "".join(f'<float name="{key}" value="0.3"/>' for key, _ in mi.traverse(mi.load_dict(given)))
-           for kind, given in CLOSED_FORMS.items()},
+        **{
+            kind: "".join(f'<float name="{key}" value="0.3"/>' for key, _ in mi.traverse(mi.load_dict(given)))
+            for kind, given in CLOSED_FORMS.items()
+        },
         "mivol_tabulated": f'<string name="filename" value="{tmp_path / "drops.csv"}"/>',
         "mivol_mixture": '<phase name="a" type="hg"/><phase name="b" type="mivol_rayleigh"/>'
         '<float name="weight_a" value="0.2"/>'

@@ -7,21 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scattering_scenes as small
-from false_alarms import (
-    assert_precise,
-    assert_same_mean,
-)
-from scattering_scenes import (
-    PLACE,
-    close_up,
-    mivol,
-    point,
-    rough_grid,
-)
-from volpath_scenes import (
-    EMITTERS,
-    same,
-)
+from false_alarms import assert_precise, assert_same_mean
+from scattering_scenes import PLACE, close_up, mivol, point, rough_grid
+from volpath_scenes import EMITTERS, same
 
 import scenes
 from scenes import box_of, grid_volume, medium, refused, transform

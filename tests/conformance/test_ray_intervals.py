@@ -6,26 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scattering_scenes as small
-from scattering_scenes import (
-    PLACE,
-    assert_same_images,
-    close_up,
-    mivol,
-    moments,
-    point,
-)
-from volpath_scenes import (
-    FOG,
-    LEAK,
-    RED,
-    cube,
-    floor,
-    grid_in,
-    lit,
-    same,
-    square,
-    turn,
-)
+from scattering_scenes import PLACE, assert_same_images, close_up, mivol, moments, point
+from volpath_scenes import FOG, LEAK, RED, cube, floor, grid_in, lit, same, square, turn
 
 import scenes
 from scenes import ball_of, box_of, centred, medium, rotation

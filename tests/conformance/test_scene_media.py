@@ -5,17 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import pytest
 import scattering_scenes as small
-from scattering_scenes import (
-    PLACE,
-    assert_same_images,
-    mivol,
-    moments,
-)
-from volpath_scenes import (
-    LEAK,
-    grid_in,
-    lit,
-)
+from scattering_scenes import PLACE, assert_same_images, mivol, moments
+from volpath_scenes import LEAK, grid_in, lit
 
 import scenes
 from scenes import ball_of, box_of

@@ -8,21 +8,8 @@ import numpy as np
 import pytest
 import scattering_scenes as small
 from false_alarms import assert_rate, fresh
-from scattering_scenes import (
-    PLACE,
-    close_up,
-    point,
-)
-from volpath_scenes import (
-    EMITTERS,
-    RED,
-    area,
-    behind_a_mask,
-    cube,
-    grid_in,
-    same,
-    square,
-)
+from scattering_scenes import PLACE, close_up, point
+from volpath_scenes import EMITTERS, RED, area, behind_a_mask, cube, grid_in, same, square
 
 from mivol.transport.estimators.lighting.shadow_rays import ROULETTE_TAU, find_transmittance
 from mivol.transport.traversal.random_numbers import seed_pcg32

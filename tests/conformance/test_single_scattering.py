@@ -23,33 +23,8 @@ from false_alarms import (
     fresh,
     over_pixels,
 )
-from scattering_scenes import (
-    PLACE,
-    assert_same_images,
-    close_up,
-    fog,
-    mivol,
-    moments,
-    point,
-    rough_grid,
-    smoke,
-    volpath,
-)
-from volpath_scenes import (
-    BARE,
-    FOG,
-    LEAK,
-    RED,
-    area,
-    behind_a_mask,
-    cube,
-    floor,
-    grid_in,
-    lit,
-    same,
-    square,
-    turn,
-)
+from scattering_scenes import PLACE, assert_same_images, close_up, fog, mivol, moments, point, rough_grid, smoke, volpath
+from volpath_scenes import BARE, FOG, LEAK, RED, area, behind_a_mask, cube, floor, grid_in, lit, same, square, turn
 
 import scenes
 from mivol.validate.moments import Moments

@@ -139,8 +139,7 @@ def test_an_spz_larger_than_memory_is_refused_before_it_is_taken(read: Read, mon
 
 
 @pytest.mark.parametrize(
-    ("at", "new", "said"),
-    [(128, b"\0", "a damaged Zstandard stream"), (132, b"\x25", "a damaged Zstandard stream")],
+    ("at", "new", "said"), [(128, b"\0", "a damaged Zstandard stream"), (132, b"\x25", "a damaged Zstandard stream")]
 )
 def test_damaged_zstandard_ends_in_a_sentence(read: Read, at: int, new: bytes, said: str) -> None:
     needs_zstandard(4)

@@ -99,8 +99,7 @@ def test_a_reference_is_rendered_as_the_file_says(
     monkeypatch.setattr(references, "standard_error", lambda found: "its error")
     made = SimpleNamespace(mean="its mean")
     chosen = SimpleNamespace(
-        fit=SimpleNamespace(max_depth=7),
-        reference=SimpleNamespace(standard_error=wanted, spp=33, seed=5, max_depth=own),
+        fit=SimpleNamespace(max_depth=7), reference=SimpleNamespace(standard_error=wanted, spp=33, seed=5, max_depth=own)
     )
     context = RunContext(chosen, Path(), tmp_path)
     references.render_views(SimpleNamespace(add=lambda *view: kept.append(view)), context, chosen, "scene", ["a", "b"])

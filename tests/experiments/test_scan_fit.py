@@ -492,10 +492,7 @@ REFUSED = {
         "18 projections and a geometry of 3 views",
     ),
     "table with a line too short": (['scan={beam="table", file="degrees.txt", detector=[14,14]}'], "12 finite numbers"),
-    "measured file that is not there": (
-        ['data={source="measured", file="a.h5"}', 'scan={beam="parallel"}'],
-        "a.h5",
-    ),
+    "measured file that is not there": (['data={source="measured", file="a.h5"}', 'scan={beam="parallel"}'], "a.h5"),
     "unknown table": (['data={source="shepp_logan", table="x"}'], "x"),
     "source inside the object's axis": (["scan.source_to_axis=0"], "> 0"),
     "prior where none is used": (["solve.name=sirt", "solve.tv=1"], "prior"),

@@ -113,8 +113,7 @@ def test_density_under_other_emitters(density, name):
 @pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize(
-    ("density", "albedo"),
-    small.cases([("empty", 0.6), ("rough", 0.6), ("rough", 0.0)], [("empty", 0.6), ("rough", 0.0)]),
+    ("density", "albedo"), small.cases([("empty", 0.6), ("rough", 0.6), ("rough", 0.0)], [("empty", 0.6), ("rough", 0.0)])
 )
 def test_density_under_a_sky(density, albedo):
     """Turned light against the background that is taken away, of nearly the same size."""
@@ -331,10 +330,7 @@ def test_scattering_grid():
     v = np.random.default_rng(7).uniform(0.2, 1, scatter.shape)
 
     def light(x):
-        media = [
-            twins.Medium(twins.Grid(absorb, PLACE), 0.0),
-            twins.Medium(twins.Grid(scatter + x * v, PLACE), 1.0),
-        ]
+        media = [twins.Medium(twins.Grid(absorb, PLACE), 0.0), twins.Medium(twins.Grid(scatter + x * v, PLACE), 1.0)]
         return rows @ twins.radiance(media, [emitter[1]], seen.o, seen.d)[:, 0]
 
     along = sums(seen, MEDIUM + "sigma_s.data", w, 512, v)

@@ -151,8 +151,7 @@ OTHERS = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("key", "depth"),
-    cases(OTHERS, [("floor.bsdf.reflectance.value", 2), ("sky.radiance.value", 1), ("sky.radiance.value", 3)]),
+    ("key", "depth"), cases(OTHERS, [("floor.bsdf.reflectance.value", 2), ("sky.radiance.value", 1), ("sky.radiance.value", 3)])
 )
 def test_other_parameters_against_finite_differences(key, depth):
     """The scale of a medium, the radiance of emitters and the colour of surfaces have their derivatives too."""

@@ -123,10 +123,7 @@ def test_pcg_with_prior_reaches_the_minimum_that_lbfgs_finds(scan):
 
     def objective(x):
         r = problem.A @ x - problem.b
-        return (
-            0.5 * np.sum(problem.weights * r * r) + prior.value(x),
-            problem.A.T @ (problem.weights * r) + prior.gradient(x),
-        )
+        return (0.5 * np.sum(problem.weights * r * r) + prior.value(x), problem.A.T @ (problem.weights * r) + prior.gradient(x))
 
     options = {"maxiter": 5000, "maxfun": 20000, "ftol": 1e-15, "gtol": 1e-10}
     found = scipy.optimize.minimize(objective, np.zeros(GRID.size), jac=True, bounds=[(0, None)] * GRID.size, options=options)

@@ -72,9 +72,7 @@ TOO_LARGE = [("cpu", 36, 40), ("cpu", 128, 100), ("gpu", 300, 500), ("many views
 
 
 @pytest.mark.parametrize(("preset", "longest", "limit"), TOO_LARGE)
-def test_suggested_resolution_fits(
-    variant_rgb: str, photos: list[Photo], preset: str, longest: int, limit: int
-) -> None:
+def test_suggested_resolution_fits(variant_rgb: str, photos: list[Photo], preset: str, longest: int, limit: int) -> None:
     """Taken as the next ``longest``, whichever stage then takes the most; one more is refused. Limits in MiB."""
     views = RayBatches.from_photos(photos[:2])
 

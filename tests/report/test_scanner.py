@@ -140,9 +140,6 @@ def test_a_flat_side_view_has_one_vertical_tick() -> None:
     side, _ = plot_scanner(ParallelBeam(ANGLES, (1, 7), (0.01, 0.5)), slices, np.arange(0)).axes
     ticks = [
         [low <= at <= high for at in axis.get_majorticklocs()]
-        for axis, (low, high) in (
-            (side.xaxis, side.get_xlim()),
-            (side.zaxis, side.get_zlim()),
-        )
+        for axis, (low, high) in ((side.xaxis, side.get_xlim()), (side.zaxis, side.get_zlim()))
     ]
     assert sum(ticks[0]) > 2 >= sum(ticks[1])
