@@ -21,26 +21,26 @@ from mivol.tomography.geometry import FlatDetector, VoxelGrid
 __all__ = ["draw_photo_cameras", "draw_scanner", "draw_view_cameras", "survey_all_cameras"]
 
 CAPTIONS = {
-    "side": "Where the cameras stand, and the box where matter may be",
-    "plan": "The same from above",
+    "side": "Cameras, and the box of the matter",
+    "plan": "View from above",
     "far": "All nested boxes from above",
 }
 
 
 def draw_photo_cameras(folder: Path, photos: Photos, judged: Photos | None, levels: int = 1) -> list[Image]:
-    """Draw the cameras of all photographs and their boxes.
+    """Draw the photographs' cameras and the boxes of the model.
 
     Args:
         folder: run folder.
         photos: photographs to fit.
-        judged: photographs that judge the fit; may be None.
+        judged: held-out photographs; may be None.
         levels: nested boxes of the model.
     """
     return _pictures(folder, survey_all_cameras(photos, judged, levels))
 
 
 def survey_all_cameras(photos: Photos, judged: Photos | None, levels: int) -> PhotoSurvey:
-    """Survey of all photographs and nested boxes of a fit."""
+    """Survey of fitted and held-out photographs, with the nested boxes of a fit."""
     frames = photos.survey.frames + (() if judged is None else judged.survey.frames)
     return replace(photos.survey, frames=frames, levels=levels)
 
@@ -69,7 +69,7 @@ def draw_scanner(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held_out
 
     Args:
         folder: run folder.
-        geometry: geometry of all views.
+        geometry: geometry of the scan.
         grid: the voxels.
         held_out: indices of the held-out views.
     """
@@ -77,7 +77,7 @@ def draw_scanner(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held_out
         plot_scanner(geometry, grid, held_out, folder / f"scanner_{part}.png", part)
     count = geometry.shape[0]
     drawn = sum(map(len, select_views(count, held_out)))
-    title = "Which way the light goes" if geometry.whole_lines else "Where the source stands"
+    title = "Directions of the light" if geometry.whole_lines else "Positions of the source"
     captions = {
         "side": f"{title} in {f'{drawn} of ' * (drawn < count)}{count} views, some detectors, and the box of the voxels",
         "plan": CAPTIONS["plan"],

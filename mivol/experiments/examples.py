@@ -1,7 +1,7 @@
 """The examples of mivol: their list, their files, and their runs.
 
-Conventions. An example is a folder of ``scenes/`` with a ``fit.toml``; a wheel has them in ``mivol/examples``. An example of
-public data has a stand-in, a procedural volume from a seed, so that it runs without the data.
+Conventions. An example is a folder of ``scenes/`` with a ``fit.toml``; a wheel installs the examples in ``mivol/examples``.
+An example of public data has a stand-in, a procedural volume from a seed, and runs without the data.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CHECKOUT = Path(__file__).resolve().parents[2] / "scenes"
 
 
 TEXTS = (".toml", ".xml", ".md", ".py")
-"""Suffixes of an example's files that may contain the names of other files."""
+"""Suffixes of files with names of other files in the text."""
 
 NEIGHBOUR = re.compile(r"\.\./demo/([\w.]+)")
 """A file of the example ``demo`` in the text of another example."""
@@ -54,7 +54,7 @@ class StandIn:
     shape: tuple[int, int, int]
     peak: float
 
-    says = "a procedural volume stands in for it"
+    says = "a procedural volume replaces it"
 
     def make(self, folder: Path) -> list[str]:
         """Write the volume to a folder; return the settings with its path."""
@@ -67,15 +67,14 @@ class StandIn:
         return path
 
     def place(self, named: str, folder: Path) -> Path:
-        """Return the path in a script's argument: a path, or ``data:NAME``, for which the stand-in is made if the data are not
-        here.
+        """Return the path in a script's argument: a path, or ``data:NAME``; the stand-in replaces missing data.
 
         Raises:
-            MivolError: other data, which have not been fetched.
+            MivolError: other data that have not been fetched.
         """
         if named != PREFIX + self.data or find_local_file(self.data) is not None:
             return resolve_path(Path(), named).resolve()
-        print(f'the public data set "{self.data}" is not here: {self.says} (mivol fetch {self.data} brings it)')
+        print(f'the public data set "{self.data}" is not on this machine: {self.says} (get it: mivol fetch {self.data})')
         return self.write(folder)
 
 
@@ -85,13 +84,13 @@ class ComputedScan:
 
     Attributes:
         data: name of the public data.
-        settings: settings that replace those of the file.
+        settings: settings replacing the settings of the file.
     """
 
     data: str
     settings: tuple[str, ...]
 
-    says = "exact projections of a phantom, with noise, stand in for it"
+    says = "exact projections of a phantom, with noise, replace it"
 
     def make(self, folder: Path) -> list[str]:
         """Return the settings; nothing is written."""
@@ -104,10 +103,10 @@ class Example:
 
     Attributes:
         says: subject of the example.
-        stand_in: replacement of its public data; None without public data.
-        photographs: script in its folder that makes its photographs; may be "".
-        scan: script in its folder that makes its readings, with a stand-in of its own; may be "".
-        folder: folder of its files; "" for a folder of its own name.
+        stand_in: replacement of the public data; None without public data.
+        photographs: script making the photographs, in the example's folder; may be "".
+        scan: script making the readings, with an own stand-in, in the example's folder; may be "".
+        folder: folder of the files; "" means the example's name.
         file: experiment of the example.
     """
 
@@ -140,7 +139,7 @@ _SLICES = ComputedScan(
         "solve.iterations=20",
     ),
 )
-"""As many views as the tooth, and half as many columns; the head fills them."""
+"""As many views as the tooth, and half as many columns; the head fills the detector."""
 
 SCAN_FILES = {
     "scan.file": "panels.txt",
@@ -148,7 +147,7 @@ SCAN_FILES = {
     "data.flats": "flats.npy",
     "data.darks": "darks.npy",
 }
-"""Settings of an example with a ``scan``, and the files that its script writes."""
+"""Settings of an example with a ``scan``, and the files written by the script."""
 
 EXAMPLES: dict[str, Example] = {
     "demo": Example("a tangle of absorbing matter from 16 pictures, about a minute"),
@@ -167,7 +166,7 @@ EXAMPLES: dict[str, Example] = {
 
 
 def examples_folder() -> Path:
-    """Folder of the examples: in the package, or beside it in a checkout."""
+    """Folder of the examples: in the package, or beside the package in a checkout."""
     return INSTALLED if INSTALLED.is_dir() else CHECKOUT
 
 
@@ -181,7 +180,7 @@ def find_example(name: str) -> Example:
     """Return the example with this name.
 
     Raises:
-        MivolError: an unknown name, with the nearest known one.
+        MivolError: an unknown name, with the nearest known name.
     """
     if name not in EXAMPLES:
         raise MivolError(f'there is no example "{name}": {suggest_name(name, list(EXAMPLES))}')
@@ -203,7 +202,7 @@ def copy_example(name: str, into: Path) -> Path:
     """
     example = find_example(name)
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
-        raise MivolError(f'"{into}" is there already: name a folder that is not there yet, or is empty.')
+        raise MivolError(f'"{into}" exists and is not an empty folder: name a new or an empty folder.')
     source = example.source(name)
     with disk_faults(into, "room for the files of the example", " (nothing was left half-written)"), whole_folder(into):
         for path in sorted(source.rglob("*")):
@@ -218,10 +217,10 @@ def copy_example(name: str, into: Path) -> Path:
 
 
 def copy_text(path: Path, target: Path, source: Path, into: Path) -> None:
-    """Copy a text of an example from ``source``, and adapt its paths to ``into``.
+    """Copy a text of an example from ``source``, and adapt the paths in the text to ``into``.
 
-    Files of a neighbour (``../demo/empty.vol``) are copied beside it. Runs go to the working directory, as for the example's
-    scripts, and commands contain the new folder.
+    Files of a neighbour (``../demo/empty.vol``) are copied into the same folder. Runs go to the working directory, as for the
+    example's scripts, and commands contain the new folder.
     """
     text = path.read_text(encoding="utf-8")
     for name in NEIGHBOUR.findall(text):
@@ -232,7 +231,7 @@ def copy_text(path: Path, target: Path, source: Path, into: Path) -> None:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[None]:
-    """Remove the folder if an error interrupts its filling."""
+    """Remove the folder after an error in the block."""
     try:
         yield
     except BaseException:
@@ -247,17 +246,17 @@ def run_example(
 
     Args:
         name: key of ``EXAMPLES``.
-        folder: run folder; None means the ``output`` of the changes, else runs/NAME.
+        folder: run folder; None means the ``output`` of the changes, or runs/NAME.
         changes: settings as in ``--set``.
         progress: display of the run's progress.
         command: command line, for the record.
 
     Raises:
-        MivolError: an unknown example, and refusals of its fit.
+        MivolError: an unknown example, or a refusal of the fit.
     """
     example, progress = find_example(name), progress or NullProgress()
     source = example.source(name)
-    # Before anything is made for it: what the changes ask for may be refused.
+    # First check the changes: an invalid setting is refused before files are made.
     output = config.load(source / example.file, (f"output=runs/{name}", *changes)).output
     folder = folder or Path(output)
     all_changes = (*prepare(name, example, source, folder, progress), *changes)
@@ -284,13 +283,13 @@ def prepare(name: str, example: Example, source: Path, folder: Path, progress: P
         return []
     stand_in = example.stand_in
     progress.say([
-        f'the public data set "{stand_in.data}" is not on this machine: {stand_in.says} (mivol fetch {stand_in.data} brings it)'
+        f'the public data set "{stand_in.data}" is not on this machine: {stand_in.says} (get it: mivol fetch {stand_in.data})'
     ])  # fmt: skip
     return stand_in.make(folder)
 
 
 def to_toml_string(path: Path) -> str:
-    """A path as a string of TOML that keeps backslashes."""
+    """A path as a literal TOML string, with backslashes unchanged."""
     return f"'{path}'"
 
 

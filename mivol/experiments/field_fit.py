@@ -1,7 +1,7 @@
 """A fit of a radiance field to photographs.
 
 Conventions. The loss in ``metrics.jsonl`` is the mean squared error of a step's rays. ``field.npz`` is the field, ``sky.exr``
-the sky behind it, and ``volumes/`` has its density for other programs.
+the fitted sky, and ``volumes/`` has the density for other programs.
 """
 
 from __future__ import annotations
@@ -96,11 +96,11 @@ class FieldFit(PhotoFit):
 
 
 def write_result(folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0) -> None:
-    """Write the field of a problem, and its sky if there is one.
+    """Write the field of a problem, and the fitted sky if present.
 
     Args:
         folder, problem, which: folder, problem, and a suffix of the file names.
-        white: factor on the colours: the radiance that was 1 in the fit.
+        white: factor on the colours: the radiance of the value 1 in the fit.
     """
     write_field(folder / f"field{which}.npz", problem.field.scale_colours(white))
     if problem.sky is not None:
@@ -110,7 +110,7 @@ def write_result(folder: Path, problem: RadianceProblem, which: str = "", white:
 def judge_view(
     problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]
 ) -> tuple[FieldView, ImageScore]:
-    """Render a photograph's view of the field, and measure it."""
+    """Render a photograph's view of the field; return the view and the errors."""
     view = render_view(problem.field, photo.camera, find_background(problem, photo))
     return view, score_image(view.image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
@@ -132,7 +132,7 @@ def tabulate_storage(field: SphericalGrid, path: Path) -> Table:
     }
     rows = [(name, f"{size / 2**20:.2f} MiB", f"{size / nodes:.3g}") for name, size in kinds.items()]
     head = (f"{kept} of {nodes} nodes are kept ({kept / nodes:.1%})", "in all", "bytes a node of the box")
-    return Table(title="What it takes", head=head, rows=tuple(rows))
+    return Table(title="Storage", head=head, rows=tuple(rows))
 
 
 def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:

@@ -1,4 +1,4 @@
-"""The plan of a radiance-field fit: a preset, changed by the settings and adapted to the photographs, with its reasons."""
+"""The plan of a radiance-field fit: a preset, changed by the settings and adapted to the photographs, with reasons."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from mivol.photos.region import FEWEST_POINTS, count_levels, nested_boxes, point
 from mivol.report.record import PlanLine
 
 GAINS = PlanLine(
-    choice="gains of each photograph, where they disagree",
-    reason="cameras that choose their exposure; after the first stage they are left out where photographs agree",
+    choice="gains of each photograph, if the photographs differ",
+    reason="for cameras with automatic exposure; dropped after the first stage if the photographs agree",
 )
 
 SMALLEST = 16
@@ -40,7 +40,7 @@ steps the field stays far from its optimum (12 photographs of wires, held-out vi
 300, and 27.6 with 300 steps in each stage)."""
 
 LEARNED = {"sky": ("sky", "sky_smooth"), "nested": ("sky", "sky_smooth", "levels", "near")}
-"""Fields of the plan that come from the preset ``capture``, by the word for the background."""
+"""Fields of the plan taken from the preset ``capture``, by the word for the background."""
 
 
 def make_plan(settings: FieldExperiment) -> RadiancePlan:
@@ -68,7 +68,7 @@ def make_plan(settings: FieldExperiment) -> RadiancePlan:
 
 
 def set_background(plan: RadiancePlan, background: str | tuple[float, float, float]) -> RadiancePlan:
-    """Return the plan with a fitted background or without, by its word; an empty word keeps the preset's."""
+    """Return the plan with or without a fitted background; an empty word keeps the preset's background."""
     if background == "":
         return plan
     names = LEARNED.get(background, ()) if isinstance(background, str) else ()
@@ -83,12 +83,12 @@ def make_batches(plan: RadiancePlan, photos: Photos) -> RayBatches:
 
 
 def adapt_plan(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
-    """Adapt a plan to its photographs.
+    """Adapt a plan to the photographs.
 
-    A plan for cubes keeps its number of nodes in a box of other proportions; its voxels become smaller than neither the plan's
-    voxels nor a pixel. Photographs shrink to the plan's number of pixels per voxel at the middle of the box. Stages take no
-    more steps than their pixels justify. Few photographs get a lower degree. Nested boxes end where they hold the reconstructed
-    points.
+    A plan for cubes keeps the number of nodes in a box of other proportions; the voxels stay at least as large as the plan's
+    voxels and as a pixel. Photographs shrink to the plan's number of pixels per voxel at the middle of the box. Stages take no
+    more steps than their pixels justify. Few photographs get a lower degree. The nested boxes end at the first box with the
+    reconstructed points.
     """
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
@@ -123,7 +123,7 @@ def adapt_to_few(plan: RadiancePlan) -> RadiancePlan:
 
 
 def reduce_levels(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
-    """Return the plan with the nested boxes that hold the reconstructed points, if there are enough points."""
+    """Return the plan with only the nested boxes around the reconstructed points; few points change nothing."""
     points = photos.survey.points
     if not plan.fewer_levels or points is None or len(points) < FEWEST_POINTS:
         return plan
@@ -141,7 +141,7 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
     outer_boxes = [
         PlanLine(
             choice=f"{plan.levels} nested boxes, the largest of {outer} [length]",
-            reason=f"each has twice the extent of the one before, for what is around; "
+            reason=f"each box has twice the extent of the box before, for the surroundings; "
             f"{len(points_in_box(origins, box))} of {len(origins)} cameras stand in the innermost",
         )
     ]
@@ -152,14 +152,14 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
         *explain_depths(plan, batches),
         *explain_near_cameras(plan, origins, box),
         *explain_wide_lenses(photos),
-        PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
+        PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find empty space"),
         explain_steps(plan),
         explain_sizes(plan, (width, height)),
         PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
         explain_background(plan, photos),
         *[GAINS][: plan.exposure],
-        PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
-        PlanLine(choice=check_memory(plan, box, batches), reason="counted before it is taken"),
+        PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="largest neglected share of the light"),
+        PlanLine(choice=check_memory(plan, box, batches), reason="estimated before the allocation"),
     ]
 
 
@@ -169,30 +169,30 @@ def explain_points_outside(plan: RadiancePlan, photos: Photos) -> list[PlanLine]
     if points is None or (beyond := len(points) - len(points_in_box(points, nested_boxes(photos.box, plan.levels)[-1]))) == 0:
         return []
     box = "the largest box" if plan.levels > 1 else "the box"
-    reason = f"they lie beyond {box}, where {'the sky is' if plan.sky else 'nothing can be'}"
+    reason = f"they lie outside {box}, {'in the sky' if plan.sky else 'where the model is empty'}"
     return [PlanLine(choice=f"{beyond} of {len(points)} points of the reconstruction left out", reason=reason)]
 
 
 def explain_depths(plan: RadiancePlan, batches: RayBatches) -> list[PlanLine]:
     """Return a line if reconstructed points give depths of rays."""
     point_count = sum(map(len, batches.points))
-    choice = f"{point_count} points that photographs found say where their rays end, with a weight of {plan.depth:g}"
-    return [PlanLine(choice=choice, reason="a model of COLMAP names them; field.depth")] if plan.depth and point_count else []
+    choice = f"{point_count} points seen in photographs give the depths of rays, with a weight of {plan.depth:g}"
+    return [PlanLine(choice=choice, reason="from a model of COLMAP; field.depth")] if plan.depth and point_count else []
 
 
 def explain_near_cameras(plan: RadiancePlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:
     """Return a line if derivatives decrease towards cameras at ``origins``."""
     reach = plan.near_distance(origins, box)
     choice = f"derivatives nearer to a camera than {reach:.4g} [length] fall with the square of the distance"
-    return [PlanLine(choice=choice, reason="else matter grows before the lenses")] if reach else []
+    return [PlanLine(choice=choice, reason="otherwise matter grows in front of the lenses")] if reach else []
 
 
 def explain_steps(plan: RadiancePlan) -> PlanLine:
-    """Return the number of steps of the stages, and its bound."""
+    """Return the number of steps of the stages, and the bound on the steps."""
     steps = ", ".join(str(stage.steps) for stage in plan.stages)
     reason = "field.effort"
     if plan.epochs < math.inf:
-        reason += f"; in more than {FEWEST_STEPS} no pixel is looked at over {plan.epochs:g} times, or noise is learned"
+        reason += f"; beyond {FEWEST_STEPS} steps, each pixel is used at most {plan.epochs:g} times, to avoid a fit of noise"
     return PlanLine(choice=f"{steps} steps in these stages", reason=reason)
 
 
@@ -204,27 +204,27 @@ def explain_sizes(plan: RadiancePlan, stored_size: tuple[int, int]) -> PlanLine:
         return PlanLine(choice=f"photographs at {width} x {height} in all stages", reason=reason)
     return PlanLine(
         choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)} in these stages",
-        reason=f"voxels of these stages are too large to tell smaller pixels; they are held at {width} x {height}",
+        reason=f"voxels of these stages are larger than finer pixels; memory holds the photographs at {width} x {height}",
     )
 
 
 def explain_wide_lenses(photos: Photos) -> list[PlanLine]:
     """Return a line if the lens of photographs has no image plane."""
     kinds = [type(view.camera.distortion).__name__.lower() for view in photos.views if view.camera.distortion.is_wide]
-    reason = "traced exactly once a lens and size, and looked up: nothing is resampled"
+    reason = "traced once for each lens and size, then looked up without resampling"
     return [PlanLine(choice=f"rays of {len(kinds)} {kinds[0]} photographs", reason=reason)] if kinds else []
 
 
 def explain_background(plan: RadiancePlan, photos: Photos) -> PlanLine:
     """Return the choice of the background; for an assumed colour, the reason has the colour at the photographs' edges."""
     if plan.sky:
-        return PlanLine(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; it is learned with the field")
+        return PlanLine(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; fitted with the field")
     if photos.views[0].alpha is not None:
-        return PlanLine(choice="nothing behind the box", reason="alpha says what is there")
+        return PlanLine(choice="nothing behind the box", reason="alpha marks the object")
     edges = [view.image[at] for view in photos.views for at in (0, -1, (slice(None), 0), (slice(None), -1))]
     edge_colour, assumed_colour = (
         "(" + ", ".join(f"{c:.2g}" for c in colour) + ")"
         for colour in (np.median(np.concatenate(edges), axis=0), photos.views[0].background)
     )
-    reason = f'photos.background; the edges of the photographs show {edge_colour} mostly, and "sky" would learn it'
+    reason = f'photos.background; the median at the edges of the photographs is {edge_colour}; "sky" would fit the background'
     return PlanLine(choice=f"the colour {assumed_colour} behind the box", reason=reason)

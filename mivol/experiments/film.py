@@ -37,7 +37,7 @@ class Film:
     """Camera path of a film.
 
     Attributes:
-        cameras: one camera per frame; empty for no film.
+        cameras: camera of each frame; empty without a film.
         way: key of WAYS.
         shrink: size of the photographs over the size of the frames.
         notes: reason of a missing film.
@@ -53,7 +53,7 @@ class Film:
 
         Args:
             folder: run folder; the film is in ``film/``.
-            picture: function that renders the code values (H, W, 3) of a camera.
+            picture: function from a camera to code values (H, W, 3).
             progress: display of the run's progress.
         """
         path = f"film/{self.way}{film_suffix()}"
@@ -71,8 +71,7 @@ class Film:
 def plan_film(show: ShowSettings, photos: Photos) -> Film:
     """Place the cameras of a film.
 
-    If the photographs have no common upward direction, or if there is only one, a film without keyframes is left out with a
-    note.
+    Without keyframes, a single photograph or photographs without a common upward direction give no film but a note.
 
     Raises:
         MivolError: keyframes without a valid camera.
@@ -96,7 +95,7 @@ def plan_film(show: ShowSettings, photos: Photos) -> Film:
 
 
 def film_of_volume(run: RunFolder, values: NDArray, size: Sequence[float], upright: str, quantity: str) -> list[Image]:
-    """Write a film of a volume that rotates about its upright axis; empty for volumes that :func:`volume_frames` leaves out.
+    """Write a film of a volume that rotates about its upright axis; empty for volumes left out by :func:`volume_frames`.
 
     The film is an animated WebP, which is small for grey images.
 

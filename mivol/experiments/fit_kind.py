@@ -1,4 +1,4 @@
-"""What a kind of fit implements, so that one skeleton runs and explains all kinds."""
+"""Interface of a kind of fit. A common skeleton runs and explains all kinds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mivol.scene.explain import Explanation
 T = TypeVar("T")
 
 Say = Callable[[str], None]
-"""Receives one line of facts."""
+"""Receives a line of facts."""
 
 
 class Progress(Protocol):
@@ -30,30 +30,30 @@ class Progress(Protocol):
         """Show sentences about the run."""
 
     def track(self, items: Sequence[T], label: str) -> Iterator[T]:
-        """Yield the items one by one, and show how many are done."""
+        """Yield the items, and show the number of finished items."""
 
     def watch(self, iterations: int) -> AbstractContextManager[Callable[[Fit], None]]:
         """Return the function to call after each iteration of a fit with at most ``iterations``."""
 
 
 class NullProgress:
-    """Progress that shows nothing."""
+    """Progress without a display."""
 
     def say(self, lines: Sequence[str]) -> None:
         """Show nothing."""
 
     def track(self, items: Sequence[T], label: str) -> Iterator[T]:
-        """Yield the items one by one."""
+        """Yield the items."""
         return iter(items)
 
     def watch(self, iterations: int) -> AbstractContextManager[Callable[[Fit], None]]:
-        """Return a function that does nothing."""
+        """Return a function without effect."""
         return nullcontext(lambda fit: None)
 
 
 @dataclass(frozen=True)
 class RunContext:
-    """An experiment to run, and the place where it runs.
+    """An experiment to run, with folders and display.
 
     Attributes:
         settings: all settings of the experiment.
@@ -73,7 +73,7 @@ class RunContext:
 
 
 class Stages(NamedTuple):
-    """Names of the timed stages of a run, as its record lists them."""
+    """Names of the timed stages of a run, as listed in the record."""
 
     load: str
     fit: str
@@ -81,29 +81,30 @@ class Stages(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Errors of the newest iterate by name, and its arrays for ``best.npz``; None if files hold the iterate."""
+    """Errors of the newest iterate by name, and the arrays for ``best.npz``; None if files hold the iterate."""
 
     errors: dict[str, float]
     values: dict[str, Any] | None = None
 
 
 class FitKind(ABC):
-    """One experiment of one kind, from its settings to the contents of its run folder.
+    """An experiment of a kind, from the settings to the contents of the run folder.
 
     :func:`mivol.experiments.kinds.run_experiment` and :func:`~mivol.experiments.kinds.explain_experiment` call the methods in
     the order in which they stand here. A new kind is a subclass and an entry of :data:`mivol.experiments.kinds.KINDS`.
 
     Attributes:
         stages: names of the timed stages.
-        first_row: number of the first row in ``metrics.jsonl``: 1 if a row counts the steps taken, 0 if it names its step.
+        first_row: number of the first row in ``metrics.jsonl``: 1 if a row counts the steps taken, 0 if a row has the index of
+            the step.
         context: the experiment to run.
         settings: settings of the experiment; ``load`` puts values in place of "auto".
-        record: content of ``run.json``; its settings stay as given.
-        problem: the fitted model and its data, from ``make_problem`` on.
-        measure: errors of the model at the ``evaluate`` events of the course; None: ``evaluate`` below is asked instead.
+        record: content of ``run.json``; the recorded settings stay as given.
+        problem: the fitted model and the data; set after ``make_problem``.
+        measure: errors of the model at the ``evaluate`` events of the course; None means the method ``evaluate``.
 
     Raises:
-        MivolError: settings that need no data to be refused.
+        MivolError: settings that are invalid for all data.
     """
 
     stages: ClassVar[Stages]
@@ -121,14 +122,14 @@ class FitKind(ABC):
 
     @abstractmethod
     def describe_run(self) -> dict[str, Any]:
-        """Return method, seeds, citations and units for the record, as :meth:`RunRecord.new` names them."""
+        """Return method, seeds, citations and units for the record: keywords of :meth:`RunRecord.new`."""
 
     @abstractmethod
     def load(self, say: Say) -> None:
         """Load the data and plan the fit; put plan and notes on record.
 
         Args:
-            say: receives the facts that ``mivol explain`` prints, as they are found.
+            say: receives the facts printed by ``mivol explain``.
 
         Raises:
             MivolError: unreadable data, or data without a fit.
@@ -141,14 +142,14 @@ class FitKind(ABC):
         return []
 
     def render_data(self, run: RunFolder) -> None:  # noqa: B027  (most kinds have none)
-        """Compute data that are too costly for ``mivol explain``."""
+        """Compute data too costly for ``mivol explain``."""
 
     @abstractmethod
     def make_problem(self) -> Problem:
-        """Return the problem at its start."""
+        """Return the problem before the first step."""
 
     def best_files(self) -> BestFiles | None:
-        """Return the files that hold the best iterate; None if ``best.npz`` holds all of it."""
+        """Return the files of the best iterate; None if ``best.npz`` holds the whole iterate."""
         return None
 
     def prepare(self, run: RunFolder) -> None:  # noqa: B027
@@ -159,7 +160,7 @@ class FitKind(ABC):
         """Return the optimizer of the problem.
 
         Raises:
-            MivolError: settings that the data do not allow.
+            MivolError: settings in conflict with the data.
         """
 
     @abstractmethod
@@ -168,14 +169,14 @@ class FitKind(ABC):
 
     @abstractmethod
     def digests(self) -> dict[str, str]:
-        """Return hashes of the data, by which a checkpoint knows its run."""
+        """Return hashes of the data. A resumed run must have the same hashes."""
 
     def evaluate(self, fit: Fit) -> Evaluation | None:
         """Evaluate the newest iterate; None if no evaluation is due."""
         return None
 
     def after_step(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
-        """If an evaluation is due, add its row to the metrics and keep the best iterate."""
+        """If an evaluation is due, add a row to the metrics and keep the best iterate."""
         evaluation = self.evaluate(fit)
         if evaluation is not None:
             best.see(fit.next_iteration, *evaluation)
@@ -191,7 +192,7 @@ class FitKind(ABC):
 
     @abstractmethod
     def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
-        """Write images, volumes and curves, and put them and the results on record."""
+        """Write images, volumes and curves, and record the files and the results."""
 
     # -- Explain ---------------------------------------------------------------------------------------------------
 
@@ -200,5 +201,5 @@ class FitKind(ABC):
         """Begin the fit up to its first step, and write nothing; return the remaining facts.
 
         Raises:
-            MivolError: settings or data that the first step would refuse.
+            MivolError: settings or data refused by the first step.
         """

@@ -58,10 +58,10 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     """Write the Gaussians of a file, or points as Gaussians, as a radiance field.
 
     Args:
-        source: file of Gaussians or points in any format.
+        source: file of Gaussians or points in a known format.
         target: file ending in .npz.
         resolution: voxels along the longest edge of the box.
-        box: two corners, six numbers [length]; None means three standard deviations around all Gaussians.
+        box: two corners, six numbers [length]; None means three standard deviations around the Gaussians.
         variant: Mitsuba variant of the compared views.
 
     Returns:
@@ -91,9 +91,10 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
     """Write a radiance field as Gaussians.
 
     Args:
-        source: field (.npz) of one level.
+        source: field (.npz) with a single level.
         target: file ending in .ply.
-        resolution: blocks of voxels along the longest edge of its grid, one Gaussian per block; None means blocks of 2 voxels.
+        resolution: blocks of voxels along the longest edge of the grid, with a Gaussian per block; None means blocks of 2
+            voxels.
         variant: Mitsuba variant of the compared views.
 
     Returns:
@@ -116,12 +117,12 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
 
 
 def corners_of_box(cloud: Gaussians, box: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner (3,) of a given box [length]; None means three standard deviations around all Gaussians."""
+    """Lower and upper corner (3,) of a given box [length]; None means three standard deviations around the Gaussians."""
     return gaussian_box(cloud) if box is None else (np.array(box[:3]), np.array(box[3:]))
 
 
 def read_as_gaussians(source: Path) -> Gaussians:
-    """Read Gaussians, or one Gaussian for each point.
+    """Read Gaussians, or make a Gaussian for each point.
 
     Raises:
         MivolError: as the readers.
@@ -134,8 +135,8 @@ def field_psnr(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> floa
     """PSNR between views of a field and splatted Gaussians [dB]: code values over black, peak 1.
 
     Args:
-        cloud: Gaussians from which the field was made, or that were made from the field.
-        field: field of one level, in code values.
+        cloud: source of the field, or Gaussians made from the field.
+        field: single-level field, in code values.
         edge: edge of a view [pixel].
     """
     splatter, reals = Splatter(edge, edge, cloud.degree), to_tensors(cloud)
@@ -164,17 +165,17 @@ FUSED = 64
 """Number of fused views, from a Fibonacci lattice of directions around the box."""
 
 FINENESS = 2
-"""Pixels of a fused view along the box's longest edge, over the voxels there."""
+"""Pixels of a fused view over voxels, both along the longest edge of the box."""
 
 
 def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[float] | None, variant: str) -> str:
     """Write the Gaussians of a file, or points as Gaussians, as a mesh with colours.
 
     Args:
-        source: file of Gaussians or points in any format.
+        source: file of Gaussians or points in a known format.
         target: file ending in .ply or .obj.
         resolution: voxels of the fused distances along the longest edge of the box.
-        box: two corners, six numbers [length]; None means three standard deviations around all Gaussians.
+        box: two corners, six numbers [length]; None means three standard deviations around the Gaussians.
         variant: Mitsuba variant.
 
     Returns:
@@ -206,7 +207,7 @@ def mesh_of_gaussians(cloud: Gaussians, low: np.ndarray, high: np.ndarray, resol
     Args:
         cloud: Gaussians.
         low, high: corners (3,) of the box [length].
-        resolution: voxels along its longest edge.
+        resolution: voxels along the longest edge of the box.
 
     Raises:
         MivolError: as :func:`mivol.fields.depth_fusion.fuse_depths`.
@@ -262,7 +263,7 @@ def box_to_world(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 def _splat_depths(cloud: Gaussians, cameras: Sequence[Camera]) -> Iterator[DepthView]:
-    """Depths and colours of Gaussians for cameras of one size."""
+    """Depths and colours of Gaussians for cameras of equal size."""
     splatter, reals = Splatter(*cameras[0].size, cloud.degree, median=True), to_tensors(cloud)
     for camera in cameras:
         picture = np.array(splatter.forward(reals, camera, derivatives=False)[0], np.float64)

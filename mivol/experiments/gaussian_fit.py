@@ -1,7 +1,7 @@
 """A fit of 3D Gaussians to photographs.
 
-Conventions. The loss in ``metrics.jsonl`` is that of a step's picture. ``gaussians.ply`` holds the Gaussians as published
-viewers read them.
+Conventions. The loss in ``metrics.jsonl`` is the loss of a step's image. ``gaussians.ply`` holds the Gaussians in the format
+of published viewers.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class GaussianFit(PhotoFit):
 
 
 def judge_view(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, ImageScore]:
-    """Render a photograph's view of the Gaussians (H, W, 3), and measure it; distorted photographs are undistorted first."""
+    """Render a photograph's view of the Gaussians (H, W, 3), and score the view; lens distortion is removed first."""
     photo = rectify(photo)
     image = render_gaussians(problem, photo.camera, photo.background, problem.plan.low_pass)
     return image, score_image(image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
@@ -118,7 +118,7 @@ def tabulate_gaussians(gaussians: Gaussians, bytes_: int) -> Table:
         ("longest axis: median [length]", f"{np.median(scale.max(axis=1)):.3g}"),
         ("longest over shortest axis: median", f"{np.median(scale.max(axis=1) / scale.min(axis=1)):.3g}"),
     )
-    return Table(title="What was found", head=("", ""), rows=rows)
+    return Table(title="Fitted Gaussians", head=("", ""), rows=rows)
 
 
 @dataclass(frozen=True)
@@ -165,10 +165,10 @@ def make_gaussian_plan(settings: GaussianExperiment) -> GaussianPlan:
 
 
 def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> GaussianStart:
-    """Adapt the plan to the photographs, and place the first Gaussians; memory is checked before it is allocated.
+    """Adapt the plan to the photographs, and place the first Gaussians; memory is checked before the allocation.
 
     Raises:
-        MivolError: more memory than there is, or no place for Gaussians.
+        MivolError: more memory than available, or no place for Gaussians.
     """
     views = tuple(rectify(view) for view in photos.views)
     longest = max(max(view.camera.size) for view in views)
@@ -188,25 +188,25 @@ def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: Gaussian
     return GaussianStart(views, plan, batches, cloud, lines)
 
 
-GAINS = PlanLine(choice="gains of each photograph", reason="cameras that choose their exposure; pulled towards 1")
+GAINS = PlanLine(choice="gains of each photograph", reason="for cameras with automatic exposure; with a prior towards 1")
 
 
 def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:
     """Return the choices of the plan with their reasons."""
     stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
-    behind = "alpha says what is there" if photos.views[0].alpha is not None else "photos.background"
+    behind = "alpha marks the object" if photos.views[0].alpha is not None else "photos.background"
     control = {
-        "clone_split": "divided where the photographs pull most, taken out where they are transparent (Kerbl et al. 2023)",
-        "relocation": "moved from where they are transparent to where others are opaque (Kheradmand et al. 2024)",
+        "clone_split": "split or cloned at large gradients, removed if transparent (Kerbl et al. 2023)",
+        "relocation": "transparent Gaussians move to opaque Gaussians (Kheradmand et al. 2024)",
     }[plan.control]
     return [
         PlanLine(choice=f"{len(photos.views)} photographs", reason=photos.survey.box_from),
         PlanLine(choice=f"{count} Gaussians at first", reason=whence),
         PlanLine(choice=f"up to {max(plan.most, count)} Gaussians", reason=control),
-        PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason="small photographs first, one a step"),
-        PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="absolute error beside it"),
-        PlanLine(choice="what is behind is no part of the Gaussians", reason=behind),
+        PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason="small photographs first, one photograph a step"),
+        PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="the rest is the absolute error"),
+        PlanLine(choice="no Gaussians for the background", reason=behind),
         *[GAINS][: plan.exposure],
-        PlanLine(choice=f"about {minutes:.2g} minutes", reason="on two idle cores, by the number of steps; no clock ends it"),
-        PlanLine(choice=memory, reason="counted before it is taken"),
+        PlanLine(choice=f"about {minutes:.2g} minutes", reason="for two idle cores; the number of steps is fixed"),
+        PlanLine(choice=memory, reason="estimated before the allocation"),
     ]

@@ -1,4 +1,4 @@
-"""The views that judge a fit of photographs: metrics, tables and images."""
+"""Held-out views of a fit of photographs: metrics, tables and images."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 MANY = 32
-"""Number of judged views above which small images are smaller, so that a page stays below about 20 MB."""
+"""Number of judged views above which small images are smaller, to keep a page below about 20 MB."""
 
 EDGES = 256, 128
 """Longest edge of a small image [pixel], for few and for many views."""
@@ -39,9 +39,9 @@ def select_shown_views(count: int, shown: int) -> frozenset[int]:
 
 
 def describe_quality(quality: ImageScore, fitted: float | None = None) -> str:
-    """Caption of a view: its metrics, and its PSNR [dB] after colour correction if given."""
+    """Caption of a view: metrics, and the PSNR [dB] after colour correction if given."""
     metrics = [format_metric(name, value) for name, value in quality.values.items()]
-    return ", ".join(metrics if fitted is None else [*metrics, f"{fitted:.2f} dB with its colours fitted"])
+    return ", ".join(metrics if fitted is None else [*metrics, f"{fitted:.2f} dB after a fit of the colours"])
 
 
 def format_metric(metric: str, value: float) -> str:
@@ -52,7 +52,7 @@ def format_metric(metric: str, value: float) -> str:
 
 @dataclass
 class JudgedViews:
-    """Images of judged views, written one by one.
+    """Images of judged views, written view by view.
 
     Attributes:
         folder: run folder.
@@ -108,7 +108,7 @@ def write_view(
     caption: str = "",
     edge: int | None = None,
 ) -> list[Image]:
-    """Write a render beside its photograph, both tone-mapped for a screen.
+    """Write a render beside the photograph, both tone-mapped for a screen.
 
     Args:
         folder, photo, number: run folder, photograph, and number in the file names.
@@ -145,13 +145,13 @@ def describe_views(views: Iterable[Photo]) -> str:
 
 
 def judge_colour_fitted(image: NDArray, photo: Photo, space: str) -> float:
-    """PSNR [dB] of a view after a fit of its colours to the photograph, for screen colours."""
+    """PSNR [dB] of a view after a fit of the view's colours to the photograph, for screen colours."""
     render_codes, photo_codes = (CONVERSIONS[space, "srgb"](values) for values in (image, photo.image))
     return score_image(fit_colours(render_codes, photo_codes, photo.mask), photo_codes, mask=photo.mask).values["psnr"]
 
 
 def tabulate_views(camera: Camera, scores: Sequence[ImageScore], fitted: Sequence[float] = ()) -> Table:
-    """Table of all judged views with their metrics, the worst first.
+    """Table of the judged views with their metrics, the worst view first.
 
     Args:
         camera: camera of the first view, for the size in the title.

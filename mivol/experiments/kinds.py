@@ -1,4 +1,4 @@
-"""All kinds of experiments, and the one way to run or explain each of them.
+"""Kinds of experiments: run an experiment, or explain an experiment.
 
 Conventions. ``explain`` begins a fit up to its first step. After that, only the disk and the run folder can refuse the fit.
 """
@@ -30,13 +30,13 @@ KINDS: dict[type, type[FitKind]] = {
     config.FieldExperiment: FieldFit,
     config.GaussianExperiment: GaussianFit,
 }
-"""The kind of an experiment, by the type of its settings."""
+"""Kind of an experiment by the type of the settings."""
 
 
 def run_experiment(context: RunContext) -> Path:
-    """Run an experiment, and write its run folder.
+    """Run an experiment, and write the run folder.
 
-    The settings of a checkpoint are compared before a resumed run touches its folder.
+    The settings of a checkpoint are compared before a resumed run changes the folder.
 
     Returns:
         The report page.
@@ -73,7 +73,7 @@ def complete_fit(kind: FitKind, run: RunFolder, best: BestIterate) -> Fit:
     """Take all steps of a fit, with metrics and checkpoints, and keep the best iterate.
 
     Raises:
-        MivolError: a checkpoint of another run, settings that the optimizer refuses, or a loss that is not finite.
+        MivolError: a checkpoint of another run, settings refused by the optimizer, or an infinite or NaN loss.
         KeyboardInterrupt: Ctrl-C; the checkpoint has been written.
     """
     course, context = kind.course(), kind.context
@@ -100,7 +100,7 @@ def complete_fit(kind: FitKind, run: RunFolder, best: BestIterate) -> Fit:
 
 
 def explain_experiment(settings: config.Experiment, base: Path, picture: Path | None = None) -> Explanation:
-    """Say what an experiment would do, and make every check that it makes itself.
+    """Describe the steps of an experiment, and make the same checks as a run.
 
     Args:
         settings: all settings.
@@ -108,13 +108,13 @@ def explain_experiment(settings: config.Experiment, base: Path, picture: Path | 
         picture: image file (.png, .svg) for the cameras of photographs and the boxes; may be None.
 
     Returns:
-        The facts found, and the reason of a refusal.
+        Facts about the experiment, and the reason of a refusal.
     """
     lines = [f"experiment  {settings.title}"]
     kind = KINDS[type(settings)]
     try:
         if picture is not None and not issubclass(kind, PhotoFit):
-            raise MivolError(f"{picture} was asked for, and only cameras of photographs are drawn: leave out --output.")
+            raise MivolError(f"--output {picture}: only cameras of photographs are drawn, so leave out --output.")
         choose_back_end(settings.variant, settings.threads)
         fit = kind(RunContext(settings, base, Path()))
         fit.load(lines.append)

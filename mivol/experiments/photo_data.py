@@ -1,4 +1,4 @@
-"""Photographs to fit, photographs that judge the fit, and the box of the matter."""
+"""Photographs to fit, held-out photographs, and the box of the matter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mivol.validate.images import check_metrics
 
 
 def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos | None]:
-    """Read the photographs to fit, and the photographs that judge the fit (may be None).
+    """Read the photographs to fit, and the held-out photographs (may be None).
 
     Raises:
         MivolError: as :func:`mivol.photos.load_photos`, metrics for larger photographs, or an unknown word for the box or the
@@ -41,14 +41,14 @@ def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos |
     }
     if isinstance(settings, GaussianExperiment):
         if photo_settings.space == "linear":
-            raise MivolError('photos.space = "linear" was asked for; Gaussians are fitted to code values: "srgb" is expected.')
+            raise MivolError('photos.space = "linear" is not for Gaussians, which are fitted to code values: choose "srgb".')
         options["space"] = "srgb"
     path = base / photo_settings.path
     surveyed = {"held_out": photo_settings.held_out, "box": options["box"]}
     fitted = survey_photos(path, split="train", **surveyed)
     is_judged = photo_settings.judged != "held_out" or photo_settings.held_out > 0
     others = survey_photos(path, split=photo_settings.judged, **surveyed).frames if is_judged else ()
-    # Before any is read: a background that is asked for would be the first of two answers.
+    # Check before the photographs are read: otherwise another error would hide a wrong background.
     has_alpha = check_alpha([*fitted.frames, *others])
     check_background(settings, has_alpha)
     if has_alpha:
@@ -86,7 +86,7 @@ MIDDLE_GREY = 0.18
 
 
 def find_white(photos: Photos) -> float:
-    """Radiance of white on a screen: a power of 2, so that a division has no rounding error.
+    """Radiance of white on a screen: a power of 2, which makes divisions exact.
 
     The median of lit pixels (mean of rgb above 0) is then within a factor of sqrt(2) of ``MIDDLE_GREY``.
     """
@@ -105,7 +105,7 @@ def divide_by_white(photos: Photos, white: float) -> Photos:
 
 
 def _put_over(photos: Photos, background: str | tuple[float, float, float]) -> Photos:
-    """Set the background colour of photographs without alpha; photographs with alpha have one already."""
+    """Set the background colour of photographs without alpha; photographs with alpha already have a background colour."""
     if photos.views[0].alpha is not None:
         return photos
     colour = np.full(3, background == "white", np.float32) if isinstance(background, str) else np.array(background, np.float32)
@@ -113,7 +113,7 @@ def _put_over(photos: Photos, background: str | tuple[float, float, float]) -> P
 
 
 def note_on_alpha(survey: PhotoSurvey) -> str:
-    """Return a note on the alpha of all photographs; "" without alpha.
+    """Return a note on the alpha of the photographs; "" without alpha.
 
     Raises:
         MivolError: alpha in some photographs only.
@@ -121,9 +121,9 @@ def note_on_alpha(survey: PhotoSurvey) -> str:
     if not check_alpha(survey.frames):
         return ""
     if any(frame.camera.distortion.is_wide for frame in survey.frames):
-        return "alpha in all photographs: photos.background says what they are put over"
-    box = "a fit takes the box about what alpha shows, unless photos.box says otherwise"
-    return f"alpha in all photographs: photos.background says what they are put over; {box}"
+        return "alpha in all photographs: photos.background sets the colour behind them"
+    box = "a fit takes the box around the opaque pixels, unless photos.box names another box"
+    return f"alpha in all photographs: photos.background sets the colour behind them; {box}"
 
 
 def add_box(settings: PhotoExperiment, photos: Photos) -> Photos:
@@ -137,7 +137,7 @@ def add_box(settings: PhotoExperiment, photos: Photos) -> Photos:
 
 
 def _find_box(photos: Photos) -> Photos:
-    """Box around the opaque pixels if all photographs have alpha and an image plane; else the box that the cameras look at."""
+    """Box around the opaque pixels if all photographs have alpha and an image plane; otherwise the cameras' box."""
     has_silhouettes = all(view.alpha is not None and not view.camera.distortion.is_wide for view in photos.views)
     return _box_silhouettes(photos) if has_silhouettes else photos
 
@@ -145,7 +145,7 @@ def _find_box(photos: Photos) -> Photos:
 def _box_silhouettes(photos: Photos) -> Photos:
     box = photos.silhouette_box()
     near_far = near_and_far([view.camera for view in photos.views], box)
-    return replace(photos, survey=replace(photos.survey, box=box, box_from="about what alpha shows", near_far=near_far))
+    return replace(photos, survey=replace(photos.survey, box=box, box_from="around the opaque pixels", near_far=near_far))
 
 
 BOXES = {
@@ -154,10 +154,10 @@ BOXES = {
     "silhouettes": _box_silhouettes,
     "middle": lambda photos: photos,
 }
-"""Functions that set the box, by their word in the settings."""
+"""Functions setting the box, by the word in the settings."""
 
 SEARCHED = {"middle": "middle"}
-"""Words for a box that ``load_photos`` finds itself."""
+"""Words for a box found by ``load_photos``."""
 
 
 def describe_photos(photos: Photos, judged: Photos | None = None) -> list[str]:
@@ -169,9 +169,9 @@ def describe_photos(photos: Photos, judged: Photos | None = None) -> list[str]:
             "figures are tone-mapped: the sRGB curve of y, from 0 to 1."
         ]
     else:
-        notes = ["Colours are srgb code values; in a scene mivol_sh and mivol_gaussians show the radiance that they stand for."]
+        notes = ["Colours are srgb code values; in a scene, mivol_sh and mivol_gaussians show the decoded radiance."]
     if "linear" in photos.stored and photos.space == "srgb":
-        notes.append("The light of photographs of radiance was encoded; what is above 1 counts as 1.")
+        notes.append("Photographs of radiance were encoded as sRGB; radiance above 1 counts as 1.")
     if "srgb" in photos.stored and photos.space == "linear":
         notes.append("Code values were decoded by the sRGB curve.")
     if judged is not None:
@@ -181,5 +181,5 @@ def describe_photos(photos: Photos, judged: Photos | None = None) -> list[str]:
             "sRGB codes of 8 bits, with the peak 1."
         )
     if photos.skipped:
-        notes.append(f"{len(photos.skipped)} photographs are listed and not there: {', '.join(photos.skipped[:5])} ...")
+        notes.append(f"{len(photos.skipped)} listed photographs are missing: {', '.join(photos.skipped[:5])} ...")
     return notes

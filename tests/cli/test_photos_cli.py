@@ -42,7 +42,7 @@ def test_explain_says_what_there_is_and_draws_it(tmp_path: Path, capsys: pytest.
 
 def test_explain_says_what_alpha_means_for_a_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Whose box a fit then takes, where not every photograph can be cut out; a set of both kinds is refused after its facts."""
-    note = "a fit takes the box about what alpha shows"
+    note = "a fit takes the box around the opaque pixels"
     cut, plain = (write_blender(tmp_path / name, alpha=name == "cut") for name in ("cut", "plain"))
     assert main(["explain", str(cut)]) == main(["explain", str(plain)]) == 0
     with_alpha, without = capsys.readouterr().out.split(f"{plain}: ")

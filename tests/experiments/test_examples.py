@@ -43,7 +43,7 @@ def test_an_example_is_copied_once(tmp_path: Path, capsys: pytest.CaptureFixture
     assert {path.name for path in (tmp_path / "mine").iterdir()} == {
         path.name for path in (examples_folder() / "demo").iterdir()
     }
-    assert "is there already" in refused(capsys, "demo", "demo", "--into", tmp_path / "mine")
+    assert "exists and is not an empty folder" in refused(capsys, "demo", "demo", "--into", tmp_path / "mine")
 
 
 def test_a_copy_stands_by_itself(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +145,7 @@ def test_a_stand_in_takes_the_place_of_public_data(tmp_path: Path, name: str) ->
     progress.say = told.extend
     source = examples_folder() / name
     changes = examples.prepare(name, example, source, tmp_path / "run", progress)
-    assert "stands in for it" in told[0]
+    assert "a procedural volume replaces it" in told[0]
     chosen = config.load(source / "fit.toml", changes)
     setting = chosen.truth.file if example.stand_in.setting == "truth.file" else chosen.scene.define["volume"]
     values = read_volume(setting, frame="unit").values

@@ -83,7 +83,7 @@ def test_photographs_become_gaussians_and_a_page(photographs: Path, tmp_path: Pa
     assert main(["optimize", str(toml(tmp_path, photographs)), "-o", str(tmp_path / "run")]) == 0
     said = capsys.readouterr()
     assert said.out.strip().endswith("report.html")
-    for text in ("that no view shows as transparent", "counted before it is taken", "alpha says what is there"):
+    for text in ("that no view shows as transparent", "estimated before the allocation", "alpha marks the object"):
         assert text in said.err
     record = json.loads((tmp_path / "run/run.json").read_text())
     assert record["results"]["held_out_psnr"] > 18
@@ -91,7 +91,7 @@ def test_photographs_become_gaussians_and_a_page(photographs: Path, tmp_path: Pa
     assert found.count == record["results"]["gaussians"]
     assert found.degree == 1
     page = (tmp_path / "run/report.html").read_text()
-    for text in ("data:video/mp4;base64,", "What was found", "view_03.png", "Kerbl"):
+    for text in ("data:video/mp4;base64,", "Fitted Gaussians", "view_03.png", "Kerbl"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == [40, 80, 100]

@@ -31,7 +31,7 @@ def cloud(n: int = 3) -> Gaussians:
 def test_what_the_gaussians_take() -> None:
     """Medians of the opacities, of the longest axes, and of these over the shortest ones."""
     table = outputs.tabulate_gaussians(cloud(), 3 * 2**19)
-    assert (table.title, table.head) == ("What was found", ("", ""))
+    assert (table.title, table.head) == ("Fitted Gaussians", ("", ""))
     assert table.rows == (
         ("Gaussians", "3"),
         ("harmonics", "degree 1"),

@@ -86,7 +86,7 @@ def test_many_views_are_smaller_and_none_are_written_where_none_are_asked_for(tm
 
 def test_what_is_said_of_views() -> None:
     quality = ImageScore("a", {"psnr": 24.126, "ssim": 0.7781})
-    assert describe_quality(quality, 25.3) == "PSNR 24.13 dB, SSIM 0.7781, 25.30 dB with its colours fitted"
+    assert describe_quality(quality, 25.3) == "PSNR 24.13 dB, SSIM 0.7781, 25.30 dB after a fit of the colours"
     assert describe_quality(quality) == "PSNR 24.13 dB, SSIM 0.7781"
     assert describe_views([photo("a")] * 3) == "3 views at 4 x 2 pixels"
     assert describe_views([photo("a")]) == "1 view at 4 x 2 pixels"

@@ -121,7 +121,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert "PSNR compares 8-bit sRGB values; its peak is 1." in page
     assert "largest value as its peak" not in page
     assert f"{record['results']['held_out_psnr']:.1f} dB PSNR on held-out views" in page
-    shown = ("data:video/mp4;base64,", "distance of the first judged view", "Where the cameras stand", "What it takes")
+    shown = ("data:video/mp4;base64,", "distance of the first judged view", "Cameras, and the box of the matter", "Storage")
     for text in (*shown, "view_3.png"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
@@ -227,7 +227,7 @@ def test_what_was_done_to_linear_photographs_is_said(photographs: Path, tmp_path
     for folder in (photographs, tmp_path):
         photos, _ = photo_data.read_photos(config.load(toml(tmp_path, folder), ["photos.space=srgb"]), tmp_path)
         said.append(" ".join(photo_data.describe_photos(photos)))
-    assert ["light of photographs of radiance was encoded" in note for note in said] == [False, True]
+    assert ["Photographs of radiance were encoded" in note for note in said] == [False, True]
     assert all("srgb code values" in note for note in said)
 
 
@@ -238,7 +238,7 @@ def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -
     plan = field_plan.make_plan(chosen)
     said = field_plan.explain_background(plan, photos)
     assert said.choice == "the colour (0, 0.5, 0) behind the box"
-    assert "edges of the photographs show (1, 1, 1) mostly" in said.reason
+    assert "edges of the photographs is (1, 1, 1)" in said.reason
     assert "sky of 8 rows" in field_plan.explain_background(replace(plan, sky=8), photos).choice
     clear = replace(photos, views=tuple(replace(v, alpha=np.ones((SIZE, SIZE))) for v in photos.views))
     assert "alpha" in field_plan.explain_background(plan, clear).reason
@@ -326,7 +326,7 @@ def test_stages_look_at_each_pixel_so_often_at_most(photos: Photos, photographs:
     assert [stage.steps for stage in field_plan.adapt_plan(RadiancePlan(stages), photos).stages] == [10_000, 10_000, 5]
     asked = field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
-    assert "no pixel is looked at over 20 times" in field_plan.explain_steps(plan).reason
+    assert "each pixel is used at most 20 times" in field_plan.explain_steps(plan).reason
     assert field_plan.explain_steps(RadiancePlan(stages)).reason == "field.effort"
 
 
@@ -393,17 +393,17 @@ def test_nested_boxes_are_those_that_points_need(photos: Photos, photographs: Pa
 
     text = said(points, plan)
     assert "3 nested boxes" in text and f"0 of {len(photos.views)} cameras stand in the innermost" in text
-    assert "3 of 1000 points of the reconstruction left out: they lie beyond the largest box, where nothing can be" in text
+    assert "3 of 1000 points of the reconstruction left out: they lie outside the largest box, where the model is empty" in text
     distances = [np.linalg.norm(view.camera.origin - photos.box.mean(axis=0)) for view in photos.views]
     assert f"nearer to a camera than {np.median(distances):.4g} [length]" in text
     assert "5 nested boxes" in said(points[:99], plan) and "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
     seen = replace(photos, views=tuple(replace(view, points=points[:7]) for view in photos.views))
     batches = field_plan.make_batches(plan, seen)
     lines = [line.choice for line in field_plan.explain_plan(replace(plan, depth=0.5), seen, batches)]
-    assert f"{7 * len(photos.views)} points that photographs found say where their rays end, with a weight of 0.5" in lines
+    assert f"{7 * len(photos.views)} points seen in photographs give the depths of rays, with a weight of 0.5" in lines
     assert field_plan.explain_depths(plan, batches) == []
     one = said(points, replace(plan, levels=1, near=0.0, sky=8))
-    assert "1000 of 1000 points" in one and "beyond the box, where the sky is" in one
+    assert "1000 of 1000 points" in one and "outside the box, in the sky" in one
     assert "nested" not in one and "nearer to a camera" not in one
     told = field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.levels=2", "field.depth=0.5"]))
     assert (told.levels, told.fewer_levels, told.depth) == (2, False, 0.5)
@@ -525,6 +525,6 @@ def test_the_box_is_about_silhouettes_where_all_photographs_have_alpha(photograp
     tight = photo_data.add_box(chosen, replace(photos, views=tuple(cut)))
     # The ball's radius is 0.6 and no camera is nearer than 2.9 to it; two cells of the second search are 0.1.
     assert (np.abs(tight.box) > 0.55).all() and (np.abs(tight.box) < 0.75).all() and (np.abs(photos.box) > 0.9).all()
-    assert tight.survey.box_from == "about what alpha shows"
+    assert tight.survey.box_from == "around the opaque pixels"
     mixed = replace(photos, views=(photos.views[0], *cut[1:]))
     assert photo_data.add_box(chosen, mixed) is mixed

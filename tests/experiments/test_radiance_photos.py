@@ -176,7 +176,7 @@ def test_codes_and_radiance_in_one_set_are_refused(photographs: Path, tmp_path: 
     photos, _ = read(toml(tmp_path, tmp_path, 'space = "srgb"'))
     for view in photos.views:
         np.testing.assert_allclose(view.image[7, 7], encode_srgb(np.array([0.5, 0.25, 1])), atol=0.6 / 255)
-    assert any("what is above 1 counts as 1" in note for note in describe_photos(photos))
+    assert any("radiance above 1 counts as 1" in note for note in describe_photos(photos))
     photos, judged = read(toml(tmp_path, tmp_path, 'space = "linear"'))
     np.testing.assert_allclose(photos.views[1].image[7, 7] * photos.white, [0.5, 0.25, 1], atol=0.005)
     np.testing.assert_allclose(judged.views[0].image[7, 7] * judged.white, [0.5, 0.25, 2], rtol=1e-6)
@@ -190,5 +190,5 @@ def test_gaussians_are_fitted_to_codes(photographs: Path, tmp_path: Path) -> Non
     photos, _ = read(path)
     assert (photos.space, photos.white) == ("srgb", 1.0) and max(view.image.max() for view in photos.views) < 1.01
     path.write_text(path.read_text().replace("held_out = 0", 'space = "linear"'))
-    with pytest.raises(MivolError, match='Gaussians are fitted to code values: "srgb" is expected'):
+    with pytest.raises(MivolError, match='Gaussians, which are fitted to code values: choose "srgb"'):
         read(path)

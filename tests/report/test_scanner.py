@@ -127,10 +127,10 @@ def test_captions_state_the_number_of_drawn_views(tmp_path: Path) -> None:
     """A source and parallel light have different captions."""
     images = draw_scanner(tmp_path, CONE, GRID, HELD_OUT)
     assert [(i.path, i.role) for i in images] == [("scanner_side.png", "picture"), ("scanner_plan.png", "picture")]
-    assert images[0].caption == "Where the source stands in 12 views, some detectors, and the box of the voxels"
+    assert images[0].caption == "Positions of the source in 12 views, some detectors, and the box of the voxels"
     many = ParallelBeam(np.arange(100.0), (5, 7))
     (first, _) = draw_scanner(tmp_path, many, GRID, HELD_OUT)
-    assert first.caption.startswith(f"Which way the light goes in {MOST_VIEWS + 2} of 100 views")
+    assert first.caption.startswith(f"Directions of the light in {MOST_VIEWS + 2} of 100 views")
     assert all((tmp_path / image.path).is_file() for image in images)
 
 
