@@ -1,4 +1,4 @@
-"""What fits of photographs share, whatever the model.
+"""Common part of the fits of photographs to any model.
 
 Conventions. ``metrics.jsonl`` has the loss of a step and, at some steps, the PSNR of a fixed set of judged views. Films are
 ``film/turntable.mp4``, or ``.webp`` without ffmpeg.
@@ -47,7 +47,7 @@ class PhotoFit(FitKind):
     Attributes:
         plan: stages, steps and rates of the fit.
         photos: photographs to fit, with their box.
-        judged: photographs to judge by; may be None.
+        judged: held-out photographs; may be None.
         film: cameras of the film.
         levels: nested boxes of the model.
         fits_colours: whether judged views also have a PSNR with their colours fitted to the photographs'.
@@ -73,7 +73,7 @@ class PhotoFit(FitKind):
 
     @abstractmethod
     def plan_fit(self) -> list[PlanLine]:
-        """Adapt the plan to the photographs; return its choices with their reasons."""
+        """Adapt the plan to the photographs; return the choices with reasons."""
 
     def load(self, say: Say) -> None:
         photos, self.judged = read_photos(self.settings, self.context.base)
@@ -107,9 +107,10 @@ class PhotoFit(FitKind):
         return Evaluation(self.judge_few())
 
     def judge_few(self) -> dict[str, float]:
-        """Return the mean PSNR [dB] of the same judged views at each call, evenly spread over all of them.
+        """Return the mean PSNR [dB] of a fixed, evenly spread subset of the judged views.
 
-        Its name is that of the held-out views only if all of them are judged.
+                The name is
+        ``held_out_psnr`` if the subset has all judged views, otherwise ``few_psnr``.
         """
         if self.judged is None:
             return {}
@@ -134,14 +135,14 @@ class PhotoFit(FitKind):
 
     @abstractmethod
     def write_model(self, run: RunFolder) -> dict[str, float]:
-        """Write the files of the model, and put their tables and volumes on record; return results on its size."""
+        """Write the files of the model, and record tables and volumes; return results on the size of the model."""
 
     @abstractmethod
     def gains(self) -> NDArray | None:
         """Return the fitted gains of the photographs (photographs, 3); None without gains."""
 
     def rectified(self, photo: Photo) -> Photo:
-        """Return the photograph that a view of the model is compared with."""
+        """Return the photograph to compare with a view of the model."""
         return photo
 
     def write_first_view(self, run: RunFolder, view: FieldView | NDArray, photo: Photo) -> list[Image]:
@@ -164,7 +165,7 @@ class PhotoFit(FitKind):
         run.write_curves()
 
     def write_judged(self, run: RunFolder) -> dict[str, float]:
-        """Judge all views, and write them beside their photographs; return the means of their metrics."""
+        """Judge all views, and write the views beside the photographs; return the means of the metrics."""
         views, space, show = self.judged.views, self.judged.space, self.settings.show
         qualities, fitted, first = [], [], []
         pictures = JudgedViews(run.path, space, len(views), show.views)
@@ -192,7 +193,7 @@ class PhotoFit(FitKind):
         return Explanation(())
 
     def draw_cameras(self, path: Path) -> None:
-        """Draw the cameras of all photographs and the boxes of the model into an image."""
+        """Draw the photographs' cameras and the boxes of the model into an image."""
         plot_cameras(survey_all_cameras(self.photos, self.judged, self.levels), path)
 
 

@@ -49,7 +49,7 @@ class Projections:
         truth: true volume (Z, Y, X), if known.
         quanta: numbers of quanta, if known: simulated, or from readings with flats and darks.
         notes: notes for the report.
-        is_noise_known: whether 1 / weights are the variances, and not only proportional to them.
+        is_noise_known: whether 1 / weights are the variances; otherwise 1 / weights are only proportional to the variances.
     """
 
     geometry: FlatDetector
@@ -164,7 +164,7 @@ def project_ellipsoids(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return exact line integrals, and the phantom averaged over voxels."""
     phantom = shepp_logan(settings.table, settings.half_width)
-    # Two sub-points an edge err by 0.06 of a head of 128^3, four by 0.015: less than what is judged by them.
+    # For a head of 128^3 voxels, two sub-points an edge have an error of 0.06, four an error of 0.015, below the judged errors.
     return settings.scale * phantom.project(geometry), settings.scale * phantom.voxelise(grid, 4)
 
 
@@ -187,7 +187,7 @@ SIMULATED = {Ellipsoids: project_ellipsoids, Known: project_volume}
 def add_noise(geometry: FlatDetector, exact: np.ndarray, truth: np.ndarray, photons: float, seed: int) -> Projections:
     """Return line integrals of Poisson counts with weights 1 / var y = counts; exact line integrals without photons.
 
-    A pixel without any quantum has no logarithm: y = 0 with weight 0.
+    A pixel without a quantum has no logarithm, and gets y = 0 with weight 0.
     """
     if not photons:
         return Projections(geometry, exact, np.ones_like(exact), truth)
@@ -229,7 +229,7 @@ def resolve_axis(
 ) -> tuple[float | None, list[str]]:
     """Return the found ``axis_offset`` of a circular scan [length] or None, and notes.
 
-    An offset in the settings holds, unless they also have ``data.find_axis = true``.
+    An offset in the settings replaces the search, unless ``data.find_axis = true``.
     """
     search, known = settings.data.find_axis, settings.scan.axis_offset
     if search or (search is None and not known):
@@ -287,5 +287,5 @@ def held_out_views(settings: config.ScanExperiment, count: int) -> np.ndarray:
 
 
 def fitted_views(held_out: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the views that are not held out."""
+    """Indices of the fitted views."""
     return np.setdiff1d(np.arange(count), held_out)

@@ -1,4 +1,4 @@
-"""Measured projections from files: transmission, and angles or geometry if the files have them."""
+"""Measured projections from files: transmission, with angles or geometry if present in the files."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class ScanReadings:
 
     Attributes:
         transmission: transmission (views, rows, cols), lowest row first.
-        angles: angles (views,) [rad]; None if the geometry has them.
-        geometry: geometry, if the files have one.
-        intensity: readings, flats and darks, if the files have them.
+        angles: angles (views,) [rad]; None if the geometry has the angles.
+        geometry: geometry, if present in the files.
+        intensity: readings, flats and darks, if present in the files.
         notes: notes for the report.
     """
 
@@ -129,7 +129,7 @@ def note_order(angles: np.ndarray) -> list[str]:
         return []
     at = int(back[0])
     turned = f"view {at + 1} at {np.degrees(angles[at + 1]):.2f} degrees follows view {at} at {np.degrees(angles[at]):.2f}"
-    return [f"the angles turn back {len(back)} times ({turned}): they are taken as they are"]
+    return [f"the angles turn back {len(back)} times ({turned}): they are used as given"]
 
 
 def read_nikon_scan(settings: Nikon, base: Path) -> tuple[Transmission, ConeBeam | PanelViews, list[str]]:
@@ -154,7 +154,7 @@ def describe_nikon_settings(scan: NikonScan, geometry: ConeBeam | PanelViews) ->
     if isinstance(geometry, PanelViews):
         notes.append(f"the rotation axis is tilted by {scan.tilt:g} and rolled by {scan.roll:g} degrees: z runs along it")
     if scan.left_out:
-        notes.append(f"not heeded: {', '.join(scan.left_out)}")
+        notes.append(f"ignored settings: {', '.join(scan.left_out)}")
     return notes
 
 

@@ -28,12 +28,12 @@ from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult, read_reference
 
 SEEN = 2 * 3 * 4
-"""Memory per pixel of a view [byte]: the reference in three channels, and its standard error or its batch."""
+"""Memory per pixel of a view [byte]: the reference in three channels, and the standard error or a batch."""
 
 
 @dataclass
 class References:
-    """References of all views.
+    """References of the views.
 
     Attributes:
         held_out_numbers: indices of the held-out views.
@@ -56,7 +56,7 @@ class References:
             self.standard_errors[view.name] = error
 
     def digest(self) -> str:
-        """SHA-256 of all references."""
+        """SHA-256 of the references."""
         h = hashlib.sha256()
         for view in (*self.fitted, *self.held_out):
             h.update(np.ascontiguousarray(view.reference).tobytes())
@@ -71,7 +71,7 @@ def find_references(
     sensors: Sequence[Any],
     held_out: frozenset[int],
 ) -> References:
-    """Render or read the reference of each view; renders show the truth if it is known.
+    """Render or read the reference of each view; renders show the truth if known.
 
     Args:
         context: base folder, run folder and progress.
@@ -94,7 +94,7 @@ def find_references(
 
 
 def find_sensors(settings: SceneExperiment, scene: mi.Scene) -> tuple[list[Any], frozenset[int]]:
-    """Return the sensors of all views, and the indices of the held-out views.
+    """Return the sensors of the views, and the indices of the held-out views.
 
     Raises:
         MivolError: no views, views of different sizes, more views than memory, or unknown held-out views.
@@ -113,7 +113,7 @@ def load_experiment_scene(settings: SceneExperiment, base: Path) -> LoadedScene:
     """Load the scene of an experiment with its defines; a define may name public data (``data:NAME``).
 
     Raises:
-        MivolError: as :func:`mivol.scene.load.load_scene`, or data that are not here.
+        MivolError: as :func:`mivol.scene.load.load_scene`, or missing public data.
     """
     given = settings.scene.define.items()
     is_data = {key: isinstance(value, str) and value.startswith(PREFIX) for key, value in given}
@@ -156,7 +156,7 @@ def render_views(
 
 
 def standard_error(reference: ReferenceResult) -> np.ndarray:
-    """Standard error of each pixel's mean, with an allowance for light that no sample has found."""
+    """Standard error of each pixel's mean, with an allowance for light missed by all samples."""
     return np.sqrt(reference.variance_with_unseen(float(reference.mean.max())))
 
 
@@ -170,7 +170,7 @@ def read_references(
     """
     reference_settings, references = settings.reference, References(held_out)
     if len(reference_settings.paths) != len(sensors):
-        raise MivolError(f"found {len(reference_settings.paths)} reference files for {len(sensors)} views: give one for each.")
+        raise MivolError(f"found {len(reference_settings.paths)} reference files for {len(sensors)} views: give as many files.")
     scene_hash = load_scene(base / reference_settings.scene).content_hash if reference_settings.scene else loaded.content_hash
     for name, sensor in zip(reference_settings.paths, sensors, strict=True):
         channels, header = read_exr(base / name)
@@ -183,7 +183,7 @@ def read_references(
 
 
 def select_colours(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the channels that the variant renders: colours (height, width, 3), or luminance (height, width, 1).
+    """Return the channels rendered by the variant: colours (height, width, 3), or luminance (height, width, 1).
 
     Raises:
         MivolError: channels of other names.
@@ -191,12 +191,12 @@ def select_colours(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
     name, expected = ("Y", "Y (luminance)") if "mono" in mi.variant() else ("", "R, G and B")
     if name not in channels:
         names = ", ".join(one or "R, G, B" for one in sorted(channels))
-        raise MivolError(f"{path}: found the channels {names}, expected {expected}; write the picture with these.")
+        raise MivolError(f"{path}: found the channels {names}, expected {expected}; write the image with these channels.")
     return channels[name][..., None] if channels[name].ndim == 2 else channels[name][..., :3]
 
 
 VOXEL_BYTES = 9 * 8
-"""Memory per voxel of a procedural volume while it is made [byte]: the position twice, and three numbers, in float64."""
+"""Memory per voxel during the computation of a procedural volume [byte]: the position twice, and three numbers, in float64."""
 
 
 def make_truth(settings: SceneExperiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
@@ -217,7 +217,7 @@ def make_truth(settings: SceneExperiment, base: Path, scene: mi.Scene) -> np.nda
 
 
 def check_truth(settings: SceneExperiment) -> None:
-    """Refuse a true volume of a parameter that is not fitted: references and renders would show different volumes.
+    """Refuse a true volume of an unfitted parameter: references and renders would show different volumes.
 
     Raises:
         MivolError: with the key.
@@ -225,13 +225,13 @@ def check_truth(settings: SceneExperiment) -> None:
     if settings.truth is not None and settings.truth.key not in [parameter.key for parameter in settings.parameter]:
         raise MivolError(
             f"truth.key is {settings.truth.key}, which is no parameter of the fit, so the references would show another volume "
-            "than the renders: look for it too, or put what is known into the scene (scene.define) and take the truth out."
+            "than the renders: fit it too, or put the known values into the scene (scene.define) and remove the truth."
         )
 
 
 @contextmanager
 def hold_values(scene: mi.Scene, key: str, values: np.ndarray) -> Iterator[None]:
-    """Put other values of one parameter into the scene for the time of a block."""
+    """Replace the values of a parameter in the scene within a block."""
     params = mi.traverse(scene)
     before = type(params[key])(params[key])
     set_parameter(params, key, values)

@@ -1,8 +1,8 @@
 """An image of a scene, a radiance field, points or Gaussians.
 
-Conventions. The image of a scene is the mean of passes of at most ``SAMPLES_PER_PASS`` samples, so that Ctrl-C acts within
-seconds. Channels keep Mitsuba's names, with AOVs after the colour. Fields, points and Gaussians are rendered without a scene,
-through a given camera.
+Conventions. The image of a scene is the mean of passes of at most ``SAMPLES_PER_PASS`` samples. Ctrl-C therefore stops a
+render within seconds. Channels keep Mitsuba's names, with AOVs after the colour. Fields, points and Gaussians are rendered
+without a scene, through a given camera.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from mivol.splatting import Splatter, to_tensors
 
 SAMPLES_PER_PASS = 1 << 21
 KEPT = 2 * 4 * 8
-"""Memory per pixel beside a pass [byte]: the sum of four channels in float64, and the pass while it is added."""
+"""Memory per pixel beside a pass [byte]: the sum of four channels in float64, and the pass during the addition."""
 
 COLOURS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
@@ -59,21 +59,21 @@ def integrator_name(integrator: mi.Integrator) -> str:
 
 
 def choose_integrator(scene: mi.Scene, name: str | None = None) -> mi.Integrator:
-    """Return the scene's integrator, or the named one with the same ``max_depth`` if it has that setting.
+    """Return the scene's integrator, or the named integrator, with the same ``max_depth`` if supported.
 
     Raises:
         MivolError: no integrator in the scene and no name, or an unknown name.
     """
     if name is None:
         if scene.integrator() is None:
-            raise MivolError("the scene has no integrator: add one to it, or name one (--integrator mivol).")
+            raise MivolError("the scene has no integrator: add an integrator to the scene, or choose --integrator mivol.")
         return scene.integrator()
     try:
         return mi.load_dict({"type": name, "max_depth": read_settings(scene).max_depth})
     except RuntimeError as error:
         if "max_depth" in str(error):
             return mi.load_dict({"type": name})
-        raise MivolError(f'the integrator "{name}" cannot be loaded ({describe_error(error)}): "mivol" is ours.') from None
+        raise MivolError(f'the integrator "{name}" cannot be loaded ({describe_error(error)}): choose "mivol".') from None
 
 
 def render_image(
@@ -109,7 +109,7 @@ def render_image(
 
 
 def write_image(path: Path, image: np.ndarray, names: list[str]) -> None:
-    """Write an image in the format of its suffix.
+    """Write an image in the format of the file's suffix.
 
     Raises:
         MivolError: another suffix than .exr or .png, or a disk error.
@@ -122,11 +122,11 @@ def write_image(path: Path, image: np.ndarray, names: list[str]) -> None:
 
 
 SKY_FILE = "sky.exr"
-"""Name of the fitted sky beside its field."""
+"""Name of the fitted sky beside the field."""
 
 
 def render_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> np.ndarray:
-    """Render a field through a pinhole, over the sky beside its file or black: linear light (height, width, 3).
+    """Render a field through a pinhole, over the sky beside the file or black: linear light (height, width, 3).
 
     Args:
         path: file of the field.
@@ -184,13 +184,13 @@ class PointLook:
     """Appearance of points.
 
     Attributes:
-        drawn_as: one of :data:`DRAWN_AS`.
+        drawn_as: shape, from :data:`DRAWN_AS`.
         radius: radius of a disc, or standard deviation of a splat [length]; None means half the median distance to the nearest
             points.
         opacity: opacity of a point, above 0 and up to 1.
 
     Raises:
-        MivolError: a number outside its domain.
+        MivolError: a number outside the domain.
     """
 
     drawn_as: str = "discs"
@@ -199,9 +199,9 @@ class PointLook:
 
     def __post_init__(self) -> None:
         if not 0.03 <= self.opacity <= 1:
-            raise MivolError(f"points of opacity {self.opacity:g} were asked for; 0.03 to 1 is expected: choose one of those.")
+            raise MivolError(f"points of opacity {self.opacity:g}: expected 0.03 to 1; choose an opacity in this range.")
         if self.radius is not None and not 0 < self.radius < math.inf:
-            raise MivolError(f"points of radius {self.radius:g} were asked for; a length above 0 is expected.")
+            raise MivolError(f"points of radius {self.radius:g}: expected a length above 0; choose a positive radius.")
 
 
 def render_points(
@@ -209,11 +209,11 @@ def render_points(
 ) -> np.ndarray:
     """Render points or Gaussians through a pinhole over black: linear light (height, width, 3).
 
-    Points are sorted by depth and composited front to back. A point smaller than a pixel covers a share of the pixel, so its
-    light decreases with the inverse square of its distance.
+    Points are sorted by depth and composited front to back. A point smaller than a pixel covers a share of the pixel. The
+    light of the point therefore decreases with the inverse square of the distance.
 
     Args:
-        path: file of points or Gaussians in any format; points without colours are coloured by their local density.
+        path: file of points or Gaussians in a known format; points without colours are coloured by their local density.
         look_at: positions of camera and target, six numbers [length]; None means a view of nearly all points.
         up: upward direction, three numbers.
         fov: horizontal field of view [degree].
@@ -225,14 +225,14 @@ def render_points(
     """
     is_cloud = not is_gaussian_file(check_file(path))
     if not is_cloud and look != PointLook():
-        raise MivolError(f"{path} holds Gaussians, which have shapes of their own: leave out how points are drawn.")
+        raise MivolError(f"{path} holds Gaussians, which have their own shapes: leave out the options for points.")
     gaussians = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)
     camera = make_camera(look_at or frame_points(gaussians.means, up, fov, size), up, fov, size)
     return decode_srgb(splat_points(gaussians, camera, is_cloud, is_cloud and look.drawn_as == "discs"))
 
 
 def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
-    """Round Gaussians of one radius at the points; points without colours are coloured by their local density."""
+    """Round Gaussians of equal radius at the points; points without colours are coloured by their local density."""
     gaussians = points_to_gaussians(cloud, look.opacity)
     if cloud.colours is None:
         gaussians = points_to_gaussians(replace(cloud, colours=density_colours(gaussians.scales()[:, 0])), look.opacity)
@@ -241,7 +241,7 @@ def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
 
 
 def density_colours(distances: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) of points by the logarithms of their distances to others; bright where the points are dense."""
+    """Colours (N, 3) of points by the logarithms of the distances between neighbours; dense points are bright."""
     height = -np.log(distances.astype(np.float64))
     low, high = np.quantile(height, [SHARE, 1 - SHARE])
     return mpl.colormaps[COLOUR_MAP]((height - low) / max(high - low, 1e-12))[:, :3]

@@ -1,8 +1,8 @@
 """Detection of upside-down detector rows, by coarse reconstructions with both row orders.
 
 Views from opposite sides see the heights of an object from either side. If source and detector are symmetric about a plane, as
-on a circle with a centred detector, an upside-down scan equals a scan of the mirrored object, and nothing tells them apart; the
-same holds for parallel light. A detector displaced along v, a helix, or any other trajectory breaks the symmetry.
+on a circle with a centred detector, an upside-down scan equals a scan of the mirrored object. Both cases have the same
+projections, also in parallel light. A detector displaced along v, a helix, or another trajectory breaks the symmetry.
 """
 
 from __future__ import annotations
@@ -21,12 +21,11 @@ from mivol.tomography.panel_views import PanelViews
 from mivol.tomography.projector import Projector
 
 VIEWS, EDGE, ITERATIONS = 32, 24, 10
-"""At most so many views of so many rows, columns and voxels along an edge are compared, after so many iterations of CGLS."""
+"""Bounds of the comparison: number of views; rows, columns and voxels along an edge; iterations of CGLS."""
 
 LIMIT = 6.0
 """Mean difference of the views' residuals over its standard error, above which rows count as upside down. If both orders
-explain a
-scan equally well, Student's t of 31 degrees of freedom exceeds 6 with probability 6e-7."""
+explain a scan equally well, Student's t of 31 degrees of freedom exceeds 6 with probability 6e-7."""
 
 ROUNDING = 1e-4
 """Relative rounding error of a residual after ten iterations of float32 products, whose sums have errors of about 1e-6 each."""
@@ -47,7 +46,7 @@ class RowOrder:
 
 
 def can_tell(geometry: object, grid: VoxelGrid) -> bool:
-    """Whether a scan differs from the scan of its mirror image."""
+    """Whether a scan of an object differs from a scan of the mirrored object."""
     if isinstance(geometry, ParallelBeam) or geometry.shape[1] < 2:
         return False
     return not isinstance(geometry, ConeBeam) or geometry.detector_offset[0] != 0 or grid.centre[2] != 0

@@ -1,8 +1,8 @@
-"""The folder of a run: its record, its metrics and its best iterate, protected from other runs.
+"""The folder of a run: record, metrics and best iterate, protected from other runs.
 
 Conventions. A run folder holds ``run.json``, ``metrics.jsonl``, ``checkpoint.npz``, ``report.html`` and folders of results:
 ``views/``, ``volumes/``, ``curves/``, ``references/``, ``film/``. A running reconstruction also writes ``preview.png``. Every
-file is written whole. The files of an earlier run move to ``earlier/`` when a new run takes its first step.
+file is written atomically. The files of an earlier run move to ``earlier/`` when a new run takes its first step.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ CHECKPOINT = "checkpoint.npz"
 BEST = "best.npz"
 EARLIER = "earlier"
 KEPT = (RECORD, METRICS, CHECKPOINT, BEST, "report.html")
-"""Files that move to ``earlier/``."""
+"""Files moved to ``earlier/``."""
 
 
 class RunFolder:
-    """A folder, created if missing, and the record of the run in it.
+    """A folder, created if missing, with the record of a run.
 
     Attributes:
         path: path of the folder.
@@ -70,7 +70,7 @@ class RunFolder:
     def at_work(self) -> Iterator[None]:
         """Keep ``run.json`` up to date: "running" first, "finished" or "stopped" in the end, with the reason of the stop.
 
-        A run that is refused before its first step leaves the record of an earlier run unchanged.
+        A run refused before the first step leaves the record of an earlier run unchanged.
 
         Raises:
             MivolError: another run uses the folder.
@@ -92,10 +92,10 @@ class RunFolder:
             self._write()
 
     def begin(self, iteration: int) -> None:
-        """Take over the folder before the first step, when nothing can be refused any more.
+        """Take over the folder before the first step, after the last check.
 
         Args:
-            iteration: last iteration whose metrics a resumed run keeps; a new run keeps none.
+            iteration: last iteration with metrics kept by a resumed run; a new run keeps no metrics.
         """
         if self.is_resumed:
             rewind_metrics(self.path, iteration)
@@ -104,7 +104,7 @@ class RunFolder:
         self._write()
 
     def _holds_a_run(self) -> bool:
-        """Whether an earlier run has taken a step or finished here, or was being moved when its process was killed."""
+        """Whether the folder has an earlier run with a step or an end, or a run whose move was interrupted."""
         present = {name for name in KEPT if (self.path / name).exists()}
         if present != {RECORD}:
             return bool(present)
@@ -113,7 +113,7 @@ class RunFolder:
         return False
 
     def _put_away(self) -> None:
-        """Move the files of an earlier run to ``earlier/``, so that runs are never mixed and none is lost.
+        """Move the files of an earlier run to ``earlier/``. Runs are never mixed or lost.
 
         If the process is killed, the earlier run is complete in the folder or in ``earlier/``: the files are copied first (by
         hard links if the file system has them), then removed, the record first. Files without a record have been moved before.
@@ -130,7 +130,7 @@ class RunFolder:
             (self.path / name).unlink()
 
     def _copy_to_earlier(self, names: list[str], coming: Path, going: Path) -> None:
-        """Make ``earlier/`` of these files in one rename, by way of two temporary folders."""
+        """Make ``earlier/`` of these files by a single rename, with two temporary folders."""
         coming.mkdir()
         for name in names:
             try:
@@ -166,7 +166,7 @@ class RunFolder:
                 (self.path / name).mkdir(exist_ok=True)
 
     def summary(self) -> str:
-        """Return the results of the record in one line."""
+        """Return the results of the record in a line."""
         words = []
         for name, value in self.record.results.items():
             quantity = find_quantity(name, self.record.units)
@@ -176,7 +176,7 @@ class RunFolder:
         return f"saved: {', '.join(words)}"
 
     def rewind(self, iteration: int) -> None:
-        """Remove the metrics after an iteration, so that a resumed run repeats none."""
+        """Remove the metrics after an iteration, to keep a resumed run from repeating rows."""
         rewind_metrics(self.path, iteration)
 
     def append(self, iteration: int, seconds: float, **values: float) -> None:
@@ -193,7 +193,7 @@ class RunFolder:
 
 
 JUDGES = {"nrmse": 1.0, "held_out_psnr": -1.0, "few_psnr": -1.0}
-"""Errors that judge an iterate, in order of preference. Smaller is better after multiplication by the sign."""
+"""Errors to compare iterates, in order of preference. Smaller is better after multiplication by the sign."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class BestFiles:
 
     Attributes:
         names: paths relative to the run folder.
-        write: function that writes the current model into a folder.
+        write: function writing the current model into a folder.
     """
 
     names: tuple[str, ...]
@@ -213,9 +213,9 @@ class BestIterate:
     """The best iterate so far, and the error of the newest iterate.
 
     Attributes:
-        run: run folder; its ``best.npz`` has the best iterate, from which a resumed run continues.
+        run: run folder; its ``best.npz`` has the best iterate, with which a resumed run continues.
         files: more files of the best iterate; may be None.
-        judge: name of the judging error, a key of ``JUDGES``; "" before the first judgement, and without any error.
+        judge: name of the judging error, a key of ``JUDGES``; "" before the first comparison, and without an error.
         iteration: iteration of the best iterate.
         value: error of the best iterate.
         newest: error of the newest iterate.
@@ -248,7 +248,7 @@ class BestIterate:
         if judge == self.judge and JUDGES[judge] * (self.newest - self.value) >= 0:
             return
         self.judge, self.iteration, self.value = judge, iteration, self.newest
-        if self.files is not None:  # first, so that best.npz never speaks of files that are not there yet
+        if self.files is not None:  # first: best.npz must not name files before they exist
             self.files.write(self.run.path)
         about = {"judge": judge, "iteration": iteration, "value": self.value, "fingerprint": {}}
         checkpoint.write(self.run.best, {name: np.array(value) for name, value in (values or {}).items()}, about)
@@ -278,5 +278,5 @@ class BestIterate:
         verb = "holds" if self.files is not None and len(self.files.names) == 1 else "hold"
         return [
             f"{quantity.label} was best at iteration {self.iteration}, {best}, and is {last} at the end: "
-            f"{where} {verb} that iterate, all else is of the last."
+            f"{where} {verb} the best iterate, all other files hold the last iterate."
         ]

@@ -59,10 +59,10 @@ class ScanFit(FitKind):
     """A reconstruction of a volume from projections.
 
     Attributes:
-        grid: requested voxels; the projector's grid may divide them.
+        grid: requested voxels; the projector's grid may be finer.
         data: projections; after the fit without the fitted drift of the light.
-        held_out, kept: indices of the views that are predicted, and of the views that are fitted.
-        projector: rays of all views, and the unknowns.
+        held_out, kept: indices of the predicted and of the fitted views.
+        projector: rays of the scan, and the unknowns.
     """
 
     stages = Stages("projections", "solve", "images and volumes")
@@ -158,7 +158,7 @@ class ScanFit(FitKind):
         settings = self.settings
         if settings.solve.start == "filtered":
             check_directions(self.projector)
-        # Back-projection alone takes longer than all else here.
+        # Back-projection alone takes longer than the other steps of this rehearsal.
         cheap = msgspec.structs.replace(settings, solve=msgspec.structs.replace(settings.solve, start="empty"))
         problem = make_problem(cheap, self.projector, self.data, self.kept)
         storage = choose_storage(settings.solve, problem.linear_problem.A).line
@@ -171,7 +171,7 @@ class ScanFit(FitKind):
 
 
 def make_projector(settings: config.ScanExperiment, data: Projections, grid: VoxelGrid) -> Projector:
-    """Return the projector of all rays through the unknowns.
+    """Return the projector of the scan's rays through the unknowns.
 
     Raises:
         MivolError: more unknowns than memory.
@@ -208,7 +208,7 @@ def view_times(data: Projections) -> np.ndarray:
 
 
 def subtract_drift(problem: ProjectionProblem, data: Projections, held_out: np.ndarray, state: SolverState) -> Projections:
-    """Subtract the drift of the light, fitted to the views that are not held out, from the line integrals."""
+    """Subtract the drift of the light from the line integrals; the fitted views determine the drift."""
     if problem.times is None:
         return data
     drift = fit_drift(problem.linear_problem, state.x, problem.times)
@@ -219,7 +219,7 @@ def start_volume(solve: config.SolveSettings, a: Projector, data: Projections, k
     """Return the first volume of an iterative solver, nonnegative if requested; None means an empty volume.
 
     Raises:
-        MivolError: geometries that filtered back-projection refuses.
+        MivolError: geometries refused by filtered back-projection.
     """
     if solve.start == "empty" or solve.name in DIRECT:
         return None
@@ -229,7 +229,7 @@ def start_volume(solve: config.SolveSettings, a: Projector, data: Projections, k
 
 
 def expected_noise(settings: config.ScanExperiment, problem: ProjectionProblem, data: Projections) -> float | None:
-    """Norm of the residual that the noise alone leaves; None if the noise is unknown.
+    """Norm of the residual due to noise alone; None if the noise is unknown.
 
     Raises:
         MivolError: a stop by an unknown noise.
@@ -240,7 +240,7 @@ def expected_noise(settings: config.ScanExperiment, problem: ProjectionProblem, 
 
 
 def make_solver(settings: config.ScanExperiment, noise: float | None) -> LinearSolve:
-    """Return the solver with its settings; it stops at the noise if requested."""
+    """Return the solver with the settings, including a requested stop at the noise."""
     solve = settings.solve
     shared = {name: getattr(solve, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     if solve.discrepancy:

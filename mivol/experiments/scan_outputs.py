@@ -21,12 +21,12 @@ from mivol.validate.metrics import nrmse
 def write_outputs(
     run: RunFolder, projector: Projector, grid: VoxelGrid, data: Projections, held_out: np.ndarray, x: np.ndarray
 ) -> None:
-    """Write volume, sinogram, held-out views and curves, and put them and the results on record.
+    """Write volume, sinogram, held-out views and curves, and record the files and the results.
 
     Args:
-        run: run folder; its record has the iterations already.
-        projector: projector of all views.
-        grid: requested voxels; the projector's grid may divide them.
+        run: run folder, with the iterations on record.
+        projector: projector of fitted and held-out views.
+        grid: requested voxels; the projector's grid may be finer.
         data: projections.
         held_out: indices of the held-out views.
         x: reconstruction (Z, Y, X) on the projector's grid.
@@ -55,13 +55,13 @@ def write_outputs(
 
 
 def write_best(run: RunFolder, grid: VoxelGrid, best: BestIterate) -> None:
-    """Write the best iterate beside the last one, if they differ."""
+    """Write the best iterate beside the last iterate, if the iterates differ."""
     if not best.is_newest:
         write_volume(run.path / "volumes/reconstruction_best.npz", best.read()["volume"].reshape(grid.shape), grid.to_world)
 
 
 class Pair(NamedTuple):
-    """Line integrals of one shape: measured, predicted, and their standard deviation; NaN if unknown."""
+    """Line integrals of equal shape: measured, predicted, and the standard deviation; NaN if unknown."""
 
     measured: np.ndarray
     predicted: np.ndarray
@@ -77,7 +77,7 @@ def line_noise(data: Projections) -> np.ndarray:
 
 
 def write_pair(folder: Path, name: str, pair: Pair, caption: str = "", held_out: bool = False) -> list[Image]:
-    """Write measured and predicted line integrals and their noise as layers of one file."""
+    """Write measured and predicted line integrals and the noise as layers of a file."""
     path = f"views/{name.replace(' ', '_')}.exr"
     layers = {"Y": pair.predicted, "reference.Y": pair.measured}
     roles = {"render": "Y", "reference": "reference.Y"}

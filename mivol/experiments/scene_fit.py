@@ -1,7 +1,7 @@
 """A fit of scene parameters to images of the scene.
 
-Conventions. References are cached by their content, so another fit of the same views renders none. A row of the metrics has the
-number of its step, and errors measured before the step; the last row has the errors of the result.
+Conventions. References are cached by content, and another fit of the same views uses the cache. A row of the metrics has the
+index of a step, and errors measured before the step; the last row has the errors of the result.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ from mivol.validate.metrics import nrmse, psnr
 __all__ = ["SceneFit"]
 
 REHEARSAL_SPP = 2
-"""Largest number of samples per pixel in the derivative that ``mivol explain`` takes; a noisy loss needs pairs."""
+"""Largest number of samples per pixel in the derivative taken by ``mivol explain``; a noisy loss needs pairs."""
 
 
 class SceneFit(FitKind):
-    """A fit of scene parameters; ``mivol explain`` describes the scene with the truth in it, or at its start if unknown.
+    """A fit of scene parameters; ``mivol explain`` describes the scene with the truth, or with the first values if unknown.
 
     Attributes:
         loaded: scene of the experiment.
-        sensors, held_out: sensors of all views, and the indices of the held-out views.
+        sensors, held_out: sensors of the views, and the indices of the held-out views.
         truth: true volume (Z, Y, X, C); None if unknown.
         depth_plan: the choice of "auto" for ``fit.max_depth``.
         starts: parameters and their first values.
         integrator: integrator of the renders.
-        references: images of all views.
+        references: images of the views.
     """
 
     stages = Stages("scene", "fit", "images and volumes")
@@ -123,9 +123,10 @@ class SceneFit(FitKind):
             self.record.citations += [key for key in cites if key not in self.record.citations]
 
     def improve_starts(self, run: RunFolder) -> list[str]:
-        """Fit emissive starts for the parameters that ask for one; return notes on them.
+        """Fit emissive starts for parameters with ``start_fit = "emission"``; return notes on the starts.
 
-        A run that continues from a checkpoint has its values from there.
+                A resumed
+        run takes the values from the checkpoint.
         """
         if self.context.resume and run.checkpoint.exists():
             return []
@@ -161,7 +162,7 @@ class SceneFit(FitKind):
             run.append(**fit.evaluations[-1])
         if self.references.held_out:
             self.record.notes.append(
-                f"PSNR of the held-out views is the mean over {len(self.references.held_out)} of them, the same at each point "
+                f"PSNR of the held-out views is the mean over {len(self.references.held_out)} views, the same at each point "
                 "of the curve; the peak is the largest value of each reference."
             )
         self.record.notes += fit.log + ([f"stopped early: {fit.run.stop_reason}"] if fit.run.stop_reason else [])
@@ -188,7 +189,7 @@ class SceneFit(FitKind):
             set_parameter(params, start.parameter.name, start.value)
         if self.truth is not None:
             set_parameter(params, settings.truth.key, self.truth)
-        say(f"  holding   {'the truth' if self.truth is not None else 'the start'}, in what follows")
+        say(f"  holding   {'the truth' if self.truth is not None else 'the start'}, in the following lines")
         return explain_scene(scene, settings.fit.max_depth, to_sensor(self.sensors[0]))
 
 
@@ -201,12 +202,12 @@ def resolve_depth(
     truth is unknown, nothing can be measured, and paths have no limit.
 
     Returns:
-        Settings with a number, and its reason; the given settings if they have a number.
+        Settings with a number, and the reason; unchanged settings if ``max_depth`` is a number.
     """
     if settings.fit.max_depth != AUTO:
         return settings, []
     if truth is None and not isinstance(settings.reference, Rendered):
-        depth, reason = -1, "the references are files, and what they show is not known"
+        depth, reason = -1, "the references are files of an unknown volume"
     else:
         with nullcontext() if truth is None else hold_values(loaded.scene, settings.truth.key, truth):
             sensor = to_sensor(next(iter(settings.views.sensors(loaded.scene))))
@@ -228,18 +229,18 @@ def make_integrator(settings: SceneExperiment) -> mi.Integrator:
     """Load the integrator of the fit.
 
     Raises:
-        MivolError: Mitsuba has no integrator of that name, or the integrator refuses its settings.
+        MivolError: an unknown integrator, or settings refused by the integrator.
     """
     name = settings.fit.integrator
     try:
         return mi.load_dict({"type": name, "max_depth": settings.fit.max_depth})
     except RuntimeError as error:
         reason = " ".join(str(error).split())
-        raise MivolError(f'fit.integrator = "{name}" cannot be loaded ({reason}): "mivol" is the usual one.') from None
+        raise MivolError(f'fit.integrator = "{name}" cannot be loaded ({reason}): choose "mivol", the default.') from None
 
 
 def make_white_references(sensors: Sequence[Any], held_out: frozenset[int]) -> References:
-    """White images in place of the references that a fit would render."""
+    """White images in place of rendered references."""
     references = References(held_out)
     for sensor in sensors:
         width, height = to_sensor(sensor).film().crop_size()
@@ -270,7 +271,7 @@ def plan_renders(settings: SceneExperiment, problem: SceneProblem) -> Plan | Non
 
 
 class SceneErrors:
-    """Errors that a fit does not minimise.
+    """Errors outside the loss of a fit.
 
     These are the PSNR of held-out views, the error of the volume if the truth is known, and the values of parameters of few
     numbers.
@@ -301,7 +302,7 @@ class SceneErrors:
 
 
 def scalar_values(problem: SceneProblem) -> dict[str, float]:
-    """Current numbers of all parameters that are neither grids nor images, by key and index."""
+    """Current numbers of the parameters without a grid or an image, by key and index."""
     values = {name: np.asarray(value) for name, value in problem.values().items() if value.ndim == 1}
     return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}
 

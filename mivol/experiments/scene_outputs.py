@@ -48,7 +48,7 @@ class SceneOutputs:
     best: BestIterate
 
     def write(self) -> None:
-        """Write images, volumes and curves, and put them and the results on record."""
+        """Write images, volumes and curves, and record the files and the results."""
         record, fit = self.run.record, self.fit
         self.run.make("views", "volumes")
         for number, view in enumerate((*self.references.fitted, *self.references.held_out)):
@@ -68,11 +68,11 @@ class SceneOutputs:
         }
 
     def render_last(self, view: View, number: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Render a view; return it with the standard error of its difference from the reference, None if the reference's is
-        unknown.
+        """Render a view; return the image and the standard error of the difference from the reference, or None if the
+        standard error of the reference is unknown.
 
-        The render's own noise counts. At the edge of a lit region, the render may see light that no path of the reference has
-        found, and its noise is then the larger part. It is estimated from ``BATCHES`` renders of at least one sample.
+        The render's own noise counts. At the edge of a lit region, the render may see light missed by the reference. The
+        noise of the render is then the larger part. The estimate uses ``BATCHES`` renders of at least one sample.
         """
         render, spp = self.fit.problem.render, self.settings.fit.spp_shown or self.settings.fit.spp
         seed, error = (self.settings.seed, 0, number, FINAL), self.references.standard_errors.get(view.name)
@@ -83,7 +83,7 @@ class SceneOutputs:
         return batches.mean.astype(np.float32), np.sqrt(np.square(error) + batches.variance_of_mean).astype(np.float32)
 
     def write_view(self, view: View, number: int) -> list[Image]:
-        """Write a render beside its reference."""
+        """Write a render beside the reference."""
         stem = f"views/{view.name.replace(' ', '_')}"
         image, error = self.render_last(view, number)
         reference = np.asarray(view.reference)
@@ -98,9 +98,9 @@ class SceneOutputs:
         return [Image(path=f"{stem}.exr", role=role, layer=layer_name(*part), **about) for role, part in parts.items()]
 
     def write_grid(self, parameter: Sought) -> list[Volume]:
-        """Write a fitted grid as .npz and .vol at its place in the scene, and as a film, and the truth if known.
+        """Write a fitted grid as .npz and .vol at the place in the scene, and as a film, and the truth if known.
 
-        A .vol holds only boxes along the axes. For a rotated grid it has the unit cube, which the scene places.
+        A .vol holds only boxes along the axes. For a rotated grid, the .vol has the unit cube; the scene has the transform.
         """
         value = np.asarray(self.fit.values()[parameter.key])
         if value.ndim != GRID:
@@ -128,8 +128,8 @@ class SceneOutputs:
     def write_image(self, key: str) -> list[Image]:
         """Write a fitted image (texture, sky) as .exr of linear values and as .png.
 
-        Mitsuba's ``envmap`` repeats a column at either side of its input. The output has no repeated columns, since another
-        ``envmap`` would repeat them again.
+        Mitsuba's ``envmap`` repeats a column at either side of the input. The output has no repeated columns, since another
+        ``envmap`` would add new ones.
         """
         value = np.asarray(self.fit.values()[key])
         if value.ndim != 3 or value.shape[2] not in (1, 3):
@@ -140,7 +140,7 @@ class SceneOutputs:
         stem = f"images/{key.replace('.', '_')}"
         write_exr(self.run.path / f"{stem}.exr", to_exr_layer("", image))
         write_png(self.run.path / f"{stem}.png", image)
-        return [Image(path=f"{stem}.png", role="picture", caption=f"{key} as found, in {stem}.exr")]
+        return [Image(path=f"{stem}.png", role="picture", caption=f"fitted {key}; linear values are in {stem}.exr")]
 
 
 def to_exr_layer(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:

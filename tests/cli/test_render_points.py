@@ -65,7 +65,7 @@ def test_flags_that_do_not_fit_are_refused(tmp_path: Path, capsys: pytest.Captur
     for name, flags, said in (
         ("cloud.npy", ["--opacity", "0"], "0.03 to 1 is expected"),
         ("cloud.npy", ["--radius", "-1"], "a length above 0"),
-        ("set.ply", ["--radius", "1"], "have shapes of their own"),
+        ("set.ply", ["--radius", "1"], "have their own shapes"),
         ("none.ply", ["--radius", "1"], "nothing there"),
         ("scene.xml", ["--radius", "1"], "are for clouds of points"),
         ("scene.xml", ["--look-at", *"000111"], "a scene has its own cameras"),

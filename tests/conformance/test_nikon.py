@@ -153,7 +153,7 @@ def test_angles_are_read_from_a_list(variant_rgb, tmp_path: Path, name: str) -> 
     chosen = config.load(tmp_path / "fit.toml", [f'data.angles="{name}"'])
     data = projections.make_data(chosen, tmp_path, projections.make_grid(chosen, tmp_path))
     np.testing.assert_allclose(data.geometry.angles, np.radians(angles - 180), atol=1e-14)
-    assert data.notes == ("not heeded: DetectorOffsetX = 2",)
+    assert data.notes == ("ignored settings: DetectorOffsetX = 2",)
 
 
 REFUSED = {

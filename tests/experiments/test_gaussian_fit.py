@@ -115,7 +115,7 @@ def test_the_best_gaussians_are_kept_beside_the_last(
     made = [read_gaussians(tmp_path / f"run/{name}.ply").means for name in ("gaussians_best", "gaussians")]
     assert [np.array_equal(one, seen[number]) for one in made for number in (1, -1)] == [True, False, False, True]
     risen, saved = capsys.readouterr().err.strip().splitlines()[-2:]
-    assert "was best at iteration 80, 25 dB, and is 20 dB at the end: gaussians_best.ply holds that iterate" in risen
+    assert "was best at iteration 80, 25 dB, and is 20 dB at the end: gaussians_best.ply holds the best iterate" in risen
     assert risen in json.loads((tmp_path / "run/run.json").read_text())["notes"]
     assert saved.startswith("saved: ")
 

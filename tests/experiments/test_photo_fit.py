@@ -178,7 +178,7 @@ def test_the_best_field_is_kept_beside_the_last(
     assert (nearest("field_best"), nearest("field")) == (1, 2)
     record = json.loads((tmp_path / "run/run.json").read_text())
     risen, saved = capsys.readouterr().err.strip().splitlines()[-2:]
-    assert "was best at iteration 20, 25 dB, and is 20 dB at the end: field_best.npz holds that iterate" in risen
+    assert "was best at iteration 20, 25 dB, and is 20 dB at the end: field_best.npz holds the best iterate" in risen
     assert risen in record["notes"]
     assert saved.startswith("saved: ")
     assert f"PSNR of the held-out views {record['results']['held_out_psnr']:.4g} dB" in saved

@@ -197,7 +197,7 @@ def test_angles_that_turn_back_are_noted() -> None:
         note_order(np.array([0.0, 1.0, 1.0, 2.0])) == note_order(np.array([2.0, 1.0, 0.0])) == note_order(np.array([1.0])) == []
     )
     (said,) = note_order(np.radians([0.0, 10, 5, 20, 15, 30]))
-    assert said == ("the angles turn back 2 times (view 2 at 5.00 degrees follows view 1 at 10.00): they are taken as they are")
+    assert said == ("the angles turn back 2 times (view 2 at 5.00 degrees follows view 1 at 10.00): they are used as given")
     assert "turn back 1 times (view 3 at 2.00" in note_order(np.radians([3.0, 2, 1, 2, 0]))[0]
 
 

@@ -270,7 +270,7 @@ def test_of_photographs_nothing_is_known(variant_rgb, folder: Path) -> None:
     (folder / "fit.toml").write_text("\n".join(line for line in text.splitlines() if not line.startswith("truth")))
     assert run("optimize", folder / "fit.toml", "-o", folder / "run", *ONE[:4], *PHOTOS) == 0
     first = record_of(folder)["plan"][0]
-    assert (first["choice"], first["reason"]) == ("max_depth: -1", "the references are files, and what they show is not known")
+    assert (first["choice"], first["reason"]) == ("max_depth: -1", "the references are files of an unknown volume")
 
 
 def test_other_words_are_refused(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:

@@ -86,7 +86,7 @@ def test_a_sky_that_was_found_is_an_image(variant_rgb, folder: Path) -> None:
     assert image.shape == (4, 6, 3)
     again = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image)})
     np.testing.assert_allclose(np.array(mi.traverse(again)["data"])[:, 1:-1], found[:, 1:-1], rtol=1e-6)
-    assert "sky.data as found" in (folder / "run" / "report.html").read_text()
+    assert "fitted sky.data" in (folder / "run" / "report.html").read_text()
 
 
 @pytest.mark.slow
