@@ -63,7 +63,7 @@ def test_flags_that_do_not_fit_are_refused(tmp_path: Path, capsys: pytest.Captur
     write_gaussians(tmp_path / "set.ply", random_gaussians(5, 0))
     out = ["-o", str(tmp_path / "a.png"), *SMALL]
     for name, flags, said in (
-        ("cloud.npy", ["--opacity", "0"], "0.03 to 1 is expected"),
+        ("cloud.npy", ["--opacity", "0"], "expected 0.03 to 1"),
         ("cloud.npy", ["--radius", "-1"], "a length above 0"),
         ("set.ply", ["--radius", "1"], "have their own shapes"),
         ("none.ply", ["--radius", "1"], "nothing there"),
