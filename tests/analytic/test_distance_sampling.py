@@ -5,15 +5,28 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import oracle_scattering as twins
 import pytest
-from scattering_scenes import close_up, point, smoke
+from false_alarms import Estimate, assert_precise, assert_same_mean
+from hard_scattering import BATCHES, holds_twin
+from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
 
+import scenes
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_media, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.emitters import ChosenEmitter
-from mivol.transport.estimators.single_scattering.distance_sampling import Candidate, DistanceProposal, sample_distance
+from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU
+from mivol.transport.estimators.single_scattering.distance_sampling import (
+    Candidate,
+    DistanceProposal,
+    fill_reservoir,
+    lit_length,
+    sample_distance,
+    start_reservoir,
+)
 from mivol.transport.path.estimators import Settings
+from scenes import as_float32, box_of, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -47,3 +60,88 @@ def test_collisions_in_a_cell_of_linear_extinction(ends):
     # Its density is sigma exp(-tau) over what the cell takes; tau is off by sigma times the error of the distance.
     density = sigma * np.exp(-goal) / -np.expm1(-length * (a + b) / 2)
     np.testing.assert_allclose(np.array(event.pdf), density, rtol=1e-4)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("peak", [20.0, 2000.0])
+def test_one_dense_voxel(peak):
+    """One voxel 10 or 1000 times denser than the rest, beside the rays and between some rays and the emitter: the same law."""
+    values = rough_grid(6)
+    values[-1, -1, -1] = peak
+    box, m = smoke(values, 0.8, "own")
+    emitter = point([1.5, 1, 2.0])
+    holds_twin(pencils({"smoke": box, "emitter": emitter[0]}, *aimed(6, 6)), m, emitter[1], quadrature=1e-4, order=16)
+
+
+def test_noise_does_not_follow_the_majorant():
+    """Rays far from the dense voxel have the same radiance with and without the voxel, to the last digits, with the same
+    noise."""
+    values = rough_grid(6)
+    o = as_float32(np.stack([np.full(4, -3.0), np.linspace(-0.8, 0.0, 4), np.full(4, -0.5)], axis=1))
+    images = []
+    for peak in (1.0, 1000.0):
+        values[-1, -1, -1] = peak
+        box, _ = smoke(values, 0.8, "own")
+        seen = pencils({"smoke": box, "sun": sun([0, 0, 1.0])[0]}, o, [1.0, 0, 0])
+        images.append(scenes.render(seen.scene, mivol(), 16, seed=2))
+    assert np.allclose(*images, rtol=1e-5, atol=0)
+
+
+@pytest.mark.slow_for("ratio1", "ratio2")
+@pytest.mark.statistical
+@pytest.mark.parametrize("ratio", [(1e-3, 1.0, 10.0), (0.0, 1.0, 2.0), (8.0, 8.0, 8e-4)])
+def test_channels_of_very_different_extinction(ratio):
+    """Each channel equals its own grey image, at ratios of 1e4 and with a channel of vacuum."""
+    values = as_float32(rough_grid(7, 1.0) * np.array(ratio))
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "hg", "g": 0.4})
+    emitter = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box_of(interior, PLACE), "emitter": emitter[0]}, *aimed(7, 6))
+    m = twins.Medium(twins.Grid(values, PLACE), float(as_float32(0.8)), twins.hg(0.4))
+    truth = twins.radiance([m], [emitter[1]], seen.o, seen.d)
+    found = seen.moments(mivol(), 4096, BATCHES)
+    for c in range(3):
+        top = truth[:, c].max()
+        channel = Estimate(found.mean[:, c], found.variance_of_mean[:, c], BATCHES - 1)
+        assert_same_mean(channel, truth[:, c], rounding=2e-5 * top + 1e-30, what=f"channel {c}")
+        bright = truth[:, c] > 0.1 * top
+        if top > 0:
+            assert_precise(channel._replace(var=channel.var[bright]), 0.03 * truth[bright, c], what=f"channel {c}")
+    assert np.all(found.mean >= 0)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "length", "lit"),
+    [
+        ((2.0,), 1e9, NEGLIGIBLE_TAU / 2),
+        ((2.0, 0.5, 4.0), 1e9, NEGLIGIBLE_TAU / 0.5),
+        ((2.0, 0.0), 1e9, NEGLIGIBLE_TAU / 2),
+        ((2.0,), 3.0, 3.0),
+        ((0.0,), 7.0, 0.0),
+    ],
+    ids=["grey", "rgb", "a channel of 0", "short", "empty"],
+)
+def test_what_is_behind_the_dark_takes_no_candidates(sigma, length, lit):
+    """A region of constant extinction may have no end; its clearest channel determines its lit length. A vacuum needs none."""
+    found = lit_length([mi.Float(s) for s in sigma], mi.Float(length))
+    assert float(np.array(found).item()) == pytest.approx(lit, rel=1e-6)
+
+
+def test_a_probe_is_spread_over_the_grid_alone():
+    """A grid fills the middle half of a box of vacuum: the optical depth of a probe is uniform over the length of the grid."""
+    grid = np.diag([1.0, 1, 1, 1])
+    grid[:3, 3] = -0.5
+    place = np.diag([2.0, 2, 2, 1])
+    place[:3, 3] = -1
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", np.ones((4, 4, 4, 1), np.float32), grid), 0.8)
+    seen = pencils({"smoke": box_of(interior, place), "sun": sun([0, 0, 1.0])[0]}, *aimed(4, 4))
+    n = 8
+    with dr.suspend_grad():
+        media = media_of(seen.scene)
+        ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -5 + dr.zeros(mi.Float, n)), mi.Vector3f(0, 0, 1))
+        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None), None, 0.7)
+        start = start_reservoir(media, mi.Float((np.arange(n) + 0.5) / n), n)
+        _, reservoir = fill_reservoir(proposal, media.medium_at(ray), start, mi.Bool(True))
+    (kept,) = reservoir.candidates
+    # The length of the grid comes from two slabs in float32.
+    np.testing.assert_allclose(np.array(kept.probe_sigma), 0.7, rtol=1e-5)
+    np.testing.assert_allclose(np.array(reservoir.tau[0]), 1.0, rtol=1e-5)

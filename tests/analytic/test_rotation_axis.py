@@ -1,4 +1,4 @@
-"""Parts of the search for a rotation axis, on numbers that are known."""
+"""The rotation axis: parts of the search on known numbers, cone beams of a known head, and the scan of scenes/bonsai."""
 
 from __future__ import annotations
 

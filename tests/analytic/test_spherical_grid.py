@@ -1,4 +1,4 @@
-"""Sizes of rows of harmonics, and valid numbers of harmonics."""
+"""Grids of spherical harmonics: sizes of rows, the index of stored nodes, and the same field on other nodes."""
 
 from __future__ import annotations
 

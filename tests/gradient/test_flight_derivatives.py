@@ -127,23 +127,39 @@ PARAMETERS = {
 }
 
 
-@pytest.mark.slow_for("albedo-grey", "density-grey", "emission-grey")
-@pytest.mark.parametrize("colour", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["grey", "rgb"])
-@pytest.mark.parametrize("name", small.cases(PARAMETERS, slow=("g", "scale", "floor", "emitter")))
-def test_forward_is_the_transpose_of_reverse(name, colour, whole_paths):
+OF_A_SUN = PARAMETERS | {"emitter": "sun.irradiance.value"}
+
+
+def _in_the_sun() -> mi.Scene:
+    """A peaked phase function under the sun, with side flights."""
+    smoky = grid_volume("mivol_voxels", rough_grid(4, 4.0), PLACE)
+    albedo = grid_volume("mivol_voxels", 0.9 * rough_grid(5, 1.0, (3, 3, 3)), PLACE)
+    interior = medium("mivol_medium", smoky, albedo, phase={"type": "mivol_hg", "g": 0.8})
+    return close_up({"smoke": box_of(interior, PLACE), "sun": sun([0.3, 0.2, -1.0])[0]}, res=8)
+
+
+SCENES = {
+    "grey": (_everything, PARAMETERS, {"max_depth": 5, "rr_depth": 3}),
+    "rgb": (lambda: _everything(True), PARAMETERS, {"max_depth": 5, "rr_depth": 3}),
+    "side flights": (_in_the_sun, OF_A_SUN, {"max_depth": 4}),
+}
+PAIRS = [(place, name) for place in ("grey", "rgb") for name in PARAMETERS]
+PAIRS += [("side flights", name) for name in ("density", "albedo", "g", "emitter")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("place", "name"), PAIRS)
+def test_forward_is_the_transpose_of_reverse(place, name, whole_paths):
     """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
-    scene, key = _everything(colour), PARAMETERS[name]
-    integrator = mi.load_dict(mivol(max_depth=5, rr_depth=3))
+    build, keys, settings = SCENES[place]
+    scene, key, integrator, seed = build(), keys[name], mi.load_dict(mivol(**settings)), fresh(5)
     w = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3))
     params = mi.traverse(scene)
     v = np.random.default_rng(2).uniform(0.5, 1.5, np.shape(params[key])) if np.size(params[key]) > 3 else 1.0
-    seed = fresh(5)
-    there = _forward(scene, key, v, 16, seed, integrator)
-    back = _backward(scene, key, w, 16, seed, integrator)
-    a, b = np.sum(there * w), np.sum(back * v)
+    there, back = _forward(scene, key, v, 16, seed, integrator), _backward(scene, key, w, 16, seed, integrator)
     # 1024 paths of some ten terms each, summed in float32; they are of both signs, so the sum of sizes counts.
-    assert a == pytest.approx(b, abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum()))
-    assert a != 0
+    assert np.sum(there * w) == pytest.approx(np.sum(back * v), abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum()))
+    assert np.sum(there * w) != 0
 
 
 def _along(scene: mi.Scene, key: str, v: np.ndarray, integrator: mi.Integrator, spp: int) -> Estimate:
@@ -256,29 +272,6 @@ def test_probes_are_kept_in_proportion_to_their_gain():
 
 
 # -- Side flights --------------------------------------------------------------------------------------------------------
-
-OF_A_SUN = PARAMETERS | {"emitter": "sun.irradiance.value"}
-
-
-def _in_the_sun() -> mi.Scene:
-    """A peaked phase function under the sun, with side flights."""
-    smoky = grid_volume("mivol_voxels", rough_grid(4, 4.0), PLACE)
-    albedo = grid_volume("mivol_voxels", 0.9 * rough_grid(5, 1.0, (3, 3, 3)), PLACE)
-    interior = medium("mivol_medium", smoky, albedo, phase={"type": "mivol_hg", "g": 0.8})
-    return close_up({"smoke": box_of(interior, PLACE), "sun": sun([0.3, 0.2, -1.0])[0]}, res=8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["density", "albedo", "g", "emitter"])
-def test_of_side_flights_forward_is_the_transpose_of_reverse(name, whole_paths):
-    """As above, to the same bound."""
-    scene, key, integrator = _in_the_sun(), OF_A_SUN[name], mi.load_dict(mivol(max_depth=4))
-    w = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3))
-    params = mi.traverse(scene)
-    v = np.random.default_rng(2).uniform(0.5, 1.5, np.shape(params[key])) if np.size(params[key]) > 3 else 1.0
-    seed = fresh(5)
-    there, back = _forward(scene, key, v, 16, seed, integrator), _backward(scene, key, w, 16, seed, integrator)
-    assert np.sum(there * w) == pytest.approx(np.sum(back * v), abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum()))
 
 
 def test_of_side_flights_light_is_linear_in_a_sky(whole_paths):
