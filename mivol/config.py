@@ -1,4 +1,4 @@
-"""The settings of an experiment, as a TOML file gives them: each with its unit, domain and meaning on one line.
+"""The settings of an experiment, as a TOML file gives them: each with unit, domain and meaning on a line.
 
 Conventions. The physics stays in Mitsuba's XML. The TOML file names the parameters, the views and the method. An unknown key
 is an error that offers the nearest valid key. The command line (``--set a.b=c``) overrides the file. Paths are relative to the
@@ -35,10 +35,10 @@ from mivol.validate.images import METRICS
 INFINITY = math.inf
 
 AUTO = "auto"
-"""Value of settings that mivol chooses itself."""
+"""Value of settings chosen by mivol."""
 
 DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
-"""A key of a hundred names with dots between them. The time of tomllib grows with the square of their number: a file of 200 kB
+"""A key of a hundred names separated by dots. The time of tomllib grows with the square of this number: a file of 200 kB
 takes a minute."""
 
 LONGEST_SENTENCE = 600
@@ -65,7 +65,7 @@ CheckpointSteps = Annotated[int, setting("step", "steps between two checkpoints"
 
 
 def check_word(word: str, known: Sequence[str] | dict[str, Any], subject: str) -> None:
-    """Refuse a word that is not among the known ones, and offer the nearest.
+    """Refuse an unknown word, and offer the nearest known word.
 
     Raises:
         ValueError: with the word.
@@ -580,16 +580,16 @@ KINDS: dict[str, type[Section]] = {
     "gaussians": GaussianExperiment,
     "photos": FieldExperiment,
 }
-"""Kinds of experiments by the table of the file that tells them apart; the first table found decides."""
+"""Kinds of experiments by a table of the file; the first present table decides."""
 
 CAPTURE = {
     "photos": {"largest": 240, "box": "middle"},
     "show": {"views": 64},
 }
-"""Defaults of a file with ``field.preset = "capture"``: photograph size that its grids resolve, nested boxes, views."""
+"""Defaults of a file with ``field.preset = "capture"``: photograph size resolved by the grids, nested boxes, views."""
 
 NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "show")
-"""Settings that change neither the result nor its checkpoint."""
+"""Settings without effect on result and checkpoint."""
 
 
 def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
@@ -620,10 +620,10 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
 
 
 def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
-    """Make an experiment from dicts and lists; its tables tell its kind (``KINDS``).
+    """Make an experiment from dicts and lists; the tables determine the kind (``KINDS``).
 
     Args:
-        raw: tables and settings as TOML holds them.
+        raw: tables and settings, as in TOML.
         name: beginning of an error message.
 
     Raises:
@@ -657,7 +657,7 @@ def of_photographs(path: Path, preset: str, changes: Sequence[str] = ()) -> Fiel
 
 
 def _with_capture(raw: dict[str, Any]) -> dict[str, Any]:
-    """Add the defaults of ``CAPTURE`` to a file with that preset."""
+    """Add the defaults of ``CAPTURE`` to a file with the preset ``capture``."""
     field = raw.get("field")
     if "photos" not in raw or not isinstance(field, dict) or field.get("preset") != "capture":
         return raw
@@ -671,7 +671,7 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
 
 
 def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """Return the settings that change the result, by dotted key."""
+    """Return the settings with effect on the result, by dotted key."""
     if isinstance(tree, dict | list | tuple) and len(tree):
         items = tree.items() if isinstance(tree, dict) else enumerate(tree)
         values: dict[str, Any] = {}
@@ -686,14 +686,14 @@ def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def apply_change(raw: dict[str, Any], change: str) -> None:
-    """Put ``a.b=c`` into ``raw``; a value that is no TOML is a text.
+    """Put ``a.b=c`` into ``raw``; a value outside TOML's syntax is a text.
 
     Raises:
         MivolError: no "=", or a key below a value without parts.
     """
     dotted, equals, text = change.partition("=")
     if not equals or not dotted.strip():
-        raise MivolError(f'--set "{change}" is no change: write key.of.setting=value.')
+        raise MivolError(f'--set "{change}" is not a change: write key.of.setting=value.')
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except ValueError:
@@ -711,5 +711,5 @@ def apply_change(raw: dict[str, Any], change: str) -> None:
 
 def _entry(place: Any, step: str, change: str) -> Any:
     if not isinstance(place, list) or not step.isdigit() or int(step) >= len(place):
-        raise MivolError(f'--set "{change}": "{step}" is not there to change: entries of a list count from 0.')
+        raise MivolError(f'--set "{change}": "{step}" does not exist: entries of a list count from 0.')
     return place[int(step)]

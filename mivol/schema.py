@@ -74,7 +74,7 @@ def _check_tag(raw: dict[str, Any], tag: str | None, choices: dict[str, type], w
 
 
 def structs_in(kind: Any) -> list[type]:
-    """Return the structs that a value of this type may be."""
+    """Return the structs among the types of a value."""
     if get_origin(kind) is tuple or isinstance(kind, str):
         return []
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
@@ -132,7 +132,7 @@ class Setting(NamedTuple):
         unit: unit; "1" for none.
         meaning: meaning in a line.
         choices: words or names of tables to choose from; empty without a choice.
-        table: whether the setting is a table with settings of its own.
+        table: whether the setting is a table with own settings.
     """
 
     key: str
@@ -144,7 +144,7 @@ class Setting(NamedTuple):
 
 
 def settings_in(kind: type, prefix: str = "") -> list[Setting]:
-    """Return every setting of a struct, of the tables in it and of the entries of its lists."""
+    """Return every setting of a struct, of the tables in the struct and of the entries of lists."""
     settings = []
     hints = get_type_hints(kind, include_extras=True)
     for field in msgspec.structs.fields(kind):

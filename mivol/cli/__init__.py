@@ -1,7 +1,7 @@
 """The command ``mivol``: a verb is one function and one entry of ``VERBS``.
 
 Conventions. A refusal of mivol, a full disk or memory, and Ctrl-C become one sentence on the error output and a nonzero exit
-code; only a bug of the program shows a traceback. Slow imports wait for the verb that needs them.
+code; only a bug of the program shows a traceback. Each verb makes its own slow imports.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def describe_error(error: MivolError | OSError | MemoryError) -> str:
-    """The sentence for an error that is no bug of the program."""
+    """Message for an error other than a bug."""
     if isinstance(error, MemoryError):
         return f"the memory does not suffice ({error or 'nothing more is known'}): take fewer voxels, pixels or views."
     return str(error)
@@ -67,7 +67,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser of all verbs and their flags."""
+    """Parser of the verbs and flags."""
     top = argparse.ArgumentParser(prog="mivol", description=DESCRIPTION)
     top.add_argument("--version", action="version", version=f"mivol {mivol.__version__}")
     verbs = top.add_subparsers(required=True, metavar="verb", title="verbs")
@@ -84,9 +84,9 @@ class Verb(NamedTuple):
     """A verb of the command.
 
     Attributes:
-        run: function of the parsed flags; its docstring is the help, and it returns the exit code or None for 0.
-        flags: function that returns the flags; its imports wait until the parser is made.
-        epilog: function that returns the last part of the help.
+        run: function of the parsed flags; the docstring is the help, and the result is the exit code or None for 0.
+        flags: function returning the flags; imports are delayed until the parser is made.
+        epilog: function returning the last part of the help.
     """
 
     run: Callable[[argparse.Namespace], int | None]
@@ -126,7 +126,7 @@ MAX_DEPTH = flag("--max-depth", type=int, help="longest path (default: the max_d
 
 
 def list_flag(name: str, metavar: str, text: str) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """A flag that may be given several times."""
+    """Flag for repeated use."""
     return flag(name, action="append", default=[], metavar=metavar, help=text)
 
 
@@ -273,7 +273,7 @@ def convert_flags() -> list:
 
 
 def demo(arguments: argparse.Namespace) -> None:
-    """Run an example, list the examples, or copy one to start from."""
+    """Run an example, list the examples, or copy the files of an example."""
     from mivol.cli.progress import TerminalProgress
     from mivol.experiments.examples import copy_example, list_examples, run_example
 
@@ -289,7 +289,7 @@ def demo(arguments: argparse.Namespace) -> None:
 def explain(arguments: argparse.Namespace) -> int:
     """Say what mivol would do with a scene or an experiment, and why, before it renders more than a small preview.
 
-    For photographs, explain lists what is there and what is missing, and draws the cameras with --output. For points and
+    For photographs, explain lists present and missing data, and draws the cameras with --output. For points and
     Gaussians, it prints their number, extent, sizes and opacities. A refusal comes after the facts, with exit code 1.
     """
     from mivol.photos import find_format
@@ -297,7 +297,7 @@ def explain(arguments: argparse.Namespace) -> int:
 
     is_experiment = arguments.scene.suffix.lower() == ".toml" or arguments.preset is not None
     if arguments.set and not is_experiment:
-        raise MivolError(f"--set is for fits, and {arguments.scene} is none: give --preset, or the file of an experiment.")
+        raise MivolError(f"--set is for fits, and {arguments.scene} is not a fit: give --preset, or the file of an experiment.")
     if is_experiment:
         from mivol.experiments.kinds import explain_experiment
 
@@ -316,7 +316,7 @@ def explain(arguments: argparse.Namespace) -> int:
 
 
 def explain_photos(path: Path, picture: Path | None) -> int:
-    """Print the facts of a data set, and draw its cameras into an image."""
+    """Print the facts of a data set, and draw the cameras into an image."""
     from mivol.experiments.photo_data import note_on_alpha
     from mivol.photos import survey_photos
     from mivol.report.cameras import plot_cameras
@@ -355,7 +355,7 @@ def render(arguments: argparse.Namespace) -> None:
 
 
 def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
-    """Return the function that renders a radiance field, points or Gaussians; None for a scene.
+    """Return the function to render a radiance field, points or Gaussians; None for a scene.
 
     Raises:
         MivolError: a camera for a scene, or no camera for a field.
@@ -382,9 +382,9 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
 
 
 def reference(arguments: argparse.Namespace) -> None:
-    """Render a reference with Mitsuba's path tracer, with its variance, up to a given error.
+    """Render a reference and its variance with Mitsuba's path tracer, up to a given error.
 
-    With --sensor all, all sensors are rendered, with a file of cameras: photographs for a fit.
+    With --sensor all, the images of all sensors and a file of cameras are written: photographs for a fit.
     """
     from mivol.cli.loading import load
     from mivol.validate.photographs import render_photographs
@@ -444,7 +444,7 @@ def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Pat
 def validate(arguments: argparse.Namespace) -> int:
     """Compare mivol with Mitsuba's path tracer on a scene: bias, z-image, relMSE, gradients and a verdict.
 
-    The exit code is 0 if both agree, 3 if they differ, and 4 if Mitsuba's image cannot be trusted.
+    The exit code is 0 if both agree, 3 if they differ, and 4 if Mitsuba's image is not reliable.
     """
     from mivol.cli.loading import load
     from mivol.experiments.validation import Validation, validate_scene
@@ -474,7 +474,7 @@ def convert(arguments: argparse.Namespace) -> None:
 
     A field (.npz) is the mivol_sh of a scene. Conversions between a field and Gaussians (.ply) print their error in dB, from
     views of the field and of splatted Gaussians. A mesh (.obj, or .ply with --to mesh) is fused from depths of splatted views;
-    convert prints its distance from them.
+    convert prints the distance between mesh and splats.
     """
     source, target = arguments.source, arguments.output
     from_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
@@ -493,7 +493,7 @@ def convert(arguments: argparse.Namespace) -> None:
 
 
 WRITTEN_AS = {".npz": "field", ".obj": "mesh"}
-"""Kind of the file by its suffix, where only one is possible."""
+"""Kind of the file by suffix, for suffixes of a single kind."""
 
 
 def convert_cloud(arguments: argparse.Namespace, kind: str | None) -> str:
@@ -518,7 +518,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 
 def fetch(arguments: argparse.Namespace) -> None:
-    """Download public data of the examples into a cache, and check them."""
+    """Download public data of the examples into a cache, and verify the data."""
     from mivol.files.fetch import DATA, fetch_data, find_data_set
 
     if not arguments.name:

@@ -1,8 +1,8 @@
 """Ctrl-C and SIGTERM end a command with one sentence at any moment.
 
-Conventions. The handler raises KeyboardInterrupt. A callback from C++ (a render, a film) may turn it into another error, with
-or without the interrupt as its reason. Therefore the handler also records the signal, and every later error counts as its
-consequence.
+Conventions. The handler raises KeyboardInterrupt. A callback from C++ (a render, a film) may turn the interrupt into another
+error, with or without the interrupt as the cause. Therefore the handler also records the signal, and every later error counts
+as a consequence of the signal.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from types import FrameType
 class Signals:
     """Records signals, and raises KeyboardInterrupt.
 
-    A signal that the process was started to ignore (such as Ctrl-C for a background job of a script) stays ignored.
+    A signal ignored at the start of the process stays ignored, for example Ctrl-C for a background job of a script.
 
     Attributes:
         came: whether a signal has come.

@@ -12,10 +12,10 @@ from mivol.scene.load import LoadedScene, load_scene
 
 
 def load(arguments: argparse.Namespace) -> LoadedScene:
-    """Load the scene of the flags, with its variant and threads.
+    """Load the scene of the flags, with variant and threads.
 
     Raises:
-        MivolError: an unknown variant, a define without "=", or a scene that cannot be loaded.
+        MivolError: an unknown variant, a define without "=", or an invalid scene.
     """
     choose_back_end(arguments.mode, arguments.threads)
     mi.set_log_level(mi.LogLevel.Debug if arguments.verbose else mi.LogLevel.Warn)

@@ -1,7 +1,7 @@
 """Progress of a run on the terminal: messages, bars, loss, errors and remaining time.
 
 Conventions. The run's own thread draws between iterations. If the error output is no terminal, each evaluation prints one line.
-Log messages of a fit (a refined grid, noise in its loss) are printed at once.
+Log messages of a fit (a refined grid, noise in the loss) are printed at once.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class TerminalProgress:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
 
     def track(self, items: Sequence[T], label: str) -> Iterator[T]:
-        """Yield the items with a progress bar; without a terminal, print one line at the end."""
+        """Yield the items with a progress bar; without a terminal, print a line at the end."""
         console, start = Console(stderr=True), time.monotonic()
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, auto_refresh=False, disable=not console.is_terminal) as bar:
@@ -54,7 +54,7 @@ def figures(fit: Fit) -> str:
 
 
 class Display:
-    """Context manager that is called after each iteration."""
+    """Context manager to call after each iteration."""
 
     def __init__(self, iterations: int) -> None:
         self.console = Console(stderr=True)

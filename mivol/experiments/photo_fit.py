@@ -109,8 +109,7 @@ class PhotoFit(FitKind):
     def judge_few(self) -> dict[str, float]:
         """Return the mean PSNR [dB] of a fixed, evenly spread subset of the judged views.
 
-                The name is
-        ``held_out_psnr`` if the subset has all judged views, otherwise ``few_psnr``.
+        The name is ``held_out_psnr`` if the subset has all judged views, otherwise ``few_psnr``.
         """
         if self.judged is None:
             return {}

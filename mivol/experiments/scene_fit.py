@@ -125,8 +125,7 @@ class SceneFit(FitKind):
     def improve_starts(self, run: RunFolder) -> list[str]:
         """Fit emissive starts for parameters with ``start_fit = "emission"``; return notes on the starts.
 
-                A resumed
-        run takes the values from the checkpoint.
+        A resumed run takes the values from the checkpoint.
         """
         if self.context.resume and run.checkpoint.exists():
             return []

@@ -50,8 +50,8 @@ class Problem(SceneProblem):
         parameters: keys of ``mi.traverse(scene)``, or :class:`Parameter` with domain, rate and priors.
         loss: one of ``mivol.optim.losses``, or any function (image, reference) -> one number, of tensors (height, width,
             channels).
-        integrator: an integrator with derivatives; None means the scene's own if it is mivol's, else mivol's at the same
-            depth.
+        integrator: an integrator with derivatives; None means the scene's integrator if from mivol, otherwise mivol's
+            integrator with the same depth.
         sensors: sensors of the images; None means the scene's own sensors.
         spp: samples per pixel of an image, and of its derivative.
         seed: root of all random numbers.
@@ -85,7 +85,7 @@ class Problem(SceneProblem):
 
 
 def choose_own_integrator(scene: mi.Scene) -> mi.Integrator:
-    """Return the scene's integrator if it is mivol's and renders colours only, else mivol's at the same depth.
+    """Return the scene's integrator if from mivol and without AOVs, otherwise mivol's integrator with the same depth.
 
     Images to fit have no AOVs.
     """
@@ -102,7 +102,7 @@ def make_parameters(parameters: Sequence[str | Parameter]) -> list[Parameter]:
         MivolError: one key without a list, or an entry that is neither a key nor a :class:`Parameter`.
     """
     if isinstance(parameters, str | Parameter):
-        raise MivolError(f"parameters: found a single {type(parameters).__name__}, expected a list of them; put it in a list.")
+        raise MivolError(f"parameters: found a single {type(parameters).__name__}, expected a list; give [parameter].")
     strange = next((one for one in parameters if not isinstance(one, str | Parameter)), None)
     if strange is not None:
         kind = type(strange).__name__
@@ -118,8 +118,8 @@ def load_reference_scene(references: SceneSource | mi.Scene) -> mi.Scene:
     """
     if isinstance(references, str | os.PathLike) and Path(references).suffix.lower() != ".xml":
         raise MivolError(
-            f"references: found the single file {references}, expected a list of pictures, one a sensor, or a scene (.xml); "
-            "put it in a list."
+            f"references: found the single file {references}, expected a list of images, one a sensor, or a scene (.xml); "
+            "put the file in a list."
         )
     return load_scene(references).scene
 
@@ -155,7 +155,7 @@ def to_image_tensor(reference: Reference) -> mi.TensorXf:
         values = np.asarray(reference, dtype=np.float32)
     values = values[..., None] if values.ndim == 2 else values
     if values.ndim != 3:
-        raise MivolError(f"a reference has the shape {values.shape}, expected (height, width, channels) of a picture.")
+        raise MivolError(f"a reference has the shape {values.shape}, expected (height, width, channels) of an image.")
     return mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
 
 

@@ -1,9 +1,9 @@
 """The solver of a scan: the choices behind "auto", their memory, the stored rows and the prior.
 
-The choices follow the table of docs/benchmarks.md, with slices of few, noisy and many views. In all of them pcg has the
-smallest error after 20 iterations, if it starts from filtered back-projection, has unknowns twice as fine as the voxels, and a
-total variation that balances the noise. The scan decides whether it can start filtered, whether the finer unknowns fit, and
-what counts as noise.
+The choices follow the table of docs/benchmarks.md, with slices of few, noisy and many views. For these slices pcg has the
+smallest error after 20 iterations, with a start from filtered back-projection, unknowns twice as fine as the voxels, and a
+total variation balancing the noise. The scan determines whether a filtered start is possible, whether the finer unknowns fit
+into memory, and the size of the noise.
 """
 
 from __future__ import annotations
@@ -132,9 +132,9 @@ def choose_storage(settings: config.SolveSettings, walk: Projector) -> Storage:
         MivolError: requested rows that the solver cannot use, that do not exist, or that need more memory than allowed.
     """
     if settings.storage == "walk":
-        return plan_walk("as asked for")
+        return plan_walk("as requested")
     if settings.name in DIRECT:
-        return refuse_matrix(settings, f"{settings.name} takes one step, without a matrix")
+        return refuse_matrix(settings, f"{settings.name} is a direct solver, without a matrix")
     size = matrix_bytes(walk)
     if size is None:
         return refuse_matrix(settings, "only a parallel beam, or a fan of one row, has layers of rays that share a matrix")
@@ -159,7 +159,7 @@ def refuse_matrix(settings: config.SolveSettings, reason: str) -> Storage:
         MivolError: stored rows were requested.
     """
     if settings.storage == "matrix":
-        raise MivolError(f"solve.storage = matrix cannot be had: {reason}: choose auto or walk.")
+        raise MivolError(f"solve.storage = matrix is impossible: {reason}: choose auto or walk.")
     return plan_walk(reason)
 
 
@@ -192,8 +192,8 @@ def estimate_noise(problem: ProjectionProblem, settings: config.SolveSettings, d
     left = state.residual_norm / expected_residual_norm(task, "pcg")
     prior = replace(task.prior, strength=left * task.prior.strength)
     problem.linear_problem = replace(task, x0=state.x, prior=prior)
-    reason = f"the projections have none that is known: this is what {n} iterations without total variation leave of them"
-    return [PlanLine(choice=f"noise: {left:.4g} times what the weights say", reason=reason)]
+    reason = f"the noise is unknown: estimated from the residual after {n} iterations without total variation"
+    return [PlanLine(choice=f"noise: {left:.4g} times the size implied by the weights", reason=reason)]
 
 
 def explain_prior(prior: SmoothedTV | None, state: SolverState) -> list[PlanLine]:
@@ -204,7 +204,7 @@ def explain_prior(prior: SmoothedTV | None, state: SolverState) -> list[PlanLine
     return [
         PlanLine(
             choice=f"total variation: strength {prior.strength:.4g} / length, smooth below {prior.delta:.4g} / length^2",
-            reason=f"it is {share:.2%} of the objective in the end, and keeps {edges:.2%} of the slopes as edges",
+            reason=f"{share:.2%} of the final objective; {edges:.2%} of the slopes are kept as edges",
         )
     ]
 
@@ -217,6 +217,6 @@ def check_noise(setting: str, data: Projections) -> None:
     """
     if not data.is_noise_known:
         raise MivolError(
-            f"{setting} needs the noise of the projections, which these do not have: give readings with flats and darks, or "
+            f"{setting} needs the noise of the projections, which is unknown: give readings with flats and darks, or "
             "simulate with photons."
         )

@@ -1,6 +1,6 @@
 """The first values of the parameters of a scene fit, with their units and the places of their grids.
 
-Conventions. Memory is checked before it is allocated, for the first grids and for the refined grids of later events. ``length``
+Conventions. Memory is checked before the allocation, for the first grids and for the refined grids of later events. ``length``
 and ``radiance`` are the units of the scene; ``1`` is a pure number; "" is an unknown unit.
 """
 
@@ -105,7 +105,9 @@ def check_start(settings: Sought, shape: Sequence[int]) -> Any:
     """
     given = np.size(settings.start)
     if given not in (1, shape[-1]):
-        raise MivolError(f"{settings.key} starts from {given} numbers and has {shape[-1]}: give one for all, or one for each.")
+        raise MivolError(
+            f"{settings.key} starts from {given} numbers and has {shape[-1]} channels: give 1 or {shape[-1]}."
+        )
     return settings.start
 
 
@@ -134,8 +136,7 @@ UNITS = {
     "scale": "1",
 }
 """Units by a word of the key. Mitsuba's extinction is ``scale`` times ``sigma_t``, its sky ``scale`` times ``data``: only one
-of
-the factors has the unit."""
+factor has the unit."""
 
 
 def find_unit(settings: Sought) -> str:

@@ -127,7 +127,7 @@ class Verdict:
 
     @property
     def code(self) -> int:
-        """Exit code: 0 for agreement, 4 for a reference that cannot be trusted, 3 for a difference."""
+        """Exit code: 0 for agreement, 4 for an untrusted reference, 3 for a difference."""
         if any(doubt.fatal for doubt in self.doubts):
             return UNTRUSTED
         return AGREES if self.comparison.agrees and all(slope.agrees for slope in self.slopes) else DIFFERS

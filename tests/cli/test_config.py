@@ -104,7 +104,7 @@ WRONG = {
     "unknown map": (['parameter.0.map="softpluss"'], 'did you mean "softplus"?'),
     "truth of two sources": (['truth={key="a", file="b", procedural="tangle"}'], "either a file or procedural"),
     "a change without a value": (["fit.iterations"], "write key.of.setting=value"),
-    "a change of an entry that is not there": (["parameter.3.lr=1"], '"3" is not there'),
+    "a change of an entry that is not there": (["parameter.3.lr=1"], '"3" does not exist'),
 }
 
 

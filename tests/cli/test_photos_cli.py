@@ -83,7 +83,7 @@ def test_explain_draws_the_cameras_of_a_fit_of_gaussians(tmp_path: Path, capsys:
 
 REFUSED = {
     "a scene with a preset": (["--preset", "cpu", "scene.xml"], "scene.xml holds none: leave it out"),
-    "a scene with settings": (["--set", "field.sky=8", "scene.xml"], "--set is for fits, and .*scene.xml is none"),
+    "a scene with settings": (["--set", "field.sky=8", "scene.xml"], "--set is for fits, and .*scene.xml is not a fit"),
     "an experiment with a preset": (["--preset", "cpu", "fit.toml"], "--set field.preset=cpu changes it"),
     "a picture of no cameras": (["fit.toml", "-o", "cameras.png"], "only cameras of photographs are drawn"),
 }

@@ -497,7 +497,7 @@ REFUSED = {
     "source inside the object's axis": (["scan.source_to_axis=0"], "> 0"),
     "prior where none is used": (["solve.name=sirt", "solve.tv=1"], "prior"),
     "misspelt window": (["solve.window=han"], 'did you mean "hann"'),
-    "stored rows of a cone": (["solve.storage=matrix"], "solve.storage = matrix cannot be had: only a parallel beam"),
+    "stored rows of a cone": (["solve.storage=matrix"], "solve.storage = matrix is impossible: only a parallel beam"),
     "filtered back-projection of a cone": (["solve.name=fbp"], "fdk is filtered"),
     "prior beside a direct method": (["solve.name=fdk", "solve.tv=1"], "prior"),
     "subsets beyond the views": (["solve.name=os-sart", "solve.subsets=99"], "99 subsets"),

@@ -111,7 +111,7 @@ def test_what_a_script_gets_wrong_is_said(scene: mi.Scene) -> None:
         Problem(scene, [seen(), seen()], [KEY])
     with refuses(r"shape \(6,\), expected \(height, width, channels\)"):
         Problem(scene, [np.zeros(6)], [KEY])
-    with refuses("the single file seen.exr, expected a list of pictures"):
+    with refuses("the single file seen.exr, expected a list of images"):
         Problem(scene, "seen.exr", [KEY])
     with refuses("found a single str, expected a list"):
         Problem(scene, [seen()], KEY)

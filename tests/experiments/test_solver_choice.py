@@ -108,7 +108,7 @@ def test_the_noise_is_what_plain_iterations_leave(variant_rgb: str) -> None:
     (line,) = estimate_noise(problem, WANTED, data)
     left = state.residual_norm / np.sqrt(data.y.size)
     # Threads add up in any order: five iterations end within 1e-4 of each other; the line has four digits.
-    assert line.choice.endswith("times what the weights say")
+    assert line.choice.endswith("times the size implied by the weights")
     assert float(line.choice.split()[1]) == pytest.approx(left, rel=1e-3)
     assert np.abs(problem.linear_problem.x0 - state.x).max() < 1e-4 * state.x.max()
     # Least squares of weights 1 are those of 1 / left^2, times left^2.
