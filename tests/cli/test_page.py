@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.run_folder import write_run
 from matplotlib.image import imread
 
 from mivol.cite import CITATIONS, Citation, list_citations
@@ -84,6 +83,39 @@ def decode(uri: str) -> np.ndarray:
     head, data = uri.split(",")
     assert head == "data:image/png;base64"
     return np.round(255 * imread(io.BytesIO(base64.b64decode(data)), format="png")[..., :3]).astype(int)
+
+
+def write_run(folder: Path) -> Path:
+    """Write a run as a fit does: two held-out views with standard errors, a volume with its truth, and two curves."""
+    rng, images = np.random.default_rng(3), []
+    for name in ("images", "volumes"):
+        (folder / name).mkdir()
+    for view in (9, 10):
+        for role, low, high in (("reference", 0.2, 0.9), ("render", 0.2, 0.9), ("standard error", 0.004, 0.006)):
+            path = f"images/view_{view}_{role.replace(' ', '_')}.exr"
+            write_exr(folder / path, {"Y": rng.uniform(low, high, (16, 16))})
+            images.append(Image(path=path, role=role, view=f"view {view}", held_out=True, quantity="transmittance"))
+    for name in ("truth", "sigma_t"):
+        write_volume(folder / f"volumes/{name}.npz", rng.random((12, 12, 12, 1), np.float32))
+    for iteration in range(1, 5):
+        append_metrics(folder, iteration, 0.15 * iteration, residual=1 / iteration, nrmse=0.5 / iteration)
+    record = RunRecord.new(
+        "Blobs",
+        method="Absorption only: conjugate gradients on the log-transmittance of 8 views.",
+        status="finished",
+        command="mivol optimize scenes/blobs/fit.toml",
+        config={"scene": "scene.xml", "views": {"fitted": 8, "held_out": 2}, "solver": {"name": "cg", "non_negative": True}},
+        seeds={"volume": 3, "noise": 4},
+        plan=[PlanLine(choice="One channel", reason="The extinction is grey.")],
+        timings={"references": 0.41, "solver": 1.9},
+        results={"nrmse": 0.125, "iterations": 4, "views": 8},
+        images=images,
+        volumes=[Volume(path="volumes/truth.npz", role="truth"), Volume(path="volumes/sigma_t.npz", role="reconstruction")],
+        notes=["The references carry Gaussian noise of 0.005."],
+        citations=["mitsuba3", "drjit", "kak_1988", "hestenes_1952"],
+    )
+    write_record(record, folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -466,7 +498,7 @@ def test_headline_states_the_known_results():
 )
 def test_damaged_run_folders_are_refused(tmp_path, spoil, says):
     """In one sentence, without a half-written page."""
-    folder = write_run(tmp_path, n=6, size=16, fitted=8, held_out=1, steps=2)
+    folder = write_run(tmp_path)
     spoil(folder)
     with pytest.raises(MivolError, match=re.escape(says)) as refused:
         write_page(folder)

@@ -40,7 +40,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(folder: Path, *flags: str, to: str = "run") -> int:
+def run(folder: Path, *changes: str, to: str = "run") -> int:
+    """The exit code of a fit with changed settings, or with --resume."""
+    flags = [flag for change in changes for flag in ([change] if change == "--resume" else ["--set", change])]
     return main(["optimize", str(folder / "fit.toml"), "-o", str(folder / to), *flags])
 
 
@@ -72,15 +74,15 @@ def test_a_scan_leaves_a_whole_run_folder(variant_rgb, folder: Path) -> None:
 @pytest.mark.parametrize("solver", cases(["pcg", "cgls", "sirt", "sart", "os-sart", "ml-tr"], ["pcg", "cgls", "sirt"]))
 def test_every_solver_is_reached_by_name(variant_rgb, folder: Path, solver: str) -> None:
     """And lowers the error of the volume well below that of an empty one, which is 1."""
-    extra = ["--set", "data.photons=1e5"] if solver == "ml-tr" else []
-    assert run(folder, "--set", f"solve.name={solver}", "--set", "solve.iterations=3", "--set", "solve.subsets=3", *extra) == 0
+    extra = ["data.photons=1e5"] if solver == "ml-tr" else []
+    assert run(folder, f"solve.name={solver}", "solve.iterations=3", "solve.subsets=3", *extra) == 0
     assert rows_of(folder)[-1]["nrmse"] < 0.75
 
 
 @pytest.mark.slow
 def test_direct_methods_are_reached_by_name(variant_rgb, folder: Path) -> None:
     """FDK of 15 views, smoothed, is well below an empty volume; it ends after its one step, and has nothing to resume."""
-    changes = ["--set", "solve.name=fdk", "--set", "solve.window=hann"]
+    changes = ["solve.name=fdk", "solve.window=hann"]
     assert run(folder, *changes) == 0
     rows = rows_of(folder)
     assert len(rows) == 1
@@ -95,9 +97,9 @@ def test_direct_methods_are_reached_by_name(variant_rgb, folder: Path) -> None:
 @pytest.mark.parametrize("solver", cases(["pcg", "sirt", "ml-tr"], ["pcg"]))
 def test_solvers_start_where_fdk_ends(variant_rgb, folder: Path, solver: str) -> None:
     """One iteration from FDK has a lower error than one from nothing."""
-    changes = ["--set", f"solve.name={solver}", "--set", "solve.iterations=1", "--set", "data.photons=1e5"]
+    changes = [f"solve.name={solver}", "solve.iterations=1", "data.photons=1e5"]
     assert run(folder, *changes, to="cold") == 0
-    assert run(folder, *changes, "--set", "solve.start=filtered", to="warm") == 0
+    assert run(folder, *changes, "solve.start=filtered", to="warm") == 0
     assert rows_of(folder, "warm")[0]["nrmse"] < 0.95 * rows_of(folder, "cold")[0]["nrmse"]
 
 
@@ -131,10 +133,9 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
         data = projections.make_data(chosen, folder, projections.make_grid(chosen, folder))
         np.save(folder / "y.npy", data.y + np.linspace(0, 0.1, 18)[:, None, None] * np.linspace(-1, 1, 14))
         changes = changes[1:]
-    flags = [part for change in changes for part in ("--set", change)]
     monkeypatch.setattr(kinds, "write_page", lambda folder: folder)
     monkeypatch.setattr(RunFolder, "write_curves", lambda run: None)
-    assert run(folder, *flags, to="whole") == 0
+    assert run(folder, *changes, to="whole") == 0
     append = RunFolder.append
 
     def stop(run: RunFolder, iteration: int, seconds: float, **values: float) -> None:
@@ -144,13 +145,13 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
 
     with monkeypatch.context() as patch:
         patch.setattr(RunFolder, "append", stop)
-        assert run(folder, *flags, to="cut") == 130
+        assert run(folder, *changes, to="cut") == 130
     assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "stopped"
     assert (folder / "cut" / "preview.png").exists()
     continued = []
     with monkeypatch.context() as patch:
         patch.setattr(RunFolder, "append", lambda run, i, t, **v: (continued.append(i), append(run, i, t, **v)))
-        assert run(folder, "--resume", *flags, to="cut") == 0
+        assert run(folder, "--resume", *changes, to="cut") == 0
     assert continued == [4, 5, 6]
     values = [[row | {"seconds": 0} for row in rows_of(folder, to)] for to in ("whole", "cut")]
     assert values[0] == values[1]
@@ -163,7 +164,7 @@ def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, ca
     """Four iterations, then two more: every number as if there had been six; fewer than there are is another run. What is on
     record is the command as it was typed, and the last line on the console is what was saved."""
     assert run(folder, to="whole") == 0
-    assert run(folder, "--set", "solve.iterations=4", to="more") == 0
+    assert run(folder, "solve.iterations=4", to="more") == 0
     assert run(folder, "--resume", to="more") == 0
     said = capsys.readouterr().err.splitlines()
     losses = [[(row["iteration"], row["loss"], row["nrmse"]) for row in rows_of(folder, to)] for to in ("whole", "more")]
@@ -173,7 +174,7 @@ def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, ca
     assert record["command"].endswith("more --resume")
     assert said[-1].startswith("saved: ")
     assert f"nRMSE of the volume {record['results']['nrmse']:.4g}" in said[-1]
-    assert run(folder, "--resume", "--set", "solve.iterations=3", to="more") == 1
+    assert run(folder, "--resume", "solve.iterations=3", to="more") == 1
     assert "solve.iterations is 6 there and 3 here" in capsys.readouterr().err
 
 
@@ -181,7 +182,7 @@ def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, ca
 def test_a_rise_is_flagged_and_the_best_volume_kept(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     """100 quanta a pixel are a noise of 10 %: conjugate gradients without bounds fit it after a few iterations."""
     noisy = ["data.photons=100", "solve.iterations=12", "solve.nonnegative=false"]
-    assert run(folder, *[part for one in noisy for part in ("--set", one)]) == 0
+    assert run(folder, *noisy) == 0
     errors = [row["nrmse"] for row in rows_of(folder)]
     lowest = int(np.argmin(errors))
     assert errors[-1] > errors[lowest]
@@ -202,8 +203,7 @@ def test_a_solver_stops_at_the_noise(variant_rgb, folder: Path, solver: str) -> 
     200 quanta a pixel: the noise is 7 % and voxels of 1/6 explain the head to about that.
     """
     changes = ["solve.iterations=40", "data.photons=200", "solve.discrepancy=1.5", f"solve.name={solver}"]
-    flags = [part for change in changes for part in ("--set", change)]
-    assert run(folder, *flags) == 0
+    assert run(folder, *changes) == 0
     over = [row["discrepancy"] for row in rows_of(folder)]
     assert over[-1] <= 1.5
     assert all(value > 1.5 for value in over[:-1])
@@ -211,14 +211,14 @@ def test_a_solver_stops_at_the_noise(variant_rgb, folder: Path, solver: str) -> 
     record = json.loads((folder / "run" / "run.json").read_text())
     assert f"stopped after iteration {len(over)} of 40: the residual is as small as the noise" in record["notes"]
     assert record["results"]["discrepancy"] == pytest.approx(over[-1])
-    assert run(folder, "--resume", *flags) == 0
+    assert run(folder, "--resume", *changes) == 0
     assert len(rows_of(folder)) == len(over)
 
 
 @pytest.mark.slow
 def test_a_prior_in_units_of_the_noise_says_what_it_did(variant_rgb, folder: Path) -> None:
     changes = ["data.photons=200", "solve.tv=1", "solve.delta=0.1", "solve.tv_unit=noise"]
-    assert run(folder, *[part for change in changes for part in ("--set", change)]) == 0
+    assert run(folder, *changes) == 0
     (line,) = [line for line in json.loads((folder / "run/run.json").read_text())["plan"] if "variation" in line["choice"]]
     assert "strength" in line["choice"]
     assert "% of the slopes as edges" in line["reason"]
@@ -308,7 +308,7 @@ def test_stored_rows_find_what_the_walk_finds(variant_rgb, folder: Path) -> None
     """2e-6 a product, times 10 for each of 6 iterations of conjugate gradients; the record says which it was."""
     found = {}
     for storage in ("walk", "matrix"):
-        assert run(folder, "--set", PARALLEL, "--set", f"solve.storage={storage}", to=storage) == 0
+        assert run(folder, PARALLEL, f"solve.storage={storage}", to=storage) == 0
         found[storage] = read_volume(folder / storage / "volumes/reconstruction.npz").values
         plan = json.loads((folder / storage / "run.json").read_text())["plan"]
         assert any(line["choice"].startswith(f"storage: {'none' if storage == 'walk' else 'the exact'}") for line in plan)
@@ -334,7 +334,7 @@ def test_a_table_of_views_is_the_beam_that_it_lists(variant_rgb, folder: Path) -
     helix = circle_table(36)
     helix[:, [2, 5]] += np.linspace(-0.4, 0.4, 36)[:, None]
     np.savetxt(folder / "table.txt", helix, delimiter=",", header="sx,sy,sz,dx,dy,dz,ux,uy,uz,vx,vy,vz", comments="")
-    assert run(folder, "--set", 'scan={beam="table", file="table.txt", detector=[20,14]}') == 0
+    assert run(folder, 'scan={beam="table", file="table.txt", detector=[20,14]}') == 0
     assert rows_of(folder)[-1]["nrmse"] < 0.5
 
 
@@ -364,7 +364,7 @@ def test_cone_beam_data_from_files_need_no_python(variant_rgb, folder: Path, kin
     assert np.abs(found.y - data.y).max() < 2e-7
     for ours, theirs in zip(found.geometry.rays(), data.geometry.rays(), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-14)
-    assert run(folder, *[part for change in changes for part in ("--set", change)]) == 0
+    assert run(folder, *changes) == 0
 
 
 def test_the_axis_of_cone_data_from_files_is_found(variant_rgb, folder: Path) -> None:
@@ -414,7 +414,7 @@ def test_readings_are_fitted_as_counts(variant_rgb, folder: Path) -> None:
     np.testing.assert_array_equal(problem.linear_problem.used, expected)
     found = {}
     for name, change in {"quanta": "data.photons=5000", "readings": stack}.items():
-        changes = [part for one in (change, "solve.name=ml-tr", "solve.iterations=4") for part in ("--set", one)]
+        changes = (change, "solve.name=ml-tr", "solve.iterations=4")
         assert run(folder, *changes, to=name) == 0
         found[name] = nrmse(read_volume(folder / name / "volumes/reconstruction.npz").values[..., 0], data.truth)
     assert found["quanta"] < 0.75
@@ -527,7 +527,7 @@ def test_scans_that_are_refused(variant_rgb, folder: Path, capsys: pytest.Captur
             file["exchange/data_white"], file["exchange/data_dark"] = 2 * np.ones((2, 4, 14), "f"), np.zeros((2, 4, 14), "f")
     np.savetxt(folder / "few.txt", np.arange(3))
     np.savetxt(folder / "table.txt", circle_table(3))
-    assert run(folder, *[part for change in changes for part in ("--set", change)]) == 1
+    assert run(folder, *changes) == 1
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mivol: ")]
     assert len(said) == 1
     assert sentence in said[0]
@@ -535,8 +535,8 @@ def test_scans_that_are_refused(variant_rgb, folder: Path, capsys: pytest.Captur
 
 
 def test_resume_refuses_other_projections(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
-    assert run(folder, "--set", "solve.iterations=1") == 0
-    assert run(folder, "--resume", "--set", "solve.iterations=1", "--set", "data.scale=3.0") == 1
+    assert run(folder, "solve.iterations=1") == 0
+    assert run(folder, "--resume", "solve.iterations=1", "data.scale=3.0") == 1
     assert "belongs to another run: data" in capsys.readouterr().err
 
 
