@@ -7,8 +7,6 @@ import mitsuba as mi
 import numpy as np
 
 NAMES = "tau,tau.G,alpha,depth"
-
-
 DATA, VALUE = "interior_medium.sigma_t.data", "interior_medium.sigma_t.value.value"
 
 

@@ -10,8 +10,6 @@ import numpy as np
 from scenes import as_float32, centred, film, pencil, pixel_rays, render
 
 EPS = 2.0**-23
-
-
 CUBE = centred(np.eye(3))
 
 

@@ -12,7 +12,6 @@ from scenes import as_float32, tau_fast
 BOUND = 2e-6
 """Error asked for, relative to the integral of sigma + h |grad sigma|."""
 
-
 EPS = 2.0**-23
 """Spacing of float32 at 1."""
 

@@ -10,11 +10,7 @@ import oracle_phase as oracle
 from mivol.phase.scattering_angle import ScatteringAngle
 
 EPS = 2.0**-23
-
-
 NEAR = np.geomspace(1e-6, 1, 200)
-
-
 ANGLES = np.concatenate([NEAR, np.linspace(1, np.pi - 1, 50), np.pi - NEAR, [0, np.pi]])
 
 

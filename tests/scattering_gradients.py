@@ -13,8 +13,6 @@ from scattering_scenes import Pencils, mivol, rough_grid
 from mivol.validate.moments import Moments
 
 GRID = "smoke.interior_medium.sigma_t.data"
-
-
 BATCHES = 16
 
 

@@ -55,7 +55,6 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("seed", range(2))
 """
 
-
 QUIET = ("cacheprovider", "faulthandler", "xdist", "hypothesispytest", "unraisableexception", "threadexception")
 """Plugins of the run that would touch what the run around it holds, or collect garbage."""
 

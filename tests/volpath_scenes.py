@@ -12,8 +12,6 @@ from mivol.validate.moments import Moments
 from scenes import affine, grid_volume, medium, transform
 
 LEAK = 1e-4
-
-
 RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
 
 

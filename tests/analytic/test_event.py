@@ -21,7 +21,6 @@ from scenes import box_of, camera, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-
 WALL = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
 
 

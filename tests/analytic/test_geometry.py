@@ -179,19 +179,24 @@ def test_the_least_of_everything_is_taken() -> None:
     assert PencilRays([[0, 0, 0]], [[1, 0, 0]]).shape == (1, 1, 1)
 
 
+BEAM = ConeBeam(np.array([0.2, 1.9, 4.0]), (5, 4), 7.0, 11.0, (0.3, 0.4), axis_offset=0.6, detector_offset=(-0.2, 0.7))
 GOOD = np.array([0, -5, 0, 0, 5, 0, 0.5, 0, 0, 0, 0, 0.25], float)
+
+
+def table_of(beam: ConeBeam) -> PanelViews:
+    panels = beam.panels()
+    rows, columns = beam.detector
+    middle = panels.corner + (columns - 1) / 2 * panels.along_u + (rows - 1) / 2 * panels.along_v
+    return PanelViews(np.hstack([panels.source, middle, panels.along_u, panels.along_v]), beam.detector)
 
 
 def test_rays_and_panels_are_those_of_a_cone_beam() -> None:
     """A circular scanner with every offset, written as a table: the same rays, to the rounding of float64."""
-    beam = ConeBeam(np.array([0.2, 1.9]), (5, 4), 7.0, 11.0, (0.3, 0.4), axis_offset=0.6, detector_offset=(-0.2, 0.7))
-    panels = beam.panels()
-    middle = panels.corner + 1.5 * panels.along_u + 2.0 * panels.along_v
-    table = PanelViews(np.hstack([panels.source, middle, panels.along_u, panels.along_v]), (5, 4))
-    assert table.shape == beam.shape
-    for found, expected in zip(table.rays([1, 0]), beam.rays([1, 0]), strict=True):
+    table = table_of(BEAM)
+    assert table.shape == BEAM.shape
+    for found, expected in zip(table.rays([1, 0]), BEAM.rays([1, 0]), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-14)
-    np.testing.assert_allclose(table.panels().corner, panels.corner, atol=1e-14)
+    np.testing.assert_allclose(table.panels().corner, BEAM.panels().corner, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -211,9 +216,6 @@ def test_tables_that_place_no_detector_are_refused(change: dict, sentence: str) 
         PanelViews(row[None], (3, 3))
 
 
-BEAM = ConeBeam(np.array([0.2, 1.9, 4.0]), (5, 4), 7.0, 11.0, (0.3, 0.4), axis_offset=0.6, detector_offset=(-0.2, 0.7))
-
-
 def matrices_of(beam: ConeBeam) -> np.ndarray:
     """(views, 3, 4) by way of the camera: intrinsics in pixels, times rotation and translation."""
     found = []
@@ -228,13 +230,6 @@ def matrices_of(beam: ConeBeam) -> np.ndarray:
         inner = np.array([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]])
         found.append(inner @ np.hstack([turned, -(turned @ source)[:, None]]))
     return np.array(found)
-
-
-def table_of(beam: ConeBeam) -> PanelViews:
-    panels = beam.panels()
-    rows, columns = beam.detector
-    middle = panels.corner + (columns - 1) / 2 * panels.along_u + (rows - 1) / 2 * panels.along_v
-    return PanelViews(np.hstack([panels.source, middle, panels.along_u, panels.along_v]), beam.detector)
 
 
 @pytest.mark.parametrize("factor", [1.0, -3e4])

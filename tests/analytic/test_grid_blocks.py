@@ -92,8 +92,6 @@ def test_blocks_hold_all_nodes_of_their_cells(shape):
 
 
 SIZE = (9, 14, 11)
-
-
 TWO = centred(2 * np.eye(3))
 
 

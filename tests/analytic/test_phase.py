@@ -130,11 +130,7 @@ def test_shares_without_any_weight_are_equal():
 
 
 SMALL = (1e-7, 1e-5, 1e-3)
-
-
 LARGE = (0.2, 0.6, 0.9, 0.99, 0.9999, 0.99999, NEXT_TO_ONE)
-
-
 ALL_G = (0.0, *SMALL, *LARGE, *(-g for g in SMALL), *(-g for g in LARGE))
 
 
@@ -298,8 +294,6 @@ def test_bad_moments_and_files_are_refused(tmp_path):
 
 
 COSINES = np.array([-1, -0.93, -0.2, -0.15, 0.4, 0.999, 0.99999, 0.9999999, 1.0])
-
-
 VALUES = np.array([0.3, 0.0, 0.0, 1.0, 1.0, 2.0, 40.0, 300.0, 1000.0])
 
 
@@ -308,7 +302,6 @@ def lookup(table: Table) -> tuple[Lookup, mi.Float, mi.Float, mi.Float]:
     return nodes, *nodes.normalise(mi.Float(table.values.astype(np.float32)))
 
 
-@pytest.mark.usefixtures("variant_rgb")
 def test_values_between_irregular_nodes():
     nodes, values, integral, _ = lookup(Table(COSINES, VALUES))
     turn, m, p = turns()
@@ -324,7 +317,6 @@ def test_values_between_irregular_nodes():
     assert np.all(np.abs(got * total - want) <= 17 * EPS * larger)
 
 
-@pytest.mark.usefixtures("variant_rgb")
 def test_samples_of_a_table_invert_its_distribution():
     nodes, values, integral, cumulative = lookup(Table(COSINES, VALUES))
     turn = nodes.sample(*lanes(U), values, integral, cumulative)
@@ -345,7 +337,6 @@ def test_samples_of_a_table_invert_its_distribution():
     assert not np.any((m > 1.2001) & (m < 1.9299))
 
 
-@pytest.mark.usefixtures("variant_rgb")
 def test_table_of_a_stock_size():
     """Equally spaced values as for tabphase: (0.5, 1, 1.5) is (2 + c) / (8 pi)."""
     nodes, values, integral, _ = lookup(Table.regular([0.5, 1.0, 1.5]))

@@ -7,7 +7,7 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.tomography import preprocess
-from mivol.tomography.preprocess import LightDrift, Transmission, correct_transmission, count_quanta, fit_air, to_line_integrals
+from mivol.tomography.preprocess import LightDrift, Transmission, correct_transmission, count_quanta, to_line_integrals
 
 
 def test_noise_of_which_the_form_is_known() -> None:
@@ -200,13 +200,3 @@ def test_flats_without_noise_count_nothing() -> None:
     readings, flats, darks = fields()
     with pytest.raises(MivolError, match="scatter no more than darks"):
         count_quanta(readings, np.repeat(flats.mean(0, keepdims=True), 2, 0), darks)
-
-
-def test_air_leaves_out_dead_pixels() -> None:
-    """The same line through the others; without any of them there is no air."""
-    t = np.full((1, 2, 8), 0.9)
-    t[0, 1, 0] = np.nan
-    np.testing.assert_allclose(fit_air(t, 2), 0.9, rtol=1e-15)
-    t[0, 1, 1] = np.inf
-    with pytest.raises(MivolError, match="at an edge of row 1 of view 0"):
-        fit_air(t, 2)

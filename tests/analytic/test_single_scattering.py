@@ -318,7 +318,6 @@ COLOURS = {
     "sigma_s": {"type": "constvolume", "value": {"type": "rgb", "value": [1, 2, 4]}},
 }
 
-
 LANES = [[True, False, False], [False, True, False]]
 
 

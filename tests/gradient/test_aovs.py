@@ -89,7 +89,6 @@ CASES = {
     ),
 }
 
-
 SLOW = ("rgb constant", "two grids", "cut grid", "boxes", "traced")
 """What is in these, other cases combine."""
 

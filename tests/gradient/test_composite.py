@@ -44,10 +44,8 @@ PROFILES = {
     "hidden behind a rise": np.where(np.arange(64) < 8, 0.01, 57.0),
 }
 
-
 START = -1 + 8.94e-5
 """Where the rays of a radiancemeter at z = -1 begin: Mitsuba moves them on by its RayEpsilon."""
-
 
 BALL = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.9}
 """A boundary that has to be traced and holds the whole unit cube."""

@@ -239,8 +239,6 @@ def test_a_recording_walks_whole_paths(monkeypatch: pytest.MonkeyPatch) -> None:
 
 ALBEDO, SIGMA = 0.8, 0.05
 FAR, POWER = 200.0, 3e4
-
-
 MISSED = 40.0
 """Where a ray passes all boxes."""
 

@@ -32,8 +32,6 @@ KEYS = {
     ("balls", "emission"): FIRE + "emission.value.value",
 }
 QUICK = ("over a floor", "sigma_t")
-
-
 CASES = [pytest.param(*case, marks=() if case == QUICK else pytest.mark.slow) for case in KEYS]
 
 

@@ -126,7 +126,6 @@ PARAMETERS = {
     "floor": "floor.bsdf.reflectance.value",
 }
 
-
 OF_A_SUN = PARAMETERS | {"emitter": "sun.irradiance.value"}
 
 

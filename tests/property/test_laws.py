@@ -1,6 +1,6 @@
 """Laws that every line integral obeys, on seeded random grids, frames and rays; no oracle is needed.
 
-Tolerances: each side of an equation errs by at most 2e-6 * integral of (sigma + h |grad sigma|) (hard cases 1 to 52),
+Tolerances: each side of an equation errs by at most 2e-6 * integral of (sigma + h |grad sigma|),
 so a law with k terms is granted k times that; where float32 arithmetic is exact (multiplying by a power of two) it is
 equality.
 """
@@ -181,12 +181,6 @@ def test_axis_row_is_known_exactly(seed):
         assert np.all(np.abs(line - 1 / n) <= 4 * 2.0**-24)
         row[tuple(where)] = 0
         assert np.all(row <= 4 * 2.0**-24 / n)
-
-
-def test_a_permutation_of_lanes_permutes_the_answers(seed):
-    rng, values, to_world, o, d = draw(seed, "sheared")
-    order = rng.permutation(N_RAYS)
-    assert np.array_equal(tau_fast(values, to_world, o, d)[order], tau_fast(values, to_world, o[order], d[order]))
 
 
 def test_width_one_broadcasts(seed):
