@@ -1,6 +1,6 @@
 """A tree of dicts and lists against msgspec structs: the first fault in a sentence, and every setting on a line.
 
-Conventions. A place in the tree is a dotted key; entries of lists count from 0. If a setting may be one of several structs,
+Conventions. A place in the tree is a dotted key; entries of lists count from 0. If a setting has several possible structs,
 their tag tells which. msgspec checks types and domains; this module adds the nearest valid name, and refuses infinite numbers
 for settings without an infinite default.
 """
@@ -127,7 +127,7 @@ class Setting(NamedTuple):
     """A setting of a file.
 
     Attributes:
-        key: dotted key; an entry of a list has the number 0; a key of one choice has the choice's name in brackets.
+        key: dotted key; an entry of a list has the number 0; a key of a choice has the choice's name in brackets.
         default: default as Python writes it; "" for required settings and tables.
         unit: unit; "1" for none.
         meaning: meaning in a line.

@@ -84,7 +84,7 @@ class Verb(NamedTuple):
     """A verb of the command.
 
     Attributes:
-        run: function of the parsed flags; the docstring is the help, and the result is the exit code or None for 0.
+        run: function of the parsed flags; the docstring is the help, and the result is the exit code, or None (code 0).
         flags: function returning the flags; imports are delayed until the parser is made.
         epilog: function returning the last part of the help.
     """
@@ -355,7 +355,7 @@ def render(arguments: argparse.Namespace) -> None:
 
 
 def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
-    """Return the function to render a radiance field, points or Gaussians; None for a scene.
+    """Return the function to render a radiance field, points or Gaussians; None if the file is a scene.
 
     Raises:
         MivolError: a camera for a scene, or no camera for a field.
@@ -384,7 +384,7 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
 def reference(arguments: argparse.Namespace) -> None:
     """Render a reference and its variance with Mitsuba's path tracer, up to a given error.
 
-    With --sensor all, the images of all sensors and a file of cameras are written: photographs for a fit.
+    With --sensor all, the images of every sensor and a file of cameras are written: photographs for a fit.
     """
     from mivol.cli.loading import load
     from mivol.validate.photographs import render_photographs
@@ -541,7 +541,7 @@ def bench(arguments: argparse.Namespace) -> int:
 
 
 def doctor(arguments: argparse.Namespace) -> int:
-    """Check whether this machine can render, and say how to fix what is missing."""
+    """Check whether this machine can render, and say how to fix a missing part."""
     from mivol.doctor import main
 
     return main([])

@@ -105,9 +105,7 @@ def check_start(settings: Sought, shape: Sequence[int]) -> Any:
     """
     given = np.size(settings.start)
     if given not in (1, shape[-1]):
-        raise MivolError(
-            f"{settings.key} starts from {given} numbers and has {shape[-1]} channels: give 1 or {shape[-1]}."
-        )
+        raise MivolError(f"{settings.key} starts from {given} numbers and has {shape[-1]} channels: give 1 or {shape[-1]}.")
     return settings.start
 
 
