@@ -19,7 +19,10 @@ from mivol.bench.harness import agreement
 from mivol.bench.harness.contests import Contest
 from mivol.bench.harness.timing import Timing
 from mivol.bench.scenes import box_scene, make_integrator, milk_in_a_glass
+from mivol.bench.studies import media_light, multiple_scattering
 from mivol.bench.studies import single_scattering as study
+from mivol.bench.studies.media_light import BARS, find_dark_pixels, make_scene
+from mivol.bench.studies.multiple_scattering import CONTESTS
 from mivol.bench.studies.single_scattering import LIGHTS, PEERS, STUDY, ContestSize, Light, contend, emitter_distances
 
 TINY = replace(ContestSize.quick(), rounds=6, max_pixels=8, spp=64)
@@ -186,3 +189,64 @@ def test_means_are_compared_in_thin_matter(variant_rgb: str, monkeypatch: pytest
         assert 0 < used["fair"].sum() < used["gain"].sum()
     else:
         assert used["gain"][side // 2, side // 2] and not used["gain"][0, -1]
+
+
+def test_unlimited_depth_is_judged_by_the_median() -> None:
+    """Errors of unlimited paths have heavy tails."""
+    lights = [light for lights in CONTESTS.values() for light in lights.values()]
+    assert all(light.by_pixel == light.has_tails == (light.depth < 0) for light in lights)
+    assert set(CONTESTS) == set(multiple_scattering.VOLUMES) == set(multiple_scattering.STUDY.questions)
+    assert multiple_scattering.white_box().values.max() * 2 == multiple_scattering.WHITE_DEPTH == 64
+    assert np.allclose(multiple_scattering.thin_smoke().values.max() * 20, multiple_scattering.smoke().values.max())
+
+
+def test_the_milk_is_the_measured_one() -> None:
+    """Skim milk scatters 0.70, 1.22 and 1.90 times per millimetre and absorbs 0.0014, 0.0025 and 0.0142 times; the edge of 2 is
+    40 mm long."""
+    sigma_s, sigma_a = np.array([0.7, 1.22, 1.9]) * 20, np.array([0.0014, 0.0025, 0.0142]) * 20
+    (light,) = CONTESTS["milk"].values()
+    np.testing.assert_allclose(multiple_scattering.milk().values, sigma_s + sigma_a)
+    np.testing.assert_allclose(multiple_scattering.milk().values * light.albedo, sigma_s)
+    assert light.peers == ("volpath", "prbvolpath", "volpathmis")
+
+
+def test_only_volpath_has_a_bar() -> None:
+    """Three ratios of the milk with their agreement, of which one is judged."""
+    figures = {"variance_x_time_median_over_pixels": 11.0, "z": -1.0, "z_bound": 4.0}
+    answer = {name: {f"mivol over {peer}": figures for peer in light.peers} for name, light in CONTESTS["milk"].items()}
+    bars = multiple_scattering.STUDY.bars("milk", answer)
+    assert [(bar["value"], bar["bar"]) for bar in bars] == [(11.0, 10), (1.0, 4.0), (1.0, 4.0), (1.0, 4.0)]
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_integrators_agree_at_each_depth(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a small fog in each light of the smoke, at the false-alarm rate of the suite."""
+    monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
+    values = np.pad(np.random.default_rng(1).uniform(0.5, 1.5, (3, 4, 5)), 1).astype(np.float32)
+    for name, light in CONTESTS["smoke"].items():
+        figures = contend(values, light, replace(TINY, seed=fresh(0) % 40_000))
+        bars = multiple_scattering.STUDY.bars("smoke", dict.fromkeys(CONTESTS["smoke"], figures))
+        note(ALPHA, name)
+        assert all(bar["met"] for bar in bars if bar["figure"].startswith("|z|")), name
+
+
+def test_pixels_that_count_do_not_see_the_medium(variant_rgb: str) -> None:
+    """A fire is in the centre of its image; a room fills its image, and all pixels count."""
+    dark = find_dark_pixels(make_scene("fire", 12))
+    assert not dark[6, 6] and dark[0].all() and dark[:, 0].all()
+    assert find_dark_pixels(make_scene("room", 12)).all()
+
+
+@pytest.mark.slow
+def test_every_medium_is_lit_and_timed(variant_rgb: str) -> None:
+    for name in BARS:
+        answer = media_light.STUDY.questions[name](replace(TINY, max_pixels=6, rounds=2, spp=2))
+        assert answer["pixels_that_count"] > 0 and answer["time"] > 0
+
+
+@pytest.mark.parametrize("name", BARS)
+def test_the_median_is_judged(name: str) -> None:
+    answer = {"variance_x_time_median_over_pixels": 5.0, "z": -2.0, "z_bound": 3.5}
+    bars = [(bar["value"], bar["bar"], bar["met"]) for bar in media_light.STUDY.bars(name, answer)]
+    assert bars == [(5.0, BARS[name], name == "room"), (2.0, 3.5, True)]
