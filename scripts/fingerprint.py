@@ -58,7 +58,8 @@ def follow(scene: dict, ends: tuple[str, ...], **settings: object) -> Iterator[t
     yield "image", np.array(image)
     weight = mi.TensorXf(np.random.default_rng(1).normal(size=image.shape).astype(np.float32))
     params = mi.traverse(scene)
-    keys = [key for key, _ in params if key.endswith(ends)]
+    # Sorted: the order in which Mitsuba lists the parameters of a scene can change from run to run.
+    keys = sorted(key for key, _ in params if key.endswith(ends))
     for key in keys:
         dr.enable_grad(params[key])
         params[key] = params[key]
