@@ -35,4 +35,4 @@ def test_wheel(tmp_path: Path) -> None:
     assert "License-Expression: BSD-3-Clause" in metadata
     # On PyPI no file of the checkout lies beside the description.
     assert "](docs/" not in metadata
-    assert "/raw/v0.1.0/docs/demo.png)" in metadata
+    assert "/raw/v0.1.0/docs/showcase.jpg)" in metadata

@@ -144,7 +144,7 @@ def test_a_grid_has_what_the_plan_asks_for(skips: bool, tracks: bool, depth: int
     needs = find_needs(scene, scene.sensors()[0], survey)
     plan = make_plan(needs, settings)
     assert (plan.segment == "free_flight") == (depth == 4)
-    media = build_media(scene, needs, replace(plan, skips=(skips,), tracks=(tracks,)), survey)
+    media = build_media(scene, needs, replace(plan, skips_empty=(skips,), estimates_shadows=(tracks,)), survey)
     ((part,),) = [body.view.parts for body in media.bodies]
     assert (part.lattice.empty_distances is not None) == skips
     assert (part.lattice.block_ranges is not None) == (tracks or depth == 4)
