@@ -75,7 +75,7 @@ threads = 1
 reference = {{ source = "render", spp = 32, held_out = [1] }}
 views = {{ rig = "ring", count = 3, width = 8, height = 8 }}
 truth = {{ key = "{KEY}", procedural = "tangle", shape = [6, 6, 6], peak = 3.0 }}
-optimiser = {{ name = "adam" }}
+optimizer = {{ name = "adam" }}
 fit = {{ iterations = 4, spp = 2 }}
 event = [{{ name = "evaluate", every = 2 }}, {{ name = "checkpoint", every = 2 }}]
 [[parameter]]

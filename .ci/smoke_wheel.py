@@ -104,7 +104,7 @@ scene.file = "smoke.xml"
 reference = { source = "render", spp = 32, held_out = [1] }
 views = { rig = "ring", count = 3, width = 8, height = 8 }
 truth = { key = "cube.interior_medium.sigma_t.data", procedural = "tangle", shape = [6, 6, 6], peak = 3.0 }
-optimiser = { name = "adam" }
+optimizer = { name = "adam" }
 fit = { iterations = 2, spp = 2 }
 parameter = [{ key = "cube.interior_medium.sigma_t.data", domain = [0, inf], start = 0.1, shape = [6, 6, 6] }]
 """

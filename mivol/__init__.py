@@ -1,7 +1,7 @@
 """Differentiable and inverse volume rendering on Mitsuba 3. The import needs no active variant.
 
 ``mivol.<tab>`` lists the functions for scripts: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
-``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
+``Parameter``, ``optimize`` and optimizers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
 (``load_photos``, ``fit_photographs``, ``fit_gaussians``, ``read_field``), Gaussians and points (``read_gaussians``,
 ``read_points``, ``Splatter``) and tomography (``Projector`` and its geometries). Each name is imported at its first use.
 """

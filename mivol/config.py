@@ -177,7 +177,7 @@ class SceneExperiment(Section):
     reference: Annotated[Rendered | Files, setting("1", "the images to fit")] = Rendered()
     truth: Annotated[Truth | None, setting("1", "the true volume in the references, if known")] = None
     fit: Annotated[SceneFitSettings, setting("1", "length and precision of the fit")] = SceneFitSettings()
-    optimiser: Annotated[union_type(OPTIMIZERS), setting("1", "the optimizer")] = Adam()
+    optimizer: Annotated[union_type(OPTIMIZERS), setting("1", "the optimizer")] = Adam()
     schedule: Annotated[union_type(SCHEDULES), setting("1", "factor on the learning rate")] = Constant()
     loss: Annotated[union_type(LOSSES), setting("1", "distance between image and reference")] = L2()
     event: Annotated[tuple[union_type(EVENTS), ...], setting("1", "actions between iterations")] = (

@@ -17,7 +17,7 @@ BATCHES = 16
 
 
 def watched(scene: mi.Scene, key: str) -> tuple[mi.SceneParameters, object]:
-    """A parameter whose derivatives are asked for, as an optimiser does it: stock textures make copies of the variable."""
+    """A parameter whose derivatives are asked for, as an optimizer does it: stock textures make copies of the variable."""
     params = mi.traverse(scene)
     variable = type(params[key])(params[key])
     dr.enable_grad(variable)

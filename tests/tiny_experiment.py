@@ -47,7 +47,7 @@ threads = 1
 reference = {{ source = "render", spp = 64, held_out = [1] }}
 views = {{ rig = "ring", count = 3, width = 8, height = 8 }}
 {TRUTH}
-optimiser = {{ name = "adam" }}
+optimizer = {{ name = "adam" }}
 fit = {{ iterations = 4, spp = 2 }}
 event = [{{ name = "evaluate", every = 2 }}]
 [[parameter]]

@@ -22,8 +22,8 @@ mean: np.ndarray = reference.mean
 density = mivol.Parameter("cube.interior_medium.sigma_t.data", domain=(0, 50), lr=0.1)
 problem = mivol.Problem(scene, "truth.xml", [density], loss=loss, spp=4)
 problem = mivol.Problem({"type": "scene"}, ["a.exr", Path("b.exr"), mean, mi.TensorXf(mean)], [density.name])
-for optimiser in (mivol.Adam(), mivol.Lbfgs(), mivol.GaussNewton(), mivol.RMSprop()):
-    fit = mivol.optimize(problem, optimiser, 3, observer=lambda fit: print(fit.history[-1]["loss"]))
+for optimizer in (mivol.Adam(), mivol.Lbfgs(), mivol.GaussNewton(), mivol.RMSprop()):
+    fit = mivol.optimize(problem, optimizer, 3, observer=lambda fit: print(fit.history[-1]["loss"]))
 found: np.ndarray = np.array(fit.values()[density.name])
 
 mivol.write_volume("a.vol", mivol.make_procedural("tangle", (8, 8, 8), seed=1, peak=2.0), metadata={"space": "RAS"})

@@ -76,10 +76,10 @@ class SceneFit(FitKind):
     def describe_run(self) -> dict[str, Any]:
         settings = self.settings
         priors = [prior for parameter in settings.parameter for prior in parameter.prior]
-        strategies = [settings.optimiser, settings.loss, *priors]
+        strategies = [settings.optimizer, settings.loss, *priors]
         keys = ", ".join(parameter.key for parameter in settings.parameter)
         emission = ["nimier_david_2022"] if any(parameter.start_fit for parameter in settings.parameter) else []
-        method = f"{settings.fit.integrator}, {settings.optimiser.label()} on {settings.loss.label()}; parameter: {keys}"
+        method = f"{settings.fit.integrator}, {settings.optimizer.label()} on {settings.loss.label()}; parameter: {keys}"
         return {
             "method": method,
             "seeds": {"fit": settings.seed, "references": getattr(settings.reference, "seed", 0)},
@@ -133,7 +133,7 @@ class SceneFit(FitKind):
         for parameter in self.settings.parameter:
             if parameter.start_fit == "emission":
                 place = grid_to_world(parameter.key, self.problem.scene)
-                start = find_emissive_start(self.problem, parameter.key, place, self.settings.optimiser, self.settings.seed)
+                start = find_emissive_start(self.problem, parameter.key, place, self.settings.optimizer, self.settings.seed)
                 set_parameter(self.problem.params, parameter.key, start.value)
                 self.problem.set_reals(self.problem.initial_reals())
                 notes.append(f"{parameter.key} {start.description}")
@@ -141,7 +141,7 @@ class SceneFit(FitKind):
         return notes
 
     def optimizer(self) -> Optimizer:
-        return self.settings.optimiser
+        return self.settings.optimizer
 
     def course(self) -> Course:
         return Course(self.settings.fit.iterations, self.settings.schedule, self.settings.event)
@@ -181,7 +181,7 @@ class SceneFit(FitKind):
         for parameter in settings.parameter:
             if parameter.start_fit == "emission":
                 check_given_start(parameter.key, np.asarray(problem.values()[parameter.key]))
-        settings.optimiser.begin(problem)
+        settings.optimizer.begin(problem)
         problem.rehearse()
         params = mi.traverse(scene)
         for start in self.starts:

@@ -161,7 +161,7 @@ def to_image_tensor(reference: Reference) -> mi.TensorXf:
 
 def optimize(
     problem: SceneProblem,
-    optimiser: Optimizer | mi.ad.Optimizer | None = None,
+    optimizer: Optimizer | mi.ad.Optimizer | None = None,
     iterations: int = 100,
     *,
     measure: Measure | None = None,
@@ -171,7 +171,7 @@ def optimize(
 
     Args:
         problem: the problem.
-        optimiser: an optimizer of mivol or of ``mi.ad``, or any object with a method ``begin(problem)``; None for Adam.
+        optimizer: an optimizer of mivol or of ``mi.ad``, or any object with a method ``begin(problem)``; None for Adam.
         iterations: largest number of iterations.
         measure: function of the problem that returns errors by name, called at the end.
         observer: function of the fit, called after each iteration.
@@ -183,7 +183,7 @@ def optimize(
         MivolError: a loss that is not finite, or a scene that cannot be rendered.
         KeyboardInterrupt: Ctrl-C; the scene holds the newest parameters.
     """
-    return reconstruct(problem, to_optimizer(optimiser or Adam()), iterations, measure=measure, observer=observer)
+    return reconstruct(problem, to_optimizer(optimizer or Adam()), iterations, measure=measure, observer=observer)
 
 
 def explain(

@@ -67,7 +67,7 @@ def check_grid(key: str, shape: Sequence[int], way_out: str) -> None:
         MivolError: with its shape and size.
     """
     size = " x ".join(str(n) for n in shape)
-    check_memory(NUMBER_BYTES * math.prod(shape), f"{key} of {size} numbers, with its derivative and the optimiser,", way_out)
+    check_memory(NUMBER_BYTES * math.prod(shape), f"{key} of {size} numbers, with its derivative and the optimizer,", way_out)
 
 
 def make_start(settings: Sought, base: Path, scene: mi.Scene) -> Start:

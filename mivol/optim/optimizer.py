@@ -57,7 +57,7 @@ class OptimizerRun:
             self.replace(name, value)
 
 
-class Optimizer(Strategy, tag="optimiser"):
+class Optimizer(Strategy, tag="optimizer"):
     """Settings of a minimisation."""
 
     def begin(self, problem: Problem) -> OptimizerRun:

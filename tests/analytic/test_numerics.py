@@ -65,7 +65,7 @@ def test_moments_against_quadrature():
 
 
 def test_a_negative_argument_is_no_special_case():
-    # An extinction that an optimiser has pushed below 0 must not make NaN.
+    # An extinction that an optimizer has pushed below 0 must not make NaN.
     x = np.array([-0.3, -1.5, -4.0])
     assert np.array(one_minus_exp(mi.Float(x))) == pytest.approx(-np.expm1(-x), rel=1e-6)
     assert np.array(phi1(mi.Float(x))) == pytest.approx(-np.expm1(-x) / x, rel=1e-6)

@@ -50,7 +50,7 @@ def test_resolved_settings_are_an_experiment_again() -> None:
 def test_every_setting_says_what_it_is() -> None:
     """Each line of the help names a setting, and each setting has one; units are said where there are any."""
     lines = describe(config.SceneExperiment)
-    assert any(line.startswith("optimiser[adam].beta_1 = 0.9: ") for line in lines)
+    assert any(line.startswith("optimizer[adam].beta_1 = 0.9: ") for line in lines)
     assert any(line.startswith("fit.spp = 16 [sample/pixel]: ") for line in lines)
     assert any(line.startswith("parameter.0.prior.0[tv].weight = 1.0: ") for line in lines)
     assert all(line.partition(": ")[2].strip() for line in lines)
@@ -59,10 +59,10 @@ def test_every_setting_says_what_it_is() -> None:
 def test_command_line_overrides_the_file(tmp_path: Path) -> None:
     path = tmp_path / "fit.toml"
     path.write_text(SMALLEST)
-    changes = ["fit.iterations=7", "parameter.0.lr=0.5", "views.count=3", 'optimiser={name="gauss_newton"}', "title=two words"]
-    found = config.load(path, [*changes, "optimiser.inner=4", "parameter.0.prior.0.weight=2"])
+    changes = ["fit.iterations=7", "parameter.0.lr=0.5", "views.count=3", 'optimizer={name="gauss_newton"}', "title=two words"]
+    found = config.load(path, [*changes, "optimizer.inner=4", "parameter.0.prior.0.weight=2"])
     assert (found.fit.iterations, found.parameter[0].lr, found.views.count) == (7, 0.5, 3)
-    assert found.optimiser == GaussNewton(inner=4)
+    assert found.optimizer == GaussNewton(inner=4)
     assert found.title == "two words"
     assert found.parameter[0].prior[0].weight == 2.0
 
@@ -70,7 +70,7 @@ def test_command_line_overrides_the_file(tmp_path: Path) -> None:
 def test_flat_names_everything_that_changes_the_result() -> None:
     flat = config.flat(config.resolved(config.from_dict(raw())))
     assert flat["parameter.0.prior.0.weight"] == 0.5
-    assert flat["optimiser.beta_1"] == 0.9
+    assert flat["optimizer.beta_1"] == 0.9
     assert not {"title", "output", "threads"} & set(flat)
 
 
@@ -87,7 +87,7 @@ WRONG = {
     "misspelt key in a list": (["parameter.0.domian=[0, 1]"], '"parameter.0.domian": did you mean "domain"'),
     "misspelt key of a strategy": (['loss={name="huber", detla=1}'], '"loss.detla": did you mean "delta"'),
     "key of another strategy": (['loss={name="l1", delta=1}'], 'unknown key "loss.delta"'),
-    "misspelt strategy": (['optimiser={name="addam"}'], 'optimiser.name = "addam" is unknown: did you mean "adam"'),
+    "misspelt strategy": (['optimizer={name="addam"}'], 'optimizer.name = "addam" is unknown: did you mean "adam"'),
     "misspelt prior": (['parameter.0.prior=[{name="tvv"}]'], 'prior.0.name = "tvv" is unknown: did you mean "tv"'),
     "strategy without a name": (["schedule={final=0.1}"], '"schedule.name" is missing'),
     "misspelt rig": (['views.rig="rings"'], 'views.rig = "rings" is unknown: did you mean "ring"'),

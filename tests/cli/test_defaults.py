@@ -15,7 +15,7 @@ from mivol.optim.schedules import Constant
 
 DEFAULTS = {
     SceneExperiment: {
-        **{"held_out": None, "truth": None, "optimiser": Adam(), "schedule": Constant(), "loss": L2()},
+        **{"held_out": None, "truth": None, "optimizer": Adam(), "schedule": Constant(), "loss": L2()},
         "event": (Checkpoint(every=10), Evaluate(every=10)),
     },
     ScanExperiment: {"grid": None},

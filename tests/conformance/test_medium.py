@@ -34,7 +34,7 @@ def test_coefficients_of_both_pairs_agree():
     assert sigma_n.min() >= 0
 
 
-# -- Numbers that an optimiser can reach ---------------------------------------------------------------------------------
+# -- Numbers that an optimizer can reach ---------------------------------------------------------------------------------
 
 
 def fog(interior: dict) -> mi.Scene:
@@ -123,7 +123,7 @@ def test_a_number_is_read_once(monkeypatch):
     assert sorted(read) == ["scale", "sigma_t"]
 
 
-# -- Voxels that an optimiser or a filter has brought below 0 ------------------------------------------------------------
+# -- Voxels that an optimizer or a filter has brought below 0 ------------------------------------------------------------
 
 
 CELLS = 0.1 + np.random.default_rng(7).uniform(0, 2, (5, 4, 6, 3))
@@ -184,7 +184,7 @@ def test_voxels_below_0_count_as_0(name):
 
 
 def test_what_is_below_0_is_told_once():
-    """Not after each step of an optimiser, of the same integrator on the same scene."""
+    """Not after each step of an optimizer, of the same integrator on the same scene."""
     scene = fog(medium("mivol_medium", grid_volume("mivol_voxels", CELLS[..., :1])))
     integrator = mi.load_dict({"type": "mivol"})
     params, images = mi.traverse(scene), []
@@ -205,15 +205,15 @@ def test_unclamped_steps_reach_the_truth_through_0():
     params, key = mi.traverse(scene), f"{MEDIUM}.sigma_t.data"
     integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
     target = mi.render(scene, integrator=integrator, spp=16, seed=0)
-    optimiser = mi.ad.Adam(lr=0.05)
-    optimiser[key] = mi.TensorXf(np.full((2, 2, 2, 1), -0.02, np.float32))
-    params.update(optimiser)
+    optimizer = mi.ad.Adam(lr=0.05)
+    optimizer[key] = mi.TensorXf(np.full((2, 2, 2, 1), -0.02, np.float32))
+    params.update(optimizer)
     with pytest.warns(RuntimeWarning, match="8 of 8 values of sigma_t"):
         for _ in range(60):
             image = mi.render(scene, params, integrator=integrator, spp=16, seed=0)
             dr.backward(dr.mean(dr.square(image - target), axis=None))
-            optimiser.step()
-            params.update(optimiser)
+            optimizer.step()
+            params.update(optimizer)
     error = np.array(mi.render(scene, integrator=integrator, spp=16, seed=0)) - np.array(target)
     # Transmittances were 1, where those of the target are exp(-0.6): 0.45 off. A step moves them by its size at most, over
     # paths of length 1 (the camera looks along the box), and that is what Adam may still sway by.

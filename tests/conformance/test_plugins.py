@@ -345,7 +345,7 @@ def test_a_rotation_about_an_axis_of_another_length_is_refused(variant):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_an_update_with_bad_values_is_refused(variant, bad):
-    """What an optimiser's overshoot leaves behind is named when it is handed in, not when it is rendered.
+    """What an optimizer's overshoot leaves behind is named when it is handed in, not when it is rendered.
 
     Hard cases 26 and 27.
     """

@@ -36,7 +36,7 @@ def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: p
     record = json.loads((target / "run.json").read_text())
     assert record["status"] == "finished"
     assert record["config"]["fit"]["iterations"] == 5
-    assert record["config"]["optimiser"]["beta_1"] == 0.9
+    assert record["config"]["optimizer"]["beta_1"] == 0.9
     assert record["seeds"] == {"fit": 0, "references": 1}
     assert {"mivol", "mitsuba", "drjit"} <= set(record["versions"])
     assert record["plan"]
@@ -105,7 +105,7 @@ OPTIMIZE_REFUSED = {
     "a photograph of another size": ([PHOTO.format("small.exr")], '"view 2" has shape (4, 4, 3), its sensor 8 x 8 pixels'),
     "a photograph with a hole": ([PHOTO.format("hole.exr")], "not finite at pixel (row 2, column 3)"),
     "a photograph without colours": ([PHOTO.format("grey.exr")], "found the channels Y, expected R, G and B"),
-    "a loss that is not squared": (['optimiser={name="gauss_newton"}', 'loss={name="l1"}'], "quadratic in the image"),
+    "a loss that is not squared": (['optimizer={name="gauss_newton"}', 'loss={name="l1"}'], "quadratic in the image"),
     "an emissive start of nothing": ([f'parameter=[{{key="{KEY}", start=0.0, start_fit="emission"}}]'], "a mean of 0"),
     "an integrator that sees no media": (['fit.integrator="path"'], "the images do not depend on cube"),
     "no grid to refine": (
@@ -211,8 +211,8 @@ def test_resume_refuses_other_settings(variant_rgb, folder: Path, capsys: pytest
     assert not (folder / "run").exists()
     assert run(*flags) == 0
     record = (folder / "run" / "run.json").read_text()
-    said = refused(capsys, *flags, "--resume", "--set", "optimiser.beta_1=0.8")
-    assert "optimiser.beta_1 is 0.9 there and 0.8 here" in said
+    said = refused(capsys, *flags, "--resume", "--set", "optimizer.beta_1=0.8")
+    assert "optimizer.beta_1 is 0.9 there and 0.8 here" in said
     assert "parameter.0.shape.0 is 3 there" in refused(capsys, *flags, "--resume", "--set", f'parameter=[{{key="{KEY}"}}]')
     assert (folder / "run" / "run.json").read_text() == record
 

@@ -1,4 +1,4 @@
-"""What a script needs in a line each: problems with a loss and an optimiser of one's own, references of every kind."""
+"""What a script needs in a line each: problems with a loss and an optimizer of one's own, references of every kind."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def test_a_function_sees_one_view_at_a_time(scene: mi.Scene) -> None:
     [None, lambda: mi.ad.Adam(lr=0.1), lambda: mi.ad.SGD(lr=2.0, momentum=0.5), mivol.Adam],
     ids=["none", "Mitsuba's Adam", "Mitsuba's SGD", "ours"],
 )
-def test_any_optimiser_lowers_the_loss(scene: mi.Scene, make) -> None:
-    """The start's transmittance of 0.6 and more is brought towards 0.3 by every optimiser; values stay in their domain."""
+def test_any_optimizer_lowers_the_loss(scene: mi.Scene, make) -> None:
+    """The start's transmittance of 0.6 and more is brought towards 0.3 by every optimizer; values stay in their domain."""
     sought = mivol.Parameter(KEY, domain=(0, 0.9), lr=0.1)
     fit = optimize(Problem(scene, [seen(0.3)], [sought], spp=4), make and make(), 8)
     losses = [row["loss"] for row in fit.history]
@@ -96,7 +96,7 @@ def test_references_are_arrays_files_or_a_scene(scene: mi.Scene, folder: Path) -
 
 
 class Silent:
-    """An optimiser that begins nothing."""
+    """An optimizer that begins nothing."""
 
     def begin(self, problem: Problem) -> None:
         pass

@@ -62,7 +62,7 @@ def test_slope_of_hg_integrates_to_nothing(g):
 
 @pytest.mark.parametrize(("g", "alpha"), [(0.0, 0.0), (0.6, 0.0), (0.6, 1.0), (-0.8, 27.0), (0.99999, 300.0)])
 def test_slopes_of_draine(g, alpha):
-    """By g and by alpha, alpha = 0 included, where an optimiser may start."""
+    """By g and by alpha, alpha = 0 included, where an optimizer may start."""
     by_g, by_alpha = slopes(eval_draine, g, alpha)
     m, p = oracle.turns(ANGLES)
     g, alpha = f32(g), f32(alpha)

@@ -1,4 +1,4 @@
-"""Hard cases of phase functions, through the plugins: what float32 and optimisers do to them."""
+"""Hard cases of phase functions, through the plugins: what float32 and optimizers do to them."""
 
 from __future__ import annotations
 

@@ -320,7 +320,7 @@ def test_memory_goes_with_what_is_there() -> None:
     tables = bake(field, cells, pinholes, mi.UInt32(0), slope=True)
     ray = rays_of([3, 0, 0], [-1, 0, 0])
     slopes = make_exact(field, ray.d, slope=True)
-    held = [field.density, field.harmonics] * 2  # the values and the optimiser's squares
+    held = [field.density, field.harmonics] * 2  # the values and the optimizer's squares
     held += [slopes.table, slopes.slope, *slopes.slopes(), field.nodes]
     held += [cells.corners, cells.rows, tables.table, tables.slope]
     taken = sum(dr.width(a) * dr.itemsize_v(a) for a in held) + field.sparse_index().bytes + cells.index.bytes

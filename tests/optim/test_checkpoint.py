@@ -33,7 +33,7 @@ CASES = {
 }
 
 
-def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int = signal.SIGINT, resume: bool = False) -> Fit:
+def fit(optimizer, path: Path | None = None, *, stop_after: int = -1, how: int = signal.SIGINT, resume: bool = False) -> Fit:
     """The same run, stopped by a signal after an iteration where asked for."""
 
     def observe(at_work: Fit) -> None:
@@ -45,7 +45,7 @@ def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int =
 
     store = None if path is None else CheckpointFile(path, {"a": 1}, resume)
     course = Course(ITERATIONS, events=EVENTS)
-    return reconstruct(small_problem(), optimiser, course, measure=measure, observer=observe, checkpoint=store)
+    return reconstruct(small_problem(), optimizer, course, measure=measure, observer=observe, checkpoint=store)
 
 
 @pytest.mark.slow
@@ -121,12 +121,12 @@ def written(path: Path, fingerprint: dict) -> Path:
 
 def test_refused_checkpoints(tmp_path: Path) -> None:
     """Another scene, another setting, none at all, half a file, a file of something else."""
-    here = {"scene": "abc", "optimiser.lr": 0.1, "domain": [0.0, float("inf")]}
+    here = {"scene": "abc", "optimizer.lr": 0.1, "domain": [0.0, float("inf")]}
     path = written(tmp_path / "a.npz", here)
     assert checkpoint.read(path, here)[0]["reals/x"].tolist() == [0, 1, 2]
     for change, sentence in (
         ({"scene": "abd"}, "scene is 'abc' there and 'abd' here"),
-        ({"optimiser.lr": 0.2}, "optimiser.lr is 0.1 there and 0.2 here"),
+        ({"optimizer.lr": 0.2}, "optimizer.lr is 0.1 there and 0.2 here"),
         ({"new": 1}, "new is None there and 1 here"),
     ):
         with pytest.raises(MivolError, match=sentence):

@@ -30,7 +30,7 @@ from mivol.validate.moments import Moments
 
 EPS = float(np.finfo(np.float32).eps)
 
-#: optimiser -> (settings, iterations, relative error of both optima that it must reach in a two-parameter problem).
+#: optimizer -> (settings, iterations, relative error of both optima that it must reach in a two-parameter problem).
 #: Gauss-Newton and L-BFGS converge superlinearly to the float32 noise of the loss (its square root: 3e-4); Adam's and RMSprop's
 #: steps of lr times the last cosine factors (below 1e-2 of 0.2) end within 1e-2.
 EXACT = {
@@ -56,7 +56,7 @@ def two_cubes(start: float) -> mi.Scene:
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_finds_a_known_optimum(variant_rgb, name: str) -> None:
     """Two unknown extinctions, each seen through a chord of 2: I = exp(-2 sigma), wanted 0.7 and 0.2, from 0.35."""
-    optimiser, iterations, bound = EXACT[name]
+    optimizer, iterations, bound = EXACT[name]
     scene = two_cubes(0.35)
     keys = [f"{side}.interior_medium.sigma_t.value.value" for side in ("left", "right")]
     pose = mi.ScalarTransform4f().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]).scale([1.5, 0.8, 1])
@@ -65,7 +65,7 @@ def test_finds_a_known_optimum(variant_rgb, name: str) -> None:
     tau = 2 * np.repeat([[0.7, 0.7, 0.2, 0.2]], 4, axis=0)[..., None].repeat(3, axis=2)
     view = View("both", sensor, mi.TensorXf(np.exp(-tau).astype(np.float32)))
     parameters = [Parameter(key, domain=(0.0, 10.0), lr=0.2) for key in keys]
-    fit = reconstruct(SceneProblem(scene, [view], parameters, spp=4), optimiser, Course(iterations, Cosine()))
+    fit = reconstruct(SceneProblem(scene, [view], parameters, spp=4), optimizer, Course(iterations, Cosine()))
     values = [float(np.asarray(fit.values()[key]).ravel()[0]) for key in keys]
     assert np.allclose(values, [0.7, 0.2], rtol=bound)
 
@@ -304,9 +304,9 @@ def test_adam_is_mitsubas_adam(variant_rgb) -> None:
 
 
 def test_bounds_hold(variant_rgb) -> None:
-    for optimiser in (Adam(), Lbfgs(), GaussNewton()):
+    for optimizer in (Adam(), Lbfgs(), GaussNewton()):
         problem = small_problem(parameters=[Parameter(KEY, domain=(0.2, 0.6), lr=0.3)])
-        values = np.asarray(reconstruct(problem, optimiser, 4).values()[KEY])
+        values = np.asarray(reconstruct(problem, optimizer, 4).values()[KEY])
         assert values.min() >= np.float32(0.2)
         assert values.max() <= np.float32(0.6)
         assert np.ptp(values) > 0.01

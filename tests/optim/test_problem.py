@@ -85,27 +85,27 @@ class Network:
         return Refinement(reals, twice, {"s": 0.5, "b": 0.5}, f"{self.width} units")
 
 
-def fit(optimiser: Optimizer, store: CheckpointFile | None = None, stop_after: int = -1) -> Fit:
+def fit(optimizer: Optimizer, store: CheckpointFile | None = None, stop_after: int = -1) -> Fit:
     def observe(at_work: Fit) -> None:
         if at_work.next_iteration == stop_after:
             os.kill(os.getpid(), signal.SIGINT)
 
     course = Course(80, Cosine(), (CoarseToFine(at=(SPLIT,)),))
-    return reconstruct(Network(), optimiser, course, observer=observe, checkpoint=store)
+    return reconstruct(Network(), optimizer, course, observer=observe, checkpoint=store)
 
 
-@pytest.mark.parametrize("optimiser", [Adam(), RMSprop(), RMSprop(half=True)], ids=["adam", "rmsprop", "halves"])
-def test_another_problem_is_fitted_refined_and_resumed(one_thread, ctrl_c, tmp_path: Path, optimiser: Optimizer) -> None:
+@pytest.mark.parametrize("optimizer", [Adam(), RMSprop(), RMSprop(half=True)], ids=["adam", "rmsprop", "halves"])
+def test_another_problem_is_fitted_refined_and_resumed(one_thread, ctrl_c, tmp_path: Path, optimizer: Optimizer) -> None:
     """Expected: the loss falls to a tenth and does not jump where units are split (the function is the same there, and a step
     changes the loss by less than half); a run stopped in the second stage goes on to the last bit."""
-    whole = fit(optimiser)
+    whole = fit(optimizer)
     losses = [row["loss"] for row in whole.history]
     assert losses[-1] < 0.1 * losses[0]
     assert losses[SPLIT] < 1.5 * losses[SPLIT - 1]
     assert whole.log == [f"iteration {SPLIT}: 8 units"] and whole.run.reals["w"].shape == (8,)
     path = tmp_path / "checkpoint.npz"
     with pytest.raises(Interrupted):
-        fit(optimiser, CheckpointFile(path, {"a": 1}), stop_after=SPLIT + 10)
-    resumed = fit(optimiser, CheckpointFile(path, {"a": 1}, resume=True))
+        fit(optimizer, CheckpointFile(path, {"a": 1}), stop_after=SPLIT + 10)
+    resumed = fit(optimizer, CheckpointFile(path, {"a": 1}, resume=True))
     assert [row["loss"] for row in resumed.history] == losses
     assert all(np.array_equal(resumed.run.reals[name], whole.run.reals[name]) for name in "wsb")
