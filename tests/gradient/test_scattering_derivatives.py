@@ -288,6 +288,19 @@ def test_derivative_by_a_number(name):
     assert_gradient(sums(seen, MEDIUM + key, w, 2048), np.array([truth]), name, 0.08)
 
 
+@pytest.mark.statistical
+@pytest.mark.parametrize("kind", small.cases(small.KINDS, ["stock"]))
+def test_albedo_0_under_a_sky_has_a_derivative(kind):
+    """At albedo 0 the derivative by the albedo is the integral of T sigma L_s, here with the light of a sky, and not 0."""
+    values = rough_grid(2)
+    seen = pencils({"smoke": smoke(values, 0.0, kind)[0], "sky": scenes.sky(0.4)}, *aimed(2, 2))
+    medium_of_1 = twins.Medium(twins.Grid(values, PLACE), 1.0)
+    truth = 3 * twins.radiance([medium_of_1], [twins.Sky(0.4, 10)], seen.o, seen.d, order=3)[:, 0].sum()  # three channels
+    found = gradients(seen, MEDIUM + "albedo.value.value", np.ones((1, 2, 3)), 1024)
+    # The twin has 10 x 20 directions of the sky: 2e-3 of the light.
+    assert_same_mean(Moments.from_values(found.reshape(BATCHES, -1)), np.array([truth]), rounding=2e-3 * truth)
+
+
 def lit(box: dict, emitter: str) -> tuple[Pencils, twins.Emitter, np.ndarray, np.ndarray]:
     """Six pencils through a box under an emitter, the emitter's twin, and weights."""
     stock, twin = EMITTERS[emitter]()
