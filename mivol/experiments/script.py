@@ -199,7 +199,7 @@ def explain(
         max_depth: longest path; None means the settings of the scene's own integrator.
         sensor: a sensor, or its index.
         noise: noise of a pixel over the mean radiance; the smallest ``max_depth`` that neglects less is measured
-            (:mod:`mivol.scene.depth_preview`); None to measure nothing.
+            (:mod:`mivol.scene.previews`); None to measure nothing.
 
     Returns:
         Facts, choices with their reasons, and the reason of a refusal.

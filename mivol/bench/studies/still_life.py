@@ -76,7 +76,7 @@ def fit_views(
         box: (2, 3) box of the scene [length].
         size: nodes, steps, rays.
         degree: degree of the harmonics.
-        priors: fields of :class:`mivol.optim.photographs.radiance_plan.FitPlan`.
+        priors: fields of :class:`mivol.optim.photographs.radiance_plan.RadiancePlan`.
 
     Returns:
         PSNR [dB] of the held-out views, nodes, processor time; for the figure the middle held-out view and its render.

@@ -4,7 +4,7 @@ Conventions. A batch consists of square tiles of pixels. Neighbouring pixels cro
 share cache lines, and a packet of lanes stays together. Tiles lie anywhere in a view, with uniform probability. Smaller sizes
 are exact area means: if voxels are larger than pixels, a small image gives the same information with fewer rays. Values are the
 photographs' values: codes in 8-bit steps, without decoding, or radiance. A masked pixel has a ray and weight 0. Rays of
-pinholes are computed. Rays of wide lenses (:mod:`mivol.photos.wide_lens`) are traced once for each lens and size, and looked
+pinholes are computed. Rays of wide lenses (:mod:`mivol.photos.lens`) are traced once for each lens and size, and looked
 up.
 """
 

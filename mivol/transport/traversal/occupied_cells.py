@@ -9,8 +9,8 @@ listed cells, plus four bytes for 64 cells of the box. Listed cells are numbered
 bits. The number of a cell (its rank) is the stored number of listed cells before its brick plus the count of set bits below
 its own bit.
 
-Levels. A grid may be a level of several nested grids (:mod:`mivol.fields.spherical`). All levels have the same nodes, and their
-cells are counted level by level. A walk (:mod:`mivol.transport.traversal.occupied_walk`) stays in a level.
+Levels. A grid may be a level of several nested grids (:mod:`mivol.fields.spherical_grid`). All levels have the same nodes, and
+their cells are counted level by level. A walk (:mod:`mivol.transport.traversal.occupied_walk`) stays in a level.
 
 References: Cohen & Sheffer 1994 (proximity clouds: distances for a ray to skip); Jacobson 1989 (rank of a bit in constant
     time).
