@@ -166,4 +166,4 @@ def test_the_page_contains_the_film(tmp_path: Path) -> None:
     write_record(record, tmp_path)
     page = write_page(tmp_path).read_text()
     assert "data:image/webp;base64" in page
-    assert "(sigma_t times length)" in page
+    assert "[sigma_t times length]" in page
