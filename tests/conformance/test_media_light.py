@@ -232,8 +232,8 @@ def test_what_cannot_be_drawn_is_refused_or_met() -> None:
     ball = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "diffuse"}, "exterior": {"type": "ref", "id": "haze"}}
     around = close_up({"haze": haze, "ball": ball}, res=4)
     assert not plan_of(around, max_depth=2).draws_emission
-    assert "a medium that emits fills no shape of its own" in explain(around, 2)
-    with refused("media_light is 'drawn', and a medium that emits fills no shape of its own"):
+    assert "an emitting medium fills no shape of its own" in explain(around, 2)
+    with refused("media_light is 'drawn', and an emitting medium fills no shape of its own"):
         plan_of(around, media_light="drawn")
     scene, (auto, by_chance, by_draws) = seen("over a floor", 4), (mi.load_dict(i) for i in (AUTO, met(2), drawn(2)))
     for integrator in (auto, by_draws):

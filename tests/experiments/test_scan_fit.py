@@ -221,7 +221,7 @@ def test_a_prior_in_units_of_the_noise_says_what_it_did(variant_rgb, folder: Pat
     assert run(folder, *changes) == 0
     (line,) = [line for line in json.loads((folder / "run/run.json").read_text())["plan"] if "variation" in line["choice"]]
     assert "strength" in line["choice"]
-    assert "% of the slopes as edges" in line["reason"]
+    assert "% of the slopes are kept as edges" in line["reason"]
 
 
 @pytest.mark.slow
