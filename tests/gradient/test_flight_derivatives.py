@@ -386,7 +386,6 @@ def test_mean_is_the_sum() -> None:
     term = ShadowTerm(media, kept)
     assert np.all(np.array(term.value) == 0)
     media.bodies[0].tangents, media.bodies[0].has_tangent = [mi.Float(1)], [True]
-    media.bodies[0].has_tangent = [True]
     found = np.array(term.jvp().x, dtype=np.float64) * np.ones(n)
     truth = -sum(a * b for a, b in zip(LIGHTS, LENGTHS, strict=True))
     assert_same_mean(Estimate(found.mean(), found.var(ddof=1) / n, n - 1), truth, rounding=1e-6, what="derivative")
