@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
+import pkgutil
 import re
 import shlex
 import tomllib
@@ -90,6 +91,28 @@ def listed_pages(index: str) -> list[str]:
     trees = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / f"{index}.md").read_text(), re.DOTALL)
     lines = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
     return [(Path(index).parent / line).as_posix() for line in lines]
+
+
+@pytest.mark.parametrize("path", [ROOT / "ARCHITECTURE.md", *PAGES], ids=name_of)
+def test_names_of_mivol_on_a_page_exist(path: Path) -> None:
+    """``mivol.points.sample_points`` in the text of a page is an object of the package."""
+    names = re.findall(r"\bmivol(?:\.[A-Za-z_]\w*)+", re.sub(r"\]\([^)]*\)", "]", path.read_text()))
+    suffixes = {"png", "io", "git", "py", "toml", "xml", "md"}
+    assert [name for name in names if name.rsplit(".", 1)[1] not in suffixes and not exists(name)] == []
+
+
+def exists(name: str) -> bool:
+    """Whether a dotted name is a module, or an attribute of one."""
+    try:
+        pkgutil.resolve_name(name)
+    except (ImportError, AttributeError):
+        return False
+    return True
+
+
+def test_names_that_do_not_exist_are_seen() -> None:
+    assert exists("mivol.points.sample_points") and exists("mivol.optim.losses")
+    assert not exists("mivol.points.density_of_points") and not exists("mivol.optim.lossess")
 
 
 def test_only_the_index_of_notes_leads_to_notes() -> None:

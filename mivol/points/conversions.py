@@ -45,7 +45,7 @@ def points_to_density(
     masses = np.ones(len(positions)) if masses is None else np.asarray(masses, np.float64)
     if positions.ndim != 2 or positions.shape[1:] != (3,) or masses.shape != positions.shape[:1]:
         found = f"positions of shape {positions.shape} and masses of shape {masses.shape}"
-        raise refusal("density_of_points", found, "(N, 3) and (N,)", "reshape them")
+        raise refusal("points_to_density", found, "(N, 3) and (N,)", "reshape them")
     to_lattice = lattice_from_world(to_world, resolution)
     q = positions @ to_lattice[:, :3].T + to_lattice[:, 3]
     size = np.array(resolution[::-1])
@@ -53,7 +53,7 @@ def points_to_density(
     outside = np.flatnonzero(~((q >= -0.5 - 1e-9 * size) & (q <= size - 0.5 + 1e-9 * size)).all(axis=1))
     if outside.size:
         found = f"point {outside[0]} outside the box (the first of {outside.size})"
-        raise refusal("density_of_points", found, "points inside", "enlarge the box, or leave these points out")
+        raise refusal("points_to_density", found, "points inside", "enlarge the box, or leave these points out")
     low = np.floor(q)
     fraction = q - low
     mass = np.zeros(np.prod(resolution))
@@ -127,15 +127,15 @@ def points_to_gaussians(cloud: PointCloud, opacity: float = 0.1) -> Gaussians:
     Source: Kerbl et al. 2023, section 5.1.
     """
     if not 0 <= opacity <= 1:
-        raise refusal("gaussians_of_points", f"opacity={opacity}", "0 to 1", "choose one of those")
+        raise refusal("points_to_gaussians", f"opacity={opacity}", "0 to 1", "choose one of those")
     if cloud.count <= NEIGHBOURS:
         found = f"{cloud.count} points"
-        raise refusal("gaussians_of_points", found, f"at least {NEIGHBOURS + 1}, for the distances among them", "add some")
+        raise refusal("points_to_gaussians", found, f"at least {NEIGHBOURS + 1}, for the distances among them", "add some")
     distances = cKDTree(cloud.positions).query(cloud.positions, NEIGHBOURS + 1)[0][:, 1:]
     scales = np.sqrt((distances**2).mean(axis=1))
     median = float(np.median(scales))
     if median == 0:
-        raise refusal("gaussians_of_points", "points that mostly coincide", "points apart", "remove what is there twice")
+        raise refusal("points_to_gaussians", "points that mostly coincide", "points apart", "remove what is there twice")
     scales = np.maximum(scales, MIN_RELATIVE_SCALE * median)
     colours = np.full((cloud.count, 3), GREY) if cloud.colours is None else cloud.colours
     return Gaussians(
