@@ -207,8 +207,8 @@ def test_opacities_are_reset_periodically(variant_rgb: str, views: list[Photo]) 
 @pytest.mark.slow
 def test_each_epoch_has_every_view_once(variant_rgb: str, views: list[Photo], monkeypatch: pytest.MonkeyPatch) -> None:
     problem, seen = problem_of(views), []
-    whole = problem.loss_of_view
-    monkeypatch.setattr(problem, "loss_of_view", lambda reals, view, behind: seen.append(view) or whole(reals, view, behind))
+    whole = problem.view_loss_and_gradient
+    monkeypatch.setattr(problem, "view_loss_and_gradient", lambda reals, view, behind: seen.append(view) or whole(reals, view, behind))
     reals = problem.initial_reals()
     for step in range(16):
         problem.loss_and_gradient(reals, step)
