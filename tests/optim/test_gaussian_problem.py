@@ -208,7 +208,12 @@ def test_opacities_are_reset_periodically(variant_rgb: str, views: list[Photo]) 
 def test_each_epoch_has_every_view_once(variant_rgb: str, views: list[Photo], monkeypatch: pytest.MonkeyPatch) -> None:
     problem, seen = problem_of(views), []
     whole = problem.view_loss_and_gradient
-    monkeypatch.setattr(problem, "view_loss_and_gradient", lambda reals, view, behind: seen.append(view) or whole(reals, view, behind))
+
+    def note(reals: dict, view: int, background: np.ndarray | None) -> tuple:
+        seen.append(view)
+        return whole(reals, view, background)
+
+    monkeypatch.setattr(problem, "view_loss_and_gradient", note)
     reals = problem.initial_reals()
     for step in range(16):
         problem.loss_and_gradient(reals, step)

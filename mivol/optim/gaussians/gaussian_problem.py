@@ -157,7 +157,7 @@ class GaussianProblem:
         Args:
             reals: of the cloud.
             view: number of the view.
-            background: put backdrop the photograph and the cloud (3,); None keeps the photograph's own background.
+            background: colour behind the photograph and the cloud (3,); None keeps the photograph's own background.
         """
         shrink = self.plan.stages[self.stage].shrink
         camera = self._camera(view, shrink)
