@@ -16,6 +16,7 @@ from mivol.bench.extinctions import TO_WORLD
 
 __all__ = [
     "box_scene",
+    "camera",
     "constant_light",
     "directional_light",
     "map_directions",
@@ -34,11 +35,21 @@ __all__ = [
 def perspective(side: int) -> dict:
     """A camera of the tutorial: distance 4, field of view 45 degrees, turned by 18 degrees; z of the smoke is up."""
     angle = math.radians(18)
-    origin = [4 * math.sin(angle), -4 * math.cos(angle), 0]
+    return camera(side, (4 * math.sin(angle), -4 * math.cos(angle), 0), (0, 0, 0), 45)
+
+
+def camera(
+    side: int,
+    origin: Sequence[float],
+    target: Sequence[float],
+    fov: float = 40,
+    up: Sequence[float] = (0, 0, 1),
+) -> dict:
+    """A camera with a square image, a box filter and independent samples; the field of view in degrees."""
     return {
         "type": "perspective",
-        "fov": 45,
-        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=[0, 0, 0], up=[0, 0, 1]),
+        "fov": fov,
+        "to_world": mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=list(up)),
         "film": {
             "type": "hdrfilm",
             "width": side,
@@ -176,9 +187,9 @@ def milk_in_a_glass() -> dict:
     return milky_glass() | {"bsdf": {"type": "dielectric", "int_ior": water, "ext_ior": glass}, "glass": outside}
 
 
-def make_integrator(name: str, depth: int, hide_emitters: bool = False) -> mi.Integrator:
+def make_integrator(name: str, depth: int, hide_emitters: bool = False, roulette: int = 64) -> mi.Integrator:
     """An integrator with a ``max_depth``, to be made anew for each scene: ``prbvolpath`` keeps flags of its first scene.
 
-    Russian roulette begins at depth 64 for all integrators. In absorbing scenes, paths beyond this depth hardly count.
+    Russian roulette begins at the depth ``roulette``. In absorbing scenes, paths beyond a depth of 64 hardly count.
     """
-    return mi.load_dict({"type": name, "max_depth": depth, "rr_depth": 64, "hide_emitters": hide_emitters})
+    return mi.load_dict({"type": name, "max_depth": depth, "rr_depth": roulette, "hide_emitters": hide_emitters})

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from false_alarms import ALPHA, fresh, note
 
-from mivol.bench.harness import agreement
+from mivol.bench.harness import agreement, contests
 from mivol.bench.harness.contests import Contest
 from mivol.bench.harness.timing import Timing
 from mivol.bench.scenes import box_scene, make_integrator, milk_in_a_glass
@@ -89,7 +89,7 @@ def test_a_bias_of_six_standard_errors_is_seen() -> None:
     freedom, so the bound is that of the normal distribution, 4.2."""
     a, counts = 10 + swings(8, 2000), np.ones((2000, 1), bool)
     error = math.sqrt(2 / 14000)
-    figures = study.agreement_figures(make_contest({"slow": a, "fast": a[::-1] + 6 * error}), "slow", "fast", counts)
+    figures = contests.agreement_figures(make_contest({"slow": a, "fast": a[::-1] + 6 * error}), "slow", "fast", counts, 40)
     assert figures["z"] == pytest.approx(6)
     assert figures["z_bound"] == pytest.approx(4.2, abs=0.05)
     assert figures["relative_standard_error"] == pytest.approx(error / 10, rel=0.01)
@@ -101,13 +101,13 @@ def test_equal_error_weighs_variance_and_time() -> None:
     swing, counts = swings(8, 400), np.ones((400, 1), bool)
     swing[:, 200:] = 0
     times = {"slow": 3.0, "fast": 1.0}
-    gain = study.gain_figures(make_contest({"slow": 2 * swing, "fast": swing}, times), "slow", "fast", counts)
+    gain = contests.gain_figures(make_contest({"slow": 2 * swing, "fast": swing}, times), "slow", "fast", counts)
     assert gain["variance_x_time_mean_over_pixels"] == pytest.approx(12)
     assert gain["variance_x_time_median_over_pixels"] == pytest.approx(12)
     assert (gain["time"], gain["processor_time"]) == (5, 3)
     uneven = 2 * swing
     uneven[:, 150:] *= 10
-    gain = study.gain_figures(make_contest({"slow": uneven, "fast": swing}, times), "slow", "fast", counts)
+    gain = contests.gain_figures(make_contest({"slow": uneven, "fast": swing}, times), "slow", "fast", counts)
     assert gain["variance_x_time_mean_over_pixels"] == pytest.approx(12 * (0.75 + 0.25 * 100))
     assert gain["variance_x_time_median_over_pixels"] == pytest.approx(12)
 
@@ -117,7 +117,7 @@ def test_pixels_without_light_in_the_other_images_count_as_0() -> None:
     swing, counts = np.array([-1.0, 1, -1, 1]), np.ones((1, 3), bool)
     slow = np.stack([0 * swing, 2 * swing, 0 * swing], axis=1)[:, None]
     fast = np.stack([swing, swing, 0 * swing], axis=1)[:, None]
-    gain = study.gain_figures(make_contest({"slow": slow, "fast": fast}), "slow", "fast", counts)
+    gain = contests.gain_figures(make_contest({"slow": slow, "fast": fast}), "slow", "fast", counts)
     assert gain["variance_x_time_median_over_pixels"] == 2
 
 
@@ -125,7 +125,7 @@ def test_errors_of_images() -> None:
     """Pixels of 2, 4 and 0 that swing by 1, 2 and 0, and one of 100 that does not count: variances 4/3, 16/3 and 0."""
     swing = np.array([-1.0, 1, -1, 1])
     images = np.stack([2 + swing, 4 + 2 * swing, 0 * swing, 100 + 9 * swing], axis=1)[:, None]
-    errors = study.image_errors(make_contest({"mivol": images}), "mivol", 1, np.array([[True, True, True, False]]))
+    errors = contests.image_errors(make_contest({"mivol": images}), "mivol", 1, np.array([[True, True, True, False]]))
     assert errors["mean"] == pytest.approx(2)
     assert errors["variance_mean_over_pixels"] == pytest.approx(20 / 9)
     assert errors["variance_median_over_pixels"] == pytest.approx(4 / 3)
@@ -152,13 +152,13 @@ def test_pixels_at_the_emitter_do_not_count(variant_rgb: str) -> None:
 def test_means_are_compared_in_thin_matter(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, light: Light) -> None:
     """Ratios are of the volume itself; means are compared in the volume thinned to an optical depth of 1 at most, in pixels
     farther than a quarter of the image from an emitter inside. A light with heavy tails has longer renders."""
-    rng, side, contests, used = np.random.default_rng(0), 16, [], {}
+    rng, side, loaded, used = np.random.default_rng(0), 16, [], {}
 
     def contest_images(scene: mi.Scene, integrators: dict, size: ContestSize, levels: tuple = (1,)) -> Contest:
         params = mi.traverse(scene)
         grid = "box.interior_medium.sigma_t.data"
         depth = float(np.max(params[grid])) if grid in params else params["box.interior_medium.scale"]
-        contests.append((depth, size.budget))
+        loaded.append((depth, size.budget))
         names = list(integrators)
         images = {name: rng.uniform(1, 2, (4, side, side)) for name in names}
         timings = {(name, 1): t for name, t in zip(names, make_images(images), strict=True)}
@@ -171,13 +171,13 @@ def test_means_are_compared_in_thin_matter(variant_rgb: str, monkeypatch: pytest
     monkeypatch.setattr(study, "contest_images", contest_images)
     monkeypatch.setattr(study, "gain_figures", lambda contest, slow, fast, counts: used.setdefault("gain", counts) is None or {
         light.ratio_key: 1.0})  # fmt: skip
-    monkeypatch.setattr(study, "agreement_figures", lambda contest, slow, fast, fair: used.setdefault("fair", fair) is None or {
-        "z": 0.0, "relative_standard_error": 0.0})  # fmt: skip
+    monkeypatch.setattr(study, "agreement_figures", lambda contest, slow, fast, fair, _: used.setdefault(
+        "fair", fair) is None or {"z": 0.0, "relative_standard_error": 0.0})  # fmt: skip
     values = np.array([3.0, 6.0, 9.0]) if light.has_tails else np.full((4, 4, 4), 7.0, np.float32)
     albedo = (0.5, 0.6, 0.7) if light.has_tails else 0.75
     figures = contend(values, light._replace(albedo=albedo), replace(TINY, max_pixels=side, budget=1.0))
     assert all(f"mivol over {peer}" in figures for peer in light.peers)
-    (depth, budget), (thin, _) = contests
+    (depth, budget), (thin, _) = loaded
     assert budget == (study.LONGER if light.has_tails else 1.0)
     # The longest ray through a box with an edge of 2 is a little longer than 2; an rgb medium has a mean extinction of 6.
     longest = 2 * (6.0 if light.has_tails else 7.0)

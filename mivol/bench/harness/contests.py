@@ -7,17 +7,32 @@ seeds. A ratio of variances times the ratio of processor times says how much soo
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import mitsuba as mi
 import numpy as np
 
+from mivol.bench.harness.agreement import compare_means, mean_of_pixels
 from mivol.bench.harness.study import Size, amount
 from mivol.bench.harness.timing import Contestant, Timing, race, ratio_of, time_call
 from mivol.validate.moments import Moments
 
-__all__ = ["SEED_STRIDE", "BudgetSize", "Contest", "Method", "compete", "find_samples"]
+__all__ = [
+    "SEED_STRIDE",
+    "BudgetSize",
+    "Contest",
+    "Method",
+    "agreement_figures",
+    "compete",
+    "contest_images",
+    "find_samples",
+    "gain_figures",
+    "image_errors",
+    "render_method",
+]
 
 MIN_SAMPLES, MAX_SAMPLES = 4, 4096
 """Samples per pixel of one call."""
@@ -113,3 +128,61 @@ def compete(
             counts[name, level] = n
             calls[name, level] = lambda number, method=method, first=first, n=n: method(first + number, n)
     return Contest(race(calls, rounds, keep=True), counts)
+
+
+# -- Contests of images -----------------------------------------------------------------------------------------------------
+
+
+def render_method(scene: mi.Scene, integrator: mi.Integrator) -> Method:
+    """The images of a scene by an integrator."""
+    return lambda seed, spp: mi.render(scene, integrator=integrator, spp=spp, seed=seed)
+
+
+def contest_images(
+    scene: mi.Scene, integrators: dict[str, mi.Integrator], size: BudgetSize, levels: tuple[int, ...] = (1,)
+) -> Contest:
+    """Render images by all integrators in turns."""
+    methods = {name: render_method(scene, integrator) for name, integrator in integrators.items()}
+    return compete(methods, size.rounds, size.budget, size.spp, levels=levels, seed=size.seed)
+
+
+def image_errors(contest: Contest, name: str, level: int, counts: np.ndarray) -> dict:
+    """Mean, variance, relative error and time of the images of one integrator, over the counted pixels."""
+    m, spp = Moments.from_values(contest.results(name, level)), contest.spp[name, level]
+    variance, mean = m.variance.mean(axis=-1)[counts], m.mean.mean(axis=-1)[counts]
+    return {
+        "spp": spp,
+        "mean": float(mean.mean()),
+        "variance_mean_over_pixels": float(variance.mean()),
+        "variance_median_over_pixels": float(np.median(variance)),
+        "relative_error_mean_over_pixels": math.sqrt(variance.mean()) / float(mean.mean()),
+        "relative_error_median_over_pixels": float(np.median(np.sqrt(variance)[mean > 0] / mean[mean > 0])),
+        **contest.timings[name, level].report(counts.size * spp, "samples"),
+    }
+
+
+def gain_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray) -> dict:
+    """Ratios of times and of variance x time, over the counted pixels."""
+    a, b = (contest.variances(name).mean(axis=-1)[counts] for name in (slow, fast))
+    times = contest.time_ratios(slow, fast)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_pixel = np.median((a / b)[(a > 0) | (b > 0)])
+    return times | {
+        "variance_x_time_mean_over_pixels": float(a.mean() / b.mean() * times["processor_time"]),
+        "variance_x_time_median_over_pixels": float(by_pixel * times["processor_time"]),
+    }
+
+
+def agreement_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray, comparisons: int) -> dict:
+    """z of the means over the counted pixels, its bound, and the standard error relative to the mean of ``slow``.
+
+    ``comparisons`` share the probability of a false alarm.
+    """
+    means = (mean_of_pixels(contest.results(name).mean(axis=-1)[:, counts]) for name in (fast, slow))
+    agreement = compare_means(*means, comparisons)
+    error = agreement["standard_error_percent"]
+    return {
+        "z": agreement["z"],
+        "z_bound": agreement["z_bound"],
+        "relative_standard_error": None if error is None else error / 100,
+    }

@@ -8,8 +8,10 @@ work on the machine changes them less than it changes the wall clock.
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -64,18 +66,34 @@ def race(contestants: dict[str, Contestant], rounds: int, keep: bool = False) ->
         rounds: timed calls of each contestant, numbered from 1; a first call with the number 0 is reported apart.
         keep: keep the returned values as NumPy arrays.
     """
-    timings = {name: Timing(time_first_call(call)) for name, call in contestants.items()}
     names = list(contestants)
-    for number in range(1, rounds + 1):
-        for name in names[number % len(names) :] + names[: number % len(names)]:
-            before = time.process_time()
-            result, seconds = time_call(contestants[name], number)
-            timings[name].processor.append(time.process_time() - before)
-            timings[name].seconds.append(seconds)
-            if keep:
-                timings[name].results.append(np.array(result))
-            del result
+    with hold_collector():
+        timings = {name: Timing(time_first_call(call)) for name, call in contestants.items()}
+        for number in range(1, rounds + 1):
+            for name in names[number % len(names) :] + names[: number % len(names)]:
+                before = time.process_time()
+                result, seconds = time_call(contestants[name], number)
+                timings[name].processor.append(time.process_time() - before)
+                timings[name].seconds.append(seconds)
+                if keep:
+                    timings[name].results.append(np.array(result))
+                del result
+            gc.collect()
     return timings
+
+
+@contextmanager
+def hold_collector() -> Iterator[None]:
+    """Hold Python's collector of reference cycles, so that no call pays for the cycles of another, and no collection falls into
+    the tracing of a kernel, where Dr.Jit aborts the process. Objects from before the block are not collected in the block."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
 
 
 def fastest(call: Callable[[], object], clock: Callable[[], float], calls: int = 3) -> float:

@@ -25,12 +25,11 @@ from matplotlib.axes import Axes
 from mivol.bench.extinctions import smoke
 from mivol.bench.harness.agreement import compare_means, mean_of_rounds
 from mivol.bench.harness.bars import Bar, judge_agreement, say_row
-from mivol.bench.harness.contests import BudgetSize, Contest, Method, compete
+from mivol.bench.harness.contests import BudgetSize, Contest, Method, compete, contest_images
 from mivol.bench.harness.figures import new_figure, plot_errors, use_plain_ticks
 from mivol.bench.harness.study import Study, amount
 from mivol.bench.scenes import box_scene, constant_light, make_integrator, sun_and_sky
 from mivol.bench.studies.gradients.density_gradient import DensityGradient
-from mivol.bench.studies.single_scattering import contest_images
 from mivol.validate.moments import Moments
 
 __all__ = ["MODELS", "STUDY", "LadderSize", "Model", "measure"]

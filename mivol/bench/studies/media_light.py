@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.bench.harness.bars import AT_LEAST, Bar, judge, judge_agreement, say_row
+from mivol.bench.harness.contests import agreement_figures, contest_images, gain_figures
 from mivol.bench.harness.figures import new_figure
 from mivol.bench.harness.study import Study, ask
 from mivol.bench.scenes import perspective
-from mivol.bench.studies.single_scattering import ContestSize, agreement_figures, contest_images, gain_figures
+from mivol.bench.studies.single_scattering import ContestSize
 from mivol.report.figures import FAINT
 
 __all__ = ["BARS", "STUDY", "find_dark_pixels", "make_scene"]
@@ -88,7 +89,7 @@ def measure(name: str, size: ContestSize) -> dict:
     settings = {"type": "mivol", "max_depth": DEPTH, "rr_depth": 64}
     integrators = {choice: mi.load_dict(settings | {"media_light": choice}) for choice in ("auto", "met")}
     contest, counts = contest_images(scene, integrators, size), find_dark_pixels(scene)
-    answer = gain_figures(contest, "met", "auto", counts) | agreement_figures(contest, "met", "auto", counts)
+    answer = gain_figures(contest, "met", "auto", counts) | agreement_figures(contest, "met", "auto", counts, len(BARS))
     say_row(name, variance_x_time=answer["variance_x_time_mean_over_pixels"], z=answer["z"])
     return {"pixels_that_count": int(counts.sum()), **answer}
 

@@ -51,17 +51,15 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mivol.bench.extinctions import Extinction, as_dense_as_smoke, ct_scan, fine_smoke, les_cloud, smoke, threads_in_space
-from mivol.bench.harness.agreement import compare_means, mean_of_pixels
 from mivol.bench.harness.bars import AT_LEAST, Bar, judge, judge_agreement, say_row
-from mivol.bench.harness.contests import BudgetSize, Contest, Method, compete
+from mivol.bench.harness.contests import BudgetSize, agreement_figures, contest_images, gain_figures, image_errors
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios, use_plain_ticks
 from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.scenes import box_scene, constant_light, make_integrator, point_light, sun_and_sky
-from mivol.validate.moments import Moments
 
 __all__ = [
-    "LIGHTS", "LONGER", "PEERS", "STUDY", "VOLUMES", "ContestSize", "Light", "contend", "contest_bars", "contest_images",
-    "contest_volume", "gain_figures", "plot_contest",
+    "LIGHTS", "LONGER", "PEERS", "STUDY", "VOLUMES", "ContestSize", "Light", "contend", "contest_bars",
+    "contest_volume", "plot_contest",
 ]  # fmt: skip
 
 ALBEDO = 0.75
@@ -140,6 +138,10 @@ VOLUMES: dict[str, Callable[[ContestSize], Extinction]] = {
 }
 
 
+COMPARISONS = len(VOLUMES) * len(LIGHTS) * len(PEERS)
+"""Means that a whole run compares."""
+
+
 # -- Contests ---------------------------------------------------------------------------------------------------------------
 
 
@@ -178,22 +180,10 @@ def contend(values: np.ndarray, light: Light, size: ContestSize, levels: tuple[i
         compared = contest_images(thinned, integrators, size)
         fair = (tau > MIN_TAU) & (distance > EMITTER_SHARE * side)
     for name in light.peers:
-        gain = gain_figures(contest, name, "mivol", counts) | agreement_figures(compared, name, "mivol", fair)
+        gain = gain_figures(contest, name, "mivol", counts) | agreement_figures(compared, name, "mivol", fair, COMPARISONS)
         answer[f"mivol over {name}"] = gain
         say_row(f"mivol over {name}", **{key: gain[key] for key in (light.ratio_key, "z", "relative_standard_error")})
     return answer
-
-
-def contest_images(
-    scene: mi.Scene, integrators: dict[str, mi.Integrator], size: BudgetSize, levels: tuple[int, ...] = (1,)
-) -> Contest:
-    """Render images by all integrators in turns."""
-
-    def rendering(integrator: mi.Integrator) -> Method:
-        return lambda seed, spp: mi.render(scene, integrator=integrator, spp=spp, seed=seed)
-
-    methods = {name: rendering(integrator) for name, integrator in integrators.items()}
-    return compete(methods, size.rounds, size.budget, size.spp, levels=levels, seed=size.seed)
 
 
 def pixel_depths(values: np.ndarray, light: Light, side: int) -> np.ndarray:
@@ -212,45 +202,6 @@ def emitter_distances(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
     at = 0.5 - position[:2] / position[2] / (2 * math.tan(math.radians(22.5)))
     j, i = np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5, indexing="ij")
     return np.hypot(i - side * at[0], j - side * at[1])
-
-
-def image_errors(contest: Contest, name: str, level: int, counts: np.ndarray) -> dict:
-    """Mean, variance, relative error and time of the images of one integrator, over the counted pixels."""
-    m, spp = Moments.from_values(contest.results(name, level)), contest.spp[name, level]
-    variance, mean = m.variance.mean(axis=-1)[counts], m.mean.mean(axis=-1)[counts]
-    return {
-        "spp": spp,
-        "mean": float(mean.mean()),
-        "variance_mean_over_pixels": float(variance.mean()),
-        "variance_median_over_pixels": float(np.median(variance)),
-        "relative_error_mean_over_pixels": math.sqrt(variance.mean()) / float(mean.mean()),
-        "relative_error_median_over_pixels": float(np.median(np.sqrt(variance)[mean > 0] / mean[mean > 0])),
-        **contest.timings[name, level].report(counts.size * spp, "samples"),
-    }
-
-
-def gain_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray) -> dict:
-    """Ratios of times and of variance x time, over the counted pixels."""
-    a, b = (contest.variances(name).mean(axis=-1)[counts] for name in (slow, fast))
-    times = contest.time_ratios(slow, fast)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_pixel = np.median((a / b)[(a > 0) | (b > 0)])
-    return times | {
-        "variance_x_time_mean_over_pixels": float(a.mean() / b.mean() * times["processor_time"]),
-        "variance_x_time_median_over_pixels": float(by_pixel * times["processor_time"]),
-    }
-
-
-def agreement_figures(contest: Contest, slow: str, fast: str, counts: np.ndarray) -> dict:
-    """z of the means over the counted pixels, its bound, and the standard error relative to the mean of ``slow``."""
-    means = (mean_of_pixels(contest.results(name).mean(axis=-1)[:, counts]) for name in (fast, slow))
-    agreement = compare_means(*means, len(VOLUMES) * len(LIGHTS) * len(PEERS))
-    error = agreement["standard_error_percent"]
-    return {
-        "z": agreement["z"],
-        "z_bound": agreement["z_bound"],
-        "relative_standard_error": None if error is None else error / 100,
-    }
 
 
 # -- Bars and figure --------------------------------------------------------------------------------------------------------

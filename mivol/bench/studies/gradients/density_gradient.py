@@ -60,23 +60,25 @@ class Light:
 
 @dataclass
 class DensityGradient:
-    """Gradients with respect to the voxels of a scene, by one integrator made for this scene."""
+    """Gradients with respect to one parameter of a scene, by one integrator made for this scene."""
 
     scene: mi.Scene
     integrator: mi.Integrator
+    key: str = KEY
 
     def __post_init__(self) -> None:
         self.params = mi.traverse(self.scene)
 
     def _collect(self, backward: Callable[[], None]) -> mi.Float:
-        values = mi.TensorXf(self.params[KEY])
+        values = self.params[self.key]
+        values = type(values)(values)
         dr.enable_grad(values)
-        self.params[KEY] = values
+        self.params[self.key] = values
         self.params.update()
         backward()
-        gradient = dr.grad(self.params[KEY]).array
+        gradient = dr.ravel(dr.grad(self.params[self.key]))
         dr.eval(gradient)
-        dr.disable_grad(self.params[KEY])
+        dr.disable_grad(self.params[self.key])
         return gradient
 
     def of_mean(self, seed: int, spp: int) -> mi.Float:
@@ -85,17 +87,16 @@ class DensityGradient:
         ones = dr.full(mi.TensorXf, 1 / (3 * height * width), (height, width, 3))
         return self._collect(lambda: self.integrator.render_backward(self.scene, self.params, ones, seed=seed, spp=spp))
 
-    def of_loss(self, target: mi.TensorXf, seed: int, spp: int) -> mi.Float:
-        """Gradient of the mean squared difference to a target, with the render of the image."""
+    def of_loss(self, loss: Callable[[mi.TensorXf], mi.Float], seed: int, spp: int) -> mi.Float:
+        """Gradient of a loss of the image, with the render of the image."""
 
         def backward() -> None:
-            image = mi.render(self.scene, self.params, integrator=self.integrator, seed=seed, spp=spp)
-            dr.backward(dr.mean(dr.square(image - target), axis=None))
+            dr.backward(loss(mi.render(self.scene, self.params, integrator=self.integrator, seed=seed, spp=spp)))
 
         return self._collect(backward)
 
     def mean(self, values: np.ndarray, seed: int, spp: int) -> float:
         """Mean of the image for other values (Z, Y, X)."""
-        self.params[KEY] = mi.TensorXf(np.float32(values)[..., None])
+        self.params[self.key] = mi.TensorXf(np.float32(values)[..., None])
         self.params.update()
         return float(np.mean(np.array(mi.render(self.scene, integrator=self.integrator, seed=seed, spp=spp), np.float64)))
