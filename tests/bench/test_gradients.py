@@ -89,7 +89,7 @@ def test_gradients_of_a_mean_and_of_a_loss(variant_rgb: str) -> None:
     is known to a few percent by 64 samples of 16 pixels, and its seeds are fixed: 4 to 8 tells 6 from 1, 3 and 12."""
     gradient = LIGHTS["constant light"].gradients(np.full((2, 2, 2), 0.5, np.float32), 4)[MIVOL]
     image = mi.render(gradient.scene, integrator=gradient.integrator, spp=256, seed=1)
-    mean, loss = np.array(gradient.of_mean(3, 64)), np.array(gradient.of_loss(image - 3, 3, 64))
+    mean, loss = np.array(gradient.of_mean(3, 64)), np.array(gradient.of_loss(square_error(image - 3), 3, 64))
     assert mean.shape == loss.shape == (8,)
     assert np.all(mean < 0)
     assert 4 < loss.sum() / mean.sum() < 8

@@ -53,7 +53,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
@@ -72,7 +71,7 @@ from mivol.bench.scenes import (
     sun_and_sky,
     sun_before_the_camera,
 )
-from mivol.bench.studies.gradients.density_gradient import INTEGRATORS, DensityGradient, Light
+from mivol.bench.studies.gradients.density_gradient import INTEGRATORS, DensityGradient, Light, square_error
 from mivol.bench.studies.gradients.tutorial import TutorialSize, measure_tutorial
 from mivol.bench.studies.gradients.twin import Twin
 from mivol.report.figures import MARKERS, SERIES
@@ -152,13 +151,9 @@ def measure_contest(question: str, size: GradientSize) -> dict:
         scene, integrator = light.scene(0.7 * volume.values, size.side), light.integrator("mivol")
         target = mi.render(scene, integrator=integrator, seed=77, spp=size.difference_spp)
         both = light.gradients(volume.values, size.side)
-
-        def square_error(image: mi.TensorXf, target: mi.TensorXf = target) -> mi.Float:
-            return dr.mean(dr.square(image - target), axis=None)
-
         functionals = {
             "mean": {who: g.of_mean for who, g in both.items()},
-            "L2": {who: partial(g.of_loss, square_error) for who, g in both.items()},
+            "L2": {who: partial(g.of_loss, square_error(target)) for who, g in both.items()},
         }
         answer[name] = {}
         for functional, methods in functionals.items():

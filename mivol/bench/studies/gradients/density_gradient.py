@@ -12,7 +12,7 @@ import numpy as np
 
 from mivol.bench.scenes import box_scene, make_integrator
 
-__all__ = ["ALBEDO", "INTEGRATORS", "KEY", "DensityGradient", "Light"]
+__all__ = ["ALBEDO", "INTEGRATORS", "KEY", "DensityGradient", "Light", "square_error"]
 
 ALBEDO = 0.75
 INTEGRATORS = ("mivol", "prbvolpath")
@@ -100,3 +100,8 @@ class DensityGradient:
         self.params[self.key] = mi.TensorXf(np.float32(values)[..., None])
         self.params.update()
         return float(np.mean(np.array(mi.render(self.scene, integrator=self.integrator, seed=seed, spp=spp), np.float64)))
+
+
+def square_error(target: mi.TensorXf) -> Callable[[mi.TensorXf], mi.Float]:
+    """The mean squared difference of an image to a target."""
+    return lambda image: dr.mean(dr.square(image - target), axis=None)
