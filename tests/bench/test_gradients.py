@@ -29,6 +29,7 @@ from mivol.bench.studies.gradients import (
     measure_row,
     refine,
 )
+from mivol.bench.studies.gradients.density_gradient import square_error
 from mivol.bench.studies.gradients.tutorial import (
     Judge,
     Run,
