@@ -218,6 +218,7 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "vtk": (".vtk", _bytes(vtk(numbered())), mivol.read_volume),
     "vtk text": (".vtk", _bytes(vtk(numbered(), binary=False)), mivol.read_volume),
     "pbrt": (".pbrt", _bytes(pbrt(numbered())), mivol.read_volume),
+    "vdb": (".vdb", _volume, mivol.read_volume),
     "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
     "hdf5": (".h5", _hdf5, mivol.read_volume),
     "projections": (".h5", _projections, read_projections),

@@ -55,8 +55,11 @@ class Voxels:
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Voxels:
-        """Make a grid from plugin parameters: ``filename``, ``grid`` or ``data``; box and sign options."""
-        sources = [k for k in ("filename", "grid", "data") if k in props]
+        """Make a grid from plugin parameters: ``filename`` (with the name of its ``grid``), ``grid`` or ``data``; box and sign
+        options.
+        """
+        names_grid = "filename" in props and "grid" in props and isinstance(props["grid"], str)
+        sources = ["filename"] if names_grid else [k for k in ("filename", "grid", "data") if k in props]
         name = f"mivol_voxels {props.id()}".strip()
         if len(sources) != 1:
             found = " and ".join(sources) or "none of them"
@@ -75,7 +78,7 @@ class Voxels:
     def _values(props: mi.Properties, source: str, own_box: bool) -> tuple[np.ndarray | mi.TensorXf, np.ndarray]:
         if source == "filename":
             path = mi.file_resolver().resolve(props["filename"])
-            volume = read_volume(str(path), frame="file" if own_box else "unit")
+            volume = read_volume(str(path), props.get("grid"), frame="file" if own_box else "unit")
             return volume.values, volume.to_world
         if own_box and source == "data":
             raise MivolError("mivol_voxels was given data and use_grid_bbox; a bare tensor has no box: give to_world.")

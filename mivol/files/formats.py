@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from mivol.files import hdf5, les, metaimage, nifti, npy, nrrd, pbrt, vol, vti, vtk_legacy
+from mivol.files import hdf5, les, metaimage, nifti, npy, nrrd, pbrt, vdb, vol, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
 from mivol.files.volume import VolumeData, check_frame, to_values
@@ -66,6 +66,7 @@ FORMATS: dict[str, VolumeFormat] = {
     ".nii.gz": VolumeFormat("gzip-compressed NIfTI", nifti.is_nifti_gz, nifti.read_nifti),
     ".vti": VolumeFormat("VTK XML image", lambda head: b"<VTKFile" in head, vti.read_vti),
     ".vtk": VolumeFormat("legacy VTK", _starts_with(vtk_legacy.MAGIC), vtk_legacy.read_vtk),
+    ".vdb": VolumeFormat("OpenVDB", vdb.is_vdb, vdb.read_vdb),
     ".pbrt": VolumeFormat("pbrt volumegrid", pbrt.is_pbrt, pbrt.read_pbrt),
     ".csv": _LES,
     ".txt": _LES,
@@ -79,6 +80,7 @@ WRITERS: dict[str, Callable[[BinaryIO, np.ndarray, np.ndarray, dict[str, Any]], 
     ".npy": npy.write_npy,
     ".npz": npy.write_npz,
     ".nrrd": nrrd.write_nrrd,
+    ".vdb": vdb.write_vdb,
 }
 
 #: suffix -> writer without compression.
@@ -96,7 +98,7 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
 
     Args:
         path: file; the suffix selects the format, and the first bytes must agree.
-        dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .h5, LES text).
+        dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .h5, LES text).
         frame: key of :data:`FRAMES`: "file" places the volume as in the header and refuses a degenerate box, "unit" puts the
             volume on the unit cube.
 
