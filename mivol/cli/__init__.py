@@ -122,6 +122,7 @@ def flag(*names: str, **options: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
 MODE = flag("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
 SENSOR = flag("-s", "--sensor", type=int, default=0, help="index of the sensor (default: %(default)s)")
 SEED = flag("--seed", type=int, default=0, help="seed of the random numbers (default: %(default)s)")
+DATASET = flag("--dataset", help="array of a volume file with several arrays (default: the only one)")
 MAX_DEPTH = flag("--max-depth", type=int, help="longest path (default: the max_depth of the scene's integrator)")
 
 
@@ -145,10 +146,14 @@ def scene_flags(text: str = "scene: Mitsuba XML") -> list[tuple[tuple[str, ...],
 def explain_flags() -> list:
     """Flags of ``mivol explain``."""
     return [
-        *scene_flags("scene (.xml), experiment (.toml), points or Gaussians (.ply, .spz, ...), or photographs (folder, file)"),
+        *scene_flags(
+            "scene (.xml), experiment (.toml), points or Gaussians (.ply, .spz, ...), volume (.vdb, .nrrd, ...), or "
+            "photographs (folder, file)"
+        ),
         flag("-o", "--output", type=Path, help="image (.png, .svg) of the cameras of photographs, and of the boxes"),
         flag("--preset", help="for photographs: explain the fit of mivol optimize --preset (capture, cpu, ...)"),
         list_flag("--set", "key=value", "override a setting of the experiment"),
+        DATASET,
         MAX_DEPTH,
         flag(
             "--noise", type=float, default=0.02,
@@ -251,14 +256,18 @@ def export_flags() -> list:
 
 def convert_flags() -> list:
     """Flags of ``mivol convert``."""
+    from mivol.files.formats import FORMATS, SHARED_SUFFIXES, WRITERS
     from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS
     from mivol.points.gaussian_files import GAUSSIAN_READERS, GAUSSIAN_WRITERS
     from mivol.points.summary import KINDS
 
+    volumes = [suffix for suffix in FORMATS if suffix not in SHARED_SUFFIXES]
     readable, writable = ({**GAUSSIAN_READERS, **CLOUD_READERS}, {**GAUSSIAN_WRITERS, **CLOUD_WRITERS})
     return [
-        flag("source", type=Path, help=f"file to read: {', '.join(readable)}, .npz (field)"),
-        flag("output", type=Path, help=f"file to write: {', '.join(writable)}, .npz (field), .obj (mesh)"),
+        flag("source", type=Path, help=f"file to read: {', '.join(readable)}, .npz (field); volumes: {', '.join(volumes)}"),
+        flag("output", type=Path,
+             help=f"file to write: {', '.join(writable)}, .npz (field), .obj (mesh); volumes: {', '.join(WRITERS)}"),
+        DATASET,
         flag("--to", choices=(*KINDS, "field", "mesh"), help="kind of the output (default: as the source, if possible)"),
         flag("--resolution", type=int,
              help="for a field or a mesh: voxels along the longest edge (default: 128); for Gaussians from a field: Gaussians "
@@ -290,15 +299,17 @@ def explain(arguments: argparse.Namespace) -> int:
     """Say what mivol would do with a scene or an experiment, and why, before it renders more than a small preview.
 
     For photographs, explain lists present and missing data, and draws the cameras with --output. For points and
-    Gaussians, it prints their number, extent, sizes and opacities. A refusal comes after the facts, with exit code 1.
+    Gaussians, it prints their number, extent, sizes and opacities; for a volume, its size, values and place. A refusal comes
+    after the facts, with exit code 1.
     """
+    from mivol.files.formats import describe_volume, is_volume_file
     from mivol.photos import find_format
     from mivol.points.summary import is_points_file, summarize_file
 
-    is_experiment = arguments.scene.suffix.lower() == ".toml" or arguments.preset is not None
-    if arguments.set and not is_experiment:
-        raise MivolError(f"--set is for fits, and {arguments.scene} is not a fit: give --preset, or the file of an experiment.")
-    if is_experiment:
+    if is_volume_file(_check_dataset(arguments.scene, arguments.dataset)):
+        print(describe_volume(arguments.scene, arguments.dataset))
+        return 0
+    if _is_experiment(arguments):
         from mivol.experiments.kinds import explain_experiment
 
         answer = explain_experiment(*load_experiment(arguments.scene, arguments), arguments.output)
@@ -313,6 +324,23 @@ def explain(arguments: argparse.Namespace) -> int:
         answer = explain_scene(load(arguments).scene, arguments.max_depth, noise=arguments.noise)
     print(answer.text)
     return int(bool(answer.refusal))
+
+
+def _is_experiment(arguments: argparse.Namespace) -> bool:
+    """Whether a fit is to be explained; refuse ``--set`` for anything else."""
+    is_experiment = arguments.scene.suffix.lower() == ".toml" or arguments.preset is not None
+    if arguments.set and not is_experiment:
+        raise MivolError(f"--set is for fits, and {arguments.scene} is not a fit: give --preset, or the file of an experiment.")
+    return is_experiment
+
+
+def _check_dataset(path: Path, dataset: str | None) -> Path:
+    """Return the file; refuse ``--dataset`` for a file that is no volume."""
+    from mivol.files.formats import is_volume_file
+
+    if dataset is not None and not is_volume_file(path):
+        raise MivolError(f"--dataset names an array of a volume, and {path} is no volume: leave it out.")
+    return path
 
 
 def explain_photos(path: Path, picture: Path | None) -> int:
@@ -470,12 +498,46 @@ def export(arguments: argparse.Namespace) -> None:
 
 
 def convert(arguments: argparse.Namespace) -> None:
-    """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats.
+    """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats; volumes too.
 
     A field (.npz) is the mivol_sh of a scene. Conversions between a field and Gaussians (.ply) print their error in dB, from
     views of the field and of splatted Gaussians. A mesh (.obj, or .ply with --to mesh) is fused from depths of splatted views;
     convert prints the distance between mesh and splats.
     """
+    from mivol.files.formats import is_volume_file
+
+    is_volume = is_volume_file(_check_dataset(arguments.source, arguments.dataset))
+    print((_convert_volume if is_volume else _convert_cloud)(arguments))
+
+
+def _convert_volume(arguments: argparse.Namespace) -> str:
+    """Convert a volume; return the line to print."""
+    from mivol.files.formats import convert_volume
+
+    if arguments.to or arguments.resolution or arguments.box:
+        raise MivolError(
+            f"{arguments.source}: --to, --resolution and --box are for points, Gaussians and fields: leave them out."
+        )
+    return convert_volume(arguments.source, arguments.output, arguments.dataset)
+
+
+def _convert_cloud(arguments: argparse.Namespace) -> str:
+    """Convert points, Gaussians or a field; return the lines to print."""
+    from mivol.experiments import gaussian_conversion
+    from mivol.points.summary import convert_file
+
+    source, target, resolution = arguments.source, arguments.output, arguments.resolution
+    kind = _check_conversion(arguments)
+    if source.suffix.lower() == ".npz":
+        return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
+    if kind not in ("field", "mesh"):
+        return convert_file(source, target, kind)
+    make = gaussian_conversion.convert_to_field if kind == "field" else gaussian_conversion.convert_to_mesh
+    return make(source, target, 128 if resolution is None else resolution, arguments.box, arguments.mode)
+
+
+def _check_conversion(arguments: argparse.Namespace) -> str | None:
+    """Return the kind of the output; refuse flags and suffixes that do not belong together."""
     source, target = arguments.source, arguments.output
     from_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
     kind = arguments.to or WRITTEN_AS.get(target.suffix.lower())
@@ -489,25 +551,11 @@ def convert(arguments: argparse.Namespace) -> None:
     has_box, has_resolution = arguments.box is not None, arguments.resolution is not None
     if (has_box and not is_gridded) or (has_resolution and not (is_gridded or from_field)):
         raise MivolError(f"{target}: --resolution and --box are for a radiance field (.npz) or a mesh: leave them out.")
-    print(convert_cloud(arguments, "from field" if from_field else kind))
+    return kind
 
 
 WRITTEN_AS = {".npz": "field", ".obj": "mesh"}
 """Kind of the file by suffix, for suffixes of a single kind."""
-
-
-def convert_cloud(arguments: argparse.Namespace, kind: str | None) -> str:
-    """Convert a file; return the lines to print."""
-    from mivol.experiments import gaussian_conversion
-    from mivol.points.summary import convert_file
-
-    source, target, resolution = arguments.source, arguments.output, arguments.resolution
-    if kind == "from field":
-        return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
-    if kind not in ("field", "mesh"):
-        return convert_file(source, target, kind)
-    make = gaussian_conversion.convert_to_field if kind == "field" else gaussian_conversion.convert_to_mesh
-    return make(source, target, 128 if resolution is None else resolution, arguments.box, arguments.mode)
 
 
 def report(arguments: argparse.Namespace) -> None:

@@ -159,6 +159,75 @@ def write_volume(
     write_whole(path, lambda file: writer(file, values, to_world, dict(metadata or {})))
 
 
+# -- Files of volumes alone ----------------------------------------------------------------------------------------------
+
+SHARED_SUFFIXES = (".npy", ".npz", ".csv", ".txt")
+"""Suffixes of volumes and of other contents: points, radiance fields, tables."""
+
+
+def is_volume_file(path: Path) -> bool:
+    """Whether a suffix belongs to volumes alone."""
+    return path.name.lower().endswith(tuple(suffix for suffix in FORMATS if suffix not in SHARED_SUFFIXES))
+
+
+def describe_volume(path: Path, dataset: str | None = None) -> str:
+    """Describe a volume in a few lines: size, values, place, and numbers that no medium takes.
+
+    Raises:
+        MivolError: as :func:`read_volume`.
+    """
+    volume = read_volume(path, dataset)
+    values, finite = volume.values, np.isfinite(volume.values)
+    size = " x ".join(str(n) for n in volume.size)
+    corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ volume.to_world.T
+    is_turned = np.count_nonzero(volume.to_world[:3, :3]) > 3
+    array = volume.meta.get("grid") or volume.meta.get("dataset")
+    lines = [
+        f"{path}: {FORMATS[_find_suffix(path, FORMATS)].name}" + (f", array {array!r}" if array else ""),
+        f"voxels (x, y, z): {size}, {values.shape[3]} channel{'s' if values.shape[3] > 1 else ''} of {volume.meta['dtype']}, "
+        f"{values.nbytes / 2**20:.3g} MiB in memory",
+        f"box: {_format_point(corners.min(axis=0))} to {_format_point(corners.max(axis=0))}"
+        + (" around the turned axes" if is_turned else "")
+        + f"; voxel {_format_point(volume.spacing)}",
+    ]
+    if finite.any():
+        inside = values[finite]
+        shares = f"mean {inside.mean(dtype=np.float64):.4g}, {100 * np.mean(inside == 0):.3g} % are 0"
+        lines.append(f"values: {inside.min():.4g} to {inside.max():.4g}, {shares}")
+        if negative := np.count_nonzero(inside < 0):
+            lines.append(f"{negative} values are below 0: no extinction, albedo or emission takes them")
+    if not finite.all():
+        lines.append(f"{np.count_nonzero(~finite)} values are NaN or Inf: no medium takes them")
+    return "\n".join(lines)
+
+
+def convert_volume(source: Path, target: Path, dataset: str | None = None) -> str:
+    """Write a volume in another format; its values and place are kept.
+
+    Returns:
+        A line that describes the written file, and what it does not hold.
+
+    Raises:
+        MivolError: as :func:`read_volume` and :func:`write_volume`.
+    """
+    volume = read_volume(source, dataset)
+    place, lost = volume.to_world, []
+    suffix = _find_suffix(target, WRITERS)
+    space = {"space": volume.meta["space"]} if volume.meta.get("space") else {}
+    if space and suffix not in (".npz", ".nrrd"):
+        lost.append(f"the frame {space.pop('space')}")
+    if suffix == ".npy" and not np.array_equal(place, np.eye(4)):
+        place = np.eye(4)
+        lost.append("the place")
+    write_volume(target, volume.values, place, metadata=space)
+    size = " x ".join(str(n) for n in volume.size)
+    return f"{target}: {size} voxels" + (f"; {suffix} does not hold {' and '.join(lost)}" if lost else "")
+
+
+def _format_point(values: np.ndarray) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in values[:3])})"
+
+
 def _find_suffix(path: Path, table: Mapping[str, Any]) -> str:
     name = path.name.lower()
     for suffix in table:

@@ -1,0 +1,78 @@
+"""``mivol explain`` and ``mivol convert`` on files of volumes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from mivol.cli import main
+from mivol.files import FORMATS, read_volume, write_volume
+
+PLACE = np.array([[4.0, 0, 0, -1], [0, 3, 0, 2], [0, 0, 2, 5], [0, 0, 0, 1]])
+VALUES = np.array([0, 0, 0.25, -1, 2, 4, np.nan, 8], np.float32).reshape(2, 2, 2, 1)
+
+
+def run(*words: object) -> int:
+    return main([str(word) for word in words])
+
+
+def test_explain_describes_a_volume(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_volume(tmp_path / "a.nrrd", VALUES, PLACE)
+    assert run("explain", tmp_path / "a.nrrd") == 0
+    text = capsys.readouterr().out
+    assert "NRRD" in text and "2 x 2 x 2, 1 channel of float32" in text
+    assert "box: (-1, 2, 5) to (3, 5, 7); voxel (2, 1.5, 1)" in text
+    assert "values: -1 to 8, mean 1.893, 28.6 % are 0" in text  # 13.25 / 7, 2 / 7
+    assert "1 values are below 0" in text and "1 values are NaN or Inf" in text
+
+
+@pytest.mark.parametrize("target", ["b.vdb", "b.vol", "b.nrrd", "b.npz"])
+def test_convert_keeps_values_and_place(tmp_path: Path, target: str) -> None:
+    values = np.abs(np.nan_to_num(VALUES)) + 1
+    write_volume(tmp_path / "a.nrrd", values, PLACE)
+    assert run("convert", tmp_path / "a.nrrd", tmp_path / target) == 0
+    volume = read_volume(tmp_path / target)
+    np.testing.assert_array_equal(volume.values, values)
+    np.testing.assert_allclose(volume.to_world, PLACE, atol=1e-12)
+
+
+def test_convert_says_what_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_volume(tmp_path / "a.nrrd", VALUES, PLACE, metadata={"space": "LPS"})
+    assert run("convert", tmp_path / "a.nrrd", tmp_path / "b.npy") == 0
+    assert ".npy does not hold the frame LPS and the place" in capsys.readouterr().out
+    np.testing.assert_array_equal(read_volume(tmp_path / "b.npy").values, VALUES)
+
+
+def test_an_array_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["one"], file["two"] = VALUES[..., 0], 2 * VALUES[..., 0]
+    assert run("explain", tmp_path / "a.h5") == 1
+    assert "2 arrays ('one', 'two')" in capsys.readouterr().err
+    assert run("explain", tmp_path / "a.h5", "--dataset", "two") == 0
+    assert "values: -2 to 16" in capsys.readouterr().out
+    assert run("convert", tmp_path / "a.h5", tmp_path / "b.vdb", "--dataset", "two") == 0
+    np.testing.assert_array_equal(read_volume(tmp_path / "b.vdb").values, 2 * VALUES)
+
+
+@pytest.mark.parametrize("words", [("explain",), ("convert", "b.vdb")])
+def test_a_dataset_of_something_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture, words: tuple) -> None:
+    (tmp_path / "a.xml").write_text("<scene/>")
+    assert run(words[0], tmp_path / "a.xml", *words[1:], "--dataset", "two") == 1
+    assert "is no volume: leave it out" in capsys.readouterr().err
+
+
+def test_flags_of_points_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_volume(tmp_path / "a.vdb", VALUES)
+    assert run("convert", tmp_path / "a.vdb", tmp_path / "b.nrrd", "--resolution", 3) == 1
+    assert "--to, --resolution and --box are for points" in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_volume(tmp_path / "a.vdb", VALUES)
+    assert run("convert", tmp_path / "a.vdb", tmp_path / "b.tif") == 1
+    error = capsys.readouterr().err
+    assert "the suffix '.tif'" in error and ".vdb" in error
+    assert ".vdb" in FORMATS
