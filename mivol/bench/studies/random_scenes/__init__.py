@@ -3,6 +3,7 @@
     mivol bench random_scenes                    # 15 minutes on 2 idle cores
     mivol bench random_scenes --quick            # a minute: a dozen scenes
     mivol bench random_scenes --only hard
+    mivol bench random_scenes --only built
 
 trials: random scenes (:mod:`mivol.bench.studies.random_scenes.generate`) with homogeneous media and grids, grey and rgb, in
 boxes and balls, one, two side by side, or one inside the other, behind boundaries that transmit, refract or blur light; with
@@ -10,6 +11,9 @@ phase functions, emitters and surfaces; ``max_depth`` from 2 to unlimited. Each 
 rgb extinction one channel at a time), 12 x 12 pixels, 64 samples per pixel. The means of each quarter of the image and each
 colour are compared by Student's t. If all means are equal, any of all comparisons fails with a probability of 1 in 1000.
 Refusals are counted by their message.
+
+built: as trials, with 40 random scenes as people build them: bodies, more of them homogeneous, in rooms, over floors and in
+glass, and fogs without a boundary, with one to sixteen lamps inside and beside the media.
 
 hard: an optical depth of 64, voxels of 2000, vacuum, extinctions of three colours at ratios of 10,000, nearly straight phase
 functions, glass, an emitter inside: more than 1e8 paths of unlimited depth, one in each pixel. No radiance may be negative,
@@ -22,7 +26,7 @@ import gc
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import drjit as dr
@@ -36,14 +40,17 @@ from mivol.bench.harness.bars import AT_MOST, Bar, judge, judge_agreement, say, 
 from mivol.bench.harness.figures import new_figure
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.bench.scenes import box_scene, constant_light, emitter_inside, make_integrator, milky_glass, sun_and_sky
-from mivol.bench.studies.random_scenes.generate import RandomScene, draw_scene
+from mivol.bench.studies.random_scenes.generate import RandomScene, draw_built_scene, draw_scene
 from mivol.errors import MivolError
 from mivol.report.figures import SERIES
 
-__all__ = ["HARD", "STUDY", "RandomSize", "measure_hard", "measure_trials", "try_scene"]
+__all__ = ["HARD", "STUDY", "RandomSize", "measure_built", "measure_hard", "measure_trials", "try_scene"]
 
 MEANS = 12
 """Compared means of a scene: of each quarter of the image, in each colour."""
+
+DrawScene = Callable[[int, int | None], RandomScene]
+"""Seed, channel of rgb extinctions or None -> scene."""
 
 HARD_SIDE = 1024
 """Edge of an image of a hard scene [pixels], with one path in each pixel."""
@@ -54,6 +61,7 @@ class RandomSize(Size):
     """Amount of work."""
 
     scenes: int = amount(300, 12, "number of random scenes")
+    built_scenes: int = amount(40, 4, "number of random scenes as people build them")
     first: int = amount(0, doc="seed of the first scene")
     rounds: int = amount(16, doc="images of each scene")
     spp: int = amount(64, doc="samples per pixel of an image by mivol")
@@ -66,9 +74,19 @@ class RandomSize(Size):
 
 def measure_trials(size: RandomSize) -> dict:
     """Do the means of random scenes agree with volpath's, and is every pixel finite and not negative?"""
+    return try_scenes(draw_scene, size)
+
+
+def measure_built(size: RandomSize) -> dict:
+    """The same for random scenes as people build them: rooms, floors, glass, fog, and lamps inside."""
+    return try_scenes(draw_built_scene, replace(size, scenes=size.built_scenes))
+
+
+def try_scenes(draw: DrawScene, size: RandomSize) -> dict:
+    """Compare all scenes, and count the refusals."""
     trials, refused = {}, Counter()
     for seed in range(size.first, size.first + size.scenes):
-        trials[seed] = trial = try_scene(seed, size)
+        trials[seed] = trial = try_scene(seed, size, draw)
         refused.update(trial.get("refused", []))
         outcome = trial.get("refused", [f"z {trial.get('z')} of {trial.get('z_bound')}"])[0]
         say(f"  scene {seed}: {outcome}: {', '.join(trial['features'])}")
@@ -77,9 +95,9 @@ def measure_trials(size: RandomSize) -> dict:
     return {"scenes": size.scenes, "refusals": dict(refused), "trials": trials}
 
 
-def try_scene(seed: int, size: RandomSize) -> dict:
+def try_scene(seed: int, size: RandomSize, draw: DrawScene) -> dict:
     """Compare one scene: the largest z over the bound and the pixels without a valid radiance, or the reason of a refusal."""
-    scene = draw_scene(seed)
+    scene = draw(seed, None)
     answer: dict = {"features": scene.features}
     try:
         images = render_rounds(scene, "mivol", size.rounds, size.spp)
@@ -87,7 +105,7 @@ def try_scene(seed: int, size: RandomSize) -> dict:
         return answer | {"refused": [re.sub(r"[\d.]+", "#", str(error))]}
     answer["not_a_radiance"] = int(np.sum(~(np.isfinite(images) & (images >= 0))))
     if scene.is_rgb:
-        channels = [render_rounds(draw_scene(seed, c), "volpath", size.rounds, size.stock_spp)[..., c] for c in range(3)]
+        channels = [render_rounds(draw(seed, c), "volpath", size.rounds, size.stock_spp)[..., c] for c in range(3)]
         expected = np.stack(channels, axis=-1)
     else:
         expected = render_rounds(scene, "volpath", size.rounds, size.stock_spp)
@@ -183,13 +201,15 @@ def compare(question: str, answer: dict) -> list[Bar]:
     rendered = {seed: trial for seed, trial in answer["trials"].items() if "refused" not in trial}
     rows = [judge("refused scenes", sum(answer["refusals"].values()), AT_MOST, 0)]
     rows.append(judge("pixels that are no radiance", sum(t["not_a_radiance"] for t in rendered.values()), AT_MOST, 0))
-    return rows + [judge_agreement(f"scene {seed}", trial["z"], trial["z_bound"]) for seed, trial in rendered.items()]
+    return rows + [
+        judge_agreement(f"{question}, scene {seed}", trial["z"], trial["z_bound"]) for seed, trial in rendered.items()
+    ]
 
 
 def draw(answers: dict, path: Path) -> None:
     """Draw a histogram of the largest z of each scene over its bound."""
-    trials = answers.get("trials", {}).get("trials", {})
-    shares = [abs(f["z"]) / f["z_bound"] for f in trials.values() if f.get("z") is not None]
+    trials = [trial for answer in answers.values() for trial in answer.get("trials", {}).values()]
+    shares = [abs(f["z"]) / f["z_bound"] for f in trials if f.get("z") is not None]
     with new_figure(path, 5, 4) as figure:
         axes = figure.subplots()
         axes.hist(shares, bins=np.linspace(0, 1.5, 31), color=SERIES[0])
@@ -199,4 +219,6 @@ def draw(answers: dict, path: Path) -> None:
         axes.legend()
 
 
-STUDY = Study(__name__, __doc__, RandomSize, {"trials": measure_trials, "hard": measure_hard}, compare, draw)
+STUDY = Study(
+    __name__, __doc__, RandomSize, {"trials": measure_trials, "built": measure_built, "hard": measure_hard}, compare, draw
+)

@@ -1,8 +1,9 @@
 """Random scenes with media that Mitsuba renders correctly: boundaries, media, surfaces, emitters, a camera and a depth.
 
-The seed decides everything. Scenes avoid known errors of Mitsuba. ``heterogeneous`` has one grey majorant, so an rgb extinction
-is compared with the grey scenes of its channels. Mitsuba's volumes continue outside their box, so each grid fills the box of
-its boundary. Emitters are not hidden.
+Two kinds: bodies before a sky (:func:`draw_scene`), and scenes as people build them: rooms, floors, glass and fog, with lamps
+inside and beside the media (:func:`draw_built_scene`). The seed decides everything. Scenes avoid known errors of Mitsuba.
+``heterogeneous`` has one grey majorant, so an rgb extinction of a grid is compared with the grey scenes of its channels.
+Mitsuba's volumes continue outside their box, so each grid fills the box of its boundary. Emitters are not hidden.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["RandomScene", "draw_scene"]
+__all__ = ["RandomScene", "draw_built_scene", "draw_scene"]
 
 SIDE = 12
 """Edge of the image [pixels]."""
@@ -47,12 +48,14 @@ class _Draw:
         channel: channel of rgb extinctions; None: all three.
         features: names of the parts so far.
         is_rgb: an extinction has three channels.
+        is_built: more media are homogeneous, some of them with an extinction in rgb.
     """
 
     rng: np.random.Generator
     channel: int | None
     features: list[str] = field(default_factory=list)
     is_rgb: bool = False
+    is_built: bool = False
 
     def one_of(self, kinds: dict[str, float]) -> str:
         """Draw a kind in proportion to its weight, and add it to the features."""
@@ -87,6 +90,26 @@ def draw_scene(seed: int, channel: int | None = None) -> RandomScene:
     parts |= _surfaces(draw)
     parts |= _emitters(draw)
     parts["sensor"] = _camera(draw, parts)
+    return _finish(draw, parts)
+
+
+def draw_built_scene(seed: int, channel: int | None = None) -> RandomScene:
+    """Draw a scene as people build them: homogeneous media more often than grids, and up to sixteen lamps inside and beside.
+
+    Args:
+        seed: decides everything.
+        channel: keep only this channel of rgb extinctions; None: keep all three.
+    """
+    draw = _Draw(np.random.default_rng([seed, 1]), channel, is_built=True)
+    place = PLACES[draw.one_of(dict.fromkeys(PLACES, 1.0))]
+    parts = {"type": "scene"} | place(draw) | _lamps(draw)
+    if "sensor" not in parts:
+        parts["sensor"] = _view([draw.number(-1, 1), -3.3, draw.number(-0.5, 1)])
+    return _finish(draw, parts)
+
+
+def _finish(draw: _Draw, parts: dict) -> RandomScene:
+    """Draw the depth."""
     depth = DEPTHS[draw.rng.integers(len(DEPTHS))]
     draw.features.append(f"depth {depth}")
     settings = {"max_depth": depth, "rr_depth": int(draw.rng.choice([5, 20]))}
@@ -139,10 +162,14 @@ def _boundary(draw: _Draw) -> dict:
 
 def _medium(draw: _Draw, to_grid: mi.ScalarTransform4f, size: float) -> dict:
     tau, albedo = 10 ** draw.number(-0.7, 1.1), _albedo(draw, to_grid)
-    kind = draw.one_of({"homogeneous": 0.3, "grid": 0.45, "rgb grid": 0.25})
+    kind = draw.one_of({"homogeneous": 1.5 if draw.is_built else 0.3, "grid": 0.45, "rgb grid": 0.25})
     phase = _phase(draw)
     if kind == "homogeneous":
-        return {"type": "homogeneous", "sigma_t": tau / (2 * size), "albedo": albedo, "phase": phase}
+        medium = {"type": "homogeneous", "sigma_t": tau / (2 * size), "albedo": albedo, "phase": phase}
+        if draw.is_built and draw.chance(0.3):
+            draw.features.append("rgb homogeneous")
+            medium |= {"sigma_t": draw.colour(0.3, 1), "scale": tau / size}
+        return medium
     channels = 3 if kind == "rgb grid" else 1
     res = [int(draw.rng.integers(1, 9)) for _ in range(3)]
     values = draw.rng.uniform(0, 1, (*res, channels)) ** draw.number(0.5, 4)
@@ -257,16 +284,94 @@ SKIES = {"constant", "envmap"}
 def _camera(draw: _Draw, parts: dict) -> dict:
     origin = [draw.number(-1, 1), -4.5, draw.number(-0.5, 1.5)]
     body = parts.get("body", parts.get("a"))
-    camera = {
-        "type": "perspective",
-        "fov": 42,
-        "film": {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
-        "sampler": {"type": "independent"},
-    }
+    medium = {}
     # For nested bodies the position could lie in the inner body, but the sensor names the outer one.
     if body["bsdf"]["type"] == "null" and draw.chance(0.15) and "b" not in parts:
         draw.features.append("camera inside")
         origin = [0.02, -0.35, 0.05] if "other" not in parts else [-0.9, -0.2, 0.05]
-        camera["medium"] = {"type": "ref", "id": "m1"}
-    camera["to_world"] = mi.ScalarTransform4f().look_at(origin=origin, target=[0.1, 0, 0], up=[0, 0, 1])
-    return camera
+        medium = {"medium": {"type": "ref", "id": "m1"}}
+    return _view(origin) | medium
+
+
+def _view(origin: list[float]) -> dict:
+    """A camera aimed at the first body."""
+    return {
+        "type": "perspective",
+        "fov": 42,
+        "film": {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+        "sampler": {"type": "independent"},
+        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=[0.1, 0, 0], up=[0, 0, 1]),
+    }
+
+
+# -- Scenes as people build them --------------------------------------------------------------------------------------------
+
+
+def _room(draw: _Draw) -> dict:
+    """A closed room with a square lamp below its ceiling; the camera stands inside."""
+    box = mi.ScalarTransform4f().translate([0, -0.8, 0]).scale([2.2, 3.0, 2.2])
+    walls = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": draw.colour(0.2, 0.8)}}
+    down = mi.ScalarTransform4f().look_at(origin=[0.3, 0.2, 2.1], target=[0.3, 0.2, 0], up=[0, 1, 0]).scale(0.5)
+    lamp = {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": draw.colour(3, 9)}}
+    return {"room": {"type": "cube", "to_world": box, "bsdf": walls}, "ceiling": lamp, "body": _small_body(draw)}
+
+
+def _floor(draw: _Draw) -> dict:
+    """A body over a floor, under a faint sky."""
+    down = mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(4)
+    floor = {"type": "rectangle", "to_world": down, "bsdf": {"type": "diffuse", "reflectance": draw.colour(0.1, 0.9)}}
+    return {"sky": {"type": "constant", "radiance": draw.number(0.1, 0.6)}, "floor": floor, "body": _small_body(draw)}
+
+
+def _glass(draw: _Draw) -> dict:
+    """A ball of liquid in a thin ball of glass, under a sky with a sun."""
+    radius, place = draw.number(0.5, 0.9), mi.ScalarTransform4f()
+    liquid = _medium(draw, place.scale(radius).translate(-1).scale(2), radius) | {"id": "m1"}
+    inner = {"type": "dielectric", "int_ior": draw.number(1.2, 1.4), "ext_ior": 1.5}
+    return {
+        "sky": _envmap(draw),
+        "glass": {"type": "sphere", "radius": 1.1 * radius, "bsdf": {"type": "dielectric", "int_ior": 1.5}},
+        "body": {"type": "sphere", "radius": radius, "bsdf": inner, "interior": liquid},
+    }
+
+
+def _fog(draw: _Draw) -> dict:
+    """A fog without a boundary before a wall; the camera and all lamps stand in the fog."""
+    fog = {"type": "homogeneous", "id": "fog", "sigma_t": draw.number(0.05, 0.5), "albedo": draw.number(0.3, 0.95)}
+    back = mi.ScalarTransform4f().look_at(origin=[0, 2.5, 0], target=[0, 0, 0], up=[0, 0, 1]).scale(5)
+    wall = {"type": "rectangle", "to_world": back, "bsdf": {"type": "diffuse", "reflectance": draw.colour(0.2, 0.8)}}
+    sensor = _view([0.2, -3.3, 0.3]) | {"medium": {"type": "ref", "id": "fog"}}
+    # Mitsuba resolves a reference only to an object that it has loaded before.
+    return {"fog": fog | {"phase": _phase(draw)}, "wall": wall, "sensor": sensor}
+
+
+PLACES: dict[str, Callable[[_Draw], dict]] = {"room": _room, "over a floor": _floor, "in glass": _glass, "in fog": _fog}
+
+
+def _small_body(draw: _Draw) -> dict:
+    """A body within a distance of 1.4 of the origin."""
+    return _body(draw, [0.0, 0, 0], draw.number(0.5, 0.8), "m1")
+
+
+def _lamps(draw: _Draw) -> dict:
+    """Draw one, three or sixteen lamps of one power in all, inside the first body (distance 0.2) or around it."""
+    count = {"one lamp": 1, "three lamps": 3, "sixteen lamps": 16}[
+        draw.one_of({"one lamp": 0.4, "three lamps": 0.3, "sixteen lamps": 0.3})
+    ]
+    parts = {}
+    for k in range(count):
+        kind = draw.one_of({"point lamp": 1.0, "spot lamp": 1.0, "lamp with a shape": 1.0})
+        is_inside = draw.chance(0.4)
+        if is_inside:
+            draw.features.append("lamp inside")
+        at = (0.2 if is_inside else draw.number(1.5, 1.9)) * _direction(draw)
+        intensity = {"type": "rgb", "value": [draw.number(1, 4) / count for _ in range(3)]}
+        if kind == "point lamp":
+            parts[f"lamp{k}"] = {"type": "point", "position": at.tolist(), "intensity": intensity}
+        elif kind == "spot lamp":
+            aim = mi.ScalarTransform4f().look_at(origin=at.tolist(), target=(-at).tolist(), up=[0.1, 0.9, 0.2])
+            parts[f"lamp{k}"] = {"type": "spot", "to_world": aim, "intensity": intensity, "cutoff_angle": 40.0}
+        else:
+            emitter = {"type": "area", "radiance": {"type": "rgb", "value": [v * 30 for v in intensity["value"]]}}
+            parts[f"lamp{k}"] = {"type": "sphere", "center": at.tolist(), "radius": 0.08, "emitter": emitter}
+    return parts
