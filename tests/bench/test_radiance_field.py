@@ -16,13 +16,16 @@ import pytest
 from mivol.bench import photo_fits
 from mivol.bench.studies import radiance_field as study
 from mivol.bench.studies.radiance_field import (
+    EVERY,
     STUDY,
     PhotoFit,
     RadianceSize,
     fields,
-    fits,
+    fit_mivol,
+    fit_peer,
+    follow,
+    held_out_psnr,
     make_tasks,
-    measure_memory,
     mivol_step,
     peer_step,
     to_peer,
@@ -38,7 +41,6 @@ from mivol.bench.studies.radiance_field.fields import (
     to_bundle,
     trace,
 )
-from mivol.bench.studies.radiance_field.fits import EVERY, fit_mivol, fit_peer, follow, held_out_psnr
 from mivol.bench.studies.radiance_field.peer import Peer
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, Photo, intrinsics
@@ -117,8 +119,8 @@ def asked_plans(monkeypatch: pytest.MonkeyPatch, fit: Callable[[], object]) -> l
         calls.append([(s.longest, s.steps, s.shrink, s.views, s.tiles) for s in plan.stages])
         return SimpleNamespace(course=SimpleNamespace(iterations=0), advance=lambda: None)
 
-    monkeypatch.setattr(fits, "begin_radiance_fit", begin)
-    monkeypatch.setattr(fits.RayBatches, "from_photos", lambda *of: of)
+    monkeypatch.setattr(study, "begin_radiance_fit", begin)
+    monkeypatch.setattr(study.RayBatches, "from_photos", lambda *of: of)
     fit()
     return calls
 
@@ -185,25 +187,6 @@ def test_only_steps_are_counted() -> None:
     assert (judged, len(curve), len(taken)) == ([7, 14], 2, 20)
 
 
-def test_pixels_are_drawn_anywhere(variant_rgb: str) -> None:
-    """As many rays as tiles would have; four neighbours of a tile are rarely neighbours here."""
-    photos = photograph(FIELDS["fog"](TINY)[0], ring_cameras(16, 3))
-    batches = [
-        kind.from_photos(photos).draw_tiles(1, np.arange(3), 4, np.random.default_rng(0))
-        for kind in (fits.PixelBatches, fits.RayBatches)
-    ]
-    widths = [dr.width(batch.rays.d) for batch in batches]
-    assert widths == [3 * 4 * 16] * 2
-    steps = [np.linalg.norm(np.diff(np.array(batch.rays.d), axis=1), axis=0) for batch in batches]
-    assert np.median(steps[0]) > 3 * np.median(steps[1])
-
-
-@pytest.mark.slow
-def test_memory_a_ray(variant_rgb: str) -> None:
-    (bar,) = STUDY.bars("memory", measure_memory(replace(TINY, fields=("shell",), side=64)))
-    assert bar["met"], bar
-
-
 @pytest.mark.parametrize("there", [True, False])
 def test_the_fitted_field_is_the_chair_where_there_is_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, there: bool) -> None:
     """Without the data, views of the shell are fitted instead."""
@@ -242,7 +225,6 @@ def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     size = replace(TINY, photo_fits=calls, photo_folder=str(tmp_path / "photographs"))
     answers = STUDY.answer(tuple(STUDY.questions), size)
     assert all(answers["step"]["fog"][kind]["ratio_of_processor_time"] > 0 for kind in ("camera", "pixels", "any"))
-    assert set(answers["locality"]) == {"tiles", "pixels"}
     assert answers["fit"]["fog"]["peer_psnr"] > 5
     assert set(answers["photographs"]) == {"wires at 16", "wires, tiny"}
     result = answers["photographs"]["wires at 16"]
@@ -250,7 +232,7 @@ def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     # Seconds of a machine that is as fast as this one are those of its threads.
     threads, rate = dr.thread_count(), result["walk_rays_per_second"]
     assert result["seconds"] == pytest.approx(result["processor_seconds"] / threads * rate / 25e6)
-    assert len(answers.pop("bars")) == 3 + 1 + 1
+    assert len(answers.pop("bars")) == 3 + 1
     STUDY.draw(answers, tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
@@ -259,7 +241,7 @@ def test_pixels_of_the_peer_are_those_of_the_camera(variant_rgb: str) -> None:
     """What the peer fits, and what it shows, lies where a view has it: rays in the unit cube, colours by row and column."""
     camera = ring_cameras(16, 3)[1]
     image = np.random.default_rng(0).random((16, 16, 3), dtype=np.float32)
-    o, d, colours = fits.peer_view(Photo("a", image, None, None, camera, np.zeros(3)))
+    o, d, colours = study.peer_view(Photo("a", image, None, None, camera, np.zeros(3)))
     origins, directions = trace(camera, tiled_pixels(16))
     np.testing.assert_allclose(np.array(o).T, (origins + 1) / 2, atol=1e-6)
     np.testing.assert_allclose(np.array(d).T, directions, atol=1e-6)
@@ -270,7 +252,7 @@ def test_pixels_of_the_peer_are_those_of_the_camera(variant_rgb: str) -> None:
             assert np.abs(np.array(at) - np.array(o)).max() <= 1e-6 and np.abs(np.array(along) - np.array(d)).max() <= 1e-6
             return colours
 
-    np.testing.assert_array_equal(fits.render_peer(Mirror(), camera), image)
+    np.testing.assert_array_equal(study.render_peer(Mirror(), camera), image)
 
 
 def test_a_stage_of_the_peer_has_twice_the_resolution(variant_rgb: str) -> None:
@@ -292,11 +274,11 @@ def test_a_step_of_the_peer_goes_to_its_target(variant_rgb: str, target: float) 
 @pytest.mark.parametrize(("ours", "ratio"), [([(1.0, 20.0), (2.0, 25.0), (4.0, 30.0)], 10.0), ([(1.0, 20.0)], 0.0)])
 def test_a_fit_is_as_good_as_the_peers_best(monkeypatch: pytest.MonkeyPatch, ours: list, ratio: float) -> None:
     """24 dB, which the peer had after 20 s and lost again; ours is there after 2 s, or never."""
-    monkeypatch.setattr(fits, "load_field", lambda name, size: (None, "made"))
-    monkeypatch.setattr(fits, "photograph", lambda field, cameras: [])
-    monkeypatch.setattr(fits, "fit_mivol", lambda *asked: ours)
-    monkeypatch.setattr(fits, "fit_peer", lambda *asked: [(10.0, 18.0), (20.0, 24.0), (30.0, 23.0)])
-    result = fits.measure_fit(TINY)["fog"]
+    monkeypatch.setattr(study, "load_field", lambda name, size: (None, "made"))
+    monkeypatch.setattr(study, "photograph", lambda field, cameras: [])
+    monkeypatch.setattr(study, "fit_mivol", lambda *asked: ours)
+    monkeypatch.setattr(study, "fit_peer", lambda *asked: [(10.0, 18.0), (20.0, 24.0), (30.0, 23.0)])
+    result = study.measure_fit(TINY)["fog"]
     assert (result["peer_psnr"], result["ratio"], result["field"]) == (24.0, ratio, "made")
 
 
@@ -324,8 +306,6 @@ def test_missing_photographs_are_left_out(
 
 
 BARS = {
-    "memory": ({"bytes_per_ray": 512.0}, [(512, "at most", 512, True)]),
-    "locality": ({}, []),
     "photographs": (
         {
             "chair at 256": {"psnr": 31.0, "seconds": 300.0, "held_gib": 1.6},
@@ -337,7 +317,6 @@ BARS = {
             (32, "at least", 32, True), (1201, "at most", 1200, False), (3, "at most", 16, True),
         ],
     ),
-    "priors": ({}, []),
     "fit": ({"fog": {"ratio": 9.0}, "shell": {"ratio": 10.0}}, [(9, "at least", 10, False), (10, "at least", 10, True)]),
     "step": (
         {"fog": {kind: {"ratio_of_processor_time": r} for kind, r in (("camera", 7.0), ("pixels", 5.0), ("any", 3.0))}},

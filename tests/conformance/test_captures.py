@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_photos import SIZE, cameras, capture, write_capture
+from capture_photos import DISTANCE, SIZE, cameras, capture, write_capture
 
 from mivol import config
-from mivol.bench.studies.radiance_field.room import DISTANCE
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos import Camera, intrinsics, load_photos, survey_photos

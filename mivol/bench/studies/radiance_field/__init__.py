@@ -1,7 +1,7 @@
 """How fast are a radiance field's rays and their derivatives, and how much sooner is a fit done, beside Mitsuba's tutorial?
 
     mivol bench radiance_field                     # an hour on 2 idle cores, most of it in photographs and the peer
-    mivol bench radiance_field --only step,memory  # 6 minutes
+    mivol bench radiance_field --only step         # 5 minutes
     mivol bench radiance_field --only photographs  # 40 minutes, a third of them for one fit
     mivol bench radiance_field --quick             # under two minutes, small sizes: the times mean nothing
 
@@ -15,11 +15,6 @@ draws them; ``any``, random origins and directions. The first two share pinholes
 node and pinhole, and this time counts. Rays of the third kind share nothing: each reads 28 numbers at every corner and carries
 the corners of a face on to the next cell. They are sorted first, and this time counts.
 
-memory: the most that Dr.Jit holds during a gradient step, for N and 4 N rays; the difference is the state of the rays.
-
-locality: fits of 64^3 nodes from 24 views of the fitted scene, with rays of tiles of 4 x 4 pixels (as every fit) and with as
-many rays of random single pixels of the same views: time of a step, and held-out PSNR after the same number of steps.
-
 fit: 7 views of 256 x 256 pixels, rendered of each field over black. The peer fits as the tutorial does: 4 stages of doubling
 resolution up to 128^3, 105 steps each, one view in each step. mivol has 3 stages up to the same resolution. Its last stage has
 as many rays in a step as a view has pixels, from all views; all else is as in every fit. The mean PSNR of 4 views in between is
@@ -27,15 +22,11 @@ measured every 7 steps of either, with stopped clock, after all kernels were com
 over mivol's time to the best PSNR of the peer.
 
 photographs: fits of data sets with the settings of ``mivol optimize``: quality of test views, time, memory.
-
-priors: the preset for captures at a small size, with and without each of its priors, on a procedural room and on the fox of
-MIVOL_DATA: mean PSNR of the photographs of each fold, from fits to the other photographs; the gain of a prior over the folds.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -48,23 +39,30 @@ from matplotlib.axes import Axes
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, say_row
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import Study, amount
-from mivol.bench.harness.timing import Stopwatch, peak_bytes, race, ratio_of
+from mivol.bench.harness.timing import Stopwatch, race, ratio_of
 from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs, prepare_fit
 from mivol.bench.studies.radiance_field.fields import (
+    BLACK,
+    BOX,
     STOP,
+    FieldSize,
     load_field,
     make_camera,
+    middle_cameras,
+    photograph,
     ring_cameras,
     tiled_pixels,
     to_bundle,
     trace,
 )
-from mivol.bench.studies.radiance_field.fits import measure_fit, measure_locality
 from mivol.bench.studies.radiance_field.peer import Peer
-from mivol.bench.studies.radiance_field.priors import PriorSize, measure_priors
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import Fit
-from mivol.optim.photographs.radiance_plan import estimate_bytes
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage, estimate_bytes
+from mivol.optim.photographs.radiance_problem import begin_radiance_fit, current_field
+from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.photos import Camera, Photo
 from mivol.report.figures import SERIES
 from mivol.transport.line_integrals.radiance_field import (
     RayBundle,
@@ -75,8 +73,9 @@ from mivol.transport.line_integrals.radiance_field import (
     vjp_rays,
 )
 from mivol.transport.line_integrals.radiance_source import bake, make_exact, vjp_bake
+from mivol.validate.metrics import psnr
 
-__all__ = ["STUDY", "PhotoFit", "RadianceSize", "RayTask"]
+__all__ = ["STUDY", "PhotoFit", "RadianceSize"]
 
 
 class PhotoFit(NamedTuple):
@@ -108,7 +107,7 @@ ALL_FITS = (
 
 
 @dataclass(frozen=True)
-class RadianceSize(PriorSize, PhotoSize):
+class RadianceSize(FieldSize, PhotoSize):
     """Amount of work."""
 
     side: int = amount(256, 64, "edge of images whose rays are timed [pixels]")
@@ -208,29 +207,114 @@ def measure_step(size: RadianceSize) -> dict:
     return answer
 
 
-def measure_memory(size: RadianceSize) -> dict:
-    """How much memory does a gradient step hold, and how much of it grows with the rays?"""
-    field, _ = load_field("shell", size)
-    peaks = []
-    for side in (size.side, 2 * size.side):
-        step = mivol_step(field, make_tasks(replace(size, side=side))["camera"])
-        # The first calls compile, and allocate what later calls use again.
-        peaks.append([peak_bytes(lambda step=step: dr.eval(step(0))) for _ in range(3)][-1])
-    return {
-        "field_bytes": field.bytes,
-        "peak_bytes": peaks,
-        "bytes_per_ray": (peaks[1] - peaks[0]) / (3 * size.side**2),
-        "resident_bytes": resident_bytes(),
-    }
+# -- Fits of rendered views -------------------------------------------------------------------------------------------------
+
+EVERY = 7
+"""Steps between two measurements of the held-out views."""
+
+Curve = list[tuple[float, float]]
+"""Seconds of a fit, and the PSNR of the held-out views at this time [dB]."""
 
 
-def resident_bytes() -> int | None:
-    """Largest memory of this process so far; None on Windows."""
-    if sys.platform == "win32":
-        return None
-    import resource
+def held_out_psnr(photos: Sequence[Photo], render: Callable[[Camera], np.ndarray]) -> float:
+    """Mean PSNR of renders (H, W, 3) of held-out views [dB]; a view counts 100 dB at most."""
+    values = [psnr(np.clip(render(photo.camera), 0, 1), photo.image, 1.0) for photo in photos]
+    return float(np.mean(np.minimum(values, 100.0)))
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+def render_peer(peer: Peer, camera: Camera) -> np.ndarray:
+    """Render a view of the peer's field (H, W, 3)."""
+    pixels = tiled_pixels(camera.size[0])
+    ray = to_bundle(*trace(camera, pixels))
+    image = np.empty((*camera.size, 3), np.float32)
+    image[tuple(pixels.T)] = np.array(peer.render(mi.Point3f((ray.o + 1) * 0.5), ray.d)).T
+    return image
+
+
+def follow(steps: Iterable, measure: Callable[[], float]) -> Curve:
+    """Take steps, and measure after every EVERY steps; only the steps are timed."""
+    curve, watch, steps = [], Stopwatch(), iter(steps)
+    while True:
+        with watch:
+            taken = sum(1 for _ in zip(range(EVERY), steps, strict=False))
+        if taken < EVERY:
+            return curve
+        curve.append((watch.seconds, measure()))
+
+
+def compile_fit(views: RayBatches, stages: Sequence[RadianceStage]) -> None:
+    """Take a step of each stage, which compiles its kernels before a clock runs."""
+    for stage in stages:
+        begin_radiance_fit(views, BOX, RadiancePlan((replace(stage, steps=2),))).advance()
+    dr.sync_thread()
+
+
+def all_steps(fit: Fit) -> Iterator[None]:
+    """Take all steps of a fit; yields after each step."""
+    for _ in range(fit.course.iterations):
+        yield fit.advance()
+
+
+def measure_newest(fit: Fit, held_out: Sequence[Photo]) -> float:
+    """PSNR of the held-out views by the newest field of a fit [dB]."""
+    return held_out_psnr(held_out, lambda camera: render_view(current_field(fit), camera, BLACK, STOP).image)
+
+
+def fit_mivol(photos: list[Photo], held_out: list[Photo], size: FieldSize) -> Curve:
+    """Fit by mivol: three stages; a step of the last stage has as many rays as a view has pixels."""
+    n, steps = size.fit_resolution, size.steps
+    tiles = max(size.fit_side**2 // 112, 4)
+    kinds = ((8, 1, 4, tiles // 4), (4, 1, 2, tiles // 4), (1, 2, 1, tiles))
+    stages = tuple(RadianceStage(n // k, steps * s, shrink, 7, count) for k, s, shrink, count in kinds)
+    views = RayBatches.from_photos(photos, (1, 2, 4))
+    compile_fit(views, stages)
+    fit = begin_radiance_fit(views, BOX, RadiancePlan(stages))
+    return follow(all_steps(fit), lambda: measure_newest(fit, held_out))
+
+
+def fit_peer(photos: list[Photo], held_out: list[Photo], size: FieldSize) -> Curve:
+    """Fit by the peer: four stages of doubling resolution, one view in each step."""
+    views = [peer_view(photo) for photo in photos]
+    for n in (8, 4, 2, 1):  # compiles
+        list(Peer.start(size.fit_resolution // n).fit(views, 1))
+    dr.sync_thread()
+    peers = [Peer.start(size.fit_resolution // 8)]
+    return follow(
+        peer_steps(peers, views, size.steps),
+        lambda: held_out_psnr(held_out, lambda camera: render_peer(peers[-1], camera)),
+    )
+
+
+def peer_view(photo: Photo) -> tuple[mi.Point3f, mi.Vector3f, mi.Color3f]:
+    """Rays of all pixels of a view in the unit cube of the peer, and their colours."""
+    pixels = tiled_pixels(photo.camera.size[0])
+    o, d = trace(photo.camera, pixels)
+    ray = to_bundle((o + 1) / 2, d)
+    return ray.o, ray.d, mi.Color3f(np.ascontiguousarray(photo.image[tuple(pixels.T)].T))
+
+
+def peer_steps(peers: list[Peer], views: list, steps: int) -> Iterator[None]:
+    """Take all steps of the four stages of the peer; the peer of each stage is appended to ``peers``."""
+    for stage in range(4):
+        if stage:
+            peers.append(peers[-1].refined())
+        for _ in peers[-1].fit(views, steps):
+            yield dr.eval(peers[-1].density, peers[-1].harmonics)
+
+
+def measure_fit(size: FieldSize) -> dict:
+    """How long until the PSNR of held-out views reaches the best PSNR of the peer?"""
+    answer = {}
+    for name in size.fields:
+        field, origin = load_field(name, size)
+        photos, held_out = photograph(field, ring_cameras(size.fit_side)), photograph(field, middle_cameras(size.fit_side))
+        mivol, peer = fit_mivol(photos, held_out, size), fit_peer(photos, held_out, size)
+        duration, goal = max(peer, key=lambda point: point[1])
+        reached = next((t for t, decibels in mivol if decibels >= goal), None)
+        ratio = 0.0 if reached is None else duration / reached
+        answer[name] = {"field": origin, "peer_psnr": goal, "ours": mivol, "peer": peer, "ratio": ratio}
+        say_row(name, peer_psnr=goal, peer_seconds=duration, seconds=reached, final_psnr=mivol[-1][1])
+    return answer
 
 
 # -- Photographs ------------------------------------------------------------------------------------------------------------
@@ -302,8 +386,6 @@ STEP_BARS = {"camera": 8, "pixels": 4, "any": 4}
 
 def compare(question: str, answer: dict) -> list[Bar]:
     """Judge the figures of an answer."""
-    if question == "memory":
-        return [judge("bytes a ray beyond the grid's", answer["bytes_per_ray"], AT_MOST, 512)]
     if question == "photographs":
         bars = [(fit, *bar) for fit in PHOTO_BARS if fit in answer for bar in PHOTO_BARS[fit]]
         return [judge(f"{fit}: {figure}", answer[fit][figure], sense, bar) for fit, figure, sense, bar in bars]
@@ -319,8 +401,8 @@ def compare(question: str, answer: dict) -> list[Bar]:
 
 
 def draw(answers: dict, path: Path) -> None:
-    """A panel for each question with a picture, and a panel for each field of the fits."""
-    panels = [(PANELS[question], answer) for question, answer in answers.items() if question in PANELS]
+    """A panel for the steps, and a panel for each field of the fits."""
+    panels = [(plot_step, answers["step"])] if "step" in answers else []
     panels += [(plot_fit, {name: answer}) for name, answer in answers.get("fit", {}).items()]
     with new_figure(path, 4.2 * max(len(panels), 1), 3.6) as figure:
         for number, (plot, answer) in enumerate(panels, 1):
@@ -337,23 +419,6 @@ def plot_step(axes: Axes, answer: dict) -> None:
     axes.legend(loc="upper left")
 
 
-def plot_memory(axes: Axes, answer: dict) -> None:
-    """Plot the peak of a step for two numbers of rays."""
-    axes.bar(("rays", "4 x rays"), np.array(answer["peak_bytes"]) / 2**20, 0.5, color=SERIES[0])
-    axes.axhline(answer["field_bytes"] / 2**20, color=SERIES[1], linestyle="--", linewidth=1.2, label="the field")
-    axes.set(title=f"{answer['bytes_per_ray']:.0f} bytes a ray", ylabel="peak of a step [MiB]")
-    axes.legend()
-
-
-def plot_locality(axes: Axes, answer: dict) -> None:
-    """Plot the time of a step, and the PSNR after the same number of steps."""
-    points = {name: ([1e3 * a["processor_seconds"] / a["steps"]], [a["psnr"]]) for name, a in answer.items()}
-    plot_errors(axes, points, log=False, linestyle="none")
-    axes.set(title="Tiles and single pixels", xlabel="processor time of a step [ms]", ylabel="held-out PSNR [dB]")
-    axes.margins(0.4)
-    axes.legend()
-
-
 def plot_fit(axes: Axes, answer: dict) -> None:
     """Plot the PSNR of held-out views against time."""
     ((name, curves),) = answer.items()
@@ -365,13 +430,5 @@ def plot_fit(axes: Axes, answer: dict) -> None:
     axes.legend()
 
 
-PANELS = {"step": plot_step, "memory": plot_memory, "locality": plot_locality}
-QUESTIONS = {
-    "step": measure_step,
-    "memory": measure_memory,
-    "locality": measure_locality,
-    "fit": measure_fit,
-    "photographs": measure_photographs,
-    "priors": measure_priors,
-}
+QUESTIONS = {"step": measure_step, "fit": measure_fit, "photographs": measure_photographs}
 STUDY = Study(__name__, __doc__, RadianceSize, QUESTIONS, compare, draw, on_request=("photographs",))
