@@ -128,13 +128,12 @@ def test_the_result_of_the_solvers(
 
 
 def test_tables_of_slices() -> None:
-    """Least errors and ratios of times for slices, the gain of each part for the default solver."""
+    """Least errors and ratios of times for slices."""
     curves = {"few": {"mivol fbp": {"errors": [0.5], "seconds": [1.0]}, "astra FBP": {"errors": [0.5], "seconds": [2.0]}}}
     assert study.table("peers", curves)[2:] == [
         "| mivol fbp | 0.5000 (1, 1.00 s) |", "| astra FBP | 0.5000 (1, 2.00 s) |", "",
         "| time at equal error | few |", "|---|---|", "| mivol fbp / astra FBP | 0.50 (0.5000) |",
     ]  # fmt: skip
-    assert study.table("parts", {"few": {"a": 0.25}})[2:] == ["| a | 0.250 |"]
     assert study.table("solvers", {}) == []
 
 
@@ -370,21 +369,6 @@ def test_astra_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     bounded = {"option": {"MinConstraint": 0.0}}
     assert created == [{"type": name} | common | (bounded if name in ("SIRT", "SART") else {}) for name in steps]
     assert ran == [(1, 1), (2, 1), (3, 1), (4, 3)]
-
-
-@pytest.mark.slow
-def test_rows_of_parts_differ(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a slice of 33^2 with noise: no row equals another, and the last but one is the default."""
-    monkeypatch.setattr(peers, "PART_KINDS", {"noisy": (20, 1e3)})
-    answer = peers.measure_parts(None, 33)
-    assert list(answer["noisy"]) == list(peers.PARTS) and len(set(answer["noisy"].values())) == len(peers.PARTS)
-    scan = make_slice(33, 20, 1e3)
-    *_, last = itertools.islice(peers.default_states(scan), 20)
-    # Float32 sums in another order.
-    assert answer["noisy"]["from fbp, twice as fine, tv = 1"] == pytest.approx(scan.error(last), rel=1e-3)
-    assert peers.part_rows({"few": {"a": 0.25, "b": 0.5}, "many": {"a": 0.125, "b": 1.0}})[2:] == [
-        "| a | 0.250 | 0.125 |", "| b | 0.500 | 1.000 |",
-    ]  # fmt: skip
 
 
 @pytest.mark.slow

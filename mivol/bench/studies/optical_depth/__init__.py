@@ -6,8 +6,8 @@
 
 All contestants trace the same rays through the same grid, in turns within each round. A time is the median over the rounds,
 with the fastest time beside it. A ratio of times is the median of the ratios within a round. The cost of the first call is
-reported apart: seconds in the compiler, or kernels found on disk (HOME=$(mktemp -d) hides those). Errors are differences to a
-slow twin in float64 NumPy.
+reported apart: seconds in the compiler, or kernels found on disk (HOME=$(mktemp -d) hides those). Errors are differences to
+sums in float64 NumPy.
 
 The smoke of the Mitsuba tutorial and a CT scan come from MIVOL_DATA (default ../shared/data). Without the data, made-up fields
 of the same sizes take their place, and the JSON records this.
@@ -33,6 +33,7 @@ from mivol.bench.reference_walk import GridRays, camera_rays
 from mivol.bench.scenes import box_scene
 from mivol.bench.studies.optical_depth.peers import (
     delta_survival,
+    exact_tau,
     integrate_by_drjit,
     intersect_box,
     marching,
@@ -41,7 +42,6 @@ from mivol.bench.studies.optical_depth.peers import (
     tracking,
     volpath,
 )
-from mivol.bench.studies.optical_depth.twin import exact_tau
 from mivol.report.figures import Series, plot_error_against_time
 from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_tau
 from mivol.transport.traversal.grid_blocks import bound_blocks
@@ -61,7 +61,6 @@ class OpticalDepthSize(Size):
     image_spp: int = amount(16, 4, "samples per pixel of rendered images")
     exact_pixels: int = amount(192, 32, "pixels compared with float64")
     exact_rays: int = amount(4096, 1024, "rays compared with float64")
-    accuracy_res: tuple[int, ...] = amount((64, 256), (64,), "voxels along an edge of the grids for errors")
     memory_res: tuple[int, ...] = amount((16, 64), doc="voxels along an edge of the grids for memory")
     memory_sides: tuple[int, ...] = amount((256, 512, 1024), (64, 128, 256), "edges of the images for memory [pixels]")
     grid_side: int = amount(512, 128, "edge of the image whose rays cross large grids [pixels]")
@@ -236,45 +235,6 @@ def measure_memory(size: OpticalDepthSize) -> dict:
 # -- Errors -----------------------------------------------------------------------------------------------------------------
 
 
-def measure_accuracy(size: OpticalDepthSize) -> dict:
-    """How far is tau from the float64 twin, relative to the integral of sigma + h |grad sigma|?"""
-    answer = {}
-    for res in size.accuracy_res:
-        rng = np.random.default_rng(res)
-        fields = {"noise": rng.uniform(0, 4, (res,) * 3).astype(np.float32), "threads": threads_in_space(res).values}
-        for name, values in fields.items():
-            o, d = rays_across(rng, size.exact_rays)
-            exact = exact_tau(values, *(x.T.astype(np.float64) for x in (o, d)))
-            rays = GridRays(values, mi.Point3f(o), mi.Vector3f(d))
-            answer |= {
-                f"{res}^3 {name}": tau_errors(rays.optical_depths()(0), *exact),
-                f"{res}^3 {name}, empty blocks skipped": tau_errors(rays.optical_depths(skip_empty=True)(0), *exact),
-                f"drjit.dda.integrate, {res}^3 {name}": tau_errors(integrate_by_drjit(rays, pad_for_drjit(values)), *exact),
-            }
-    return answer
-
-
-def rays_across(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rays (3, n) float32 through random points of the box in all directions; an eighth is parallel to an axis."""
-    d = rng.normal(size=(3, n))
-    d[:, : n // 8] = np.repeat(np.eye(3), -(-n // 24), axis=1)[:, : n // 8]
-    d /= np.linalg.norm(d, axis=0)
-    return np.float32(rng.uniform(-1, 1, (3, n)) - rng.uniform(2, 8, n) * d), np.float32(d)
-
-
-def tau_errors(tau: mi.Float, exact: np.ndarray, measure: np.ndarray) -> dict[str, float]:
-    """Errors of optical depths relative to their measure; a ray with measure 0 must have an optical depth of 0."""
-    error, hit = np.abs(np.array(tau) - exact), measure > 0
-    relative = error[hit] / measure[hit]
-    return {
-        "rays": int(hit.sum()),
-        "largest_error": float(relative.max()),
-        "rms_error": float(np.sqrt(np.mean(relative**2))),
-        "error_of_99.9_percent": float(np.quantile(relative, 0.999)),
-        "error_where_exactly_empty": float(error[~hit].max(initial=0)),
-    }
-
-
 def measure_image(size: OpticalDepthSize) -> dict:
     """How much sooner than ``volpath`` does ``mi.render`` finish, with the same samples per pixel and with the same error?"""
     grid = smoke()
@@ -309,7 +269,7 @@ def pixel_means(values: np.ndarray, side: int, pixels: np.ndarray, k: int = 12) 
     means = []
     for parts in (k, k // 2):
         o, d = (np.array(x).T.astype(np.float64) for x in camera_rays(side, pixels, parts))
-        means.append(np.exp(-exact_tau(values, o, d)[0]).reshape(len(pixels), -1).mean(axis=1))
+        means.append(np.exp(-exact_tau(values, o, d)).reshape(len(pixels), -1).mean(axis=1))
     return means[0], rms(means[0] - means[1])
 
 
@@ -333,7 +293,7 @@ def measure_peers(size: OpticalDepthSize) -> dict:
     }
     timings = race(methods, size.peer_rounds, keep=True)
     index, o, d = rays.select(size.exact_rays)
-    exact = np.exp(-exact_tau(grid.values, o, d)[0])
+    exact = np.exp(-exact_tau(grid.values, o, d))
     answer: dict = {"grid": str(grid), "rays": rays.n, "exact_rays": len(index)}
     for (method, setting), timing in timings.items():
         error = np.array([T[index] - exact for T in timing.results])
@@ -356,14 +316,6 @@ def compare(question: str, answer: dict) -> list[Bar]:
     if question == "memory":
         # The state of a ray: o and d, its optical depth, and the derivative of the optical depth: 8 float32.
         return [judge("gradient step [bytes/ray]", max(f["bytes_per_ray"] for f in answer.values()), AT_MOST, 32)]
-    if question == "accuracy":
-        largest: dict[str, float] = {}
-        for name, figures in answer.items():
-            if not name.startswith("drjit"):
-                res = name.split()[0]
-                largest[res] = max(largest.get(res, 0.0), figures["largest_error"])
-        label = "error of tau over int (sigma + h |grad sigma|)"
-        return [judge(f"{label}, {res}", error, AT_MOST, 2e-6) for res, error in largest.items()]
     return []
 
 
@@ -383,7 +335,6 @@ def draw(answers: dict, path: Path) -> None:
 QUESTIONS = {
     "walk": measure_walk,
     "image": measure_image,
-    "accuracy": measure_accuracy,
     "reverse": measure_reverse,
     "memory": measure_memory,
     "grids": measure_grids,

@@ -6,14 +6,13 @@
     mivol bench tomography --only peers            slices beside astra-toolbox and scikit-image
     mivol bench tomography --only tooth            a measured slice beside them (first: mivol fetch tooth_projections)
     mivol bench tomography --only volume256        128 cone-beam views through 256^3, time and memory
-    mivol bench tomography --only parts            the gain of each part of the default solver, half a minute
 
 solvers: the geometry is TIGRE's test "configuration 1" (cone beam, 100 views on a full circle). The object is the Shepp-Logan
 head. Its projections are sums of ellipsoid chords (float64, no grid), so no operator reconstructs data of its own. A measured
 volume is projected at twice the resolution of the reconstruction. nRMSE is |x - truth| / |truth|, with the truth averaged over
 voxels. TIGRE's tests accept 0.2 after 20 iterations (0.3 for SIRT) of a head projected by the tested operator itself.
 
-peers, tooth, parts: see :mod:`mivol.bench.studies.tomography.peers` and :mod:`mivol.bench.studies.tomography.slices`.
+peers, tooth: see :mod:`mivol.bench.studies.tomography.peers` and :mod:`mivol.bench.studies.tomography.slices`.
 
 volume256: one product with A and one with its transpose, of random voxels (none is empty), for cone beams and for parallel
 beams. Beside it astra-toolbox on the processor, which has no cones there: its parallel projector (``linear``, Joseph's), layer
@@ -39,7 +38,7 @@ from mivol.bench.harness.bars import say, say_row
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.bench.harness.timing import Stopwatch, fastest
-from mivol.bench.studies.tomography.peers import error_rows, measure_parts, measure_peers, measure_tooth, part_rows, ratio_rows
+from mivol.bench.studies.tomography.peers import error_rows, measure_peers, measure_tooth, ratio_rows
 from mivol.files import read_volume
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.smoothed_tv import SmoothedTV
@@ -271,7 +270,7 @@ def table(question: str, answer: dict) -> list[str]:
     """Markdown tables of the slices."""
     if question in ("peers", "tooth"):
         return [*error_rows(answer), "", *ratio_rows(answer)]
-    return part_rows(answer) if question == "parts" else []
+    return []
 
 
 def draw(answers: dict, path: Path) -> None:
@@ -308,13 +307,5 @@ def draw_scan(answer: dict, path: Path) -> None:
         figure.suptitle(title, x=0.01, ha="left", weight="bold")
 
 
-QUESTIONS = {
-    "solvers": measure_solvers,
-    "peers": measure_peers,
-    "tooth": measure_tooth,
-    "volume256": measure_volume,
-    "parts": measure_parts,
-}
-STUDY = Study(
-    __name__, __doc__, TomographySize, QUESTIONS, draw=draw, table=table, on_request=("peers", "tooth", "volume256", "parts")
-)
+QUESTIONS = {"solvers": measure_solvers, "peers": measure_peers, "tooth": measure_tooth, "volume256": measure_volume}
+STUDY = Study(__name__, __doc__, TomographySize, QUESTIONS, draw=draw, table=table, on_request=("peers", "tooth", "volume256"))

@@ -3,9 +3,6 @@
 All programs get the same slices (:mod:`mivol.bench.studies.tomography.slices`). Times are processor times (user and system, all
 threads). mivol's times include storing matrices and all work before the first iteration, after a run that compiles. Each method
 runs three times, and medians are reported. astra-toolbox and scikit-image take part if they are installed.
-
-``parts`` measures the default solver with and without each of its parts, on the same slices and on two more kinds of data with
-other noise: pcg on voxels >= 0, nRMSE after 20 iterations.
 """
 
 from __future__ import annotations
@@ -15,9 +12,7 @@ import importlib.util
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from itertools import islice
 
-import msgspec
 import numpy as np
 
 from mivol import config
@@ -34,7 +29,7 @@ from mivol.tomography.geometry import subdivide_grid, voxel_means
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import store_matrix
 
-__all__ = ["error_rows", "measure_parts", "measure_peers", "measure_tooth", "part_rows", "ratio_rows"]
+__all__ = ["error_rows", "measure_peers", "measure_tooth", "ratio_rows"]
 
 KINDS = {"few views": (30, 0.0), "noisy": (90, 1e4), "many": (360, 1e4)}
 """Kind of data: number of views, quanta per pixel (0: no noise)."""
@@ -95,9 +90,9 @@ def run_solvers(scan: Slice) -> dict[str, Curve]:
     return curves
 
 
-def default_states(scan: Slice, solve: config.SolveSettings | None = None) -> Iterator[np.ndarray]:
-    """States of the solver that mivol chooses (``solve.name = "auto"``), or of given settings."""
-    wanted, _ = resolve_solver(solve or config.SolveSettings(), Projector(scan.beam, scan.grid))
+def default_states(scan: Slice) -> Iterator[np.ndarray]:
+    """States of the solver that mivol chooses (``solve.name = "auto"``)."""
+    wanted, _ = resolve_solver(config.SolveSettings(), Projector(scan.beam, scan.grid))
     walk = Projector(scan.beam, subdivide_grid(scan.grid, wanted.supersampling, scan.beam))
     data, all_views = Projections(scan.beam, scan.y, scan.weights, is_noise_known=scan.photons > 0), np.arange(len(scan.y))
     start, prior = start_volume(wanted, walk, data, all_views), make_prior(wanted, walk, data, all_views)
@@ -214,40 +209,6 @@ def median_times(runs: list[dict[str, Curve]]) -> dict[str, Curve]:
     }
 
 
-PART_KINDS = {
-    "few (30), no noise": (30, 0.0),
-    "few (30), 1e4 quanta": (30, 1e4),
-    "noisy (90, 1e4)": (90, 1e4),
-    "many (360, 1e4)": (360, 1e4),
-    "very noisy (90, 1e3)": (90, 1e3),
-}
-"""Kind of data: number of views, quanta per pixel (0: no noise)."""
-
-PARTS = {
-    "from nothing": {"start": "empty", "supersampling": 1, "tv": 0.0},
-    "from fbp": {"supersampling": 1, "tv": 0.0},
-    "from fbp, unknowns twice as fine": {"tv": 0.0},
-    "from fbp, tv = 1": {"supersampling": 1},
-    "from fbp, twice as fine, tv = 0.5": {"tv": 0.5},
-    "from fbp, twice as fine, tv = 1": {},
-    "from fbp, twice as fine, tv = 2": {"tv": 2.0},
-}
-"""Settings that differ from the default."""
-
-
-def measure_parts(size: object, n: int = 129) -> dict[str, dict[str, float]]:
-    """What does each part of the default solver gain, as nRMSE of slices after 20 iterations?"""
-    answer: dict[str, dict[str, float]] = {}
-    for kind, (views, photons) in PART_KINDS.items():
-        scan = make_slice(n, views, photons)
-        answer[kind] = {}
-        for part, changes in PARTS.items():
-            wanted = msgspec.structs.replace(config.SolveSettings(), **changes)
-            *_, last = islice(default_states(scan, wanted), wanted.iterations)
-            answer[kind][part] = scan.error(last)
-    return answer
-
-
 # -- Tables -----------------------------------------------------------------------------------------------------------------
 
 
@@ -282,10 +243,3 @@ def ratio_rows(answer: dict[str, dict[str, Curve]]) -> list[str]:
     pairs = [(mivol, peer) for mivol, peer in PAIRS if all(peer in curves for curves in answer.values())]
     rows = {f"{mivol} / {peer}": [cell(curves[mivol], curves[peer]) for curves in answer.values()] for mivol, peer in pairs}
     return _table("time at equal error", answer, rows)
-
-
-def part_rows(answer: dict[str, dict[str, float]]) -> list[str]:
-    """Markdown table: nRMSE by part and kind of data."""
-    parts = next(iter(answer.values()))
-    rows = {part: [f"{errors[part]:.3f}" for errors in answer.values()] for part in parts}
-    return _table("pcg, nRMSE after 20 iterations", answer, rows)
