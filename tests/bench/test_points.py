@@ -148,48 +148,27 @@ def test_clouds_and_rays_are_measured(variant_rgb: str) -> None:
 
 @pytest.mark.slow
 def test_the_fits_of_the_chair(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Photographs of a shell in the place of the chair: a fit for each seed, with the bar of its question; a pair of fits
-    differs by one option, and views are judged at every size."""
-    folder = write_captures(tmp_path, 64, alpha=True)
+    """Photographs of a shell in the place of the chair: a fit for each seed, with the bar of its question."""
+    folder = write_captures(tmp_path, 64)
     monkeypatch.setattr(points, "find_data", lambda name: folder)
-    monkeypatch.setattr(points, "MIP_SCALES", (0.25, 0.5))
     size = points.PointsSize("quick", effort=0.002, walk_side=16)
     wanted = points.CHAIR["chair"]._replace(preset="tiny", seeds=(0, 3), scale=0.5)
     answer = points.fit_chair(wanted, replace(size, effort=0.02))
     assert (answer["pixels"], answer["views"], list(answer["seeds"])) == ([32, 32], 2, ["0", "3"])
     assert all(seed["psnr"] > 5 and seed["minutes"] > 0 and seed["gaussians"] > 0 for seed in answer["seeds"].values())
     assert [bar["bar"] for bar in points.STUDY.bars("chair", answer)] == [34, 34]
-    mip = points.measure_mip(size)
-    assert list(mip["with"]) == list(mip["without"]) == ["16", "32"] and mip["fitted_at"] == 16
-    assert points.STUDY.bars("mip", mip) == []
 
 
-@pytest.mark.slow
-def test_gains_are_found_where_photographs_differ(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Every other photograph is half as bright: gains differ by a quarter at least after some steps."""
-    folder = write_captures(tmp_path, 128, alpha=False)
-    monkeypatch.setattr(points, "find_data", lambda name: folder)
-    monkeypatch.setattr(points, "HELD_OUT", 5)
-    answer = points.measure_exposure(points.PointsSize("quick", effort=0.2, walk_side=16))
-    assert answer["without"]["gains"] == [1, 1]
-    low, high = answer["with"]["gains"]
-    assert high > 1.25 * low
-    assert answer["fitted"] + answer["judged"] == 10
-    for name in ("without", "with"):
-        assert answer[name]["psnr_colour_fitted"] > answer[name]["psnr"] > 5
-
-
-def write_captures(folder: Path, side: int, alpha: bool) -> Path:
-    """Ten views of coloured Gaussians: with alpha, two of them the test split; or every other one half as bright."""
+def write_captures(folder: Path, side: int) -> Path:
+    """Ten views of coloured Gaussians with alpha, two of them the test split."""
     cloud = Gaussians(**make_start_cloud(np.random.default_rng(2).uniform(-0.5, 0.5, (80, 3)), [], 0))
     cloud.opacity_logits[:] = 3
     cloud.harmonics[:, 0] = np.sin(5 * cloud.means)
     splatter, tensors, cameras = Splatter(side, side, 0), to_tensors(cloud), {}
     for k in range(10):
         image = np.clip(np.array(splatter.forward(tensors, camera(k, side), derivatives=False)[0]), 0, 1)
-        rgb = image[..., :3] / np.maximum(image[..., 3:], 1e-3) if alpha else image[..., :3] * (1.0, 0.5)[k % 2]
-        pixels = np.concatenate([rgb, image[..., 3:]], axis=-1) if alpha else rgb
+        pixels = np.concatenate([image[..., :3] / np.maximum(image[..., 3:], 1e-3), image[..., 3:]], axis=-1)
         Image.fromarray(np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8)).save(folder / f"view_{k}.png")
         cameras[f"view_{k}.png"] = camera(k, side)
-    write_transforms(folder / "transforms.json", cameras, ["view_3.png", "view_8.png"] if alpha else [])
+    write_transforms(folder / "transforms.json", cameras, ["view_3.png", "view_8.png"])
     return folder

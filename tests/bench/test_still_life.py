@@ -1,9 +1,8 @@
-"""Photographs of the still life: view-dependent where they should be, and inside their box; their fits."""
+"""Photographs of the still life: view-dependent where they should be, and inside their box."""
 
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -12,13 +11,11 @@ import numpy as np
 import pytest
 
 from mivol.bench import photo_fits
-from mivol.bench.studies.still_life import STUDY, StillLifeSize, fit_views, load_still_life
 from mivol.files.mesh import write_mesh
 from mivol.photos import load_photos, project
 from scenes import refused
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scenes" / "still_life" / "photographs.py"
-TINY = replace(StillLifeSize.quick(), views=10, side=24, longest=8, steps=24, tiles=16, spp=16)
 
 
 @pytest.fixture(scope="module")
@@ -82,39 +79,10 @@ def test_what_is_there_is_not_rendered_again(still_life, variant_rgb, tmp_path, 
     assert (tmp_path / names[0]).read_bytes() == first
 
 
-@pytest.mark.slow
-def test_a_fit_is_judged_by_held_out_views(variant_rgb, tmp_path):
-    """A few steps see that something stands in front of white; its figure is drawn."""
-    size = replace(TINY, folder=str(tmp_path / "photographs"))
-    train, held_out, box = load_still_life(size)
-    assert (len(train), len(held_out)) == (8, 2)
-    result = fit_views(train, held_out, box, size, 2)
-    assert result["psnr"] == pytest.approx(np.mean(result["each"]))
-    white = np.mean([-10 * np.log10(np.mean((1 - photo.image) ** 2)) for photo in held_out])
-    assert result["psnr"] > white + 1
-    assert (result["degree"], result["views"], len(result["each"])) == (2, 8, 2)
-    assert result["photograph"] is held_out[1].image and result["view"].shape == held_out[1].image.shape
-    figures = {"few": {"TV": result, "no TV": result | {"psnr": result["psnr"] - 1}}}
-    (bar,) = STUDY.bars("few", figures["few"])
-    assert bar["value"] == pytest.approx(1)
-    STUDY.draw(figures, tmp_path / "a.png")
-    assert (tmp_path / "a.png").stat().st_size > 10_000
-
-
 def test_a_checkout_without_the_scene(monkeypatch, tmp_path):
     monkeypatch.setattr(photo_fits, "SCRIPT", tmp_path / "photographs.py")
     with refused("run this study in a checkout"):
-        load_still_life(TINY)
-
-
-@pytest.mark.slow
-def test_a_field_sees_directions_and_total_variation_helps(variant_rgb, tmp_path):
-    """Two degrees more are worth 1.5 dB on views between the others, and total variation something where views are few: at
-    three quarters of the bench's size and half of its steps, where they were worth 2.7 and 0.2 dB."""
-    size = StillLifeSize(folder=str(tmp_path), side=96, longest=48, steps=300, tiles=128)
-    answers = STUDY.answer(("degree", "few"), size)
-    assert len(answers["bars"]) == 2
-    assert all(bar["met"] for bar in answers["bars"]), answers["bars"]
+        photo_fits.load_photographer()
 
 
 def test_the_other_scenes_are_thin_and_glossy(still_life, variant_rgb, tmp_path):

@@ -4,7 +4,6 @@
     mivol bench points --quick         # under a minute, small clouds
     mivol bench points --only clouds
     mivol bench points --only chair    # fits: 3 minutes; chair_minutes 15, chair_large 5, chair_finest 20
-    mivol bench points --only mip,exposure    # gains by two options of a fit: 3 minutes
 
 Clouds are random: means uniform in a unit cube, scales about a quarter of the mean distance, opacities by the logistic function
 of a normal variable, harmonics of degree 2. The camera sees the whole cube. The reference walk through the tutorial's smoke
@@ -20,9 +19,7 @@ sorting. The biker (152,746 Gaussians) comes from MIVOL_DATA (default ../shared/
 same size takes its place, and the JSON records this.
 
 Photographs of the chair (NeRF-synthetic) are fitted as by ``mivol optimize``. Minutes hold for the reference machine. Training
-and judged views are averaged over squares of pixels of the files; PSNR is the mean over views, over white. ``mip`` and
-``exposure`` compare pairs of fits with the same photographs, steps, rates and seed. At each size the image has the low-pass
-filter of its own pixels, compensated if the fit was compensated.
+and judged views are averaged over squares of pixels of the files; PSNR is the mean over views, over white.
 """
 
 from __future__ import annotations
@@ -43,9 +40,7 @@ from mivol.bench.harness.study import Size, Study, amount, ask
 from mivol.bench.harness.timing import Contestant, Timing, race, ratio_of
 from mivol.bench.photo_fits import find_data, fit_photographs, prepare_fit
 from mivol.bench.reference_walk import REFERENCE_RATE, reference_walk
-from mivol.experiments.judged_views import judge_colour_fitted
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
-from mivol.photos import load_photos, rectify
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import Gaussians, read_gaussians
 from mivol.splatting import Splatter, to_tensors
@@ -91,12 +86,6 @@ CHAIR = {
     "chair_large": ChairFit("fine", 0.85, 1.0, (0,), 31.0, f"{PSNR_TEXT} at 800 pixels after five minutes?"),
     "chair_finest": ChairFit("finest", 1.0, 1.0, (0,), 32.5, f"{PSNR_TEXT} at 800 pixels after twenty minutes?"),
 }
-
-MIP_SCALES = (0.125, 0.25, 1.0)
-"""Sizes of judged views of fits at scale 0.25: 100, 200 and 800 pixels."""
-
-HELD_OUT = 8
-"""Every eighth photograph of the fox is judged; photographs have 135 x 240 pixels."""
 
 
 @dataclass(frozen=True)
@@ -333,44 +322,6 @@ def fit_chair(wanted: ChairFit, size: PointsSize) -> dict:
     return answer | {"seeds": seeds}
 
 
-def measure_mip(size: PointsSize) -> dict:
-    """How many dB do test views of the chair gain by the mip filter, at the size of the fit and at others?"""
-    folder, answer = find_data("chair"), {}
-    views_by_width = {}
-    for scale in MIP_SCALES:
-        views = load_photos(folder, split="test", scale=scale, background="white", space="srgb").views
-        views_by_width[str(views[0].camera.size[0])] = views
-    for name, mip in (("without", False), ("with", True)):
-        settings = {"preset": "minute", "effort": 0.5 * size.effort, "mip": mip}
-        prepared = prepare_fit(folder, CHAIR_PHOTOS | {"scale": 0.25}, {"gaussians": settings})
-        fit_photographs(prepared.problem, size.walk_side)
-        answer[name] = {width: prepared.score(views)["psnr"] for width, views in views_by_width.items()}
-        say_row(f"{name} mip", **answer[name])
-    fitted_at = prepared.train.views[0].camera.size[0]
-    return {"steps": prepared.steps, "fitted_at": fitted_at, "views": len(views), **answer}
-
-
-def measure_exposure(size: PointsSize) -> dict:
-    """How many dB do held-out photographs of the fox gain by a gain for each photograph?"""
-    photos, answer = {"scale": 0.125, "held_out": HELD_OUT}, {}
-    for name, exposure in (("without", False), ("with", True)):
-        settings = {"preset": "minute", "effort": 0.5 * size.effort, "exposure": exposure}
-        prepared = prepare_fit(find_data("fox"), photos, {"gaussians": settings})
-        fit_photographs(prepared.problem, size.walk_side)
-        views = [rectify(view) for view in prepared.judged.views]
-        # Nobody knows the exposure of a held-out photograph: its colours may be fitted before the comparison.
-        adjusted = [judge_colour_fitted(prepared.show(view), view, prepared.judged.space) for view in views]
-        gains = prepared.problem.exposure.table() if prepared.problem.exposure is not None else np.ones(1)
-        answer[name] = {
-            "psnr": prepared.score(views)["psnr"],
-            "psnr_colour_fitted": float(np.mean(adjusted)),
-            "gains": [float(gains.min()), float(gains.max())],
-        }
-        say_row(f"{name} gains", psnr=answer[name]["psnr"], with_fitted_colours=answer[name]["psnr_colour_fitted"])
-    counts = {"fitted": len(prepared.train.views), "judged": len(views), "steps": prepared.steps}
-    return answer | {"pixels": list(views[0].camera.size)} | counts
-
-
 # -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 
@@ -416,7 +367,5 @@ QUESTIONS: dict[str, Callable[[PointsSize], dict]] = {
     "rays": measure_rays,
     "biker": measure_biker,
     **{name: ask(wanted.text, fit_chair, wanted) for name, wanted in CHAIR.items()},
-    "mip": measure_mip,
-    "exposure": measure_exposure,
 }
-STUDY = Study(__name__, __doc__, PointsSize, QUESTIONS, compare, draw, on_request=(*CHAIR, "mip", "exposure"))
+STUDY = Study(__name__, __doc__, PointsSize, QUESTIONS, compare, draw, on_request=tuple(CHAIR))
