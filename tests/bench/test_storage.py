@@ -1,90 +1,49 @@
-"""Storage: the formulas give the bytes of real fields, in memory and on disk."""
+"""Storage: bytes of real fields, in memory and on disk, and their table."""
 
 from __future__ import annotations
 
 import json
-import math
-import zipfile
 from pathlib import Path
 
-import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mivol.bench.studies import storage
 from mivol.fields.field_files import write_field
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import find_occupied_cells
-
-RES = (5, 6, 7)
 
 
-def field(degree: int, keep: np.ndarray | None) -> SphericalGrid:
-    """Random numbers; the densities are positive, so that a cell is occupied where a node of it is kept."""
-    rng = np.random.default_rng(degree)
-    sh = rng.normal(size=(*RES, (degree + 1) ** 2, 3))
-    return SphericalGrid.from_dense(rng.random(RES) + 0.1, sh, np.eye(4), keep)
+@pytest.fixture(scope="module")
+def kinds(request: pytest.FixtureRequest) -> dict[str, dict]:
+    """The layouts, with a tenth of the nodes kept at 128^3."""
+    mi.set_variant(request.config.getoption("--variant"))
+    return {kind["name"]: kind for kind in storage.measure_storage(storage.StorageSize())["kinds"]}
 
 
-def held(*arrays: object) -> int:
-    """Bytes of Dr.Jit arrays of 32-bit numbers."""
-    return sum(4 * dr.width(a) for a in arrays)
+def test_bytes_of_a_cell_are_numbers_of_its_rows(variant_rgb: str, kinds: dict[str, dict]) -> None:
+    """Degree 2 has 27 numbers in rows of 28, and the density, 4 bytes each; halves without padding on disk; a kept node has its
+    number of 4 bytes besides. The row of vacuum is one of more than 10,000."""
+    assert kinds["dense SH 2"]["per_cell"] == (4 * 29, 2 * 28)
+    assert kinds["sparse SH 2"]["per_cell"] == pytest.approx((4 * 30, 2 * 28 + 4), rel=1e-4)
+    assert kinds["dense SH 0"]["per_cell"] == (4 * 5, 2 * 4)
+    assert [kind["sparse"] for kind in kinds.values()] == [False] * 6 + [True] * 4 + [False]
 
 
-@pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_formulas_are_the_bytes(variant_rgb, tmp_path: Path, degree: int, sparse: bool) -> None:
-    keep = np.random.default_rng(9).random(RES) < 0.2
-    created = field(degree, keep if sparse else None)
-    kept = int(keep.sum()) if sparse else math.prod(RES)
-    nodes = [created.nodes] if sparse else []
-    expected = storage.sparse_bytes(kept, degree) if sparse else storage.dense_bytes(kept, degree)
-    assert held(created.density, created.harmonics, *nodes) == created.bytes == expected
-
-    write_field(tmp_path / "field.npz", created)
-    with zipfile.ZipFile(tmp_path / "field.npz") as archive:
-        sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
-    # An .npy has a header of 128 bytes.
-    stored = sum(sizes[f"{name}.npy"] - 128 for name in ("density", "sh", *(["nodes"] if sparse else [])))
-    assert stored == storage.file_bytes(kept, degree, sparse=sparse)
+def test_a_surface_grows_with_the_square(kinds: dict[str, dict]) -> None:
+    """The lecture's 4 GiB at 1024^3; there an eighth of a tenth of the nodes is kept."""
+    assert kinds["dense rgba, 8 bits (the lecture's)"]["scenes"][1024] == (4 * 2**30, 4 * 2**30)
+    assert kinds["sparse SH 2"]["scenes"][1024][0] == pytest.approx(0.1 / 8 * 2**30 * 120, rel=1e-4)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.3, 1.0])
-def test_the_index_is_what_the_walk_reads(variant_rgb, share: float) -> None:
-    keep = np.random.default_rng(1).random(RES) <= share
-    created = field(0, keep)
-    cells = find_occupied_cells(created)
-    listed, rows, bricks = storage.count_cells(keep)
-    assert (cells.count, dr.width(cells.rows)) == (listed, rows)
-    index = created.sparse_index().bytes + cells.index.bytes + held(cells.corners, cells.rows)
-    assert index == storage.index_bytes(RES, listed, rows, bricks)
-
-
-def test_the_lecture_counts_4_gigabytes() -> None:
-    """1024^3 cells of 4 bytes; degree 2 is 27 numbers a cell in rows of 28, and the density; sparse falls as 1/N."""
-    result = {kind.name: kind for kind in storage.make_layouts(0.1)}
-    assert result["dense rgba, 8 bits (the lecture's)"].scenes[1024] == (4 * 2**30, 4 * 2**30)
-    assert result["dense SH 2"].per_cell == (4 * 29, 2 * 28)
-    assert result["sparse SH 2"].per_cell == (4 * 29 + 4, 2 * 28 + 4)
-    ratio = result["sparse SH 2"].scenes[1024][0] / result["dense SH 2"].scenes[1024][0]
-    assert ratio == pytest.approx(0.1 / 8 * 30 / 29, rel=1e-6)
-    # Hundreds of nodes of 64^3 lie at one distance: a share is met to a thousandth or two.
-    assert storage.ball_shell(0.2).mean() == pytest.approx(0.2, abs=2e-3)
-
-
-def test_the_index_grows_with_the_surface() -> None:
-    """A quarter of a byte a node, 4 a brick of the grid and 12 a brick with a listed cell, 32 a listed cell and 4 a row, of
-    which a surface has as at 64^3."""
-    shell = storage.ball_shell(0.1 * 128 / 64)
-    listed, rows, bricks = (count / shell.sum() for count in storage.count_cells(shell))
-    result = storage.make_layouts(0.1)[-1]
-    for n in (128, 1024):
-        near = 0.1 * 128 / n * n**3
-        expected = n**3 // 4 + 4 * (n // 4 + 1) ** 3 + 12 * round(bricks * near)
-        expected += 32 * round(listed * near) + 4 * round(rows * near)
-        assert result.scenes[n] == (expected, 0)
-    assert result.per_cell == (result.scenes[128][0] / 128**3, 0)
-    assert [kind.sparse for kind in storage.make_layouts(0.1)] == [False] * 6 + [True] * 4 + [False]
+def test_the_index_is_the_one_of_a_field(variant_rgb: str, kinds: dict[str, dict]) -> None:
+    """128^3 is a resolution that is measured, where a share of 0.1 is met to 1e-4. The index of a cell falls with the resolution
+    towards the part of all cells, which has two bits a node."""
+    index = kinds["beside it: the walk's index"]
+    assert index["scenes"][128][0] == pytest.approx(storage.index_bytes(storage.make_field(128, 0, 0.1)), rel=1e-3)
+    assert index["per_cell"][0] == pytest.approx(index["scenes"][128][0] / 128**3, rel=1e-6)
+    each = [memory / n**3 for n, (memory, _) in index["scenes"].items()]
+    assert each == sorted(each, reverse=True) and each[-1] > 0.25
 
 
 @pytest.mark.parametrize(
@@ -94,23 +53,21 @@ def test_bytes_in_units(count: int, text: str) -> None:
     assert storage.format_bytes(count) == text
 
 
-def test_a_table_with_the_quality_of_runs(variant_rgb, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """The PSNR of a run stands in the row of its layout; a run without held-out views and a wrong option are named."""
-    run = tmp_path / "a_run"
+def test_a_run_is_described(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Its memory is that of its field; a run without held-out views and wrong options are named."""
+    run, keep = tmp_path / "a_run", np.random.default_rng(0).random((5, 6, 7)) < 0.5
     run.mkdir()
-    write_field(run / "field.npz", field(2, np.ones(RES, bool)))
+    field = SphericalGrid.from_dense(np.ones(keep.shape), np.zeros((*keep.shape, 9, 3)), np.eye(4), keep)
+    write_field(run / "field.npz", field)
     (run / "run.json").write_text(json.dumps({"title": "A fit", "results": {"held_out_psnr": 29.54}}))
     options = ["--out", str(tmp_path / "out"), "--variant", variant_rgb]
     assert storage.STUDY.run(["--runs", str(run), *options]) == 0
     printed = capsys.readouterr()
-    rows = [line.split("|") for line in printed.err.splitlines() if line.startswith("|")]
-    assert all(len(row) == 9 for row in rows)
-    quality = {row[1].strip(): row[7].strip() for row in rows}
-    assert quality["sparse SH 2"] == "29.5 dB at 7^3 (A fit)"
-    assert quality["dense SH 2"] == "not fitted"
-    assert "A fit: 7^3, sparse SH 2, 29.54 dB; 210 nodes (1e+02 %)" in printed.err
+    assert {line.count("|") for line in printed.err.splitlines() if line.startswith("|")} == {7}
+    assert f"A fit: 7^3, sparse SH 2, 29.54 dB; {keep.sum()} nodes" in printed.err
     (fit,) = json.loads(printed.out)["storage"]["fitted"]
-    assert (fit["kept"], fit["share"], fit["file"]) == (210, 1.0, (run / "field.npz").stat().st_size)
+    assert (fit["kept"], fit["share"], fit["memory"]) == (keep.sum(), keep.mean(), field.bytes)
+    assert fit["file"] == (run / "field.npz").stat().st_size
     assert storage.describe_fit(fit | {"psnr": None, "sparse": False}).startswith("A fit: 7^3, dense SH 2, no held-out view;")
     for wrong, message in (
         (["--runs", str(tmp_path)], "has no run.json and no field.npz"),

@@ -4,13 +4,10 @@
 
 The count of the lecture is 4 bytes for each cell, 8 bits each for r, g, b and density: 4 GiB at 1024^3, with one colour for all
 directions. Beside it: four numbers of 32 bits (16 on disk), harmonics of degree 0 to 3 on a dense grid, and the same with only
-the nodes near a surface. ``--kept`` is the share of these nodes at 128^3; the share of a surface halves with each doubling of
-the resolution. Memory is float32 in the layout of mivol.fields.spherical_grid: rows padded to a multiple of 4 (degree 0 takes 4
-numbers, not 3); a sparse field also has the list of its nodes and the row of vacuum. Files are half floats before compression.
-
-The walk also reads an index: two bits for each node and half a bit for each cell of the box, whatever is kept; twelve bytes for
-each brick of 4^3 cells near a surface; and the corners of each such cell (mivol.transport.traversal.occupied_cells). The index
-is counted on the surface of a ball that keeps as many nodes.
+the nodes near the surface of a ball. ``--kept`` is the share of these nodes at 128^3; the share of a surface halves with each
+doubling of the resolution. Fields of 64^3 nodes are made and written; their bytes for each node, in memory and on disk before
+compression, give the bytes of larger scenes. The index of the walk is measured at two resolutions: a part of the index grows
+with all nodes, the rest with the kept nodes.
 
 Quality is the held-out PSNR of runs (``mivol optimize`` on photographs writes field.npz and run.json), with the real memory of
 their fields.
@@ -20,26 +17,22 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import drjit as dr
 import numpy as np
 
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.errors import MivolError
-from mivol.fields.harmonics import basis_size, row_width
-
-__all__ = [
-    "STUDY", "FittedField", "Layout", "StorageSize", "count_cells", "dense_bytes", "file_bytes", "index_bytes", "make_layouts",
-    "sparse_bytes",
-]  # fmt: skip
+from mivol.fields.field_files import read_field, write_field
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells
 
 RESOLUTIONS, DEGREES = (128, 256, 512, 1024), (0, 1, 2, 3)
-BALL_RES = 64
-"""Resolution at which the surface of a ball is counted."""
-
-UNITS = ("B", "KiB", "MiB", "GiB", "TiB")
+RES = 64
+"""Nodes along an edge of the measured fields."""
 
 
 @dataclass(frozen=True)
@@ -50,149 +43,87 @@ class StorageSize(Size):
     runs: tuple[Path, ...] = amount((), doc="run folders of fits of photographs", kind=Path)
 
 
-# -- Formulas ---------------------------------------------------------------------------------------------------------------
+# -- Measurement ------------------------------------------------------------------------------------------------------------
 
 
-def dense_bytes(nodes: int, degree: int) -> int:
-    """Memory of the values of a dense field [bytes]."""
-    return 4 * nodes * (1 + row_width(basis_size(degree)))
-
-
-def sparse_bytes(kept: int, degree: int) -> int:
-    """Memory of the values of a sparse field, its list of nodes and its row of vacuum [bytes]."""
-    return 4 * (kept + 1) * (1 + row_width(basis_size(degree))) + 4 * kept
-
-
-def file_bytes(kept: int, degree: int, *, sparse: bool) -> int:
-    """Half floats on disk before compression, with the list of nodes of a sparse field [bytes]."""
-    return 2 * kept * (1 + 3 * basis_size(degree)) + 4 * kept * sparse
-
-
-def index_bytes(res: Sequence[int], cells: int, rows: int, bricks: int) -> int:
-    """Memory of the index of the walk [bytes].
-
-    Args:
-        res: nodes along the axes.
-        cells: number of cells near a surface.
-        rows: number of different rows at their corners.
-        bricks: number of bricks of 4^3 cells with such cells.
-    """
-    nodes, all_bricks = math.prod(res), math.prod(-(-(n + 1) // 4) for n in res)
-    return 8 * -(-nodes // 32) + 4 * all_bricks + 12 * bricks + 4 * 8 * cells + 4 * rows
-
-
-def count_cells(keep: np.ndarray) -> tuple[int, int, int]:
-    """Count the cells with a kept node, the rows at their corners (kept nodes and vacuum), and their bricks.
-
-    Args:
-        keep: mask of the kept nodes (Z, Y, X).
-    """
-    padded = np.pad(keep, 1, mode="edge")
-    cells = np.zeros([n + 1 for n in keep.shape], bool)
-    for k in range(8):
-        cells |= padded[tuple(slice((k >> a) & 1, n + 1 + ((k >> a) & 1)) for a, n in enumerate(keep.shape))]
-    bricks = {tuple(cell) for cell in np.argwhere(cells) >> 2}
-    return int(cells.sum()), int(keep.sum() + (keep.any() and not keep.all())), len(bricks)
-
-
-# -- Layouts ----------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Layout:
-    """A way to store a scene.
-
-    Attributes:
-        name: label.
-        per_cell: bytes of a cell, or of a kept node, in memory and on disk.
-        scenes: bytes of a scene in memory and on disk, by resolution.
-        degree: degree of the harmonics; None: no harmonics.
-        sparse: only some nodes are kept.
-    """
-
-    name: str
-    per_cell: tuple[float, float]
-    scenes: dict[int, tuple[int, int]]
-    degree: int | None = None
-    sparse: bool = False
-
-
-def ball_shell(share: float) -> np.ndarray:
-    """Mask (BALL_RES,)^3 of the nodes nearest to the surface of a ball; ``share``: their share of all nodes."""
-    axis = (np.arange(BALL_RES) + 0.5) / BALL_RES - 0.5
+def make_field(res: int, degree: int, share: float | None = None) -> SphericalGrid:
+    """A field of density 1; ``share``: of the nodes, the nearest to the surface of a ball, are kept; None: dense."""
+    axis = (np.arange(res) + 0.5) / res - 0.5
     distance = np.abs(np.sqrt(axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2) - 0.35)
-    return distance < np.quantile(distance, min(share, 1.0))
+    keep = None if share is None else distance < np.quantile(distance, min(share, 1.0))
+    return SphericalGrid.from_dense(np.ones((res,) * 3), np.full((*(res,) * 3, (degree + 1) ** 2, 3), 0.5), np.eye(4), keep)
 
 
-def make_layouts(kept: float) -> list[Layout]:
-    """All layouts; ``kept`` is the share of kept nodes at 128^3. The last layout is the index of the walk."""
-    cells = {n: n**3 for n in RESOLUTIONS}
-    near = {n: round(kept * RESOLUTIONS[0] / n * n**3) for n in RESOLUTIONS}
-    layouts = [
-        Layout("dense rgba, 8 bits (the lecture's)", (4, 4), {n: (4 * c, 4 * c) for n, c in cells.items()}),
-        Layout("dense rgba", (16, 8), {n: (16 * c, 8 * c) for n, c in cells.items()}),
-    ]
-    for d in DEGREES:
-        scenes = {n: (dense_bytes(c, d), file_bytes(c, d, sparse=False)) for n, c in cells.items()}
-        layouts.append(Layout(f"dense SH {d}", (dense_bytes(1, d), file_bytes(1, d, sparse=False)), scenes, d))
-    for d in DEGREES:
-        scenes = {n: (sparse_bytes(c, d), file_bytes(c, d, sparse=True)) for n, c in near.items()}
-        each = sparse_bytes(1, d) - sparse_bytes(0, d), file_bytes(1, d, sparse=True)
-        layouts.append(Layout(f"sparse SH {d}", each, scenes, d, True))
-    return [*layouts, index_layout(kept)]
+def file_bytes(field: SphericalGrid) -> int:
+    """Bytes of the values of a written field, and of its list of nodes, before compression."""
+    with TemporaryDirectory() as folder:
+        write_field(Path(folder) / "field.npz", field)
+        with np.load(Path(folder) / "field.npz", allow_pickle=False) as stored:
+            return sum(stored[name].nbytes for name in ("density", "sh", "nodes") if name in stored)
 
 
-def index_layout(kept: float) -> Layout:
-    """The index, in memory only, counted at BALL_RES for a surface with the same thickness in voxels."""
-    thin = ball_shell(kept * RESOLUTIONS[0] / BALL_RES)
-    each = np.array(count_cells(thin)) / thin.sum()
-    scenes = {}
-    for n in RESOLUTIONS:
-        near = kept * RESOLUTIONS[0] / n * n**3
-        scenes[n] = (index_bytes((n, n, n), *(round(count * near) for count in each)), 0)
-    return Layout("beside it: the walk's index", (scenes[RESOLUTIONS[0]][0] / RESOLUTIONS[0] ** 3, 0), scenes)
+def index_bytes(field: SphericalGrid) -> int:
+    """Memory of the index of the walk."""
+    cells = find_occupied_cells(field)
+    return field.sparse_index().bytes + cells.index.bytes + 4 * (dr.width(cells.corners) + dr.width(cells.rows))
 
 
-@dataclass(frozen=True)
-class FittedField:
-    """A fitted field: memory [bytes], size of the file [bytes], quality [dB]."""
+def count_kept(field: SphericalGrid) -> int:
+    """Number of kept nodes; a sparse field has a row of vacuum besides."""
+    return field.rows - (field.nodes is not None)
 
-    title: str
-    longest: int
-    degree: int
-    sparse: bool
-    kept: int
-    share: float
-    memory: int
-    file: int
-    psnr: float | None
 
-    @classmethod
-    def read(cls, folder: Path) -> FittedField:
-        """Read a run folder.
-
-        Raises:
-            MivolError: the folder holds no fit.
-        """
-        missing = [name for name in ("run.json", "field.npz") if not (folder / name).is_file()]
-        if missing:
-            raise MivolError(f"{folder} has no {' and no '.join(missing)}; give folders of fits to photographs.")
-        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        with np.load(folder / "field.npz", allow_pickle=False) as stored:
-            res, sh, sparse = stored["res"].tolist(), stored["sh"].shape, "nodes" in stored
-        degree = math.isqrt(sh[1]) - 1
-        memory = sparse_bytes(sh[0], degree) if sparse else dense_bytes(sh[0], degree)
-        share, size = sh[0] / math.prod(res), (folder / "field.npz").stat().st_size
-        psnr = record["results"].get("held_out_psnr")
-        return cls(record["title"], max(res), degree, sparse, sh[0], share, memory, size, psnr)
+def describe_kind(name: str, per_cell: tuple, cells: dict[int, float], degree: int | None = None, sparse: bool = False) -> dict:
+    """A way to store a scene: bytes (memory, disk) of a cell or kept node, and of scenes by resolution."""
+    scenes = {n: tuple(round(each * count) for each in per_cell) for n, count in cells.items()}
+    return {"name": name, "per_cell": per_cell, "scenes": scenes, "degree": degree, "sparse": sparse}
 
 
 def measure_storage(size: StorageSize) -> dict:
     """What does a scene cost in memory and on disk, for each layout and resolution?"""
     if not 0 < size.kept <= 1:
         raise MivolError(f"--kept {size.kept:g} is no share: give a number above 0 and at most 1.")
-    fitted = [asdict(FittedField.read(folder)) for folder in size.runs]
-    return {"kept": size.kept, "kinds": [asdict(layout) for layout in make_layouts(size.kept)], "fitted": fitted}
+    fitted = [read_run(folder) for folder in size.runs]
+    cells = {n: n**3 for n in RESOLUTIONS}
+    near = {n: size.kept * RESOLUTIONS[0] / n * n**3 for n in RESOLUTIONS}
+    kinds = [describe_kind("dense rgba, 8 bits (the lecture's)", (4, 4), cells), describe_kind("dense rgba", (16, 8), cells)]
+    share = size.kept * RESOLUTIONS[0] / RES
+    for kind, counts, kept in (("dense", cells, None), ("sparse", near, share)):
+        for degree in DEGREES:
+            field = make_field(RES, degree, kept)
+            each = tuple(count / count_kept(field) for count in (field.bytes, file_bytes(field)))
+            kinds.append(describe_kind(f"{kind} SH {degree}", each, counts, degree, kept is not None))
+    # Shells of one thickness in voxels: index_bytes = a (all nodes) + b (kept nodes).
+    fields = [make_field(res, 0, size.kept * RESOLUTIONS[0] / res) for res in (RES, 2 * RES)]
+    a, b = np.linalg.solve([[f.node_count, count_kept(f)] for f in fields], [index_bytes(f) for f in fields])
+    totals = {n: a * cells[n] + b * near[n] for n in RESOLUTIONS}
+    index = describe_kind("beside it: the walk's index", (1.0, 0), totals)
+    kinds.append(index | {"per_cell": (totals[RESOLUTIONS[0]] / cells[RESOLUTIONS[0]], 0)})
+    return {"kept": size.kept, "kinds": kinds, "fitted": fitted}
+
+
+def read_run(folder: Path) -> dict:
+    """Memory [bytes], size of the file [bytes] and quality [dB] of the field of a run folder.
+
+    Raises:
+        MivolError: the folder holds no fit.
+    """
+    missing = [name for name in ("run.json", "field.npz") if not (folder / name).is_file()]
+    if missing:
+        raise MivolError(f"{folder} has no {' and no '.join(missing)}; give folders of fits to photographs.")
+    record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    field = read_field(folder / "field.npz")
+    return {
+        "title": record["title"],
+        "longest": max(field.res),
+        "degree": field.degree,
+        "sparse": field.nodes is not None,
+        "kept": count_kept(field),
+        "share": count_kept(field) / math.prod(field.res),
+        "memory": field.bytes,
+        "file": (folder / "field.npz").stat().st_size,
+        "psnr": record["results"].get("held_out_psnr"),
+    }
 
 
 # -- Table ------------------------------------------------------------------------------------------------------------------
@@ -200,28 +131,21 @@ def measure_storage(size: StorageSize) -> dict:
 
 def format_bytes(count: float) -> str:
     """Bytes with three digits and a unit."""
-    power = min(int(math.log(max(count, 1), 1024)), len(UNITS) - 1)
-    return f"{count / 1024**power:.3g} {UNITS[power]}"
-
-
-def quality_cell(layout: dict, fitted: list[dict]) -> str:
-    """PSNR of the fitted fields with a layout."""
-    fits = [f for f in fitted if (f["degree"], f["sparse"]) == (layout["degree"], layout["sparse"]) and f["psnr"] is not None]
-    return ", ".join(f"{f['psnr']:.1f} dB at {f['longest']}^3 ({f['title']})" for f in fits) or "not fitted"
+    units = ("B", "KiB", "MiB", "GiB", "TiB")
+    power = min(int(math.log(max(count, 1), 1024)), len(units) - 1)
+    return f"{count / 1024**power:.3g} {units[power]}"
 
 
 def table(question: str, answer: dict) -> list[str]:
-    """Markdown table of memory / disk, the kept shares, and a line for each fitted field."""
-    heads = ["memory / disk", "bytes a cell", *(f"{n}^3" for n in RESOLUTIONS), "held-out views"]
-    rows = [heads, ["---", *["---:"] * (len(heads) - 2), "---"]]
-    *layouts, index = answer["kinds"]
-    for layout in (*layouts, index):
-        per_cell = " / ".join(f"{b:.3g}" for b in layout["per_cell"] if b) + (" (a kept node)" if layout["sparse"] else "")
-        sizes = (" / ".join(format_bytes(count) for count in layout["scenes"][n] if count) for n in RESOLUTIONS)
-        rows.append([layout["name"], per_cell, *sizes, "" if layout is index else quality_cell(layout, answer["fitted"])])
-    shares = ", ".join(f"{100 * answer['kept'] * RESOLUTIONS[0] / n:.3g} %" for n in RESOLUTIONS)
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    return [*lines, "", f"Kept near a surface: {shares} of the nodes.", *map(describe_fit, answer["fitted"])]
+    """Markdown table of memory / disk, and a line for each fitted field."""
+    heads = ["memory / disk", "bytes a cell", *(f"{n}^3" for n in RESOLUTIONS)]
+    rows = [heads, ["---", *["---:"] * (len(heads) - 1)]]
+    for kind in answer["kinds"]:
+        per_cell = " / ".join(f"{b:.3g}" for b in kind["per_cell"] if b) + (" (a kept node)" if kind["sparse"] else "")
+        rows.append(
+            [kind["name"], per_cell, *(" / ".join(format_bytes(b) for b in kind["scenes"][n] if b) for n in RESOLUTIONS)]
+        )
+    return ["| " + " | ".join(row) + " |" for row in rows] + ["", *map(describe_fit, answer["fitted"])]
 
 
 def describe_fit(fit: dict) -> str:
