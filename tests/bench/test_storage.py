@@ -37,10 +37,10 @@ def test_a_surface_grows_with_the_square(kinds: dict[str, dict]) -> None:
 
 
 def test_the_index_is_the_one_of_a_field(variant_rgb: str, kinds: dict[str, dict]) -> None:
-    """128^3 is a resolution that is measured, where a share of 0.1 is met to 1e-4. The index of a cell falls with the resolution
-    towards the part of all cells, which has two bits a node."""
+    """128^3 is a resolution that is measured. There a share of 0.1 is met to 3e-3, because hundreds of 210,000 nodes lie at one
+    distance. The index of a cell falls with the resolution towards the part of all cells, which has two bits a node."""
     index = kinds["beside it: the walk's index"]
-    assert index["scenes"][128][0] == pytest.approx(storage.index_bytes(storage.make_field(128, 0, 0.1)), rel=1e-3)
+    assert index["scenes"][128][0] == pytest.approx(storage.index_bytes(storage.make_field(128, 0, 0.1)), rel=4e-3)
     assert index["per_cell"][0] == pytest.approx(index["scenes"][128][0] / 128**3, rel=1e-6)
     each = [memory / n**3 for n, (memory, _) in index["scenes"].items()]
     assert each == sorted(each, reverse=True) and each[-1] > 0.25
