@@ -16,7 +16,7 @@ In thin matter twice-scattered light grows with the depth from the first collisi
 :math:`\tau = 0.8966\,\sigma_t a`. The largest extinction times the diagonal would be a poor measure: 2 times tau for a cube,
 and 7 times tau for the smoke of Mitsuba's tutorial.
 
-Source: ``scripts/bench_depth.py`` prints the tables (Mitsuba's ``volpath``, a cube); standard errors are below 0.008.
+Source: ``mivol bench depth`` prints the tables (Mitsuba's ``volpath``, a cube); standard errors are below 0.008.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ from mivol.bench.studies import depth as study
 from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS
 from mivol.validate.moments import Moments
-
-CELL = study.Cell("smoke", "constant", "isotropic", 0.5, 1.0, 1.0, 2.0, 0.9, 0.01, 1.0)
 
 ROUNDING = 5e-4
 """Of a table of three digits."""
@@ -28,10 +25,10 @@ def test_a_cell_is_measured_again(variant_rgb: str, light: str, seed: int) -> No
     """Albedo 0.9 at tau = 1 by other lines and samples than the table's: within the noise of this measurement, the table's own
     (0.0014, a quarter of this one's with 16 times the lines) and its rounding; 16,384 lines: normal."""
     key = (light, "isotropic")
-    cell = study.measure_cell(study.table_cube(*key), 0.9, 1.0, n=1 << 14, seed=77 + seed)
+    cell = study.measure_cell(*key, 0.9, 1.0, n=1 << 14, seed=77 + seed)
     wanted = TABLES[key][ALBEDOS.index(0.9), TAUS.index(1.0)]
-    assert cell.standard_error < 0.01, "else the test sees nothing"
-    measured = Estimate(cell.error, cell.standard_error**2 * (1 + 1 / 16))
+    assert cell["standard_error"] < 0.01, "else the test sees nothing"
+    measured = Estimate(cell["error"], cell["standard_error"] ** 2 * (1 + 1 / 16))
     assert_same_mean(measured, wanted, rounding=ROUNDING, what="light left out")
 
 
@@ -47,11 +44,16 @@ def test_standard_error_of_a_ratio() -> None:
     assert_same_variance(errors, np.mean(standard_errors**2), what="ratios")
 
 
-def test_the_table_is_printed_as_the_module_holds_it() -> None:
-    cells = [
-        study.Cell("cube", *key, albedo, tau, 0.0, 0.0, TABLES[key][i, j], 0.0, 0.0)
+def cells_of_the_module() -> list[dict]:
+    """The table as measured cells, with a standard error of 0.001."""
+    return [
+        {"light": key[0], "phase": key[1], "albedo": albedo, "tau": tau, "error": TABLES[key][i, j], "standard_error": 0.001}
         for key in TABLES for i, albedo in enumerate(ALBEDOS) for j, tau in enumerate(TAUS)
     ]  # fmt: skip
+
+
+def test_the_table_is_printed_as_the_module_holds_it() -> None:
+    cells = cells_of_the_module()
     assert "\n".join(study.table_source(cells)) in Path(depth_two.__file__).read_text()
 
 
@@ -59,11 +61,7 @@ def test_the_table_is_printed_as_the_module_holds_it() -> None:
 def test_a_table_that_is_off_is_seen(tmp_path: Path) -> None:
     """Cells that are the table meet their bars and are drawn; one that is off by six of its standard errors does not."""
     size = replace(study.DepthSize.quick(), taus=TAUS)
-    cells = [
-        study.Cell("cube", *key, albedo, tau, 0.0, 0.0, TABLES[key][i, j], 0.001, 0.0)
-        for key in TABLES for i, albedo in enumerate(ALBEDOS) for j, tau in enumerate(TAUS)
-    ]  # fmt: skip
-    answer = {"lines": size.lines, "cells": [asdict(c) for c in cells]}
+    answer = {"lines": size.lines, "cells": cells_of_the_module()}
     assert all(bar["met"] for bar in study.STUDY.bars("table", answer))
     study.draw({"table": answer}, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 20_000
@@ -71,35 +69,11 @@ def test_a_table_that_is_off_is_seen(tmp_path: Path) -> None:
     assert [bar["met"] for bar in study.STUDY.bars("table", answer)] == [True, False]
 
 
-def test_what_is_measured_beside_the_table(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Smoke in two lights and a cube in one, with an eighth of the lines; a mean depth is that of the medium itself."""
-    halves = np.concatenate([np.full((4, 8, 8), 3.0), np.zeros((4, 8, 8))]).astype(np.float32)
-    monkeypatch.setattr(study, "smoke", lambda: SimpleNamespace(values=halves))
-    cells: list[tuple] = []
-    monkeypatch.setattr(study, "measure_cell", lambda subject, albedo, tau, n: cells.append((subject, albedo, tau, n)) or CELL)
-    study.measure_beside(replace(study.DepthSize.quick(), lines=1 << 10, taus=(1.0, 3.0)))
-    places = [(subject.medium, subject.light, subject.phase, tau, albedo, n) for subject, albedo, tau, n in cells]
-    pairs = [("smoke", "constant"), ("smoke", "collimated"), ("cube", "point")]
-    assert places == [(*pair, "isotropic", tau, albedo, 128) for pair in pairs for tau in (1.0, 3.0) for albedo in (0.5, 0.9)]
-    # By lines, of which there are enough for three digits.
-    assert cells[-1][0].depth == pytest.approx(study.CUBE_DEPTH, rel=2e-3)
-    assert cells[0][0].depth > 1.5 * study.CUBE_DEPTH
-
-
 @pytest.mark.slow
-def test_every_question_is_answered(variant_rgb: str) -> None:
-    """Every cell is there, with a standard error that falls with the root of the lines; those are too few here for bars."""
+def test_every_cell_is_measured(variant_rgb: str) -> None:
+    """With a standard error that falls with the root of the lines; those are too few here for bars."""
     size = replace(study.DepthSize.quick(), lines=1 << 10, taus=(1.0,))
-    answers = study.STUDY.answer(("table", "beside"), size)
+    answers = study.STUDY.answer(("table",), size)
     assert len(answers["table"]["cells"]) == len(TABLES) * len(ALBEDOS)
-    assert len(answers["beside"]["cells"]) == 3 * len(study.BESIDE_ALBEDOS)
     assert all(0 < cell["standard_error"] < 0.2 for cell in answers["table"]["cells"])
-    assert len(answers["bars"]) == 3
-
-
-def test_the_distance_from_the_table_is_judged() -> None:
-    """The largest distance, of either sign."""
-    answer = {"cells": [asdict(replace(CELL, error=0.2)), asdict(CELL)], "lines": 1}
-    (bar,) = study.STUDY.bars("beside", answer)
-    known = study.depth_two_error(0.5, 1.0, "constant", "isotropic")
-    assert (bar["value"], bar["bar"], bar["met"]) == (pytest.approx(0.9 - known), 0.2, False)
+    assert len(answers["bars"]) == 2
