@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 
@@ -20,10 +19,9 @@ from mivol.bench.studies import (
     radiance_field,
     random_scenes,
     single_scattering,
-    still_life,
     tomography,
 )
-from mivol.bench.studies.depth import TABLES, Cell
+from mivol.bench.studies.depth import TABLES
 from mivol.bench.studies.gradients import CONTESTS
 from mivol.bench.studies.gradients.density_gradient import INTEGRATORS
 
@@ -53,13 +51,19 @@ def of_gradients() -> dict:
 
 def of_depth() -> dict:
     cells = [
-        Cell("cube", light, phase, albedo, tau, 1.0, 2.0, albedo * tau / (4 + tau), 0.01 * k, 1.0)
-        for k, (light, phase) in enumerate(TABLES, 1)
+        {
+            "light": light,
+            "phase": phase,
+            "albedo": albedo,
+            "tau": tau,
+            "error": albedo * tau / (4 + tau),
+            "standard_error": 0.02,
+        }
+        for light, phase in TABLES
         for albedo in depth.ALBEDOS
         for tau in (0.1, 1.0, 10.0)
     ]
-    beside = [Cell(*place, "isotropic", 0.5, 2.0, 1.0, 2.0, 0.2 + 0.1 * k, 0.01, 1.0) for k, place in enumerate(depth.MARKERS)]
-    return {"table": {"cells": [asdict(c) for c in cells]}, "beside": {"cells": [asdict(c) for c in beside]}}
+    return {"table": {"cells": cells}}
 
 
 def of_tomography() -> dict:
@@ -71,16 +75,9 @@ def of_tomography() -> dict:
 def of_radiance_fields() -> dict:
     ratios = {kind: {"ratio_of_processor_time": k + 2.0} for k, kind in enumerate(("camera", "pixels", "any"))}
     curves = {"ours": [(1.0, 20.0), (2.0, 25.0)], "peer": [(10.0, 18.0), (20.0, 23.0)], "peer_psnr": 24.0}
-    return {
-        "step": {"fog": ratios, "shell": ratios},
-        "memory": {"peak_bytes": [2**20, 4 * 2**20], "field_bytes": 3 * 2**20, "bytes_per_ray": 100.4},
-        "locality": {name: {"processor_seconds": t, "steps": 100, "psnr": 10 * t} for name, t in (("tiles", 3), ("pixels", 5))},
-        "fit": {"fog": curves},
-    }
+    return {"step": {"fog": ratios, "shell": ratios}, "fit": {"fog": curves}}
 
 
-RAMP = np.linspace(0, 1, 3 * 4 * 3).reshape(3, 4, 3)
-FITS = {"SH 2": {"photograph": RAMP, "view": RAMP * 1.5, "psnr": 20.125, "views": 8}}
 TRIALS = {str(k): {"z": z, "z_bound": 4.0} for k, z in enumerate((-2.0, None, 5.0), 1)}
 ANSWERS = {
     single_scattering: lambda: dict.fromkeys(("smoke", "cloud"), contest(single_scattering.LIGHTS, single_scattering.PEERS)),
@@ -91,7 +88,6 @@ ANSWERS = {
     media_light: lambda: {
         name: {"variance_x_time_median_over_pixels": ratio} for name, ratio in (("fire", 0.0), ("fog", 37.2), ("room", 0.998))
     },
-    still_life: lambda: {"degree": FITS, "few": FITS},
     tomography: of_tomography,
     radiance_field: of_radiance_fields,
     random_scenes: lambda: {"trials": {"trials": TRIALS}},
