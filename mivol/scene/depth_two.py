@@ -194,7 +194,7 @@ def _traced_depths(scene: mi.Scene, view: MediumView, ray: mi.Ray3f) -> np.ndarr
     """Optical depth (n, channels) of lines in a boundary of arbitrary shape, up to the first opaque surface."""
     media = SceneMedia(scene, [Body(view, None)], has_surfaces=True, size=scene_diagonal(scene))
     nowhere = dr.zeros(mi.MediumPtr, dr.width(ray))
-    _, tau = integrate_optical_depth(media, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
+    _, tau, _ = integrate_optical_depth(media, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
     return np.stack([np.array(t, np.float64) for t in tau], axis=-1)
 
 

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import scattering_scenes as small
+from false_alarms import assert_rate, fresh
 from scattering_scenes import PLACE, assert_same_images, close_up, mivol, moments, point
 from volpath_scenes import FOG, LEAK, RED, cube, floor, grid_in, lit, same, square, turn
 
 import scenes
-from scenes import ball_of, box_of, centred, medium, rotation
+from mivol.transport.estimators.flights.free_flight import FreeFlight
+from mivol.transport.estimators.scores import IMAGE
+from mivol.transport.estimators.segment import PathSegment
+from mivol.transport.media.optical_depth import integrate_optical_depth, segment_optical_depth, vjp_optical_depth
+from mivol.transport.media.ray_intervals import RaySegment
+from mivol.transport.traversal.random_numbers import seed_pcg32
+from scenes import ball_of, box_of, centred, media_of, medium, rotation
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -96,3 +104,67 @@ def test_boundaries_that_are_moved():
     # A GPU adds the samples of a pixel in no fixed order.
     rtol = 0 if mi.variant().startswith("llvm") else 1e-6
     np.testing.assert_allclose(np.array(mi.render(scene, integrator=ours, spp=16)), first, rtol=rtol)
+
+
+# -- Homogeneous media are traced once ---------------------------------------------------------------------------------------
+
+SIGMA = {"balls": 0.5, "box": 2.0}
+CHORD = 2 * np.sqrt(0.5**2 - 0.3**2)
+"""Length in a ball of radius 0.5 of a ray that passes 0.3 from its centre."""
+
+
+def row_of_fogs(**more: dict) -> mi.Scene:
+    """Balls and a box in a row along x; the ray of these tests passes 0.3 beside their centres."""
+    fog, ref = medium("homogeneous", SIGMA["balls"], 0.8), {"type": "ref", "id": "fog"}
+    box = box_of(medium("homogeneous", SIGMA["box"], 0.8), centred(np.eye(3), (3, 0, 0)))
+    balls = {"a": ball_of(ref, (-1, 0, 0), 0.5), "b": ball_of(ref, (1, 0, 0), 0.5)}
+    return close_up({"fog": fog, **balls, "box": box, "bulb": point([0, 0, 5])[0], **more}, res=1)
+
+
+def along_the_row(n: int) -> mi.Ray3f:
+    return mi.Ray3f(dr.full(mi.Point3f, 0, n) + mi.Point3f(-3, 0.3, 0), mi.Vector3f(1, 0, 0))
+
+
+def test_optical_depths_of_homogeneous_media_follow_from_one_trace() -> None:
+    """The lengths in media give depth and gradient of a ray whose boundaries are not traced again."""
+    scene, on = row_of_fogs(), mi.Bool([True])
+    media = media_of(scene)
+    ray, nowhere = along_the_row(1), dr.zeros(mi.MediumPtr, 1)
+    end, tau, passages = integrate_optical_depth(media, ray, nowhere, on)
+    np.testing.assert_allclose(np.array(passages), [[2 * CHORD]], rtol=1e-5)
+    truth = SIGMA["balls"] * 2 * CHORD + SIGMA["box"] * 1
+    np.testing.assert_allclose(np.array(tau[0]), [truth], rtol=1e-5)
+    segment, media.scene = RaySegment(ray, nowhere, end.t, passages=passages), None
+    np.testing.assert_allclose(np.array(segment_optical_depth(media, segment, on)[0]), [truth], rtol=1e-5)
+    media.start_gradients()
+    vjp_optical_depth(media, segment, dr.full(mi.Spectrum, 1, 1), on)
+    box, balls = (float(np.array(body.gradients[0]).sum()) for body in media.bodies)
+    np.testing.assert_allclose([balls, box], [3 * 2 * CHORD, 3 * 1], rtol=1e-5)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("wall", [None, 0.0, 2.2, 4.0])
+def test_flights_end_at_the_first_collision_or_surface(wall: float | None) -> None:
+    """Flights through balls and box, with a wall in front of some, among them or behind them: distances on paper."""
+    place = turn().translate([wall or 0, 0, 0]).rotate([0, 1, 0], 90).scale(2)
+    more = {} if wall is None else {"wall": {"type": "rectangle", "to_world": place, "bsdf": RED}}
+    media, n = media_of(row_of_fogs(**more)), 1 << 12
+    ray, on, seed = along_the_row(n), dr.full(mi.Bool, True, n), mi.Float((0.2 + 0.618 * fresh(0)) % 1)
+    # The flight in the box is given: half of the light is left after log(2) / 2.
+    samples, nowhere = (dr.full(mi.Float, 0.5, n), seed_pcg32(seed, n)), dr.zeros(mi.MediumPtr, n)
+    segment = PathSegment(ray, nowhere, dr.full(mi.Spectrum, 1, n), on, samples, dr.zeros(mi.UInt32, n))
+    found = FreeFlight(media).estimate(segment, IMAGE, on)
+    hit, t = np.array(found.collision.on), np.array(found.collision.t)
+    in_balls = [hit & (np.abs(t - middle) < CHORD / 2 + 1e-5) for middle in (2, 4)]
+    in_box = hit & (np.abs(t - (5.5 + np.log(2) / SIGMA["box"])) < 1e-5)
+    assert np.all(hit == in_balls[0] | in_balls[1] | in_box)
+    survives = np.exp(-SIGMA["balls"] * CHORD)
+    assert_rate(int(in_balls[0].sum()), n, 1 - survives)
+    assert_rate(int(in_balls[1].sum()), n, 0 if wall == 0 else survives * (1 - survives))
+    assert_rate(int(in_box.sum()), n, 0 if wall in (0, 2.2) else survives**2)
+    passed = found.transmittance.shared.passed
+    chords = sum(np.clip(np.array(passed.length) - (middle - CHORD / 2), 0, CHORD) for middle in (2, 4))
+    np.testing.assert_allclose(np.array(passed.passages[0]), chords, atol=1e-5)
+    if wall in (0, 2.2):
+        assert np.all(np.array(found.end.si.is_valid())[~hit])
+        np.testing.assert_allclose(np.array(found.end.t)[~hit], 3 + wall, rtol=1e-5)

@@ -54,7 +54,7 @@ def through(sigma_t: np.ndarray | float, rng: bool) -> tuple[np.ndarray, np.ndar
     media = media_of(close_up({"fog": box_of(medium("mivol_medium", sigma, 0.5), PLACE)}, res=1))
     ray = mi.Ray3f(dr.full(mi.Point3f, 0, N) + mi.Point3f(-2, 0.1, 0.2), mi.Vector3f(1, 0, 0))
     state = seed_pcg32(mi.Float((0.3 + 0.618 * fresh(0)) % 1), N) if rng else None
-    _, tau, T = find_transmittance(media, ray, dr.zeros(mi.MediumPtr, N), mi.Bool(True), state)
+    _, tau, _, T = find_transmittance(media, ray, dr.zeros(mi.MediumPtr, N), mi.Bool(True), state)
     return np.array(T, dtype=np.float64).T, np.array(tau).T
 
 

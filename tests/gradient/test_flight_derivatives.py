@@ -380,7 +380,8 @@ def test_mean_is_the_sum() -> None:
     rng, kept = seed_pcg32(mi.Float((0.4 + fresh(0) * 0.6180339887498949) % 1), n), ShadowReservoir.empty(media, ray)
     for light, length in zip(LIGHTS, LENGTHS, strict=True):
         rng, (chance,) = draw_pcg32(rng, 1)
-        segment = RaySegment(ray, dr.zeros(mi.MediumPtr, n), dr.full(mi.Float, length, n), True)
+        nowhere = dr.zeros(mi.MediumPtr, n)
+        segment = RaySegment(ray, nowhere, dr.full(mi.Float, length, n), True, passages=[])
         term = DirectLight(media, segment, dr.full(mi.Spectrum, light, n), mi.Bool(light > 0))
         kept = kept.offer(term, chance)
     term = ShadowTerm(media, kept)

@@ -252,8 +252,8 @@ class Absorption:
             self.drawn_by.draw(sampler, active, strata)
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        end, tau = integrate_optical_depth(self.media, segment.ray, segment.medium, active)
-        passed = RaySegment(segment.ray, segment.medium, end.t)
+        end, tau, passages = integrate_optical_depth(self.media, segment.ray, segment.medium, active)
+        passed = RaySegment(segment.ray, segment.medium, end.t, passages=passages)
         return SegmentEstimate(end, transmittance(tau), None, Transmittance(self.media, passed, active))
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:

@@ -147,11 +147,11 @@ def _find_first_segment(media: SceneMedia, ray: Ray, active: mi.Bool) -> _FirstS
     """Follow rays to the first opaque surface or out of the scene."""
     ray = clip_camera_ray(ray)
     medium = media.medium_at(ray)
-    end, tau = integrate_optical_depth(media, ray, medium, mi.Bool(active))
+    end, tau, passages = integrate_optical_depth(media, ray, medium, mi.Bool(active))
     stopped = end.si.is_valid()
     T = [dr.select(stopped, 0, dr.exp(-t)) for t in tau]
     alpha = [dr.select(stopped, 1, one_minus_exp(t)) for t in tau]
-    return _FirstSegment(RaySegment(ray, medium, end.t), end, tau, T, alpha)
+    return _FirstSegment(RaySegment(ray, medium, end.t, passages=passages), end, tau, T, alpha)
 
 
 def _integrate_depth(media: SceneMedia, first: _FirstSegment, active: mi.Bool) -> tuple[mi.Float, mi.Float]:

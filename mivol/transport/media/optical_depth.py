@@ -8,12 +8,15 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mivol.numerics import minimum
 from mivol.transport.media.channels import colours_to_channels, to_spectrum
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
     RaySegment,
     SegmentEnd,
+    add_passage,
     revisit_media,
+    start_passages,
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
@@ -38,7 +41,7 @@ def integrate_optical_depth(
     active: mi.Bool,
     enough: float | mi.Float | None = None,
     passes_null: bool = False,
-) -> tuple[SegmentEnd, list[mi.Float]]:
+) -> tuple[SegmentEnd, list[mi.Float], list[mi.Float] | None]:
     """Integrate the optical depth [1] of each channel to the first opaque surface or to ``ray.maxt``.
 
     Args:
@@ -46,19 +49,25 @@ def integrate_optical_depth(
         ray: world space, unit direction.
         medium: the medium around the origin of the ray.
         active: lanes to follow.
-        enough: the walk of a grid may stop where the optical depth of the grid exceeds this number in every channel; None to
-            walk to the end.
+        enough: the ray may stop where its optical depth exceeds this number in every channel; None to follow it to the end.
         passes_null: as of :func:`.ray_intervals.visit_media`.
 
     Returns:
-        The end of the ray, and the optical depth to there.
+        The end of the ray, the optical depth to there, and the ``passages`` of a ``RaySegment``.
     """
 
-    def add(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
+    def add(state: tuple, interval: MediumInterval) -> tuple:
+        tau, passages = state
         own = interval.body.optical_depth(interval, media.channels, None, enough)
-        return [t + d for t, d in zip(tau, own, strict=True)]
+        return [t + d for t, d in zip(tau, own, strict=True)], add_passage(media, passages, interval)
 
-    return visit_media(media, ray, medium, add, [mi.Float(0) for _ in range(media.channels)], active, passes_null)
+    def reach(state: tuple) -> mi.Float64:
+        return mi.Float64(dr.select(minimum(state[0]) > enough, 0, dr.inf))
+
+    width = dr.width(ray)
+    start = [dr.zeros(mi.Float, width) for _ in range(media.channels)], start_passages(media, width)
+    end, (tau, passages) = visit_media(media, ray, medium, add, start, active, passes_null, None if enough is None else reach)
+    return end, tau, passages
 
 
 def segment_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
@@ -68,7 +77,7 @@ def segment_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Boo
         own = interval.body.optical_depth(interval, media.channels)
         return [t + d for t, d in zip(tau, own, strict=True)]
 
-    return revisit_media(media, segment, add, [mi.Float(0) for _ in range(media.channels)], active)
+    return revisit_media(media, segment, add, [mi.Float(0) for _ in range(media.channels)], active, anywhere=True)
 
 
 def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
@@ -99,7 +108,9 @@ def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], act
         interval.body.vjp_optical_depth(interval, weight)
         return _pass(points, bounded, interval)
 
-    points = revisit_media(media, segment, visit, start_reservoirs(len(bounded), segment.u, dr.width(segment.ray)), active)
+    points = revisit_media(
+        media, segment, visit, start_reservoirs(len(bounded), segment.u, dr.width(segment.ray)), active, True
+    )
     for (body, part), point in zip(bounded, points, strict=True):
         # After the walk: Dr.Jit loses what is differentiated in a loop with respect to an array that already has a gradient.
         on, each = active & (point.total > 0), [w * point.total for w in weight]
@@ -122,7 +133,7 @@ def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi
         return [t + d for t, d in zip(tau, own, strict=True)], _pass(points, bounded, interval)
 
     start = (zero, start_reservoirs(len(bounded), segment.u, dr.width(segment.ray)))
-    tau, points = revisit_media(media, segment, visit, start, active)
+    tau, points = revisit_media(media, segment, visit, start, active, anywhere=True)
     for (body, part), point in zip(bounded, points, strict=True):
         on = active & (point.total > 0)
         rows = body.jvp_part_at(part, segment.ray, point.t, media.channels, on)

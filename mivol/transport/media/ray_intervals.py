@@ -32,10 +32,12 @@ __all__ = [
     "MediumInterval",
     "RaySegment",
     "SegmentEnd",
+    "add_passage",
     "find_boxed_intervals",
     "find_end",
     "is_transparent",
     "revisit_media",
+    "start_passages",
     "trace_boundaries",
     "visit_media",
 ]
@@ -72,6 +74,8 @@ class RaySegment:
         length: length of the segment [length].
         passes_null: whether the ray passes surfaces that transmit part of the light undeviated.
         u: number in [0, 1) that draws the points for derivatives of bounded media; None if all optical depths are exact.
+        passages: length of the segment in each of ``media.traced`` [length], if all media are homogeneous. Optical depths then
+            follow without tracing the boundaries again. None if these lengths are not known.
     """
 
     ray: Ray
@@ -79,11 +83,29 @@ class RaySegment:
     length: mi.Float | mi.Float64
     passes_null: bool = False
     u: mi.Float | None = None
+    passages: list[mi.Float] | None = None
 
     @classmethod
-    def upto(cls, ray: Ray, medium: mi.MediumPtr, t: mi.Float64) -> RaySegment:
+    def upto(cls, ray: Ray, medium: mi.MediumPtr, t: mi.Float64, passages: list[mi.Float] | None = None) -> RaySegment:
         """The first part of a ray, of length ``t``."""
-        return cls(replace(FineRay.from_ray(ray), maxt=mi.Float(t)), medium, t)
+        return cls(replace(FineRay.from_ray(ray), maxt=mi.Float(t)), medium, t, passages=passages)
+
+
+def start_passages(media: SceneMedia, width: int) -> list[mi.Float] | None:
+    """Lengths of 0 in each of ``media.traced``; None unless all media are homogeneous."""
+    return [dr.zeros(mi.Float, width) for _ in media.traced] if media.is_homogeneous else None
+
+
+def add_passage(
+    media: SceneMedia, passages: list[mi.Float] | None, interval: MediumInterval, end: mi.Float64 | float = dr.inf
+) -> list[mi.Float] | None:
+    """Add an interval, up to the distance ``end`` on its ray, to the lengths in its medium."""
+    if passages is None or interval.body.box is not None:
+        return passages
+    stop = dr.minimum(mi.Float64(interval.t1), end)
+    length = dr.select(interval.active & (stop > interval.t0), mi.Float(stop - interval.t0), 0)
+    pairs = zip(media.traced, passages, strict=True)
+    return [total + length if body is interval.body else total for body, total in pairs]
 
 
 @dataclass
@@ -120,11 +142,13 @@ def visit_media(
     state: Any,
     active: mi.Bool,
     passes_null: bool = False,
+    reach: Callable[[Any], mi.Float64] | None = None,
 ) -> tuple[SegmentEnd, Any]:
     """Follow a ray to the first opaque surface or to ``ray.maxt``, and visit each medium on the way.
 
-    Media behind traced boundaries come first, in the order of the ray. Media in boxes follow in no order, so ``visit`` must
-    compute a result that does not depend on the order, such as a sum.
+    Media behind traced boundaries are visited in the order of the ray. Media in boxes are visited in no order: before the
+    tracing, if all media are homogeneous, since ``reach`` then shortens the traced ray at no cost; and after it, if there are
+    grids to walk. So ``visit`` must compute a result that does not depend on the order, such as a sum.
 
     Args:
         media: media and surfaces of the scene.
@@ -135,21 +159,45 @@ def visit_media(
         active: lanes to follow.
         passes_null: whether the ray continues through surfaces that transmit part of the light undeviated (a shadow ray);
             ``null_transmission`` of the result is the transmitted fraction.
+        reach: ``reach(state)``, the distance [length] beyond which the ray is of no use (behind a collision, in the dark). If
+            the end lies behind it, surfaces behind it may be missing, and an end at a boundary of media is possible. None to
+            follow all rays to their ends.
 
     Returns:
         The end of the ray, and the last state.
     """
-    end, state = trace_boundaries(media, ray, medium, visit, state, active, passes_null)
+    boxes_first = reach is not None and media.is_homogeneous
+    if boxes_first:
+        for interval in find_boxed_intervals(media, ray, ray.maxt, active):
+            state = visit(state, interval)
+    end, state = trace_boundaries(media, ray, medium, visit, state, active, passes_null, reach)
+    if boxes_first:
+        return end, state
     for interval in find_boxed_intervals(media, ray, end.t, active):
         state = visit(state, interval)
     return end, state
 
 
 def revisit_media(
-    media: SceneMedia, segment: RaySegment, visit: Callable[[Any, MediumInterval], Any], state: Any, active: mi.Bool
+    media: SceneMedia,
+    segment: RaySegment,
+    visit: Callable[[Any, MediumInterval], Any],
+    state: Any,
+    active: mi.Bool,
+    anywhere: bool = False,
 ) -> Any:
-    """Visit the media of a segment of known length; only boundaries that are no boxes are traced again."""
-    if media.traced:
+    """Visit the media of a segment of known length; only boundaries that are no boxes are traced again.
+
+    Args:
+        media, visit, state, active: as in :func:`visit_media`.
+        segment: the segment.
+        anywhere: whether ``visit`` depends only on the length of an interval in a homogeneous medium, not on its place. With
+            known ``passages``, no boundary is traced then.
+    """
+    if anywhere and segment.passages is not None:
+        for body, length in zip(media.traced, segment.passages, strict=True):
+            state = visit(state, MediumInterval(segment.ray, mi.Float(0), length, active & (length > 0), body))
+    elif media.traced:
         return visit_media(media, segment.ray, segment.medium, visit, state, active, segment.passes_null)[1]
     for interval in find_boxed_intervals(media, segment.ray, segment.length, active):
         state = visit(state, interval)
@@ -197,6 +245,7 @@ def trace_boundaries(
     state: Any,
     active: mi.Bool,
     passes_null: bool,
+    reach: Callable[[Any], mi.Float64] | None = None,
 ) -> tuple[SegmentEnd, Any]:
     """Trace through transparent surfaces to the first opaque surface, and visit the media behind traced boundaries.
 
@@ -214,6 +263,11 @@ def trace_boundaries(
     medium = mi.MediumPtr(medium)  #                 what surrounds its origin
     t = mi.Float(0)  #                               distance of that origin
     going = mi.Bool(active)
+    maxt = mi.Float(ray.maxt)
+    if dr.hint(reach is not None, mode="scalar"):
+        maxt = dr.minimum(maxt, mi.Float(reach(state)))
+        going &= maxt > 0
+    onward.maxt = maxt
     null_transmission = dr.full(mi.Spectrum, 1, dr.width(ray)) if passes_null else 1.0
 
     while dr.hint(going, label="to the next opaque surface"):
@@ -240,8 +294,10 @@ def trace_boundaries(
         si = dr.select(going, hit, si)
         t = dr.select(going, t_hit, t)
         onward = spawn_ray(hit, ray.d, media.size)
-        onward.maxt = ray.maxt - t_hit
+        onward.maxt = maxt - t_hit
         going &= clear
+        if dr.hint(reach is not None, mode="scalar"):
+            going &= mi.Float64(t_hit) < reach(state)
     return SegmentEnd(si, t, medium, null_transmission), state
 
 

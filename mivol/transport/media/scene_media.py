@@ -72,6 +72,11 @@ class SceneMedia:
         return medium
 
     @property
+    def is_homogeneous(self) -> bool:
+        """Whether every medium is the same everywhere in its boundary, so only the length of a ray inside counts."""
+        return all(part.is_constant for body in self.bodies for part in body.view.parts)
+
+    @property
     def is_single(self) -> bool:
         """Whether a single walk of cells passes all extinction in order: one medium, whose grids share their cells."""
         return len(self.bodies) == 1 and len(self.bodies[0].flight_parts) == len(self.bodies[0].view.parts)

@@ -39,7 +39,7 @@ from mivol.transport.estimators.segment import Collision, FlightPoint, PathSegme
 from mivol.transport.media.body import Body, emission_slope, eval_albedo, eval_emission
 from mivol.transport.media.channels import colours_to_channels, take_tangent, to_spectrum
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
-from mivol.transport.media.ray_intervals import RaySegment
+from mivol.transport.media.ray_intervals import RaySegment, start_passages
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import FineRay, Ray
 
@@ -395,7 +395,10 @@ class ShadowReservoir:
         zero = dr.zeros(mi.Float, n)
         u = zero if media.is_bounded else None
         return cls(
-            RaySegment(FineRay.from_ray(ray), dr.zeros(mi.MediumPtr, n), zero, True, u), dr.zeros(mi.Spectrum, n), zero, zero
+            RaySegment(FineRay.from_ray(ray), dr.zeros(mi.MediumPtr, n), zero, True, u, start_passages(media, n)),
+            dr.zeros(mi.Spectrum, n),
+            zero,
+            zero,
         )
 
     def offer(self, light: DirectLight, chance: mi.Float) -> ShadowReservoir:
@@ -414,6 +417,7 @@ class ShadowReservoir:
             dr.select(keep, mi.Float(new.length), old.length),
             True,
             None if old.u is None else dr.select(keep, new.u, old.u),
+            None if old.passages is None else dr.select(keep, new.passages, old.passages),
         )
         return ShadowReservoir(kept, dr.select(keep, light.value, self.value), dr.select(keep, weight, self.weight), total)
 

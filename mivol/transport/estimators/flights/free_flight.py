@@ -43,7 +43,14 @@ from mivol.transport.media.channels import to_components, to_spectrum
 from mivol.transport.media.extinction import Extinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.optical_depth import segment_optical_depth
-from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, SegmentEnd, visit_media
+from mivol.transport.media.ray_intervals import (
+    MediumInterval,
+    RaySegment,
+    SegmentEnd,
+    add_passage,
+    start_passages,
+    visit_media,
+)
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.uniform_points import draw_uniform_point
 from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_pcg32, draw_state
@@ -60,11 +67,13 @@ class _Flight:
         t: distance of the collision on the ray [length]; infinite without a collision.
         body: index of its medium.
         rng: state of the random number generator.
+        passages: length up to the collision in each of ``media.traced``, as in ``RaySegment``.
     """
 
     t: mi.Float64
     body: mi.UInt32
     rng: mi.UInt32
+    passages: list[mi.Float] | None
 
 
 class FreeFlight:
@@ -112,7 +121,7 @@ class FreeFlight:
         end, flight = _find_first_collision(media, ray, segment.medium, u, channel, rng, active)
         collides = active & (flight.t < mi.Float64(end.t))
         t = dr.select(collides, flight.t, mi.Float64(end.t))
-        passed = RaySegment.upto(ray, segment.medium, t)
+        passed = RaySegment.upto(ray, segment.medium, t, flight.passages)
         if media.is_bounded:
             # One point of the flight estimates the derivatives of bounded media.
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
@@ -231,11 +240,11 @@ def _find_first_collision(
                 hit = regular_tracking(part, scale, ahead, goal, channel)
             nearer = ahead.active & (hit < t)
             t, index = dr.select(nearer, hit, t), dr.select(nearer, mi.UInt32(number), index)
-        return _Flight(t, index, rng)
+        return _Flight(t, index, rng, add_passage(media, flight.passages, interval, t))
 
     width = dr.width(ray)
-    start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), rng)
-    return visit_media(media, ray, medium, visit, start, active)
+    start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), rng, start_passages(media, width))
+    return visit_media(media, ray, medium, visit, start, active, reach=lambda flight: flight.t)
 
 
 def _draws_many_numbers(part: Extinction) -> bool:

@@ -257,7 +257,7 @@ class DirectLighting:
         wo, weight, pdf = sample_phase(self.media, mei, samples.component, samples.direction, active)
         on = active & (pdf > 0)
         ray = FineRay.from_point(vertex.p, wo, mei)
-        end, _, light = find_transmittance(self.media, ray, mei.medium, on, rng)
+        end, _, passages, light = find_transmittance(self.media, ray, mei.medium, on, rng)
         si = end.si
         emitter = si.emitter(self.media.scene, on)
         on &= (emitter != None) & ~is_among(emitters.transmissive, emitter)
@@ -271,4 +271,4 @@ class DirectLighting:
             if attached:
                 weight = vertex.eval(wo, on) / pdf
             value = dr.select(on, factor * weight * emitter.eval(si, on), 0)
-        return DirectSample(RaySegment(ray, mei.medium, end.t, True), value, on)
+        return DirectSample(RaySegment(ray, mei.medium, end.t, True, passages=passages), value, on)

@@ -42,7 +42,7 @@ scattering events in cloud and smoke: 1.02 to 1.2 times less than without roulet
 
 def find_transmittance(
     media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None = None
-) -> tuple[SegmentEnd, list[mi.Float] | None, mi.Spectrum]:
+) -> tuple[SegmentEnd, list[mi.Float] | None, list[mi.Float] | None, mi.Spectrum]:
     """Follow a ray to the first opaque surface, and find its transmittance.
 
     Args:
@@ -54,21 +54,22 @@ def find_transmittance(
             the scene, by roulette otherwise; None means the exact transmittance.
 
     Returns:
-        The end of the ray; its optical depth for each channel [1], or None if tracking has estimated the transmittance; and the
-        transmittance of media and surfaces [1]. If the transmittance is 0, the optical depth may be too small, but not below
-        ``ROULETTE_TAU``.
+        The end of the ray; its optical depth for each channel [1], or None if tracking has estimated the transmittance; the
+        ``passages`` of a ``RaySegment``; and the transmittance of media and surfaces [1]. If the transmittance is 0, the
+        optical depth may be too small, but not below ``ROULETTE_TAU``.
     """
     if rng is not None and media.tracks_shadows:
         end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
-        return end, None, T * end.null_transmission
+        return end, None, None, T * end.null_transmission
     enough = NEGLIGIBLE_TAU if rng is None else ROULETTE_TAU - dr.log(draw_pcg32(rng, 1)[1][0])
-    end, tau = integrate_optical_depth(media, ray, medium, active, enough, passes_null=True)
+    end, tau, passages = integrate_optical_depth(media, ray, medium, active, enough, passes_null=True)
     if rng is None:
-        return end, tau, transmittance(tau) * end.null_transmission
+        return end, tau, passages, transmittance(tau) * end.null_transmission
     # Every channel is divided by the survival probability of the clearest channel, so weights stay below 1.
     clearest = minimum(tau)
     thicker = [t - dr.maximum(clearest - ROULETTE_TAU, 0) for t in tau]
-    return end, tau, dr.select(clearest <= enough, transmittance(thicker), 0) * end.null_transmission
+    light = dr.select(clearest <= enough, transmittance(thicker), 0)
+    return end, tau, passages, light * end.null_transmission
 
 
 def estimate_transmittance(
@@ -136,6 +137,6 @@ def trace_shadow_ray(
     away = direct.p - mi.Point3f(start)
     length = dr.norm(away)
     ray = FineRay.from_point(start, dr.normalize(away), direct, length)
-    stop, tau, light = find_transmittance(media, ray, medium, active, rng)
+    stop, tau, passages, light = find_transmittance(media, ray, medium, active, rng)
     clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
-    return RaySegment(ray, medium, length, True, u), clear, tau, light
+    return RaySegment(ray, medium, length, True, u, passages), clear, tau, light
