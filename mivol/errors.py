@@ -42,7 +42,11 @@ def reveal_refusals(render: Callable[..., Any]) -> Callable[..., Any]:
                 raise
         # Raised outside of the except block, the refusal does not get the RuntimeError as its context. Otherwise each would be
         # the cause of the other, and a logger following causes would never end.
-        raise refusal
+        try:
+            raise refusal
+        finally:
+            # The traceback holds this frame; a frame that holds the refusal would close a cycle around the scene.
+            del refusal
 
     revealing.reveals_refusals = True
     return revealing

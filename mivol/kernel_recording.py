@@ -9,14 +9,15 @@ aborts: callables of several targets and of one target have different keys (``Gl
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["copy_aligned", "ensure_aligned", "is_recording", "without_garbage_collection"]
+__all__ = ["copy_aligned", "ensure_aligned", "is_recording", "record_kernels", "without_garbage_collection"]
 
 ALIGNMENT = 64
 """Alignment that Dr.Jit assumes for its arrays [byte]."""
@@ -25,6 +26,17 @@ ALIGNMENT = 64
 def is_recording() -> bool:
     """Whether ``dr.freeze`` records the running function. The host must not read values of arrays then."""
     return bool(dr.flag(dr.JitFlag.FreezingScope))
+
+
+def record_kernels(function: Callable, *settings: Any) -> Callable:
+    """``dr.freeze`` of a function with its first arguments given.
+
+    Args:
+        function: function of a module. ``dr.freeze`` keeps it in a reference cycle: a method would keep its object, with all
+            recorded kernels, until Python's collector runs.
+        settings: first arguments, without arrays.
+    """
+    return dr.freeze(lambda *given: function(*settings, *given))
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from mivol.points.cloud import read_points
 from mivol.points.conversions import points_to_gaussians
 from mivol.points.gaussian_files import GAUSSIAN_WRITERS, is_gaussian_file, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
+from mivol.scene_graph import traverse
 from mivol.splatting.splatter import Splatter, to_tensors
 from mivol.validate.metrics import psnr
 
@@ -274,7 +275,7 @@ def _splat_depths(cloud: Gaussians, cameras: Sequence[Camera]) -> Iterator[Depth
 
 def _shape_of(mesh: Mesh) -> mi.Mesh:
     shape = mi.Mesh("mesh", len(mesh.points), len(mesh.faces))
-    params = mi.traverse(shape)
+    params = traverse(shape)
     params["vertex_positions"] = mi.Float(np.ascontiguousarray(mesh.points, np.float32).ravel())
     params["faces"] = mi.UInt32(np.ascontiguousarray(mesh.faces, np.uint32).ravel())
     params.update()

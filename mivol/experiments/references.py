@@ -24,6 +24,7 @@ from mivol.optim.parameters import find, like
 from mivol.optim.scenes.views import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.sensors import check_film
+from mivol.scene_graph import traverse
 from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult, read_reference
 
@@ -207,7 +208,7 @@ def make_truth(settings: SceneExperiment, base: Path, scene: mi.Scene) -> np.nda
     """
     if settings.truth is None:
         return None
-    find(settings.truth.key, mi.traverse(scene))
+    find(settings.truth.key, traverse(scene))
     if settings.truth.file:
         return read_volume(resolve_path(base, settings.truth.file)).values
     truth_settings = settings.truth
@@ -232,7 +233,7 @@ def check_truth(settings: SceneExperiment) -> None:
 @contextmanager
 def hold_values(scene: mi.Scene, key: str, values: np.ndarray) -> Iterator[None]:
     """Replace the values of a parameter in the scene within a block."""
-    params = mi.traverse(scene)
+    params = traverse(scene)
     before = type(params[key])(params[key])
     set_parameter(params, key, values)
     try:

@@ -46,6 +46,7 @@ from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
 from mivol.scene.previews import find_sufficient_depth
 from mivol.scene.survey import survey_scene
+from mivol.scene_graph import traverse
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.validate.metrics import nrmse, psnr
 
@@ -183,7 +184,7 @@ class SceneFit(FitKind):
                 check_given_start(parameter.key, np.asarray(problem.values()[parameter.key]))
         settings.optimizer.begin(problem)
         problem.rehearse()
-        params = mi.traverse(scene)
+        params = traverse(scene)
         for start in self.starts:
             set_parameter(params, start.parameter.name, start.value)
         if self.truth is not None:
@@ -251,7 +252,7 @@ def make_problem(
     settings: SceneExperiment, scene: mi.Scene, integrator: mi.Integrator, starts: Sequence[Start], references: References
 ) -> SceneProblem:
     """Make the problem of an experiment, and put the starts into the scene."""
-    params = mi.traverse(scene)
+    params = traverse(scene)
     for start in starts:
         set_parameter(params, start.parameter.name, start.value)
     options = {"spp": settings.fit.spp, "samples_per_pass": settings.fit.samples_per_pass, "seed": settings.seed}

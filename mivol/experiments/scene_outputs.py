@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import mitsuba as mi
 import numpy as np
 
 from mivol.config import SceneExperiment, Sought
@@ -24,6 +23,7 @@ from mivol.optim.loop import Fit
 from mivol.optim.parameters import GRID
 from mivol.optim.scenes.views import FINAL, View, derive_seed
 from mivol.report.record import Image, Volume
+from mivol.scene_graph import traverse
 from mivol.validate.moments import BATCHES, Moments
 
 
@@ -134,7 +134,7 @@ class SceneOutputs:
         value = np.asarray(self.fit.values()[key])
         if value.ndim != 3 or value.shape[2] not in (1, 3):
             return []
-        is_sky = mi.traverse(self.fit.problem.scene).properties[key][2].class_name() == "EnvironmentMapEmitter"
+        is_sky = traverse(self.fit.problem.scene).properties[key][2].class_name() == "EnvironmentMapEmitter"
         image = value[:, 1:-1] if is_sky else value
         self.run.make("images")
         stem = f"images/{key.replace('.', '_')}"

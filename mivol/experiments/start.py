@@ -22,6 +22,7 @@ from mivol.files.fetch import resolve_path as place_in
 from mivol.machine import check_memory
 from mivol.optim.events import Upsample, check_for_grids
 from mivol.optim.parameters import GRID, Parameter, as_tensor, find
+from mivol.scene_graph import traverse
 from mivol.transport.media.medium_view import find_grid_place
 
 NUMBER_BYTES = 6 * 4
@@ -76,7 +77,7 @@ def make_start(settings: Sought, base: Path, scene: mi.Scene) -> Start:
     Raises:
         MivolError: an unknown parameter, a value outside its domain, an unreadable file, or a grid beyond the memory.
     """
-    params = mi.traverse(scene)
+    params = traverse(scene)
     start_value = as_tensor(params[find(settings.key, params)])
     # A copy: the scene may give the memory behind a view to another tensor when its parameter changes.
     value = np.array(start_value)
@@ -111,7 +112,7 @@ def check_start(settings: Sought, shape: Sequence[int]) -> Any:
 
 def grid_to_world(key: str, scene: mi.Scene) -> np.ndarray:
     """Transform (4, 4) from the unit cube to the world for the grid of a parameter."""
-    return find_grid_place(mi.traverse(scene).properties[key][2])
+    return find_grid_place(traverse(scene).properties[key][2])
 
 
 def box_edges(place: np.ndarray) -> tuple[float, float, float]:

@@ -27,6 +27,7 @@ from mivol.report import figures
 from mivol.scene.explain import read_settings
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
+from mivol.scene_graph import traverse
 from mivol.validate.compare import Comparison, compare
 from mivol.validate.moments import BATCHES, Moments
 from mivol.validate.reference import render_reference
@@ -162,7 +163,7 @@ def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> V
     """
     scene, camera = loaded.scene, find_sensor(loaded.scene, settings.sensor)
     for key in settings.parameters:
-        find(key, mi.traverse(scene))
+        find(key, traverse(scene))
     folder.mkdir(parents=True, exist_ok=True)
     depth = read_settings(scene).max_depth if settings.max_depth is None else settings.max_depth
     integrator = mi.load_dict({"type": "mivol", "max_depth": depth})
@@ -207,7 +208,7 @@ def check_gradient(
     """Check one direction of one parameter: each value times a random number from 0 to 2, so that no step passes 0 and the
     effects
     of the values do not cancel."""
-    params = mi.traverse(scene)
+    params = traverse(scene)
     start = np.array(as_tensor(params[key]), dtype=np.float64)
     direction = np.random.default_rng([settings.seed, len(key)]).uniform(0.0, 2.0, start.shape) * start
     if not direction.any():
@@ -245,7 +246,7 @@ class MeanRadiance:
 
     def slope(self, direction: np.ndarray, seed: int, seed_grad: int) -> float:
         """d mean / d t of the parameter x + t v, by reverse mode."""
-        params = mi.traverse(self.scene)
+        params = traverse(self.scene)
         dr.enable_grad(params[self.key])
         params.update()
         how = {"integrator": self.integrator, "sensor": self.camera, "spp": self.spp}
@@ -257,7 +258,7 @@ class MeanRadiance:
 
     def difference(self, start: np.ndarray, step: np.ndarray, seed: int) -> float:
         """Half the difference of the means one step forward and one step back, with the same random numbers."""
-        params, means = mi.traverse(self.scene), []
+        params, means = traverse(self.scene), []
         for sign in (1.0, -1.0):
             set_parameter(params, self.key, start + sign * step)
             with dr.suspend_grad():

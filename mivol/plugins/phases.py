@@ -22,6 +22,7 @@ from mivol.phase.domain import ASYMMETRY, COSINE_SQUARED, WEIGHT, Domain
 from mivol.phase.mixture import choose_lobe, normalise_weights
 from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table, check_values
+from mivol.scene_graph import traverse
 
 VOLUME_KEYS = ("data", "value.value")
 """Keys of the values of grids and constants, of Mitsuba and of mivol."""
@@ -341,7 +342,7 @@ def _check_parameters(parameters: dict[str, mi.Float | mi.Volume], domains: dict
 def _known_values(value: mi.Float | mi.Volume) -> list[object]:
     if not isinstance(value, mi.Volume):
         return [value]
-    params = mi.traverse(value)
+    params = traverse(value)
     return [params[key] for key in VOLUME_KEYS if key in params]
 
 

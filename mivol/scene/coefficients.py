@@ -14,6 +14,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.gaussian_field import GaussianField
+from mivol.scene_graph import traverse
 from mivol.transport.traversal.box import clip_to_box
 
 __all__ = ["Coefficients"]
@@ -243,7 +244,7 @@ def _is_constant(volume: mi.Volume) -> bool:
 
 
 def _constant_value(volume: mi.Volume) -> mi.Float | mi.Color3f:
-    return mi.traverse(volume)["value.value"]
+    return traverse(volume)["value.value"]
 
 
 def _channel_count(volume: mi.Volume) -> int:

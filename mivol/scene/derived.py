@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.kernel_recording import is_recording
+from mivol.scene_graph import list_values, traverse
 from mivol.transport.media.medium_view import traverse_medium
 
 __all__ = ["carry_tangents", "recompute_derived"]
@@ -83,8 +84,8 @@ def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
     owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _find_derived_owners(m))]
     parameters = []
     for owner in {o.ptr: o for o in owners if o is not None}.values():
-        params = mi.traverse(owner)
-        followed = [(k, v) for k, v in params if _is_differentiated(v) and not _is_computed(params, k)]
+        params = traverse(owner)
+        followed = [(k, v) for k, v in list_values(params) if _is_differentiated(v) and not _is_computed(params, k)]
         parameters += [_DifferentiatedParameter(params, k, type(v)(v)) for k, v in followed]
     return parameters
 

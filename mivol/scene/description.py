@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.scene_graph import traverse
 
 __all__ = [
     "NOT_UTF8",
@@ -284,7 +285,7 @@ def hash_object(thing: mi.Object) -> str:
     """Hash an existing object: its printed form and every value of ``mi.traverse``."""
     h = hashlib.sha256(b"mivol object 1")
     h.update(_printed_settings(thing).encode())
-    params = mi.traverse(thing)
+    params = traverse(thing)
     for key in sorted(params.keys(), key=_stable_key):
         h.update(_stable_key(key).encode())
         _hash_value(h, params[key], key)

@@ -24,6 +24,7 @@ import numpy as np
 from mivol.kernel_recording import without_garbage_collection
 from mivol.scene.nesting import shape_bounds
 from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, is_instance
+from mivol.scene_graph import list_values
 from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
 from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
@@ -114,7 +115,7 @@ def _box_of_shapes(scene: mi.Scene, medium: mi.Medium) -> np.ndarray:
 def _emission_state(view: MediumView) -> list:
     """The values behind the light of a medium: flat arrays and numbers."""
     found = []
-    for _, value in traverse_medium(view.medium):
+    for _, value in list_values(traverse_medium(view.medium)):
         if isinstance(value, int | float):
             found.append(value)
         elif dr.is_array_v(value):

@@ -21,6 +21,7 @@ from mivol.scene.media_light import MediaLight, read_media_light
 from mivol.scene.nesting import OrientedBox, shape_bounds
 from mivol.scene.readings import GridReading, check_constants, check_emission, is_scattering, read_extinction
 from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, find_outside_media, is_instance, survey_scene
+from mivol.scene_graph import list_values, traverse
 from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.medium_view import MediumView, medium_kind
@@ -51,8 +52,8 @@ def find_needs(
     start = [] if sensor.get_medium() is None else [sensor.get_medium()]
     boundaries = (*survey.boundaries, *find_outside_media(start, survey.boundaries))
     views = tuple(b.view(survey.places) for b in boundaries)
-    params = mi.traverse(scene)
-    differentiated = tuple(k for k, v in params if dr.grad_enabled(v))
+    params = traverse(scene)
+    differentiated = tuple(k for k, v in list_values(params) if dr.grad_enabled(v))
     media = tuple(
         replace(_read_medium_facts(b, view, survey, recording), misplaced=_find_misplaced(b, view, boundaries, survey))
         for b, view in zip(boundaries, views, strict=True)

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.scene_graph import traverse
 from mivol.transport.traversal.box import Box, fit_box
 from mivol.transport.traversal.rays import spawn_ray
 
@@ -124,7 +125,7 @@ def shape_bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     box = shape.bbox()
     if box.valid():
         return np.array(box.min), np.array(box.max)
-    points = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)
+    points = np.array(traverse(shape)["vertex_positions"]).reshape(-1, 3)
     return points.min(axis=0), points.max(axis=0)
 
 
@@ -136,7 +137,7 @@ def scene_diagonal(scene: mi.Scene) -> float:
 
 def _is_closed(shape: mi.Shape) -> bool:
     """Whether a shape encloses its interior: a ball, or a mesh with every edge passed once each way."""
-    geometry = mi.traverse(shape)
+    geometry = traverse(shape)
     if "vertex_positions" not in geometry:  # no mesh, or a rectangle, whose vertices Mitsuba does not show
         return shape.shape_type() in (mi.ShapeType.Sphere.value, mi.ShapeType.Ellipsoids.value)
     points = np.array(geometry["vertex_positions"]).reshape(-1, 3)

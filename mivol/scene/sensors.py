@@ -16,6 +16,7 @@ from mivol.files.source import refusal
 from mivol.machine import check_memory
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera import PIXELS_LOST
+from mivol.scene_graph import traverse
 
 __all__ = ["check_film", "find_sensor", "to_camera", "to_sensor"]
 
@@ -110,7 +111,7 @@ def to_camera(sensor: mi.Sensor, name: str = "sensor") -> Camera:
     """
     if sensor.class_name() != "PerspectiveCamera":
         raise refusal(name, f"a {sensor.class_name()}", "a perspective sensor", "photographs have pinhole cameras")
-    params = mi.traverse(sensor)
+    params = traverse(sensor)
     film = sensor.film()
     full, crop, size = (np.array(v, float).ravel() for v in (film.size(), film.crop_offset(), film.crop_size()))
     offset = np.array([_number(params[f"principal_point_offset_{axis}"]) for axis in "xy"])

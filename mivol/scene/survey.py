@@ -11,6 +11,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording
 from mivol.scene.nesting import OrientedBox, find_nesting_fault, oriented_box, scene_diagonal
+from mivol.scene_graph import traverse
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
@@ -103,7 +104,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     fault = None if is_recording() else find_nesting_fault(scene, edges)
     if fault is not None:
         raise MivolError(fault)
-    around = find_outside_media([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
+    around = find_outside_media([o for o in traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
     exteriors = {s.exterior_medium().ptr for s in shapes if s.is_medium_transition() and s.exterior_medium() is not None}
     # A medium that also surrounds a shape has no known end.
     boundaries = [replace(b, around=None) if b.medium.ptr in exteriors else b for b in boundaries]
@@ -126,7 +127,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
 
 def _read_placement(shape: mi.Shape) -> object:
     """The placement of a shape: the array of a mesh's vertices, else the bounding box."""
-    params = mi.traverse(shape)
+    params = traverse(shape)
     # A rectangle is a mesh, but does not expose its vertices.
     if "vertex_positions" in params:
         return dr.detach(params["vertex_positions"])

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.kernel_recording import copy_aligned, ensure_aligned
+from mivol.kernel_recording import copy_aligned, ensure_aligned, record_kernels
 from mivol.machine import available_memory
 from mivol.photos.camera import Camera
 from mivol.points import Gaussians
@@ -128,9 +128,9 @@ class Splatter:
         self._filter = Filter(*(dr.opaque(mi.Float, value) for value in (low_pass * scale**2, near, sheen)))
         self._grid = Grid(dr.opaque(mi.Int32, columns), dr.opaque(mi.Int32, rows), dr.opaque(mi.Float, least_alpha))
         self._width, self._height = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
-        self._project, self._write = dr.freeze(self._trace_projection), dr.freeze(write_tiles)
-        self._composite = dr.freeze(composite)
-        self._project_adjoint = dr.freeze(self._trace_adjoint)
+        self._project = record_kernels(_trace_projection, degree, compensated)
+        self._write, self._composite = dr.freeze(write_tiles), dr.freeze(composite)
+        self._project_adjoint = record_kernels(_trace_adjoint, degree, compensated)
 
     def __repr__(self) -> str:
         return f"Splatter({self.size[0]} x {self.size[1]}, degree {self.degree})"
@@ -212,35 +212,6 @@ class Splatter:
         gradient["pose"] = mi.TensorXf(np.array([np.array(d).sum(dtype=np.float64) for d in pose], np.float32))
         return gradient, ScreenStatistics(cache.visible, np.array(d_mean2d), cache.radius)
 
-    # -- What is recorded --------------------------------------------------------------------------------------------------
-
-    def _trace_projection(
-        self, cloud: Cloud, view: mi.Float, filtering: Filter, grid: Grid, shape: mi.Float, rest: mi.Float
-    ) -> tuple:
-        splats = project(cloud.split(self.degree), View.unpack(view), filtering, self.degree, self.compensated)
-        index = dr.arange(mi.UInt32, dr.width(splats.x))
-        drawn = splats.drawn & ~splats.faulty
-        dr.scatter(shape, mi.ArrayXf(splats.shape()), index)
-        dr.scatter(rest, mi.ArrayXf(splats.rest()), index)
-        dr.eval(shape, rest, drawn)
-        return shape, rest, splats.depth, splats.faulty, count_tiles(shape, drawn, grid), _radius(splats)
-
-    def _trace_adjoint(
-        self, cloud: Cloud, view: mi.Float, filtering: Filter, adjoint: Adjoint, target: Cloud
-    ) -> tuple[Cloud, list[mi.Float], mi.Float]:
-        parts, looking = cloud.split(self.degree), View.unpack(view)
-        # A motion for each Gaussian: Dr.Jit would add up the derivatives by a single one at each step of the formula.
-        nothing = mi.Float(dr.arange(mi.UInt32, dr.width(cloud.opacity_logits)) & 0)
-        looking.turn, looking.shift = mi.Vector3f(nothing), mi.Vector3f(nothing)
-        dr.enable_grad(parts, looking.turn, looking.shift)
-        splats = project(parts, looking, filtering, self.degree, self.compensated)
-        derivatives = _derivatives(splats, adjoint.shape, adjoint.rest)
-        values = [*splats.shape(), *splats.rest()]
-        dr.backward(sum(dr.select(splats.drawn, dr.detach(d) * v, 0) for d, v in zip(derivatives, values, strict=True)))
-        target.write(dr.grad(parts))
-        pose = [*dr.grad(looking.turn), *dr.grad(looking.shift)]
-        return target, pose, dr.sqrt(dr.square(derivatives[0]) + dr.square(derivatives[1]))
-
     # -- Lists ---------------------------------------------------------------------------------------------------------------
 
     def _list(self, shape: mi.Float, depth: np.ndarray, counts: np.ndarray) -> Lists:
@@ -286,6 +257,38 @@ class Splatter:
 
     def _tensor(self, image: mi.Float) -> mi.TensorXf:
         return mi.TensorXf(image, (self.size[1], self.size[0], self.channels))
+
+
+# -- Recorded functions --------------------------------------------------------------------------------------------------
+
+
+def _trace_projection(
+    degree: int, compensated: bool, cloud: Cloud, view: mi.Float, filtering: Filter, grid: Grid, shape: mi.Float, rest: mi.Float
+) -> tuple:
+    splats = project(cloud.split(degree), View.unpack(view), filtering, degree, compensated)
+    index = dr.arange(mi.UInt32, dr.width(splats.x))
+    drawn = splats.drawn & ~splats.faulty
+    dr.scatter(shape, mi.ArrayXf(splats.shape()), index)
+    dr.scatter(rest, mi.ArrayXf(splats.rest()), index)
+    dr.eval(shape, rest, drawn)
+    return shape, rest, splats.depth, splats.faulty, count_tiles(shape, drawn, grid), _radius(splats)
+
+
+def _trace_adjoint(
+    degree: int, compensated: bool, cloud: Cloud, view: mi.Float, filtering: Filter, adjoint: Adjoint, target: Cloud
+) -> tuple[Cloud, list[mi.Float], mi.Float]:
+    parts, looking = cloud.split(degree), View.unpack(view)
+    # A motion for each Gaussian: Dr.Jit would add up the derivatives by a single one at each step of the formula.
+    nothing = mi.Float(dr.arange(mi.UInt32, dr.width(cloud.opacity_logits)) & 0)
+    looking.turn, looking.shift = mi.Vector3f(nothing), mi.Vector3f(nothing)
+    dr.enable_grad(parts, looking.turn, looking.shift)
+    splats = project(parts, looking, filtering, degree, compensated)
+    derivatives = _derivatives(splats, adjoint.shape, adjoint.rest)
+    values = [*splats.shape(), *splats.rest()]
+    dr.backward(sum(dr.select(splats.drawn, dr.detach(d) * v, 0) for d, v in zip(derivatives, values, strict=True)))
+    target.write(dr.grad(parts))
+    pose = [*dr.grad(looking.turn), *dr.grad(looking.shift)]
+    return target, pose, dr.sqrt(dr.square(derivatives[0]) + dr.square(derivatives[1]))
 
 
 def _blank(size: int) -> mi.Float:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
+from mivol.kernel_recording import record_kernels
 from mivol.tomography.column_integral import (
     ColumnGrid,
     Line,
@@ -39,15 +40,17 @@ class RecordedKernels:
 
     def __init__(self, grid: VoxelGrid) -> None:
         self.grid = grid
-        self._shape = (*grid.shape, 1)
-        self._from_world = self._lattice_of(dr.zeros(mi.Float, grid.size)).from_world
+        values = dr.zeros(mi.TensorXf, (*grid.shape, 1))
+        self._from_world = Lattice(values, VoxelGrid(grid.shape, grid.voxel_size).to_world).from_world
         self._record()
 
     def _record(self) -> None:
         # The recording of the transpose includes a buffer with a copy per thread.
         self._threads = dr.thread_count()
-        self._integrate, self._backproject = dr.freeze(self._trace_integral), dr.freeze(self._trace_backprojection)
-        self._pad = dr.freeze(lambda values: pad_nodes(values, ColumnGrid(self.grid.shape, 2)))
+        shape = self.grid.shape
+        self._integrate = record_kernels(_trace_integral, shape)
+        self._backproject = record_kernels(_trace_backprojection, shape)
+        self._pad = record_kernels(_pad_columns, ColumnGrid(shape, 2))
         self._columns: dict[str, Callable] = {}
 
     def _renew(self) -> None:
@@ -64,19 +67,6 @@ class RecordedKernels:
         self._renew()
         return self._backproject(weight, o, d, self._from_world)
 
-    def _trace_integral(self, values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
-        lattice = Lattice(mi.TensorXf(values, self._shape), None, empty, from_world=rows)
-        return integrate_segment(lattice, values, clip_to_grid(lattice, o, d, 0, dr.inf))[0]
-
-    def _trace_backprojection(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
-        lattice = Lattice(mi.TensorXf(dr.zeros(mi.Float, self.grid.size), self._shape), None, from_world=rows)
-        target = NodeGradient.zeros(lattice)
-        backproject_segment(lattice, target, [weight], clip_to_grid(lattice, o, d, 0, dr.inf))
-        return target.fold()
-
-    def _lattice_of(self, values: mi.Float) -> Lattice:
-        return Lattice(mi.TensorXf(values, self._shape), VoxelGrid(self.grid.shape, self.grid.voxel_size).to_world)
-
     # -- Rays that seldom cross one axis --------------------------------------------------------------------------------------
 
     def pad(self, values: mi.Float) -> mi.Float:
@@ -85,26 +75,48 @@ class RecordedKernels:
 
     def integrate_columns(self, padded: mi.Float, o: mi.Point3f, d: mi.Vector3f, along: int) -> mi.Float:
         """As :meth:`integrate`, for rays that seldom cross the layers of the axis ``along``."""
-        return self._by_columns(f"integrate {along}", self._trace_columns, padded, o, d, along)
+        return self._by_columns(f"integrate {along}", _trace_columns, padded, o, d, along)
 
     def backproject_columns(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, along: int) -> mi.Float:
         """As :meth:`backproject`, for rays that seldom cross the layers of the axis ``along``."""
-        return self._by_columns(f"backproject {along}", self._trace_column_sums, weight, o, d, along)
+        return self._by_columns(f"backproject {along}", _trace_column_sums, weight, o, d, along)
 
     def _by_columns(self, name: str, trace: Callable, given: mi.Float, o: mi.Point3f, d: mi.Vector3f, along: int) -> mi.Float:
         self._renew()
         if name not in self._columns:
-            grid = ColumnGrid(self.grid.shape, along)
-            self._columns[name] = dr.freeze(lambda given, o, d, rows: trace(grid, given, o, d, rows))
+            self._columns[name] = record_kernels(trace, ColumnGrid(self.grid.shape, along))
         return self._columns[name](given, o, d, self._from_world)
 
-    def _trace_columns(self, grid: ColumnGrid, padded: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
-        return integrate_columns(grid, padded, _line_in(grid, o, d, rows))
 
-    def _trace_column_sums(self, grid: ColumnGrid, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
-        target = zero_nodes(grid)
-        backproject_columns(grid, target, weight, _line_in(grid, o, d, rows))
-        return fold_nodes(target, grid)
+# -- Recorded functions --------------------------------------------------------------------------------------------------
+
+
+def _trace_integral(
+    shape: tuple[int, int, int], values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f, rows: Rows
+) -> mi.Float:
+    lattice = Lattice(mi.TensorXf(values, (*shape, 1)), None, empty, from_world=rows)
+    return integrate_segment(lattice, values, clip_to_grid(lattice, o, d, 0, dr.inf))[0]
+
+
+def _trace_backprojection(shape: tuple[int, int, int], weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+    lattice = Lattice(dr.zeros(mi.TensorXf, (*shape, 1)), None, from_world=rows)
+    target = NodeGradient.zeros(lattice)
+    backproject_segment(lattice, target, [weight], clip_to_grid(lattice, o, d, 0, dr.inf))
+    return target.fold()
+
+
+def _pad_columns(grid: ColumnGrid, values: mi.Float) -> mi.Float:
+    return pad_nodes(values, grid)
+
+
+def _trace_columns(grid: ColumnGrid, padded: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+    return integrate_columns(grid, padded, _line_in(grid, o, d, rows))
+
+
+def _trace_column_sums(grid: ColumnGrid, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+    target = zero_nodes(grid)
+    backproject_columns(grid, target, weight, _line_in(grid, o, d, rows))
+    return fold_nodes(target, grid)
 
 
 def _line_in(grid: ColumnGrid, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> Line:

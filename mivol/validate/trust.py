@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.scene.nesting import find_nesting_fault, shape_bounds
-from mivol.transport.media.medium_view import find_children, medium_kind, traverse_medium
+from mivol.scene_graph import find_children, traverse
+from mivol.transport.media.medium_view import medium_kind, traverse_medium
 
 __all__ = [
     "DOUBT_CHECKS",
@@ -328,7 +329,7 @@ class MediumShape:
 
 def read_medium_shape(shape: mi.Shape) -> MediumShape:
     """Read the facts of a shape with a medium inside."""
-    geometry = mi.traverse(shape)
+    geometry = traverse(shape)
     params = traverse_medium(shape.interior_medium())
     volumes = _extinction_volumes(shape.interior_medium())
     stock = next((v for v in volumes if v.class_name() in ("GridVolume", "ConstVolume")), None)

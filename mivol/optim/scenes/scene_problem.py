@@ -38,6 +38,7 @@ from mivol.optim.scenes.views import (
     make_batches,
     make_single_batches,
 )
+from mivol.scene_graph import traverse
 
 
 @dataclass(repr=False)
@@ -73,7 +74,7 @@ class SceneProblem:
         if not self.parameters:
             raise MivolError("found no parameter to fit: name at least one key of mi.traverse(scene).")
         self.integrator = self.integrator or self.scene.integrator()
-        self.params = mi.traverse(self.scene)
+        self.params = traverse(self.scene)
         for parameter in self.parameters:
             find(parameter.name, self.params)
         check_names([parameter.name for parameter in self.parameters])

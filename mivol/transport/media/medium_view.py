@@ -25,13 +25,14 @@ from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.protocol import BOUNDED, Field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.kernel_recording import is_recording
+from mivol.scene_graph import find_children, list_values, traverse
 from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, Extinction
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["MediumView", "find_children", "nested_field", "traverse_medium", "view_medium"]
+__all__ = ["MediumView", "nested_field", "traverse_medium", "view_medium"]
 
 
 @dataclass
@@ -125,6 +126,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     if kind not in (*STOCK, "mivol_medium"):
         raise MivolError(f"a medium of type {kind} was found; mivol_medium, homogeneous or heterogeneous is expected.")
     children = find_children(medium)
+    values = list_values(params)
     names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if n in children]
     places = {} if places is None else places
     scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
@@ -134,10 +136,10 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
         else _part(name, params, children[name], kind, boundary, places)
         for name in names
     ]
-    albedo_arrays = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
+    albedo_arrays = [v for k, v in values if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
     albedo = _field(params, "albedo") if "sigma_s" not in names else None
     emission, emission_density = _field(params, "emission"), _field(params, "emission_density")
-    emission_arrays = [v for k, v in params if k.startswith("emission") and k.endswith((".data", ".value.value"))]
+    emission_arrays = [v for k, v in values if k.startswith("emission") and k.endswith((".data", ".value.value"))]
     if not parts:
         parts, albedo, emission_arrays = [_part_of_field(emission, level)], mi.Float(0), []
         if isinstance(parts[0], GaussianExtinction):
@@ -145,7 +147,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     light = [f for f in (emission_density, emission, albedo) if emission is not None or emission_density is not None]
     emission_lattice = _emission_lattice(emission_density, light, boundary, places)
     stock_boxes = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats_border(v)}
-    numbers = {k.partition(".")[0]: v for k, v in params if k in ("scale", *(f"{n}.value.value" for n in names))}
+    numbers = {k.partition(".")[0]: v for k, v in values if k in ("scale", *(f"{n}.value.value" for n in names))}
     return MediumView(
         medium,
         parts,
@@ -172,7 +174,7 @@ def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
     # In a blend or a mixture Mitsuba lets microflakes scatter light, but leaves the extinction independent of direction.
     if phase is None or phase.class_name() != "SGGXPhaseFunction":
         return None
-    flat = dr.ravel(next(v for k, v in mi.traverse(phase) if k.startswith("S.")))
+    flat = dr.ravel(next(v for k, v in list_values(traverse(phase)) if k.startswith("S.")))
     rows = [dr.gather(mi.Float, flat, mi.UInt32(c)) for c in range(6)]
     if not is_recording():
         host = np.array(dr.detach(flat)).reshape(-1, 6)
@@ -234,19 +236,6 @@ def medium_kind(medium: mi.Medium) -> str:
     return "mivol_medium" if hasattr(medium, "coefficients") else medium.class_name()
 
 
-def find_children(medium: mi.Medium) -> dict[str, mi.Object]:
-    """The volumes and the phase function of a medium, by name; an object may occur under several names."""
-    children = {}
-
-    class Children(mi.TraversalCallback):  # in here, since Mitsuba has no such class before a variant is set
-        def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
-            if isinstance(value, mi.Object):
-                children[name] = value
-
-    medium.traverse(Children())
-    return children
-
-
 def nested_field(medium: mi.Medium) -> SphericalGrid | None:
     """The radiance field of a medium, if the field has more than one level; otherwise None."""
     field = getattr(find_children(medium).get("emission"), "mivol_field", None)
@@ -259,9 +248,9 @@ def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
     ``mi.traverse`` visits an object once. A volume used as both ``sigma_t`` and ``albedo`` (by a ``ref``, or because Mitsuba
     merges equal objects of a scene) is listed under a single name there, and under both names here.
     """
-    params = mi.traverse(medium)
+    params = traverse(medium)
     for name, child in find_children(medium).items():
-        own = mi.traverse(child)
+        own = traverse(child)
         params.properties |= {f"{name}.{key}": entry for key, entry in own.properties.items()}
         params.hierarchy |= {node: entry for node, entry in own.hierarchy.items() if node not in params.hierarchy}
     return params

@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.scene_graph import traverse
+
 __all__ = ["Box", "fit_box", "clip_to_box"]
 
 
@@ -62,7 +64,7 @@ def fit_box(shape: mi.Shape) -> Box:
 
 
 def _vertices(shape: mi.Shape) -> np.ndarray:
-    return np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    return np.array(traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
 
 
 def clip_to_box(
