@@ -226,7 +226,22 @@ RECORDED = {"Gaussians": fit_gaussians, "splatter": splat, "projector": project}
 """Calls that record kernels by ``dr.freeze``, which leaves classes and functions of its own in cycles."""
 
 
-@pytest.mark.parametrize("name", CALLS)
+QUICK = {
+    *("single_scattering, picture", "free_flight, reverse", "scattering_quadrature, picture", "tracked_absorption, picture"),
+    *(
+        "surfaces, reverse",
+        "AOVs, forward",
+        "Gaussians as matter, picture",
+        "a refusal",
+        "inside another integrator",
+        "explain",
+    ),
+    *("scene by Gauss-Newton", "radiance field"),
+}
+"""Calls that every run of the tests makes; between them they pass through each room."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in CALLS])
 def test_a_call_leaves_no_cycle(name: str) -> None:
     assert garbage_of(CALLS[name]) == []
 
