@@ -201,7 +201,10 @@ BARS = {
     "walk": ({"camera order": {"rays_per_second_median": 2e7}}, [(20, "at least", 15, True)]),
     "image": ({"volpath, max_depth 1": {"mivol_is_faster": 19.0}}, [(19, "at least", 20, False)]),
     "reverse": ({"smoke": {"reverse over forward": 4.5}}, [(4.5, "at most", 4, False)]),
-    "memory": ({"a": {"bytes_per_ray": 20.0}, "b": {"bytes_per_ray": 33.0}}, [(33, "at most", 32, False)]),
+    "memory": (
+        {"a": {"bytes_per_ray": 20.0}, "b": {"bytes_per_ray": 33.0}},
+        [(20, "at most", 32, True), (33, "at most", 32, False)],
+    ),
     "grids": ({}, []),
 }
 

@@ -18,7 +18,7 @@ from mivol.bench.studies import radiance_field as study
 from mivol.bench.studies.radiance_field import (
     EVERY,
     STUDY,
-    PhotoFit,
+    FitChoice,
     RadianceSize,
     fields,
     fit_mivol,
@@ -221,7 +221,7 @@ def test_rays_are_float32(variant_rgb: str) -> None:
 
 @pytest.mark.slow
 def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
-    calls = (PhotoFit("wires", 16, 0.03), PhotoFit("wires", effort=0.01, preset="tiny"))
+    calls = (FitChoice("wires", 16, 0.03), FitChoice("wires", effort=0.01, preset="tiny"))
     size = replace(TINY, photo_fits=calls, photo_folder=str(tmp_path / "photographs"))
     answers = STUDY.answer(tuple(STUDY.questions), size)
     assert all(answers["step"]["fog"][kind]["ratio_of_processor_time"] > 0 for kind in ("camera", "pixels", "any"))
@@ -301,7 +301,7 @@ def test_missing_photographs_are_left_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(photo_fits, "DATA", tmp_path)
-    assert study.measure_photographs(replace(TINY, photo_fits=(PhotoFit("chair", 16, 0.03),))) == {}
+    assert study.measure_photographs(replace(TINY, photo_fits=(FitChoice("chair", 16, 0.03),))) == {}
     assert "chair: left out, its data is missing (MIVOL_DATA" in capsys.readouterr().err
 
 

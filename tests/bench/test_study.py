@@ -18,7 +18,16 @@ from tiny_experiment import refused, run
 
 from mivol.bench.harness import catalogue, contests, timing
 from mivol.bench.harness.agreement import FALSE_ALARM, compare_means, finite_or_none, mean_of_pixels, mean_of_rounds
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, find_disagreements, judge, judge_agreement, say_row
+from mivol.bench.harness.bars import (
+    AT_LEAST,
+    AT_MOST,
+    Promise,
+    find_disagreements,
+    judge,
+    judge_agreement,
+    judge_promises,
+    say_row,
+)
 from mivol.bench.harness.contests import Contest, compete, find_samples
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, amount, ask, without_arrays
@@ -62,7 +71,7 @@ TOY = Study(
     "What does a toy measure?",
     ToySize,
     {"height": measure_height, "width": ask("How wide?", measure_width, "it")},
-    bars=lambda question, answer: [judge(f"{question} [m]", answer["metres"], AT_LEAST, 2.0)],
+    promises={name: [Promise(f"{name} [m]", ("metres",), AT_LEAST, 2.0)] for name in ("height", "width")},
     draw=draw,
     table=lambda question, answer: ["| a row |"],
     on_request=("width",),
@@ -88,7 +97,7 @@ def test_exit_codes(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixt
     options = ["--out", str(tmp_path), "--variant", variant_rgb]
     assert TOY.run(["--only", "width", *options]) == 0
     assert "MISSED" in capsys.readouterr().err
-    biased = replace(TOY, bars=lambda question, answer: [judge_agreement("toy", -7.0, 4.2)])
+    biased = replace(TOY, compare=lambda question, answer: [judge_agreement("toy", -7.0, 4.2)])
     assert biased.run(["--only", "height,width", *options]) == 1
     assert "the means differ (|z|: toy; |z|: toy)" in capsys.readouterr().err
     assert TOY.run(["--quick", "--only", "width", *options]) == 1
@@ -132,6 +141,18 @@ def test_means_that_differ_are_named(capsys: pytest.CaptureFixture) -> None:
     printed = capsys.readouterr().err
     assert "|z|: a" not in printed
     assert "|z|: b: 3, bar at most 2: MISSED" in printed
+
+
+def test_promises_find_their_figures() -> None:
+    """A star stands for every key; a figure that the answer lacks or that is None has no bar."""
+    answer = {"cost": {"a": {"b": 2.0}, "c": {"b": 5.0}, "d": {"b": None}}, "rate": 3e6}
+    promises = [
+        Promise("cost of {}", ("cost", "*", "b"), AT_MOST, 4),
+        Promise("rate [M/s]", ("rate",), AT_LEAST, 4, 1e-6),
+        Promise("speed", ("speed", "*"), AT_LEAST, 1),
+    ]
+    bars = [(bar["figure"], bar["value"], bar["met"]) for bar in judge_promises(promises, answer)]
+    assert bars == [("cost of a", 2, True), ("cost of c", 5, False), ("rate [M/s]", pytest.approx(3), False)]
 
 
 def test_rows_of_progress_have_three_digits(capsys: pytest.CaptureFixture) -> None:

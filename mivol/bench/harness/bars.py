@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 import sys
-from typing import TypedDict
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple, TypedDict
 
-__all__ = ["AT_LEAST", "AT_MOST", "Bar", "find_disagreements", "judge", "judge_agreement", "say", "say_row"]
+__all__ = [
+    "AT_LEAST",
+    "AT_MOST",
+    "Bar",
+    "Promise",
+    "find_disagreements",
+    "judge",
+    "judge_agreement",
+    "judge_promises",
+    "say",
+    "say_row",
+]
 
 AT_LEAST, AT_MOST = "at least", "at most"
 AGREEMENT = "|z|: "
@@ -20,6 +32,24 @@ class Bar(TypedDict):
     sense: str
     bar: float
     met: bool
+
+
+class Promise(NamedTuple):
+    """A declared bar.
+
+    Attributes:
+        label: label of the figure; braces stand for the keys that "*" has matched.
+        keys: keys of the figure in the answer; "*" matches every key.
+        sense: AT_LEAST or AT_MOST.
+        bar: bound.
+        factor: factor from the value in the answer to the figure.
+    """
+
+    label: str
+    keys: tuple[str, ...]
+    sense: str
+    bar: float
+    factor: float = 1.0
 
 
 def say(text: str) -> None:
@@ -47,6 +77,27 @@ def judge(figure: str, value: float, sense: str, bar: float, quiet: bool = False
     if not (quiet and met):
         say(f"  {figure}: {value:.3g}, bar {sense} {bar:g}{'' if met else ': MISSED'}")
     return {"figure": figure, "value": value, "sense": sense, "bar": bar, "met": bool(met)}
+
+
+def judge_promises(promises: Iterable[Promise], answer: dict) -> list[Bar]:
+    """Compare the figures of an answer with their bars. A figure that the answer lacks, or that is None, has no bar."""
+    return [
+        judge(promise.label.format(*names), promise.factor * value, promise.sense, promise.bar)
+        for promise in promises
+        for names, value in find_figures(answer, promise.keys)
+        if value is not None
+    ]
+
+
+def find_figures(answer: dict, keys: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float | None]]:
+    """Figures at some keys, with the keys that "*" has matched."""
+    if not keys:
+        yield (), answer
+        return
+    first, *rest = keys
+    for name in answer if first == "*" else [first] if first in answer else []:
+        for names, value in find_figures(answer[name], tuple(rest)):
+            yield ((name, *names) if first == "*" else names), value
 
 
 def judge_agreement(label: str, z: float | None, bound: float) -> Bar:

@@ -18,7 +18,7 @@ import mitsuba as mi
 import msgspec
 import numpy as np
 
-from mivol.bench.harness.bars import Bar, find_disagreements, say
+from mivol.bench.harness.bars import Bar, Promise, find_disagreements, judge_promises, say
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report.record import describe_machine, package_versions
@@ -80,20 +80,26 @@ class Study:
         doc: text of ``--help``: the docstring of the module, which begins with a question.
         size: class of its sizes.
         questions: by name.
-        bars: name of a question, its answer -> figures beside their bars.
+        compare: name of a question, its answer -> figures beside bars that are not declared.
         draw: answers by question, path of the figure -> writes the figure.
         table: name of a question, its answer -> lines of a Markdown table; printed as progress.
         on_request: questions that only ``--only`` asks.
+        promises: declared bars, by question.
     """
 
     module: str
     doc: str | None
     size: type[Size]
     questions: dict[str, Question]
-    bars: Callable[[str, dict], list[Bar]] = lambda question, answer: []
+    compare: Callable[[str, dict], list[Bar]] = lambda question, answer: []
     draw: Callable[[dict, Path], None] = lambda answers, path: None
     table: Callable[[str, dict], list[str]] = lambda question, answer: []
     on_request: tuple[str, ...] = ()
+    promises: dict[str, list[Promise]] = field(default_factory=dict)
+
+    def bars(self, question: str, answer: dict) -> list[Bar]:
+        """Figures of an answer beside their bars."""
+        return judge_promises(self.promises.get(question, []), answer) + self.compare(question, answer)
 
     @property
     def name(self) -> str:

@@ -34,7 +34,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.bench.extinctions import DATA
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, say_row
+from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise, say_row
 from mivol.bench.harness.figures import new_figure, show_images
 from mivol.bench.harness.study import Size, Study, amount, ask
 from mivol.bench.harness.timing import Contestant, Timing, race, ratio_of
@@ -52,12 +52,6 @@ DEGREE, FOCAL, DISTANCE = 2, 1.6, 1.8
 
 SPACING = 0.25
 """Mean scale of the Gaussians in mean distances: the cloud hides nine tenths of the background."""
-
-RATES = {"10,000 at 200^2": 1.7, "50,000 at 400^2": 1.3}
-"""Bars of splatting, forward and backward [M pixels/s, scaled]."""
-
-RATIO, BIKER_SECONDS, TRACED_RATE = 40.0, 2.0, 0.14
-"""Bars: ratio to the rate of the peer; time of an image of the biker [s]; rate of traced rays [M pixels/s, scaled]."""
 
 
 class ChairFit(NamedTuple):
@@ -325,26 +319,16 @@ def fit_chair(wanted: ChairFit, size: PointsSize) -> dict:
 # -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 
-def compare(question: str, answer: dict) -> list[Bar]:
-    """Judge the figures of an answer."""
-    if question == "clouds":
-        label = "forward and backward"
-        rates = {name: answer[f"{name}, {label}"] for name in RATES if f"{name}, {label}" in answer}
-        return [
-            judge(f"{name}, {label} [M pixels/s, scaled]", rate["pixels_per_second_scaled"] / 1e6, AT_LEAST, RATES[name])
-            for name, rate in rates.items()
-        ]
-    if question == "peer":
-        return [judge("rate over volprim_rf_basic's, forward and backward", answer["mivol_is_faster"], AT_LEAST, RATIO)]
-    if question == "rays":
-        rate = answer["mivol"]["pixels_per_second_scaled"] / 1e6
-        return [judge(f"{answer['cloud']}, traced, forward [M pixels/s, scaled]", rate, AT_LEAST, TRACED_RATE)]
-    if question == "biker":
-        return [judge("an image of the biker [s]", answer["seconds_median"], AT_MOST, BIKER_SECONDS)]
-    if question in CHAIR:
-        label, bar = f"{question}, {answer['pixels'][0]} pixels [dB]", CHAIR[question].decibels
-        return [judge(f"{label}, seed {seed}", one["psnr"], AT_LEAST, bar) for seed, one in answer["seeds"].items()]
-    return []
+SCALED = "[M pixels/s, scaled]"
+PROMISES = {
+    "clouds": [
+        Promise(f"{name} {SCALED}", (name, "pixels_per_second_scaled"), AT_LEAST, bar, 1e-6)
+        for name, bar in (("10,000 at 200^2, forward and backward", 1.7), ("50,000 at 400^2, forward and backward", 1.3))
+    ],
+    "peer": [Promise("rate over volprim_rf_basic's, forward and backward", ("mivol_is_faster",), AT_LEAST, 40)],
+    "rays": [Promise(f"traced, forward {SCALED}", ("mivol", "pixels_per_second_scaled"), AT_LEAST, 0.14, 1e-6)],
+    "biker": [Promise("an image of the biker [s]", ("seconds_median",), AT_MOST, 2)],
+} | {name: [Promise(f"{name}, seed {{}} [dB]", ("seeds", "*", "psnr"), AT_LEAST, fit.decibels)] for name, fit in CHAIR.items()}
 
 
 def draw(answers: dict, path: Path) -> None:
@@ -368,4 +352,4 @@ QUESTIONS: dict[str, Callable[[PointsSize], dict]] = {
     "biker": measure_biker,
     **{name: ask(wanted.text, fit_chair, wanted) for name, wanted in CHAIR.items()},
 }
-STUDY = Study(__name__, __doc__, PointsSize, QUESTIONS, compare, draw, on_request=tuple(CHAIR))
+STUDY = Study(__name__, __doc__, PointsSize, QUESTIONS, draw=draw, on_request=tuple(CHAIR), promises=PROMISES)

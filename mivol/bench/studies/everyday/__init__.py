@@ -36,7 +36,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mivol.bench.harness.agreement import compare_means, finite_or_none, mean_of_rounds
-from mivol.bench.harness.bars import AT_LEAST, Bar, judge, judge_agreement, say_row
+from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, say_row
 from mivol.bench.harness.contests import agreement_figures, compete, gain_figures, image_errors, render_method
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, amount
@@ -52,9 +52,6 @@ SAMPLERS = {"volpath": "independent", "volpath, multijitter": "multijitter"}
 """Samplers of the peers of images."""
 
 PEER = "prbvolpath"
-MEAN_BARS = {"images": 8.0, "gradients": 5.0}
-"""Bars of the geometric means over all scenes."""
-
 DENSE = 0.3
 """Voxels with at least this share of the largest value count."""
 
@@ -167,19 +164,23 @@ def _mean_of_image(image: mi.TensorXf) -> mi.Float:
 
 
 def compare(question: str, answer: dict) -> list[Bar]:
-    """Judge the ratios, and the agreement of the means of images. A gradient that is 0 for ``prbvolpath`` has no ratio."""
-    bars = []
-    for name, row in answer["scenes"].items():
-        bar = SCENES[name].image_bar if question == "images" else SCENES[name].gradient_bar
-        if bar is not None and row["ratio"] is not None:
-            bars.append(judge(f"variance x time, {question}: {name}", row["ratio"], AT_LEAST, bar))
-        if question == "images":
-            agreements = {peer: row[f"mivol over {peer}"] for peer in SAMPLERS}
-            bars += [judge_agreement(f"{name}, {peer}", f["z"], f["z_bound"]) for peer, f in agreements.items()]
-    if answer["geometric_mean"] is None:
-        return bars
-    label = f"geometric mean, {question}: {len(answer['scenes'])} of {len(SCENES)} scenes"
-    return [*bars, judge(label, answer["geometric_mean"], AT_LEAST, MEAN_BARS[question])]
+    """Judge the agreement of the means of images."""
+    rows = [(name, peer, row[f"mivol over {peer}"]) for name, row in answer["scenes"].items() for peer in SAMPLERS
+            if question == "images"]  # fmt: skip
+    return [judge_agreement(f"{name}, {peer}", figures["z"], figures["z_bound"]) for name, peer, figures in rows]
+
+
+def promise(question: str, bars: dict[str, float | None], mean: float) -> list[Promise]:
+    """Bars on the ratios of scenes, and on the geometric mean of the measured scenes."""
+    label = f"variance x time, {question}"
+    ratios = [Promise(f"{label}: {name}", ("scenes", name, "ratio"), AT_LEAST, bar) for name, bar in bars.items() if bar]
+    return [*ratios, Promise(f"{label}: geometric mean", ("geometric_mean",), AT_LEAST, mean)]
+
+
+PROMISES = {
+    "images": promise("images", {name: scene.image_bar for name, scene in SCENES.items()}, 8),
+    "gradients": promise("gradients", {name: scene.gradient_bar for name, scene in SCENES.items()}, 5),
+}
 
 
 def tabulate(question: str, answer: dict) -> list[str]:
@@ -218,6 +219,5 @@ def _plot_bars(axes: Axes, ratios: dict[str, float]) -> None:
     use_plain_ticks(axes.xaxis, "×")
 
 
-STUDY = Study(
-    __name__, __doc__, EverydaySize, {"images": measure_images, "gradients": measure_gradients}, compare, draw, tabulate
-)
+QUESTIONS = {"images": measure_images, "gradients": measure_gradients}
+STUDY = Study(__name__, __doc__, EverydaySize, QUESTIONS, compare, draw, tabulate, promises=PROMISES)

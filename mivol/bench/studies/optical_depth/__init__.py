@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.bench.extinctions import TO_WORLD, Extinction, ct_scan, made_up, smoke, threads_in_space
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge
+from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.bench.harness.timing import peak_bytes, race, ratio_of, time_call
 from mivol.bench.reference_walk import GridRays, camera_rays
@@ -305,18 +305,13 @@ def measure_peers(size: OpticalDepthSize) -> dict:
 # -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 
-def compare(question: str, answer: dict) -> list[Bar]:
-    """Judge the figures of an answer."""
-    if question == "walk":
-        return [judge("walk [M rays/s]", answer["camera order"]["rays_per_second_median"] / 1e6, AT_LEAST, 15)]
-    if question == "image":
-        return [judge("mi.render, rate over volpath's", answer["volpath, max_depth 1"]["mivol_is_faster"], AT_LEAST, 20)]
-    if question == "reverse":
-        return [judge("reverse pass over forward pass", answer["smoke"]["reverse over forward"], AT_MOST, 4)]
-    if question == "memory":
-        # The state of a ray: o and d, its optical depth, and the derivative of the optical depth: 8 float32.
-        return [judge("gradient step [bytes/ray]", max(f["bytes_per_ray"] for f in answer.values()), AT_MOST, 32)]
-    return []
+# The state of a ray: o and d, its optical depth, and the derivative of the optical depth: 8 float32.
+PROMISES = {
+    "walk": [Promise("walk [M rays/s]", ("camera order", "rays_per_second_median"), AT_LEAST, 15, 1e-6)],
+    "image": [Promise("mi.render, rate over volpath's", ("volpath, max_depth 1", "mivol_is_faster"), AT_LEAST, 20)],
+    "reverse": [Promise("reverse pass over forward pass", ("smoke", "reverse over forward"), AT_MOST, 4)],
+    "memory": [Promise("gradient step, {} [bytes/ray]", ("*", "bytes_per_ray"), AT_MOST, 32)],
+}
 
 
 def draw(answers: dict, path: Path) -> None:
@@ -340,4 +335,4 @@ QUESTIONS = {
     "grids": measure_grids,
     "peers": measure_peers,
 }
-STUDY = Study(__name__, __doc__, OpticalDepthSize, QUESTIONS, compare, draw)
+STUDY = Study(__name__, __doc__, OpticalDepthSize, QUESTIONS, draw=draw, promises=PROMISES)

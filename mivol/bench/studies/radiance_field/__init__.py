@@ -36,7 +36,7 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, say_row
+from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise, say_row
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import Study, amount
 from mivol.bench.harness.timing import Stopwatch, race, ratio_of
@@ -75,10 +75,10 @@ from mivol.transport.line_integrals.radiance_field import (
 from mivol.transport.line_integrals.radiance_source import bake, make_exact, vjp_bake
 from mivol.validate.metrics import psnr
 
-__all__ = ["STUDY", "PhotoFit", "RadianceSize"]
+__all__ = ["STUDY", "FitChoice", "RadianceSize"]
 
 
-class PhotoFit(NamedTuple):
+class FitChoice(NamedTuple):
     """A fit of a data set of photographs.
 
     Attributes:
@@ -98,11 +98,11 @@ class PhotoFit(NamedTuple):
 
 
 ALL_FITS = (
-    PhotoFit("chair", 128),
-    PhotoFit("chair", 256, 1.9),
-    PhotoFit("chair", preset="fine"),
-    *(PhotoFit(name, 128) for name in ("still_life", "wires", "glossy")),
-    *(PhotoFit(name, preset="fine") for name in ("still_life", "wires", "glossy")),
+    FitChoice("chair", 128),
+    FitChoice("chair", 256, 1.9),
+    FitChoice("chair", preset="fine"),
+    *(FitChoice(name, 128) for name in ("still_life", "wires", "glossy")),
+    *(FitChoice(name, preset="fine") for name in ("still_life", "wires", "glossy")),
 )
 
 
@@ -112,8 +112,8 @@ class RadianceSize(FieldSize, PhotoSize):
 
     side: int = amount(256, 64, "edge of images whose rays are timed [pixels]")
     rounds: int = amount(3, 1, "warm steps of each contestant")
-    photo_fits: tuple[PhotoFit, ...] = amount(
-        ALL_FITS, (PhotoFit("chair", 32, 0.03), PhotoFit("wires", 32, 0.03)), "fits", tuple
+    photo_fits: tuple[FitChoice, ...] = amount(
+        ALL_FITS, (FitChoice("chair", 32, 0.03), FitChoice("wires", 32, 0.03)), "fits", tuple
     )
 
 
@@ -319,13 +319,6 @@ def measure_fit(size: FieldSize) -> dict:
 
 # -- Photographs ------------------------------------------------------------------------------------------------------------
 
-PHOTO_BARS = {
-    "chair at 128": [("psnr", AT_LEAST, 30.2), ("seconds", AT_MOST, 60), ("step_milliseconds", AT_MOST, 70)],
-    "chair at 256": [("psnr", AT_LEAST, 31.3), ("seconds", AT_MOST, 300), ("held_gib", AT_MOST, 1.5)],
-    "chair, fine": [("psnr", AT_LEAST, 32.0), ("seconds", AT_MOST, 1200), ("held_gib", AT_MOST, 16)],
-}
-"""Bars of fits of photographs, by fit."""
-
 STEPS_TIMED = 8
 
 
@@ -340,7 +333,7 @@ def measure_photographs(size: RadianceSize) -> dict:
     return answer
 
 
-def fit_and_judge(folder: Path, wanted: PhotoFit, size: RadianceSize) -> dict:
+def fit_and_judge(folder: Path, wanted: FitChoice, size: RadianceSize) -> dict:
     """Fit a data set as ``mivol optimize`` does, and measure.
 
     Returns:
@@ -383,21 +376,21 @@ def time_step(fit: Fit) -> float:
 STEP_BARS = {"camera": 8, "pixels": 4, "any": 4}
 """Smallest ratio to the peer's rays per second, by kind of rays."""
 
+PHOTO_BARS = {
+    "chair at 128": [("psnr", AT_LEAST, 30.2), ("seconds", AT_MOST, 60), ("step_milliseconds", AT_MOST, 70)],
+    "chair at 256": [("psnr", AT_LEAST, 31.3), ("seconds", AT_MOST, 300), ("held_gib", AT_MOST, 1.5)],
+    "chair, fine": [("psnr", AT_LEAST, 32.0), ("seconds", AT_MOST, 1200), ("held_gib", AT_MOST, 16)],
+}
+"""Bars of fits of photographs, by fit."""
 
-def compare(question: str, answer: dict) -> list[Bar]:
-    """Judge the figures of an answer."""
-    if question == "photographs":
-        bars = [(fit, *bar) for fit in PHOTO_BARS if fit in answer for bar in PHOTO_BARS[fit]]
-        return [judge(f"{fit}: {figure}", answer[fit][figure], sense, bar) for fit, figure, sense, bar in bars]
-    if question == "fit":
-        return [judge(f"{name}: time to the same PSNR", a["ratio"], AT_LEAST, 10) for name, a in answer.items()]
-    if question == "step":
-        return [
-            judge(f"{name}: {kind} rays, forward and backward", a[kind]["ratio_of_processor_time"], AT_LEAST, bar)
-            for name, a in answer.items()
-            for kind, bar in STEP_BARS.items()
-        ]
-    return []
+PROMISES = {
+    "step": [
+        Promise(f"{{}}: {kind} rays, forward and backward", ("*", kind, "ratio_of_processor_time"), AT_LEAST, bar)
+        for kind, bar in STEP_BARS.items()
+    ],
+    "fit": [Promise("{}: time to the same PSNR", ("*", "ratio"), AT_LEAST, 10)],
+    "photographs": [Promise(f"{fit}: {bar[0]}", (fit, bar[0]), *bar[1:]) for fit, bars in PHOTO_BARS.items() for bar in bars],
+}
 
 
 def draw(answers: dict, path: Path) -> None:
@@ -431,4 +424,4 @@ def plot_fit(axes: Axes, answer: dict) -> None:
 
 
 QUESTIONS = {"step": measure_step, "fit": measure_fit, "photographs": measure_photographs}
-STUDY = Study(__name__, __doc__, RadianceSize, QUESTIONS, compare, draw, on_request=("photographs",))
+STUDY = Study(__name__, __doc__, RadianceSize, QUESTIONS, draw=draw, on_request=("photographs",), promises=PROMISES)
