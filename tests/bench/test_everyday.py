@@ -58,17 +58,17 @@ def test_images_are_compared_with_the_better_sampler(variant_rgb: str, monkeypat
 
 
 def test_gradients_count_where_the_density_is_large(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second of two voxels has 0.4 of the largest density, the third 0.1: deviations count in the first two.
+    """The second of four voxels has 0.4 of the largest density, the third 0.1: deviations count in the first two.
     The derivatives along the logarithm of the density are sums of gradient times density over all voxels."""
 
     class Gradient:
         def __init__(self, *_: object) -> None:
-            self.params = {SCENES["thin_smoke"].parameter: np.array([1.0, 0.4, 0.1])}
+            self.params = {SCENES["thin_smoke"].parameter: np.array([1.0, 0.4, 0.1, 0.0])}
 
         def of_loss(self, *_: object) -> None: ...
 
     def compete(methods: dict, *_: object, seed: int) -> Contest:
-        deviations = {everyday.PEER: [2.0, 4.0, 99.0], "mivol": [1.0, 1.0, 1.0]}
+        deviations = {everyday.PEER: [2.0, 4.0, 99.0, 99.0], "mivol": [1.0, 1.0, 1.0, 1.0]}
         results = {name: 5 + SWING[:, None] * np.array(d) for name, d in deviations.items()}
         return contest_of(results, {everyday.PEER: 3.0, "mivol": 1.0})
 
