@@ -5,7 +5,8 @@ an amount of work (:class:`~mivol.bench.harness.study.Size`) to numbers for a JS
 figures. The quick size is for CI, and its times mean nothing. Standard output holds the JSON; progress goes to standard error.
 No other room of mivol imports this room, except ``cli/``.
 
-A new study is one file in ``studies/`` with a module docstring, whose first line is a question, and a constant ``STUDY``.
+A new study is one file in ``studies/`` with a module docstring, whose first line is a question, and a constant ``STUDY``, its
+only public name. Bars on single figures are declared (:class:`~mivol.bench.harness.bars.Promise`).
 
 Shared: ``harness`` (timing, contests, bars, command line, figures), ``extinctions`` and ``scenes`` (volumes and lights),
 ``reference_walk`` (rays through a volume; the rate of this walk measures the speed of a machine).

@@ -32,8 +32,6 @@ from mivol.bench.scenes import box_scene, constant_light, make_integrator, sun_a
 from mivol.bench.studies.gradients.density_gradient import DensityGradient
 from mivol.validate.moments import Moments
 
-__all__ = ["MODELS", "STUDY", "LadderSize", "Model", "measure"]
-
 
 @dataclass(frozen=True)
 class LadderSize(BudgetSize):

@@ -25,8 +25,6 @@ from mivol.bench.scenes import perspective
 from mivol.bench.studies.single_scattering import ContestSize
 from mivol.report.figures import FAINT
 
-__all__ = ["BARS", "STUDY", "find_dark_pixels", "make_scene"]
-
 DEPTH = 3
 BARS = {"fire": 10, "fog": 10, "room": 0.8}
 """Smallest ratio of variance x time, median over the counted pixels."""

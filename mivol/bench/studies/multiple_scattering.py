@@ -41,8 +41,6 @@ from mivol.bench.studies.single_scattering import (
 )
 from mivol.phase.measured import MeasuredMedium, named_medium
 
-__all__ = ["CONTESTS", "STUDY", "VOLUMES"]
-
 THIN, WHITE_DEPTH = 0.05, 64.0
 """Factor on the density of the smoke; optical depth along an edge of the white box."""
 

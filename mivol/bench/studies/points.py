@@ -45,8 +45,6 @@ from mivol.photos.camera import Camera, intrinsics
 from mivol.points import Gaussians, read_gaussians
 from mivol.splatting import Splatter, to_tensors
 
-__all__ = ["STUDY", "ChairFit", "PointsSize", "random_cloud"]
-
 DEGREE, FOCAL, DISTANCE = 2, 1.6, 1.8
 """Degree of the harmonics; focal length in image widths, distance of the camera from the centre of the cube in edges."""
 

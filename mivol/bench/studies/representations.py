@@ -30,8 +30,6 @@ from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import survey_photos
 from mivol.points import Gaussians, write_gaussians
 
-__all__ = ["STUDY", "RepresentationSize"]
-
 
 @dataclass(frozen=True)
 class RepresentationSize(PhotoSize):

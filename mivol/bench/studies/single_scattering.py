@@ -57,11 +57,6 @@ from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios, us
 from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.scenes import box_scene, constant_light, make_integrator, point_light, sun_and_sky
 
-__all__ = [
-    "LIGHTS", "LONGER", "PEERS", "STUDY", "VOLUMES", "ContestSize", "Light", "contend", "contest_bars",
-    "contest_volume", "plot_contest",
-]  # fmt: skip
-
 ALBEDO = 0.75
 PEERS = ("volpath", "prbvolpath")
 MIN_TAU = 0.01

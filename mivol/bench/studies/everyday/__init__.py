@@ -47,8 +47,6 @@ from mivol.errors import MivolError
 from mivol.optim.strategy import suggest_name
 from mivol.report.figures import SERIES
 
-__all__ = ["STUDY", "EverydaySize", "measure_gradients", "measure_images"]
-
 SAMPLERS = {"volpath": "independent", "volpath, multijitter": "multijitter"}
 """Samplers of the peers of images."""
 

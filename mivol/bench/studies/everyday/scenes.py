@@ -14,8 +14,6 @@ import numpy as np
 
 from mivol.bench.scenes import camera, make_integrator
 
-__all__ = ["SCENES", "EverydayScene"]
-
 ORIGIN, UP = (0, 0, 0), (0, 0, 1)
 
 

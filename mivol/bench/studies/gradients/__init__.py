@@ -78,8 +78,6 @@ from mivol.report.figures import MARKERS, SERIES
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
 
-__all__ = ["CONTESTS", "STUDY", "TABLES", "TUTORIALS", "Case", "GradientSize"]
-
 CONSTANT, SUN, DIRECTIONAL = "constant light", "HG 0.8, sun in a sky", "HG 0.8, directional"
 
 CONTESTS: dict[str, tuple[Callable[[], Extinction], dict[str, Light]]] = {

@@ -12,8 +12,6 @@ import numpy as np
 
 from mivol.bench.scenes import box_scene, make_integrator
 
-__all__ = ["ALBEDO", "INTEGRATORS", "KEY", "DensityGradient", "Light", "square_error"]
-
 ALBEDO = 0.75
 INTEGRATORS = ("mivol", "prbvolpath")
 

@@ -28,8 +28,6 @@ from mivol.bench.studies.gradients.density_gradient import ALBEDO, INTEGRATORS, 
 from mivol.validate.metrics import nrmse
 from mivol.validate.statistics import Estimate
 
-__all__ = ["Run", "TutorialSize", "compare_runs", "measure_tutorial", "turn_upright"]
-
 
 @dataclass(frozen=True)
 class TutorialSize(Size):

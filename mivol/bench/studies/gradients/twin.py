@@ -29,8 +29,6 @@ import numpy as np
 
 from mivol.bench.studies.gradients.density_gradient import Light
 
-__all__ = ["Twin"]
-
 MAJORANT_FACTOR, P_MIN, P_MAX = 1.1, 0.25, 0.95
 """Majorant over the largest extinction; bounds of P."""
 

@@ -48,8 +48,6 @@ from mivol.transport.traversal.grid_blocks import bound_blocks
 from mivol.transport.traversal.grid_walk import walk_cells
 from mivol.transport.traversal.lattice import Lattice, clip_to_grid
 
-__all__ = ["STUDY", "OpticalDepthSize"]
-
 
 @dataclass(frozen=True)
 class OpticalDepthSize(Size):

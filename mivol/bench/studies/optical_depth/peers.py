@@ -20,11 +20,6 @@ from mivol.bench.harness.timing import Contestant
 from mivol.bench.reference_walk import GridRays
 from mivol.bench.scenes import box_scene
 
-__all__ = [
-    "delta_survival", "exact_tau", "integrate_by_drjit", "intersect_box", "marching", "pad_for_drjit", "ratio_survival",
-    "tracking", "volpath",
-]  # fmt: skip
-
 
 def intersect_box(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
     """Hit, entry and exit distance of rays and the box, by Mitsuba's bounding box."""

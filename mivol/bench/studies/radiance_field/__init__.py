@@ -75,8 +75,6 @@ from mivol.transport.line_integrals.radiance_field import (
 from mivol.transport.line_integrals.radiance_source import bake, make_exact, vjp_bake
 from mivol.validate.metrics import psnr
 
-__all__ = ["STUDY", "FitChoice", "RadianceSize"]
-
 
 class FitChoice(NamedTuple):
     """A fit of a data set of photographs.

@@ -22,11 +22,6 @@ from mivol.photos import Camera, Photo, intrinsics, load_photos, pixel_centres, 
 from mivol.photos.camera_path import aim_camera
 from mivol.transport.line_integrals.radiance_field import RayBundle
 
-__all__ = [
-    "BLACK", "BOX", "FIELDS", "STOP", "FieldSize", "load_field", "make_camera", "middle_cameras", "photograph", "ring_cameras",
-    "tiled_pixels", "to_bundle", "trace",
-]  # fmt: skip
-
 STOP = 1e-4
 """Transmittance at which mivol's rays end; rays of the peer end at 0."""
 

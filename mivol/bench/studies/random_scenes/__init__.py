@@ -44,8 +44,6 @@ from mivol.bench.studies.random_scenes.generate import RandomScene, draw_built_s
 from mivol.errors import MivolError
 from mivol.report.figures import SERIES
 
-__all__ = ["HARD", "STUDY", "RandomSize", "measure_built", "measure_hard", "measure_trials", "try_scene"]
-
 MEANS = 12
 """Compared means of a scene: of each quarter of the image, in each colour."""
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["RandomScene", "draw_built_scene", "draw_scene"]
-
 SIDE = 12
 """Edge of the image [pixels]."""
 

@@ -48,8 +48,6 @@ from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
 
-__all__ = ["STUDY", "Scan", "TomographySize", "make_head_scan", "make_volume_scan"]
-
 REPORTED = (5, 10, 20)
 ACCEPTED = 0.2
 """nRMSE that TIGRE's own tests accept after 20 iterations."""

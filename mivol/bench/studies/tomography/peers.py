@@ -29,8 +29,6 @@ from mivol.tomography.geometry import subdivide_grid, voxel_means
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import store_matrix
 
-__all__ = ["error_rows", "measure_peers", "measure_tooth", "ratio_rows"]
-
 KINDS = {"few views": (30, 0.0), "noisy": (90, 1e4), "many": (360, 1e4)}
 """Kind of data: number of views, quanta per pixel (0: no noise)."""
 

@@ -28,8 +28,6 @@ from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
 
-__all__ = ["MeasuredSlice", "Slice", "centre_axis", "load_tooth", "make_slice"]
-
 
 @dataclass(frozen=True)
 class Slice:
