@@ -234,22 +234,35 @@ def measure_peer(size: PointsSize) -> dict:
         return [dr.grad(params[key]) for key in keys]
 
     both = race({"mivol": drawing.both(), "volprim_rf_basic": peer_step}, max(3, size.rounds // 2))
-    forward = race(
-        {"mivol": drawing.forward(), "volprim_rf_basic": lambda seed: mi.render(scene, spp=1, seed=seed)}, 3, keep=True
-    )
-    images = [forward[name].results[0][..., :3] for name in ("mivol", "volprim_rf_basic")]
+    renders = {"mivol": drawing.forward(), "volprim_rf_basic": lambda seed: mi.render(scene, spp=1, seed=seed)}
+    forward = race(renders, 3, keep=True)
+    pictures = first_pictures(forward)
     return {
         "cloud": f"{n:,} at {side}^2",
         "forward and backward": {name: t.report(side**2, "pixels") for name, t in both.items()},
         "forward": {name: t.report(side**2, "pixels") for name, t in forward.items()},
-        "mivol_is_faster": ratio_of(both["volprim_rf_basic"], both["mivol"]),
-        "mivol_is_faster_by_processor": ratio_of(both["volprim_rf_basic"], both["mivol"], "processor"),
+        **speed_over_peer(both),
         "mivol_is_faster_forward": ratio_of(forward["volprim_rf_basic"], forward["mivol"]),
-        "rms_difference": float(np.sqrt(np.mean((images[0] - images[1]) ** 2))),
-        "mean_difference": float(np.mean(images[0] - images[1])),
-        "mean": float(images[0].mean()),
-        "pictures": np.stack(images),
+        **compare_pictures(pictures),
+        "mean_difference": float(np.mean(pictures[0] - pictures[1])),
+        "pictures": pictures,
     }
+
+
+def first_pictures(timings: dict[str, Timing]) -> np.ndarray:
+    """Images (2, H, W, 3) of mivol and of the peer."""
+    return np.stack([timings[name].results[0][..., :3] for name in ("mivol", "volprim_rf_basic")])
+
+
+def compare_pictures(pictures: np.ndarray) -> dict[str, float]:
+    """RMS difference of the images, and the mean of mivol's image."""
+    return {"rms_difference": float(np.sqrt(np.mean((pictures[0] - pictures[1]) ** 2))), "mean": float(pictures[0].mean())}
+
+
+def speed_over_peer(timings: dict[str, Timing]) -> dict[str, float]:
+    """Time of the peer over the time of mivol, by wall clock and by processor time."""
+    pair = timings["volprim_rf_basic"], timings["mivol"]
+    return {"mivol_is_faster": ratio_of(*pair), "mivol_is_faster_by_processor": ratio_of(*pair, "processor")}
 
 
 def measure_rays(size: PointsSize) -> dict:
@@ -263,16 +276,12 @@ def measure_rays(size: PointsSize) -> dict:
     }
     renders = {name: lambda seed, scene=scene: mi.render(scene, spp=1, seed=seed) for name, scene in scenes.items()}
     timings = race({"walk": reference_walk(size.walk_side), **renders}, size.rounds, keep=True)
-    walk, peer = timings["walk"], timings["volprim_rf_basic"]
-    images = [timings["mivol"].results[0][..., :3], peer.results[0][..., :3]]
     return {
         "cloud": f"{n:,} at {side}^2",
-        **{name: report_scaled(timings[name], side**2, walk, size) for name in ("mivol", "extinction")},
-        "volprim_rf_basic": peer.report(side**2, "pixels"),
-        "mivol_is_faster": ratio_of(peer, timings["mivol"]),
-        "mivol_is_faster_by_processor": ratio_of(peer, timings["mivol"], "processor"),
-        "rms_difference": float(np.sqrt(np.mean((images[0] - images[1]) ** 2))),
-        "mean": float(images[0].mean()),
+        **{name: report_scaled(timings[name], side**2, timings["walk"], size) for name in ("mivol", "extinction")},
+        "volprim_rf_basic": timings["volprim_rf_basic"].report(side**2, "pixels"),
+        **speed_over_peer(timings),
+        **compare_pictures(first_pictures(timings)),
     }
 
 
@@ -294,24 +303,20 @@ def measure_biker(size: PointsSize) -> dict:
 
 # -- Fits -------------------------------------------------------------------------------------------------------------------
 
-CHAIR_PHOTOS = {"background": "white", "judged": "test", "held_out": 0, "box": "silhouettes"}
-
 
 def fit_chair(wanted: ChairFit, size: PointsSize) -> dict:
     """Fit the chair once for each seed, and judge by the test views."""
-    photos = CHAIR_PHOTOS | {"scale": wanted.scale}
+    photos = {"background": "white", "judged": "test", "held_out": 0, "box": "silhouettes", "scale": wanted.scale}
     settings = {"gaussians": {"preset": wanted.preset, "effort": wanted.effort * size.effort}}
-    answer: dict = {}
     seeds = {}
     for seed in wanted.seeds:
         prepared = prepare_fit(find_data("chair"), photos, settings, seed)
-        done = fit_photographs(prepared.problem, size.walk_side)
+        minutes = fit_photographs(prepared.problem, size.walk_side).seconds / 60
         psnr = prepared.score(prepared.judged.views)["psnr"]
-        seeds[str(seed)] = {"psnr": psnr, "minutes": done.seconds / 60, "gaussians": len(prepared.problem.cloud["means"])}
-        say_row(f"{wanted.preset}, seed {seed}", psnr=psnr, minutes=done.seconds / 60)
-        views = prepared.judged.views
-        answer = {"pixels": list(views[0].camera.size), "views": len(views), "steps": prepared.steps}
-    return answer | {"seeds": seeds}
+        seeds[str(seed)] = {"psnr": psnr, "minutes": minutes, "gaussians": len(prepared.problem.cloud["means"])}
+        say_row(f"{wanted.preset}, seed {seed}", psnr=psnr, minutes=minutes)
+    views = prepared.judged.views
+    return {"pixels": list(views[0].camera.size), "views": len(views), "steps": prepared.steps, "seeds": seeds}
 
 
 # -- Bars and figure --------------------------------------------------------------------------------------------------------
