@@ -72,7 +72,7 @@ def test_gradients_count_where_the_density_is_large(variant_rgb: str, monkeypatc
         results = {name: 5 + SWING[:, None] * np.array(d) for name, d in deviations.items()}
         return contest_of(results, {everyday.PEER: 3.0, "mivol": 1.0})
 
-    monkeypatch.setattr(everyday, "DensityGradient", Gradient)
+    monkeypatch.setattr(everyday, "ParameterGradient", Gradient)
     monkeypatch.setattr(everyday, "compete", compete)
     row = measure_gradients(replace(TINY, scenes=("thin_smoke",)))["scenes"]["thin_smoke"]
     assert row["ratio"] == pytest.approx(3 * (4 + 16) / 2)

@@ -20,7 +20,7 @@ from mivol.bench.extinctions import TO_WORLD
 from mivol.bench.harness.timing import Timing
 from mivol.bench.reference_walk import GridRays, camera_rays
 from mivol.bench.studies import optical_depth as study
-from mivol.bench.studies.optical_depth import STUDY, OpticalDepthSize, gradient_step, shuffle
+from mivol.bench.studies.optical_depth import STUDY, OpticalDepthSize, gradient_step
 from mivol.bench.studies.optical_depth.peers import delta_survival, exact_tau, ratio_survival, tracking, volpath
 from mivol.report.figures import SERIES
 
@@ -133,25 +133,6 @@ def test_a_gradient_step_derives_the_sum_of_squares(variant_rgb: str) -> None:
     values = mi.TensorXf([1.0, -2.0, 4.0])
     result = gradient_step(values, lambda v: 3 * v.array)
     assert np.array(result).tolist() == [18.0, -36.0, 72.0] and not dr.grad_enabled(values)
-
-
-def test_shuffled_rays_are_the_same_rays(variant_rgb: str) -> None:
-    """In the order of the seed 0."""
-    numbers = np.arange(15, dtype=np.float32).reshape(3, 5)
-    o, d = shuffle(mi.Point3f(numbers), mi.Vector3f(-numbers))
-    order = np.random.default_rng(0).permutation(5)
-    assert np.array_equal(np.array(o), numbers[:, order]) and np.array_equal(np.array(d), -numbers[:, order])
-
-
-def test_rays_are_spread_over_all(variant_rgb: str) -> None:
-    """From the first to the last, as many as asked for, or all."""
-    numbers = np.arange(30, dtype=np.float32).reshape(3, 10)
-    rays = GridRays(np.ones((2, 2, 2), np.float32), mi.Point3f(numbers), mi.Vector3f(-numbers))
-    assert rays.n == 10 and rays.tensor.shape == (2, 2, 2, 1)
-    for count, index in ((4, [0, 3, 6, 9]), (20, list(range(10)))):
-        result, o, d = rays.select(count)
-        assert result.tolist() == index and o.dtype == d.dtype == np.float64
-        assert np.array_equal(o, numbers.T[index]) and np.array_equal(d, -numbers.T[index])
 
 
 @pytest.mark.slow

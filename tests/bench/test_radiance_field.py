@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -31,14 +29,11 @@ from mivol.bench.studies.radiance_field import (
     to_peer,
 )
 from mivol.bench.studies.radiance_field.fields import (
-    BOX,
     FIELDS,
-    centre,
     middle_cameras,
     photograph,
     ring_cameras,
     tiled_pixels,
-    to_bundle,
     trace,
 )
 from mivol.bench.studies.radiance_field.peer import Peer
@@ -109,30 +104,6 @@ def test_both_fits_learn_the_views(variant_rgb: str) -> None:
         assert len(curve) == stages
         assert curve[-1][1] > black + 1
         assert all(0 < early < late for (early, _), (late, _) in itertools.pairwise(curve))
-
-
-def asked_plans(monkeypatch: pytest.MonkeyPatch, fit: Callable[[], object]) -> list[list[tuple]]:
-    """The stages of each plan that a bench fits: resolution, steps, shrinking, views and tiles of a step."""
-    calls = []
-
-    def begin(views: object, box: object, plan: object) -> SimpleNamespace:
-        calls.append([(s.longest, s.steps, s.shrink, s.views, s.tiles) for s in plan.stages])
-        return SimpleNamespace(course=SimpleNamespace(iterations=0), advance=lambda: None)
-
-    monkeypatch.setattr(study, "begin_radiance_fit", begin)
-    monkeypatch.setattr(study.RayBatches, "from_photos", lambda *of: of)
-    fit()
-    return calls
-
-
-def test_fit_mivol_has_three_stages(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
-    """An eighth, a quarter and all of the nodes, from views shrunk by 4, by 2 and not at all; each is compiled first."""
-    size = replace(RadianceSize.quick(), fit_resolution=32, fit_side=64, steps=10)
-    plans = asked_plans(monkeypatch, lambda: fit_mivol([], [], size))
-    assert plans[-1] == [(4, 10, 4, 7, 9), (8, 10, 2, 7, 9), (32, 20, 1, 7, 36)]
-    assert plans[:-1] == [[(n, 2, shrink, 7, tiles)] for n, _, shrink, _, tiles in plans[-1]]
-    small = asked_plans(monkeypatch, lambda: fit_mivol([], [], replace(size, fit_side=8)))[-1]
-    assert [stage[-1] for stage in small] == [1, 1, 4]
 
 
 @pytest.mark.parametrize("kind", ["camera", "pixels", "any"])
@@ -208,17 +179,6 @@ def test_the_fitted_field_is_the_chair_where_there_is_one(monkeypatch: pytest.Mo
     assert calls.value.args == (chair if there else ("shell", {}))
 
 
-def test_a_smaller_array_stands_in_the_middle() -> None:
-    result = centre(np.ones((2, 3, 4, 2), np.float32), 6)
-    assert result.shape == (6, 6, 6, 2)
-    assert np.all(result[2:4, 1:4, 1:5] == 1) and result.sum() == 2 * 24
-
-
-def test_rays_are_float32(variant_rgb: str) -> None:
-    created = to_bundle(BOX.repeat(2, axis=0), np.ones((4, 3)))
-    assert np.array_equal(np.array(created.o).T, BOX.repeat(2, axis=0).astype(np.float32))
-
-
 @pytest.mark.slow
 def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     calls = (FitChoice("wires", 16, 0.03), FitChoice("wires", effort=0.01, preset="tiny"))
@@ -253,11 +213,6 @@ def test_pixels_of_the_peer_are_those_of_the_camera(variant_rgb: str) -> None:
             return colours
 
     np.testing.assert_array_equal(study.render_peer(Mirror(), camera), image)
-
-
-def test_a_stage_of_the_peer_has_twice_the_resolution(variant_rgb: str) -> None:
-    refined = Peer.start(4).refined()
-    assert (refined.density.shape, refined.harmonics.shape) == ((8, 8, 8, 1), (8, 8, 8, 27))
 
 
 @pytest.mark.slow

@@ -238,11 +238,6 @@ def test_times_are_compared_at_the_error_that_both_reach(monkeypatch: pytest.Mon
     assert peers.ratio_rows(result)[2:] == ["| a / b | 0.50 (0.2000) | 2.00 (0.4000) |"]
 
 
-def test_times_are_medians_of_runs() -> None:
-    runs = [{"a": curve([0.5, 0.2], seconds)} for seconds in ([1.0, 9.0], [3.0, 5.0], [2.0, 7.0])]
-    assert peers.median_times(runs) == {"a": curve([0.5, 0.2], [2.0, 7.0])}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("photons", [0.0, 1e3])
 def test_the_default_of_a_slice_is_that_of_a_file(variant_rgb: str, photons: float) -> None:

@@ -15,8 +15,9 @@ from scattering_gradients import BATCHES, DENSITIES, GRID, assert_gradient, grad
 from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
+from mivol.bench.parameter_gradient import ParameterGradient
 from mivol.bench.scenes import box_scene, constant_light
-from mivol.bench.studies.gradients.density_gradient import DensityGradient, Light
+from mivol.bench.studies.gradients.lights import Light
 from mivol.bench.studies.gradients.twin import Twin
 from mivol.scene import plan
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes, ShadowReservoir, ShadowTerm
@@ -239,7 +240,7 @@ def test_what_no_camera_ray_meets():
     left = np.broadcast_to(np.arange(8) < 4, (8, 8, 8))
     values, direction = np.where(left, 2.0, 0), np.where(left, 0.0, 1.0)
     light = _Aside(constant_light, depth=4)
-    subject = DensityGradient(light.scene(np.float32(values), 8), light.integrator("mivol"))
+    subject = ParameterGradient(light.scene(np.float32(values), 8), light.integrator("mivol"))
     twin = Twin(values, direction, 8, light)
     found = [float(np.array(subject.of_mean(fresh(k), 512), np.float64) @ direction.ravel()) for k in range(BATCHES)]
     truth = [twin.derivative(fresh(100 + k), 256) for k in range(BATCHES)]

@@ -28,8 +28,8 @@ from mivol.bench.harness.bars import Bar, judge_agreement, say_row
 from mivol.bench.harness.contests import BudgetSize, Contest, Method, compete, contest_images
 from mivol.bench.harness.figures import new_figure, plot_errors, use_plain_ticks
 from mivol.bench.harness.study import Study, amount
+from mivol.bench.parameter_gradient import ParameterGradient
 from mivol.bench.scenes import box_scene, constant_light, make_integrator, sun_and_sky
-from mivol.bench.studies.gradients.density_gradient import DensityGradient
 from mivol.validate.moments import Moments
 
 
@@ -100,7 +100,7 @@ def measure_image(model: Model, values: np.ndarray, size: LadderSize) -> dict:
 def measure_gradient(model: Model, values: np.ndarray, size: LadderSize) -> dict:
     """Errors of voxels against time."""
     methods: dict[str, Method] = {
-        name: DensityGradient(model.scene(values, size.side), integrator).of_mean
+        name: ParameterGradient(model.scene(values, size.side), integrator).of_mean
         for name, integrator in model.integrators("prbvolpath").items()
     }
     contest = compete(methods, size.rounds, size.budget, size.spp, levels=size.levels, seed=size.seed)

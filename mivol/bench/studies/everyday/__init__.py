@@ -41,8 +41,8 @@ from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, sa
 from mivol.bench.harness.contests import agreement_figures, compete, gain_figures, image_errors, render_method
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.parameter_gradient import ParameterGradient
 from mivol.bench.studies.everyday.scenes import SCENES, EverydayScene
-from mivol.bench.studies.gradients.density_gradient import DensityGradient
 from mivol.errors import MivolError
 from mivol.optim.strategy import suggest_name
 from mivol.report.figures import SERIES
@@ -134,7 +134,7 @@ def _contend_images(scene: EverydayScene, size: EverydaySize) -> dict:
 def _contend_gradients(scene: EverydayScene, size: EverydaySize) -> dict:
     """Variances and times of the gradients of both integrators, and derivatives along the logarithm of the parameter."""
     gradients = {
-        name: DensityGradient(scene.load(size.side), scene.integrator(name), scene.parameter) for name in (PEER, "mivol")
+        name: ParameterGradient(scene.load(size.side), scene.integrator(name), scene.parameter) for name in (PEER, "mivol")
     }
     methods = {name: partial(g.of_loss, _mean_of_image) for name, g in gradients.items()}
     values = np.array(gradients["mivol"].params[scene.parameter], np.float64).ravel()

@@ -59,10 +59,11 @@ from matplotlib.axes import Axes
 
 from mivol.bench.extinctions import Extinction, fine_smoke, les_cloud, smoke
 from mivol.bench.harness.agreement import compare_means, finite_or_none, mean_of_rounds
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, judge_agreement, say_row
+from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, Promise, judge, judge_agreement, say_row
 from mivol.bench.harness.contests import SEED_STRIDE, Contest, compete
-from mivol.bench.harness.figures import new_figure, plot_errors, use_plain_ticks
+from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import Study, amount, ask
+from mivol.bench.parameter_gradient import ParameterGradient, square_error
 from mivol.bench.scenes import (
     constant_light,
     directional_light,
@@ -71,12 +72,15 @@ from mivol.bench.scenes import (
     sun_and_sky,
     sun_before_the_camera,
 )
-from mivol.bench.studies.gradients.density_gradient import INTEGRATORS, DensityGradient, Light, square_error
+from mivol.bench.studies.gradients.lights import INTEGRATORS, Light
 from mivol.bench.studies.gradients.tutorial import TutorialSize, measure_tutorial
 from mivol.bench.studies.gradients.twin import Twin
 from mivol.report.figures import MARKERS, SERIES
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
+
+DENSE = "sigma_t >= 1"
+"""Region whose gradients are judged."""
 
 CONSTANT, SUN, DIRECTIONAL = "constant light", "HG 0.8, sun in a sky", "HG 0.8, directional"
 
@@ -157,7 +161,7 @@ def measure_contest(question: str, size: GradientSize) -> dict:
         for functional, methods in functionals.items():
             contest = compete(methods, size.rounds * light.rounds, size.budget, size.spp, seed=size.seed)
             answer[name][functional] = contest_figures(contest, volume.values, size.side, 2 * len(lights))
-            dense = answer[name][functional]["sigma_t >= 1"]
+            dense = answer[name][functional][DENSE]
             say_row(f"{name}, {functional}", variance_x_time=dense["variance_x_time"], z=dense["z"])
     return answer
 
@@ -178,7 +182,7 @@ def contest_figures(contest: Contest, values: np.ndarray, side: int, comparisons
         spp = contest.spp[name, 1]
         figures[name] = {"spp": spp} | contest.timings[name, 1].report(side * side * spp, "samples")
     figures |= times
-    regions = {"sigma_t >= 1": values >= 1, "0 < sigma_t < 1": (values > 0) & (values < 1), "sigma_t = 0": values == 0}
+    regions = {DENSE: values >= 1, "0 < sigma_t < 1": (values > 0) & (values < 1), "sigma_t = 0": values == 0}
     for region, chosen in regions.items():
         if not chosen.any():
             continue
@@ -245,7 +249,7 @@ def make_deep_cases(res: int, light: Light) -> dict[str, Case]:
     return {name: Case(np.where(left, least, noise), np.where(left, 1.0, 0.0)), "dense": Case(3 * noise, 3 * noise)}
 
 
-def finite_difference(gradient: DensityGradient, case: Case, seed: int, spp: int) -> float:
+def finite_difference(gradient: ParameterGradient, case: Case, seed: int, spp: int) -> float:
     """Finite difference along the direction with common random numbers: central of order 4, or one-sided of order 3."""
     v, h = case.direction, case.step
     central = (case.values[v > 0] > 0).all()
@@ -253,7 +257,7 @@ def finite_difference(gradient: DensityGradient, case: Case, seed: int, spp: int
     return sum(w * gradient.mean(case.values + s * h * v, seed, spp) for s, w in weights.items()) / (6 * h)
 
 
-def estimate_truth(case: Case, light: Light, gradient: DensityGradient, size: GradientSize) -> Callable[[int], float]:
+def estimate_truth(case: Case, light: Light, gradient: ParameterGradient, size: GradientSize) -> Callable[[int], float]:
     """Estimator of the true derivative, by its seed: finite differences of mivol's images, or the twin."""
     if case.step:
         return lambda seed: finite_difference(gradient, case, seed, size.difference_spp)
@@ -336,44 +340,37 @@ def bias_figures(derivatives: np.ndarray, truth: Estimate, rows: int) -> dict:
 # -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 
+PROMISES = {
+    question: [
+        Promise(
+            f"variance x time: {question}, gradient of {{}}, {name}", (name, "*", DENSE, "variance_x_time"), AT_LEAST, light.bar
+        )
+        for name, light in lights.items()
+    ]
+    for question, (_, lights) in CONTESTS.items()
+} | {
+    question: [
+        Promise(f"{question}: how much sooner at the {loss} loss", (key, "sooner"), AT_LEAST, bar)
+        for loss, key, bar in (("last", "to_the_last_loss_of_prbvolpath", last), ("lowest", "to_its_lowest_loss", lowest))
+        if bar is not None
+    ]
+    for question, (_, last, lowest) in TUTORIALS.items()
+}
+
+
 def compare(question: str, answer: dict) -> list[Bar]:
-    """Judge the figures of an answer."""
+    """Judge the agreement of the means of contests, and the bias of mivol in tables."""
     if question in CONTESTS:
-        return compare_contest(question, answer)
-    return compare_table(answer) if question in TABLES else compare_tutorial(question, answer)
-
-
-def compare_contest(question: str, answer: dict) -> list[Bar]:
-    """Judge the ratios, and the agreement of the means."""
+        parts = [(f"{f}, {name}", answer[name][f][DENSE]) for name in CONTESTS[question][1] for f in answer[name]]
+        return [judge_agreement(f"{question}, gradient of {label}", d["z"], d["z_bound"]) for label, d in parts]
     rows = []
-    for name, light in CONTESTS[question][1].items():
-        for functional, figures in answer[name].items():
-            dense, label = figures["sigma_t >= 1"], f"{question}, gradient of {functional}, {name}"
-            rows.append(judge(f"variance x time: {label}", dense["variance_x_time"], AT_LEAST, light.bar))
-            rows.append(judge_agreement(label, dense["z"], dense["z_bound"]))
-    return rows
-
-
-def compare_table(answer: dict) -> list[Bar]:
-    """Judge the bias of mivol."""
-    rows = []
-    for light, table in answer.items():
+    for light, table in answer.items() if question in TABLES else ():
         for name, row in table.items():
             label, figures = f"{name}, {light}", row["mivol"]
             bound = abs(figures["bias_percent"]) + 3 * figures["known_to_percent"]
             rows.append(judge(f"bias and 3 standard errors [%]: {label}", bound, AT_MOST, 0.5, quiet=True))
             z = abs(figures["bias_standard_errors"])
             rows.append(judge(f"bias [standard errors]: {label}", z, AT_MOST, 3, quiet=True))
-    return rows
-
-
-def compare_tutorial(question: str, answer: dict) -> list[Bar]:
-    """Judge the ratios of times."""
-    _, last, lowest = TUTORIALS[question]
-    rows = [judge(f"{question}: how much sooner", answer["to_the_last_loss_of_prbvolpath"]["sooner"], AT_LEAST, last)]
-    if lowest is not None:
-        sooner = answer["to_its_lowest_loss"]["sooner"]
-        rows.append(judge(f"{question}: how much sooner at the lowest loss", sooner, AT_LEAST, lowest))
     return rows
 
 
@@ -388,14 +385,11 @@ def draw(answers: dict, path: Path) -> None:
 def plot_contest(axes: Axes, question: str, answer: dict) -> None:
     """Plot ratios beside their bars."""
     lights = CONTESTS[question][1]
-    names = [(light, functional) for light in lights for functional in answer[light]]
-    for row, (light, functional) in enumerate(reversed(names)):
-        axes.semilogx([answer[light][functional]["sigma_t >= 1"]["variance_x_time"]], [row], MARKERS[0], color=SERIES[0])
-        axes.plot([lights[light].bar] * 2, [row - 0.3, row + 0.3], color=SERIES[0], linestyle="--")
-    axes.set(yticks=range(len(names)), yticklabels=[f"{f}, {light}" for light, f in reversed(names)])
-    axes.set(title=f"Gradient ({question}), voxels with sigma_t >= 1")
-    axes.set(xlabel="variance x time over prbvolpath's (line: the bar)")
-    use_plain_ticks(axes.xaxis, "×")
+    ratios = {f"{f}, {name}": answer[name][f][DENSE]["variance_x_time"] for name in lights for f in answer[name]}
+    plot_ratios(axes, list(ratios), {"mivol": list(ratios.values())}, [])
+    bars = [light.bar for name, light in lights.items() for _ in answer[name]]
+    axes.plot(bars, np.arange(len(bars))[::-1], "|", markersize=14, color=SERIES[0])
+    axes.set(title=f"Gradient ({question}), voxels with {DENSE}", xlabel="variance x time over prbvolpath's (mark: the bar)")
 
 
 def plot_table(axes: Axes, question: str, answer: dict) -> None:
@@ -432,4 +426,4 @@ QUESTIONS = (
     | {name: ask(f"{TUTORIAL} {depth}?", measure_tutorial, depth) for name, (depth, *_) in TUTORIALS.items()}
 )
 ON_REQUEST = ("tutorial", "deep smoke", "deep fine smoke", "deep cloud", "deep estimators", "deep tutorial")
-STUDY = Study(__name__, __doc__, GradientSize, QUESTIONS, compare, draw, on_request=ON_REQUEST)
+STUDY = Study(__name__, __doc__, GradientSize, QUESTIONS, compare, draw, on_request=ON_REQUEST, promises=PROMISES)

@@ -23,8 +23,9 @@ from mivol.bench.harness.agreement import compare_means, mean_of_rounds
 from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.study import Size, amount
 from mivol.bench.harness.timing import Stopwatch
+from mivol.bench.parameter_gradient import DENSITY
 from mivol.bench.scenes import box_scene, constant_light, make_integrator, perspective
-from mivol.bench.studies.gradients.density_gradient import ALBEDO, INTEGRATORS, KEY
+from mivol.bench.studies.gradients.lights import ALBEDO, INTEGRATORS
 from mivol.validate.metrics import nrmse
 from mivol.validate.statistics import Estimate
 
@@ -121,7 +122,7 @@ def optimize(name: str, depth: int, judge: Judge, size: TutorialSize) -> Iterato
     scene = mi.load_dict(tutorial_scene(dr.full(mi.TensorXf, 0.002, (res, res, res, 1))))
     params, integrator, judging = mi.traverse(scene), make_integrator(name, depth), make_integrator("mivol", depth)
     opt = mi.ad.Adam(lr=0.02)
-    opt[KEY] = params[KEY]
+    opt[DENSITY] = params[DENSITY]
     params.update(opt)
     run, watch = Run(), Stopwatch()
 
@@ -129,13 +130,13 @@ def optimize(name: str, depth: int, judge: Judge, size: TutorialSize) -> Iterato
         image = mi.render(scene, params, sensor=judge.sensors[k], integrator=integrator, spp=spp, seed=seed)
         dr.backward(dr.mean(dr.square(image - judge.references[k])))
         opt.step()
-        opt[KEY] = dr.clip(opt[KEY], 1e-6, 1.0)
+        opt[DENSITY] = dr.clip(opt[DENSITY], 1e-6, 1.0)
         params.update(opt)
-        dr.eval(opt[KEY])
+        dr.eval(opt[DENSITY])
 
     for stage, (iterations, spp) in enumerate(zip(size.steps, size.step_spp, strict=True)):
         if stage:
-            opt[KEY] = dr.resample(opt[KEY], shape=(*(size.resolutions[stage],) * 3, 1), filter="linear")
+            opt[DENSITY] = dr.resample(opt[DENSITY], shape=(*(size.resolutions[stage],) * 3, 1), filter="linear")
             params.update(opt)
         for iteration in range(iterations):
             with watch:
@@ -144,7 +145,7 @@ def optimize(name: str, depth: int, judge: Judge, size: TutorialSize) -> Iterato
             run.seconds.append(watch.seconds)
             run.processor.append(watch.processor)
             run.loss.append(judge.loss(scene, iteration + 1000 * stage, judging))
-            run.density_error.append(judge.density_error(np.array(params[KEY])[..., 0]))
+            run.density_error.append(judge.density_error(np.array(params[DENSITY])[..., 0]))
             yield run
 
 

@@ -27,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.studies.gradients.density_gradient import Light
+from mivol.bench.studies.gradients.lights import Light
 
 MAJORANT_FACTOR, P_MIN, P_MAX = 1.1, 0.25, 0.95
 """Majorant over the largest extinction; bounds of P."""

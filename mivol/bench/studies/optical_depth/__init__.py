@@ -29,6 +29,7 @@ from mivol.bench.extinctions import TO_WORLD, Extinction, ct_scan, made_up, smok
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.bench.harness.timing import peak_bytes, race, ratio_of, time_call
+from mivol.bench.parameter_gradient import ParameterGradient
 from mivol.bench.reference_walk import GridRays, camera_rays
 from mivol.bench.scenes import box_scene
 from mivol.bench.studies.optical_depth.peers import (
@@ -192,18 +193,13 @@ def gradient_step(values: mi.TensorXf, integrate: Callable[[mi.TensorXf], mi.Flo
 
 def race_gradient_of_render(size: OpticalDepthSize) -> dict:
     """Times of a render and of a gradient step through ``mi.render``."""
-    scene, integrator = mi.load_dict(box_scene(smoke().values, size.image_side)), mi.load_dict({"type": "mivol"})
-    params, key = mi.traverse(scene), "box.interior_medium.sigma_t.data"
+    gradient = ParameterGradient(mi.load_dict(box_scene(smoke().values, size.image_side)), mi.load_dict({"type": "mivol"}))
 
     def render(seed: int) -> mi.TensorXf:
-        return mi.render(scene, params, integrator=integrator, spp=size.image_spp, seed=seed)
+        return mi.render(gradient.scene, gradient.params, integrator=gradient.integrator, spp=size.image_spp, seed=seed)
 
     def step(seed: int) -> mi.Float:
-        dr.enable_grad(params[key])
-        dr.backward(dr.mean(render(seed)))
-        gradient = dr.grad(params[key])
-        dr.disable_grad(params[key])
-        return gradient
+        return gradient.of_loss(lambda image: dr.mean(image, axis=None), seed, size.image_spp)
 
     timings = race({"render": render, "gradient step": step}, size.rounds)
     reports = {name: t.report(size.image_side**2 * size.image_spp, "paths") for name, t in timings.items()}

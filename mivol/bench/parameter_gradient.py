@@ -1,8 +1,7 @@
-"""Density gradients of images by one integrator, and the lights in which integrators are compared."""
+"""Gradients of images with respect to one parameter of a scene."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,59 +9,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.scenes import box_scene, make_integrator
+__all__ = ["DENSITY", "ParameterGradient", "square_error"]
 
-ALBEDO = 0.75
-INTEGRATORS = ("mivol", "prbvolpath")
-
-KEY = "box.interior_medium.sigma_t.data"
-"""Key of the voxels in ``mi.traverse``."""
-
-
-@dataclass(frozen=True)
-class Light:
-    """A light on a box, and the number of scatterings in the box.
-
-    Attributes:
-        parts: makes the parts of the scene.
-        bar: smallest ratio of variance x time.
-        depth: ``max_depth``; -1: unlimited.
-        albedo: albedo of the medium.
-        samples_emitters: the twin samples emitters at collisions; otherwise its paths find light by chance.
-        hidden: ``hide_emitters``.
-        traps_light: the boundary of the medium reflects all light of some directions, so this light stays inside.
-        rounds: factor on the number of rounds, for variances as well known as in other lights.
-    """
-
-    parts: Callable[[], dict]
-    bar: float = math.nan
-    depth: int = 2
-    albedo: float = ALBEDO
-    samples_emitters: bool = False
-    hidden: bool = False
-    traps_light: bool = False
-    rounds: int = 1
-
-    def scene(self, values: np.ndarray, side: int) -> mi.Scene:
-        """The box around an extinction (Z, Y, X), seen in an image with ``side`` x ``side`` pixels."""
-        return mi.load_dict(box_scene(values, side, self.albedo, **self.parts()))
-
-    def integrator(self, name: str) -> mi.Integrator:
-        """An integrator with the depth of this light."""
-        return make_integrator(name, self.depth, self.hidden)
-
-    def gradients(self, values: np.ndarray, side: int) -> dict[str, DensityGradient]:
-        """The gradients of both integrators, with separate scenes."""
-        return {name: DensityGradient(self.scene(values, side), self.integrator(name)) for name in INTEGRATORS}
+DENSITY = "box.interior_medium.sigma_t.data"
+"""Key of the voxels of :func:`mivol.bench.scenes.box_scene` in ``mi.traverse``."""
 
 
 @dataclass
-class DensityGradient:
+class ParameterGradient:
     """Gradients with respect to one parameter of a scene, by one integrator made for this scene."""
 
     scene: mi.Scene
     integrator: mi.Integrator
-    key: str = KEY
+    key: str = DENSITY
 
     def __post_init__(self) -> None:
         self.params = mi.traverse(self.scene)
@@ -94,7 +53,7 @@ class DensityGradient:
         return self._collect(backward)
 
     def mean(self, values: np.ndarray, seed: int, spp: int) -> float:
-        """Mean of the image for other values (Z, Y, X)."""
+        """Mean of the image for other values (Z, Y, X) of a grid."""
         self.params[self.key] = mi.TensorXf(np.float32(values)[..., None])
         self.params.update()
         return float(np.mean(np.array(mi.render(self.scene, integrator=self.integrator, seed=seed, spp=spp), np.float64)))
