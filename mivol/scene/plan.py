@@ -227,10 +227,12 @@ def build_estimators(
             choice.visibility_cache = _make_visibility_cache(direct, needs, plan, survey, for_images)
             if settings.shadows == "grid":
                 choice.transmittance_grid = build_transmittance_grid(media, direct.emitters)
-    lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1
     segment = SEGMENT_ESTIMATORS[plan.segment].make(choice)
     is_even = all(kind == "uniform" for kind in needs.emitter_kinds)
+    lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1 and not is_even
     lights_media = segment.ends_in_media and not needs.is_sealed and not is_even
+    if lights_surfaces or lights_media:
+        direct.emitters  # noqa: B018  (made now, not in the loop of a path)
     lobe = None if plan.side_flight_cosine is None else dr.opaque(mi.Float, plan.side_flight_cosine)
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)

@@ -328,7 +328,7 @@ def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> 
     w_mis = mi.Float(1)
     if estimators.lights_surfaces or estimators.lights_media:
         direct = mi.DirectionSample3f(scene, si, path.last)
-        pdf_emitter = scene.pdf_emitter_direction(path.last, direct, ~path.delta & (emitter != None))
+        pdf_emitter = estimators.direct.emitters.pdf_direction(path.last, direct, ~path.delta & (emitter != None))
         w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
     with dr.resume_grad(when=path.score.purpose != IMAGE):
         Le = path.beta * w_mis * emitter.eval(si, visible)

@@ -67,11 +67,10 @@ class EmitterSample:
     """A direction sampled towards an emitter.
 
     Attributes:
-        direct: Mitsuba's sample.
+        direct: Mitsuba's sample; its density contains the probability of the emitter.
         weight: radiance over ``direct.pdf``.
         emitter: the emitter.
         u: random numbers of the direction.
-        count: number of emitters chosen from with equal probabilities; not contained in ``direct.pdf``.
         has_alternative: lanes in which a BSDF or phase sample can hit the emitter too, with a power heuristic between both.
     """
 
@@ -79,7 +78,6 @@ class EmitterSample:
     weight: mi.Spectrum
     emitter: mi.EmitterPtr
     u: mi.Point2f
-    count: int
     has_alternative: mi.Bool | bool
 
 
@@ -119,7 +117,7 @@ class DistantEmitterSample:
         direct.p, direct.n, direct.d, direct.dist = mi.Point3f(it.p) + self.dist * self.d, -self.d, self.d, self.dist
         direct.pdf, direct.delta, direct.emitter = self.pdf, self.delta, self.emitter
         direct.uv, direct.time = self.uv, it.time
-        return EmitterSample(direct, self.weight, self.emitter, self.u, 1, True)
+        return EmitterSample(direct, self.weight, self.emitter, self.u, True)
 
 
 class DirectLight(TrackedTerm):
@@ -160,13 +158,14 @@ class DirectLighting:
 
     @cached_property
     def emitters(self) -> SceneEmitters:
-        """The emitters of the scene, for choosing one in media; at surfaces Mitsuba chooses the emitter."""
-        return SceneEmitters(self.media.scene)
+        """The emitters of the scene. Their tables are made at the first call, which must not lie in a recorded loop."""
+        with dr.suspend_grad():
+            return SceneEmitters(self.media.scene, self.media.start is not None)
 
     def sample_emitter(self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> EmitterSample:
         """Sample a direction from a point towards an emitter, by two uniform random numbers in [0, 1)."""
-        direct, weight = self.media.scene.sample_emitter_direction(it, u, False, active)
-        return EmitterSample(direct, weight, direct.emitter, u, 1, True)
+        direct, weight, emitter, u = self.emitters.sample_direction(it, u, active)
+        return EmitterSample(direct, weight, emitter, u, True)
 
     def estimate_at_vertex(
         self, vertex: Vertex, sample: EmitterSample, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
@@ -189,11 +188,9 @@ class DirectLighting:
         on &= clear
         w_mis = mi.Float(1)
         if sample.has_alternative is not False:
-            pdf = direct.pdf / sample.count
-            w_mis = dr.select(
-                direct.delta | ~mi.Bool(sample.has_alternative), 1, power_heuristic(pdf, vertex.pdf(direct.d, on))
-            )
-        factor = light * (w_mis * sample.count)
+            pdf = vertex.pdf(direct.d, on)
+            w_mis = dr.select(direct.delta | ~mi.Bool(sample.has_alternative), 1, power_heuristic(direct.pdf, pdf))
+        factor = light * w_mis
         with dr.resume_grad(when=attached):
             source, moved = sample.weight, direct
             if attached:
@@ -242,15 +239,23 @@ class DirectLighting:
         if self.emitters.sampled:
             mei = vertex.interaction
             direct, weight = chosen.emitter.sample_direction(mei, samples.emitter, active)
+            probability = chosen.distribution.probability(chosen.number)
+            direct.pdf, weight = direct.pdf * probability, weight / dr.select(probability > 0, probability, 1)
             weighed = ~is_among(self.emitters.transmissive, chosen.emitter) if self.emitters.samples_phase else False
-            sample = EmitterSample(direct, weight, chosen.emitter, samples.emitter, len(self.emitters.sampled), weighed)
+            sample = EmitterSample(direct, weight, chosen.emitter, samples.emitter, weighed)
             directs.append(self.estimate_at_vertex(vertex, sample, attached, active, rngs[0]))
         if self.emitters.samples_phase:
-            directs.append(self._phase_sample(vertex, samples, attached, active, rngs[1]))
+            directs.append(self._phase_sample(vertex, chosen, samples, attached, active, rngs[1]))
         return directs
 
     def _phase_sample(
-        self, vertex: MediumVertex, samples: EventSamples, attached: bool, active: mi.Bool, rng: mi.UInt32 | None
+        self,
+        vertex: MediumVertex,
+        chosen: ChosenEmitter,
+        samples: EventSamples,
+        attached: bool,
+        active: mi.Bool,
+        rng: mi.UInt32 | None,
     ) -> DirectSample:
         """Light from a direction sampled from the phase function."""
         emitters, mei = self.emitters, vertex.interaction
@@ -264,8 +269,7 @@ class DirectLighting:
         w_mis = mi.Float(1)
         if emitters.sampled:
             direct = mi.DirectionSample3f(self.media.scene, si, mei)
-            pdf_emitter = emitter.pdf_direction(mei, direct, on) / len(emitters.sampled)
-            w_mis = dr.select(is_among(emitters.sampled, emitter), power_heuristic(pdf, pdf_emitter), 1)
+            w_mis = power_heuristic(pdf, emitters.weigh_density(chosen.distribution, mei, direct, on))
         factor = light * w_mis
         with dr.resume_grad(when=attached):
             if attached:

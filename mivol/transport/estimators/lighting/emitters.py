@@ -1,4 +1,7 @@
-"""The emitters of a scene, the choice of an emitter for each lane, and the random numbers and distances of samples towards it.
+"""The emitters of a scene, and the random numbers and distances of samples towards an emitter.
+
+An emitter is chosen by the light that it gives around a vertex or along a ray (:mod:`.emitter_grid`). The light of a constant
+environment is found by sampled directions alone.
 
 Equiangular sampling draws distances along a ray uniformly in the angle seen from an emitter.
 
@@ -14,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.transport.estimators.lighting.emitter_grid import EmitterDistribution, tabulate_emitters
 from mivol.transport.traversal.random_numbers import Strata
 from mivol.transport.traversal.rays import Ray
 
@@ -39,15 +43,16 @@ class SceneEmitters:
 
     Args:
         scene: Mitsuba's scene.
+        from_camera: media surround the camera, so rays scatter light from their origin on.
 
     Attributes:
-        sampled: emitters that next-event estimation chooses from with equal probabilities: all except a constant environment.
+        sampled: emitters that next-event estimation chooses from: all except a constant environment.
         transmissive: emitters on surfaces that transmit part of the light without deviation.
         samples_phase: phase functions are sampled too, since their directions can hit an emitter.
         is_near: some emitter has a finite distance.
     """
 
-    def __init__(self, scene: mi.Scene) -> None:
+    def __init__(self, scene: mi.Scene, from_camera: bool = False) -> None:
         emitters = scene.emitters()
         delta = int(mi.EmitterFlags.Delta)
         self.sampled = [e for e in emitters if e.class_name() != UNIFORM_EMITTER]
@@ -57,6 +62,10 @@ class SceneEmitters:
         balls = [_find_bounding_ball(e) for e in self.sampled]
         self.is_near = any(b is not None for b in balls)
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
+        self._from_camera = from_camera
+        if self.sampled:
+            self._table = _EmitterTable.of(scene, self.sampled, self._balls)
+            self._grid = tabulate_emitters(self._table.pointers, _find_lit_box(scene), self.is_near)
 
     def bounding_ball(self, number: int) -> list[mi.Float] | None:
         """Centre and radius of a ``sampled`` emitter [length]; None if the emitter is at infinity."""
@@ -76,19 +85,130 @@ class SceneEmitters:
         )
 
     def choose_emitter(self, ray: Ray, u: mi.Float) -> ChosenEmitter:
-        """Choose one of the ``sampled`` emitters for each lane with equal probabilities, by ``u`` in [0, 1)."""
-        n, width = len(self.sampled), dr.width(ray)
-        index = dr.minimum(mi.UInt32(u * n), max(n - 1, 0))
-        emitter = dr.zeros(mi.EmitterPtr, width)
-        centre, radius2, finite = mi.Point3f(0), mi.Float(0), mi.Bool(False)
-        for k, (candidate, ball) in enumerate(zip(self.sampled, self._balls, strict=True)):
-            is_chosen = index == k
-            emitter = dr.select(is_chosen, mi.EmitterPtr(candidate), emitter)
-            if ball is not None:
-                x, y, z, r = ball
-                centre = dr.select(is_chosen, mi.Point3f(x, y, z), centre)
-                radius2, finite = dr.select(is_chosen, dr.square(r), radius2), is_chosen | finite
-        return ChosenEmitter(index, emitter, make_equiangular_sampler(ray, centre, radius2, finite) if self.is_near else None)
+        """Choose one of the ``sampled`` emitters for each lane, by its light along a ray and by ``u`` in [0, 1)."""
+        if not self.sampled:
+            return ChosenEmitter(mi.UInt32(0), dr.zeros(mi.EmitterPtr, dr.width(ray)), None, None)
+        distribution = self._grid.along_ray(ray, self._from_camera)
+        number, _ = distribution.sample(u)
+        if len(self.sampled) == 1:
+            equiangular = make_ball_sampler(ray, self._balls[0])
+        elif not self.is_near:
+            equiangular = None
+        else:
+            x, y, z, r, finite = self._table.ball(number)
+            equiangular = make_equiangular_sampler(ray, mi.Point3f(x, y, z), dr.square(r), finite)
+        return ChosenEmitter(number, self._table.pointer(number), equiangular, distribution)
+
+    def sample_direction(
+        self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.EmitterPtr, mi.Point2f]:
+        """Choose an emitter by its light at a point, and sample a direction towards it, by two numbers in [0, 1).
+
+        Returns:
+            Mitsuba's sample, its radiance over density, the emitter, and the random numbers of the direction. The density
+            contains the probability of the emitter.
+        """
+        distribution = self._grid.at_point(it.p)
+        number, rest = distribution.sample(u.x)
+        emitter, u = self._table.pointer(number), mi.Point2f(rest, u.y)
+        direct, weight = emitter.sample_direction(it, u, active)
+        probability = distribution.probability(number)
+        direct.pdf *= probability
+        return direct, weight / dr.select(probability > 0, probability, 1), emitter, u
+
+    def pdf_direction(self, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
+        """Density of a direction in :meth:`sample_direction` [1/sr]; 0 towards an emitter that is not sampled."""
+        if not self.sampled:
+            return mi.Float(0)
+        return self.weigh_density(self._grid.at_point(it.p), it, direct, active)
+
+    def weigh_density(
+        self, distribution: EmitterDistribution, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool
+    ) -> mi.Float:
+        """Density of a direction towards an emitter [1/sr], times the probability of the emitter."""
+        probability = distribution.probability(self._table.number(direct.emitter))
+        return direct.emitter.pdf_direction(it, direct, active & (probability > 0)) * probability
+
+
+@dataclass
+class _EmitterTable:
+    """The sampled emitters by number, and their numbers.
+
+    Attributes:
+        emitters: the emitters.
+        pointers: the emitters as an array.
+        numbers: number of each emitter by its index in Dr.Jit's registry, and a number beyond all emitters for others.
+        balls: centre and radius of each emitter, and whether its distance is finite, one array for each.
+    """
+
+    emitters: list[mi.Emitter]
+    pointers: mi.EmitterPtr
+    numbers: mi.UInt32
+    balls: list[mi.Float]
+
+    @classmethod
+    def of(cls, scene: mi.Scene, emitters: list[mi.Emitter], balls: list[list[mi.Float] | None]) -> _EmitterTable:
+        """Make the table.
+
+        Args:
+            scene: Mitsuba's scene.
+            emitters: the emitters, in the order of the scene.
+            balls: centre and radius of each; None for an emitter at infinity.
+        """
+        count, everyone = len(emitters), scene.emitters()
+        if count == 1:
+            (only,) = emitters
+            return cls(emitters, mi.EmitterPtr(only), mi.UInt32(0), [])
+        # A scene has at most one environment, so at most one emitter is left out.
+        left_out = next((k for k, e in enumerate(everyone) if not any(e is other for other in emitters)), count)
+        number = dr.arange(mi.UInt32, count)
+        pointers = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.select(number < left_out, number, number + 1))
+        size = max(int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0]) for e in everyone) + 1
+        numbers = dr.full(mi.UInt32, count, size)
+        dr.scatter(numbers, number, dr.reinterpret_array(mi.UInt32, pointers))
+        far = [dr.opaque(mi.Float, 0)] * 4
+        rows = zip(*(far if b is None else b for b in balls), strict=True)
+        finite = [dr.opaque(mi.Float, float(b is not None)) for b in balls]
+        columns = [_join(list(row)) for row in (*rows, finite)]
+        dr.eval(pointers, numbers, columns)
+        return cls(emitters, pointers, numbers, columns)
+
+    def pointer(self, number: mi.UInt32) -> mi.EmitterPtr:
+        """The emitter of a number."""
+        if len(self.emitters) == 1:
+            return mi.EmitterPtr(self.emitters[0])
+        return dr.gather(mi.EmitterPtr, self.pointers, number)
+
+    def number(self, emitter: mi.EmitterPtr) -> mi.UInt32:
+        """The number of an emitter; a number beyond all emitters if it is not sampled."""
+        if len(self.emitters) == 1:
+            return dr.select(emitter == mi.EmitterPtr(self.emitters[0]), mi.UInt32(0), 1)
+        index = dr.reinterpret_array(mi.UInt32, emitter)
+        known = index < dr.width(self.numbers)
+        return dr.select(known, dr.gather(mi.UInt32, self.numbers, index, known), len(self.emitters))
+
+    def ball(self, number: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Bool]:
+        """Centre and radius of an emitter [length], and whether its distance is finite."""
+        x, y, z, r, finite = (dr.gather(mi.Float, column, number) for column in self.balls)
+        return x, y, z, r, finite > 0
+
+
+def _join(values: list[mi.Float], at_once: int = 16) -> mi.Float:
+    """Join arrays, few at once: a kernel with hundreds of inputs would take a second to compile."""
+    while len(values) > 1:
+        values = [dr.concat(values[k : k + at_once]) for k in range(0, len(values), at_once)]
+        dr.eval(values)
+    return values[0]
+
+
+def _find_lit_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
+    """The box around all boundaries of media; around the scene without boundaries; of zero size without shapes."""
+    shapes = scene.shapes()
+    boxes = [s.bbox() for s in shapes if s.is_medium_transition()] or [s.bbox() for s in shapes]
+    found = mi.ScalarBoundingBox3f()
+    for box in boxes:
+        found.expand(box)
+    return found if found.valid() else mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
 
 
 def _is_transmissive(emitter: mi.Emitter) -> bool:
@@ -123,11 +243,13 @@ class ChosenEmitter:
         number: index in ``SceneEmitters.sampled``.
         emitter: Mitsuba's emitter.
         equiangular: sampler of distances by the angle seen from the emitter; None if all emitters are at infinity.
+        distribution: distribution of the choice; None without emitters to choose from.
     """
 
     number: mi.UInt32
     emitter: mi.EmitterPtr
     equiangular: EquiangularSampler | None
+    distribution: EmitterDistribution | None
 
 
 @dataclass
