@@ -110,17 +110,19 @@ def samples() -> EventSamples:
 
 
 def test_a_point_of_smoke_under_two_emitters():
-    """I / (4 pi r^2) of the chosen emitter, doubled since one of two was chosen; the fog lies below."""
+    """I / (4 pi r^2) of the chosen emitter, over its probability; the fog lies below."""
     found = scene(one=emitter(4.0, 3.0), two=emitter(5.0, 7.0))
     direct, vertex = at_smoke(found)
     assert len(direct.emitters.sampled) == 2 and not direct.emitters.samples_phase
-    light = []
-    for u in (0.25, 0.75):
+    light, probabilities = [], []
+    for u in (0.02, 0.98):
         chosen = direct.emitters.choose_emitter(mi.Ray3f(vertex.interaction.p, mi.Vector3f(0, 0, 1)), mi.Float(u))
         with dr.suspend_grad():
             (sample,) = direct.estimate_in_medium(vertex, chosen, samples(), False, mi.Bool(True))
-        light.append(np.array(sample.value).ravel()[0])
-    np.testing.assert_allclose(sorted(light), np.array([7 / 4, 3 / 1]) * 2 / (4 * np.pi), rtol=ROUNDING)
+        probabilities.append(chosen.distribution.probability(chosen.number)[0])
+        light.append(np.array(sample.value).ravel()[0] * probabilities[-1])
+    np.testing.assert_allclose(sorted(light), np.array([7 / 4, 3 / 1]) / (4 * np.pi), rtol=ROUNDING)
+    assert sum(probabilities) == pytest.approx(1, rel=ROUNDING)
 
 
 def test_a_point_of_smoke_under_a_sky():

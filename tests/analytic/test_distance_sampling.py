@@ -46,7 +46,7 @@ def test_collisions_in_a_cell_of_linear_extinction(ends):
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -5 + zero), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
         kept = Candidate(one, begin * one, zero, length * one, [zero], zero, mi.UInt32(zero), mi.Bool(True), mi.UInt32(1))
         numbers = mi.Point2f(mi.Float(0.5), mi.Float(np.float32(u)))
-        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None), None, 0.0)
+        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None, None), None, 0.0)
         event = sample_distance(proposal, kept, one, numbers, mi.Bool(True))
     a, b = map(float, np.float32(ends))
     goal = -np.log1p(u * np.expm1(-length * (a + b) / 2))
@@ -138,7 +138,7 @@ def test_a_probe_is_spread_over_the_grid_alone():
     with dr.suspend_grad():
         media = media_of(seen.scene)
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -5 + dr.zeros(mi.Float, n)), mi.Vector3f(0, 0, 1))
-        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None), None, 0.7)
+        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None, None), None, 0.7)
         start = start_reservoir(media, mi.Float((np.arange(n) + 0.5) / n), n)
         _, reservoir = fill_reservoir(proposal, media.medium_at(ray), start, mi.Bool(True))
     (kept,) = reservoir.candidates

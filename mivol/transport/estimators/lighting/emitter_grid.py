@@ -7,8 +7,8 @@ So the cone of a spot, the horizon of a panel, textures and distances count, in 
 f_k / P(k) has the least variance if P(k) is in proportion to the root of the mean square of f_k. The factor s_k is the
 ``sampling_weight`` of the emitter in the scene.
 
-Each emitter has a share of an even choice besides. So no light is lost if the points of a cell miss an emitter, and an emitter
-of radiance 0 has derivatives.
+A choice by the light in all cells has a share, in case the points of a cell miss an emitter. An even choice has a smaller share,
+so an emitter of radiance 0 has derivatives.
 
 A vertex chooses by its cell. A ray chooses by the sum over points along the ray.
 
@@ -46,8 +46,8 @@ SINGLE_CELL_POINTS = 256
 MARGIN = 0.125
 """Width by which the points of a cell reach into its neighbours, as a fraction of a cell [1]."""
 
-EVEN_SHARE = 0.1
-"""Share of the even choice [1]."""
+MEAN_SHARE, EVEN_SHARE = 0.1, 0.01
+"""Shares of a choice by the light in all cells, and of an even choice [1]."""
 
 RAY_POINTS = 16
 """Points along a ray."""
@@ -205,10 +205,14 @@ def tabulate_emitters(emitters: mi.EmitterPtr, box: mi.ScalarBoundingBox3f, is_n
     # -- Weights -------------------------------------------------------------------------------------------------------------
     entry = dr.arange(mi.UInt32, cells**3 * count)
     scale = dr.detach(dr.gather(mi.EmitterPtr, emitters, entry % count).sampling_weight())
-    weight = rms * scale
-    total, scales = (dr.gather(mi.Float, dr.block_sum(v, count), entry // count) for v in (weight, scale))
-    even = dr.maximum(total, MIN_TOTAL) * scale / dr.maximum(scales, MIN_TOTAL)
-    cumulative = dr.block_prefix_reduce(dr.ReduceOp.Add, dr.lerp(weight, even, EVEN_SHARE), count, exclusive=False)
+    weight, everywhere = rms * scale, dr.zeros(mi.Float, count)
+    dr.scatter_add(everywhere, weight, entry % count)
+    total = dr.gather(mi.Float, dr.block_sum(weight, count), entry // count)
+    even = scale / dr.maximum(dr.gather(mi.Float, dr.block_sum(scale, count), entry // count), MIN_TOTAL)
+    mean = dr.gather(mi.Float, everywhere / dr.maximum(dr.sum(everywhere), MIN_TOTAL), entry % count)
+    other = dr.maximum(total, MIN_TOTAL) * (MEAN_SHARE * mean + EVEN_SHARE * even)
+    weight = dr.fma(1 - MEAN_SHARE - EVEN_SHARE, weight, other)
+    cumulative = dr.block_prefix_reduce(dr.ReduceOp.Add, weight, count, exclusive=False)
     dr.eval(cumulative)
     return EmitterGrid(cumulative, count, cells, centre, half)
 

@@ -12,7 +12,7 @@ from false_alarms import Estimate, assert_precise, assert_same_mean, assert_same
 from scattering_scenes import assert_same_images, close_up, fog, mivol, moments, point, spot, sun
 from volpath_scenes import LEAK, area, floor, panorama, textured
 
-from mivol.transport.estimators.lighting.emitter_grid import EVEN_SHARE, MARGIN, MAX_CELLS
+from mivol.transport.estimators.lighting.emitter_grid import EVEN_SHARE, MARGIN, MAX_CELLS, MEAN_SHARE
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -64,7 +64,10 @@ def test_two_lamps_at_points() -> None:
     for sign in (1, -1):
         strong, weak = (np.linalg.norm(p - lamp, axis=1) for lamp in (STRONG, WEAK))
         ratios.append(30.0 * np.maximum(weak - sign * reach, 0) ** 2 / (strong + sign * reach) ** 2)
-    low, high = (EVEN_SHARE / 2 + (1 - EVEN_SHARE) * r / (1 + r) for r in ratios)
+    rest = 1 - EVEN_SHARE - MEAN_SHARE
+    # The share by the light in all cells is at least even for the stronger lamp.
+    low, high = ratios[0] / (1 + ratios[0]), ratios[1] / (1 + ratios[1])
+    low, high = rest * low + MEAN_SHARE / 2 + EVEN_SHARE / 2, rest * high + MEAN_SHARE + EVEN_SHARE / 2
     it = dr.zeros(mi.Interaction3f)
     places = [np.array(e.sample_direction(it, mi.Point2f(0))[0].p).ravel() for e in found.sampled]
     strongest = int(np.argmin([np.linalg.norm(place - STRONG) for place in places]))
@@ -134,7 +137,7 @@ def test_as_in_volpath(lights: Callable[[], dict], depth: int) -> None:
 
 @pytest.mark.statistical
 def test_the_variance_of_a_lamp_beside_a_dark_one() -> None:
-    """A second lamp of no light takes half of an even share: of the second moment of samples 1 / (1 - share / 2) is left.
+    """A second lamp of no light takes half of the even share.
 
     One sample a pixel has the variance s of a lamp alone, of mean m. Beside the dark lamp it is (s + m^2) / q - m^2 with
     q = 1 - EVEN_SHARE / 2; an even choice would give q = 1/2, at least twice the variance.
