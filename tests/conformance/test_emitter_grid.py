@@ -21,8 +21,12 @@ STRONG, WEAK = [1.5, -1.0, 1.8], [-1.6, 0.9, 0.4]
 ROUNDING = 2.0**-20
 
 
+def scene_of(lights: dict) -> mi.Scene:
+    return mi.load_dict({"type": "scene", "fog": fog(0.3)[0], **lights})
+
+
 def emitters_of(lights: dict) -> SceneEmitters:
-    return SceneEmitters(mi.load_dict({"type": "scene", "fog": fog(0.3)[0], **lights}))
+    return SceneEmitters(scene_of(lights))
 
 
 def pair(ratio: float, **more: object) -> dict:
@@ -101,6 +105,20 @@ def test_numbers_of_emitters_and_of_others() -> None:
     each = [p.probability(found._table.number(e))[0] for e in scene_emitters]
     assert sum(each) == pytest.approx(1, rel=ROUNDING) and min(each) >= 0.99 * EVEN_SHARE / 4
     assert p.probability(found._table.number(dr.zeros(mi.EmitterPtr, 1)))[0] == 0
+
+
+def test_the_density_of_a_direction_is_the_density_of_its_sample() -> None:
+    """The density of a direction that hits a panel is the density with which emitter samples find it."""
+    scene, n = scene_of(lamps(7)), 4096
+    found = SceneEmitters(scene)
+    it, k = dr.zeros(mi.Interaction3f, n), dr.arange(mi.Float, n)
+    it.p = mi.Point3f(*(dr.sin(k * step) for step in (1.1, 2.3, 3.7)))
+    u = mi.Point2f((k + 0.5) / n, k * 0.618034 - dr.floor(k * 0.618034))
+    direct, _, emitter, _ = found.sample_direction(it, u, mi.Bool(True))
+    again = found.pdf_direction(it, direct, mi.Bool(True))
+    panel = np.array(~direct.delta & (direct.pdf > 0) & (emitter == direct.emitter))
+    assert panel.sum() > 100
+    np.testing.assert_allclose(np.array(again)[panel], np.array(direct.pdf)[panel], rtol=ROUNDING)
 
 
 def test_weights_of_the_scene_count() -> None:
