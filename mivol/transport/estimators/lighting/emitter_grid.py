@@ -7,8 +7,8 @@ So the cone of a spot, the horizon of a panel, textures and distances count, in 
 f_k / P(k) has the least variance if P(k) is in proportion to the root of the mean square of f_k. The factor s_k is the
 ``sampling_weight`` of the emitter in the scene.
 
-A choice by the light in all cells has a share, in case the points of a cell miss an emitter. An even choice has a smaller share,
-so an emitter of radiance 0 has derivatives.
+A choice by the light in all cells has a share, in case the points of a cell miss an emitter. An even choice has a smaller
+share, so an emitter of radiance 0 has derivatives.
 
 A vertex chooses by its cell. A ray chooses by the sum over points along the ray.
 
