@@ -29,14 +29,12 @@ import numpy as np
 
 from mivol.bench.extinctions import Extinction, as_dense_as_smoke, fine_smoke, les_cloud, smoke, threads_in_space
 from mivol.bench.harness.figures import new_figure
-from mivol.bench.harness.study import Study, ask
 from mivol.bench.scenes import constant_light, directional_light, milk_in_a_glass, sun_and_sky
 from mivol.bench.studies.single_scattering import (
     PEERS,
     ContestSize,
     Light,
-    contest_bars,
-    contest_volume,
+    contest_study,
     plot_contest,
 )
 from mivol.phase.measured import MeasuredMedium, named_medium
@@ -122,14 +120,4 @@ def draw(answers: dict, path: Path) -> None:
         axes.legend()
 
 
-STUDY = Study(
-    __name__,
-    __doc__,
-    ContestSize,
-    {
-        name: ask(f"How much sooner has mivol the same error in the {name}?", contest_volume, name, make, CONTESTS[name])
-        for name, make in VOLUMES.items()
-    },
-    lambda volume, answer: contest_bars(volume, CONTESTS[volume], answer, ("volpath",)),
-    draw,
-)
+STUDY = contest_study(__name__, __doc__, VOLUMES, CONTESTS, ("volpath",), draw)

@@ -51,7 +51,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mivol.bench.extinctions import Extinction, as_dense_as_smoke, ct_scan, fine_smoke, les_cloud, smoke, threads_in_space
-from mivol.bench.harness.bars import AT_LEAST, Bar, judge, judge_agreement, say_row
+from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, say_row
 from mivol.bench.harness.contests import BudgetSize, agreement_figures, contest_images, gain_figures, image_errors
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios, use_plain_ticks
 from mivol.bench.harness.study import Study, amount, ask
@@ -202,16 +202,37 @@ def emitter_distances(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
 # -- Bars and figure --------------------------------------------------------------------------------------------------------
 
 
-def contest_bars(volume: str, lights: dict[str, Light], answer: dict, judged: tuple[str, ...]) -> list[Bar]:
-    """Judge the ratios to the ``judged`` integrators, and the agreement of all means."""
-    rows = []
-    for name, light in lights.items():
-        for peer in light.peers:
-            figures, label = answer[name][f"mivol over {peer}"], f"{volume}, {name}, {peer}"
-            if peer in judged:
-                rows.append(judge(f"variance x time, {light.average}: {label}", figures[light.ratio_key], AT_LEAST, light.bar))
-            rows.append(judge_agreement(label, figures["z"], figures["z_bound"]))
-    return rows
+def contest_study(
+    module: str,
+    doc: str | None,
+    volumes: dict[str, Callable[[ContestSize], Extinction]],
+    contests: dict[str, dict[str, Light]],
+    judged: tuple[str, ...],
+    draw: Callable[[dict, Path], None],
+) -> Study:
+    """A study with a question for each volume, and with bars on the ratios to the ``judged`` integrators."""
+    text = "How much sooner has mivol the same error in the {}?"
+    questions = {name: ask(text.format(name), contest_volume, name, make, contests[name]) for name, make in volumes.items()}
+    promises = {
+        volume: [
+            Promise(
+                f"variance x time, {light.average}: {volume}, {name}, {peer}",
+                (name, f"mivol over {peer}", light.ratio_key),
+                AT_LEAST,
+                light.bar,
+            )
+            for name, light in lights.items()
+            for peer in judged
+        ]
+        for volume, lights in contests.items()
+    }
+
+    def compare(volume: str, answer: dict) -> list[Bar]:
+        pairs = [(name, peer) for name, light in contests[volume].items() for peer in light.peers]
+        found = [(f"{volume}, {name}, {peer}", answer[name][f"mivol over {peer}"]) for name, peer in pairs]
+        return [judge_agreement(label, figures["z"], figures["z_bound"]) for label, figures in found]
+
+    return Study(module, doc, ContestSize, questions, compare, draw, promises=promises)
 
 
 def draw(answers: dict, path: Path) -> None:
@@ -244,10 +265,4 @@ def plot_contest(axes: Axes, figures: dict, light: Light) -> None:
     use_plain_ticks(axes.yaxis)
 
 
-QUESTIONS = {
-    name: ask(f"How much sooner has mivol the same error in the {name}?", contest_volume, name, make, LIGHTS)
-    for name, make in VOLUMES.items()
-}
-STUDY = Study(
-    __name__, __doc__, ContestSize, QUESTIONS, lambda volume, answer: contest_bars(volume, LIGHTS, answer, PEERS), draw
-)
+STUDY = contest_study(__name__, __doc__, VOLUMES, dict.fromkeys(VOLUMES, LIGHTS), PEERS, draw)
