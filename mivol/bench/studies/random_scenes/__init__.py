@@ -1,6 +1,6 @@
 """Do images of random scenes agree with Mitsuba's, and is the radiance of every path of hard scenes finite and not negative?
 
-    mivol bench random_scenes                    # 15 minutes on 2 idle cores
+    mivol bench random_scenes                    # 20 minutes on 2 idle cores
     mivol bench random_scenes --quick            # a minute: a dozen scenes
     mivol bench random_scenes --only hard
     mivol bench random_scenes --only built
