@@ -49,9 +49,9 @@ def weights(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return w, w[0].sum(axis=1)
 
 
-def gradients(seen: Pencils, key: str, w: np.ndarray, spp: int) -> np.ndarray:
+def gradients(seen: Pencils, key: str, w: np.ndarray, spp: int, settings: dict | None = None) -> np.ndarray:
     """J^T w of independent passes, (BATCHES, ...)."""
-    integrator = mi.load_dict(mivol())
+    integrator = mi.load_dict(mivol(**(settings or {})))
     return np.stack([vjp(seen.scene, key, w, spp, fresh(seed), integrator) for seed in range(BATCHES)])
 
 

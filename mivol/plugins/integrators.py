@@ -28,6 +28,9 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
             auto.
         media_light: how light emitted by media finds scattering points. drawn: points in media are sampled, besides chance
             hits; met: by chance hits only; auto: the method with the smaller error in a small preview. Default auto.
+        near_light: where emitters with a position (point, spot, area) light media that scatter several times. segments: every
+            segment of a path draws a distance by the emitter; vertices: at collisions; auto: along segments if an emitter lies
+            inside or near a medium, and a small preview finds less noise. Default auto.
         aovs: comma-separated list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the given order.
     """
 
@@ -39,6 +42,7 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
             _read(props, "deterministic", False),
             _read(props, "shadows", "auto"),
             _read(props, "media_light", "auto"),
+            _read(props, "near_light", "auto"),
         )
         self.session = Session(settings, _read(props, "aovs", ""))
         super().__init__(props)

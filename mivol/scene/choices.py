@@ -19,6 +19,8 @@ __all__ = [
     "choose_flights",
     "choose_lighting",
     "choose_media_light",
+    "choose_near_light",
+    "is_near_light_open",
     "choose_shadows",
     "choose_side_flights",
     "choose_skipping",
@@ -56,6 +58,10 @@ SUCCESSIVE_PATHS, MIN_SUCCESSIVE_SCATTERINGS = 16, 16
 """Paths per lane walked one after the other, and the number of scatterings from which successive paths pay. Measured processor
 time of 1 path per lane over 16, on 2 cores, at depths 6, 16, 64 and unlimited: smoke 1.0, 1.0, 1.1; a cloud of albedo 0.999
 0.9, 1.2, 1.5, 1.4; a white box of optical depth 64 0.8, 1.0, 1.35, 2.2."""
+
+NEAR_DISTANCE = 1.0
+"""Distance of an emitter to a medium, over the longest edge of the medium [1], beyond which collisions draw its light: 1 / r^2
+varies by less than 4 across the medium."""
 
 MIN_FILLED_SHARE = 0.25
 """Share of occupied blocks above which a grid counts as filled."""
@@ -287,6 +293,47 @@ def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Cho
     draws, gain = settings.media_light == "drawn" or light.gain > 1, f"{light.gain:.2g} times as fast as chance alone"
     method = "sampled by emission, and met by chance" if draws else "met by chance"
     return draws, [Choice(subject, method, f"sampling reaches the same error {gain}")]
+
+
+def is_near_light_open(needs: Needs, settings: Settings, segment: str) -> bool:
+    """Whether a preview decides where the light of near emitters is drawn."""
+    can_draw = _explain_missing_near_light(needs, segment) is None
+    return can_draw and settings.near_light == "auto" and 0 < needs.nearness < NEAR_DISTANCE
+
+
+def choose_near_light(needs: Needs, settings: Settings, segment: str) -> tuple[bool, list[Choice]]:
+    """Choose whether segments of paths in media draw the light of near emitters."""
+    subject, vertices, segments = "near emitters", "lit at collisions", "lit at a distance drawn on each segment"
+    if segment != "free_flight" or math.isinf(needs.nearness):
+        return False, []
+    missing = _explain_missing_near_light(needs, segment)
+    if missing is not None:
+        return False, [Choice(subject, vertices, missing)]
+    if settings.near_light != "auto":
+        draws = settings.near_light == "segments"
+        return draws, [Choice(subject, segments if draws else vertices, "set by the user")]
+    if needs.nearness == 0:
+        why = "an emitter with a position lies inside a medium, and its light at collisions has a heavy tail"
+        return True, [Choice(subject, segments, why)]
+    where = f"the nearest emitter with a position is {needs.nearness:.2g} edges away from a medium"
+    if needs.nearness >= NEAR_DISTANCE:
+        return False, [Choice(subject, vertices, where)]
+    if needs.near_gain is None:
+        return False, [Choice(subject, vertices, f"{where}, and no preview has measured the noise")]
+    draws = needs.near_gain > 1
+    why = f"{where}; a distance on each segment reaches the same error {needs.near_gain:.2g} times as fast as collisions"
+    return draws, [Choice(subject, segments if draws else vertices, why)]
+
+
+def _explain_missing_near_light(needs: Needs, segment: str) -> str | None:
+    """The reason why segments cannot draw the light of near emitters; None if they can."""
+    if segment != "free_flight" or math.isinf(needs.nearness):
+        return "no path in media meets the light of an emitter with a position"
+    if any(m.bounded for m in needs.media):
+        return "only a majorant of a medium is known"
+    if any(m.gaussians for m in needs.media):
+        return "a medium consists of Gaussians"
+    return "media lie behind refracting boundaries" if needs.is_sealed else None
 
 
 def _explain_missing_light(needs: Needs) -> str:

@@ -7,6 +7,7 @@ found once for each scene. Values (zero albedo, empty blocks) are read again aft
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from mivol.scene.nesting import OrientedBox, shape_bounds
 from mivol.scene.readings import GridReading, check_constants, check_emission, is_scattering, read_extinction
 from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, find_outside_media, is_instance, survey_scene
 from mivol.scene_graph import list_values, traverse
+from mivol.transport.estimators.lighting.emitters import find_bounding_ball
 from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.medium_view import MediumView, medium_kind
@@ -76,6 +78,7 @@ def find_needs(
         places=tuple(k for k in differentiated if _is_placement(k, params.properties[k][2])),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
+        nearness=_find_nearness(scene, [b for b, m in zip(boundaries, media, strict=True) if m.is_scattering]),
     )
     scatters = needs.surfaces or any(m.is_scattering for m in media)
     refused = any(m.bounded or m.gaussians for m in media)
@@ -85,6 +88,16 @@ def find_needs(
     scattering = [body for body, facts in zip(bodies, media, strict=True) if facts.is_scattering]
     light = read_media_light(needs.make_media(scene, bodies, survey.size), boundaries, scattering, sensor, survey)
     return replace(needs, media_light=light)
+
+
+def _find_nearness(scene: mi.Scene, boundaries: Sequence[Boundary]) -> float:
+    """``Needs.nearness`` of the emitters to the media in some boundaries."""
+    balls = [ball for e in scene.emitters() if (ball := find_bounding_ball(e)) is not None]
+    return min((_relative_distance(b, ball) for b in boundaries for ball in balls), default=math.inf)
+
+
+def _relative_distance(boundary: Boundary, ball: list[float]) -> float:
+    return 0.0 if boundary.around is None else boundary.around.distance(np.array(ball[:3]))
 
 
 def _find_misplaced(
@@ -260,6 +273,11 @@ class Needs:
         places: keys among ``parameters`` that place shapes and sensors.
         film_samples: pixels times samples per pixel of the sensor.
         are_samples_independent: whether the sampler stratifies nothing, so that other random numbers may replace its own.
+        nearness: distance of the nearest emitter with a position to a medium that scatters, over the longest edge of the box
+            around the medium [1]; 0 for an emitter inside, or for a medium without a known end; infinite without such an
+            emitter.
+        near_gain: measured gain of drawing the light of near emitters along segments [1] (:mod:`mivol.scene.previews`); None
+            before a measurement.
         media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
     """
 
@@ -280,6 +298,8 @@ class Needs:
     places: tuple[str, ...]
     film_samples: int
     are_samples_independent: bool = True
+    nearness: float = math.inf
+    near_gain: float | None = None
     media_light: MediaLight | None = None
 
     def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:

@@ -67,6 +67,13 @@ class OrientedBox:
         size = max(np.abs(self.corners).max(), np.abs(other.corners).max())
         return bool((gap < margin * size).all())
 
+    def distance(self, point: np.ndarray) -> float:
+        """Distance of a point, over the longest edge [1]; 0 inside. For a sheared box, at most the distance."""
+        edges = self.corners[[4, 2, 1]] - self.corners[0]
+        inside = np.linalg.solve(edges.T, point - self.corners[0])
+        lengths = np.linalg.norm(edges, axis=1)
+        away = (inside - np.clip(inside, 0, 1)) * lengths
+        return float(np.linalg.norm(away) / lengths.max())
 
     @classmethod
     def from_box(cls, box: Box) -> OrientedBox:

@@ -22,6 +22,7 @@ from mivol.scene.choices import (
     choose_flights,
     choose_lighting,
     choose_media_light,
+    choose_near_light,
     choose_scattering_points,
     choose_shadows,
     choose_side_flights,
@@ -33,12 +34,13 @@ from mivol.scene.choices import (
 )
 from mivol.scene.media_light import find_emitting_boxes
 from mivol.scene.needs import Needs
-from mivol.scene.readings import read_block_ranges, read_coarse_grid, read_empty_distances
+from mivol.scene.readings import read_block_ranges, read_coarse_grid, read_empty_distances, read_rough_extinction
 from mivol.scene.refusals import (
     check_bounded,
     check_emission_cells,
     check_gaussians,
     check_media_light,
+    check_near_light,
     check_nested,
     check_placements,
     check_quadrature,
@@ -47,11 +49,13 @@ from mivol.scene.refusals import (
 from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
+from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.shadow_tables import (
     VisibilityCache,
     build_transmittance_grid,
     build_visibility_cache,
 )
+from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import (
@@ -63,7 +67,7 @@ from mivol.transport.path.estimators import (
     choose_segment_estimator,
 )
 
-__all__ = ["Plan", "make_plan", "build_estimators", "build_media"]
+__all__ = ["Plan", "build_estimators", "build_media", "choose_segment", "make_plan"]
 
 
 PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
@@ -89,6 +93,7 @@ class Plan:
         draws_emission: whether scattering points sample the light emitted by media.
         successive_paths: most paths per lane, walked one after the other.
         branches: whether paths branch at their first collision for derivatives.
+        draws_near_light: whether segments of paths draw the light of emitters with a position.
     """
 
     choices: tuple[Choice, ...]
@@ -102,6 +107,7 @@ class Plan:
     draws_emission: bool = False
     successive_paths: int = 1
     branches: bool = False
+    draws_near_light: bool = False
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -119,7 +125,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     check_gaussians(needs, aovs)
     check_nested(needs)
     check_media_light(needs, settings)
-    segment = _choose_segment(needs, settings)
+    segment = choose_segment(needs, settings)
+    check_near_light(needs, settings, segment)
     choices = [
         choose_transport(needs, settings, segment),
         *choose_emission(needs, segment),
@@ -150,10 +157,25 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     branches, why = choose_branches(needs, settings, segment)
     choices += why
-    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe, draws_emission, successive, branches)
+    near, why = choose_near_light(needs, settings, segment)
+    choices += why
+    return Plan(
+        tuple(choices),
+        skips,
+        tracks,
+        segment,
+        events,
+        pass_rays,
+        memory,
+        lobe,
+        draws_emission,
+        successive,
+        branches,
+        near,
+    )
 
 
-def _choose_segment(needs: Needs, settings: Settings) -> str:
+def choose_segment(needs: Needs, settings: Settings) -> str:
     """Choose the name of the segment estimator. Requests without an estimator have been refused before."""
     emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
     scatters = (emits or bool(needs.emitter_kinds)) and is_scattering_visible(needs, settings)
@@ -211,6 +233,8 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) 
             flies = plan.segment == "free_flight" and part.channels == 1
             if (tracks or flies) and part.lattice is not None and part.activation is None and not mixes:
                 part.lattice.block_ranges = read_block_ranges(part, survey)
+            if plan.draws_near_light and part.lattice is not None and part.activation is None:
+                part.rough = read_rough_extinction(part, survey)
         bodies.append(boundary.body(view, tracks))
     return needs.make_media(scene, bodies, survey.size)
 
@@ -236,7 +260,8 @@ def build_estimators(
     lobe = None if plan.side_flight_cosine is None else dr.opaque(mi.Float, plan.side_flight_cosine)
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)
-    return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count)
+    near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH) if plan.draws_near_light else None
+    return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count, near)
 
 
 def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:

@@ -22,10 +22,12 @@ from mivol.kernel_recording import is_recording
 from mivol.scene.coefficients import check_constant
 from mivol.scene.survey import SceneSurvey
 from mivol.transport.media.extinction import ExactExtinction
+from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.grid_blocks import (
     BlockRanges,
     CoarseGrid,
+    block_shift,
     bound_blocks,
     coarsen_grid,
     find_block_ranges,
@@ -204,6 +206,11 @@ def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, lists: b
     """Coarsen a grid, once for each state of the array and each placement."""
     kind = ("coarse", shift, lists, lattice.empty_distances is None, lattice.to_world.tobytes())
     return _read_once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
+
+
+def read_rough_extinction(part: GridExtinction, survey: SceneSurvey) -> GridExtinction:
+    """The means of blocks of voxels of a grid, as a grid of their own."""
+    return GridExtinction(part.name, read_coarse_grid(survey, part.lattice, block_shift(part.lattice.res), False).lattice)
 
 
 def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:

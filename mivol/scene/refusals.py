@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.scene.choices import choose_media_light, is_scattering_visible, shares_cells
+from mivol.scene.choices import choose_media_light, choose_near_light, is_scattering_visible, shares_cells
 from mivol.scene.needs import Needs
 from mivol.transport.line_integrals.aovs import AOVS
 from mivol.transport.media.grid_extinction import have_same_cells
@@ -19,6 +19,7 @@ __all__ = [
     "parse_aovs",
     "check_bounded",
     "check_media_light",
+    "check_near_light",
     "check_emission_cells",
     "check_gaussians",
     "check_nested",
@@ -33,6 +34,7 @@ SHADOWS = ("auto", "exact", "estimated", "grid")
 
 
 MEDIA_LIGHT = ("auto", "drawn", "met")
+NEAR_LIGHT = ("auto", "segments", "vertices")
 """Methods for the light of media: ``drawn`` (sampled, besides chance hits) or ``met`` (chance hits only); ``auto`` chooses."""
 
 
@@ -140,6 +142,16 @@ def check_media_light(needs: Needs, settings: Settings) -> None:
     draws, why = choose_media_light(needs, settings)
     if settings.media_light == "drawn" and why and not draws:
         raise MivolError(f"media_light is 'drawn', and {why[0].reason}: leave it at auto.")
+
+
+def check_near_light(needs: Needs, settings: Settings, segment: str) -> None:
+    """Refuse the setting ``segments`` for a scene in which segments cannot draw the light of near emitters."""
+    if settings.near_light not in NEAR_LIGHT:
+        known = f"{', '.join(NEAR_LIGHT[:-1])} or {NEAR_LIGHT[-1]}"
+        raise MivolError(f"near_light is {settings.near_light!r}; {known} is expected.")
+    draws, why = choose_near_light(needs, settings, segment)
+    if settings.near_light == "segments" and why and not draws:
+        raise MivolError(f"near_light is 'segments', and {why[0].reason}: leave it at auto.")
 
 
 def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> None:

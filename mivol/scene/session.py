@@ -16,7 +16,7 @@ from mivol.kernel_recording import is_recording, without_garbage_collection
 from mivol.scene.derived import carry_tangents, recompute_derived
 from mivol.scene.needs import find_needs, warn_of_misplaced_grids
 from mivol.scene.plan import Plan, build_estimators, make_plan
-from mivol.scene.previews import measure_media_light
+from mivol.scene.previews import measure_media_light, measure_near_light
 from mivol.scene.refusals import parse_aovs
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
@@ -138,6 +138,7 @@ class Session:
         needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
         warn_of_misplaced_grids(needs, survey)
         needs = measure_media_light(scene, sensor, needs, survey, self.settings)
+        needs = measure_near_light(scene, sensor, needs, survey, self.settings)
         plan = make_plan(needs, self.settings, self.aovs)
         return build_estimators(scene, needs, plan, self.settings, survey, for_images), plan
 

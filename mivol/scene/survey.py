@@ -44,6 +44,7 @@ class SceneSurvey:
             first reading.
         gain_of_draws: measured gain of sampling the light of media [1] (:mod:`mivol.scene.previews`); None before a
             measurement.
+        near_gain: measured gain of drawing the light of near emitters along segments [1]; None before a measurement.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -66,6 +67,7 @@ class SceneSurvey:
     misplaced: dict = field(default_factory=dict)
     media_light: tuple | None = None
     gain_of_draws: float | None = None
+    near_gain: float | None = None
 
     @property
     def is_current(self) -> bool:

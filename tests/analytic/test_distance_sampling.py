@@ -26,6 +26,7 @@ from mivol.transport.estimators.single_scattering.distance_sampling import (
     start_reservoir,
 )
 from mivol.transport.path.estimators import Settings
+from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import as_float32, box_of, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -139,7 +140,7 @@ def test_a_probe_is_spread_over_the_grid_alone():
         media = media_of(seen.scene)
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -5 + dr.zeros(mi.Float, n)), mi.Vector3f(0, 0, 1))
         proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None, None), None, 0.7)
-        start = start_reservoir(media, mi.Float((np.arange(n) + 0.5) / n), n)
+        start = start_reservoir(media, [seed_pcg32(mi.Float((np.arange(n) + 0.5) / n), n)])
         _, reservoir = fill_reservoir(proposal, media.medium_at(ray), start, mi.Bool(True))
     (kept,) = reservoir.candidates
     # The length of the grid comes from two slabs in float32.

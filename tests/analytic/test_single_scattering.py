@@ -23,9 +23,8 @@ import scenes
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
 from mivol.transport.estimators.single_scattering.scattering_derivatives import (
     Scattering,
+    event_coefficients,
     event_interaction,
-    event_sigma_s,
-    event_sigma_t,
 )
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import affine, as_float32, ball_of, box_of, camera, centred, grid_volume, media_of, medium
@@ -334,27 +333,25 @@ def test_events_know_their_medium():
 
 
 def test_coefficients_are_those_of_the_medium():
-    """The albedo times the extinction, or sigma_s itself; 0 without a scattering event."""
+    """The extinction, and the albedo times the extinction or sigma_s itself; 0 without a scattering event."""
     media = scene_of(medium("mivol_medium", **GREY), COLOURS)
     mei = event_interaction(media, upward(), event(media))
-    found = np.array(event_sigma_s(media, upward(), event(media), mei))
-    np.testing.assert_array_equal(found, [[0.5, 1, 0], [0.5, 2, 0], [0.5, 4, 0]])
-    low, top = (media.bodies[k] for k in upwards(media))
-    for body, expected in ((low, [2, 2, 2]), (top, [1.5, 2.5, 4.5])):
-        sigma_t = event_sigma_t(media, body, upward(), event(media), mi.Bool(True))
-        np.testing.assert_array_equal(np.array(sigma_t).ravel(), expected)
+    sigma_t, sigma_s = event_coefficients(media, upward(), event(media), mei, is_exact=False)
+    np.testing.assert_array_equal(np.array(sigma_t), [[2, 1.5, 0], [2, 2.5, 0], [2, 4.5, 0]])
+    np.testing.assert_array_equal(np.array(sigma_s), [[0.5, 1, 0], [0.5, 2, 0], [0.5, 4, 0]])
 
 
 def test_a_single_walk_knows_the_extinction_already():
-    """The event of a single medium carries the extinction; no second look-up."""
+    """The event of a single medium carries the extinction; no second look-up. The third lane has no event."""
     media = scene_of(medium("mivol_medium", **GREY))
-    found = event_sigma_t(media, media.bodies[0], upward(), event(media), mi.Bool(True))
-    np.testing.assert_array_equal(np.array(found), [[5, 6, 7]] * 3)
+    mei = event_interaction(media, upward(), event(media))
+    found, _ = event_coefficients(media, upward(), event(media), mei, is_exact=True)
+    np.testing.assert_array_equal(np.array(found), [[5, 6, 0]] * 3)
 
 
 def test_the_weight_of_an_event_is_its_gain_times_all_direct_light():
     value = mi.Spectrum(1, 2, 4)
     dr.enable_grad(value)
     samples = [SimpleNamespace(value=value), SimpleNamespace(value=mi.Spectrum(3))]
-    found = Scattering(None, None, mi.Spectrum(0.5, 1, 2), samples, mi.Spectrum(7), mi.Float(0)).weight
+    found = Scattering(None, None, mi.Spectrum(0.5, 1, 2), samples, mi.Spectrum(8), mi.Spectrum(7), mi.Float(0)).weight
     assert np.array(found).ravel().tolist() == [2, 5, 14] and not dr.grad_enabled(found)

@@ -103,7 +103,7 @@ def test_a_gradient_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_one_estimator_answers(media: tuple, settings: Settings, more: dict, segment: str) -> None:
-    assert plan._choose_segment(needs(*media, **more), settings) == segment
+    assert plan.choose_segment(needs(*media, **more), settings) == segment
 
 
 def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:

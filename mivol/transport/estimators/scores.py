@@ -38,6 +38,7 @@ __all__ = [
     "REVERSE",
     "Factor",
     "Primal",
+    "PrimalBehind",
     "Replay",
     "Tangent",
     "Term",
@@ -152,6 +153,26 @@ class Primal:
     def scale(self, factor: Factor) -> Primal:
         """The score after a factor on all light from further along the path; the values of terms contain the factor already."""
         return self
+
+
+@dataclass
+class PrimalBehind:
+    """Sum the radiance of a path behind its first factor.
+
+    Attributes:
+        L: the radiance so far.
+        is_behind: lanes behind the first factor.
+    """
+
+    L: mi.Spectrum
+    is_behind: mi.Bool
+    purpose = IMAGE
+
+    def add(self, term: Term) -> PrimalBehind:
+        return PrimalBehind(self.L + dr.select(self.is_behind, term.value, 0), self.is_behind)
+
+    def scale(self, factor: Factor) -> PrimalBehind:
+        return PrimalBehind(self.L, dr.full(mi.Bool, True, dr.width(self.L)))
 
 
 @dataclass

@@ -82,7 +82,13 @@ class Extinction(Protocol):
 
 
 class ExactExtinction(Extinction, Protocol):
-    """A part whose integral over an interval of a ray is known: in closed form, or cell by cell."""
+    """A part whose integral over an interval of a ray is known: in closed form, or cell by cell.
+
+    Attributes:
+        rough: a part with fewer cells and nearly the same values, for drawing distances; None without one.
+    """
+
+    rough: ExactExtinction | None
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
         """Optical depth [1] for a scale of 1; the walk may stop where every channel exceeds ``enough``."""
@@ -108,6 +114,7 @@ class ConstantExtinction:
     exact_line: ClassVar[bool] = True
     is_constant: ClassVar[bool] = True
     lattice: ClassVar[None] = None
+    rough: ClassVar[None] = None
 
     @property
     def channels(self) -> int:

@@ -57,6 +57,7 @@ class GaussianExtinction:
     exact_line: ClassVar[bool] = True
     is_constant: ClassVar[bool] = False
     lattice: ClassVar[None] = None
+    rough: ClassVar[None] = None
     channels: ClassVar[int] = 1
 
     def __post_init__(self) -> None:

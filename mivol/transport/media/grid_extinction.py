@@ -92,9 +92,11 @@ class GridExtinction(NodeValues):
 
     Attributes:
         volume: the stock grid of these values, which may look up voxels in another way; None without a stock grid.
+        rough: the means of blocks of voxels as a grid of their own, for drawing distances; None without one.
     """
 
     volume: mi.Volume | None = None
+    rough: GridExtinction | None = None
     activation: ClassVar[None] = None
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
@@ -161,6 +163,7 @@ class ActivatedGridExtinction(NodeValues):
 
     activation: Activation
     volume: ClassVar[None] = None
+    rough: ClassVar[None] = None
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
         return self._integrate(self.lattice, interval, enough)

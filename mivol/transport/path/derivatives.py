@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.transport.estimators.flights.flight_derivatives import Baseline, collision_weights
-from mivol.transport.estimators.scores import IMAGE, Primal, Replay
+from mivol.transport.estimators.scores import IMAGE, Primal, PrimalBehind, Replay
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.channels import to_components
 from mivol.transport.path.estimators import Estimators
@@ -209,7 +209,11 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point2
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(BASELINE_SEED, count)
     collision = _find_first_collisions(estimators, sampler.clone(), chosen)
-    path = walk_path(estimators, sampler, chosen, Primal(dr.zeros(mi.Spectrum, count)))[0]
+    score = Primal(dr.zeros(mi.Spectrum, count))
+    if estimators.near is not None:
+        # The light of near emitters on the first segment has derivatives of its own, without a baseline.
+        score = PrimalBehind(score.L, dr.full(mi.Bool, False, count))
+    path = walk_path(estimators, sampler, chosen, score)[0]
     # Behind a refracting boundary no first flight collides; the mean over all rays replaces the mean over collisions.
     weight = dr.select(dr.any(collision.on), dr.square(collision_weights(media, chosen, collision)), 1)
     L, weight, chosen_tile = dr.detach(path.L), dr.detach(weight), dr.gather(mi.UInt32, tile, index)

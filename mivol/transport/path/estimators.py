@@ -15,6 +15,7 @@ from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator, TrackedAbsorption
+from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.single_scattering.shadow_tables import (
     TransmittanceGrid,
@@ -51,7 +52,9 @@ class Settings:
         shadows: with ``deterministic``, ``exact`` or interpolated in a ``grid``; without, ``exact`` or ``estimated`` by ratio
             tracking; ``auto`` leaves the choice to the plan.
         media_light: ``drawn`` samples the emission of media at scattering events, ``met`` leaves it to paths passing through
-            the media; ``auto`` leaves the choice to the plan."""
+            the media; ``auto`` leaves the choice to the plan.
+        near_light: in media that scatter several times, the light of emitters with a position is drawn along ``segments``, at
+            distances of its own, or at ``vertices``, the collisions; ``auto`` leaves the choice to the plan."""
 
     max_depth: int = 6
     rr_depth: int = 5
@@ -59,6 +62,7 @@ class Settings:
     deterministic: bool = False
     shadows: str = "auto"
     media_light: str = "auto"
+    near_light: str = "auto"
 
     @property
     def depth_limit(self) -> int:
@@ -232,6 +236,7 @@ class Estimators:
         emission: sampler of the emission of media at scattering events; None to leave the emission to paths passing through.
         long_paths_count: long paths carry as much light as short ones (an even environment) or more (emitting media); roulette
             then spares them.
+        near: estimator of the light of near emitters along segments of paths in media; None if vertices draw this light.
         media: media of the scene.
         draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
     """
@@ -244,12 +249,18 @@ class Estimators:
     lobe: mi.Float | None = None
     emission: EmissionSampling | None = None
     long_paths_count: bool = False
+    near: NearLighting | None = None
     media: SceneMedia = field(init=False)
     draws_shadows: bool = field(init=False)
 
     def __post_init__(self) -> None:
         self.media = self.direct.media
         self.draws_shadows = self.media.is_bounded or self.segment.ends_in_media
+
+    @property
+    def lights_media_at_vertices(self) -> bool:
+        """Whether emitter samples light the collisions in media: not if segments draw the light of all sampled emitters."""
+        return self.lights_media and (self.near is None or self.near.lights_vertices)
 
     def replayed(self) -> Estimators:
         """The estimators of the radiance that a replay subtracts from, without light sampled anew for its derivatives."""

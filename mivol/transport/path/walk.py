@@ -25,7 +25,12 @@ import mitsuba as mi
 
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes, ProbeTerm, ShadowReservoir, ShadowTerm
 from mivol.transport.estimators.flights.free_flight import make_collision
-from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantEmitterSample, power_heuristic
+from mivol.transport.estimators.lighting.direct_lighting import (
+    DirectLight,
+    DistantEmitterSample,
+    EmitterSample,
+    power_heuristic,
+)
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.body import medium_interaction
@@ -98,6 +103,7 @@ class Path:
         emitter_sample: emitter sample of the next vertex; None without side flights (each vertex then draws its own sample).
         emission_pdf: ``pdf`` in lanes where ``last`` has sampled the emission of media too, 0 in other lanes [1/sr]; None if
             media emission is never sampled.
+        left_medium: lanes in which ``last`` is a point of a medium; None if vertices draw the light of near emitters.
     """
 
     ray: FineRay
@@ -118,6 +124,7 @@ class Path:
     shadow: ShadowReservoir | None = None
     emitter_sample: WeightedEmitterSample | None = None
     emission_pdf: mi.Float | None = None
+    left_medium: mi.Bool | None = None
 
 
 @dataclass
@@ -165,6 +172,7 @@ def start_path(
         sampler=sampler,
         strata=strata,
         emission_pdf=None if estimators.emission is None else dr.zeros(mi.Float, n),
+        left_medium=None if estimators.near is None else dr.full(mi.Bool, False, n),
     )
 
 
@@ -311,6 +319,8 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
     estimate = estimators.segment.estimate(segment, path.score.purpose, path.active)
     if estimate.light is not None:
         path.score = path.score.add(estimate.light)
+    if estimators.near is not None:
+        path = _add_near_light(estimators, path, segment, estimate.end.t)
     path.score = path.score.scale(estimate.transmittance)
     if estimate.probe is not None:
         path.probes = path.probes.offer(segment, estimate.probe)
@@ -328,12 +338,26 @@ def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> 
     w_mis = mi.Float(1)
     if estimators.lights_surfaces or estimators.lights_media:
         direct = mi.DirectionSample3f(scene, si, path.last)
-        pdf_emitter = estimators.direct.emitters.pdf_direction(path.last, direct, ~path.delta & (emitter != None))
+        pdf_emitter = _emitter_pdf(estimators, path, direct, ~path.delta & (emitter != None))
         w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
     with dr.resume_grad(when=path.score.purpose != IMAGE):
         Le = path.beta * w_mis * emitter.eval(si, visible)
     path.score = path.score.add(TrackedTerm(Le, visible))
     return path
+
+
+def _emitter_pdf(estimators: Estimators, path: Path, direct: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
+    """Density of a direction in the emitter samples of the last vertex [1/sr]."""
+    lighting = estimators.direct
+    if path.left_medium is None:
+        return lighting.emitters.pdf_direction(path.last, direct, active)
+    inside, pdf = active & path.left_medium, mi.Float(0)
+    for emitters in (lighting.near_emitters, lighting.far_emitters):
+        pdf += dr.select(inside, emitters.pdf_direction(path.last, direct, inside), 0)
+    if not estimators.lights_surfaces:
+        return pdf
+    outside = active & ~path.left_medium
+    return pdf + dr.select(outside, lighting.emitters.pdf_direction(path.last, direct, outside), 0)
 
 
 def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
@@ -370,6 +394,8 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     if path.emission_pdf is not None:
         samples_emission = event.in_medium | ~onward.delta
         path.emission_pdf = dr.select(scatters, dr.select(samples_emission, onward.pdf, 0), path.emission_pdf)
+    if path.left_medium is not None:
+        path.left_medium = dr.select(scatters, event.in_medium, path.left_medium)
     path.depth += dr.select(scatters, mi.UInt32(1), mi.UInt32(0))
 
     # -- Russian roulette ----------------------------------------------------------------------------------------------
@@ -393,19 +419,21 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
 
 def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
     """Next-event estimation: add the light of an emitter sample, attenuated by the media along its shadow ray."""
-    if not (estimators.lights_surfaces or estimators.lights_media):
+    if not (estimators.lights_surfaces or estimators.lights_media_at_vertices):
         return path
     media, sampler, attached = estimators.media, path.sampler, path.score.purpose != IMAGE
     lit = mi.Bool(False)
     if estimators.lights_surfaces:
         lit = may_scatter & event.at_surface & mi.has_flag(event.si.bsdf().flags(), mi.BSDFFlags.Smooth)
-    if estimators.lights_media:
+    if estimators.lights_media_at_vertices:
         lit |= may_scatter & event.in_medium
     vertex = event.vertex(media)
-    if path.emitter_sample is None:
+    if path.emitter_sample is not None:
+        sample = path.emitter_sample.sample.at_point(vertex.interaction)
+    elif estimators.near is None or not estimators.lights_media_at_vertices:
         sample = estimators.direct.sample_emitter(vertex.interaction, sampler.next_2d(lit), lit)
     else:
-        sample = path.emitter_sample.sample.at_point(vertex.interaction)
+        sample = _sample_far_emitter(estimators, vertex.interaction, event, sampler.next_2d(lit), lit)
     rng = draw_state(sampler, lit) if estimators.draws_shadows else None
     direct = estimators.direct.estimate_at_vertex(vertex, sample, attached, lit, rng)
     with dr.resume_grad(when=attached):
@@ -422,6 +450,27 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
     path.score = path.score.add(TrackedTerm(value, direct.on))
     path.shadow = path.shadow.offer(light, event.chance)
     return path
+
+
+def _sample_far_emitter(
+    estimators: Estimators, it: mi.Interaction3f, event: PathEvent, u: mi.Point2f, active: mi.Bool
+) -> EmitterSample:
+    """Sample an emitter for a vertex: in media an emitter at infinity, since segments draw the light of near emitters."""
+    lighting, inside = estimators.direct, active & event.in_medium
+    sample = lighting.sample_emitter(it, u, inside, lighting.far_emitters)
+    if not estimators.lights_surfaces:
+        return sample
+    at_surface = lighting.sample_emitter(it, u, active & ~event.in_medium)
+    return dr.select(event.in_medium, sample, at_surface)
+
+
+def _add_near_light(estimators: Estimators, path: Path, segment: PathSegment, length: mi.Float) -> Path:
+    """Add the light of near emitters scattered along a segment."""
+    attached = path.score.purpose != IMAGE
+    samples = estimators.near.draw(path.sampler, path.active & segment.may_scatter)
+    near = estimators.near.estimate(segment, length, samples, attached, path.active)
+    path.score = path.score.add(near.light)
+    return _keep_shadow_ray(estimators, path, near.shadow, near.chance)
 
 
 def _add_media_emission(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
@@ -441,11 +490,16 @@ def _add_media_emission(estimators: Estimators, path: Path, event: PathEvent, ma
         estimators.draws_shadows,
     )
     path.score = path.score.add(light)
+    return _keep_shadow_ray(estimators, path, light.shadow, light.point.chance)
+
+
+def _keep_shadow_ray(estimators: Estimators, path: Path, shadow: DirectLight, chance: mi.Float) -> Path:
+    """Offer a shadow ray to the reservoir of the path; without a reservoir, add its derivatives now."""
     if path.shadow is not None:
-        path.shadow = path.shadow.offer(light.shadow, light.point.chance)
-    elif attached:
-        alone = ShadowReservoir.empty(media, path.ray).offer(light.shadow, light.point.chance)
-        path.score = path.score.add(ShadowTerm(media, alone))
+        path.shadow = path.shadow.offer(shadow, chance)
+    elif path.score.purpose != IMAGE:
+        alone = ShadowReservoir.empty(estimators.media, path.ray).offer(shadow, chance)
+        path.score = path.score.add(ShadowTerm(estimators.media, alone))
     return path
 
 

@@ -23,6 +23,7 @@ from mivol.transport.traversal.lattice import Lattice
 __all__ = [
     "BLOCK",
     "REACH",
+    "block_shift",
     "SHIFT",
     "Reduction",
     "bound_blocks",
@@ -205,20 +206,23 @@ class BlockRanges:
         return row[:-1], row[-1]
 
 
+def block_shift(res: tuple[int, int, int]) -> int:
+    """log2 of the edge of the blocks of a grid (Z, Y, X) [cells]: 2 up to ``SMALL`` voxels an axis, 3 for larger grids."""
+    return 2 if max(res) <= SMALL else 3
+
+
 def find_block_ranges(values: mi.TensorXf, shift: int | None = None) -> BlockRanges:
     """Find the minorant and the range of each block of a grid.
 
     Args:
         values: (Z, Y, X, C), finite.
-        shift: log2 of the edge of a block [cells]; by default 2 for a grid of at most ``SMALL`` voxels an axis, 3 for larger
-            grids.
+        shift: log2 of the edge of a block [cells]; by default :func:`block_shift`.
 
     Cost: 9/8 reads a voxel along each axis, since neighbouring blocks share a layer of nodes.
     """
     z, y, x, c = values.shape
     flat = dr.detach(values.array)
-    if shift is None:
-        shift = 2 if max(z, y, x) <= SMALL else 3
+    shift = block_shift((z, y, x)) if shift is None else shift
     res = tuple(count_blocks(n, shift) for n in (z, y, x))
     rows, ranges = [], []
     for channel in range(c):

@@ -24,7 +24,12 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.lighting.emitters import ChosenEmitter, EventSamples, SceneEmitters, is_among
+from mivol.transport.estimators.lighting.emitters import (
+    ChosenEmitter,
+    EventSamples,
+    SceneEmitters,
+    is_among,
+)
 from mivol.transport.estimators.lighting.moving_emitters import attach_position, moving_transmittance
 from mivol.transport.estimators.lighting.shadow_rays import find_transmittance, trace_shadow_ray
 from mivol.transport.estimators.lighting.vertex import MediumVertex, Vertex, sample_phase
@@ -72,6 +77,8 @@ class EmitterSample:
         emitter: the emitter.
         u: random numbers of the direction.
         has_alternative: lanes in which a BSDF or phase sample can hit the emitter too, with a power heuristic between both.
+        density: density that stands for this sample in the power heuristic [1/sr]; None means ``direct.pdf``. A path that hits
+            the emitter does not know the ray along which this sample chose it.
     """
 
     direct: mi.DirectionSample3f
@@ -79,6 +86,7 @@ class EmitterSample:
     emitter: mi.EmitterPtr
     u: mi.Point2f
     has_alternative: mi.Bool | bool
+    density: mi.Float | None = None
 
 
 @dataclass
@@ -162,10 +170,35 @@ class DirectLighting:
         with dr.suspend_grad():
             return SceneEmitters(self.media.scene, self.media.start is not None)
 
-    def sample_emitter(self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> EmitterSample:
-        """Sample a direction from a point towards an emitter, by two uniform random numbers in [0, 1)."""
-        direct, weight, emitter, u = self.emitters.sample_direction(it, u, active)
+    @cached_property
+    def near_emitters(self) -> SceneEmitters:
+        """The emitters with a position; made as :attr:`emitters`."""
+        return self._among("near")
+
+    @cached_property
+    def far_emitters(self) -> SceneEmitters:
+        """The emitters at infinity; made as :attr:`emitters`."""
+        return self._among("far")
+
+    def _among(self, distance: str) -> SceneEmitters:
+        everyone = self.emitters
+        if all((everyone.bounding_ball(k) is not None) == (distance == "near") for k in range(len(everyone.sampled))):
+            return everyone
+        with dr.suspend_grad():
+            return SceneEmitters(self.media.scene, self.media.start is not None, distance)
+
+    def sample_emitter(
+        self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, emitters: SceneEmitters | None = None
+    ) -> EmitterSample:
+        """Sample a direction from a point towards an emitter, by two uniform random numbers in [0, 1); by default of all."""
+        direct, weight, emitter, u = (emitters or self.emitters).sample_direction(it, u, active)
         return EmitterSample(direct, weight, emitter, u, True)
+
+    def sample_near_emitter(self, it: mi.Interaction3f, chosen: ChosenEmitter, u: mi.Point2f, active: mi.Bool) -> EmitterSample:
+        """Sample a direction from a point of a ray towards an emitter with a position, chosen along the ray."""
+        direct, weight = _sample_chosen_emitter(it, chosen, u, active)
+        density = self.near_emitters.pdf_direction(it, direct, active)
+        return EmitterSample(direct, weight, chosen.emitter, u, True, density)
 
     def estimate_at_vertex(
         self, vertex: Vertex, sample: EmitterSample, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
@@ -189,7 +222,8 @@ class DirectLighting:
         w_mis = mi.Float(1)
         if sample.has_alternative is not False:
             pdf = vertex.pdf(direct.d, on)
-            w_mis = dr.select(direct.delta | ~mi.Bool(sample.has_alternative), 1, power_heuristic(direct.pdf, pdf))
+            own = direct.pdf if sample.density is None else sample.density
+            w_mis = dr.select(direct.delta | ~mi.Bool(sample.has_alternative), 1, power_heuristic(own, pdf))
         factor = light * w_mis
         with dr.resume_grad(when=attached):
             source, moved = sample.weight, direct
@@ -238,9 +272,7 @@ class DirectLighting:
         rngs = [seed_pcg32(samples.which_shadow_ray, dr.width(active), k) if estimates else None for k in range(2)]
         if self.emitters.sampled:
             mei = vertex.interaction
-            direct, weight = chosen.emitter.sample_direction(mei, samples.emitter, active)
-            probability = chosen.distribution.probability(chosen.number)
-            direct.pdf, weight = direct.pdf * probability, weight / dr.select(probability > 0, probability, 1)
+            direct, weight = _sample_chosen_emitter(mei, chosen, samples.emitter, active)
             weighed = ~is_among(self.emitters.transmissive, chosen.emitter) if self.emitters.samples_phase else False
             sample = EmitterSample(direct, weight, chosen.emitter, samples.emitter, weighed)
             directs.append(self.estimate_at_vertex(vertex, sample, attached, active, rngs[0]))
@@ -276,3 +308,13 @@ class DirectLighting:
                 weight = vertex.eval(wo, on) / pdf
             value = dr.select(on, factor * weight * emitter.eval(si, on), 0)
         return DirectSample(RaySegment(ray, mei.medium, end.t, True, passages=passages), value, on)
+
+
+def _sample_chosen_emitter(
+    it: mi.Interaction3f, chosen: ChosenEmitter, u: mi.Point2f, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """Sample a direction towards a chosen emitter; its density contains the probability of the emitter."""
+    direct, weight = chosen.emitter.sample_direction(it, u, active)
+    probability = chosen.distribution.probability(chosen.number)
+    direct.pdf, weight = direct.pdf * probability, weight / dr.select(probability > 0, probability, 1)
+    return direct, weight

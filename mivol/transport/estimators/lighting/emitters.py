@@ -25,6 +25,7 @@ __all__ = [
     "UNIFORM_EMITTER",
     "ChosenEmitter",
     "SceneEmitters",
+    "find_bounding_ball",
     "fractional_part",
     "is_among",
     "EventSamples",
@@ -44,6 +45,7 @@ class SceneEmitters:
     Args:
         scene: Mitsuba's scene.
         from_camera: media surround the camera, so rays scatter light from their origin on.
+        distance: ``near`` for the emitters with a position alone, ``far`` for the emitters at infinity alone, ``any`` for all.
 
     Attributes:
         sampled: emitters that next-event estimation chooses from: all except a constant environment.
@@ -52,14 +54,16 @@ class SceneEmitters:
         is_near: some emitter has a finite distance.
     """
 
-    def __init__(self, scene: mi.Scene, from_camera: bool = False) -> None:
+    def __init__(self, scene: mi.Scene, from_camera: bool = False, distance: str = "any") -> None:
         emitters = scene.emitters()
+        if distance != "any":
+            emitters = [e for e in emitters if (find_bounding_ball(e) is not None) == (distance == "near")]
         delta = int(mi.EmitterFlags.Delta)
         self.sampled = [e for e in emitters if e.class_name() != UNIFORM_EMITTER]
         self.transmissive = [e for e in self.sampled if _is_transmissive(e)]
         opaque = [e for e in emitters if not any(e is emitter for emitter in self.transmissive)]
         self.samples_phase = any(not int(e.flags()) & delta for e in opaque)
-        balls = [_find_bounding_ball(e) for e in self.sampled]
+        balls = [find_bounding_ball(e) for e in self.sampled]
         self.is_near = any(b is not None for b in balls)
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
         self._from_camera = from_camera
@@ -159,10 +163,14 @@ class _EmitterTable:
         if count == 1:
             (only,) = emitters
             return cls(emitters, mi.EmitterPtr(only), mi.UInt32(0), [])
-        # A scene has at most one environment, so at most one emitter is left out.
-        left_out = next((k for k, e in enumerate(everyone) if not any(e is other for other in emitters)), count)
-        number = dr.arange(mi.UInt32, count)
-        pointers = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.select(number < left_out, number, number + 1))
+        chosen = {id(e) for e in emitters}
+        left_out = [k for k, e in enumerate(everyone) if id(e) not in chosen]
+        number = place = dr.arange(mi.UInt32, count)
+        if len(left_out) == 1:
+            place = dr.select(number < left_out[0], number, number + 1)
+        elif left_out:
+            place = _join([dr.opaque(mi.UInt32, k) for k, e in enumerate(everyone) if id(e) in chosen])
+        pointers = dr.gather(mi.EmitterPtr, scene.emitters_dr(), place)
         size = max(int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0]) for e in everyone) + 1
         numbers = dr.full(mi.UInt32, count, size)
         dr.scatter(numbers, number, dr.reinterpret_array(mi.UInt32, pointers))
@@ -193,7 +201,7 @@ class _EmitterTable:
         return x, y, z, r, finite > 0
 
 
-def _join(values: list[mi.Float], at_once: int = 16) -> mi.Float:
+def _join(values: list[mi.Float] | list[mi.UInt32], at_once: int = 16) -> mi.Float | mi.UInt32:
     """Join arrays, few at once: a kernel with hundreds of inputs would take a second to compile."""
     while len(values) > 1:
         values = [dr.concat(values[k : k + at_once]) for k in range(0, len(values), at_once)]
@@ -216,7 +224,7 @@ def _is_transmissive(emitter: mi.Emitter) -> bool:
     return shape is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
 
 
-def _find_bounding_ball(emitter: mi.Emitter) -> list[float] | None:
+def find_bounding_ball(emitter: mi.Emitter) -> list[float] | None:
     """Centre of an emitter's bounding box, and root mean square distance of its points [length]; None for an emitter at
     infinity.
     """

@@ -30,12 +30,13 @@ from mivol.transport.estimators.lighting.emitters import ChosenEmitter
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU
 from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
 from mivol.transport.media.body import Body
-from mivol.transport.media.ray_intervals import MediumInterval, SegmentEnd, visit_media
+from mivol.transport.media.extinction import ExactExtinction
+from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, SegmentEnd, revisit_media, visit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, corner_nodes, read_nodes, walk_cells
 from mivol.transport.traversal.interpolation import eval_cubic, fit_cubic, gauss_points, integrate_cubic, invert_cubic_integral
 from mivol.transport.traversal.lattice import clip_to_grid, points_of_piece, split_float64
-from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.transport.traversal.random_numbers import draw_pcg32
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [
@@ -47,9 +48,15 @@ __all__ = [
     "fill_reservoir",
     "bounded_inverse",
     "lit_length",
+    "refill_reservoir",
     "start_reservoir",
     "extinguished_light",
 ]
+
+
+MIN_ROUGH_TRANSMITTANCE = 1e-3
+"""Smallest transmittance that weighs a piece with a rough optical depth [1]. A ray may pass between dense voxels whose means
+stand in its way; light from behind then weighs at most 1000 times as much."""
 
 
 # -- The reservoir ------------------------------------------------------------------------------------------------------
@@ -65,6 +72,8 @@ class DistanceProposal:
         chosen: emitter of each lane.
         cache: rough visibility of the emitters; None without a cache.
         probe_depth: optical depth added uniformly over each medium, for probes of derivatives [1]; 0 for an image.
+        is_rough: coarse grids stand for the grids of media, where media have them: fewer cells, and an optical depth and an
+            extinction of the event that weigh the distance only.
     """
 
     media: SceneMedia
@@ -72,6 +81,16 @@ class DistanceProposal:
     chosen: ChosenEmitter
     cache: VisibilityCache | None
     probe_depth: float
+    is_rough: bool = False
+
+    def parts_of(self, body: Body) -> list[ExactExtinction]:
+        """The parts of a medium whose cells are walked."""
+        return [p if p.rough is None else p.rough for p in body.flight_parts] if self.is_rough else body.flight_parts
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether optical depth and extinction of an event are those of the media."""
+        return self.media.is_single and not (self.is_rough and any(p.rough for p in self.media.bodies[0].flight_parts))
 
 
 @dataclass
@@ -123,12 +142,11 @@ class Reservoir:
         return candidate
 
 
-def start_reservoir(media: SceneMedia, u: mi.Float, width: int, count: int = 1) -> Reservoir:
-    """An empty reservoir of ``count`` candidates; ``u`` in [0, 1) seeds their random number generators."""
+def start_reservoir(media: SceneMedia, rngs: list[mi.UInt32]) -> Reservoir:
+    """An empty reservoir, with a candidate for each state of a random number generator."""
+    width = dr.width(rngs[0])
     tau, T = [[dr.full(mi.Float, v, width) for _ in range(media.channels)] for v in (0, 1)]
-    return Reservoir(
-        tau, T, dr.zeros(mi.Float, width), [_start_candidate(media, seed_pcg32(u, width, k), width) for k in range(count)]
-    )
+    return Reservoir(tau, T, dr.zeros(mi.Float, width), [_start_candidate(media, rng, width) for rng in rngs])
 
 
 def _start_candidate(media: SceneMedia, rng: mi.UInt32, width: int) -> Candidate:
@@ -155,6 +173,11 @@ def fill_reservoir(
     candidate).
     """
     return visit_media(proposal.media, proposal.ray, medium, _Filling(proposal).visit, reservoir, active)
+
+
+def refill_reservoir(proposal: DistanceProposal, passed: RaySegment, reservoir: Reservoir, active: mi.Bool) -> Reservoir:
+    """Fill a reservoir as :func:`fill_reservoir` does, along a segment of known length."""
+    return revisit_media(proposal.media, passed, _Filling(proposal).visit, reservoir, active)
 
 
 @dataclass
@@ -203,8 +226,9 @@ class _Filling:
         """
         body, t0, t1, on = interval.body, interval.t0, interval.t1, interval.active
         ray, rows, chosen, cache = self.proposal.ray, self.proposal.media.to_channels, self.proposal.chosen, self.proposal.cache
-        extinction = body.extinction(ray, body.flight_parts)
-        grid = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
+        parts = self.proposal.parts_of(body)
+        extinction = body.extinction(ray, parts)
+        grid = next((p.lattice for p in parts if p.lattice is not None), None)
         segment = clip_to_grid(grid, ray.o, ray.d, t0, t1) if grid is not None else None
         filled = segment.length if segment is not None and not extinction.has_constants else mi.Float(t1 - t0)
         probe_sigma = self._probe_sigma(filled)
@@ -237,8 +261,9 @@ class _Filling:
         if extinction.has_constants:
             reservoir = add_constant(reservoir, t0, dr.select(hit, segment.start, t1))
         # Light from beyond NEGLIGIBLE_TAU does not matter in an image. Derivatives need the whole optical depth, since their
-        # sweep starts at the far end.
-        until = None if self.proposal.probe_depth else lambda p: minimum(p.tau) > NEGLIGIBLE_TAU
+        # sweep starts at the far end. A rough optical depth may be far above the true one.
+        whole = self.proposal.probe_depth or self.proposal.is_rough
+        until = None if whole else lambda p: minimum(p.tau) > NEGLIGIBLE_TAU
         reservoir = walk_cells(lattice, segment, visit, reservoir, extinction.reads, on, until)
         if extinction.has_constants:
             reservoir = add_constant(reservoir, dr.select(hit, segment.end, t1), t1)
@@ -257,7 +282,10 @@ class _Filling:
         beyond = [dr.exp(-t) for t in ahead]
         weight = mi.Float(0)
         for tau, T, T_out in zip(piece.tau, reservoir.T, beyond, strict=True):
-            weight += extinguished_light(tau, T, T_out)
+            extinguished = extinguished_light(tau, T, T_out)
+            if self.proposal.is_rough:
+                extinguished = dr.maximum(extinguished, MIN_ROUGH_TRANSMITTANCE * tau / (1 + tau))
+            weight += extinguished
             if probe_sigma is not None:
                 weight += 0.5 * probe_sigma * dt * (T + T_out)
         if equiangular is not None:
@@ -365,10 +393,10 @@ def sample_distance(
         u: two uniform random numbers in [0, 1).
         active: lanes that may scatter.
     """
-    media, ray, equiangular = proposal.media, proposal.ray, proposal.chosen.equiangular
+    equiangular = proposal.chosen.equiangular
     on = active & (candidate.weight > 0)
     dt = dr.select(on, candidate.dt, 1)
-    curve = _extinction_curves(media, ray, candidate, on)
+    curve = _extinction_curves(proposal, candidate, on)
     whole = [integrate_cubic(c, dt, 1) for c in curve]
     front = [dr.exp(-f) for f in candidate.front]
 
@@ -402,23 +430,25 @@ def sample_distance(
     )
 
 
-def _extinction_curves(media: SceneMedia, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+def _extinction_curves(proposal: DistanceProposal, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
     """The extinction along a piece for each channel: the coefficients of a cubic on [0, 1]."""
+    media = proposal.media
     values = [[mi.Float(0) for _ in range(4)] for _ in range(media.channels)]
     for index, body in enumerate(media.bodies):
         lanes = on & (candidate.body == index)
-        along = _extinction_along(media, body, ray, candidate, lanes)
+        along = _extinction_along(proposal, body, candidate, lanes)
         values = [
             [dr.select(lanes, n, v) for n, v in zip(new, old, strict=True)] for new, old in zip(along, values, strict=True)
         ]
     return [fit_cubic(*v) for v in values]
 
 
-def _extinction_along(media: SceneMedia, body: Body, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+def _extinction_along(proposal: DistanceProposal, body: Body, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
     """[channel][point] extinction at 0, 1/3, 2/3 and 1 of a piece, in one medium [1/length]."""
-    extinction = body.extinction(ray, body.flight_parts)
+    media, ray, parts = proposal.media, proposal.ray, proposal.parts_of(body)
+    extinction = body.extinction(ray, parts)
     constant = [[c] * 4 for c in extinction.constant]
-    lattice = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
+    lattice = next((p.lattice for p in parts if p.lattice is not None), None)
     if lattice is None:
         return _to_scene_channels(media, constant)
     start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)

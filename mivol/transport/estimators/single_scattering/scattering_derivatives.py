@@ -30,14 +30,14 @@ from mivol.transport.estimators.single_scattering.control_variates import (
     SweepSums,
 )
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
-from mivol.transport.media.body import Body, eval_albedo, medium_interaction
+from mivol.transport.media.body import eval_albedo, medium_interaction
 from mivol.transport.media.channels import colours_to_channels, take_tangent, to_components, to_spectrum
 from mivol.transport.media.optical_depth import jvp_optical_depth, transmittance, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import Ray
 
-__all__ = ["ScatteredSegment", "Scattering", "event_interaction", "event_sigma_s", "event_sigma_t"]
+__all__ = ["ScatteredLight", "ScatteredSegment", "Scattering", "event_coefficients", "event_interaction"]
 
 
 # -- A scattering event -------------------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ class Scattering:
         mei: position as Mitsuba's interaction.
         gain: throughput times transmittance to the camera, over the density of the position [length].
         direct: shadow rays; their values carry derivatives on request.
-        sigma_s: scattering coefficient [1/length].
+        sigma_t, sigma_s: extinction and scattering coefficient [1/length].
         chance: uniform random number in [0, 1) choosing the differentiated shadow ray.
     """
 
@@ -60,6 +60,7 @@ class Scattering:
     mei: mi.MediumInteraction3f
     gain: mi.Spectrum
     direct: list[DirectSample]
+    sigma_t: mi.Spectrum
     sigma_s: mi.Spectrum
     chance: mi.Float
 
@@ -76,22 +77,111 @@ def event_interaction(media: SceneMedia, ray: Ray, event: MediumEvent) -> mi.Med
     return mei
 
 
-def event_sigma_t(media: SceneMedia, body: Body, ray: Ray, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
-    """The extinction at an event [1/length]."""
-    rows = event.sigma_t if media.is_single else body.extinction_at(ray, event.t, media.channels, on)
-    return to_spectrum(rows)
-
-
-def event_sigma_s(media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
-    """The scattering coefficient at an event [1/length]."""
-    total = mi.Spectrum(0)
+def event_coefficients(
+    media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.MediumInteraction3f, is_exact: bool
+) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """The extinction and the scattering coefficient at an event [1/length]; ``is_exact`` as of the event's proposal."""
+    sigma_t, sigma_s = mi.Spectrum(0), mi.Spectrum(0)
     for body, on in media.bodies_at(event.body, event.on):
+        extinction = to_spectrum(event.sigma_t if is_exact else body.extinction_at(ray, event.t, media.channels, on))
         if body.view.albedo is None:
-            value = to_spectrum(body.extinction_at(ray, event.t, media.channels, on, "sigma_s"))
+            scattering = to_spectrum(body.extinction_at(ray, event.t, media.channels, on, "sigma_s"))
         else:
-            value = dr.detach(eval_albedo(body, mei, on)) * event_sigma_t(media, body, ray, event, on)
-        total = dr.select(on, value, total)
-    return total
+            scattering = dr.detach(eval_albedo(body, mei, on)) * extinction
+        sigma_t, sigma_s = dr.select(on, extinction, sigma_t), dr.select(on, scattering, sigma_s)
+    return sigma_t, sigma_s
+
+
+# -- The light of a scattering event -------------------------------------------------------------------------------------
+
+
+@dataclass
+class ScatteredLight:
+    """The light of a scattering event on a segment, as a term without the derivatives of the media along its shadow rays.
+
+    Attributes:
+        media: media of the scene.
+        segment: segment of the path.
+        event: the event with its direct light.
+    """
+
+    media: SceneMedia
+    segment: PathSegment
+    event: Scattering
+    is_replayed = True
+
+    @property
+    def value(self) -> mi.Spectrum:
+        return dr.select(self.event.event.on, self.event.sigma_s * self.event.weight, 0)
+
+    def vjp(self, dL: mi.Spectrum) -> None:
+        self.vjp_direct(dL)
+        self.vjp_coefficients(dL, mi.Spectrum(0), mi.Spectrum(0))
+
+    def jvp(self) -> mi.Spectrum:
+        return self.jvp_direct() + self.jvp_coefficients(mi.Spectrum(0), mi.Spectrum(0))
+
+    def vjp_direct(self, dL: mi.Spectrum) -> None:
+        """Add the derivatives of the emitters, the phase function and the albedo."""
+        scattering = self.event
+        carried = dL * scattering.sigma_s * scattering.gain
+        for sample in scattering.direct:
+            with dr.resume_grad():
+                if dr.grad_enabled(sample.value):
+                    dr.backward_from(dr.select(sample.on, carried * sample.value, 0))
+        for body, lanes in self.media.bodies_at(scattering.event.body, scattering.event.on):
+            if body.view.albedo is None:
+                continue
+            with dr.resume_grad():
+                albedo = eval_albedo(body, scattering.mei, lanes)
+                if dr.grad_enabled(albedo):
+                    dr.backward_from(dr.select(lanes, dL * scattering.weight * scattering.sigma_t * albedo, 0))
+
+    def jvp_direct(self) -> mi.Spectrum:
+        """The transpose of :meth:`vjp_direct`."""
+        scattering = self.event
+        carried = scattering.sigma_s * scattering.gain
+        with dr.resume_grad():
+            # The terms are differentiated as one sum: they share edges of the graph, and each traversal clears its edges.
+            value = sum((dr.select(s.on, carried * s.value, 0) for s in scattering.direct), mi.Spectrum(0))
+            for body, on in self.media.bodies_at(scattering.event.body, scattering.event.on):
+                if body.view.albedo is not None:
+                    value += dr.select(on, scattering.weight * scattering.sigma_t * eval_albedo(body, scattering.mei, on), 0)
+            return take_tangent(value)
+
+    def vjp_coefficients(self, dL: mi.Spectrum, source: mi.Spectrum, lost: mi.Spectrum) -> None:
+        """Add the derivatives with respect to the coefficients at the event and in front of it.
+
+        Args:
+            dL: d loss / d light.
+            source, lost: weight of the event in a control variate, for an extinction of 1 and for the actual extinction.
+        """
+        media, ray, scattering = self.media, self.segment.ray, self.event
+        for body, on in media.bodies_at(scattering.event.body, scattering.event.on):
+            albedo, name = mi.Spectrum(1), "sigma_s"
+            if body.view.albedo is not None:
+                albedo, name = dr.detach(eval_albedo(body, scattering.mei, on)), "sigma_"
+            weight = colours_to_channels(dL * (scattering.weight * albedo - source), media.channels)
+            body.vjp_extinction_at(ray, scattering.event.t, weight, on, name)
+        vjp_optical_depth(media, self._in_front, -dL * (scattering.sigma_s * scattering.weight - lost), scattering.event.on)
+
+    def jvp_coefficients(self, source: mi.Spectrum, lost: mi.Spectrum) -> mi.Spectrum:
+        """The transpose of :meth:`vjp_coefficients`."""
+        media, ray, scattering = self.media, self.segment.ray, self.event
+        along = jvp_optical_depth(media, self._in_front, scattering.event.on)
+        dL = -along * (scattering.sigma_s * scattering.weight - lost)
+        for body, on in media.bodies_at(scattering.event.body, scattering.event.on):
+            albedo, name = mi.Spectrum(1), "sigma_s"
+            if body.view.albedo is not None:
+                albedo, name = dr.detach(eval_albedo(body, scattering.mei, on)), "sigma_"
+            tangent = to_spectrum(body.jvp_extinction_at(ray, scattering.event.t, media.channels, on, name))
+            dL += dr.select(on, (scattering.weight * albedo - source) * tangent, 0)
+        return dr.select(scattering.event.on, dL, 0)
+
+    @property
+    def _in_front(self) -> RaySegment:
+        """The ray up to the event."""
+        return RaySegment.upto(self.segment.ray, self.segment.medium, self.event.event.t)
 
 
 # -- A segment and its scattering event ---------------------------------------------------------------------------------
@@ -122,48 +212,26 @@ class ScatteredSegment:
     active: mi.Bool
     dL: mi.Spectrum | None = None
 
+    @property
+    def _light(self) -> ScatteredLight:
+        return ScatteredLight(self.media, self.segment, self.probe)
+
     # -- Direct light at the event -------------------------------------------------------------------------------------
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
-        """Add the derivatives of the direct light: emitters, phase function, the media along a shadow ray, and the albedo."""
-        probe = self.probe
-        carried = dL * probe.sigma_s * probe.gain
-        for sample in probe.direct:
-            with dr.resume_grad():
-                if dr.grad_enabled(sample.value):
-                    dr.backward_from(dr.select(sample.on, carried * sample.value, 0))
-        shadow, value, on = _choose_shadow_ray(probe)
-        vjp_optical_depth(self.media, shadow, -carried * value, on)
-        for body, lanes in self.media.bodies_at(probe.event.body, probe.event.on):
-            if body.view.albedo is None:
-                continue
-            with dr.resume_grad():
-                albedo = eval_albedo(body, probe.mei, lanes)
-                if dr.grad_enabled(albedo):
-                    sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, lanes)
-                    dr.backward_from(dr.select(lanes, dL * probe.weight * sigma_t * albedo, 0))
+        """Add the derivatives of the direct light: emitters, phase function, albedo, and the media along a shadow ray."""
+        self._light.vjp_direct(dL)
+        shadow, value, on = _choose_shadow_ray(self.probe)
+        vjp_optical_depth(self.media, shadow, -dL * self.probe.sigma_s * self.probe.gain * value, on)
 
     def jvp_light(self) -> mi.Spectrum:
-        dL = self._jvp_direct()
+        shadow, light, on = _choose_shadow_ray(self.probe)
+        carried = self.probe.sigma_s * self.probe.gain
+        dL = self._light.jvp_direct() - dr.select(on, carried * light * jvp_optical_depth(self.media, shadow, on), 0)
         if self.grid_control is not None:
             return dL + self._jvp_by_sweep()
-        dL += self._jvp_coefficients()
+        dL += self._light.jvp_coefficients(*self._constant_source_at())
         return dL - self._constant_source_behind() * self.jvp_transmittance()
-
-    def _jvp_direct(self) -> mi.Spectrum:
-        """The tangent from emitters, phase function, shadow ray and albedo: the transpose of :meth:`vjp_light`."""
-        probe = self.probe
-        carried = probe.sigma_s * probe.gain
-        with dr.resume_grad():
-            # The terms are differentiated as one sum: they share edges of the graph, and each traversal clears its edges.
-            value = sum((dr.select(s.on, carried * s.value, 0) for s in probe.direct), mi.Spectrum(0))
-            for body, on in self.media.bodies_at(probe.event.body, probe.event.on):
-                if body.view.albedo is not None:
-                    sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, on)
-                    value += dr.select(on, probe.weight * sigma_t * eval_albedo(body, probe.mei, on), 0)
-            dL = take_tangent(value)
-        shadow, light, on = _choose_shadow_ray(probe)
-        return dL - dr.select(on, carried * light * jvp_optical_depth(self.media, shadow, on), 0)
 
     # -- Coefficients along the segment --------------------------------------------------------------------------------
 
@@ -173,38 +241,12 @@ class ScatteredSegment:
             shares = _control_factors(lit, self.media.channels, self.grid_control.channels)
             self._sweep(shares, dlog, self.dL, False)
             return
-        self._vjp_coefficients()
+        self._light.vjp_coefficients(self.dL, *self._constant_source_at())
         kept = self._constant_source_behind()
         vjp_optical_depth(self.media, self._passed, self.dL * kept - dlog, self.active)
 
     def jvp_transmittance(self) -> mi.Spectrum:
         return -jvp_optical_depth(self.media, self._passed, self.active)
-
-    def _vjp_coefficients(self) -> None:
-        """Add the derivatives with respect to the coefficients at the event and in front of it."""
-        media, ray, probe, dL = self.media, self.segment.ray, self.probe, self.dL
-        source, lost = self._constant_source_at()
-        for body, on in media.bodies_at(probe.event.body, probe.event.on):
-            albedo, name = mi.Spectrum(1), "sigma_s"
-            if body.view.albedo is not None:
-                albedo, name = dr.detach(eval_albedo(body, probe.mei, on)), "sigma_"
-            weight = colours_to_channels(dL * (probe.weight * albedo - source), media.channels)
-            body.vjp_extinction_at(ray, probe.event.t, weight, on, name)
-        vjp_optical_depth(media, self._in_front, -dL * (probe.sigma_s * probe.weight - lost), probe.event.on)
-
-    def _jvp_coefficients(self) -> mi.Spectrum:
-        """The transpose of :meth:`_vjp_coefficients`."""
-        media, ray, probe = self.media, self.segment.ray, self.probe
-        source, lost = self._constant_source_at()
-        along = jvp_optical_depth(media, self._in_front, probe.event.on)
-        dL = -along * (probe.sigma_s * probe.weight - lost)
-        for body, on in media.bodies_at(probe.event.body, probe.event.on):
-            albedo, name = mi.Spectrum(1), "sigma_s"
-            if body.view.albedo is not None:
-                albedo, name = dr.detach(eval_albedo(body, probe.mei, on)), "sigma_"
-            tangent = to_spectrum(body.jvp_extinction_at(ray, probe.event.t, media.channels, on, name))
-            dL += dr.select(on, (probe.weight * albedo - source) * tangent, 0)
-        return dr.select(probe.event.on, dL, 0)
 
     # -- Control variate: a source function on a lattice ---------------------------------------------------------------
 
@@ -245,10 +287,8 @@ class ScatteredSegment:
         """The control variate's weight of the event for an extinction of 1, and for the actual extinction."""
         if self.constant_control is None:
             return mi.Spectrum(0), mi.Spectrum(0)
-        source, sigma_t, event = self.probe.gain * self._constant_source, mi.Spectrum(0), self.probe.event
-        for body, on in self.media.bodies_at(event.body, event.on):
-            sigma_t = dr.select(on, event_sigma_t(self.media, body, self.segment.ray, event, on), sigma_t)
-        return source, source * sigma_t
+        source = self.probe.gain * self._constant_source
+        return source, source * self.probe.sigma_t
 
     def _constant_source_behind(self) -> mi.Spectrum:
         """T S of the whole segment: the exact derivative of the control variate by the optical depth of any part of it."""
@@ -262,11 +302,6 @@ class ScatteredSegment:
     @property
     def _passed(self) -> RaySegment:
         return RaySegment(self.segment.ray, self.segment.medium, self.end.t)
-
-    @property
-    def _in_front(self) -> RaySegment:
-        """The ray up to the event."""
-        return RaySegment.upto(self.segment.ray, self.segment.medium, self.probe.event.t)
 
 
 def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.Bool]:

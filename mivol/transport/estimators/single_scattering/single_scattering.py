@@ -46,16 +46,16 @@ from mivol.transport.estimators.single_scattering.distance_sampling import (
 from mivol.transport.estimators.single_scattering.scattering_derivatives import (
     ScatteredSegment,
     Scattering,
+    event_coefficients,
     event_interaction,
-    event_sigma_s,
 )
 from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
 from mivol.transport.media.optical_depth import segment_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
-from mivol.transport.traversal.random_numbers import Strata
+from mivol.transport.traversal.random_numbers import Strata, seed_pcg32
 from mivol.transport.traversal.rays import point_along
 
-__all__ = ["SingleScattering"]
+__all__ = ["PROBE_DEPTH", "SingleScattering"]
 
 
 PROBE_DEPTH = 4.0
@@ -160,7 +160,7 @@ class SingleScattering:
         """Choose an emitter, walk the segment to its end, and fill a reservoir with candidates of scattering points."""
         ray, samples = segment.ray, segment.samples
         chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
-        reservoir = start_reservoir(self.media, samples.piece, dr.width(ray), count)
+        reservoir = start_reservoir(self.media, [seed_pcg32(samples.piece, dr.width(ray), k) for k in range(count)])
         proposal = DistanceProposal(self.media, ray, chosen, self.visibility_cache, probe_depth)
         end, reservoir = fill_reservoir(proposal, segment.medium, reservoir, active)
         return _WalkedSegment(end, reservoir, proposal)
@@ -182,4 +182,5 @@ class SingleScattering:
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
         # No roulette: single scattering has little noise, and the noise of roulette would show.
         direct = self.direct.estimate_in_medium(vertex, chosen, samples, probes, event.on, not probes and media.tracks_shadows)
-        return Scattering(event, mei, gain, direct, event_sigma_s(media, ray, event, mei), samples.which_shadow_ray)
+        coefficients = event_coefficients(media, ray, event, mei, proposal.is_exact)
+        return Scattering(event, mei, gain, direct, *coefficients, samples.which_shadow_ray)

@@ -1,0 +1,248 @@
+"""Light of emitters with a position, drawn at a distance of its own on every segment of a path in media."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import oracle_scattering as twins
+import pytest
+from false_alarms import assert_precise, assert_same_mean, fresh
+from numpy.typing import NDArray
+from scattering_gradients import DENSITIES, GRID, assert_gradient, gradients, weights
+from scattering_scenes import (
+    PLACE,
+    aimed,
+    assert_same_images,
+    assert_twin,
+    close_up,
+    fog,
+    mivol,
+    moments,
+    pencils,
+    point,
+    rough_grid,
+    smoke,
+    spot,
+    volpath,
+)
+
+import scenes
+from mivol.errors import MivolError
+from mivol.scene import plan
+from mivol.scene.explain import explain_scene
+from mivol.scene.needs import find_needs
+from mivol.scene.plan import build_media, make_plan
+from mivol.scene.survey import survey_scene
+from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
+from mivol.transport.estimators.segment import PathSegment
+from mivol.transport.estimators.single_scattering.near_light import NearLighting
+from mivol.transport.path.estimators import Settings
+from scenes import ball_of, box_of, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+SEGMENTS = {"near_light": "segments"}
+
+
+def lamp(at: list[float] = (0, 0.4, 1.5), size: float = 0.6, radiance: float = 6.0) -> dict:
+    """A square area light that shines towards the origin."""
+    place = mi.ScalarTransform4f().look_at(list(at), [0, 0, 0], [0, 1, 0]).scale(size)
+    return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": radiance}}
+
+
+def floor() -> dict:
+    place = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)
+    return {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": 0.6}}
+
+
+@pytest.fixture
+def flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plan uses free flights at depth 2 too, instead of the estimator of single scattering."""
+    choose = plan.choose_segment_estimator
+    monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
+
+
+# -- One scattering, against the twin ------------------------------------------------------------------------------------
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("media", "emitter"),
+    [
+        ("fog", lambda: point([0.3, -0.2, 0.35])),
+        ("grid", lambda: point([0.3, -0.2, 0.35])),
+        ("grid", lambda: spot([1.0, -2, 2.5], [0, 0, 0])),
+    ],
+    ids=["fog, point inside", "grid, point inside", "grid, spot"],
+)
+def test_one_scattering(flies, media, emitter):
+    box, m = fog(1.5) if media == "fog" else smoke(rough_grid(1), 0.7, "own", PLACE, "hg", 0.4)
+    shine, known = emitter()
+    seen = pencils({"smoke": box, "emitter": shine}, *aimed(1, 8))
+    top = twins.radiance([m], [known], seen.o, seen.d).max()
+    assert_twin(seen, [m], [known], mivol(**SEGMENTS), 512, rounding=2e-5 * top)
+
+
+@pytest.mark.slow_for("rough")
+@pytest.mark.statistical
+@pytest.mark.parametrize("density", ["empty", "half empty", "rough"])
+def test_gradient_of_one_scattering(flies, density):
+    """In empty voxels too, where no path collides: the probe of the segment samples them."""
+    shine, known = point([0.4, 0.3, 1.3])
+    box, m = smoke(np.float32(DENSITIES[density]()), 0.7, "own", PLACE, "hg", 0.4)
+    seen = pencils({"smoke": box, "emitter": shine}, *aimed(1, 8))
+    w, rows = weights(8)
+    truth, _ = twins.radiance_gradient(m, [known], seen.o, seen.d, rows)
+    assert_gradient(gradients(seen, GRID, w, 1024, SEGMENTS), truth[..., None], density, 0.1)
+
+
+# -- Two scatterings of a lamp in an endless fog, against quadrature in float64 --------------------------------------------
+
+
+def _first_order(r: NDArray, cosine: NDArray, sigma: float, nodes: int = 64) -> NDArray:
+    """Light of a point of intensity 1 scattered once along rays that start at the distance r from it.
+
+    ``cosine`` is that of the angle between the ray and the direction to the point. The substitution to the angle seen from the
+    point removes 1 / d^2: with d^2 = h^2 + s^2, ds / d^2 is d theta / h. Isotropic phase function, albedo 1.
+    """
+    x, weight = np.polynomial.legendre.leggauss(nodes)
+    h = r * np.sqrt(1 - cosine**2)
+    low = -np.arctan2(r * cosine, h)
+    half = 0.5 * (np.pi / 2 - low)
+    theta = low[..., None] + half[..., None] * (x + 1)
+    s = h[..., None] * np.tan(theta)
+    path = s + (r * cosine)[..., None] + np.hypot(s, h[..., None])
+    return sigma / (4 * np.pi) * (np.exp(-sigma * path) * weight).sum(axis=-1) * half / h
+
+
+def _orders(h: float, away: float, sigma: float) -> tuple[float, float]:
+    """The first two orders along an endless ray that passes the lamp at a distance h, after the length ``away``."""
+    first = float(_first_order(np.array(np.hypot(h, away)), np.array(away / np.hypot(h, away)), sigma))
+    x, weight = np.polynomial.legendre.leggauss(200)
+    # The mean over directions: d cos = sin d phi, which cancels the 1 / sin of the first order.
+    phi, dphi = 0.5 * np.pi * (x + 1), 0.5 * np.pi * weight
+    # Two intervals of the ray, in the angle seen from the lamp: in front of the nearest point, and behind.
+    low, total = -np.arctan2(away, h), 0.0
+    for a, b in ((low, 0.0), (0.0, np.pi / 2)):
+        theta, dtheta = a + 0.5 * (b - a) * (x + 1), 0.5 * (b - a) * weight
+        t, r = away + h * np.tan(theta), h / np.cos(theta)
+        inner = _first_order(r[:, None] + 0 * phi, np.cos(phi) + 0 * r[:, None], sigma)
+        source = 0.5 * (inner * np.sin(phi) * dphi).sum(axis=1)
+        total += float((np.exp(-sigma * t) * sigma * source * h / np.cos(theta) ** 2 * dtheta).sum())
+    return first, total
+
+
+def _lamp_in_fog(h: float, away: float, sigma: float, albedo: float = 1.0) -> mi.Scene:
+    """A ray along x in an endless fog, which passes a lamp of intensity 1 at a distance h after the length ``away``."""
+    parts = {"fog": scenes.medium("homogeneous", sigma, albedo), "lamp": point([away, h, 0], 1.0)[0]}
+    sensor = scenes.pencil(np.zeros(3), np.array([1.0, 0, 0])) | {"medium": {"type": "ref", "id": "fog"}}
+    return mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+
+
+@pytest.mark.statistical
+def test_two_scatterings_in_an_endless_fog():
+    """A lamp 0.7 beside the ray. The quadrature has converged: half as many nodes change it by less than 1e-10."""
+    h, away, sigma = 0.7, 1.2, 0.5
+    scene, truth = _lamp_in_fog(h, away, sigma), sum(_orders(h, away, sigma))
+    found = moments(scene, mivol(max_depth=3), 1 << 15)
+    found = replace(found, mean=found.mean[..., :1], m2=found.m2[..., :1])
+    assert_same_mean(found, truth, rounding=1e-5 * truth, what="the first two orders")
+    assert_precise(found, 0.01 * truth, what="the first two orders")
+
+
+# -- Any number of scatterings, against volpath ----------------------------------------------------------------------------
+
+
+PLACES = {
+    "lamp over a grid": lambda: {"smoke": smoke(rough_grid(1, 4.0), 0.8)[0], "lamp": lamp(), "floor": floor()},
+    "peaked phase function": lambda: {"smoke": fog(1.5, 0.9, name="hg", g=0.8)[0], "lamp": lamp()},
+    "colours": lambda: {
+        "fog": box_of(medium("homogeneous", {"type": "rgb", "value": [0.5, 1.0, 2.0]}, 0.8), PLACE),
+        "lamp": lamp(),
+        "envmap": {"type": "envmap", "bitmap": mi.Bitmap(np.random.default_rng(1).random((4, 8, 3)).astype(np.float32))},
+    },
+    "two lights, a ball": lambda: {
+        "fog": ball_of(medium("homogeneous", 1.0, 0.8), (0, 0, 0), 1.0),
+        "spot": spot([0.6, -0.4, 1.8], [0, 0, 0], 12.0, 40.0)[0],
+        "lamp": lamp([1.6, 0.5, 0.3], 0.4, 8.0),
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(np.random.default_rng(1).random((4, 8, 3)).astype(np.float32))},
+        "floor": floor(),
+    },
+}
+
+
+@pytest.mark.slow_for("colours")
+@pytest.mark.statistical
+@pytest.mark.parametrize("place", PLACES)
+def test_paths_have_the_mean_of_volpath(place):
+    """Extended emitters are found in both ways, and emitters at infinity at collisions; each light counts once."""
+    scene = close_up(PLACES[place](), res=8)
+    assert_same_images(scene, (256, 1024), ours=mivol(max_depth=4, rr_depth=50, **SEGMENTS), stock=volpath(max_depth=4))
+
+
+# -- Fireflies -------------------------------------------------------------------------------------------------------------
+
+
+def test_samples_are_bounded():
+    """In a homogeneous medium every sample of a segment is at most sigma_s I / (2 h) for a lamp at the distance h from the ray.
+
+    Half of the distances are drawn uniformly in the angle seen from the lamp, of at most pi, so their density is at least
+    h / (2 pi d^2) at the distance d from the lamp. The phase function is 1 / (4 pi), and no transmittance exceeds 1.
+    """
+    n, sigma, intensity, albedo = 1 << 16, 2.0, 3.0, 0.7
+    scene = close_up({"fog": fog(sigma, albedo)[0], "lamp": point([0, 0, 0], intensity)[0]})
+    survey, settings = survey_scene(scene), Settings(max_depth=3)
+    with dr.suspend_grad():
+        needs = find_needs(scene, scene.sensors()[0], survey)
+        media = build_media(scene, needs, make_plan(needs, settings), survey)
+        h = mi.Float(np.geomspace(1e-2, 0.9, n))
+        ray = mi.Ray3f(mi.Point3f(h, 0, -2), mi.Vector3f(0, 0, 1))
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(fresh(1), n)
+        on, near = dr.full(mi.Bool, True, n), NearLighting(DirectLighting(media), 0.0)
+        segment = PathSegment(ray, media.medium_at(ray), mi.Spectrum(1), on, None, dr.zeros(mi.UInt32, n))
+        light = near.estimate(segment, mi.Float(dr.inf), near.draw(sampler, on), False, on).light.value
+    share = np.array(light.x, np.float64) * 2 * np.array(h, np.float64) / (sigma * albedo * intensity)
+    # The sampler rounds h up by 1e-8 of the squared distance to the origin of the ray, which is 2.2 at most.
+    assert 0.1 < share.max() <= 1 + 1e-8 * 2.2**2 / 1e-2**2 / 2 + 1e-4
+
+
+# -- The plan --------------------------------------------------------------------------------------------------------------
+
+
+def _draws(parts: dict, **settings: object) -> tuple[bool, list[str]]:
+    scene = close_up(parts, res=8)
+    needs = find_needs(scene, scene.sensors()[0], survey_scene(scene))
+    made = make_plan(needs, Settings(**{"max_depth": 4, **settings}))
+    return made.draws_near_light, [c.reason for c in made.choices if c.subject == "near emitters"]
+
+
+def test_the_plan_knows_where_emitters_are():
+    grid = smoke(rough_grid(1))[0]
+    draws, (why,) = _draws({"smoke": grid, "lamp": point([0.2, 0, 0])[0]})
+    assert draws and "inside a medium" in why
+    draws, (why,) = _draws({"smoke": grid, "lamp": point([0, 0, 9.0])[0]})
+    assert not draws and "4 edges away" in why
+    assert _draws({"smoke": grid, "sky": scenes.sky()}) == (False, [])
+    assert _draws({"smoke": grid, "lamp": point([0.2, 0, 0])[0]}, max_depth=2) == (False, [])
+    assert _draws({"smoke": grid, "lamp": point([0.2, 0, 0])[0]}, near_light="vertices")[0] is False
+    assert _draws({"smoke": grid, "lamp": point([0, 0, 9.0])[0]}, near_light="segments")[0] is True
+
+
+def test_a_preview_decides_for_emitters_close_by():
+    """Half an edge above the smoke: explain says what the preview has found."""
+    scene = close_up({"smoke": smoke(rough_grid(1))[0], "lamp": point([0, 0, 2.0])[0]}, res=8)
+    text = explain_scene(scene, max_depth=4).text
+    assert "0.5 edges away from a medium; a distance on each segment reaches the same error" in text
+
+
+@pytest.mark.parametrize(("setting", "words"), [("everywhere", "auto, segments or vertices is expected"), ("segments", "auto")])
+def test_refusals(setting, words):
+    """An unknown word, and segments where a boundary of glass hides all emitters."""
+    glass = ball_of(medium("homogeneous", 1.0, 0.8), (0, 0, 0), 1.0) | {"bsdf": {"type": "dielectric"}}
+    scene = close_up({"milk": glass, "lamp": lamp()}, res=8)
+    with pytest.raises(MivolError, match=words):
+        scenes.render(scene, mivol(max_depth=4, near_light=setting), 1)
