@@ -9,7 +9,7 @@ failing, an import that breaks does not.
     scripts/mutate.py --only '*lattice*'     those whose file, test or list matches
     scripts/mutate.py --random 60 --seed 7   not these: 60 faults drawn from the whole package, and the share that the
                                              tests of their modules notice (the folder mutation/); from a part
-                                             of it with --only 'mivol/scene/*'
+                                             of it with --only 'mivol/scene/*'; without the first 40 with --from 41
 """
 
 from __future__ import annotations
@@ -179,12 +179,12 @@ def judge_random(args: argparse.Namespace) -> None:
     os.environ.setdefault("MIVOL_DATA", str(ROOT.parent / "shared" / "data"))
     # Each process of tests takes its share of the cores, as tests/conftest.py does for those of pytest-xdist.
     os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(args.jobs)
-    faults = draw(args.only, args.random, args.seed)
+    faults = draw(args.only, args.random, args.seed)[args.first - 1 :]
     guards = index_guards(ROOT, [(e.file, e.test) for e in load_entries()])
     with copies(args.jobs + 1) as (untouched, *broken):
         first = Checkout(broken[0], untouched, args.limit, args.rounds)
         checkouts = [first, *(replace(first, broken=copy) for copy in broken[1:])]
-        report(judge_all(faults, guards, checkouts), args.random, lambda line: print(line, flush=True))
+        report(judge_all(faults, guards, checkouts), len(faults), lambda line: print(line, flush=True))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -194,13 +194,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--sample", type=int, metavar="N", help="a random choice of so many")
     parser.add_argument("--random", type=int, metavar="N", help="instead of entries, so many faults drawn from the package")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the random choice")
+    parser.add_argument("--from", dest="first", type=int, default=1, metavar="N", help="of --random: continue at the Nth fault")
     parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
     parser.add_argument("--rounds", type=int, default=4, choices=(1, 2, 3, 4), help="of --random: 3 leave out slow tests")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)
     if args.random is not None:
-        if args.random < 1 or args.jobs < 1:
-            parser.error("--random and --jobs take a number of 1 or more")
+        if args.jobs < 1 or not 1 <= args.first <= args.random:
+            parser.error("--random and --jobs take a number of 1 or more, --from one that is no larger than that of --random")
         judge_random(args)
         return 0
     chosen = choose(load_entries(), args.only, args.sample, args.seed)
