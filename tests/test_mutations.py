@@ -198,6 +198,7 @@ def index(tmp_path: Path) -> guards.Guards:
         "pkg/e.py": "",
         "pkg/h.py": 'register_volume("grid", g)\n',
         "pkg/room/c.py": "",
+        "pkg/other/__init__.py": "",
         "tests/helper.py": "import pkg.e\n",
         "tests/one/test_a.py": "from pkg.b import x\nload('grid')\n",
         "tests/two/test_more.py": "from pkg import a, b, f\n",
@@ -213,7 +214,9 @@ ONE, MORE, OTHER = "tests/one/test_a.py", "tests/two/test_more.py", "tests/two/t
 
 
 def test_tests_named_like_a_module_and_named_by_its_mutations_come_first(index) -> None:
+    """A package is called like its folder."""
     assert index.rounds("pkg/a.py") == [[ONE, f"{OTHER}::t", f"{MORE}::t"], [OTHER, MORE], [], ["-m", "slow", ONE, OTHER, MORE]]
+    assert index.rounds("pkg/other/__init__.py")[0] == [OTHER]
 
 
 def test_tests_that_import_a_module_come_nearest_first(index) -> None:

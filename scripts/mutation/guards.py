@@ -92,7 +92,7 @@ def index_guards(root: Path, entries: Iterable[tuple[str, str]], package: str = 
         guards.files.append(name)
         reached[name] = _distances(_files_of(path, names), imports)
         for file in modules.values():
-            if path.stem.removeprefix("test_") == Path(file).stem:
+            if path.stem.removeprefix("test_") == _name(Path(file)):
                 guards.named.setdefault(file, []).append(name)
     # Among tests equally far from a module, those that reach the fewest modules are about it rather than about the whole.
     for name in sorted(reached, key=lambda name: (len(reached[name]), name)):
@@ -138,6 +138,11 @@ def _files_of(path: Path, names: dict[str, str]) -> set[str]:
             name = f"'{node.value}'"  # a plugin, as a scene names it
             found |= {names[name]} if name in names else set()
     return found
+
+
+def _name(path: Path) -> str:
+    """The last part of a module's dotted name: a package is called like its folder."""
+    return _module(path).rpartition(".")[2]
 
 
 def _module(path: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -126,7 +127,7 @@ def test_alpha_blends_over_a_background(blender: Path, background: object) -> No
 
 def test_random_backgrounds_depend_on_view_and_seed(blender: Path) -> None:
     colours = [view.background for view in load_photos(blender, background="random", seed=3).views]
-    assert len({tuple(colour) for colour in colours}) == 4
+    assert np.shape(colours) == (4, 3) and len({tuple(colour) for colour in colours}) == 4
     again = [view.background for view in load_photos(blender, background="random", seed=3).views]
     np.testing.assert_array_equal(colours, again)
 
@@ -841,6 +842,17 @@ def test_a_test_view_in_the_training_split_is_refused(tmp_path: Path) -> None:
     (tmp_path / "test" / "r_9.png").write_bytes((tmp_path / "train" / "r_2.png").read_bytes())
     with pytest.raises(MivolError, match=r"also fitted as \./train/r_2"):
         load_photos(tmp_path, split="test")
+
+
+def test_other_pixels_at_the_pose_of_a_training_view_are_judged(tmp_path: Path) -> None:
+    """Pixels make the difference: both files have one size and one date."""
+    write_blender(tmp_path, alpha=False)
+    fitted = json.loads((tmp_path / "transforms_train.json").read_text())["frames"][2] | {"file_path": "./test/r_9"}
+    edit(tmp_path / "transforms_test.json", lambda table: table["frames"].__setitem__(0, fitted))
+    for file, level in ((tmp_path / "train" / "r_2.png", 80), (tmp_path / "test" / "r_9.png", 90)):
+        Image.new("RGB", (12, 8), (level,) * 3).save(file, compress_level=0)
+        os.utime(file, (0, 0))
+    assert load_photos(tmp_path, split="test").views[0].image.max() == np.float32(90 / 255)
 
 
 def test_an_empty_file_of_colmap_points_is_valid(tmp_path: Path) -> None:

@@ -285,6 +285,7 @@ def test_file_says_what_it_is(variant_rgb, tmp_path):
     said = json.loads(header["mivol_reference"])
     assert said["identity"]["scene"] == made.identity["scene"] and len(made.identity["scene"]) == 64
     assert {"integrator", "max_depth", "rr_depth", "seed", "pass_spp", "mitsuba", "drjit", "variant"} <= said["identity"].keys()
+    assert f"rr_depth = {said['identity']['rr_depth']}\n" in str(mi.load_dict({"type": "volpath"}))  # Mitsuba's own default
     assert {"batches", "spp", "mivol", "seconds", "doubts"} <= said.keys()
     assert "volpath (max_depth 2" in made.text and "256 samples" in made.text
 
