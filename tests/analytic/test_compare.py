@@ -45,6 +45,11 @@ def test_pixels_are_judged_by_students_t_of_the_batches():
     assert compare(even(MEAN), reference(3)).bound == z_bound(Significance(0.5e-3, 72), 2) > 3 * found.bound
 
 
+def test_equal_images_without_noise_agree():
+    """The interval of their bias is the number 0."""
+    assert compare(even(MEAN), replace(reference(), variance=np.zeros(SHAPE))).agrees
+
+
 def test_the_mean_is_judged_by_students_t_of_all_pixels():
     """72 pixels of one error have 72 times the degrees of freedom, of which channels share their paths three by three."""
     for batches, correlated in ((3, 3), (32, 3), (3, 1)):
