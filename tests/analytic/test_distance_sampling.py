@@ -127,13 +127,17 @@ def test_what_is_behind_the_dark_takes_no_candidates(sigma, length, lit):
     assert float(np.array(found).item()) == pytest.approx(lit, rel=1e-6)
 
 
-def test_a_probe_is_spread_over_the_grid_alone():
-    """A grid fills the middle half of a box of vacuum: the optical depth of a probe is uniform over the length of the grid."""
+@pytest.mark.parametrize(("floor", "tau", "probe"), [(0.0, 1.0, 0.7), (0.25, 1.5, 0.35)], ids=["vacuum", "fog"])
+def test_matter_around_a_grid(floor, tau, probe):
+    """A grid fills the middle half of a box of length 2. Fog is before, in and behind it. The optical depth of a probe is
+    uniform over the length of what is filled: the grid in a vacuum, and the box in fog."""
     grid = np.diag([1.0, 1, 1, 1])
     grid[:3, 3] = -0.5
     place = np.diag([2.0, 2, 2, 1])
     place[:3, 3] = -1
-    interior = medium("mivol_medium", grid_volume("mivol_voxels", np.ones((4, 4, 4, 1), np.float32), grid), 0.8)
+    smoke = grid_volume("mivol_voxels", np.ones((4, 4, 4, 1), np.float32), grid)
+    coefficients = {"sigma_s": smoke, "sigma_a": floor} if floor else {"sigma_t": smoke, "albedo": 0.8}
+    interior = {"type": "mivol_medium", **coefficients}
     seen = pencils({"smoke": box_of(interior, place), "sun": sun([0, 0, 1.0])[0]}, *aimed(4, 4))
     n = 8
     with dr.suspend_grad():
@@ -144,5 +148,5 @@ def test_a_probe_is_spread_over_the_grid_alone():
         _, reservoir = fill_reservoir(proposal, media.medium_at(ray), start, mi.Bool(True))
     (kept,) = reservoir.candidates
     # The length of the grid comes from two slabs in float32.
-    np.testing.assert_allclose(np.array(kept.probe_sigma), 0.7, rtol=1e-5)
-    np.testing.assert_allclose(np.array(reservoir.tau[0]), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(np.array(kept.probe_sigma), probe, rtol=1e-5)
+    np.testing.assert_allclose(np.array(reservoir.tau[0]), tau, rtol=1e-5)

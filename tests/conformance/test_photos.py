@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from mivol import photos
 from mivol.errors import MivolError
+from mivol.experiments.photo_data import describe_photos
 from mivol.files import write_exr
 from mivol.photos import (
     Camera,
@@ -170,6 +171,11 @@ def test_missing_photographs_are_skipped_and_listed(blender: Path) -> None:
     assert photos.skipped == ("./train/r_1",)
     assert [view.name for view in photos.views] == ["r_0.png", "r_2.png", "r_3.png"]
     assert "./train/r_1" in photos.describe()
+    assert describe_photos(photos)[-1] == "1 listed photographs are missing: ./train/r_1 ..."
+
+
+def test_a_whole_data_set_misses_nothing(blender: Path) -> None:
+    assert not any("missing" in note for note in describe_photos(load_photos(blender, background="white")))
 
 
 def test_held_out_photographs_leave_the_training_split(blender: Path) -> None:
