@@ -88,6 +88,7 @@ HOSTILE = {
     "no format": (change(b"format binary_little_endian 1.0\n", b""), "without a format"),
     "another kind": (b"solid stl" + bytes(80), "first bytes b'solid st'"),
     "an element without properties": (change(b"element vertex", b"element camera 1\nelement vertex"), "'camera' without"),
+    "a list": (change(b"float rot_3", b"list uchar float rot_3"), "no property 'x'"),
     "one number less": (inria_bytes(random_gaussians(3, 1))[:-4], "at least 312 for 3"),
 }
 
