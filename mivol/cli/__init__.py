@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def describe_error(error: MivolError | OSError | MemoryError) -> str:
     """Message for an error other than a bug."""
     if isinstance(error, MemoryError):
-        return f"the memory does not suffice ({error or 'nothing more is known'}): take fewer voxels, pixels or views."
+        return f"the memory does not suffice ({str(error) or 'nothing more is known'}): take fewer voxels, pixels or views."
     return str(error)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from tiny_experiment import PHOTOS, SCENE, refused, run, write_experiment
 
-from mivol.cli import VERBS, loading, parse
+from mivol.cli import VERBS, describe_error, loading, parse
+from mivol.errors import MivolError
 from mivol.files import read_exr
 
 
@@ -18,6 +19,18 @@ from mivol.files import read_exr
 def folder(tmp_path: Path) -> Path:
     """A scene, its start volume and an experiment."""
     return write_experiment(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MivolError("no grid"), "no grid"),
+        (FileNotFoundError("no file"), "no file"),
+        (MemoryError(), "the memory does not suffice (nothing more is known): take fewer voxels, pixels or views."),
+    ],
+)
+def test_an_error_is_said_in_its_own_words(error: Exception, said: str) -> None:
+    assert describe_error(error) == said
 
 
 # -- render, explain, reference -----------------------------------------------------------------------------------

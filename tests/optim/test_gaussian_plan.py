@@ -49,8 +49,8 @@ def test_growth_over_no_steps_is_a_jump() -> None:
 
 @pytest.mark.parametrize("step", [0, 50, 200])
 def test_rates_are_geometric(step: int) -> None:
-    """Places go from their first rate to their last, times the extent; the others by ``end``: two roundings of each."""
-    plan, share = replace(PLAN, position_rate=3e-3, final_position_rate=2e-5, final_rate=0.3), step / 200
+    """Places go from their first rate to their last, times the extent; the others to 0.3 of it: two roundings of each."""
+    plan, share = replace(PLAN, position_rate=3e-3, final_position_rate=2e-5), step / 200
     falls = {"log_scales": 2e-2, "quaternions": 4e-3, "opacity_logits": 0.05, "harmonics": 1e-2}
     wanted = {"means": 2.5 * 3e-3 ** (1 - share) * 2e-5**share} | {k: v * 0.3**share for k, v in falls.items()}
     assert plan.learning_rates(step, 2.5) == pytest.approx(wanted, rel=1e-13)
