@@ -199,10 +199,11 @@ def index(tmp_path: Path) -> guards.Guards:
         "pkg/h.py": 'register_volume("grid", g)\n',
         "pkg/room/c.py": "",
         "pkg/other/__init__.py": "",
+        "pkg/other/said.py": 'raise ValueError(f"{n} rooms have no door: add one")\n',
         "tests/helper.py": "import pkg.e\n",
         "tests/one/test_a.py": "from pkg.b import x\nload('grid')\n",
         "tests/two/test_more.py": "from pkg import a, b, f\n",
-        "tests/two/test_other.py": "import pkg\nfrom helper import x\npkg.g()\n",
+        "tests/two/test_other.py": "import pkg\nfrom helper import x\npkg.g()\nraises(match='3 rooms have no door')\n",
     }.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -230,6 +231,11 @@ def test_tests_that_import_a_module_come_nearest_first(index) -> None:
     }
     assert index.importing == {**direct, "pkg/e.py": [ONE, MORE, OTHER]}
     assert index.rounds("pkg/b.py") == [[], [ONE, MORE], [OTHER], ["-m", "slow", ONE, MORE]]
+
+
+def test_tests_that_expect_a_message_of_a_module_are_asked(index) -> None:
+    assert index.expecting == {"pkg/other/said.py": [OTHER]}
+    assert index.rounds("pkg/other/said.py")[:2] == [[], [OTHER]]
 
 
 def test_the_second_round_has_few_files(index) -> None:
