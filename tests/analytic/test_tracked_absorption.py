@@ -91,10 +91,14 @@ BOUNDARIES = {"a box": "cube", "a traced sphere": "sphere"}
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
     """Rationale: exp(-sigma chord) is known, and the estimator does not know the chord. Expected: means and derivatives by the
-    extinction agree. A loose majorant costs look-ups and changes no mean."""
+    extinction agree. A loose majorant costs look-ups and changes no mean.
+
+    Power: if the drawn point shares its random numbers with the transmittance, the derivative is off by 4 %, which is 12
+    standard errors.
+    """
     chord = 2 * np.sqrt(0.8**2 - 0.5**2)
     found = scene([0, -4, 0.5], [0, 0, 0.5], fog=shape(BOUNDARIES[boundary], fog(radius=0.8, slack=slack)))
-    image, tangent, _ = follow(found, ("sigma_t.sigma",))
+    image, tangent, _ = follow(found, ("sigma_t.sigma",), spp=4 * SPP)
     seen = SKY * np.exp(-1.5 * SCALE * chord)
     check(image[..., 0], seen, "the radiance")
     check(tangent[..., 0], -SCALE * chord * seen, "the derivative by sigma")
