@@ -1,1 +1,1 @@
-"""Extinction, albedo, emission and radiance as functions of position: analytic, on grids, as Gaussians."""
+"""Extinction, albedo, emission and radiance as functions of position: on grids, as Gaussians, procedural."""

@@ -1,4 +1,4 @@
-r"""Phase functions in closed form: Henyey-Greenstein, Rayleigh, and Draine's, which includes both and Cornette-Shanks.
+r"""Phase functions in closed form: Henyey-Greenstein, Rayleigh, Draine's (with both and Cornette-Shanks as cases); mixtures.
 
 .. math:: p_{HG}(\theta) = \frac{1}{4\pi} \frac{1 - g^2}{D^{3/2}}, \quad D = 1 + g^2 - 2 g \cos\theta, \qquad
           p_{Rayleigh}(\theta) = \frac{3}{16\pi} (1 + \cos^2\theta), \qquad
@@ -14,6 +14,10 @@ c = 2 sinh(asinh(2 (2 u - 1)) / 3). Draine: the closed-form root of a quartic eq
 float32. Newton steps invert the cumulative distribution instead, in the variable of the Henyey-Greenstein inversion, in which
 the distribution is smooth for every g.
 
+Mixtures. A convex combination :math:`p = \sum_k s_k p_k`, :math:`s_k = w_k / \sum_j w_j`, is sampled by the choice of a
+component. Weights are at least 0 and need not sum to 1. If every weight is 0 (a voxel in a grid of weights), the components
+have equal probabilities.
+
 Source: Henyey & Greenstein 1941 (Astrophysical Journal 93); Rayleigh 1871; Chandrasekhar, Radiative Transfer (1960), chapter 1;
 Draine 2003 (Scattering by Interstellar Dust Grains. I, Astrophysical Journal 598); Cornette & Shanks 1992 (Applied Optics 31);
 droplets by Jendersie & d'Eon 2023 (An Approximate Mie Scattering Function for Fog and Cloud Rendering).
@@ -22,6 +26,7 @@ droplets by Jendersie & d'Eon 2023 (An Approximate Mie Scattering Function for F
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -30,14 +35,16 @@ from mivol.errors import MivolError
 from mivol.phase.scattering_angle import INV_FOUR_PI, ScatteringAngle
 
 __all__ = [
-    "eval_hg",
-    "sample_hg",
-    "eval_rayleigh",
-    "sample_rayleigh",
+    "choose_lobe",
     "droplets",
     "eval_draine",
+    "eval_hg",
+    "eval_rayleigh",
     "mean_cosine",
+    "normalise_weights",
     "sample_draine",
+    "sample_hg",
+    "sample_rayleigh",
 ]
 
 
@@ -171,3 +178,32 @@ def droplets(diameter: float) -> dict[str, float]:
         "alpha": math.exp(3.62489 - 8.29288 / (diameter + 5.52825)),
         "weight_draine": math.exp(-0.599085 / (diameter - 0.641583) - 0.665888),
     }
+
+
+# -- Mixtures --------------------------------------------------------------------------------------------------------------
+
+
+def normalise_weights(weights: Sequence[mi.Float]) -> list[mi.Float]:
+    """Normalise weights by their sum, with derivatives; the weights become equal for a sum of 0."""
+    total = sum(weights[1:], weights[0])
+    empty = ~(total > 0) & (total == 0)
+    inv = dr.rcp(total)  # infinite for a sum of 0; select has no derivative for the unused branch
+    return [dr.select(empty, 1 / len(weights), w * inv) for w in weights]
+
+
+def choose_lobe(shares: Sequence[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """Choose a component with its normalised weight as probability.
+
+    Returns:
+        The index of the component, and ``u`` rescaled to [0, 1) within its interval, for another use.
+    """
+    chosen, low, high = mi.UInt32(0), dr.zeros(mi.Float, 1), mi.Float(shares[0])
+    start = mi.Float(0)
+    for k, share in enumerate(shares):
+        # A component of weight 0 is never chosen, not even where rounding leaves u above the sum of all weights.
+        is_chosen = (u >= start) & (share > 0)
+        end = start + share
+        chosen, low, high = dr.select(is_chosen, k, chosen), dr.select(is_chosen, start, low), dr.select(is_chosen, end, high)
+        start = end
+    inside = (u - low) * dr.rcp(dr.select(high > low, high - low, 1))
+    return chosen, dr.clip(inside, 0, 1 - 2.0**-24)

@@ -17,9 +17,17 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording
-from mivol.phase.closed_forms import eval_draine, eval_hg, eval_rayleigh, sample_draine, sample_hg, sample_rayleigh
+from mivol.phase.closed_forms import (
+    choose_lobe,
+    eval_draine,
+    eval_hg,
+    eval_rayleigh,
+    normalise_weights,
+    sample_draine,
+    sample_hg,
+    sample_rayleigh,
+)
 from mivol.phase.domain import ASYMMETRY, COSINE_SQUARED, WEIGHT, Domain
-from mivol.phase.mixture import choose_lobe, normalise_weights
 from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table, check_values
 from mivol.scene_graph import traverse

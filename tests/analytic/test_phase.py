@@ -17,18 +17,19 @@ from phase_angles import EPS, U, as64, cosines_of, f32, integrals, lanes, turns,
 from mivol.errors import MivolError
 from mivol.phase import measured, mie
 from mivol.phase.closed_forms import (
+    choose_lobe,
     droplets,
     eval_draine,
     eval_hg,
     eval_rayleigh,
     mean_cosine,
+    normalise_weights,
     sample_draine,
     sample_hg,
     sample_rayleigh,
 )
 from mivol.phase.domain import ASYMMETRY, NEXT_TO_ONE, WEIGHT
 from mivol.phase.measured import ALIASES, NAMES, named_medium
-from mivol.phase.mixture import choose_lobe, normalise_weights
 from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table
 

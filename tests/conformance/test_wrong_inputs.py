@@ -11,7 +11,6 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.fields.activation import ACTIVATIONS, select_activation
-from mivol.fields.analytic import ExponentialAtmosphere
 from mivol.fields.field_archives import MAX_NODES, _check_arrays, parse_archive
 from mivol.fields.procedural import make_procedural
 from mivol.fields.spherical_grid import SphericalGrid
@@ -55,16 +54,6 @@ def test_names_that_are_not_known() -> None:
     assert refusal_of(named_medium, NAMES[0] + "x").startswith(f"no measured medium is called {NAMES[0] + 'x'!r}; near it are")
     assert "near it are milk, skim milk, red wine, ...:" in refusal_of(named_medium, "0000")
     assert named_medium(NAMES[0].upper().replace(" ", "_")) == named_medium(NAMES[0])
-
-
-@pytest.mark.parametrize(("height", "up", "says"), [
-    (0.0, (0, 0, 1), "scale_height is 0.0; give a finite length above 0."),
-    (-1.0, (0, 0, 1), "scale_height is -1.0; give"), (np.inf, (0, 0, 1), "scale_height is inf; give"),
-    (1.0, (0, 0, 1 + 2e-9), "up has length 1; give a unit vector."), (1.0, (0, 0.6, 0.7), "up has length 0.921954; give"),
-])  # fmt: skip
-def test_an_atmosphere_falls_along_a_unit_vector(height: float, up: tuple, says: str) -> None:
-    assert refusal_of(ExponentialAtmosphere, 1.0, height, up).startswith(says)
-    assert ExponentialAtmosphere(1.0, 1e-3, (0, 0.6, 0.8 + 5e-10)).sigma_0 == 1.0
 
 
 def test_droplets_have_sizes_that_the_fit_covers() -> None:
