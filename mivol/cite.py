@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 from mivol.errors import MivolError
 
-__all__ = ["CITATIONS", "Citation", "list_citations"]
-
 
 class Citation(NamedTuple):
     """One reference: ``authors`` (year). ``title``. ``where``; ``link`` is a DOI, an arXiv page or a home page."""
@@ -51,10 +49,7 @@ CITATIONS: dict[str, Citation] = {
         "https://doi.org/10.2312/egtp.19871000",
     ),
     "chao_1982": Citation(
-        "M. T. Chao",
-        1982,
-        "A general purpose unequal probability sampling plan",
-        "Biometrika 69(3), 653-656",
+        "M. T. Chao", 1982, "A general purpose unequal probability sampling plan", "Biometrika 69(3), 653-656"
     ),
     "veach_1995": Citation(
         "E. Veach, L. J. Guibas",
@@ -125,10 +120,7 @@ CITATIONS: dict[str, Citation] = {
         "https://arxiv.org/abs/2404.09591",
     ),
     "zwicker_2001": Citation(
-        "M. Zwicker, H. Pfister, J. van Baar, M. Gross",
-        2001,
-        "EWA Volume Splatting",
-        "IEEE Visualization",
+        "M. Zwicker, H. Pfister, J. van Baar, M. Gross", 2001, "EWA Volume Splatting", "IEEE Visualization"
     ),
     "wang_2004": Citation(
         "Z. Wang, A. C. Bovik, H. R. Sheikh, E. P. Simoncelli",

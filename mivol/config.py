@@ -29,7 +29,7 @@ from mivol.optim.schedules import SCHEDULES, Constant
 from mivol.optim.strategy import setting, suggest_name, union_type
 from mivol.scene.camera_rigs import Hemisphere, LookAts, Ring, SceneSensors
 from mivol.schema import check_keys, explain_error
-from mivol.tomography.ramp import WINDOWS
+from mivol.tomography.filtered import WINDOWS
 from mivol.validate.images import METRICS
 
 INFINITY = math.inf
@@ -139,10 +139,7 @@ class Sought(Section):
         Literal["", "emission"], setting("1", "emission: fit an emissive volume first, and give the first value its shape")
     ] = ""
     shape: Annotated[Size | None, setting("voxel", "(Z, Y, X) of a constant first value")] = None
-    prior: Annotated[
-        tuple[union_type(PRIORS), ...],
-        setting("1", "regularization of the parameter"),
-    ] = ()
+    prior: Annotated[tuple[union_type(PRIORS), ...], setting("1", "regularization of the parameter")] = ()
 
     def __post_init__(self) -> None:
         check_word(self.map, MAPS, "map")
@@ -180,10 +177,7 @@ class SceneExperiment(Section):
     optimizer: Annotated[union_type(OPTIMIZERS), setting("1", "the optimizer")] = Adam()
     schedule: Annotated[union_type(SCHEDULES), setting("1", "factor on the learning rate")] = Constant()
     loss: Annotated[union_type(LOSSES), setting("1", "distance between image and reference")] = L2()
-    event: Annotated[tuple[union_type(EVENTS), ...], setting("1", "actions between iterations")] = (
-        Checkpoint(),
-        Evaluate(),
-    )
+    event: Annotated[tuple[union_type(EVENTS), ...], setting("1", "actions between iterations")] = (Checkpoint(), Evaluate())
     variant: Variant = "llvm_ad_rgb"
     seed: Seed = 0
     threads: Threads = 0
@@ -329,7 +323,7 @@ class SolveSettings(Section):
     subsets: Annotated[int, setting("1", "subsets of views, for os-sart", ge=1)] = 10
     relaxation: Annotated[float, setting("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
     decay: Annotated[float, setting("1", "factor on the relaxation per sweep", gt=0, le=1)] = 0.99
-    window: Annotated[str, setting("1", "window of fbp and fdk: key of mivol.tomography.ramp.WINDOWS", min_length=1)] = (
+    window: Annotated[str, setting("1", "window of fbp and fdk: key of mivol.tomography.filtered.WINDOWS", min_length=1)] = (
         "ram-lak"
     )
     cutoff: Annotated[float, setting("1", "end of the window, over the Nyquist frequency", gt=0, le=1)] = 1.0
@@ -502,10 +496,7 @@ class ShowSettings(Section):
     ] = ()
     every: Annotated[int, setting("step", "steps between two points of the held-out curve", ge=1)] = 250
     judged: Annotated[int, setting("view", "held-out views in the curve, the same at each point; 0: all", ge=0)] = 4
-    metrics: Annotated[tuple[str, ...], setting("1", "of the judged views: psnr, ssim, flip", min_length=1)] = (
-        "psnr",
-        "ssim",
-    )
+    metrics: Annotated[tuple[str, ...], setting("1", "of the judged views: psnr, ssim, flip", min_length=1)] = ("psnr", "ssim")
 
     def __post_init__(self) -> None:
         if self.way == "keyframes" and len(self.keyframes) < 2:
@@ -582,10 +573,7 @@ KINDS: dict[str, type[Section]] = {
 }
 """Kinds of experiments by a table of the file; the first present table decides."""
 
-CAPTURE = {
-    "photos": {"largest": 240, "box": "middle"},
-    "show": {"views": 64},
-}
+CAPTURE = {"photos": {"largest": 240, "box": "middle"}, "show": {"views": 64}}
 """Defaults of a file with ``field.preset = "capture"``: photograph size resolved by the grids, nested boxes, views."""
 
 NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "show")

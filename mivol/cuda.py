@@ -7,8 +7,6 @@ the process. Seen with CUDA 13.0.
 
 from __future__ import annotations
 
-__all__ = ["spill_to_local_memory"]
-
 
 def spill_to_local_memory(variant: str | None = None) -> None:
     """Switch off spills to shared memory in this thread, for CUDA variants.

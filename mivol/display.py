@@ -12,8 +12,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-__all__ = ["summarize", "with_short_repr", "curve_html", "text_html"]
-
 T = TypeVar("T")
 
 FEW = 4

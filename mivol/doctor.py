@@ -21,8 +21,6 @@ from pathlib import Path
 from . import llvm, machine
 from .threads import run_child
 
-__all__ = ["Finding", "main", "render_works", "diagnose"]
-
 OK, NOTE, FAULT = "ok", "-", "FAULT"
 
 _MARKER = "mivol trial: "

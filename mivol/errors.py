@@ -6,8 +6,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["MivolError", "reveal_refusals"]
-
 
 class MivolError(ValueError):
     """An unusable input; the message is one sentence for the user.

@@ -17,8 +17,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["copy_aligned", "ensure_aligned", "is_recording", "record_kernels", "without_garbage_collection"]
-
 ALIGNMENT = 64
 """Alignment that Dr.Jit assumes for its arrays [byte]."""
 

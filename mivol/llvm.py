@@ -23,22 +23,6 @@ from typing import NamedTuple
 from .errors import MivolError
 from .threads import run_child
 
-__all__ = [
-    "Library",
-    "LlvmError",
-    "check_backend",
-    "choose_library",
-    "find_libraries",
-    "list_fixes",
-    "loaded_path",
-    "missing_system_library",
-    "library_origin",
-    "probe_version",
-    "rank_libraries",
-    "unloadable_libraries",
-    "loaded_version",
-]
-
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 OLDEST = 15 if platform.machine() in ("arm64", "aarch64") else 17
 NEWEST_TESTED = 23

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from mivol.errors import MivolError
 
-__all__ = ["available_memory", "check_memory", "count_cores"]
-
 _CGROUP = Path("/sys/fs/cgroup")
 
 

@@ -17,8 +17,6 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["exp_moments", "fast_max", "maximum", "minimum", "fast_min", "one_minus_exp", "phi1", "reciprocal"]
-
 PHI_SERIES_BELOW, PHI_TERMS = 0.5, 8
 """First neglected term: x^8 / 9! <= 1.1e-8."""
 

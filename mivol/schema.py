@@ -17,9 +17,6 @@ import msgspec
 from mivol.errors import MivolError
 from mivol.optim.strategy import setting, suggest_name
 
-__all__ = ["Setting", "check_keys", "describe", "explain_error", "settings_in", "structs_in"]
-
-
 LONGEST_KEY = 300
 """Characters of a key in an error message."""
 

@@ -11,8 +11,6 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["check_affine", "lattice_from_world"]
-
 
 def check_affine(matrix: np.ndarray, name: str = "to_world") -> np.ndarray:
     """Return ``matrix`` as float64 (4, 4); refuse a matrix unable to place a box in space.

@@ -18,8 +18,6 @@ from contextlib import contextmanager
 
 from .errors import MivolError
 
-__all__ = ["check_one_thread", "lend_ownership", "run_child", "set_thread_count"]
-
 _owner: threading.Thread | None = None
 _pid = os.getpid()
 
@@ -97,6 +95,12 @@ def run_child(
     """
     command = [sys.executable, *(["-I", "-S"] if isolated else ["-P"]), "-c", code, *args]
     return subprocess.run(
-        command, capture_output=True, text=True, errors="replace", timeout=timeout, env=env, stdin=subprocess.DEVNULL,
+        command,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=timeout,
+        env=env,
+        stdin=subprocess.DEVNULL,
         check=False,
     )

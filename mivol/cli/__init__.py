@@ -11,11 +11,14 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mivol
-from mivol.cli.interrupts import Signals
 from mivol.errors import MivolError
+from mivol.optim.interrupt import Signals
+
+if TYPE_CHECKING:
+    from mivol.scene.load import LoadedScene
 
 USAGE, STOPPED = 2, 130
 
@@ -318,10 +321,9 @@ def explain(arguments: argparse.Namespace) -> int:
     elif arguments.scene.is_dir() or find_format(arguments.scene):
         return explain_photos(arguments.scene, arguments.output)
     else:
-        from mivol.cli.loading import load
         from mivol.scene.explain import explain_scene
 
-        answer = explain_scene(load(arguments).scene, arguments.max_depth, noise=arguments.noise)
+        answer = explain_scene(load_named_scene(arguments).scene, arguments.max_depth, noise=arguments.noise)
     print(answer.text)
     return int(bool(answer.refusal))
 
@@ -360,12 +362,41 @@ def explain_photos(path: Path, picture: Path | None) -> int:
     return 0
 
 
+def load_named_scene(arguments: argparse.Namespace) -> LoadedScene:
+    """Load the scene of the flags, with variant and threads.
+
+    Raises:
+        MivolError: an unknown variant, a define without "=", or an invalid scene.
+    """
+    import mitsuba as mi
+
+    from mivol.experiments.back_end import choose_back_end
+    from mivol.scene.load import load_scene
+
+    choose_back_end(arguments.mode, arguments.threads)
+    mi.set_log_level(mi.LogLevel.Debug if arguments.verbose else mi.LogLevel.Warn)
+    for folder in filter(None, arguments.a.split(";")):
+        mi.file_resolver().append(folder)
+    return load_scene(arguments.scene, parse_defines(arguments.define))
+
+
+def parse_defines(pairs: list[str]) -> dict[str, str]:
+    """Convert ``name=value`` pairs to a dict.
+
+    Raises:
+        MivolError: a pair without "=".
+    """
+    wrong = next((pair for pair in pairs if "=" not in pair), None)
+    if wrong is not None:
+        raise MivolError(f'-D "{wrong}" defines nothing: write -D name=value.')
+    return dict(pair.split("=", 1) for pair in pairs)
+
+
 def render(arguments: argparse.Namespace) -> None:
     """Render an image of a scene, a radiance field, points or Gaussians.
 
     For a scene, the flags are the flags of the command mitsuba.
     """
-    from mivol.cli.loading import load
     from mivol.experiments.render import check_output, choose_integrator, integrator_name, render_image, write_image
 
     path = arguments.output or arguments.scene.with_suffix(".exr")
@@ -374,7 +405,7 @@ def render(arguments: argparse.Namespace) -> None:
         write_image(path, view(), ["R", "G", "B"])
         print(path)
         return
-    scene = load(arguments).scene
+    scene = load_named_scene(arguments).scene
     integrator = choose_integrator(scene, arguments.integrator)
     if integrator_name(integrator) != "mivol":
         print(f"rendered by {integrator_name(integrator)}; --integrator mivol renders with mivol", file=sys.stderr)
@@ -414,7 +445,6 @@ def reference(arguments: argparse.Namespace) -> None:
 
     With --sensor all, the images of every sensor and a file of cameras are written: photographs for a fit.
     """
-    from mivol.cli.loading import load
     from mivol.validate.photographs import render_photographs
     from mivol.validate.reference import render_reference
 
@@ -423,11 +453,11 @@ def reference(arguments: argparse.Namespace) -> None:
         "seed": arguments.seed, "integrator": arguments.integrator,
     }  # fmt: skip
     if arguments.sensor == "all":
-        results = render_photographs(load(arguments), arguments.output, **options)
+        results = render_photographs(load_named_scene(arguments), arguments.output, **options)
     else:
         if not arguments.output.suffix:
             arguments.output.mkdir(parents=True, exist_ok=True)
-        results = [render_reference(load(arguments), arguments.output, sensor=arguments.sensor, **options)]
+        results = [render_reference(load_named_scene(arguments), arguments.output, sensor=arguments.sensor, **options)]
     print("\n".join(result.text for result in results))
 
 
@@ -474,14 +504,13 @@ def validate(arguments: argparse.Namespace) -> int:
 
     The exit code is 0 if both agree, 3 if they differ, and 4 if Mitsuba's image is not reliable.
     """
-    from mivol.cli.loading import load
     from mivol.experiments.validation import Validation, validate_scene
 
     options = Validation(
         max_depth=arguments.max_depth, spp=arguments.spp, reference_spp=arguments.reference_spp, seed=arguments.seed,
         sensor=arguments.sensor, parameters=tuple(arguments.parameter),
     )  # fmt: skip
-    verdict = validate_scene(load(arguments), arguments.output, options)
+    verdict = validate_scene(load_named_scene(arguments), arguments.output, options)
     print(verdict.text)
     return verdict.code
 

@@ -18,13 +18,7 @@ from mivol.scene.camera_rigs import find_media_box
 from mivol.scene.sensors import to_camera
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
-__all__ = ["draw_photo_cameras", "draw_scanner", "draw_view_cameras", "survey_all_cameras"]
-
-CAPTIONS = {
-    "side": "Cameras, and the box of the matter",
-    "plan": "View from above",
-    "far": "All nested boxes from above",
-}
+CAPTIONS = {"side": "Cameras, and the box of the matter", "plan": "View from above", "far": "All nested boxes from above"}
 
 
 def draw_photo_cameras(folder: Path, photos: Photos, judged: Photos | None, levels: int = 1) -> list[Image]:

@@ -25,8 +25,6 @@ from mivol.files.atomic import disk_faults
 from mivol.files.fetch import PREFIX, find_local_file, resolve_path
 from mivol.optim.strategy import suggest_name
 
-__all__ = ["EXAMPLES", "Example", "copy_example", "examples_folder", "list_examples", "run_example"]
-
 INSTALLED = Path(__file__).resolve().parents[1] / "examples"
 CHECKOUT = Path(__file__).resolve().parents[2] / "scenes"
 
@@ -141,12 +139,7 @@ _SLICES = ComputedScan(
 )
 """As many views as the tooth, and half as many columns; the head fills the detector."""
 
-SCAN_FILES = {
-    "scan.file": "panels.txt",
-    "data.file": "readings.npy",
-    "data.flats": "flats.npy",
-    "data.darks": "darks.npy",
-}
+SCAN_FILES = {"scan.file": "panels.txt", "data.file": "readings.npy", "data.flats": "flats.npy", "data.darks": "darks.npy"}
 """Settings of an example with a ``scan``, and the files written by the script."""
 
 EXAMPLES: dict[str, Example] = {

@@ -17,8 +17,6 @@ from mivol.photos import Camera, Photos, follow_keyframes, interpolate_cameras, 
 from mivol.report.record import Image
 from mivol.report.video import NO_FFMPEG_NOTE, film_suffix, volume_frames, write_video
 
-__all__ = ["Film", "film_of_volume", "plan_film"]
-
 FILM_SIZE = 256
 """Longest edge of a film [pixel]."""
 

@@ -27,19 +27,6 @@ from mivol.scene_graph import traverse
 from mivol.splatting.splatter import Splatter, to_tensors
 from mivol.validate.metrics import psnr
 
-__all__ = [
-    "VIEWED",
-    "cameras_around",
-    "convert_to_field",
-    "convert_to_gaussians",
-    "field_psnr",
-    "read_as_gaussians",
-    "MeshLoss",
-    "convert_to_mesh",
-    "measure_mesh_error",
-    "mesh_of_gaussians",
-]
-
 VIEWS = 6
 """Number of compared views."""
 

@@ -28,8 +28,6 @@ from mivol.points import Gaussians, write_gaussians
 from mivol.report.record import PlanLine, Table
 from mivol.validate.images import ImageScore, score_image
 
-__all__ = ["GaussianStart", "GaussianFit", "start_gaussians", "judge_view", "make_gaussian_plan", "render_gaussians"]
-
 FILE = "gaussians.ply"
 
 

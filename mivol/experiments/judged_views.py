@@ -15,17 +15,6 @@ from mivol.photos.photo_file import CONVERSIONS
 from mivol.report.record import CODES, Image, Table
 from mivol.validate.images import METRICS, ImageScore, fit_colours, score_image
 
-__all__ = [
-    "JudgedViews",
-    "describe_quality",
-    "judge_colour_fitted",
-    "rename_metrics",
-    "describe_views",
-    "select_shown_views",
-    "tabulate_views",
-    "write_view",
-]
-
 MANY = 32
 """Number of judged views above which small images are smaller, to keep a page below about 20 MB."""
 
@@ -100,13 +89,7 @@ class JudgedViews:
 
 
 def write_view(
-    folder: Path,
-    photo: Photo,
-    number: int,
-    image: NDArray,
-    space: str = "srgb",
-    caption: str = "",
-    edge: int | None = None,
+    folder: Path, photo: Photo, number: int, image: NDArray, space: str = "srgb", caption: str = "", edge: int | None = None
 ) -> list[Image]:
     """Write a render beside the photograph, both tone-mapped for a screen.
 

@@ -148,12 +148,7 @@ def _box_silhouettes(photos: Photos) -> Photos:
     return replace(photos, survey=replace(photos.survey, box=box, box_from="around the opaque pixels", near_far=near_far))
 
 
-BOXES = {
-    "found": _find_box,
-    "cameras": lambda photos: photos,
-    "silhouettes": _box_silhouettes,
-    "middle": lambda photos: photos,
-}
+BOXES = {"found": _find_box, "cameras": lambda photos: photos, "silhouettes": _box_silhouettes, "middle": lambda photos: photos}
 """Functions setting the box, by the word in the settings."""
 
 SEARCHED = {"middle": "middle"}

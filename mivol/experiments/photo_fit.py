@@ -38,8 +38,6 @@ from mivol.report.record import Image, PlanLine, Table
 from mivol.scene.explain import Explanation
 from mivol.validate.images import ImageScore, average_scores
 
-__all__ = ["PhotoFit", "tabulate_gains"]
-
 
 class PhotoFit(FitKind):
     """A fit of a model to photographs.

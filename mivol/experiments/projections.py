@@ -19,19 +19,12 @@ from mivol.files.fetch import resolve_path
 from mivol.machine import check_memory
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
-from mivol.tomography.fan_axis import axis_from_fans, cone_axis_offset
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
-from mivol.tomography.preprocess import (
-    Quanta,
-    count_quanta,
-    fit_air,
-    normalise_air,
-    to_line_integrals,
-)
+from mivol.tomography.preprocess import Quanta, count_quanta, fit_air, normalise_air, to_line_integrals
 from mivol.tomography.projector import Projector
-from mivol.tomography.rotation_axis import find_axis
+from mivol.tomography.rotation_axis import axis_from_fans, cone_axis_offset, find_axis
 
 RAY_BYTES = 3 * 8
 """Memory per ray of a computed scan [byte]: exact value, noisy value and weight, in float64."""
@@ -92,10 +85,7 @@ def make_beam(
     if isinstance(scan, Matrices):
         matrices = read_columns(base / scan.file, COLUMNS).reshape(-1, 3, 4)
         return panels_from_matrices(matrices, detector, settings.grid.centre, scan.first_pixel)
-    offsets = {
-        "axis_offset": scan.axis_offset if axis_offset is None else axis_offset,
-        "detector_offset": scan.detector_offset,
-    }
+    offsets = {"axis_offset": scan.axis_offset if axis_offset is None else axis_offset, "detector_offset": scan.detector_offset}
     if isinstance(scan, Cone):
         return ConeBeam(angles, detector, scan.source_to_axis, scan.source_to_detector, scan.pitch, **offsets)
     return ParallelBeam(angles, detector, scan.pitch, **offsets)

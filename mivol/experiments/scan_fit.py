@@ -78,7 +78,7 @@ class ScanFit(FitKind):
             "seeds": {"noise": getattr(settings.data, "seed", 0)},
             "units": {"loss": "1"},
             "plan": [
-                PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
+                PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias")
             ],
             "citations": ["mitsuba3", "drjit", *CITED[name], *prior],
         }

@@ -50,8 +50,6 @@ from mivol.scene_graph import traverse
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.validate.metrics import nrmse, psnr
 
-__all__ = ["SceneFit"]
-
 REHEARSAL_SPP = 2
 """Largest number of samples per pixel in the derivative taken by ``mivol explain``; a noisy loss needs pairs."""
 

@@ -34,8 +34,6 @@ from mivol.points import Gaussians, read_gaussians
 from mivol.scene.explain import explain_scene, read_settings
 from mivol.scene.load import SceneSource, load_scene
 
-__all__ = ["Problem", "explain", "fit_gaussians", "fit_photographs", "optimize"]
-
 Reference: TypeAlias = "np.ndarray | mi.TensorXf | str | os.PathLike[str]"
 """An image: an array (height, width, channels) of linear radiance, or an OpenEXR file."""
 
@@ -187,10 +185,7 @@ def optimize(
 
 
 def explain(
-    scene: SceneSource | mi.Scene,
-    max_depth: int | None = None,
-    sensor: int | mi.Sensor = 0,
-    noise: float | None = None,
+    scene: SceneSource | mi.Scene, max_depth: int | None = None, sensor: int | mi.Sensor = 0, noise: float | None = None
 ) -> str:
     """Say what a scene needs and how mivol would render it, before more than a small preview is rendered.
 

@@ -34,8 +34,6 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 
-__all__ = ["ACTIVATIONS", "Activation", "select_activation"]
-
 MAX_EXPONENT = 60.0
 """exp(60) = 1e26 leaves room for a length and a sum in float32."""
 

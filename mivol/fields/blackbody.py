@@ -21,8 +21,6 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["LUMENS_PER_WATT", "blackbody_rgb", "blackbody_xyz", "planck"]
-
 C1, C2 = 1.1910429723971884e20, 1.438776877503933e7
 """2 h c^2 [W nm^4 m^-2 sr^-1] and h c / k [nm K]."""
 

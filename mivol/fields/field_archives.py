@@ -21,8 +21,6 @@ from mivol.files import write_whole
 from mivol.files.npy import check_memory
 from mivol.files.source import refusal
 
-__all__ = ["is_own_archive", "is_svox2", "parse_archive", "parse_svox2", "write_archive", "write_svox2"]
-
 FORMAT = "mivol spherical grid 2"
 
 HALF_MAX = float(np.finfo(np.float16).max)

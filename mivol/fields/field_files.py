@@ -35,8 +35,6 @@ from mivol.files.source import refusal
 from mivol.photos.photo_file import decode_srgb
 from mivol.points.gaussians import CONSTANT_HARMONIC
 
-__all__ = ["FIELD_FORMATS", "FieldFormat", "WriteOptions", "field_from_props", "read_field", "write_field", "write_scene"]
-
 FOREIGN = {".vdb": "a name for OpenVDB, for which no package can be installed"}
 """Suffixes of formats that users expect and mivol cannot write."""
 
@@ -95,11 +93,7 @@ def read_field(path: str | os.PathLike) -> SphericalGrid:
 
 
 def write_field(
-    path: str | os.PathLike,
-    field: SphericalGrid,
-    level: float | None = None,
-    sky: Sky | None = None,
-    half: bool = True,
+    path: str | os.PathLike, field: SphericalGrid, level: float | None = None, sky: Sky | None = None, half: bool = True
 ) -> list[Path]:
     """Write a radiance field in the format of the suffix (:data:`FIELD_FORMATS`), whole or not at all.
 

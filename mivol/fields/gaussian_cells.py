@@ -14,8 +14,6 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.machine import available_memory
 
-__all__ = ["CellLists", "list_gaussians", "MAX_CHUNK_PAIRS", "find_chunk_starts", "list_box_nodes"]
-
 CELLS_PER_GAUSSIAN = 1.0
 """Cells for each Gaussian: 22^3 cells for 10,000 Gaussians. On a dense cloud of this size line integrals take the same time
 (within 10 %) from 0.4 to 8 cells a Gaussian; with 8 the lists take four times as long to make."""

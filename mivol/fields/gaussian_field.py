@@ -34,8 +34,6 @@ from mivol.points.gaussian_files import read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.space import check_affine
 
-__all__ = ["HARMONICS", "MIN_RELATIVE_SCALE", "EXTINCTION_PARAMETERS", "GaussianField"]
-
 EXTINCTION_PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits")
 """Parameters of the extinction."""
 
@@ -193,12 +191,7 @@ class GaussianField:
         return self.visit_cell(mi.Vector3i(*cell), (ray.o, ray.d), inside, state, add)
 
     def visit_cell(
-        self,
-        cell: mi.Vector3i,
-        through: tuple[mi.Point3f, mi.Vector3f],
-        on: mi.Bool,
-        state: Any,
-        add: Callable[..., Any],
+        self, cell: mi.Vector3i, through: tuple[mi.Point3f, mi.Vector3f], on: mi.Bool, state: Any, add: Callable[..., Any]
     ) -> Any:
         """Visit the Gaussians of a cell: ``add(state, line, index) -> state``.
 

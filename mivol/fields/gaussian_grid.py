@@ -50,8 +50,6 @@ from mivol.files import encode_srgb
 from mivol.machine import available_memory
 from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, Gaussians
 
-__all__ = ["MAX_OPACITY", "gaussian_box", "gaussians_to_grid", "gaussian_masses", "grid_to_gaussians"]
-
 MAX_OPACITY = 0.999
 """Larger opacities count as this opacity, an optical depth of 6.9; an opacity of 1 would be an infinite extinction."""
 

@@ -30,8 +30,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["REACH", "ROW_SIZE", "SCALE_COLUMN", "WhitenedLine", "LineSlopes", "row_tangent", "intersect_gaussian", "read_row"]
-
 ROW_SIZE, SCALE_COLUMN = 16, 13
 """Numbers of a Gaussian, and the column of the medium's scale."""
 

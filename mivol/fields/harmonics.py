@@ -24,25 +24,6 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.gaussian_line import ROW_SIZE, read_row
 
-__all__ = [
-    "blocks_per_gaussian",
-    "eval_colour",
-    "eval_colour_slopes",
-    "read_harmonics",
-    "pack_harmonics",
-    "sum_harmonics",
-    "MAX_DEGREE",
-    "SPACES",
-    "basis_size",
-    "harmonic_degree",
-    "row_width",
-    "decode_srgb_code",
-    "srgb_slope",
-    "local_frame",
-    "rotate_direction",
-]
-
-
 MAX_DEGREE = 4
 
 

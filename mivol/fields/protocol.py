@@ -18,8 +18,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["BOUNDED", "EXACT_LINE", "Field", "accumulate_tracked"]
-
 EXACT_LINE, BOUNDED = "exact_line", "bounded"
 
 

@@ -16,8 +16,6 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 
-__all__ = ["resample_field"]
-
 
 def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray, keep: np.ndarray) -> SphericalGrid:
     """A sparse field with the same values on other nodes.

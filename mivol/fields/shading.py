@@ -21,8 +21,6 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["Shading", "gradient_grid"]
-
 COEFFICIENTS = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specular_power": 10.0}
 
 

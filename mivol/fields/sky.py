@@ -19,8 +19,6 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files import read_exr
 
-__all__ = ["Sky", "read_sky"]
-
 TEXEL = 4
 """Numbers of a texel: rgb, and one number that fills a packet."""
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["SparseIndex"]
-
 
 @dataclass
 class SparseIndex:

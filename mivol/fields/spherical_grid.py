@@ -54,8 +54,6 @@ from mivol.files.notebook import slices_html
 from mivol.kernel_recording import copy_aligned
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["SphericalGrid", "is_covered_by_inner"]
-
 HOMOGENEOUS = ("none", "relu")
 """Activations of nested fields: an n times larger density gives an n times larger extinction."""
 

@@ -40,8 +40,6 @@ from mivol.files.mesh import Mesh
 from mivol.machine import available_memory
 from mivol.photos import Camera, project
 
-__all__ = ["DepthView", "default_level", "extract_surface", "fuse_depths", "vertex_normals"]
-
 
 def default_level(field: SphericalGrid) -> float:
     """The default extinction of a surface [1/length].

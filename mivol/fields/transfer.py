@@ -31,17 +31,6 @@ from mivol.fields.voxels import Voxels
 from mivol.files import read_volume
 from mivol.kernel_recording import is_recording
 
-__all__ = [
-    "Transfer",
-    "check_domain",
-    "check_table",
-    "parse_domain",
-    "look_up",
-    "parse_table",
-    "GradientOpacity",
-    "GradientEffects",
-]
-
 
 def look_up(table: mi.TensorXf, domain: tuple[float, float], s: mi.Float) -> list[mi.Float]:
     """Entries of a table at values s, a list of channels; attached to both.

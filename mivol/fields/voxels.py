@@ -16,8 +16,6 @@ from mivol.files import check_volume, read_volume
 from mivol.kernel_recording import is_recording
 from mivol.space import check_affine
 
-__all__ = ["Voxels"]
-
 
 class Voxels:
     """A trilinear grid in the world.

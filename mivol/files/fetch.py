@@ -20,8 +20,6 @@ from pathlib import Path
 
 from mivol.errors import MivolError
 
-__all__ = ["DATA", "PREFIX", "DataSet", "cache_folder", "fetch_data", "find_local_file", "resolve_path"]
-
 PREFIX = "data:"
 """Prefix of a path that names a data set."""
 

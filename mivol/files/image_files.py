@@ -137,10 +137,7 @@ def _planes(path: object, name: str, array: np.ndarray) -> dict[str, np.ndarray]
         letters = COMPONENTS[array.shape[2]]
         return {prefix + letter: np.ascontiguousarray(plane[..., i]) for i, letter in enumerate(letters)}
     raise refusal(
-        path,
-        f"{name!r} of shape {array.shape}",
-        "(rows, columns) with a name or (rows, columns, 1, 3 or 4)",
-        "reshape it",
+        path, f"{name!r} of shape {array.shape}", "(rows, columns) with a name or (rows, columns, 1, 3 or 4)", "reshape it"
     )
 
 

@@ -22,8 +22,6 @@ from mivol.files import source
 from mivol.files.atomic import write_whole
 from mivol.files.source import refusal
 
-__all__ = ["MESH_WRITERS", "Mesh", "read_ply", "write_mesh"]
-
 PLY_HEAD = "ply\nformat binary_little_endian 1.0\n"
 
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])

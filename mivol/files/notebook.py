@@ -13,8 +13,6 @@ from PIL import Image
 from mivol.display import text_html
 from mivol.files.image_files import encode_srgb
 
-__all__ = ["pairs_html", "slices_html"]
-
 EDGE, GAP = 160, 4
 """Longest edge of an image, and the gap between two images [pixel]."""
 

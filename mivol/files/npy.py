@@ -58,12 +58,7 @@ def write_npy(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
         MivolError: a placement or metadata, which the format cannot hold.
     """
     if metadata or not np.array_equal(to_world, np.eye(4)):
-        raise refusal(
-            "write_volume",
-            "to_world or metadata for a .npy file",
-            "the values only",
-            "write .npz, or remove both",
-        )
+        raise refusal("write_volume", "to_world or metadata for a .npy file", "the values only", "write .npz, or remove both")
     # numpy.save bypasses the file object (ndarray.tofile) and loses the error of the system when the disk is full.
     np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(values))
     file.write(values.data)

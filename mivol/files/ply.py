@@ -21,8 +21,6 @@ import numpy as np
 from mivol.files import source
 from mivol.files.source import refusal
 
-__all__ = ["POSITION", "is_ply", "read_layout", "read_tables", "read_vertices", "vertex_positions", "write_table"]
-
 POSITION = ("x", "y", "z")
 """Properties with the position of a vertex."""
 

@@ -42,12 +42,7 @@ def read_vol(path: Path, dataset: str | None = None) -> VolumeData:
     if version != VERSION:
         raise refusal(path, f"version {version} of the format", "version 3", "write it again with Mitsuba 3 or mivol")
     if encoding not in ENCODINGS:
-        raise refusal(
-            path,
-            f"encoding {encoding}",
-            "1 (float32), 2 (float16) or 3 (uint8)",
-            "write it again as float32",
-        )
+        raise refusal(path, f"encoding {encoding}", "1 (float32), 2 (float16) or 3 (uint8)", "write it again as float32")
     if min(nx, ny, nz, channels) < 1:
         raise refusal(path, f"{nx} x {ny} x {nz} voxels of {channels} channels", "at least 1 each", "write the file again")
     dtype, factor = ENCODINGS[encoding]

@@ -34,19 +34,6 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.phase.scattering_angle import INV_FOUR_PI, ScatteringAngle
 
-__all__ = [
-    "choose_lobe",
-    "droplets",
-    "eval_draine",
-    "eval_hg",
-    "eval_rayleigh",
-    "mean_cosine",
-    "normalise_weights",
-    "sample_draine",
-    "sample_hg",
-    "sample_rayleigh",
-]
-
 
 def eval_hg(angle: ScatteringAngle, g: mi.Float) -> mi.Float:
     r"""Density [1/sr].

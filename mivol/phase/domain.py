@@ -16,8 +16,6 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["ASYMMETRY", "COSINE_SQUARED", "LARGEST", "WEIGHT", "Domain"]
-
 
 @dataclass(frozen=True)
 class Domain:

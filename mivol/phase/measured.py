@@ -22,8 +22,6 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["ALIASES", "NAMES", "MeasuredMedium", "named_medium"]
-
 Triple = tuple[float, float, float]
 
 # name: reduced scattering, absorption [1/mm]

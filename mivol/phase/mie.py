@@ -23,8 +23,6 @@ from scipy.special import gammainccinv, gammaincinv, ndtri
 from mivol.errors import MivolError
 from mivol.phase.table import Table, adapt_nodes
 
-__all__ = ["WATER_INDEX", "aerosol", "water_droplets"]
-
 WATER_INDEX = 1.333
 """Refractive index of water in the middle of the visible range; the absorption of water there does not change the phase
 function.

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["INV_FOUR_PI", "INV_TWO_PI", "ScatteringAngle", "scattered_direction", "angle_between"]
-
 INV_TWO_PI = 0.15915494309189535
 INV_FOUR_PI = 0.07957747154594767
 
@@ -45,8 +43,7 @@ class ScatteringAngle:
     def mirrored(self, where: mi.Bool) -> ScatteringAngle:
         """The same angle with the cosine negated in some lanes."""
         return ScatteringAngle(
-            dr.select(where, self.above_minus_one, self.below_one),
-            dr.select(where, self.below_one, self.above_minus_one),
+            dr.select(where, self.above_minus_one, self.below_one), dr.select(where, self.below_one, self.above_minus_one)
         )
 
 

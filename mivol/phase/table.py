@@ -25,8 +25,6 @@ from mivol.errors import MivolError
 from mivol.phase.domain import LARGEST, WEIGHT
 from mivol.phase.scattering_angle import INV_TWO_PI, ScatteringAngle
 
-__all__ = ["Table", "adapt_nodes", "check_values", "Lookup"]
-
 
 @dataclass(frozen=True, eq=False)
 class Table:

@@ -15,8 +15,6 @@ import numpy as np
 from mivol.files.source import refusal
 from mivol.photos.lens import LARGEST_TERM, Fisheye, Lens, Panorama, distort, undistort
 
-__all__ = ["Camera", "directions", "field_of_view", "intrinsics", "is_seen", "pixel_centres", "project", "rays"]
-
 PIXELS_LOST = 0.1
 """Largest shift of an image corner by an inexact rotation matrix [pixel]."""
 

@@ -16,8 +16,6 @@ from mivol.files.source import refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
 
-__all__ = ["aim_camera", "follow_keyframes", "interpolate_cameras", "turntable"]
-
 ALL_ROUND = np.radians(90)
 """Largest azimuth gap [radian] between cameras of a full circle; a larger gap makes the path swing between its ends."""
 

@@ -22,8 +22,6 @@ from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Fisheye, Lens
 from mivol.photos.listing import Entry, Listing, check_points
 
-__all__ = ["CAMERA_MODELS", "find_model", "quaternion_to_matrix", "read_colmap", "read_points3d"]
-
 MODEL_NUMBERS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
@@ -313,7 +311,4 @@ class Reader:
 
 
 #: suffix -> reader; binary first, as COLMAP does.
-READERS = {
-    ".bin": Reader(_cameras_bin, _images_bin, _points_bin),
-    ".txt": Reader(_cameras_txt, _images_txt, _points_txt),
-}
+READERS = {".bin": Reader(_cameras_bin, _images_bin, _points_bin), ".txt": Reader(_cameras_txt, _images_txt, _points_txt)}

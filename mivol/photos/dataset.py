@@ -25,8 +25,6 @@ from mivol.photos.photo_file import find_colour_space, read_mask, read_photo, re
 from mivol.photos.region import silhouette_box
 from mivol.photos.survey import PhotoFrame, PhotoSurvey, survey_photos
 
-__all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos", "rectify", "to_pinhole"]
-
 Background = str | Sequence[float] | None
 
 

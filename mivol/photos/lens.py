@@ -31,8 +31,6 @@ import numpy as np
 
 from mivol.files.source import refusal
 
-__all__ = ["Fisheye", "Lens", "Panorama", "distort", "undistort"]
-
 NEWTON_STEPS = 20
 """Largest number of steps that undistort a point."""
 

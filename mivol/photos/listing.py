@@ -11,8 +11,6 @@ import numpy as np
 from mivol.files.source import refusal
 from mivol.photos.camera import Camera
 
-__all__ = ["UNLISTED", "Entry", "Listing", "check_points"]
-
 UNLISTED = "in no list"
 """Split of the photographs outside the lists of the data set."""
 

@@ -24,18 +24,6 @@ from PIL import Image, UnidentifiedImageError
 from mivol.files import encode_srgb, read_exr, read_exr_header
 from mivol.files.source import check_file, refusal
 
-__all__ = [
-    "CONVERSIONS",
-    "SUFFIXES",
-    "PhotoHeader",
-    "decode_srgb",
-    "find_colour_space",
-    "read_mask",
-    "read_photo",
-    "read_photo_header",
-    "shrink",
-]
-
 #: suffixes of photographs, in the order of the trials for a name without suffix.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 

@@ -18,11 +18,6 @@ from mivol.files.source import refusal
 from mivol.photos.camera import FLIP, Camera, is_seen, project, rays
 from mivol.photos.lens import Panorama
 
-__all__ = [
-    *("FEWEST_POINTS", "MIDDLE", "VIEW_SHARE", "box_of_points", "check_box", "check_views", "count_levels", "count_views"),
-    *("find_focus", "middle_box", "near_and_far", "nested_boxes", "points_in_box", "shared_box", "silhouette_box"),
-]
-
 SEARCHES = 2
 """Searches of a box, the second one in the box that the first one found."""
 

@@ -26,8 +26,6 @@ from mivol.photos.listing import UNLISTED, Entry, Listing
 from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
 
-__all__ = ["DATA_SET_FORMATS", "SPLITS", "DataSetFormat", "PhotoFrame", "PhotoSurvey", "find_format", "survey_photos"]
-
 SPLITS = ("train", "held_out", "val", "test", "all")
 
 
@@ -116,11 +114,7 @@ class PhotoSurvey:
 
 
 def survey_photos(
-    path: str | os.PathLike,
-    *,
-    split: str = "all",
-    held_out: int | Sequence[str] = 0,
-    box: np.ndarray | str | None = None,
+    path: str | os.PathLike, *, split: str = "all", held_out: int | Sequence[str] = 0, box: np.ndarray | str | None = None
 ) -> PhotoSurvey:
     """Read cameras, sizes and box of a data set, without pixels.
 

@@ -28,8 +28,6 @@ from mivol.photos.lens import Fisheye, Lens, Panorama
 from mivol.photos.listing import UNLISTED, Entry, Listing, check_points
 from mivol.photos.photo_file import SUFFIXES
 
-__all__ = ["MODELS", "Settings", "read_blender", "read_transforms", "write_transforms"]
-
 #: file of a Blender data set -> split.
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "val", "transforms_test.json": "test"}
 

@@ -24,8 +24,6 @@ from mivol.files.npy import DAMAGE, check_memory
 from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.photos.colmap import read_points3d
 
-__all__ = ["CLOUD_READERS", "CLOUD_WRITERS", "PointCloud", "read_points", "write_points"]
-
 COLOUR = ("red", "green", "blue")
 VLR_HEADER_SIZE, EVLR_HEADER_SIZE = 54, 60
 """Size of the header of a variable length record of LAS, and of an extended record [bytes] (ASPRS LAS 1.4 R15, sections 2.5 and

@@ -16,8 +16,6 @@ from mivol.points.cloud import PointCloud
 from mivol.points.gaussians import Gaussians, logit, to_base_harmonics
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["points_to_density", "sample_points", "points_to_gaussians", "gaussians_to_points"]
-
 
 def points_to_density(
     positions: np.ndarray, resolution: tuple[int, int, int], to_world: np.ndarray, masses: np.ndarray | None = None

@@ -18,8 +18,6 @@ from mivol.points.gaussians import Gaussians
 from mivol.points.splat import read_ksplat, read_splat
 from mivol.points.spz import read_spz
 
-__all__ = ["GAUSSIAN_READERS", "GAUSSIAN_WRITERS", "is_gaussian_file", "read_gaussians", "write_gaussians"]
-
 
 def _read_ply(path: Path) -> Gaussians:
     tables = read_tables(path)

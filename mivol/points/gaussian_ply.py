@@ -28,14 +28,6 @@ from mivol.files import ply
 from mivol.files.source import refusal
 from mivol.points.gaussians import Gaussians, complete_quaternions, logit, to_base_harmonics
 
-__all__ = [
-    "parse_tables",
-    "_parse_higher_harmonics",
-    "write_gaussian_ply",
-    "parse_compressed_tables",
-    "is_compressed",
-]
-
 MEANS = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
 COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")

@@ -23,17 +23,6 @@ import numpy as np
 from mivol.display import with_short_repr
 from mivol.files.source import refusal
 
-__all__ = [
-    "CONSTANT_HARMONIC",
-    "HIGHEST_DEGREE",
-    "Gaussians",
-    "concatenate",
-    "logit",
-    "complete_quaternions",
-    "to_base_harmonics",
-    "to_log_scales",
-]
-
 CONSTANT_HARMONIC = 0.5 / np.sqrt(np.pi)
 """The constant value of the spherical harmonic of degree 0."""
 

@@ -23,8 +23,6 @@ import numpy as np
 from mivol.files.source import read_bytes, refusal
 from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, concatenate, logit, to_base_harmonics, to_log_scales
 
-__all__ = ["read_ksplat", "read_splat"]
-
 HEADER_SIZE, SECTION_HEADER_SIZE = 4096, 1024
 NUMBER_TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}
 """Level -> types of positions, of scales and rotations, of harmonics."""

@@ -24,8 +24,6 @@ from mivol.files.npy import check_memory
 from mivol.files.source import CODECS, decompress, parse_elements, read_bytes, refusal
 from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, complete_quaternions, logit
 
-__all__ = ["read_spz"]
-
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 HEAD = struct.Struct("<4sIIBBBB")

@@ -18,8 +18,6 @@ from mivol.points.conversions import gaussians_to_points, points_to_gaussians
 from mivol.points.gaussian_files import GAUSSIAN_READERS, GAUSSIAN_WRITERS, is_gaussian_file, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
 
-__all__ = ["KINDS", "SUFFIXES", "FileSummary", "convert_file", "is_points_file", "summarize_file"]
-
 KINDS = ("gaussians", "points")
 """Contents that a file can be converted to."""
 

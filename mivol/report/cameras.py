@@ -23,19 +23,6 @@ from mivol.photos import SPLITS, PhotoFrame, PhotoSurvey
 from mivol.photos.region import nested_boxes, points_in_box
 from mivol.report.figures import FAINT, INK, SERIES, STYLE, save_figure
 
-__all__ = [
-    "EDGE",
-    "FAR",
-    "PARTS",
-    "Arrangement",
-    "Strokes",
-    "list_parts",
-    "plot_arrangement",
-    "plot_cameras",
-    "pyramid",
-    "rectangle",
-]
-
 EDGE = 0.12
 """Length of a drawn field of view [median distance of the cameras from the centre of the box]."""
 

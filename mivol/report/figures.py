@@ -27,20 +27,6 @@ from mivol.files import read_volume, write_whole
 from mivol.report import pixel_scale
 from mivol.report.record import Volume, find_quantity
 
-__all__ = [
-    "SERIES",
-    "STYLE",
-    "Series",
-    "empty_figure",
-    "inline_svg",
-    "plot_curve",
-    "plot_error_against_time",
-    "plot_image_row",
-    "plot_slices",
-    "ratio_at_equal_error",
-    "save_figure",
-]
-
 INK, FAINT, GRID = "#1b1f24", "#5b6470", "#d5d9df"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 LEVELS = {"discrepancy": (1.0, "noise level")}

@@ -25,8 +25,6 @@ from mivol.report.figures import draw_profiles
 from mivol.report.page_images import Z_IMAGE, ViewRow, VolumeView, encode_film, encode_image, make_view_rows, make_volume_views
 from mivol.report.record import CODES, LINES, QUANTITIES, SINOGRAM, RunRecord, find_quantity, read_metrics, read_record
 
-__all__ = ["PAGE", "headline", "write_page"]
-
 PAGE = "report.html"
 SHOWN_VIEWS = 4
 """Views visible at once; the page folds the others."""

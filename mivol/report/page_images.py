@@ -19,11 +19,6 @@ from mivol.files import read_exr, read_volume, stack_layers
 from mivol.report import pixel_scale
 from mivol.report.record import LINES, Image, Volume
 
-__all__ = [
-    *("ColourBar", "PageImage", "ViewRow", "ViewRows", "VolumeView"),
-    *("encode_film", "encode_image", "make_view_rows", "make_volume_views"),
-]
-
 LAYERS = 16
 LAYER_EDGE = 128
 """Largest number of scrollable slices of a volume, and their largest edge [pixel]: a page stays below a few MB."""

@@ -25,11 +25,6 @@ from mivol.files import encode_srgb
 from mivol.files.atomic import write_whole_bytes
 from mivol.photos import Camera, pixel_centres, rays
 
-__all__ = [
-    *("SIGNED", "Scale", "Slices", "data_uri", "depth_pixels", "is_preview_due", "middle_slices", "normal_pixels"),
-    *("normals_from_depth", "shared_scale", "signed_scale", "to_pixels", "write_preview"),
-]
-
 SIGNED = "RdBu_r"
 """Colour map of signed values."""
 

@@ -28,25 +28,6 @@ from mivol.files import write_whole_text
 from mivol.files.atomic import disk_faults
 from mivol.machine import count_cores
 
-__all__ = [
-    "QUANTITIES",
-    "Image",
-    "Machine",
-    "PlanLine",
-    "Quantity",
-    "RunRecord",
-    "Table",
-    "Volume",
-    "append_metrics",
-    "describe_machine",
-    "find_quantity",
-    "read_metrics",
-    "read_record",
-    "rewind_metrics",
-    "package_versions",
-    "write_record",
-]
-
 RECORD = "run.json"
 METRICS = "metrics.jsonl"
 LINES = "line integral"

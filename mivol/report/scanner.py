@@ -18,8 +18,6 @@ from mivol.report.cameras import EDGE, Arrangement, Strokes, plot_arrangement, p
 from mivol.report.figures import FAINT, SERIES
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
-__all__ = ["MOST_VIEWS", "plot_scanner", "select_views"]
-
 MOST_VIEWS = 60
 """Largest number of drawn views, for fitted and for held-out views."""
 

@@ -20,8 +20,6 @@ from scipy.sparse import csr_matrix
 from mivol.errors import MivolError
 from mivol.files import whole_file
 
-__all__ = ["NO_FFMPEG_NOTE", "FILM_WRITERS", "film_suffix", "write_video", "FEWEST_LAYERS", "volume_frames"]
-
 Frames = Iterator[NDArray[np.uint8]]
 
 QUALITY = "18"

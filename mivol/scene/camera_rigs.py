@@ -18,8 +18,6 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["RIGS", "Hemisphere", "LookAts", "Rig", "Ring", "SceneSensors", "find_media_box", "look_at", "parse_rig"]
-
 Vector = tuple[float, float, float]
 
 

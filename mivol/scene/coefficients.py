@@ -17,8 +17,6 @@ from mivol.fields.gaussian_field import GaussianField
 from mivol.scene_graph import traverse
 from mivol.transport.traversal.box import clip_to_box
 
-__all__ = ["Coefficients"]
-
 COEFFICIENT_PAIRS = (("sigma_t", "albedo"), ("sigma_a", "sigma_s"))
 
 OPAQUE_EXTINCTION = 1e10

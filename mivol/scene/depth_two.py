@@ -34,8 +34,6 @@ from mivol.transport.media.optical_depth import integrate_optical_depth
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
 
-__all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "sample_lines", "mean_albedo", "scattering_depth"]
-
 ALBEDOS = (0.2, 0.5, 0.75, 0.9, 0.99, 1.0)
 TAUS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 

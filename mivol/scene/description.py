@@ -21,23 +21,6 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.scene_graph import traverse
 
-__all__ = [
-    "NOT_UTF8",
-    "VARIANTS",
-    "format_override",
-    "check_variant",
-    "find_named_file",
-    "find_named_files",
-    "parse_dict",
-    "parse_file",
-    "describe_error",
-    "resolve_beside",
-    "list_data_files",
-    "content_hash",
-    "hash_object",
-    "hash_description",
-]
-
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
 MAX_REASON_LENGTH = 700

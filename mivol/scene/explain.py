@@ -23,15 +23,10 @@ from mivol.scene.previews import find_sufficient_depth, measure_media_light, mea
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
-from mivol.transport.estimators.single_scattering.shadow_tables import (
-    build_transmittance_grid,
-    measure_transmittance_bias,
-)
+from mivol.transport.estimators.single_scattering.shadow_tables import build_transmittance_grid, measure_transmittance_bias
 from mivol.transport.media.medium_view import traverse_medium
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.transport.traversal.box import Box
-
-__all__ = ["Explanation", "explain_scene", "read_settings"]
 
 UNLIMITED = 0xFFFFFFFF
 """The depth printed by Mitsuba's integrators for -1."""
@@ -67,10 +62,7 @@ class Explanation:
 
 
 def explain_scene(
-    scene: mi.Scene,
-    max_depth: int | None = None,
-    sensor: int | mi.Sensor = 0,
-    noise: float | None = None,
+    scene: mi.Scene, max_depth: int | None = None, sensor: int | mi.Sensor = 0, noise: float | None = None
 ) -> Explanation:
     """Describe the facts of a scene and the plan of its render. At most small previews are rendered.
 

@@ -32,9 +32,8 @@ from mivol.scene.description import (
 from mivol.scene.explain import explain_scene
 from mivol.threads import set_thread_count
 
-__all__ = ["LoadedScene", "SceneSource", "load_scene"]
-
 SceneSource = str | os.PathLike | Mapping
+
 
 @with_short_repr
 @dataclass(frozen=True)
@@ -85,7 +84,6 @@ def ensure_two_threads() -> Iterator[None]:
     finally:
         if single:
             set_thread_count(1)
-
 
 
 def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] | None = None) -> LoadedScene:

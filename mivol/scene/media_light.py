@@ -34,9 +34,6 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.uniform_points import draw_uniform_point
 from mivol.transport.traversal.box import Box
 
-__all__ = ["find_emitting_boxes", "predict_gain", "read_media_light", "MediaLight"]
-
-
 SAMPLING_COST = 2.0
 """Time of a path with sampling over the time of a path without (measured on two cores: 1.4 to 2.5)."""
 

@@ -30,8 +30,6 @@ from mivol.transport.media.medium_view import MediumView, medium_kind
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
 
-__all__ = ["find_needs", "MediumFacts", "Needs", "mean_cosine"]
-
 
 def find_needs(
     scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = None, spp: int = 0, reads_emission: bool = True

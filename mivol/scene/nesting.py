@@ -19,8 +19,6 @@ from mivol.scene_graph import traverse
 from mivol.transport.traversal.box import Box, fit_box
 from mivol.transport.traversal.rays import spawn_ray
 
-__all__ = ["OrientedBox", "shape_bounds", "oriented_box", "scene_diagonal", "find_nesting_fault"]
-
 RAYS_PER_PAIR = 512
 """Rays for each pair of shapes, through the space shared by their boxes."""
 

@@ -44,18 +44,6 @@ from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.walk import walk_path
 
-__all__ = [
-    "DEPTHS",
-    "NOISE",
-    "SufficientDepth",
-    "DepthError",
-    "measure_depth_error",
-    "find_sufficient_depth",
-    "sampling_gain",
-    "measure_media_light",
-    "measure_near_light",
-]
-
 DEPTHS = (2, 3, 6, -1)
 """Compared depths; the last depth, without a limit, is the reference."""
 

@@ -37,8 +37,6 @@ from mivol.transport.traversal.grid_walk import corner_nodes
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice, locate_cell
 
-__all__ = ["GridReading", "check_emission", "check_constants", "is_scattering", "read_extinction"]
-
 
 @dataclass
 class GridReading:

@@ -15,20 +15,6 @@ from mivol.transport.media.grid_extinction import have_same_cells
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.path.estimators import Settings
 
-__all__ = [
-    "parse_aovs",
-    "check_bounded",
-    "check_media_light",
-    "check_near_light",
-    "check_emission_cells",
-    "check_gaussians",
-    "check_nested",
-    "check_placements",
-    "check_quadrature",
-    "check_scattering",
-]
-
-
 SHADOWS = ("auto", "exact", "estimated", "grid")
 """Methods for shadows: ``exact``, from a ``grid`` (quadrature) or ``estimated`` (Monte Carlo images); ``auto`` chooses."""
 

@@ -18,8 +18,6 @@ from mivol.photos import Camera, intrinsics
 from mivol.photos.camera import PIXELS_LOST
 from mivol.scene_graph import traverse
 
-__all__ = ["check_film", "find_sensor", "to_camera", "to_sensor"]
-
 FILM_NUMBERS = 5
 """Numbers summed by a film for each pixel: red, green, blue, alpha and the weight of the filter."""
 

@@ -37,8 +37,6 @@ from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, r
 from mivol.transport.path.successive import paths_per_lane, walk_successively
 from mivol.transport.path.walk import has_one_segment, walk_path
 
-__all__ = ["Session"]
-
 
 @dataclass
 class _SurveyedScene:

@@ -17,9 +17,6 @@ from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
 from mivol.transport.traversal.box import Box, fit_box
 
-__all__ = ["OUTSIDE_SHAPES", "SceneSurvey", "find_outside_media", "is_instance", "survey_scene", "Boundary"]
-
-
 OUTSIDE_SHAPES = "space around shapes"
 """Class of shape of a medium that fills no shape."""
 

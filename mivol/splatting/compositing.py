@@ -31,8 +31,6 @@ import mitsuba as mi
 from mivol.splatting.projection import EXP2
 from mivol.splatting.tile_lists import TILE, Grid
 
-__all__ = ["CHUNK", "LANES", "PIXELS", "STOP", "Adjoint", "Frame", "Lists", "composite", "composite_adjoint"]
-
 CHUNK = 4
 """Entries between two stored values of T."""
 

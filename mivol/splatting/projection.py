@@ -31,8 +31,6 @@ from mivol.errors import MivolError
 from mivol.kernel_recording import copy_aligned
 from mivol.photos.camera import FLIP, Camera
 
-__all__ = ["Cloud", "Filter", "Splats", "project", "View", "pack_view"]
-
 LEAST_COMPENSATION = 1e-12
 """Squared factor below which the compensated opacity has no derivative: with 1e-6 of its opacity no Gaussian is drawn."""
 

@@ -27,8 +27,6 @@ from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, View, pack_v
 from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, nearest_first, write_tiles
 from mivol.threads import check_one_thread
 
-__all__ = ["NAMES", "SplatterCache", "Splatter", "ScreenStatistics", "to_tensors"]
-
 NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
 """The tensors of a cloud."""
 

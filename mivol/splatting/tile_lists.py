@@ -17,8 +17,6 @@ import scipy.sparse
 
 from mivol.errors import MivolError
 
-__all__ = ["TILE", "Grid", "TileLists", "count_tiles", "list_tiles", "nearest_first", "write_tiles"]
-
 TILE = 8
 """Pixels along the edge of a tile. 4 and 16 are slower."""
 

@@ -25,20 +25,6 @@ import mitsuba as mi
 from mivol.numerics import fast_min
 from mivol.transport.traversal.interpolation import GAUSS_POINT
 
-__all__ = [
-    "backproject_columns",
-    "fold_nodes",
-    "integrate_columns",
-    "pad_nodes",
-    "zero_nodes",
-    "ColumnCell",
-    "ColumnGrid",
-    "Corner",
-    "Hooks",
-    "Line",
-    "walk_columns",
-]
-
 Columns = tuple[list, list]
 """Two numbers for each of the four columns: value at the foot and rise to the head, or sums of weights."""
 
@@ -180,12 +166,7 @@ def _interpolate(columns: Columns, point: list[mi.Float]) -> mi.Float:
 
 def _enter(old: list[mi.Float], through: mi.Bool, fresh: mi.Float, aside: mi.Float) -> list[mi.Float]:
     """Numbers of the columns of the next cell: far columns become near columns, two columns are new."""
-    return [
-        dr.select(through, old[1], old[2]),
-        dr.select(through, fresh, old[3]),
-        dr.select(through, old[3], fresh),
-        aside,
-    ]
+    return [dr.select(through, old[1], old[2]), dr.select(through, fresh, old[3]), dr.select(through, old[3], fresh), aside]
 
 
 PIECE = 32.0

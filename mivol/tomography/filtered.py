@@ -3,35 +3,71 @@
 Back-projection runs voxel by voxel: every voxel reads each view once, interpolated between the pixels at its shadow. The
 operation is not the transpose of the projector, which spreads rays over voxels: do not use it in an iterative solver.
 
-References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), sections 3.3 and 3.6; Feldkamp, Davis & Kress
-1984, J. Opt. Soc. Am. A 1, 612; Parker 1982; Wang 2002; Gullberg, Crawford & Tsui 1986, IEEE Trans. Med. Imaging 5, 23 (a
-rotation axis beside the central ray).
+Shares. The inverse is an integral over all lines, each counted once. The share of a ray is its part of a line that the scan
+measures twice; the shares of all rays on a line add up to 1. ``gamma`` is the angle [rad] between a ray and the ray through the
+rotation axis, positive towards larger columns. In the geometry of :mod:`mivol.tomography.geometry` the ray (theta, gamma) and
+the ray (theta + pi - 2 gamma, -gamma) run along the same line from its two ends.
+
+References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), sections 3.3 (Eq. 61: the band-limited ramp),
+3.4 and 3.6; Ramachandran & Lakshminarayanan 1971 (no window); Shepp & Logan 1974 (the sinc window); Feldkamp, Davis & Kress
+1984, J. Opt. Soc. Am. A 1, 612; Parker 1982, Med. Phys. 9, 254 (half scans); Wang 2002, Med. Phys. 29, 1634 (displaced
+detectors); Gullberg, Crawford & Tsui 1986, IEEE Trans. Med. Imaging 5, 23 (a rotation axis beside the central ray).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.fft
 
 from mivol.errors import MivolError
 from mivol.threads import check_one_thread
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
-from mivol.tomography.ramp import filter_ramp
-from mivol.tomography.redundancy import angle_steps, covers_circle, full_turn_weights, parker_weights, widest_gap
 
-__all__ = [
-    "check_circle",
-    "check_directions",
-    "check_parallel",
-    "feldkamp",
-    "filtered_backprojection",
-    "pixel_matrices",
-    "backproject_voxels",
-]
+WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "ram-lak": np.ones_like,
+    "shepp-logan": lambda f: np.sinc(f / 2),
+    "cosine": lambda f: np.cos(np.pi * f / 2),
+    "hamming": lambda f: 0.54 + 0.46 * np.cos(np.pi * f),
+    "hann": lambda f: 0.5 + 0.5 * np.cos(np.pi * f),
+}
+"""Windows by name: the factor on a frequency ``f``, which is in units of the cutoff, from 0 to 1."""
+
+
+def filter_ramp(y: np.ndarray, pitch: float, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
+    """Convolve each row with the band-limited ramp, zero beyond the detector.
+
+    ``h(0) = 1 / (4 pitch^2)``, ``h(n) = -1 / (pi n pitch)^2`` for odd n, 0 for even n; the sum is multiplied by ``pitch``. The
+    kernel is sampled in space, so its mean is right; a ramp sampled in frequency would shift all values of the object.
+
+    Args:
+        y: (..., cols).
+        pitch: pitch of the columns [length].
+        window: key of WINDOWS.
+        cutoff: end of the window over the Nyquist frequency, in (0, 1].
+
+    Returns:
+        (..., cols) float64 [1/length].
+
+    Raises:
+        MivolError: an unknown window, or a cutoff outside (0, 1].
+    """
+    if window not in WINDOWS:
+        raise MivolError(f'found the filter window "{window}", expected one of {", ".join(WINDOWS)}.')
+    if not 0 < cutoff <= 1:
+        raise MivolError(f"found a cutoff of {cutoff}, expected a part of the Nyquist frequency above 0, at most 1.")
+    n = y.shape[-1]
+    size = scipy.fft.next_fast_len(2 * n, real=True)
+    k = np.minimum(np.arange(size), size - np.arange(size))
+    h = np.where(k % 2 == 1, -1.0 / (np.pi * np.maximum(k, 1) * pitch) ** 2, 0.0)
+    h[0] = 1.0 / (4 * pitch**2)
+    f = 2 * scipy.fft.rfftfreq(size) / cutoff
+    kept = np.where(f <= 1, WINDOWS[window](np.minimum(f, 1.0)), 0.0)
+    return pitch * scipy.fft.irfft(scipy.fft.rfft(y, size) * (scipy.fft.rfft(h).real * kept), size)[..., :n]
 
 
 def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
@@ -39,12 +75,12 @@ def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "
 
     Views may be spread arbitrarily over half a turn or more: each view stands for its nearest directions. A detector divided
     unevenly by the rotation axis reaches its whole width over a whole turn
-    (:func:`~mivol.tomography.redundancy.full_turn_weights`).
+    (:func:`~mivol.tomography.filtered.full_turn_weights`).
 
     Args:
         projector: projector of a :class:`~mivol.tomography.geometry.ParallelBeam`, with the views of ``y``.
         y: (views, rows, cols) line integrals.
-        window, cutoff: as in :func:`~mivol.tomography.ramp.filter_ramp`.
+        window, cutoff: as in :func:`~mivol.tomography.filtered.filter_ramp`.
 
     Returns:
         (Z, Y, X) float32 [1/length].
@@ -280,3 +316,81 @@ def _read_view(
     a, b, c, d = (dr.gather(mi.Float, image, r * size[1] + k, seen) for r in (r0, r1) for k in (c0, c1))
     value = dr.lerp(dr.lerp(a, b, fc), dr.lerp(c, d, fc), fr)
     return value * dr.square(inverse) if weighted else value
+
+
+# -- Shares of lines that are measured more than once ----------------------------------------------------------------------
+
+
+MAX_GAP = 4.0
+"""Largest gap between neighbouring views, in steps (the whole range over the number of views). Golden-angle views are at most
+1.9 steps apart; a gap above 4 steps means missing directions."""
+
+BLEND_COLUMNS = 20
+"""Smallest width, in columns, of the change from a share of a half to 1 or 0 on a displaced detector: the ramp filter turns a
+sharper change into a ring."""
+
+
+def angle_steps(angles: np.ndarray, period: float) -> np.ndarray:
+    """The part of a circle of ``period`` [rad] for which each view stands: to the middle between neighbours on both sides.
+
+    Equal angles share their part. The steps add up to ``period``.
+    """
+    order = np.argsort(np.mod(angles, period), kind="stable")
+    sorted_angles = np.mod(angles, period)[order]
+    gaps = np.diff(sorted_angles, append=sorted_angles[:1] + period)
+    steps = np.empty(len(angles))
+    steps[order] = (gaps + np.roll(gaps, 1)) / 2
+    return steps
+
+
+def widest_gap(angles: np.ndarray, period: float) -> tuple[float, float]:
+    """(width, end) of the widest arc [rad] without a view on a circle of ``period``."""
+    found = np.sort(np.mod(angles, period))
+    gaps = np.diff(found, append=found[:1] + period)
+    widest = int(gaps.argmax())
+    return float(gaps[widest]), float(found[(widest + 1) % len(found)])
+
+
+def covers_circle(angles: np.ndarray, period: float) -> bool:
+    """Whether the views cover a circle of ``period``."""
+    return widest_gap(angles, period)[0] <= MAX_GAP * period / len(angles) + 1e-9
+
+
+def full_turn_weights(gamma: np.ndarray) -> np.ndarray:
+    """Shares (cols,) of the rays of a whole turn; a centred detector measures each line twice.
+
+    The share is a half in columns mirrored by the other side of the axis. Beyond the shorter side a line is measured once and
+    counts 1. The share changes smoothly from a half to 1 (and to 0 on the shorter side), over the outer fifth of the shorter
+    side or BLEND_COLUMNS.
+    """
+    short = min(-gamma[0], gamma[-1])
+    column = float(np.mean(np.diff(gamma))) if len(gamma) > 1 else 0.0
+    if abs(gamma[0] + gamma[-1]) < column:
+        return np.full(len(gamma), 0.5)
+    if short <= 0:
+        raise MivolError(
+            "found a detector that lies wholly on one side of the rotation axis, expected the axis to be seen: use an "
+            "iterative solver."
+        )
+    longer = 1.0 if gamma[-1] > -gamma[0] else -1.0
+    width = min(short, max(short / 5, BLEND_COLUMNS * column))
+    along = np.clip((np.abs(gamma) - (short - width)) / width, 0.0, 1.0)
+    return 0.5 * (1 + longer * np.sign(gamma) * np.sin(np.pi / 2 * along) ** 2)
+
+
+def parker_weights(beta: np.ndarray, gamma: np.ndarray, excess: float) -> np.ndarray:
+    """Parker's shares (views, cols) of a scan over ``pi + 2 excess``.
+
+    Args:
+        beta: (views,) angle from the first view [rad].
+        gamma: (cols,).
+        excess: half of the scan's range beyond half a turn [rad]; at least the largest gamma that sees the object.
+    """
+    b = beta[:, None]
+    # Parker's gamma has the opposite sign: his ray (beta, gamma) is the line of (beta + pi + 2 gamma, -gamma).
+    g = np.clip(-gamma, -excess, excess)[None, :]
+    rise, fall = 2 * (excess - g), 2 * (excess + g)
+    tiny = np.finfo(float).tiny
+    first = np.sin(np.pi / 2 * np.clip(b / np.maximum(rise, tiny), 0.0, 1.0)) ** 2
+    last = np.sin(np.pi / 2 * np.clip((np.pi + 2 * excess - b) / np.maximum(fall, tiny), 0.0, 1.0)) ** 2
+    return np.where(b < rise, first, np.where(b > np.pi - 2 * g, last, 1.0))

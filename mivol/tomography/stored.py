@@ -25,17 +25,6 @@ from mivol.errors import MivolError
 from mivol.tomography.geometry import Geometry, VoxelGrid
 from mivol.tomography.projector import Projector
 
-__all__ = [
-    "StoredProjector",
-    "matrix_bytes",
-    "is_worth_storing",
-    "store_matrix",
-    "Lines",
-    "build_rows",
-    "count_bytes",
-    "find_lines",
-]
-
 LAYERS_AT_ONCE = 32
 """Columns of a product: 32 floats are two cache lines, and a layer of 256^2 of them fits into a second-level cache."""
 

@@ -17,8 +17,6 @@ from mivol.validate.metrics import nrmse, psnr
 from mivol.validate.reference_file import ReferenceResult
 from mivol.validate.statistics import Bias, Estimate, Significance, estimate_bias, smallest_detectable_bias, z_bound, z_image
 
-__all__ = ["Comparison", "compare"]
-
 
 @with_short_repr
 @dataclass(frozen=True)

@@ -21,18 +21,6 @@ from mivol.errors import MivolError
 from mivol.photos.photo_file import CONVERSIONS
 from mivol.validate.metrics import check_window, psnr, ssim
 
-__all__ = [
-    "METRICS",
-    "ImageScore",
-    "MeanScore",
-    "check_metrics",
-    "fit_colours",
-    "flip",
-    "score_image",
-    "quantise",
-    "average_scores",
-]
-
 
 @dataclass(frozen=True)
 class ImageScore:

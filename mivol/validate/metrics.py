@@ -6,8 +6,6 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["nrmse", "psnr", "ssim"]
-
 
 def _rmse(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(np.mean((np.asarray(a, dtype=np.float64) - b) ** 2)))

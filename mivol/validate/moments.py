@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike
 
 from mivol.errors import MivolError
 
-__all__ = ["BATCHES", "Moments", "average_tiles", "split_tiles"]
-
 BATCHES = 16
 """Independent renders behind a mean: the standard error is known to 1 / sqrt(2 * 15) = 18 %."""
 

@@ -20,8 +20,6 @@ from mivol.scene.sensors import find_sensor, to_camera
 from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult
 
-__all__ = ["render_photographs"]
-
 
 def render_photographs(
     scene: SceneSource | mi.Scene | LoadedScene,

@@ -40,8 +40,6 @@ from mivol.validate.reference_file import (
 )
 from mivol.validate.trust import Doubt, find_doubts
 
-__all__ = ["INTEGRATORS", "render_reference", "RgbExtinction", "find_rgb_extinctions", "use_channel"]
-
 # Mitsuba's forward integrators for media.
 INTEGRATORS = ("volpath", "volpathmis")
 

@@ -26,18 +26,6 @@ from mivol.files.npy import read_archive
 from mivol.validate.moments import Moments
 from mivol.validate.trust import Doubt
 
-__all__ = [
-    "ReferenceResult",
-    "check_identity",
-    "reference_path",
-    "read_reference",
-    "read_checkpoint",
-    "relative_error",
-    "write_checkpoint",
-    "checkpoint_path",
-    "write_reference",
-]
-
 
 @with_short_repr
 @dataclass(frozen=True)

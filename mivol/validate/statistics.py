@@ -20,24 +20,6 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.validate.moments import Moments, average_tiles, split_tiles
 
-__all__ = [
-    "FAMILIES",
-    "Bias",
-    "Estimate",
-    "Significance",
-    "assert_same_mean",
-    "required_batches",
-    "estimate_bias",
-    "effective_dof",
-    "p_value",
-    "pooled_dof",
-    "smallest_detectable_bias",
-    "z_bound",
-    "z_image",
-    "assert_same_bounded_mean",
-    "bounded_p_value",
-]
-
 
 class Estimate(NamedTuple):
     """Means (of arbitrary shape), the variances of the means, and the degrees of freedom of the variances.
@@ -116,10 +98,7 @@ def _sidak(alpha: float, m: int) -> float:
 
 # Significance of each of m comparisons for a chance alpha of a false alarm in the family. Sidak is exact for independent
 # comparisons (and safe for jointly normal comparisons, two-sided); Bonferroni is always safe.
-FAMILIES: dict[str, Callable[[float, int], float]] = {
-    "sidak": _sidak,
-    "bonferroni": lambda alpha, m: alpha / m,
-}
+FAMILIES: dict[str, Callable[[float, int], float]] = {"sidak": _sidak, "bonferroni": lambda alpha, m: alpha / m}
 
 
 @dataclass(frozen=True)
@@ -205,13 +184,7 @@ def z_image(a: Estimate, b: Estimate, rounding: float = 0.0) -> np.ndarray:
 
 
 def assert_same_mean(
-    a: Estimate,
-    b: Estimate,
-    *,
-    level: Significance = STRICT,
-    tile: int = 1,
-    rounding: float = 0.0,
-    what: str = "the means",
+    a: Estimate, b: Estimate, *, level: Significance = STRICT, tile: int = 1, rounding: float = 0.0, what: str = "the means"
 ) -> None:
     """Raise unless two images have the same mean: a z-test (or t-test) for each pixel at the given level.
 

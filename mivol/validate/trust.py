@@ -20,17 +20,6 @@ from mivol.scene.nesting import find_nesting_fault, shape_bounds
 from mivol.scene_graph import find_children, traverse
 from mivol.transport.media.medium_view import medium_kind, traverse_medium
 
-__all__ = [
-    "DOUBT_CHECKS",
-    "FACE_TOLERANCE",
-    "RESTART_DISTANCE",
-    "Doubt",
-    "MediumShape",
-    "find_doubts",
-    "first_number",
-    "read_medium_shape",
-]
-
 # exp(-x) is 0 in float32 (denormals flushed) from x = 87.3. Mitsuba divides by this probability of passing without a collision.
 MAX_OPTICAL_DEPTH = 87.0
 

@@ -6,13 +6,22 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.tomography.filtered import feldkamp, filtered_backprojection
+from mivol.tomography.filtered import (
+    BLEND_COLUMNS,
+    WINDOWS,
+    angle_steps,
+    covers_circle,
+    feldkamp,
+    filter_ramp,
+    filtered_backprojection,
+    full_turn_weights,
+    parker_weights,
+    widest_gap,
+)
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, PencilRays, VoxelGrid
 from mivol.tomography.phantoms import EllipsoidPhantom
 from mivol.tomography.preprocess import interpolate_gaps
 from mivol.tomography.projector import Projector
-from mivol.tomography.ramp import WINDOWS, filter_ramp
-from mivol.tomography.redundancy import BLEND_COLUMNS, angle_steps, covers_circle, full_turn_weights, parker_weights, widest_gap
 
 GRID = VoxelGrid((1, 48, 48))
 RADIUS, CENTRE, VALUE = 14.0, (4.0, -2.5), 2.0

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from mivol import cli
-from mivol.cli.interrupts import Signals
+from mivol.optim.interrupt import Signals
 
 ROOT = Path(__file__).resolve().parents[2]
 

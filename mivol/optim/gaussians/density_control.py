@@ -19,18 +19,6 @@ from scipy.special import expit, gammaln, logit
 
 from mivol.errors import MivolError
 
-__all__ = [
-    "CloudArrays",
-    "CloudChange",
-    "select_rows",
-    "clone_and_split",
-    "grow",
-    "split_opacity_and_scale",
-    "prune",
-    "relocate",
-    "reset_opacities",
-]
-
 CloudArrays = dict[str, NDArray[np.float32]]
 """A cloud, or moments of a cloud, by name; the first axis counts Gaussians."""
 

@@ -24,8 +24,6 @@ from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course
 from mivol.photos import Camera
 
-__all__ = ["CONTROLS", "PRESETS", "GaussianPlan", "GaussianStage", "estimate_bytes", "scene_extent", "check_memory"]
-
 CONTROLS = ("clone_split", "relocation")
 """Methods of density control: Kerbl et al. 2023 (``clone_split``) and Kheradmand et al. 2024 (``relocation``)."""
 

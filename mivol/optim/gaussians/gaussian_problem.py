@@ -39,8 +39,6 @@ from mivol.photos import Camera
 from mivol.splatting import Splatter
 from mivol.splatting.splatter import ScreenStatistics
 
-__all__ = ["GaussianProblem"]
-
 GAIN_STEP = 0.05
 """Initial maximum change of a gain's logarithm per visit of the photograph: a gain of 1.5 needs eight visits or more."""
 

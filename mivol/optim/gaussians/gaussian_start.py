@@ -17,8 +17,6 @@ from mivol.optim.gaussians.density_control import CloudArrays
 from mivol.photos import Photo, Photos, project
 from mivol.photos.region import FEWEST_POINTS, count_views
 
-__all__ = ["make_start_cloud", "find_start_points"]
-
 OPACITY = 0.1
 SH_0 = 0.5 / math.sqrt(math.pi)
 """The constant spherical harmonic."""

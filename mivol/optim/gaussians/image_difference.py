@@ -18,8 +18,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["ImageShape", "image_loss", "mean_ssim"]
-
 REACH, SIGMA = 5, 1.5
 """Half width and standard deviation of the window [pixel]."""
 

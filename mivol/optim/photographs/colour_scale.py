@@ -22,8 +22,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["SCALES", "SrgbScale", "LinearScale"]
-
 EPSILON = 0.1
 """Radiance, relative to white, below which all errors have about the same weight. Mildenhall et al. use 0.001."""
 

@@ -24,8 +24,6 @@ import numpy as np
 
 from mivol.transport.line_integrals.radiance_field import RayBundle
 
-__all__ = ["DepthRays", "depth_loss_gradient", "sample_depth_rays"]
-
 OUTLIERS = 0.05
 """Assumed share of wrong points."""
 
@@ -50,12 +48,7 @@ class DepthRays:
 
 
 def sample_depth_rays(
-    points: Sequence[np.ndarray],
-    origins: np.ndarray,
-    box: np.ndarray,
-    levels: int,
-    voxel: float,
-    rng: np.random.Generator,
+    points: Sequence[np.ndarray], origins: np.ndarray, box: np.ndarray, levels: int, voxel: float, rng: np.random.Generator
 ) -> DepthRays | None:
     """Draw points of each of some photographs; None if no drawn point lies in the boxes.
 

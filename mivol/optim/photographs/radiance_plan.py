@@ -171,11 +171,7 @@ class RadiancePlan:
 
     def course(self, *more: Event) -> Course:
         """All steps, with the events of the plan and further events."""
-        own = (
-            CoarseToFine(at=self.stage_starts),
-            DropUnseen(at=self.drop_steps),
-            UpdateOccupancy(every=self.occupancy_every),
-        )
+        own = (CoarseToFine(at=self.stage_starts), DropUnseen(at=self.drop_steps), UpdateOccupancy(every=self.occupancy_every))
         return Course(self.steps, events=(*own, *more))
 
     def with_longest(self, longest: int) -> RadiancePlan:

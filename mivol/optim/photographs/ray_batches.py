@@ -137,11 +137,7 @@ class RayBatches:
 
     @classmethod
     def from_photos(
-        cls,
-        photos: Sequence[Photo],
-        shrinks: Sequence[int] = (1,),
-        with_alpha: bool | None = None,
-        space: str = "srgb",
+        cls, photos: Sequence[Photo], shrinks: Sequence[int] = (1,), with_alpha: bool | None = None, space: str = "srgb"
     ) -> RayBatches:
         """Copy photographs to the device.
 

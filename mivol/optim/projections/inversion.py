@@ -76,7 +76,7 @@ class LinearSolve(Optimizer, tag="solve"):
     drift: Annotated[int, setting("iteration", "interval between fits of the light drift; 0: never", ge=0)] = 0
     relaxation: Annotated[float, setting("1", "relaxation of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
     decay: Annotated[float, setting("1", "factor on the relaxation per sweep", gt=0, le=1)] = 0.99
-    window: Annotated[str, setting("1", "key of mivol.tomography.ramp.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
+    window: Annotated[str, setting("1", "key of mivol.tomography.filtered.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
     cutoff: Annotated[float, setting("1", "end of the window, as a share of the Nyquist frequency", gt=0, le=1)] = 1.0
     stop_norm: Annotated[float, setting("1", "stop at this norm of the residual", ge=0)] = 0.0
 

@@ -39,8 +39,6 @@ from mivol.optim.scenes.views import View
 from mivol.photos import Photo
 from mivol.scene.sensors import to_camera
 
-__all__ = ["FACTORS", "EmissiveStart", "average_density", "find_emissive_start", "fit_emission", "to_photographs"]
-
 FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Tried means of the start, in means of the grid's own start."""
 
