@@ -30,7 +30,7 @@ from mivol.optim.strategy import setting, suggest_name, union_type
 from mivol.scene.camera_rigs import Hemisphere, LookAts, Ring, SceneSensors
 from mivol.schema import check_keys, explain_error
 from mivol.tomography.filtered import WINDOWS
-from mivol.validate.images import METRICS
+from mivol.validate.metrics import METRICS
 
 INFINITY = math.inf
 

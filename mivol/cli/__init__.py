@@ -445,8 +445,7 @@ def reference(arguments: argparse.Namespace) -> None:
 
     With --sensor all, the images of every sensor and a file of cameras are written: photographs for a fit.
     """
-    from mivol.validate.photographs import render_photographs
-    from mivol.validate.reference import render_reference
+    from mivol.validate.reference import render_photographs, render_reference
 
     options = {
         "max_depth": arguments.max_depth, "target_se": arguments.target, "max_spp": arguments.spp,

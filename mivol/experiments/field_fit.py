@@ -28,7 +28,7 @@ from mivol.photos import Camera, Photo, Photos
 from mivol.photos.photo_file import CONVERSIONS, decode_srgb
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
 from mivol.report.record import Image, PlanLine, Table, Volume
-from mivol.validate.images import ImageScore, score_image
+from mivol.validate.metrics import ImageScore, score_image
 
 
 class FieldFit(PhotoFit):

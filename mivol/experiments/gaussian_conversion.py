@@ -12,7 +12,8 @@ import numpy as np
 
 from mivol.experiments.back_end import set_variant
 from mivol.fields.field_files import read_field, write_field
-from mivol.fields.gaussian_grid import MAX_OPACITY, gaussian_box, gaussian_masses, gaussians_to_grid, grid_to_gaussians
+from mivol.fields.gaussian_field import MAX_OPACITY
+from mivol.fields.gaussian_grid import gaussian_box, gaussian_masses, gaussians_to_grid, grid_to_gaussians
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import DepthView, fuse_depths
 from mivol.files.mesh import MESH_WRITERS, Mesh, write_mesh

@@ -13,7 +13,7 @@ from mivol.files import write_png
 from mivol.photos import Camera, Photo
 from mivol.photos.photo_file import CONVERSIONS
 from mivol.report.record import CODES, Image, Table
-from mivol.validate.images import METRICS, ImageScore, fit_colours, score_image
+from mivol.validate.metrics import METRICS, ImageScore, fit_colours, score_image
 
 MANY = 32
 """Number of judged views above which small images are smaller, to keep a page below about 20 MB."""

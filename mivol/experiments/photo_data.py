@@ -17,7 +17,7 @@ from mivol.optim.strategy import suggest_name
 from mivol.photos import Photos, PhotoSurvey, load_photos, survey_photos
 from mivol.photos.dataset import BACKGROUNDS, check_alpha
 from mivol.photos.region import near_and_far
-from mivol.validate.images import check_metrics
+from mivol.validate.metrics import check_metrics
 
 
 def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos | None]:

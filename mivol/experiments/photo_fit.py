@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.config import PhotoExperiment
-from mivol.experiments.camera_pictures import draw_photo_cameras, survey_all_cameras
 from mivol.experiments.film import plan_film
 from mivol.experiments.fit_kind import Evaluation, FitKind, RunContext, Say, Stages
 from mivol.experiments.judged_views import (
@@ -33,10 +32,10 @@ from mivol.optim.loop import Course, Fit
 from mivol.optim.optimizer import Optimizer
 from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, Photo
-from mivol.report.cameras import plot_cameras
+from mivol.report.cameras import draw_photo_cameras, plot_cameras, survey_all_cameras
 from mivol.report.record import Image, PlanLine, Table
 from mivol.scene.explain import Explanation
-from mivol.validate.images import ImageScore, average_scores
+from mivol.validate.metrics import ImageScore, average_scores
 
 
 class PhotoFit(FitKind):

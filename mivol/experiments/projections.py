@@ -12,8 +12,7 @@ from mivol import config
 from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, Measured, Nikon, OfData, Parallel, Stack, Table
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
-from mivol.experiments.readings import ScanReadings, nikon_grid, note_order, read_scan
-from mivol.experiments.row_order import note_rows
+from mivol.experiments.readings import ScanReadings, nikon_grid, note_order, note_rows, read_scan
 from mivol.files import read_columns, read_volume
 from mivol.files.fetch import resolve_path
 from mivol.machine import check_memory

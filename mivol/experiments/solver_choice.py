@@ -22,8 +22,7 @@ from mivol.experiments.projections import Projections
 from mivol.machine import check_memory
 from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
-from mivol.optim.projections.linear_problems import SolverState, expected_residual_norm
-from mivol.optim.projections.smoothed_tv import SmoothedTV, scale_tv_to_noise
+from mivol.optim.projections.linear_problems import SmoothedTV, SolverState, expected_residual_norm, scale_tv_to_noise
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions

@@ -44,14 +44,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
 
 from mivol.errors import MivolError
-from mivol.fields.gaussian_cells import MAX_CHUNK_PAIRS, find_chunk_starts, list_box_nodes
+from mivol.fields.gaussian_field import MAX_CHUNK_PAIRS, MAX_OPACITY, find_chunk_starts, list_box_nodes
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
 from mivol.machine import available_memory
 from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, Gaussians
-
-MAX_OPACITY = 0.999
-"""Larger opacities count as this opacity, an optical depth of 6.9; an opacity of 1 would be an infinite extinction."""
 
 DEPOSIT_REACH = 4.0
 """Standard deviations along each axis of the grid up to which a Gaussian is deposited; 2e-4 of its mass lies outside."""

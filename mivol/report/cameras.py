@@ -1,17 +1,23 @@
-"""Figures of cameras around their box, from the side and from above.
+"""Figures of cameras and scanners around their box, from the side and from above.
 
 Conventions. The colour shows the split. A camera is drawn as its pinhole with the four edges of its field of view. The up axis
 is the world axis nearest to the mean upward direction of the cameras. Of nested boxes, the side view and the plan show the
 boxes up to the farthest camera; a third panel shows all boxes.
+
+Scanners. A small pyramid marks a view. The pyramid of a point source opens towards the detector, like the pyramid of a camera;
+the apex of a pyramid of parallel light points in the direction of the light. A few detectors are drawn at their true size.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib as mpl
+import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -19,9 +25,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from mivol.photos import SPLITS, PhotoFrame, PhotoSurvey
+from mivol.optim.scenes.views import View
+from mivol.photos import SPLITS, PhotoFrame, Photos, PhotoSurvey
 from mivol.photos.region import nested_boxes, points_in_box
 from mivol.report.figures import FAINT, INK, SERIES, STYLE, save_figure
+from mivol.report.record import Image
+from mivol.scene.camera_rigs import find_media_box
+from mivol.scene.sensors import to_camera
+from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
 EDGE = 0.12
 """Length of a drawn field of view [median distance of the cameras from the centre of the box]."""
@@ -247,3 +258,174 @@ def _box_style(number: int) -> dict:
 def _figure_axes(up: int) -> list[int]:
     """World axes to the right, into the page and up, right-handed."""
     return [(up + 1) % 3, (up + 2) % 3, up]
+
+
+# -- Scanners --------------------------------------------------------------------------------------------------------------
+
+
+MOST_VIEWS = 60
+"""Largest number of drawn views, for fitted and for held-out views."""
+
+DETECTORS = 8
+"""Number of drawn detectors."""
+
+BEAM_REACH = 1.5
+"""Distance from the centre of the voxels to both ends of a drawn parallel beam [radius of the voxels]."""
+
+MARKER_WIDTH = 0.2
+"""Half the width of a marker of parallel light divided by its length."""
+
+FITTED, HELD_OUT, DETECTOR, FIRST = "fitted view", "held-out view", "detector of some views", "beam of the first view"
+
+
+class Beams(NamedTuple):
+    """The corners (views, 4, 3) of the beams at their start and at the detector [length]."""
+
+    begins: NDArray
+    ends: NDArray
+
+
+def plot_scanner(
+    geometry: FlatDetector, grid: VoxelGrid, held_out: NDArray, path: str | Path | None = None, part: str | None = None
+) -> Figure:
+    """Plot sources, detectors and the box of the voxels from the side and from above.
+
+    Args:
+        geometry: geometry of the views.
+        grid: voxels.
+        held_out: indices of the held-out views.
+        path: file to write (.svg or .png), optional.
+        part: panel of :data:`mivol.report.cameras.PARTS`; by default both panels in a single figure.
+
+    Raises:
+        MivolError: another suffix.
+    """
+    count = geometry.shape[0]
+    strokes = [
+        Strokes(label, colour, make_markers(geometry, views, grid))
+        for label, colour, views in zip((FITTED, HELD_OUT), SERIES, select_views(count, held_out), strict=False)
+        if len(views)
+    ]
+    drawn = make_beams(geometry, _evenly_spaced(np.arange(count), DETECTORS), grid)
+    strokes += [
+        Strokes(DETECTOR, SERIES[2], np.concatenate([rectangle(corners) for corners in drawn.ends])),
+        Strokes(FIRST, FAINT, np.stack([drawn.begins[0], drawn.ends[0]], axis=1)),
+    ]
+    up = int(np.argmax(np.abs(geometry.panels().along_v.mean(axis=0))))
+    box = np.asarray(grid.centre) + np.outer([-0.5, 0.5], grid.extent)
+    arranged = Arrangement(strokes, box, np.empty((0, 3)), up)
+    return plot_arrangement(arranged, f"{count} views and the box of the voxels", path, part)
+
+
+def select_views(count: int, held_out: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the indices of the drawn views: evenly spread over the fitted views, and over the held-out views."""
+    return _evenly_spaced(np.setdiff1d(np.arange(count), held_out), MOST_VIEWS), _evenly_spaced(
+        np.asarray(held_out, int), MOST_VIEWS
+    )
+
+
+def _evenly_spaced(indices: NDArray, most: int) -> NDArray:
+    return indices if len(indices) <= most else indices[np.arange(most) * len(indices) // most]
+
+
+def make_beams(geometry: FlatDetector, views: NDArray, grid: VoxelGrid) -> Beams:
+    """Return the beams of some views; the corners of the detector follow its outline."""
+    panels = geometry.panels(views)
+    _, rows, columns = geometry.shape
+    pixels = np.array([(-0.5, -0.5), (columns - 0.5, -0.5), (columns - 0.5, rows - 0.5), (-0.5, rows - 0.5)])
+    corners = panels.corner[:, None] + pixels[:, :1] * panels.along_u[:, None] + pixels[:, 1:] * panels.along_v[:, None]
+    source = panels.source[:, None]
+    if not geometry.whole_lines:
+        return Beams(np.broadcast_to(source, corners.shape), corners)
+    # The source of a parallel beam is its direction, and its detector lies in the plane of the axis.
+    middle, reach = source * (source @ np.asarray(grid.centre))[..., None], BEAM_REACH * grid.radius * source
+    return Beams(corners + middle - reach, corners + middle + reach)
+
+
+def make_markers(geometry: FlatDetector, views: NDArray, grid: VoxelGrid) -> NDArray:
+    """Return the edges (8 views, 2, 3) of a pyramid for each view; ``EDGE`` sets its length."""
+    begins, ends = make_beams(geometry, views, grid)
+    apex, along = begins.mean(axis=1, keepdims=True), (ends - begins).mean(axis=1, keepdims=True)
+    length = EDGE * np.median(np.linalg.norm(apex[:, 0] - grid.centre, axis=1))
+    if not geometry.whole_lines:
+        base = apex + (ends - apex) * length / np.linalg.norm(along, axis=2, keepdims=True)
+    else:
+        panels = geometry.panels(views)
+        sides = [
+            MARKER_WIDTH * length * side / np.linalg.norm(side, axis=1, keepdims=True)
+            for side in (panels.along_u, panels.along_v)
+        ]
+        base = apex + np.stack([a * sides[0] + b * sides[1] for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))], axis=1)
+        apex = apex + length * panels.source[:, None]
+    return np.concatenate([pyramid(tip, corners) for tip, corners in zip(apex[:, 0], base, strict=True)])
+
+
+# -- Pictures of a run -----------------------------------------------------------------------------------------------------
+
+
+CAPTIONS = {"side": "Cameras, and the box of the matter", "plan": "View from above", "far": "All nested boxes from above"}
+
+
+def draw_photo_cameras(folder: Path, photos: Photos, judged: Photos | None, levels: int = 1) -> list[Image]:
+    """Draw the photographs' cameras and the boxes of the model.
+
+    Args:
+        folder: run folder.
+        photos: photographs to fit.
+        judged: held-out photographs; may be None.
+        levels: nested boxes of the model.
+    """
+    return _pictures(folder, survey_all_cameras(photos, judged, levels))
+
+
+def survey_all_cameras(photos: Photos, judged: Photos | None, levels: int) -> PhotoSurvey:
+    """Survey of fitted and held-out photographs, with the nested boxes of a fit."""
+    frames = photos.survey.frames + (() if judged is None else judged.survey.frames)
+    return replace(photos.survey, frames=frames, levels=levels)
+
+
+def draw_view_cameras(folder: Path, scene: mi.Scene, views: Mapping[str, Sequence[View]]) -> list[Image]:
+    """Draw the cameras of a scene's views around the box of its media; without pinhole cameras nothing is drawn.
+
+    Args:
+        folder: run folder.
+        scene: the scene.
+        views: views by key of ``mivol.photos.SPLITS``.
+    """
+    frames = tuple(
+        PhotoFrame(Path(view.name), to_camera(view.sensor, view.name), split)
+        for split, of in views.items()
+        for view in of
+        if view.sensor.class_name() == "PerspectiveCamera"
+    )
+    if not frames:
+        return []
+    return _pictures(folder, PhotoSurvey(folder, "a scene", frames, (), find_media_box(scene), "about its media", (0.0, 0.0)))
+
+
+def draw_scanner(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held_out: NDArray) -> list[Image]:
+    """Draw sources and detectors of a scanner around the voxels.
+
+    Args:
+        folder: run folder.
+        geometry: geometry of the scan.
+        grid: the voxels.
+        held_out: indices of the held-out views.
+    """
+    for part in PARTS:
+        plot_scanner(geometry, grid, held_out, folder / f"scanner_{part}.png", part)
+    count = geometry.shape[0]
+    drawn = sum(map(len, select_views(count, held_out)))
+    title = "Directions of the light" if geometry.whole_lines else "Positions of the source"
+    captions = {
+        "side": f"{title} in {f'{drawn} of ' * (drawn < count)}{count} views, some detectors, and the box of the voxels",
+        "plan": CAPTIONS["plan"],
+    }
+    return [Image(path=f"scanner_{part}.png", role="picture", caption=captions[part]) for part in PARTS]
+
+
+def _pictures(folder: Path, survey: PhotoSurvey) -> list[Image]:
+    parts = list_parts(survey)
+    for part in parts:
+        plot_cameras(survey, folder / f"cameras_{part}.png", part)
+    return [Image(path=f"cameras_{part}.png", role="picture", caption=CAPTIONS[part]) for part in parts]

@@ -4,6 +4,9 @@ Conventions. A reference is the mean of independent batches with the variance of
 (:mod:`mivol.validate.reference_file` stores them). A batch is a render of ``pass_spp`` samples per pixel with its own seed.
 mivol's own integrator never makes a reference. If the extinction differs between channels, each channel is rendered alone:
 Mitsuba's ``heterogeneous`` tracks all channels with the same collision and is biased (0.077 for 0.135 at sigma_t = (2, 6, 9)).
+
+Photographs. A folder of references, one a view, with a ``transforms.json`` readable by :func:`mivol.photos.load_photos`. A
+reference has no alpha: the background belongs to the scene.
 """
 
 from __future__ import annotations
@@ -22,9 +25,10 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.interrupt import InterruptGuard
+from mivol.photos.transforms import write_transforms
 from mivol.scene.description import check_variant, content_hash
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
-from mivol.scene.sensors import check_film, find_sensor
+from mivol.scene.sensors import check_film, find_sensor, to_camera
 from mivol.transport.media.medium_view import traverse_medium
 from mivol.validate.moments import Moments
 from mivol.validate.reference_file import (
@@ -151,7 +155,7 @@ class _RenderSetup:
         loaded: LoadedScene, sensor: int | Mapping[str, object] | mi.Sensor, method: dict[str, Any], seed: int
     ) -> _RenderSetup:
         """Make the setup without the samples of a pass."""
-        look = _sensor(loaded.scene, sensor)
+        look = _find_given_sensor(loaded.scene, sensor)
         columns, rows = (int(n) for n in look.film().crop_size())
         channels = _channels(look.film())
         extinction = find_rgb_extinctions(loaded.scene) if channels == 3 else []
@@ -210,7 +214,7 @@ class _RenderSetup:
         return np.array(image, dtype=np.float64)[..., : self.shape[2]]
 
 
-def _sensor(scene: mi.Scene, sensor: int | Mapping[str, object] | mi.Sensor) -> mi.Sensor:
+def _find_given_sensor(scene: mi.Scene, sensor: int | Mapping[str, object] | mi.Sensor) -> mi.Sensor:
     if isinstance(sensor, Mapping):
         return mi.load_dict(dict(sensor))
     return find_sensor(scene, sensor)
@@ -439,3 +443,43 @@ def use_channel(media: list[RgbExtinction], channel: int) -> Iterator[None]:
     finally:
         for medium in media:
             medium.assign(medium.values)
+
+
+# -- Photographs -----------------------------------------------------------------------------------------------------------
+
+
+def render_photographs(
+    scene: SceneSource | mi.Scene | LoadedScene,
+    folder: str | Path,
+    *,
+    sensors: Sequence[int | dict | mi.Sensor] | None = None,
+    test: Sequence[int] = (),
+    **reference: Any,
+) -> list[ReferenceResult]:
+    """Render each view of a scene as a reference, and write the cameras.
+
+    Existing views in the folder are continued or reused, as :func:`render_reference` does.
+
+    Args:
+        scene: as for :func:`render_reference`.
+        folder: created if missing; views are named ``view_000.exr`` and so on.
+        sensors: numbers, dicts or sensors, all perspective; None: all sensors of the scene.
+        test: numbers of the views of the test split.
+        reference: settings of :func:`render_reference`, ``max_depth`` among them.
+
+    Raises:
+        MivolError: a scene without sensors, a sensor that is not perspective, or as :func:`render_reference`.
+    """
+    loaded = scene if isinstance(scene, LoadedScene) else load_scene(scene, reference.pop("overrides", None))
+    looks = list(range(len(loaded.scene.sensors()))) if sensors is None else list(sensors)
+    if not looks:
+        raise MivolError("the scene has no sensor to photograph it with; add one, or give sensors.")
+    names = [f"view_{number:03d}.exr" for number in range(len(looks))]
+    cameras = {name: to_camera(_find_given_sensor(loaded.scene, look), name) for name, look in zip(names, looks, strict=True)}
+    folder = Path(folder)
+    if folder.suffix == ".exr":
+        raise MivolError(f"{folder} names one image for {len(looks)} views; name a folder.")
+    folder.mkdir(parents=True, exist_ok=True)
+    made = [render_reference(loaded, folder / name, sensor=look, **reference) for name, look in zip(names, looks, strict=True)]
+    write_transforms(folder / "transforms.json", cameras, [names[number] for number in test])
+    return made

@@ -13,8 +13,7 @@ import pytest
 from mivol.errors import MivolError
 from mivol.files import encode_srgb
 from mivol.validate.compare import Comparison, compare
-from mivol.validate.images import METRICS, average_scores, quantise, score_image
-from mivol.validate.metrics import nrmse, psnr, ssim
+from mivol.validate.metrics import METRICS, average_scores, nrmse, psnr, quantise, score_image, ssim
 from mivol.validate.reference_file import ReferenceResult, relative_error
 from mivol.validate.statistics import Estimate, Significance, estimate_bias, smallest_detectable_bias, z_bound
 

@@ -10,9 +10,8 @@ import pytest
 from gaussian_sets import random_gaussians
 
 from mivol.errors import MivolError
-from mivol.fields import gaussian_cells
-from mivol.fields.gaussian_cells import CellLists, list_gaussians
-from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, MIN_RELATIVE_SCALE, GaussianField
+from mivol.fields import gaussian_field
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, MIN_RELATIVE_SCALE, CellLists, GaussianField, list_gaussians
 from mivol.fields.gaussian_line import ROW_SIZE, SCALE_COLUMN
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -102,7 +101,7 @@ def cells_of(lists: CellLists, p: np.ndarray) -> np.ndarray:
 def test_a_gaussian_is_listed_wherever_it_reaches(parts: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Points on and inside the ellipsoids lie in cells that list the Gaussian, for any size of chunks."""
     cloud = oracle.Cloud.of(random_gaussians(300, 0))
-    monkeypatch.setattr(gaussian_cells, "MAX_CHUNK_PAIRS", gaussian_cells.MAX_CHUNK_PAIRS if parts == 1 else 1000)
+    monkeypatch.setattr(gaussian_field, "MAX_CHUNK_PAIRS", gaussian_field.MAX_CHUNK_PAIRS if parts == 1 else 1000)
     lists, rng = lists_of(cloud), np.random.default_rng(1)
     assert min(lists.res) > 3
     whitening = cloud.whitening()
@@ -135,6 +134,6 @@ def test_what_cannot_be_listed_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(MivolError, match="no Gaussians were given; at least one is expected"):
         list_gaussians(np.zeros((0, 3)), np.zeros((0, 3, 3)), oracle.REACH)
     cloud = oracle.Cloud.of(random_gaussians(100, 0))
-    monkeypatch.setattr(gaussian_cells, "available_memory", lambda: gaussian_cells.PAIR_BYTES * gaussian_cells.MAX_CHUNK_PAIRS)
+    monkeypatch.setattr(gaussian_field, "available_memory", lambda: gaussian_field.PAIR_BYTES * gaussian_field.MAX_CHUNK_PAIRS)
     with pytest.raises(MivolError, match=r"100 Gaussians reach into \d+ cells each; .* GiB are free: remove the widest"):
         lists_of(cloud)

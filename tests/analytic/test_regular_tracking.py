@@ -17,7 +17,7 @@ from oracle import tau_scale, tau_twin
 from scattering_scenes import PLACE, aimed, rough_grid
 from scipy.special import logit
 
-from mivol.fields import gaussian_cells
+from mivol.fields import gaussian_field
 from mivol.fields.activation import select_activation
 from mivol.fields.gaussian_field import GaussianField
 from mivol.points.gaussians import Gaussians
@@ -130,7 +130,7 @@ FLIGHTS, GAUSSIAN_SCALE = 1 << 16, 0.6
 @pytest.mark.parametrize("cells", [0.5, 50.0])
 def test_flights_end_where_the_depth_of_the_twin_says(cells: float, variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The share of flights ending before t is 1 - exp(-tau(t)), with few and many cells; the other flights are infinite."""
-    monkeypatch.setattr(gaussian_cells, "CELLS_PER_GAUSSIAN", cells)
+    monkeypatch.setattr(gaussian_field, "CELLS_PER_GAUSSIAN", cells)
     rng = np.random.default_rng(0)
     means, scales = np.linspace([-1, 0, 0], [1, 0, 0], 20) + rng.uniform(-0.3, 0.3, (20, 3)), rng.uniform(0.1, 0.4, (20, 3))
     turns, opacities = rng.normal(size=(20, 4)), rng.uniform(0.05, 0.5, 20)

@@ -15,7 +15,7 @@ from readable_figures import assert_readable
 
 from mivol.bench.harness.timing import Timing
 from mivol.bench.studies import points
-from mivol.optim.gaussians.gaussian_start import make_start_cloud
+from mivol.experiments.gaussian_fit import make_start_cloud
 from mivol.photos.transforms import write_transforms
 from mivol.points import Gaussians
 from mivol.splatting import Splatter, to_tensors

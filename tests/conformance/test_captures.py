@@ -13,7 +13,7 @@ from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos import Camera, intrinsics, load_photos, survey_photos
 from mivol.photos.region import MIDDLE, count_levels, middle_box, nested_boxes, points_in_box
-from mivol.validate.images import fit_colours, score_image
+from mivol.validate.metrics import fit_colours, score_image
 
 
 def test_the_middle_box_is_a_cube_around_the_focus() -> None:

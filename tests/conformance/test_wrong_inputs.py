@@ -29,7 +29,7 @@ from mivol.scene.description import parse_dict, parse_file
 from mivol.scene.refusals import check_quadrature
 from mivol.scene.sensors import to_sensor
 from mivol.transport.path.estimators import Settings
-from mivol.validate.images import score_image
+from mivol.validate.metrics import score_image
 from mivol.validate.reference_file import check_identity
 from mivol.validate.statistics import Estimate, p_value, required_batches
 

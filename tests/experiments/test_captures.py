@@ -18,7 +18,7 @@ from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, Radianc
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos.region import middle_box
-from mivol.validate.images import score_image
+from mivol.validate.metrics import score_image
 
 PLAN = replace(
     PRESETS["capture"], stages=(RadianceStage(12, 60, 1, 6, 24), RadianceStage(24, 140, 1, 6, 24)), degree=0, sky=16, levels=4

@@ -13,7 +13,7 @@ from mivol.experiments import judged_views, photo_fit
 from mivol.experiments.film import Film
 from mivol.experiments.fit_kind import NullProgress
 from mivol.points import Gaussians
-from mivol.validate.images import ImageScore
+from mivol.validate.metrics import ImageScore
 
 
 def cloud(n: int = 3) -> Gaussians:

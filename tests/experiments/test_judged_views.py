@@ -18,7 +18,7 @@ from mivol.experiments.judged_views import (
     write_view,
 )
 from mivol.photos import Camera, Photo, intrinsics
-from mivol.validate.images import ImageScore
+from mivol.validate.metrics import ImageScore
 
 
 def photo(name: str, width: int = 4, height: int = 2, value: float = 0.6) -> Photo:

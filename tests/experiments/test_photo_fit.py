@@ -31,7 +31,7 @@ from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photos, intrinsics
 from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
-from mivol.validate.images import score_image
+from mivol.validate.metrics import score_image
 
 SIZE, VIEWS = 48, 20
 

@@ -14,7 +14,7 @@ from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
 from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, intrinsics
-from mivol.validate.images import ImageScore
+from mivol.validate.metrics import ImageScore
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

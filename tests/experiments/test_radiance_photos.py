@@ -26,7 +26,7 @@ from mivol.files import encode_srgb, read_exr, write_exr, write_png
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos.transforms import write_transforms
-from mivol.validate.images import score_image
+from mivol.validate.metrics import score_image
 
 UNIT = 3000.0
 """Radiance of the files: nothing is near 1."""

@@ -14,8 +14,7 @@ from mivol.experiments.projections import Projections
 from mivol.experiments.solver_choice import PLAIN_ITERATIONS, estimate_noise, make_prior, resolve_solver, tv_strength
 from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
-from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.optim.projections.smoothed_tv import scale_tv_to_noise
+from mivol.optim.projections.linear_problems import LeastSquares, scale_tv_to_noise
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector

@@ -17,7 +17,7 @@ from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 from mivol.transport.line_integrals.radiance_field import make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
-from mivol.validate.images import score_image
+from mivol.validate.metrics import score_image
 
 GREY = np.full(3, 0.5, np.float32)
 

@@ -11,12 +11,12 @@ import pytest
 from ball_photos import camera
 
 from mivol.errors import MivolError
+from mivol.experiments.gaussian_fit import make_start_cloud
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Checkpoint
 from mivol.optim.gaussians.density_control import CloudArrays, rotations
 from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan, GaussianStage, check_memory, estimate_bytes, scene_extent
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem, _move_randomly
-from mivol.optim.gaussians.gaussian_start import make_start_cloud
 from mivol.optim.loop import Fit, begin_fit, reconstruct
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo

@@ -12,8 +12,7 @@ import scipy.sparse.linalg
 from small_scan import GRID, VIEWS, Views, problem_for, run
 
 from mivol.optim.projections.iterative import _Counts
-from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState
-from mivol.optim.projections.smoothed_tv import SmoothedTV
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SmoothedTV, SolverState
 from mivol.optim.projections.solvers import SOLVERS
 
 

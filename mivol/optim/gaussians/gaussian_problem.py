@@ -30,7 +30,7 @@ from mivol.optim.gaussians.density_control import (
     select_rows,
 )
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, scene_extent
-from mivol.optim.gaussians.image_difference import ImageShape, image_loss
+from mivol.optim.losses import ImageShape, image_loss
 from mivol.optim.photographs.exposure import Exposure
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.problem import Reals, Refinement

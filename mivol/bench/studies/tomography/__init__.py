@@ -40,8 +40,7 @@ from mivol.bench.harness.study import Size, Study, amount
 from mivol.bench.harness.timing import Stopwatch, fastest
 from mivol.bench.studies.tomography.peers import error_rows, measure_peers, measure_tooth, ratio_rows
 from mivol.files import read_volume
-from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.optim.projections.smoothed_tv import SmoothedTV
+from mivol.optim.projections.linear_problems import LeastSquares, SmoothedTV
 from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid, tigre_cone_beam
 from mivol.tomography.phantoms import shepp_logan
