@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from mivol.errors import MivolError
@@ -56,20 +57,22 @@ def available_memory() -> int | None:
     return int(min(system, second, first))
 
 
-def check_memory(needed: float, what: str, way_out: str) -> None:
+def check_memory(needed: float, what: str, way_out: str | Callable[[float], str], limit: float | None = None) -> None:
     """Refuse a task with more memory than available, before its start.
 
     Args:
         needed: memory of the task [bytes].
         what: subject of the sentence, for instance "a fit of 256^3 voxels".
-        way_out: advice in the imperative.
+        way_out: advice in the imperative, or a function of the free memory [bytes] that returns the advice.
+        limit: memory to count as free [bytes]; None: :func:`available_memory`.
 
     Raises:
         MivolError: the task needs more than the free memory.
     """
-    free = available_memory()
+    free = available_memory() if limit is None else limit
     if free is not None and needed > free:
-        raise MivolError(f"{what} needs {needed / 2**30:,.1f} GiB of memory and {free / 2**30:,.1f} GiB are free: {way_out}.")
+        advice = way_out if isinstance(way_out, str) else way_out(free)
+        raise MivolError(f"{what} needs {needed / 2**30:,.1f} GiB of memory and {free / 2**30:,.1f} GiB are free: {advice}.")
 
 
 def _group_memory(limit: str, usage: str, stat: str) -> float:

@@ -34,7 +34,7 @@ from mivol.errors import MivolError
 from mivol.fields.gaussian_line import REACH, ROW_SIZE, WhitenedLine, intersect_gaussian, read_row
 from mivol.fields.harmonics import SPACES, harmonic_degree, local_frame, pack_harmonics, rotate_direction
 from mivol.fields.protocol import EXACT_LINE
-from mivol.machine import available_memory
+from mivol.machine import check_memory
 from mivol.points.gaussian_files import read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.space import check_affine
@@ -365,12 +365,9 @@ def _find_touched_cells(
 
 def _check_memory(counts: np.ndarray) -> None:
     """Refuse lists that exceed the free memory, counting all entries and one chunk of pairs."""
-    needed, free = ENTRY_BYTES * int(counts.sum()) + PAIR_BYTES * (MAX_CHUNK_PAIRS + int(counts.max())), available_memory()
-    if free is not None and needed > free:
-        raise MivolError(
-            f"{len(counts)} Gaussians reach into {counts.mean():.0f} cells each; their lists take {needed / 2**30:.1f} GiB, "
-            f"where {free / 2**30:.1f} GiB are free: remove the widest of them, which reaches into {counts.max()} cells."
-        )
+    needed = ENTRY_BYTES * int(counts.sum()) + PAIR_BYTES * (MAX_CHUNK_PAIRS + int(counts.max()))
+    what = f"a table of {len(counts)} Gaussians, which reach into {counts.mean():.0f} cells each,"
+    check_memory(needed, what, f"remove the widest of them, which reaches into {counts.max()} cells")
 
 
 MAX_CHUNK_PAIRS = 1 << 21

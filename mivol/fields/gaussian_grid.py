@@ -47,7 +47,7 @@ from mivol.errors import MivolError
 from mivol.fields.gaussian_field import MAX_CHUNK_PAIRS, MAX_OPACITY, find_chunk_starts, list_box_nodes
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
-from mivol.machine import available_memory
+from mivol.machine import check_memory
 from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, Gaussians
 
 DEPOSIT_REACH = 4.0
@@ -141,13 +141,12 @@ def _check_grid_memory(size: np.ndarray, basis: int, resolution: int) -> None:
     """Refuse a grid that exceeds the free memory, counting sums, the field, and the pairs of one wide Gaussian."""
     pairs = PAIR_BYTES * MAX_CHUNK_PAIRS
     needed = (16 * (1 + 3 * basis) + PAIR_BYTES) * int(np.prod(size)) + pairs
-    free = available_memory()
-    if free is not None and needed > free:
+
+    def advise(free: float) -> str:
         fitting = int(resolution * max((free - pairs) / (needed - pairs), 0) ** (1 / 3))
-        raise MivolError(
-            f"A grid of {size[0]} x {size[1]} x {size[2]} nodes and {basis} harmonics takes {needed / 2**30:.1f} GiB, and "
-            f"{free / 2**30:.1f} GiB are free; a resolution of at most {fitting} fits."
-        )
+        return f"a resolution of at most {fitting} fits"
+
+    check_memory(needed, f"a grid of {size[0]} x {size[1]} x {size[2]} nodes and {basis} harmonics", advise)
 
 
 TENT_VARIANCE = 1 / 6

@@ -37,7 +37,7 @@ from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
 from mivol.files.mesh import Mesh
-from mivol.machine import available_memory
+from mivol.machine import check_memory
 from mivol.photos import Camera, project
 
 
@@ -218,13 +218,12 @@ VOXEL_BYTES = 64
 
 
 def _check_memory(extent: np.ndarray, resolution: int) -> None:
-    needed, free = VOXEL_BYTES * resolution**3 * float(np.prod(extent / extent.max())), available_memory()
-    if free is not None and needed > free:
-        fitting = int(resolution * (free / needed) ** (1 / 3))
-        raise MivolError(
-            f"A grid of {resolution} voxels along the longest edge takes {needed / 2**30:.1f} GiB, and {free / 2**30:.1f} GiB "
-            f"are free; a resolution of at most {fitting} fits."
-        )
+    needed = VOXEL_BYTES * resolution**3 * float(np.prod(extent / extent.max()))
+
+    def advise(free: float) -> str:
+        return f"a resolution of at most {int(resolution * (free / needed) ** (1 / 3))} fits"
+
+    check_memory(needed, f"a grid of {resolution} voxels along the longest edge", advise)
 
 
 class _FusedDepths:

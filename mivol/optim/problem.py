@@ -1,10 +1,10 @@
-r"""Protocols of problems: methods of a model with data, for the fit loop, optimizers and events.
+r"""Problems: methods of a model with data, for the fit loop, optimizers and events.
 
 .. math:: \min_u f(u), \qquad f(u) = \mathrm{loss}(x(u)) + \mathrm{energy}(x(u))
 
 Conventions. ``u`` are the *reals*, tensors by the name of their parameter; the model maps reals to values ``x``. A scene with
 images, a radiance field with rays of photographs, Gaussians with photographs, and a volume with projections are problems. A
-network or a hash grid would be another class with these methods, and an event for changes of shape.
+network or a hash grid would be another subclass, and an event for changes of shape.
 
 Iteration i depends on the reals, on the arrays of :meth:`Problem.pack`, and on i. All random numbers are a function of the
 problem's seed and i.
@@ -45,12 +45,14 @@ class Problem(Protocol):
 
     def warning(self) -> str:
         """A sentence about the noise of the latest loss, or ""."""
+        return ""
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
         """Inputs of the next step beside the reals, as the nodes of a sparse field.
 
         State rebuilt by :meth:`unpack` is rebuilt here as well: a resumed run then equals an uninterrupted run.
         """
+        return {}
 
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
         """Continue from the arrays of :meth:`pack`, with the reals of the same moment."""

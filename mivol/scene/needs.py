@@ -21,7 +21,7 @@ from mivol.scene.description import check_variant
 from mivol.scene.media_light import MediaLight, read_media_light
 from mivol.scene.nesting import OrientedBox, shape_bounds
 from mivol.scene.readings import GridReading, check_constants, check_emission, is_scattering, read_extinction
-from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, find_outside_media, is_instance, survey_scene
+from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, ShapeFacts, find_outside_media, is_instance, survey_scene
 from mivol.scene_graph import list_values, traverse
 from mivol.transport.estimators.lighting.emitters import find_bounding_ball
 from mivol.transport.media.body import Body
@@ -59,17 +59,11 @@ def find_needs(
         for b, view in zip(boundaries, views, strict=True)
     )
     needs = Needs(
+        **vars(survey.facts),
         variant=mi.variant(),
         boundaries=boundaries,
         views=views,
         media=media,
-        surfaces=survey.surfaces,
-        has_null_transmission=survey.has_null_transmission,
-        emitters=survey.emitters,
-        emitter_kinds=survey.emitter_kinds,
-        are_emitters_far=survey.are_emitters_far,
-        refractive=survey.refractive,
-        is_sealed=survey.is_sealed,
         start=sensor.get_medium(),
         camera_inside=_may_camera_be_inside(scene, sensor, survey),
         parameters=differentiated,
@@ -165,7 +159,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
     reads = [read_extinction(p, survey, boundary.name) for p in view.parts if p.lattice is not None]
     occupied = min((r.occupied for r in reads), default=1.0)
     scatters = survey.scatters[boundary.name] = is_scattering(view, survey, boundary.name)
-    if scatters and survey.are_emitters_far and common["mean_cosine"] is None:
+    if scatters and survey.facts.are_emitters_far and common["mean_cosine"] is None:
         # Read once: if a fit changes the phase function, side flights stay unbiased.
         common["mean_cosine"] = survey.cosines[boundary.name] = mean_cosine(phase)
     return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_bound_optical_depth(boundary, view, reads))
@@ -247,8 +241,8 @@ class MediumFacts:
         )
 
 
-@dataclass(frozen=True)
-class Needs:
+@dataclass(frozen=True, kw_only=True)
+class Needs(ShapeFacts):
     """The facts of a scene.
 
     Attributes:
@@ -256,15 +250,6 @@ class Needs:
         boundaries: the media with their boundaries.
         views: the extinction of each boundary's medium, with gradients.
         media: the facts of each boundary's medium.
-        surfaces: class names of the shapes that are more than boundaries.
-        has_null_transmission: whether a surface passes light undeviated and is more than a boundary.
-        emitters: class names of the emitters.
-        emitter_kinds: kind of each emitter: ``uniform`` (environment of one radiance), ``delta`` (one position or direction)
-            or ``extended``.
-        are_emitters_far: whether all emitters are at infinity, and at least one emitter is not ``uniform``.
-        refractive: names of the boundaries that refract or blur transmitted light.
-        is_sealed: whether every medium lies behind refracting boundaries without undeviated light, with all emitters outside
-            and hittable by paths. Emitter sampling then finds no light from inside a medium.
         start: medium named by the sensor.
         camera_inside: whether the camera may be inside the box around a boundary.
         parameters: keys of the parameters with gradients enabled.
@@ -283,13 +268,6 @@ class Needs:
     boundaries: tuple[Boundary, ...]
     views: tuple[MediumView, ...]
     media: tuple[MediumFacts, ...]
-    surfaces: tuple[str, ...]
-    has_null_transmission: bool
-    emitters: tuple[str, ...]
-    emitter_kinds: tuple[str, ...]
-    are_emitters_far: bool
-    refractive: tuple[str, ...]
-    is_sealed: bool
     start: mi.Medium | None
     camera_inside: bool
     parameters: tuple[str, ...]

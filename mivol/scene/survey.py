@@ -21,13 +21,38 @@ OUTSIDE_SHAPES = "space around shapes"
 """Class of shape of a medium that fills no shape."""
 
 
-@dataclass
-class SceneSurvey:
-    """The facts about shapes and emitters, and a cache of values read from arrays.
+@dataclass(frozen=True, kw_only=True)
+class ShapeFacts:
+    """The facts about shapes and emitters.
 
     Attributes:
-        boundaries, surfaces, has_null_transmission, emitters, emitter_kinds, are_emitters_far, refractive, is_sealed: as in
-            :class:`mivol.scene.needs.Needs`.
+        surfaces: class names of the shapes that are more than boundaries.
+        has_null_transmission: whether a surface passes light undeviated and is more than a boundary.
+        emitters: class names of the emitters.
+        emitter_kinds: kind of each emitter: ``uniform`` (environment of one radiance), ``delta`` (one position or direction)
+            or ``extended``.
+        are_emitters_far: whether all emitters are at infinity, and at least one emitter is not ``uniform``.
+        refractive: names of the boundaries that refract or blur transmitted light.
+        is_sealed: whether every medium lies behind refracting boundaries without undeviated light, with all emitters outside
+            and hittable by paths. Emitter sampling then finds no light from inside a medium.
+    """
+
+    surfaces: tuple[str, ...] = ()
+    has_null_transmission: bool = False
+    emitters: tuple[str, ...] = ()
+    emitter_kinds: tuple[str, ...] = ()
+    are_emitters_far: bool = False
+    refractive: tuple[str, ...] = ()
+    is_sealed: bool = False
+
+
+@dataclass
+class SceneSurvey:
+    """The media of a scene, the facts about shapes and emitters, and a cache of values read from arrays.
+
+    Attributes:
+        boundaries: the media with their boundaries.
+        facts: the facts about shapes and emitters.
         marks: placement of each boundary: the array of its vertices, or its box.
         size: diagonal of the box around all shapes [length].
         looked_up: stock grids whose interpolation agrees with mivol's, by pointer.
@@ -45,13 +70,7 @@ class SceneSurvey:
     """
 
     boundaries: tuple[Boundary, ...]
-    surfaces: tuple[str, ...]
-    has_null_transmission: bool
-    emitters: tuple[str, ...]
-    emitter_kinds: tuple[str, ...]
-    are_emitters_far: bool
-    refractive: tuple[str, ...]
-    is_sealed: bool = False
+    facts: ShapeFacts
     marks: tuple[tuple[mi.Shape, object], ...] = ()
     size: float = 1.0
     looked_up: set = field(default_factory=set)
@@ -94,7 +113,6 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
             surfaces.append(shape.class_name())
             # The shapes of an instance have other BSDFs than the instance itself.
             has_null |= is_instance(shape) or mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
-    names = tuple(e.class_name() for e in scene.emitters())
     # Mitsuba merges equal media into one object: if a boundary of a medium is traced, all its boundaries are.
     traced = {b.medium.ptr for b in boundaries if b.box is None}
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
@@ -108,20 +126,17 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     # A medium that also surrounds a shape has no known end.
     boundaries = [replace(b, around=None) if b.medium.ptr in exteriors else b for b in boundaries]
     boundaries = [part for boundary in boundaries for part in _split_levels(boundary)] + around
-    kinds = tuple(_emitter_kind(e) for e in scene.emitters())
     marks = tuple((s, _read_placement(s)) for s in shapes if s.is_medium_transition())
-    return SceneSurvey(
-        tuple(boundaries),
-        tuple(surfaces),
-        bool(has_null),
-        names,
-        kinds,
-        _are_emitters_far(scene.emitters()),
-        tuple(refractive),
-        _are_sealed(boundaries, shapes, scene.emitters()),
-        marks,
-        scene_diagonal(scene),
+    facts = ShapeFacts(
+        surfaces=tuple(surfaces),
+        has_null_transmission=bool(has_null),
+        emitters=tuple(e.class_name() for e in scene.emitters()),
+        emitter_kinds=tuple(_emitter_kind(e) for e in scene.emitters()),
+        are_emitters_far=_are_emitters_far(scene.emitters()),
+        refractive=tuple(refractive),
+        is_sealed=_are_sealed(boundaries, shapes, scene.emitters()),
     )
+    return SceneSurvey(tuple(boundaries), facts, marks, scene_diagonal(scene))
 
 
 def _read_placement(shape: mi.Shape) -> object:

@@ -157,9 +157,30 @@ class PencilRays:
         return self.o[index][:, None, None], self.d[index][:, None, None]
 
 
+class _TurningDetector:
+    """A flat detector that turns with the beam about the z axis."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(views, rows, columns)."""
+        return len(self.angles), *self.detector
+
+    @property
+    def u(self) -> np.ndarray:
+        """Position of each column [length] from the rotation axis, for a cone beam from its foot on the detector."""
+        columns = self.detector[1]
+        return (np.arange(columns) - (columns - 1) / 2) * self.pitch[1] + self.detector_offset[1] - self.axis_offset
+
+    @property
+    def v(self) -> np.ndarray:
+        """Position of each row on the detector [length] from z = 0, for a cone beam from the central ray."""
+        rows = self.detector[0]
+        return (np.arange(rows) - (rows - 1) / 2) * self.pitch[0] + self.detector_offset[0]
+
+
 @with_short_repr
 @dataclass(frozen=True, eq=False)
-class ParallelBeam:
+class ParallelBeam(_TurningDetector):
     """Parallel light and a flat detector, turning together about the z axis.
 
     Args:
@@ -181,11 +202,6 @@ class ParallelBeam:
     def __post_init__(self) -> None:
         _check_detector(self)
 
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(views, rows, columns)."""
-        return len(self.angles), *self.detector
-
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Points of the lines nearest the rotation axis, and unit directions, each (views, rows, cols, 3) float64."""
         u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
@@ -195,16 +211,6 @@ class ParallelBeam:
         o[..., 2] = v_of_row[:, None]
         return o, np.broadcast_to(w[:, None, None, :], o.shape)
 
-    @property
-    def u(self) -> np.ndarray:
-        """Position of each column [length], from the rotation axis."""
-        return _pixel_centres(self)[1]
-
-    @property
-    def v(self) -> np.ndarray:
-        """Position of each row [length], from z = 0."""
-        return _pixel_centres(self)[0]
-
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
         """The detector's plane through the axis; ``source`` is the direction of the light."""
         u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
@@ -213,7 +219,7 @@ class ParallelBeam:
 
 @with_short_repr
 @dataclass(frozen=True, eq=False)
-class ConeBeam:
+class ConeBeam(_TurningDetector):
     """A point source and a flat detector on circles about the z axis.
 
     Args:
@@ -244,11 +250,6 @@ class ConeBeam:
             )
         _check_detector(self)
 
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(views, rows, columns)."""
-        return len(self.angles), *self.detector
-
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The source, and unit directions towards the pixel centres, each (views, rows, cols, 3) float64."""
         u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
@@ -259,16 +260,6 @@ class ConeBeam:
         d[..., 2] = v_of_row[:, None]
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
         return np.broadcast_to(source[:, None, None, :], d.shape), d
-
-    @property
-    def u(self) -> np.ndarray:
-        """Position of each column on the detector [length], from the foot of the rotation axis' plane."""
-        return _pixel_centres(self)[1]
-
-    @property
-    def v(self) -> np.ndarray:
-        """Position of each row on the detector [length], from the central ray."""
-        return _pixel_centres(self)[0]
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
         """Source and detector of each view."""
@@ -359,14 +350,6 @@ def _to_counts(given: object) -> tuple[int, ...]:
 def _beam_axes(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     c, s, zero = np.cos(angles), np.sin(angles), np.zeros_like(angles)
     return np.stack([c, s, zero], -1), np.stack([-s, c, zero], -1)
-
-
-def _pixel_centres(beam: ParallelBeam | ConeBeam) -> tuple[np.ndarray, np.ndarray]:
-    """(v of each row, u of each column) in the frame whose origin is the rotation axis [length]."""
-    (rows, cols), (pitch_v, pitch_u), (shift_v, shift_u) = beam.detector, beam.pitch, beam.detector_offset
-    v = (np.arange(rows) - (rows - 1) / 2) * pitch_v + shift_v
-    u = (np.arange(cols) - (cols - 1) / 2) * pitch_u + shift_u - beam.axis_offset
-    return v, u
 
 
 def _make_read_only(a: np.ndarray) -> np.ndarray:

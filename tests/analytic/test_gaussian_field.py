@@ -134,6 +134,6 @@ def test_what_cannot_be_listed_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(MivolError, match="no Gaussians were given; at least one is expected"):
         list_gaussians(np.zeros((0, 3)), np.zeros((0, 3, 3)), oracle.REACH)
     cloud = oracle.Cloud.of(random_gaussians(100, 0))
-    monkeypatch.setattr(gaussian_field, "available_memory", lambda: gaussian_field.PAIR_BYTES * gaussian_field.MAX_CHUNK_PAIRS)
-    with pytest.raises(MivolError, match=r"100 Gaussians reach into \d+ cells each; .* GiB are free: remove the widest"):
+    monkeypatch.setattr("mivol.machine.available_memory", lambda: gaussian_field.PAIR_BYTES * gaussian_field.MAX_CHUNK_PAIRS)
+    with pytest.raises(MivolError, match=r"100 Gaussians, which reach into \d+ cells each, .* GiB are free: remove the widest"):
         lists_of(cloud)

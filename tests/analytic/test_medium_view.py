@@ -10,7 +10,7 @@ import pytest
 
 import scenes
 from mivol.scene.readings import is_scattering
-from mivol.scene.survey import SceneSurvey
+from mivol.scene.survey import SceneSurvey, ShapeFacts
 from mivol.transport.media import medium_view
 from mivol.transport.media.extinction import ConstantExtinction
 from mivol.transport.media.grid_extinction import GridExtinction
@@ -95,7 +95,7 @@ def test_our_grid_knows_its_place():
 
 
 def scatters(description: dict) -> bool:
-    return is_scattering(view_medium(mi.load_dict(description)), SceneSurvey((), (), False, (), (), False, ()), "box")
+    return is_scattering(view_medium(mi.load_dict(description)), SceneSurvey((), ShapeFacts()), "box")
 
 
 def test_a_medium_that_scatters_says_so():

@@ -133,7 +133,7 @@ def test_what_cannot_be_a_grid_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(MivolError, match="nothing to put a box around"):
         gaussian_box(one().select(slice(0)))
     free = gaussian_grid.PAIR_BYTES * gaussian_grid.MAX_CHUNK_PAIRS + (16 * 13 + gaussian_grid.PAIR_BYTES) * 50**3
-    monkeypatch.setattr(gaussian_grid, "available_memory", lambda: free + 1)
+    monkeypatch.setattr("mivol.machine.available_memory", lambda: free + 1)
     with pytest.raises(MivolError, match="a resolution of at most 50 fits"):
         gaussians_to_grid(one(), low, high, 100)
 

@@ -56,7 +56,7 @@ def test_emitters_are_drawn_where_a_straight_ray_may_find_one(name: str) -> None
     eye = scenes.camera((2.0, 1.5, 6.0), (0.0, 0.0, 0.0), res=2)
     scene = mi.load_dict({"type": "scene", **parts, "sensor": eye})
     survey, settings = survey_scene(scene), Settings(max_depth=-1)
-    assert survey.is_sealed == sealed
+    assert survey.facts.is_sealed == sealed
     needs = find_needs(scene, scene.sensors()[0], survey)
     if not needs.media:
         return

@@ -7,7 +7,6 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.experiments.gaussian_conversion import cameras_around
-from mivol.fields import surfaces
 from mivol.fields.surfaces import DepthView, fuse_depths
 from mivol.photos import pixel_centres, rays
 
@@ -81,7 +80,7 @@ def test_what_has_no_surface_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
             fuse_depths([], low, high, resolution)
     with pytest.raises(MivolError, match="no surface was seen"):
         fuse_depths(nothing, LOW, HIGH, 8)
-    monkeypatch.setattr(surfaces, "available_memory", lambda: 64 * 100**3)
+    monkeypatch.setattr("mivol.machine.available_memory", lambda: 64 * 100**3)
     # (1.6 / 1.7)^2 of the cube of 1000^3: 100 / that^(1/3) = 104
     with pytest.raises(MivolError, match="a resolution of at most 104 fits"):
         fuse_depths(nothing, LOW, HIGH, 1000)

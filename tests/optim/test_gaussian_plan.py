@@ -102,14 +102,14 @@ def test_memory_is_described_and_checked(variant_rgb: str) -> None:
     said = f"about {needed / 2**20:.0f} MiB: photographs 3, Gaussians and an image the rest"
     assert check_memory(PLAN, pictures, pixels, needed) == check_memory(PLAN, pictures, pixels) == said
     assert check_memory(replace(PLAN, start=900, most=1), pictures, pixels, needed) == said
-    wanted = "a fit of 900 Gaussians needs about 0.0 GiB, 0.0 are available: gaussians.most = 899 fits."
+    wanted = "a fit of 900 Gaussians needs 0.0 GiB of memory and 0.0 GiB are free: gaussians.most = 899 fits."
     with pytest.raises(MivolError) as refused:
         check_memory(PLAN, pictures, pixels, needed - 1)
     assert str(refused.value) == wanted
     with pytest.raises(MivolError, match=r"read the photographs smaller \(photos.scale\)"):
         check_memory(PLAN, pictures, pixels, pictures + estimate_bytes(PLAN, 1, pixels))
     large = 1 << 40
-    with pytest.raises(MivolError, match=r"needs about 1024\.0 GiB, 2\.0 are available: read the photographs smaller"):
+    with pytest.raises(MivolError, match=r"needs 1,024\.0 GiB of memory and 2\.0 GiB are free: read the photographs smaller"):
         check_memory(PLAN, large, 0, 2 << 30)
 
 

@@ -17,8 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.errors import MivolError
-from mivol.machine import available_memory
+from mivol import machine
 from mivol.optim.events import CoarseToFine, ControlDensity, Event
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course
@@ -268,11 +267,11 @@ def check_memory(plan: GaussianPlan, photographs: int, pixels: int, limit: int |
     """
     most = max(plan.most, plan.start)
     needed = photographs + estimate_bytes(plan, most, pixels)
-    if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
-        limit = available_memory()
-    if limit is not None and needed > limit:
-        each, rest = estimate_bytes(plan, 1, 0), limit - photographs - estimate_bytes(plan, 0, pixels)
-        advice = f"gaussians.most = {rest // each} fits" if rest > each else "read the photographs smaller (photos.scale)"
-        taken, left = f"{needed / 2**30:.1f} GiB", f"{limit / 2**30:.1f}"
-        raise MivolError(f"a fit of {most} Gaussians needs about {taken}, {left} are available: {advice}.")
+
+    def advise(free: float) -> str:
+        each, rest = estimate_bytes(plan, 1, 0), free - photographs - estimate_bytes(plan, 0, pixels)
+        return f"gaussians.most = {rest // each:.0f} fits" if rest > each else "read the photographs smaller (photos.scale)"
+
+    if limit is not None or dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
+        machine.check_memory(needed, f"a fit of {most} Gaussians", advise, limit)
     return f"about {needed / 2**20:.0f} MiB: photographs {photographs / 2**20:.0f}, Gaussians and an image the rest"

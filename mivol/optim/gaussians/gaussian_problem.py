@@ -33,7 +33,7 @@ from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, scene_ex
 from mivol.optim.losses import ImageShape, image_loss
 from mivol.optim.photographs.exposure import Exposure
 from mivol.optim.photographs.ray_batches import RayBatches
-from mivol.optim.problem import Reals, Refinement
+from mivol.optim.problem import Reals, Refinement, StagedProblem
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera
 from mivol.splatting import Splatter
@@ -47,7 +47,7 @@ RESET_TO = 0.01
 
 
 @dataclasses.dataclass
-class GaussianProblem:
+class GaussianProblem(StagedProblem):
     """Gaussians with photographs.
 
     Attributes:
@@ -276,10 +276,6 @@ class GaussianProblem:
         drawn = np.random.default_rng((self.seed, 4, iteration)).standard_normal((n, 3)).astype(np.float32)
         size = dr.opaque(mi.Float, self.plan.position_noise * self.learning_rates(iteration)["means"])
         return {**reals, "means": _move_randomly(reals, mi.Float(drawn.ravel()), size)}
-
-    def warning(self) -> str:
-        """Always empty: renders have no noise."""
-        return ""
 
     # -- Density ------------------------------------------------------------------------------------------------------
 

@@ -14,9 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.errors import MivolError
+from mivol import machine
 from mivol.fields.harmonics import basis_size, row_width
-from mivol.machine import available_memory
 from mivol.optim.events import CoarseToFine, DropUnseen, Event, UpdateOccupancy
 from mivol.optim.first_order import RMSprop
 from mivol.optim.loop import Course
@@ -343,14 +342,14 @@ def check_memory(plan: RadiancePlan, box: np.ndarray, batches: RayBatches, limit
         return batches.bytes + max(estimate_bytes(plan, stage, box) for stage in plan.stages)
 
     most, last = needed(plan), plan.stages[-1]
-    if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
-        limit = available_memory()
-    if limit is not None and most > limit:
+
+    def advise(free: float) -> str:
         # Memory never falls with the number of nodes, so bisection finds the largest fit even below 2^31 nodes.
-        fitting = 7 + bisect.bisect_right(range(8, last.longest), limit, key=lambda n: needed(plan.with_longest(n)))
-        advice = f"longest = {fitting} fits" if fitting > 7 else "no resolution fits: read the photographs smaller"
-        taken, left = f"{most / 2**30:.1f} GiB", f"{limit / 2**30:.1f}"
-        raise MivolError(f"a fit with {last.longest} nodes along an edge needs about {taken}, {left} are available: {advice}.")
+        fitting = 7 + bisect.bisect_right(range(8, last.longest), free, key=lambda n: needed(plan.with_longest(n)))
+        return f"longest = {fitting} fits" if fitting > 7 else "no resolution fits: read the photographs smaller"
+
+    if limit is not None or dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
+        machine.check_memory(most, f"a fit with {last.longest} nodes along an edge", advise, limit)
     first = estimate_bytes(plan, plan.stages[0], box)
     return (
         f"about {most / 2**20:.0f} MiB: photographs {batches.bytes / 2**20:.0f}, the first grid {first / 2**20:.0f}, "

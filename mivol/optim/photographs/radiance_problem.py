@@ -37,7 +37,7 @@ from mivol.optim.photographs.exposure import AGREE, RATE, Exposure
 from mivol.optim.photographs.radiance_plan import RadiancePlan, place_grid
 from mivol.optim.photographs.ray_batches import RayBatch, RayBatches
 from mivol.optim.priors import Neighbours, Rows
-from mivol.optim.problem import Reals, Refinement
+from mivol.optim.problem import Reals, Refinement, SparseProblem
 from mivol.transport.line_integrals.radiance_field import (
     Model,
     RayGradient,
@@ -52,7 +52,7 @@ from mivol.transport.traversal.occupied_cells import OccupiedCells
 
 
 @dataclasses.dataclass
-class RadianceProblem:
+class RadianceProblem(SparseProblem):
     """A radiance field in a box, with photographs.
 
     Attributes:
@@ -261,10 +261,6 @@ class RadianceProblem:
             "density": Rows(1, self._neighbours, density, self.unit, self._first_row, iteration),
             "harmonics": Rows(self.field.width, self._neighbours, self.scale.rate * sh, 1.0, self._first_row, iteration),
         }
-
-    def warning(self) -> str:
-        """Always empty: pixel sampling adds noise but no bias."""
-        return ""
 
     # -- Stages -------------------------------------------------------------------------------------------------------
 

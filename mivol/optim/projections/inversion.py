@@ -18,7 +18,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.optimizer import Optimizer, OptimizerRun
-from mivol.optim.problem import Reals
+from mivol.optim.problem import Problem, Reals
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.optim.strategy import setting
@@ -29,8 +29,8 @@ KEY = "x"
 
 
 @dataclass
-class ProjectionProblem:
-    """A volume and its projections.
+class ProjectionProblem(Problem):
+    """A volume and its projections. The state of the solver is complete, so there is nothing to pack.
 
     Attributes:
         linear_problem: the problem of line integrals.
@@ -55,17 +55,6 @@ class ProjectionProblem:
     def values(self) -> Reals:
         """The reconstructed volume."""
         return {} if self.x is None else {KEY: self.x}
-
-    def warning(self) -> str:
-        """Always empty: projections are computed without noise."""
-        return ""
-
-    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
-        """An empty dictionary: the solver's state is complete."""
-        return {}
-
-    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
-        """Do nothing."""
 
 
 class LinearSolve(Optimizer, tag="solve"):

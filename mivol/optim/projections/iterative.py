@@ -17,8 +17,8 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.optim.projections.linear_problems import (
     LeastSquares,
-    Penalty,
     PoissonCounts,
+    SmoothedTV,
     SolverState,
     apply_weights,
     dot,
@@ -261,7 +261,7 @@ class _Counts:
     y: np.ndarray
     blank: np.ndarray
     background: np.ndarray
-    prior: Penalty | None
+    prior: SmoothedTV | None
     used: np.ndarray | float = 1.0
 
     @classmethod

@@ -16,24 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from mivol.errors import MivolError
 from mivol.tomography.projector import Projector
-
-
-class Penalty(Protocol):
-    """A convex penalty with a quadratic majoriser that touches the penalty at x."""
-
-    def value(self, x: np.ndarray) -> float: ...
-    def gradient(self, x: np.ndarray) -> np.ndarray: ...
-    def curvature(self, x: np.ndarray, p: np.ndarray) -> float:
-        """Second derivative of the majoriser at ``x``, along ``p``."""
-
-    def separable(self, x: np.ndarray) -> np.ndarray:
-        """Diagonal of a separable quadratic that majorises the majoriser."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +42,7 @@ class LeastSquares:
     weights: np.ndarray | None = None
     x0: np.ndarray | None = None
     nonnegative: bool = False
-    prior: Penalty | None = None
+    prior: SmoothedTV | None = None
 
     def __post_init__(self) -> None:
         check_sizes(self.A, self.x0, b=self.b, weights=self.weights)
@@ -81,7 +69,7 @@ class PoissonCounts:
     blank: np.ndarray | float
     background: np.ndarray | float = 0.0
     x0: np.ndarray | None = None
-    prior: Penalty | None = None
+    prior: SmoothedTV | None = None
     used: np.ndarray | None = None
 
     def __post_init__(self) -> None:

@@ -112,7 +112,7 @@ def make_noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[],
     if session.settings.scatterings == 0:
         return lambda: False
     survey = survey_scene(scene)
-    if survey.surfaces:
+    if survey.facts.surfaces:
         return lambda: True
     if session.settings.deterministic:
         return lambda: False

@@ -25,7 +25,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.optim.losses import L2, FunctionLoss, Loss, to_loss
 from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
-from mivol.optim.problem import Reals
+from mivol.optim.problem import LinearizableProblem, Reals
 from mivol.optim.scenes.render_noise import Comparison, compare_with_reference, describe_noise, make_noise_check, split_samples
 from mivol.optim.scenes.views import (
     ADJOINT,
@@ -42,7 +42,7 @@ from mivol.scene_graph import traverse
 
 
 @dataclass(repr=False)
-class SceneProblem:
+class SceneProblem(LinearizableProblem):
     """A scene, reference images, and the parameters to fit.
 
     Attributes:
@@ -283,15 +283,7 @@ class SceneProblem:
         """The problem around ``reals``, with the random numbers of iteration 0."""
         return Linearization(self, reals)
 
-    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
-        """An empty dictionary: the reals determine the scene's values."""
-        return {}
-
-    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
-        """Do nothing: every method takes the reals."""
-
     def warning(self) -> str:
-        """A sentence about the noise of the latest loss, or ""."""
         return describe_noise(self.loss, *self.newest_loss)
 
     def energy(self, reals: Reals) -> float:
