@@ -12,7 +12,7 @@ import importlib
 import warnings
 from typing import TYPE_CHECKING
 
-from . import cuda, llvm
+from . import llvm
 
 llvm.choose_library()
 
@@ -21,7 +21,7 @@ try:
 except (ImportError, NameError) as error:  # a NameError is how Dr.Jit 1.5 reports that its own library does not load
     raise ImportError(llvm.missing_system_library() or f"Mitsuba cannot be imported: {error}") from error
 
-from . import plugins  # noqa: E402
+from . import back_end, plugins  # noqa: E402
 from .errors import MivolError, reveal_refusals  # noqa: E402
 
 __version__ = "0.1.0"
@@ -105,14 +105,14 @@ def __dir__() -> list[str]:
 
 def _on_variant_change(old: str | None, new: str) -> None:
     llvm.check_backend(new)
-    cuda.spill_to_local_memory(new)
+    back_end.spill_to_local_memory(new)
     importlib.reload(plugins)
 
 
 mi.detail.add_variant_callback(_on_variant_change)
 mi.render = mi.util.render = reveal_refusals(mi.render)
 
-cuda.spill_to_local_memory()
+back_end.spill_to_local_memory()
 try:
     llvm.check_backend()
 except llvm.LlvmError as error:

@@ -12,7 +12,7 @@ from syntax import tree_of
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
-    *("errors", "display", "cite", "threads", "machine", "llvm", "cuda", "kernel_recording", "scene_graph", "numerics"),
+    *("errors", "display", "cite", "threads", "machine", "llvm", "back_end", "kernel_recording", "scene_graph", "numerics"),
     *("space", "files", "photos", "points", "fields", "phase"),
     *("transport", "splatting", "tomography", "scene", "plugins", "optim", "validate", "report", "schema", "config", "doctor"),
     *("experiments", "bench", "cli", "__main__"),

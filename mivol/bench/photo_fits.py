@@ -24,7 +24,7 @@ from mivol.bench.harness.timing import Stopwatch
 from mivol.bench.reference_walk import measure_walk_rate, reference_seconds
 from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit
-from mivol.experiments.field_plan import adapt_plan, make_batches, make_plan
+from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan
 from mivol.experiments.gaussian_fit import make_gaussian_plan, start_gaussians
 from mivol.experiments.photo_data import add_box, read_photos
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem

@@ -370,7 +370,7 @@ def load_named_scene(arguments: argparse.Namespace) -> LoadedScene:
     """
     import mitsuba as mi
 
-    from mivol.experiments.back_end import choose_back_end
+    from mivol.back_end import choose_back_end
     from mivol.scene.load import load_scene
 
     choose_back_end(arguments.mode, arguments.threads)
@@ -419,7 +419,7 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
     Raises:
         MivolError: a camera for a scene, or no camera for a field.
     """
-    from mivol.experiments.back_end import set_variant
+    from mivol.back_end import set_variant
     from mivol.experiments.render import PointLook, render_field, render_points
     from mivol.points.summary import SUFFIXES
 
@@ -516,7 +516,7 @@ def validate(arguments: argparse.Namespace) -> int:
 
 def export(arguments: argparse.Namespace) -> None:
     """Write a radiance field as a mesh, volumes, a scene with its sky, or a file of another program."""
-    from mivol.experiments.back_end import set_variant
+    from mivol.back_end import set_variant
     from mivol.experiments.render import sky_beside
     from mivol.fields.field_files import read_field, write_field
 

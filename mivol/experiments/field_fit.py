@@ -6,6 +6,8 @@ the fitted sky, and ``volumes/`` has the density for other programs.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.config import FieldExperiment
-from mivol.experiments.field_plan import adapt_plan, explain_plan, make_batches, make_plan
+from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Say
+from mivol.experiments.photo_data import LEARNED
 from mivol.experiments.photo_fit import PhotoFit
 from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.fields.field_files import write_field
@@ -22,10 +25,20 @@ from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.photographs.field_view import FieldView, render_view
-from mivol.optim.photographs.radiance_plan import RadiancePlan
+from mivol.optim.photographs.radiance_plan import (
+    FEW_PHOTOGRAPHS,
+    PRESETS,
+    RadiancePlan,
+    RadianceStage,
+    check_memory,
+    scale_longest,
+)
 from mivol.optim.photographs.radiance_problem import RadianceProblem
-from mivol.photos import Camera, Photo, Photos
+from mivol.optim.photographs.ray_batches import TILE, RayBatches
+from mivol.optim.strategy import suggest_name
+from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.photos.photo_file import CONVERSIONS, decode_srgb
+from mivol.photos.region import FEWEST_POINTS, count_levels, nested_boxes, points_in_box
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
 from mivol.report.record import Image, PlanLine, Table, Volume
 from mivol.validate.metrics import ImageScore, score_image
@@ -162,3 +175,210 @@ def write_geometry(folder: Path, view: FieldView, camera: Camera, near_far: tupl
         caption = f"{name} of the first judged view: {scale}"
         written.append(Image(path=f"views/{name}.png", role="picture", caption=caption))
     return written
+
+
+# -- The plan --------------------------------------------------------------------------------------------------------------
+
+
+GAINS = PlanLine(
+    choice="gains of each photograph, if the photographs differ",
+    reason="for cameras with automatic exposure; dropped after the first stage if the photographs agree",
+)
+
+SMALLEST = 16
+"""Shortest edge of a shrunk photograph [pixel]."""
+
+FEWEST = 16
+"""Smallest number of nodes along an edge in a preset, even if voxels are then smaller than pixels."""
+
+FEWEST_STEPS = 230
+"""Smallest number of steps of the last stage, if the preset has as many; earlier stages visit each pixel as often. With fewer
+steps the field stays far from its optimum (12 photographs of wires, held-out views: 25.3 dB in 58 steps, 29.4 in 234, 29.0 in
+300, and 27.6 with 300 steps in each stage)."""
+
+
+def make_plan(settings: FieldExperiment) -> RadiancePlan:
+    """Return the preset of the settings, changed by the other settings.
+
+    Raises:
+        MivolError: an unknown preset.
+    """
+    options = settings.field
+    if options.preset not in PRESETS:
+        raise MivolError(f'field.preset = "{options.preset}" is unknown: {suggest_name(options.preset, list(PRESETS))}')
+    plan = set_background(PRESETS[options.preset], settings.photos.background)
+    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure")
+    given = {name: getattr(options, name) for name in names}
+    plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
+    stages = [replace(stage, steps=max(1, round(stage.steps * options.effort))) for stage in plan.stages]
+    plan = replace(plan, stages=tuple(stages), epochs=plan.epochs * options.effort)
+    if options.degree is not None:
+        plan = replace(plan, few_degree=None)
+    if options.matte is not None:
+        plan = replace(plan, few_matte=None)
+    if options.levels is not None:
+        plan = replace(plan, levels=options.levels, fewer_levels=False)
+    return plan if options.longest is None else replace(plan.with_longest(options.longest), cubic=False)
+
+
+def set_background(plan: RadiancePlan, background: str | tuple[float, float, float]) -> RadiancePlan:
+    """Return the plan with or without a fitted background; an empty word keeps the preset's background."""
+    if background == "":
+        return plan
+    names = LEARNED.get(background, ()) if isinstance(background, str) else ()
+    return replace(plan, **{"sky": 0} | {name: getattr(PRESETS["capture"], name) for name in names})
+
+
+def make_batches(plan: RadiancePlan, photos: Photos) -> RayBatches:
+    """Return the photographs in the sizes of the plan, undistorted if their lens has an image plane."""
+    return RayBatches.from_photos(
+        [rectify(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space
+    )
+
+
+def adapt_plan(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
+    """Adapt a plan to the photographs.
+
+    A plan for cubes keeps the number of nodes in a box of other proportions; the voxels stay at least as large as the plan's
+    voxels and as a pixel. Photographs shrink to the plan's number of pixels per voxel at the middle of the box. Stages take no
+    more steps than their pixels justify. Few photographs get a lower degree. The nested boxes end at the first box with the
+    reconstructed points.
+    """
+    cameras, box = [view.camera for view in photos.views], photos.box
+    pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
+    least, pixels = min(min(camera.size) for camera in cameras), sum(math.prod(camera.size) for camera in cameras)
+    edge = float((box[1] - box[0]).max())
+
+    def suited_stage(stage: RadianceStage) -> RadianceStage:
+        longest = stage.longest
+        if plan.cubic:
+            longest = max(longest, min(scale_longest(longest, box), int(edge / (plan.voxel * pixel))))
+            longest = min(longest, max(int(edge / pixel), FEWEST))
+        halvings = min(round(np.log2(edge / longest / (plan.voxel * pixel))), int(np.log2(least / SMALLEST)))
+        return replace(stage, longest=longest, shrink=2 ** max(halvings, 0))
+
+    def steps_an_epoch(stage: RadianceStage) -> float:
+        return pixels / stage.shrink**2 / (min(stage.views, len(cameras)) * stage.tiles * TILE**2)
+
+    if len(photos.views) < FEW_PHOTOGRAPHS:
+        plan = adapt_to_few(plan)
+    plan = reduce_levels(plan, photos)
+    stages = [suited_stage(stage) for stage in plan.stages]
+    epochs = max(plan.epochs, FEWEST_STEPS / steps_an_epoch(stages[-1]))
+    stages = [replace(stage, steps=max(1, int(min(stage.steps, epochs * steps_an_epoch(stage))))) for stage in stages]
+    return replace(plan, stages=tuple(stages), cubic=False)
+
+
+def adapt_to_few(plan: RadiancePlan) -> RadiancePlan:
+    """Return the plan for fewer than ``FEW_PHOTOGRAPHS`` photographs."""
+    degree = plan.degree if plan.few_degree is None else plan.few_degree
+    matte = plan.matte if plan.few_matte is None else plan.few_matte
+    return replace(plan, tv_every=1, degree=degree, matte=matte)
+
+
+def reduce_levels(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
+    """Return the plan with only the nested boxes around the reconstructed points; few points change nothing."""
+    points = photos.survey.points
+    if not plan.fewer_levels or points is None or len(points) < FEWEST_POINTS:
+        return plan
+    return replace(plan, levels=count_levels(photos.box, points, plan.levels))
+
+
+def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
+    """Return the choices of a plan with their reasons."""
+    box, origins = photos.box, np.array([view.camera.origin for view in photos.views])
+    resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
+    width, height = photos.views[0].camera.size
+    size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
+    largest = nested_boxes(box, plan.levels)[-1]
+    outer = " x ".join(f"{edge:.4g}" for edge in largest[1] - largest[0])
+    outer_boxes = [
+        PlanLine(
+            choice=f"{plan.levels} nested boxes, the largest of {outer} [length]",
+            reason=f"each box has twice the extent of the box before, for the surroundings; "
+            f"{len(points_in_box(origins, box))} of {len(origins)} cameras stand in the innermost",
+        )
+    ]
+    return [
+        PlanLine(choice=f"{len(photos.views)} photographs, a box of {size} [length]", reason=photos.survey.box_from),
+        *outer_boxes[: plan.levels > 1],
+        *explain_points_outside(plan, photos),
+        *explain_depths(plan, batches),
+        *explain_near_cameras(plan, origins, box),
+        *explain_wide_lenses(photos),
+        PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find empty space"),
+        explain_steps(plan),
+        explain_sizes(plan, (width, height)),
+        PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
+        explain_background(plan, photos),
+        *[GAINS][: plan.exposure],
+        PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="largest neglected share of the light"),
+        PlanLine(choice=check_memory(plan, box, batches), reason="estimated before the allocation"),
+    ]
+
+
+def explain_points_outside(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
+    """Return a line if reconstructed points lie outside the boxes."""
+    points = photos.survey.points
+    if points is None or (beyond := len(points) - len(points_in_box(points, nested_boxes(photos.box, plan.levels)[-1]))) == 0:
+        return []
+    box = "the largest box" if plan.levels > 1 else "the box"
+    reason = f"they lie outside {box}, {'in the sky' if plan.sky else 'where the model is empty'}"
+    return [PlanLine(choice=f"{beyond} of {len(points)} points of the reconstruction left out", reason=reason)]
+
+
+def explain_depths(plan: RadiancePlan, batches: RayBatches) -> list[PlanLine]:
+    """Return a line if reconstructed points give depths of rays."""
+    point_count = sum(map(len, batches.points))
+    choice = f"{point_count} points seen in photographs give the depths of rays, with a weight of {plan.depth:g}"
+    return [PlanLine(choice=choice, reason="from a model of COLMAP; field.depth")] if plan.depth and point_count else []
+
+
+def explain_near_cameras(plan: RadiancePlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:
+    """Return a line if derivatives decrease towards cameras at ``origins``."""
+    reach = plan.near_distance(origins, box)
+    choice = f"derivatives nearer to a camera than {reach:.4g} [length] fall with the square of the distance"
+    return [PlanLine(choice=choice, reason="otherwise matter grows in front of the lenses")] if reach else []
+
+
+def explain_steps(plan: RadiancePlan) -> PlanLine:
+    """Return the number of steps of the stages, and the bound on the steps."""
+    steps = ", ".join(str(stage.steps) for stage in plan.stages)
+    reason = "field.effort"
+    if plan.epochs < math.inf:
+        reason += f"; beyond {FEWEST_STEPS} steps, each pixel is used at most {plan.epochs:g} times, to avoid a fit of noise"
+    return PlanLine(choice=f"{steps} steps in these stages", reason=reason)
+
+
+def explain_sizes(plan: RadiancePlan, stored_size: tuple[int, int]) -> PlanLine:
+    """Return the sizes of the photographs in the stages; ``stored_size`` is their size in memory."""
+    width, height = stored_size
+    if all(stage.shrink == 1 for stage in plan.stages):
+        reason = "their pixels are not much finer than voxels"
+        return PlanLine(choice=f"photographs at {width} x {height} in all stages", reason=reason)
+    return PlanLine(
+        choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)} in these stages",
+        reason=f"voxels of these stages are larger than finer pixels; memory holds the photographs at {width} x {height}",
+    )
+
+
+def explain_wide_lenses(photos: Photos) -> list[PlanLine]:
+    """Return a line if the lens of photographs has no image plane."""
+    kinds = [type(view.camera.distortion).__name__.lower() for view in photos.views if view.camera.distortion.is_wide]
+    reason = "traced once for each lens and size, then looked up without resampling"
+    return [PlanLine(choice=f"rays of {len(kinds)} {kinds[0]} photographs", reason=reason)] if kinds else []
+
+
+def explain_background(plan: RadiancePlan, photos: Photos) -> PlanLine:
+    """Return the choice of the background; for an assumed colour, the reason has the colour at the photographs' edges."""
+    if plan.sky:
+        return PlanLine(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; fitted with the field")
+    if photos.views[0].alpha is not None:
+        return PlanLine(choice="nothing behind the box", reason="alpha marks the object")
+    edges = [view.image[at] for view in photos.views for at in (0, -1, (slice(None), 0), (slice(None), -1))]
+    edge_colour, assumed_colour = (
+        "(" + ", ".join(f"{c:.2g}" for c in colour) + ")"
+        for colour in (np.median(np.concatenate(edges), axis=0), photos.views[0].background)
+    )
+    reason = f'photos.background; the median at the edges of the photographs is {edge_colour}; "sky" would fit the background'
+    return PlanLine(choice=f"the colour {assumed_colour} behind the box", reason=reason)

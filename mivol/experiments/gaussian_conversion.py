@@ -10,7 +10,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from mivol.experiments.back_end import set_variant
+from mivol.back_end import set_variant
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.gaussian_field import MAX_OPACITY
 from mivol.fields.gaussian_grid import gaussian_box, gaussian_masses, gaussians_to_grid, grid_to_gaussians

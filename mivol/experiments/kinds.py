@@ -8,8 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mivol import config
+from mivol.back_end import choose_back_end
 from mivol.errors import MivolError
-from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.fit_kind import FitKind, RunContext
 from mivol.experiments.gaussian_fit import GaussianFit

@@ -11,13 +11,15 @@ import numpy as np
 
 from mivol.config import GaussianExperiment, PhotoExperiment
 from mivol.errors import MivolError
-from mivol.experiments.field_plan import LEARNED
 from mivol.optim.photographs.colour_scale import EPSILON
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Photos, PhotoSurvey, load_photos, survey_photos
 from mivol.photos.dataset import BACKGROUNDS, check_alpha
 from mivol.photos.region import near_and_far
 from mivol.validate.metrics import check_metrics
+
+LEARNED = {"sky": ("sky", "sky_smooth"), "nested": ("sky", "sky_smooth", "levels", "near")}
+"""Fields of the plan taken from the preset ``capture``, by the word for the background."""
 
 
 def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos | None]:

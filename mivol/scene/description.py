@@ -18,10 +18,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from mivol.back_end import check_variant
 from mivol.errors import MivolError
 from mivol.scene_graph import traverse
-
-VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
 MAX_REASON_LENGTH = 700
 """Characters quoted of a message of Mitsuba: lists of plugins and parameters are shorter."""
@@ -34,20 +33,6 @@ TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)+(?:
 
 # Header formats with voxels in a second file, and the key of the line with the name of the second file.
 DATA_FILE_KEYS = {".mhd": "ElementDataFile", ".nhdr": "data file"}
-
-
-def check_variant() -> str:
-    """Return the name of the active variant.
-
-    Raises:
-        MivolError: no active variant, or an unsupported variant.
-    """
-    variant = mi.variant()
-    if variant is None:
-        raise MivolError('no Mitsuba variant is active; call mitsuba.set_variant("llvm_ad_rgb") first.')
-    if variant not in VARIANTS:
-        raise MivolError(f'the variant "{variant}" is active; mivol works in {", ".join(VARIANTS)}.')
-    return variant
 
 
 def format_override(value: Any) -> str:

@@ -15,11 +15,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.back_end import check_variant
 from mivol.display import text_html, with_short_repr
 from mivol.errors import MivolError
 from mivol.scene.description import (
     NOT_UTF8,
-    check_variant,
     describe_error,
     find_named_files,
     format_override,

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.back_end import check_variant
 from mivol.kernel_recording import is_recording
-from mivol.scene.description import check_variant
 from mivol.scene.media_light import MediaLight, read_media_light
 from mivol.scene.nesting import OrientedBox, shape_bounds
 from mivol.scene.readings import GridReading, check_constants, check_emission, is_scattering, read_extinction

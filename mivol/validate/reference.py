@@ -23,10 +23,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.back_end import check_variant
 from mivol.errors import MivolError
 from mivol.optim.interrupt import InterruptGuard
 from mivol.photos.transforms import write_transforms
-from mivol.scene.description import check_variant, content_hash
+from mivol.scene.description import content_hash
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
 from mivol.scene.sensors import check_film, find_sensor, to_camera
 from mivol.transport.media.medium_view import traverse_medium

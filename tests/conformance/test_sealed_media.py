@@ -70,7 +70,7 @@ def test_media_around_shapes_are_not_sealed() -> None:
     """A ray may begin in the medium of the sensor, or in the medium outside a shape."""
     milk = mi.load_dict({"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.9})
     bubble = ball(0.0, bsdf=GLASS, exterior=milk, interior={"type": "homogeneous", "sigma_t": 1.0})
-    assert not survey_scene(mi.load_dict({"type": "scene", "bubble": bubble, "sky": scenes.sky()})).is_sealed
+    assert not survey_scene(mi.load_dict({"type": "scene", "bubble": bubble, "sky": scenes.sky()})).facts.is_sealed
 
 
 # -- Roulette of long paths ------------------------------------------------------------------------------------------------

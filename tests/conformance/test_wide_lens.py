@@ -12,7 +12,7 @@ import pytest
 from photo_sets import COLMAP_CAMERAS, look_at, ring, write_colmap, write_transforms
 
 from mivol.errors import MivolError
-from mivol.experiments.field_plan import explain_wide_lenses
+from mivol.experiments.field_fit import explain_wide_lenses
 from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS, RadianceStage

@@ -14,7 +14,7 @@ from ball_photos import BOX, PLAN
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.experiments.field_plan import GAINS, explain_plan, make_plan
+from mivol.experiments.field_fit import GAINS, explain_plan, make_plan
 from mivol.experiments.photo_fit import tabulate_gains
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import begin_fit

@@ -1,13 +1,19 @@
-"""The Mitsuba variant and the number of threads of a run."""
+"""The back end of a run: Mitsuba's variant, the threads of the CPU, and a switch of the GPU.
+
+CUDA. Dr.Jit 1.5 spills registers to shared memory if the driver can (PTX 8.7 and newer). For a kernel with function calls, and
+so for every kernel calling a plugin, ptxas refuses ("(C7800) Smem spilling should not be enabled when functions use abi") and
+aborts the process. Seen with CUDA 13.0. Therefore spills go to local memory.
+"""
 
 from __future__ import annotations
 
-import drjit as dr
+import drjit as dr  # loads LLVM, so mivol.llvm chooses the library first
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.scene.description import check_variant
 from mivol.threads import check_one_thread, set_thread_count
+
+VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
 
 def choose_back_end(variant: str, threads: int = 0) -> None:
@@ -46,3 +52,28 @@ def set_threads(count: int) -> None:
         raise MivolError(f"found {count} threads, expected 0 (all cores) or more: correct -t.")
     if count:
         set_thread_count(count)
+
+
+def check_variant() -> str:
+    """Return the name of the active variant.
+
+    Raises:
+        MivolError: no active variant, or an unsupported variant.
+    """
+    variant = mi.variant()
+    if variant is None:
+        raise MivolError('no Mitsuba variant is active; call mitsuba.set_variant("llvm_ad_rgb") first.')
+    if variant not in VARIANTS:
+        raise MivolError(f'the variant "{variant}" is active; mivol works in {", ".join(VARIANTS)}.')
+    return variant
+
+
+def spill_to_local_memory(variant: str | None = None) -> None:
+    """Switch off spills to shared memory in this thread, for CUDA variants.
+
+    Args:
+        variant: variant about to become active; None: the active variant.
+    """
+    variant = variant or mi.variant()
+    if variant is not None and variant.startswith("cuda"):
+        dr.set_flag(dr.JitFlag.SpillToSharedMemory, False)
