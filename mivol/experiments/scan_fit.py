@@ -46,17 +46,6 @@ from mivol.tomography.preprocess import interpolate_gaps
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
 
-CITED = {
-    "pcg": ("hestenes_1952", "erdogan_1999"),
-    "cgls": ("hestenes_1952",),
-    "sirt": ("andersen_1984",),
-    "sart": ("andersen_1984",),
-    "os-sart": ("andersen_1984",),
-    "ml-tr": ("nuyts_1998", "erdogan_1999"),
-    "fbp": ("kak_1988",),
-    "fdk": ("feldkamp_1984", "parker_1982"),
-}
-
 
 class ScanFit(FitKind):
     """A reconstruction of a volume from projections.
@@ -83,7 +72,7 @@ class ScanFit(FitKind):
             "plan": [
                 PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias")
             ],
-            "citations": ["mitsuba3", "drjit", *CITED[name], *prior],
+            "citations": ["mitsuba3", "drjit", *ALL_SOLVERS[name].cites, *prior],
         }
 
     def load(self, say: Say) -> None:

@@ -43,6 +43,7 @@ def ordered_subsets_sart(
         relaxation: lambda of the first sweep, in (0, 2).
         decay: in (0, 1]; a decay below 1 shrinks the limit cycle of inconsistent data, but stops before convergence.
 
+    Operator: entries of at least 0; more than one subset needs ``n_views`` and ``subset(views)``.
     Weights: only weights of 0 matter (they exclude a ray). A prior is refused.
     Cost per iteration: one A and one A^T, and once one more A and A^T for the sums; memory: ``n_subsets`` fields.
     """

@@ -172,14 +172,14 @@ def accept_all(problem: object, **options: object) -> None:
 class Solver:
     """A solver: ``run(problem, state=None, **options)`` yields states.
 
-    ``check(problem, **options)`` raises the errors of the first iteration of ``run``, without computing.
+    ``check(problem, **options)`` raises the errors of the first iteration of ``run``, without computing. ``cites`` are keys of
+    ``mivol.cite.CITATIONS``.
     """
 
     run: Callable[..., Iterator[SolverState]]
     problem: type
-    needs: str
     promises: str
-    citation: str
+    cites: tuple[str, ...]
     check: Callable[..., None] = accept_all
 
 
