@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_experiment import PHOTOS, SCENE, refused, run, write_experiment
 
-from mivol.cli import VERBS, describe_error, loading, parse
+from mivol.cli import VERBS, describe_error, load_named_scene, parse
 from mivol.errors import MivolError
 from mivol.files import read_exr
 
@@ -57,12 +57,12 @@ def test_render_as_png_and_elsewhere(variant_rgb, folder: Path) -> None:
 def test_messages_of_mitsuba_are_asked_for(monkeypatch: pytest.MonkeyPatch, flag: list[str], level: str) -> None:
     """Its warnings are shown always, and what it does where it is asked for; the scene is looked for in more folders."""
     told, folders = [], []
-    for name in ("choose_back_end", "load_scene"):
-        monkeypatch.setattr(loading, name, lambda *asked: asked)
+    for name in ("mivol.back_end.choose_back_end", "mivol.scene.load.load_scene"):
+        monkeypatch.setattr(name, lambda *asked: asked)
     monkeypatch.setattr(mi, "set_log_level", told.append)
     monkeypatch.setattr(mi, "file_resolver", lambda: folders)
     arguments = parse(["render", "a.xml", "-a", "one;two", "-Dspp=9", *flag])
-    assert loading.load(arguments) == (Path("a.xml"), {"spp": "9"})
+    assert load_named_scene(arguments) == (Path("a.xml"), {"spp": "9"})
     assert (told, folders) == ([getattr(mi.LogLevel, level)], ["one", "two"])
 
 

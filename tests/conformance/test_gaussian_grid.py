@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from mivol.errors import MivolError
-from mivol.fields import gaussian_cells, gaussian_grid
+from mivol.fields import gaussian_field, gaussian_grid
 from mivol.fields.gaussian_grid import (
     MAX_OPACITY,
     MIN_OPACITY,
@@ -110,7 +110,7 @@ def test_parts_of_a_set_and_the_set_are_one(monkeypatch: pytest.MonkeyPatch) -> 
     (a, ka), (b, kb) = (gaussians_to_grid(part, *box).to_dense() for part in parts)
     own = np.broadcast_to(parts[0].harmonics, ka[a > 0].shape)
     np.testing.assert_allclose(ka[a > 0], own, rtol=1e-6)
-    monkeypatch.setattr(gaussian_cells, "MAX_CHUNK_PAIRS", 100)
+    monkeypatch.setattr(gaussian_field, "MAX_CHUNK_PAIRS", 100)
     both, k = gaussians_to_grid(concatenate(parts), *box).to_dense()
     np.testing.assert_allclose(both, a + b, rtol=1e-6)
     np.testing.assert_allclose(k * both[..., None, None], a[..., None, None] * ka + b[..., None, None] * kb, atol=1e-6)

@@ -18,7 +18,7 @@ from tiny_experiment import assert_explained, resume_stopped_fit
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import field_fit, field_plan, photo_data
+from mivol.experiments import field_fit, photo_data
 from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.fit_kind import RunContext
 from mivol.experiments.photo_fit import PhotoFit
@@ -125,7 +125,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     for text in (*shown, "view_3.png"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
-    assert rows[-1]["iteration"] == record["results"]["iterations"] == field_plan.make_plan(config.load(path)).steps
+    assert rows[-1]["iteration"] == record["results"]["iterations"] == field_fit.make_plan(config.load(path)).steps
     assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
 
 
@@ -208,12 +208,12 @@ def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: p
 
 def test_what_the_file_says_overrides_the_preset(tmp_path: Path) -> None:
     raw = {"title": "x", "photos": {"path": "p"}}
-    assert field_plan.make_plan(config.from_dict(raw)) == PRESETS["cpu"]
+    assert field_fit.make_plan(config.from_dict(raw)) == PRESETS["cpu"]
     raw["field"] = {"preset": "cpu", "longest": 40, "degree": 1, "effort": 0.5, "tv_sh": 1e-3}
-    plan = field_plan.make_plan(config.from_dict(raw))
+    plan = field_fit.make_plan(config.from_dict(raw))
     assert [stage.longest for stage in plan.stages] == [32, 40]
     raw["field"]["longest"] = 200
-    assert [stage.longest for stage in field_plan.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
+    assert [stage.longest for stage in field_fit.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
     assert plan.stages[0].steps == round(PRESETS["cpu"].stages[0].steps / 2)
     assert (plan.degree, plan.tv_sh, plan.tv_density) == (1, 1e-3, PRESETS["cpu"].tv_density)
 
@@ -235,13 +235,13 @@ def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -
     """The ball fills the middle of each view: its edges are white, whatever colour the file says is behind it."""
     chosen = config.load(toml(tmp_path, photographs), ["photos.background=[0, 0.5, 0]"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = field_plan.make_plan(chosen)
-    said = field_plan.explain_background(plan, photos)
+    plan = field_fit.make_plan(chosen)
+    said = field_fit.explain_background(plan, photos)
     assert said.choice == "the colour (0, 0.5, 0) behind the box"
     assert "edges of the photographs is (1, 1, 1)" in said.reason
-    assert "sky of 8 rows" in field_plan.explain_background(replace(plan, sky=8), photos).choice
+    assert "sky of 8 rows" in field_fit.explain_background(replace(plan, sky=8), photos).choice
     clear = replace(photos, views=tuple(replace(v, alpha=np.ones((SIZE, SIZE))) for v in photos.views))
-    assert "alpha" in field_plan.explain_background(plan, clear).reason
+    assert "alpha" in field_fit.explain_background(plan, clear).reason
 
 
 @pytest.mark.parametrize(
@@ -255,10 +255,10 @@ def test_what_is_behind_has_a_name(
     """A name says what is learned; a number of rows or of boxes that is given counts all the same."""
     named = [f'photos.background="{background}"']
     chosen = config.load(toml(tmp_path, photographs), [f"field.preset={preset}", *named])
-    plan = field_plan.make_plan(chosen)
+    plan = field_fit.make_plan(chosen)
     assert (plan.levels, plan.sky, plan.near > 0) == (levels, sky, levels > 1)
     given = config.load(toml(tmp_path, photographs), [f"field.preset={preset}", "field.sky=6", "field.levels=2", *named])
-    assert (field_plan.make_plan(given).levels, field_plan.make_plan(given).sky) == (2, 6)
+    assert (field_fit.make_plan(given).levels, field_fit.make_plan(given).sky) == (2, 6)
     colour = [1.0] * 3 if background == "white" else [0.0] * 3
     photos, judged = photo_data.read_photos(chosen, tmp_path)
     assert judged is not None
@@ -306,7 +306,7 @@ def test_photographs_are_shrunk_to_half_a_voxel(photos: Photos) -> None:
     The nearest power of two is taken, in octaves: 2 for 1.6 and 1 for 1.3. Of 48 pixels at least 16 stay, so 4 becomes 2.
     """
     plan = RadiancePlan((RadianceStage(4, 1), RadianceStage(8, 1), RadianceStage(11, 1), RadianceStage(13, 1, shrink=4)))
-    assert [stage.shrink for stage in field_plan.adapt_plan(plan, photos).stages] == [2, 2, 2, 1]
+    assert [stage.shrink for stage in field_fit.adapt_plan(plan, photos).stages] == [2, 2, 2, 1]
 
 
 def test_stages_look_at_each_pixel_so_often_at_most(photos: Photos, photographs: Path, tmp_path: Path) -> None:
@@ -319,15 +319,15 @@ def test_stages_look_at_each_pixel_so_often_at_most(photos: Photos, photographs:
     )
     plan = RadiancePlan(stages, epochs=20.0)
     expected = [20 * count * 24**2 // 96, 20 * 48**2 // 16, 5]
-    assert [stage.steps for stage in field_plan.adapt_plan(plan, photos).stages] == expected
-    few, least = field_plan.adapt_plan(replace(plan, stages=stages[:2], epochs=0.1), photos), field_plan.FEWEST_STEPS
+    assert [stage.steps for stage in field_fit.adapt_plan(plan, photos).stages] == expected
+    few, least = field_fit.adapt_plan(replace(plan, stages=stages[:2], epochs=0.1), photos), field_fit.FEWEST_STEPS
     # So many steps of the last stage look at each pixel least / 144 times.
     assert [stage.steps for stage in few.stages] == [least * count * 24**2 // (96 * 144), least]
-    assert [stage.steps for stage in field_plan.adapt_plan(RadiancePlan(stages), photos).stages] == [10_000, 10_000, 5]
-    asked = field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
+    assert [stage.steps for stage in field_fit.adapt_plan(RadiancePlan(stages), photos).stages] == [10_000, 10_000, 5]
+    asked = field_fit.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
-    assert "each pixel is used at most 20 times" in field_plan.explain_steps(plan).reason
-    assert field_plan.explain_steps(RadiancePlan(stages)).reason == "field.effort"
+    assert "each pixel is used at most 20 times" in field_fit.explain_steps(plan).reason
+    assert field_fit.explain_steps(RadiancePlan(stages)).reason == "field.effort"
 
 
 def test_a_long_box_has_as_many_nodes_as_a_cube(photos: Photos, photographs: Path, tmp_path: Path) -> None:
@@ -340,26 +340,26 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photos: Photos, photographs: Pat
     assert scale_longest(8, slab) == 25 and scale_longest(8, photos.box) == 8
     long = replace(photos, survey=replace(photos.survey, box=slab))
     plan = RadiancePlan((RadianceStage(4, 1), RadianceStage(8, 1), RadianceStage(40, 1)))
-    assert [stage.longest for stage in field_plan.adapt_plan(plan, long).stages] == [13, 17, 34]
-    assert [stage.longest for stage in field_plan.adapt_plan(replace(plan, voxel=1.5), long).stages] == [13, 22, 34]
+    assert [stage.longest for stage in field_fit.adapt_plan(plan, long).stages] == [13, 17, 34]
+    assert [stage.longest for stage in field_fit.adapt_plan(replace(plan, voxel=1.5), long).stages] == [13, 22, 34]
     quarter = np.diag([0.25, 0.25, 1])
     cameras = [replace(view.camera, K=quarter @ view.camera.K) for view in long.views]
     far = replace(long, views=tuple(replace(v, camera=c) for v, c in zip(long.views, cameras, strict=True)))
-    assert [stage.longest for stage in field_plan.adapt_plan(plan, far).stages] == [4, 8, 16]
-    assert field_plan.adapt_plan(field_plan.adapt_plan(plan, long), long) == field_plan.adapt_plan(plan, long)
-    assert [stage.longest for stage in field_plan.adapt_plan(replace(plan, cubic=False), long).stages] == [4, 8, 40]
-    assert not field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
+    assert [stage.longest for stage in field_fit.adapt_plan(plan, far).stages] == [4, 8, 16]
+    assert field_fit.adapt_plan(field_fit.adapt_plan(plan, long), long) == field_fit.adapt_plan(plan, long)
+    assert [stage.longest for stage in field_fit.adapt_plan(replace(plan, cubic=False), long).stages] == [4, 8, 40]
+    assert not field_fit.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
 
 
 def test_few_photographs_are_smoothed_each_step(photographs: Path, tmp_path: Path) -> None:
     """Many are looked at every fourth step, where one move would be several learning rates of a few."""
     chosen = config.load(toml(tmp_path, photographs), ["field.preset=cpu"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = field_plan.make_plan(chosen)
+    plan = field_fit.make_plan(chosen)
     assert plan.tv_every == 4 and len(photos.views) < FEW_PHOTOGRAPHS
-    assert field_plan.adapt_plan(plan, photos).tv_every == 1
+    assert field_fit.adapt_plan(plan, photos).tv_every == 1
     many = replace(photos, views=photos.views * (FEW_PHOTOGRAPHS // len(photos.views) + 1))
-    assert field_plan.adapt_plan(plan, many).tv_every == 4
+    assert field_fit.adapt_plan(plan, many).tv_every == 4
 
 
 def test_colours_of_few_photographs_do_not_decay(photos: Photos) -> None:
@@ -368,8 +368,8 @@ def test_colours_of_few_photographs_do_not_decay(photos: Photos) -> None:
 
     def found(**field: float) -> list[tuple[float, int]]:
         raw = {"title": "x", "photos": {"path": "p"}, "field": {"preset": "capture", **field}}
-        plan = field_plan.make_plan(config.from_dict(raw))
-        return [(one.matte, one.degree) for one in (field_plan.adapt_plan(plan, photos), field_plan.adapt_plan(plan, many))]
+        plan = field_fit.make_plan(config.from_dict(raw))
+        return [(one.matte, one.degree) for one in (field_fit.adapt_plan(plan, photos), field_fit.adapt_plan(plan, many))]
 
     assert found() == [(0, 1), (12, 2)]
     assert found(matte=3.0) == [(3, 1), (3, 2)]
@@ -382,13 +382,13 @@ def test_nested_boxes_are_those_that_points_need(photos: Photos, photographs: Pa
     chosen = config.load(toml(tmp_path, photographs))
     half = (photos.box[1] - photos.box[0]) / 2
     points = photos.box.mean(axis=0) + half * np.concatenate([np.tile([0, 3, 0], (997, 1)), np.tile([0, 0, 4.5], (3, 1))])
-    plan = replace(field_plan.make_plan(chosen), levels=5, near=1.0)
-    assert field_plan.adapt_plan(plan, photos).levels == 5
+    plan = replace(field_fit.make_plan(chosen), levels=5, near=1.0)
+    assert field_fit.adapt_plan(plan, photos).levels == 5
 
     def said(points: np.ndarray, plan: RadiancePlan) -> str:
         known = replace(photos, survey=replace(photos.survey, points=points))
-        fitting = field_plan.adapt_plan(plan, known)
-        lines = field_plan.explain_plan(fitting, known, field_plan.make_batches(fitting, known))
+        fitting = field_fit.adapt_plan(plan, known)
+        lines = field_fit.explain_plan(fitting, known, field_fit.make_batches(fitting, known))
         return "\n".join(f"{line.choice}: {line.reason}" for line in lines)
 
     text = said(points, plan)
@@ -398,14 +398,14 @@ def test_nested_boxes_are_those_that_points_need(photos: Photos, photographs: Pa
     assert f"nearer to a camera than {np.median(distances):.4g} [length]" in text
     assert "5 nested boxes" in said(points[:99], plan) and "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
     seen = replace(photos, views=tuple(replace(view, points=points[:7]) for view in photos.views))
-    batches = field_plan.make_batches(plan, seen)
-    lines = [line.choice for line in field_plan.explain_plan(replace(plan, depth=0.5), seen, batches)]
+    batches = field_fit.make_batches(plan, seen)
+    lines = [line.choice for line in field_fit.explain_plan(replace(plan, depth=0.5), seen, batches)]
     assert f"{7 * len(photos.views)} points seen in photographs give the depths of rays, with a weight of 0.5" in lines
-    assert field_plan.explain_depths(plan, batches) == []
+    assert field_fit.explain_depths(plan, batches) == []
     one = said(points, replace(plan, levels=1, near=0.0, sky=8))
     assert "1000 of 1000 points" in one and "outside the box, in the sky" in one
     assert "nested" not in one and "nearer to a camera" not in one
-    told = field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.levels=2", "field.depth=0.5"]))
+    told = field_fit.make_plan(config.load(toml(tmp_path, photographs), ["field.levels=2", "field.depth=0.5"]))
     assert (told.levels, told.fewer_levels, told.depth) == (2, False, 0.5)
     with pytest.raises(MivolError, match="field.levels = 13: expected `int` <= 12"):
         config.load(toml(tmp_path, photographs), ["field.levels=13"])

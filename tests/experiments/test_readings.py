@@ -1,4 +1,4 @@
-"""Detectors whose rows are upside down: which scans tell, and what is said."""
+"""Readings of a scan: detectors whose rows are upside down, which scans tell, and what is said."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from mivol import config
 from mivol.config import Measured, Stack
-from mivol.experiments import projections, row_order
+from mivol.experiments import projections, readings
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews
 from mivol.tomography.phantoms import shepp_logan
@@ -52,8 +52,8 @@ def test_rows_that_are_upside_down_are_said(variant_rgb, case: str) -> None:
     geometry, wanted, way_out = TOLD[case]
     y = scan_of(geometry)
     weights = np.ones_like(y)
-    assert row_order.note_rows(wanted, geometry, GRID, y, weights) == []
-    (said,) = row_order.note_rows(wanted, geometry, GRID, y[:, ::-1], weights)
+    assert readings.note_rows(wanted, geometry, GRID, y, weights) == []
+    (said,) = readings.note_rows(wanted, geometry, GRID, y[:, ::-1], weights)
     assert said.startswith("the detector's rows seem to be upside down: a small reconstruction misses ")
     assert said.endswith(way_out)
 
@@ -61,7 +61,7 @@ def test_rows_that_are_upside_down_are_said(variant_rgb, case: str) -> None:
 def test_a_circle_of_views_cannot_tell(variant_rgb) -> None:
     """The mirrored object explains it as well, to rounding: a table of a circle is looked at, a centred cone need not be."""
     y = scan_of(table(0.0))
-    found = [row_order.compare_rows(table(0.0), GRID, rows, np.ones_like(y)) for rows in (y, y[:, ::-1])]
+    found = [readings.compare_rows(table(0.0), GRID, rows, np.ones_like(y)) for rows in (y, y[:, ::-1])]
     for one in found:
         assert abs(one.excess) < 1
         assert one.as_read == pytest.approx(one.upside_down, rel=1e-4)
@@ -80,7 +80,7 @@ def test_a_circle_of_views_cannot_tell(variant_rgb) -> None:
     ],
 )
 def test_which_scans_can_tell(geometry: object, height: float, tells: bool) -> None:
-    assert row_order.can_tell(geometry, VoxelGrid((4, 4, 4), centre=(0.0, 0.0, height))) is tells
+    assert readings.can_tell(geometry, VoxelGrid((4, 4, 4), centre=(0.0, 0.0, height))) is tells
 
 
 def test_views_and_pixels_are_few() -> None:
@@ -92,7 +92,7 @@ def test_views_and_pixels_are_few() -> None:
     y = np.arange(70.0)[:, None, None] + np.arange(51.0)[:, None] * 100 + np.arange(50.0) * 1e4
     weights = np.ones_like(y)
     weights[0, 0, 1] = weights[-1, 3:6, 1:4] = 0
-    small, seen = row_order._coarse(beam, y, weights)
+    small, seen = readings._coarse(beam, y, weights)
     assert small.geometry.shape == small.y.shape == seen.shape == (32, 17, 16)
     assert seen.sum() == seen.size - 1 and seen[-1, 1, 0] == 0
     assert small.y[0, 1, 2] == 400 + 8e4
