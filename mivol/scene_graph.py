@@ -12,8 +12,6 @@ from typing import Any
 
 import mitsuba as mi
 
-__all__ = ["find_children", "list_values", "traverse"]
-
 
 def traverse(node: mi.Object) -> mi.SceneParameters:
     """Find the parameters of an object and of the objects in it: the result of ``mi.traverse``."""

@@ -28,12 +28,12 @@ from volpath_scenes import lit, textured
 
 import scenes
 from mivol.errors import MivolError
+from mivol.experiments.gaussian_fit import make_start_cloud
 from mivol.experiments.script import explain
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS
 from mivol.optim.first_order import Adam
 from mivol.optim.gaussians.gaussian_plan import GaussianPlan, GaussianStage
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
-from mivol.optim.gaussians.gaussian_start import make_start_cloud
 from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
