@@ -18,7 +18,8 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
 
     Parameters:
         max_depth: counted as in ``volpath``. 1: emitters seen through media; 2: surfaces lit directly, and media that scatter
-            once; n: n - 1 scatterings; -1: no limit. Default 6.
+            once; n: n - 1 scatterings; -1: no limit. Default 6 as in ``prbvolpath``; ``volpath`` has -1. Without a given depth,
+            a warning says if scattering order 5 still carries more than 1 % of the light.
         rr_depth: depth from which Russian roulette may end a path. Default 5.
         hide_emitters: do not show emitters to the camera. Default false.
         deterministic: scattered light by quadrature along the ray, without noise; at depth 2, for point, spot and directional
@@ -44,7 +45,7 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
             _read(props, "media_light", "auto"),
             _read(props, "near_light", "auto"),
         )
-        self.session = Session(settings, _read(props, "aovs", ""))
+        self.session = Session(settings, _read(props, "aovs", ""), is_depth_given="max_depth" in props)
         super().__init__(props)
 
     def aov_names(self) -> list[str]:

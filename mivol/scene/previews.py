@@ -1,5 +1,5 @@
-r"""Questions about a scene that small previews answer: the sufficient ``max_depth``, and the gain of sampling the light of
-media.
+r"""Questions about a scene that small previews answer: the sufficient ``max_depth``, the light of the last order of scattering,
+and the gain of sampling the light of media.
 
 **Depth.** A path tracer with ``max_depth`` d omits light that scatters more often. :func:`find_sufficient_depth` renders a
 preview of 32 x 32 cells of the film at each depth of :data:`DEPTHS`. With the means I_d of a cell, a depth has the error
@@ -9,6 +9,9 @@ preview of 32 x 32 cells of the film at each depth of :data:`DEPTHS`. With the m
 The sufficient depth is the smallest depth with e_d below the requested noise of a pixel. Squares are products of differences
 of independent batches, so noise adds no mean. Bias: none in e_d^2. The standard error comes from the jackknife over the
 batches (Efron & Stein 1981).
+
+**Last order.** With ``max_depth`` d, light scatters up to d - 1 times. :func:`warn_of_last_order` renders the same paths with d
+and with d - 1: the difference is the light that scatters d - 1 times. One kernel serves both, since the depth is an argument.
 
 **Light of media.** The prediction of :mod:`mivol.scene.media_light` considers only the light of media. If other light is
 noisier, sampling costs time and removes hardly any noise. So :func:`measure_media_light` renders cells of the film with and
@@ -27,7 +30,8 @@ the noise of collisions near an emitter is large in few cells.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+import warnings
+from dataclasses import asdict, dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -38,11 +42,11 @@ from mivol.kernel_recording import is_recording, without_garbage_collection
 from mivol.scene.choices import is_near_light_open
 from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import Needs, find_needs
-from mivol.scene.plan import build_estimators, choose_segment, make_plan
+from mivol.scene.plan import Plan, build_estimators, choose_segment, make_plan
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.transport.estimators.scores import Primal
-from mivol.transport.path.estimators import Settings
-from mivol.transport.path.walk import walk_path
+from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.walk import has_one_segment, walk_path
 
 DEPTHS = (2, 3, 6, -1)
 """Compared depths; the last depth, without a limit, is the reference."""
@@ -165,8 +169,77 @@ NEAR_LIGHT_COST = 2.0
 """Time of a path with a distance drawn on each segment over the time of a path with direct light at collisions (measured on two
 cores: 1.4 in a homogeneous haze with surfaces, 1.6 in fog, 2.1 to 2.4 in smoke of 64^3)."""
 
-DRAW_SIDE, DRAW_SAMPLES, DRAW_SEED = 24, 48, 0xD3A4
-"""Cells along an edge of the emission preview, samples per cell, and seed."""
+LAST_SHARE = 0.01
+"""Share of the light in the last order of scattering above which a depth that nobody chose is mentioned [1]."""
+
+LAST_SIDE, LAST_SAMPLES = 24, 16
+"""Cells along an edge of the preview of the last order, and samples per cell."""
+
+CELL_SEED = 0xD3A4
+"""Seed of previews of cells: common random numbers for what is compared."""
+
+
+class _KernelArgument(Settings):
+    """Settings whose depth is an argument of kernels."""
+
+    @classmethod
+    def shortened(cls, settings: Settings, by: int) -> _KernelArgument:
+        return cls(**{**asdict(settings), "max_depth": settings.max_depth - by})
+
+    @property
+    def depth_limit(self) -> mi.UInt32:
+        return dr.opaque(mi.UInt32, self.max_depth)
+
+
+def warn_of_last_order(
+    scene: mi.Scene, sensor: mi.Sensor, needs: Needs, plan: Plan, survey: SceneSurvey, settings: Settings
+) -> None:
+    """Warn once for each scene if light of the last order of scattering exceeds ``LAST_SHARE`` by two standard errors.
+
+    Args:
+        scene, sensor: the scene and the sensor to render.
+        needs, plan: facts and choices for ``settings``.
+        survey: remembers that the scene has been measured.
+        settings: settings of the integrator, with a limited depth.
+
+    Cost: 2 x 9216 paths once, and one kernel. Nothing while ``dr.freeze`` records.
+    """
+    if "last order" in survey.warned or is_recording():
+        return
+    survey.warned.add("last order")
+    with without_garbage_collection(), dr.suspend_grad():
+        estimators = build_estimators(scene, needs, plan, settings, survey, for_images=True)
+        if has_one_segment(estimators):
+            return
+        whole, shorter = (
+            _walk_cells(sensor, replace(estimators, settings=limited), LAST_SIDE, LAST_SAMPLES)
+            for limited in (_KernelArgument.shortened(settings, by) for by in (0, 1))
+        )
+    share, error = last_order_share(whole, shorter)
+    if share - 2 * error > LAST_SHARE:
+        warnings.warn(
+            f"max_depth was not given: light that scatters {settings.max_depth - 1} times, the last order of the default of "
+            f"{settings.max_depth}, still carries {share:.0%} of the image; give max_depth (-1 for all light, as in volpath; "
+            "this is said once).",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+
+
+def last_order_share(whole: NDArray, shorter: NDArray) -> tuple[float, float]:
+    """The share of light in ``whole`` that ``shorter`` omits, and its standard error [1], from samples (cells, n) of both.
+
+    The samples of a cell are independent of each other, so the n means over the cells give the error of the ratio.
+    """
+    full, last = whole.mean(axis=0), (whole - shorter).mean(axis=0)
+    if full.mean() <= 0:
+        return 0.0, 0.0
+    share = last.mean() / full.mean()
+    return float(share), float((last - share * full).std(ddof=1) / (math.sqrt(len(full)) * full.mean()))
+
+
+DRAW_SIDE, DRAW_SAMPLES = 24, 48
+"""Cells along an edge of the emission preview, and samples per cell."""
 
 
 def measure_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
@@ -231,12 +304,17 @@ def sampling_gain(met: NDArray, drawn: NDArray) -> float:
 
 def _render_draw_preview(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> NDArray:
     """Mean radiance over all colours of each sample (cells, DRAW_SAMPLES), along the middle of each cell."""
-    cells, n = DRAW_SIDE * DRAW_SIDE, DRAW_SIDE * DRAW_SIDE * DRAW_SAMPLES
     estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
+    return _walk_cells(sensor, estimators, DRAW_SIDE, DRAW_SAMPLES)
+
+
+def _walk_cells(sensor: mi.Sensor, estimators: Estimators, side: int, samples: int) -> NDArray:
+    """Mean radiance over all colours of each sample (cells, samples), along the middles of side x side cells of the film."""
+    cells, n = side * side, side * side * samples
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(DRAW_SEED, n)
-    cell = dr.arange(mi.UInt32, n) // DRAW_SAMPLES
-    place = (mi.Point2f(cell % DRAW_SIDE, cell // DRAW_SIDE) + 0.5) / DRAW_SIDE
+    sampler.seed(CELL_SEED, n)
+    cell = dr.arange(mi.UInt32, n) // samples
+    place = (mi.Point2f(cell % side, cell // side) + 0.5) / side
     ray, weight = sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))
     score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
-    return np.array(score.L * weight, np.float64).reshape(-1, n).mean(axis=0).reshape(cells, DRAW_SAMPLES)
+    return np.array(score.L * weight, np.float64).reshape(-1, n).mean(axis=0).reshape(cells, samples)

@@ -23,7 +23,7 @@ from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording, without_garbage_collection
 from mivol.scene.needs import find_needs, warn_of_misplaced_grids
 from mivol.scene.plan import Plan, build_estimators, make_plan
-from mivol.scene.previews import measure_media_light, measure_near_light
+from mivol.scene.previews import measure_media_light, measure_near_light, warn_of_last_order
 from mivol.scene.refusals import parse_aovs
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
@@ -59,13 +59,16 @@ class Session:
     Args:
         settings: depth, Russian roulette, hidden emitters and the like.
         aovs: comma-separated names from :data:`mivol.transport.line_integrals.aovs.AOVS`.
+        is_depth_given: whether the user has chosen ``max_depth``. If not, and the last order of scattering still carries light,
+            a warning says so.
 
     Raises:
         MivolError: an unknown AOV, or a repeated name.
     """
 
-    def __init__(self, settings: Settings, aovs: str = "") -> None:
+    def __init__(self, settings: Settings, aovs: str = "", is_depth_given: bool = True) -> None:
         self.settings = settings
+        self.is_depth_given = is_depth_given
         self.aovs = parse_aovs(aovs)
         self._surveyed: _SurveyedScene | None = None
 
@@ -147,6 +150,8 @@ class Session:
         needs = measure_media_light(scene, sensor, needs, survey, self.settings)
         needs = measure_near_light(scene, sensor, needs, survey, self.settings)
         plan = make_plan(needs, self.settings, self.aovs)
+        if not self.is_depth_given:
+            warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
         return build_estimators(scene, needs, plan, self.settings, survey, for_images), plan
 
     def _primal(self, estimators: Estimators, rays: CameraRays, successive: int) -> tuple:

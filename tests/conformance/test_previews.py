@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import re
+import warnings
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from mivol.experiments.script import explain
-from mivol.scene.previews import DEPTHS, DepthError, SufficientDepth, find_sufficient_depth, measure_depth_error
+from mivol.scene import session
+from mivol.scene.previews import (
+    DEPTHS,
+    DepthError,
+    SufficientDepth,
+    find_sufficient_depth,
+    last_order_share,
+    measure_depth_error,
+)
 from mivol.transport.path.estimators import Settings
 from scenes import box_of, camera, centred, medium, sky
 
@@ -76,3 +88,64 @@ def test_explain_says_which_depth_is_enough(variant_rgb: str) -> None:
     assert "depth     2 is enough\n              because depth 2 leaves out" in said and "noise of 50.00% is requested" in said
     assert "without a limit (-1) is enough" in explain(scene, max_depth=2, noise=1e-9)
     assert "is enough" not in explain(scene, max_depth=2) + explain(scene, max_depth=1, noise=0.5)
+
+
+# -- A depth that nobody chose -------------------------------------------------------------------------------------------------
+
+
+KEY = "fog.interior_medium.sigma_t.value.value"
+
+
+def look(scene: mi.Scene, way: str, **settings: object) -> list[str]:
+    """Render twice, or differentiate by the extinction; the warnings."""
+    integrator = mi.load_dict({"type": "mivol", **settings})
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        for seed in range(2):
+            if way == "picture":
+                dr.eval(mi.render(scene, integrator=integrator, spp=1, seed=seed))
+                continue
+            params = mi.traverse(scene)
+            dr.enable_grad(params[KEY])
+            integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (12, 12, 3)), spp=1, seed=seed)
+    return [str(one.message) for one in found]
+
+
+@pytest.mark.parametrize("way", ["picture", "gradient"])
+def test_light_beyond_a_depth_that_nobody_chose_is_mentioned_once(variant_rgb: str, way: str) -> None:
+    """Fog as dense as a cloud; the means of the fifth order of scattering and of all that is rendered are compared."""
+    scene = fog(5.0, 0.95)
+    (found,) = look(scene, way)
+    whole, shorter = (
+        np.array(mi.render(scene, integrator=mi.load_dict({"type": "mivol", "max_depth": depth}), spp=512)).mean()
+        for depth in (6, 5)
+    )
+    share = 1 - shorter / whole
+    assert 0.03 < share < 0.3
+    said = int(re.search(r"carries (\d+)% of the image", found)[1]) / 100
+    # A whole percent, and both estimates: 9216 paths of a share of some percent have a standard error below 0.2 %.
+    assert abs(said - share) < 0.005 + 6 * 0.002
+    assert found.startswith("max_depth was not given: light that scatters 5 times, the last order of the default of 6,")
+
+
+def test_no_light_beyond_the_depth_is_mentioned_without_reason(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thin fog; fog without scattering, of which nothing is walked; and a given depth, after which nothing is measured."""
+    assert look(fog(0.05, 0.5), "picture") == []
+    assert look(fog(5.0, 0.0), "picture") == []
+    measured = []
+    monkeypatch.setattr(session, "warn_of_last_order", lambda *given: measured.append(given))
+    look(fog(5.0, 0.95), "picture", max_depth=6)
+    assert measured == []
+    look(fog(5.0, 0.95), "picture")
+    assert len(measured) == 2
+
+
+def test_noise_alone_is_not_mentioned() -> None:
+    """The error of the share of a ratio of sums, against the spread of 4000 such shares."""
+    rng = np.random.default_rng(4)
+    whole = rng.gamma(2.0, size=(4000, 9, 16))
+    last = 0.02 * whole * rng.uniform(0, 2, whole.shape) * rng.gamma(0.5, 2.0, (4000, 1, 16))
+    shares, errors = np.array([last_order_share(w, w - d) for w, d in zip(whole, last, strict=True)]).T
+    # The mean square of the errors has a relative standard error of sqrt(2 / 15 / 4000) and more for the tails of the gamma.
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(shares.std(), rel=0.1)
+    assert last_order_share(np.zeros((3, 4)), np.zeros((3, 4))) == (0.0, 0.0)
