@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import json
 import math
+import time
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import drjit as dr
@@ -109,12 +110,43 @@ class Slope:
 
 
 @dataclass(frozen=True)
+class Efficiency:
+    """Variance and time of the images of both integrators.
+
+    Attributes:
+        variance, reference_variance: mean variance of the two images over pixels and channels.
+        seconds, reference_seconds: wall time of the renders, with the compilation of their kernels [s].
+    """
+
+    variance: float
+    reference_variance: float
+    seconds: float
+    reference_seconds: float
+
+    @property
+    def gain(self) -> float | None:
+        """Time of volpath over time of mivol at equal error: the ratio of variance x time; None without noise to compare."""
+        if min(self.variance, self.reference_variance, self.seconds, self.reference_seconds) <= 0:
+            return None
+        return self.reference_variance * self.reference_seconds / (self.variance * self.seconds)
+
+    @property
+    def text(self) -> str:
+        """The comparison in a sentence."""
+        times = f"renders of {self.seconds:.2g} s and {self.reference_seconds:.2g} s, with the compilation of kernels"
+        if self.gain is None:
+            return f"Times at equal error cannot be compared: an image has no noise ({times})."
+        return f"At equal error volpath takes {self.gain:.3g} times the time of mivol (variance x time; {times})."
+
+
+@dataclass(frozen=True)
 class Verdict:
     """Result of a validation.
 
     Attributes:
         comparison: comparison of the images.
         rel_mse: mean over pixels and channels of (ours - reference)^2 / (reference^2 + 1e-2 of its mean square).
+        efficiency: variance and time of both images.
         slopes: derivatives of the named parameters.
         doubts: reasons to distrust the reference.
         files: written files.
@@ -122,6 +154,7 @@ class Verdict:
 
     comparison: Comparison
     rel_mse: float
+    efficiency: Efficiency
     slopes: tuple[Slope, ...]
     doubts: tuple[Doubt, ...]
     files: tuple[Path, ...] = ()
@@ -146,7 +179,8 @@ class Verdict:
     def text(self) -> str:
         """All results in lines."""
         lines = [f"Doubt: {doubt.sentence}" for doubt in self.doubts]
-        lines += [self.comparison.text, f"relMSE {self.rel_mse:.3g}.", *(slope.text for slope in self.slopes), self.words]
+        lines += [self.comparison.text, f"relMSE {self.rel_mse:.3g}.", *(slope.text for slope in self.slopes)]
+        lines += [self.words, self.efficiency.text]
         return "\n".join([*lines, *(str(path) for path in self.files)])
 
 
@@ -167,7 +201,9 @@ def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> V
     folder.mkdir(parents=True, exist_ok=True)
     depth = read_settings(scene).max_depth if settings.max_depth is None else settings.max_depth
     integrator = mi.load_dict({"type": "mivol", "max_depth": depth})
+    start = time.monotonic()
     image = render_batches(scene, camera, integrator, settings)
+    seconds = time.monotonic() - start
     doubts = tuple(find_doubts(scene, [camera]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # doubts are part of the verdict
@@ -181,7 +217,8 @@ def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> V
     slopes = check_gradients(scene, camera, integrator, settings)
     floor = 1e-2 * float(np.mean(reference.mean**2)) or 1.0
     rel_mse = float(np.mean((estimate.mean - reference.mean) ** 2 / (reference.mean**2 + floor)))
-    verdict = Verdict(compared, rel_mse, slopes, doubts)
+    efficiency = Efficiency(float(estimate.var.mean()), float(reference.variance.mean()), seconds, reference.seconds)
+    verdict = Verdict(compared, rel_mse, efficiency, slopes, doubts)
     return write_verdict(verdict, estimate, reference, folder, settings)
 
 
@@ -282,6 +319,7 @@ def write_verdict(verdict: Verdict, image: Estimate, reference: ReferenceResult,
         "z": {"bound": compared.bound, "share beyond": compared.beyond, "worst": float(np.max(np.abs(compared.z)))},
         "relMSE": verdict.rel_mse,
         "psnr": compared.psnr,
+        "time ratio": asdict(verdict.efficiency) | {"gain": verdict.efficiency.gain},
         "gradients": [asdict(slope) | {"agrees": slope.agrees} for slope in verdict.slopes],
         "doubts": [asdict(doubt) for doubt in verdict.doubts],
         "settings": asdict(settings),
@@ -289,4 +327,4 @@ def write_verdict(verdict: Verdict, image: Estimate, reference: ReferenceResult,
     }
     path = folder / "validation.json"
     write_whole_text(path, json.dumps(about, indent=2) + "\n")
-    return Verdict(compared, verdict.rel_mse, verdict.slopes, verdict.doubts, (path, picture))
+    return replace(verdict, files=(path, picture))
