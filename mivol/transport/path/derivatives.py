@@ -19,6 +19,7 @@ References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -91,7 +92,7 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     dr.eval(seeds, stems.L, collision)
     collided = dr.compress(collision.on)
     if (count := dr.width(collided)) == 0:
-        walk_stem(estimators, replayed_sampler, rays.ray, Replay(stems.L, dL))
+        replay_in_one_kernel(n, lambda: walk_stem(estimators, replayed_sampler, rays.ray, Replay(stems.L, dL)))
         return
     k = count_branches(n, count)
     share, branches = dr.opaque(mi.Float, 1 / k), _Branches.split(collision, collided, seeds, k)
@@ -101,13 +102,34 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
         dr.scatter_add(L_stem, L_branch * share, branches.stem)
 
     # -- Their replays ---------------------------------------------------------------------------------------------------
-    walk_stem(estimators, replayed_sampler, rays.ray, Replay(stems.L, dL))
+    dr.eval(stems.L, dL)
+    replay_in_one_kernel(n, lambda: walk_stem(estimators, replayed_sampler, rays.ray, Replay(stems.L, dL)))
     baseline = estimators.segment.baseline
     estimators.segment.baseline = None if baseline is None else baseline.for_branches
     order = _order_by_length(depth)
     branches = branches.reorder(order)
-    L, dL = dr.gather(mi.Spectrum, primal.L, order), dr.gather(mi.Spectrum, dL, branches.stem)
-    branches.walk(estimators, Replay(L, dL * share))
+    L, dL_branch = dr.gather(mi.Spectrum, primal.L, order), dr.gather(mi.Spectrum, dL, branches.stem) * share
+    dr.eval(L, dL_branch)
+    replay_in_one_kernel(count * k, lambda: branches.walk(estimators, Replay(L, dL_branch)))
+
+
+def replay_in_one_kernel(width: int, walk: Callable[[], object]) -> None:
+    """Walk paths backwards, and add all their derivatives in one kernel.
+
+    Dr.Jit sums the derivative by a single number (an albedo, the radiance of an emitter) over all lanes as soon as it is known.
+    Each sum would be a kernel that walks the paths anew. In a recorded loop the sums become atomic additions, so the walk is
+    the only turn of a loop.
+
+    Args:
+        width: number of lanes.
+        walk: reports the paths to a :class:`Replay`; it changes gradients only.
+    """
+
+    def turn(number: mi.UInt32) -> tuple[mi.UInt32]:
+        walk()
+        return (number + 1,)
+
+    dr.while_loop(state=(dr.zeros(mi.UInt32, width),), cond=lambda number: number < 1, body=turn, label="replay")
 
 
 @dataclass
