@@ -20,7 +20,14 @@ from mivol.back_end import check_variant
 from mivol.kernel_recording import is_recording
 from mivol.scene.media_light import MediaLight, read_media_light
 from mivol.scene.nesting import OrientedBox, shape_bounds
-from mivol.scene.readings import GridReading, check_constants, check_emission, is_scattering, read_extinction
+from mivol.scene.readings import (
+    GridReading,
+    check_constants,
+    check_emission,
+    is_scattering,
+    read_extinction,
+    read_lowest_albedo,
+)
 from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, ShapeFacts, find_outside_media, is_instance, survey_scene
 from mivol.scene_graph import list_values, traverse
 from mivol.transport.estimators.lighting.emitters import find_bounding_ball
@@ -162,7 +169,14 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
     if scatters and survey.facts.are_emitters_far and common["mean_cosine"] is None:
         # Read once: if a fit changes the phase function, side flights stay unbiased.
         common["mean_cosine"] = survey.cosines[boundary.name] = mean_cosine(phase)
-    return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_bound_optical_depth(boundary, view, reads))
+    return MediumFacts(
+        **common,
+        is_scattering=scatters,
+        occupied=occupied,
+        tau_max=_bound_optical_depth(boundary, view, reads),
+        tau_min=_find_thinnest(boundary, view),
+        albedo_min=read_lowest_albedo(view, survey, boundary.name),
+    )
 
 
 def _describe_boundary(boundary: Boundary) -> str:
@@ -191,6 +205,14 @@ def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridR
     return scale * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * float(diagonal)
 
 
+def _find_thinnest(boundary: Boundary, view: MediumView) -> float:
+    """The optical depth of a homogeneous medium's clearest channel across its shape [1]; 0 for other media."""
+    if boundary.around is None or not all(p.is_constant for p in view.parts):
+        return 0.0
+    extinction = sum((np.array(dr.detach(p.constant), dtype=np.float64).ravel() for p in view.parts), np.zeros(1))
+    return float(np.min(extinction)) * float(np.min(np.array(dr.detach(view.scale)))) * boundary.around.edge
+
+
 @dataclass(frozen=True)
 class MediumFacts:
     """The facts of a medium.
@@ -206,6 +228,8 @@ class MediumFacts:
         phase: kind of the phase function.
         occupied: smallest share of occupied blocks among the grids [1].
         tau_max: upper bound of the optical depth through the box [1]; None unless the boundary is a box.
+        tau_min: optical depth of a homogeneous medium's clearest channel across its shape [1]; 0 for other media.
+        albedo_min: lowest albedo [1]; 0 for a medium with ``sigma_s``.
         unread: whether values could not be read because ``dr.freeze`` records.
         bounded: class of a field with only a known majorant along a ray; None with exact optical depths.
         gaussians: number of Gaussians for ray tracing; 0 for other media.
@@ -224,6 +248,8 @@ class MediumFacts:
     phase: str
     occupied: float
     tau_max: float | None
+    tau_min: float = 0.0
+    albedo_min: float = 0.0
     unread: bool = False
     bounded: str | None = None
     gaussians: int = 0

@@ -53,6 +53,11 @@ class OrientedBox:
     corners: np.ndarray
     edges: np.ndarray
 
+    @property
+    def edge(self) -> float:
+        """Mean length of its edges [length]."""
+        return float(np.mean([np.linalg.norm(self.corners[k] - self.corners[0]) for k in (1, 2, 4)]))
+
     def shares(self, other: OrientedBox, margin: float = -FACE_TOLERANCE) -> bool:
         """Whether two boxes share space: no plane separates them by ``margin`` (in sizes; a negative margin permits an
         overlap).

@@ -47,6 +47,7 @@ from mivol.scene.refusals import (
     check_scattering,
 )
 from mivol.scene.survey import SceneSurvey
+from mivol.transport.estimators.flights.flight_derivatives import MIN_ALBEDO
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
@@ -75,6 +76,10 @@ PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
 
 PASS_STEPS = {"llvm": 1 << 29, "cuda": 1 << 34, "metal": 1 << 32}
 """Most cells crossed by all rays of a pass: a second or two of work, so that Ctrl-C acts soon."""
+
+
+THICK = 1.0
+"""Optical depth across a homogeneous medium [1] from which collisions alone give its derivatives."""
 
 
 @dataclass(frozen=True)
@@ -221,8 +226,8 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
 def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) -> SceneMedia:
     """Build the media for transport as planned."""
     bodies = []
-    for boundary, view, skip, tracks in zip(
-        needs.boundaries, needs.views, plan.skips_empty, plan.estimates_shadows, strict=True
+    for boundary, view, facts, skip, tracks in zip(
+        needs.boundaries, needs.views, needs.media, plan.skips_empty, plan.estimates_shadows, strict=True
     ):
         for part in view.parts:
             if skip and part.lattice is not None:
@@ -235,7 +240,9 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) 
                 part.lattice.block_ranges = read_block_ranges(part, survey)
             if plan.draws_near_light and part.lattice is not None and part.activation is None:
                 part.rough = read_rough_extinction(part, survey)
-        bodies.append(boundary.body(view, tracks))
+        body = boundary.body(view, tracks)
+        body.is_thick, body.has_low_albedo = facts.tau_min >= THICK, facts.albedo_min < MIN_ALBEDO
+        bodies.append(body)
     return needs.make_media(scene, bodies, survey.size)
 
 

@@ -217,14 +217,22 @@ def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:
     Raises:
         MivolError: an albedo outside [0, 1].
     """
-    positive = [_is_positive(a, survey, name, view.albedo is not None) for a in view.albedo_arrays]
-    return any(positive)
+    highest = [_read_range(a, survey, name, view.albedo is not None)[1] for a in view.albedo_arrays]
+    return any(high > 0 or dr.grad_enabled(a) for high, a in zip(highest, view.albedo_arrays, strict=True))
 
 
-def _is_positive(values: mi.TensorXf, survey: SceneSurvey, name: str, is_albedo: bool) -> bool:
+def read_lowest_albedo(view: MediumView, survey: SceneSurvey, name: str) -> float:
+    """The lowest albedo of a medium [1]; 0 for a medium without an albedo. Each array is read once."""
+    if view.albedo is None:
+        return 0.0
+    return min((_read_range(a, survey, name, True)[0] for a in view.albedo_arrays), default=0.0)
+
+
+def _read_range(values: mi.TensorXf, survey: SceneSurvey, name: str, is_albedo: bool) -> tuple[float, float]:
+    """The lowest and the highest value of an array."""
     flat = dr.detach(dr.ravel(values))
 
-    def make() -> bool:
+    def make() -> tuple[float, float]:
         low, high = float(dr.min(flat)[0]), float(dr.max(flat)[0])
         # NaN fails every comparison.
         if is_albedo and not (low >= 0 and high <= 1 and bool(dr.all(dr.isfinite(flat)))):
@@ -232,9 +240,9 @@ def _is_positive(values: mi.TensorXf, survey: SceneSurvey, name: str, is_albedo:
                 f"the albedo of the medium in {name} lies in [{low:.9g}, {high:.9g}] (or is NaN); the share of light that is "
                 "scattered lies in [0, 1]: clip it after each step."
             )
-        return high > 0
+        return low, high
 
-    return _read_once(survey, ("albedo",), flat, make) or dr.grad_enabled(values)
+    return _read_once(survey, ("albedo",), flat, make)
 
 
 def check_constants(view: MediumView, survey: SceneSurvey, name: str) -> None:

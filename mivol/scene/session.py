@@ -101,6 +101,7 @@ class Session:
         with without_garbage_collection(), dr.suspend_grad(), carry_tangents(scene):
             with dr.resume_grad():
                 estimators, plan = self._open(scene, sensor, spp)
+                estimators.media.find_followed()
                 estimators.media.start_tangent()
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
             return render_on_film(samples, self.aovs, lambda rays: self._tangent(estimators, rays))
@@ -116,6 +117,7 @@ class Session:
                 recompute_derived(scene)
                 estimators, plan = self._open(scene, sensor, spp)
             media = estimators.media
+            media.find_followed()
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
             media.start_gradients()
             # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only

@@ -276,11 +276,11 @@ def test_baseline_in_a_white_furnace_is_the_light_of_the_sky():
 
 
 def test_collisions_count_as_their_derivatives_weigh():
-    """A white box of sigma 3 and a black box of 0.5, kappa = 0.6 / 2. Half of the paths fly to each box, and collide with
-    probabilities of 1 - exp(-2 sigma). 2048 paths determine the second probability to 1.7 %; the paths are the same in each
-    run."""
-    sigma, light = np.array([3.0, 0.5]), np.array([0.5, 0.0])
-    weight = (1 - np.exp(-2 * sigma)) / (sigma + 0.3) ** 2
+    """A white box of sigma 3, which is thick and needs no probes, and a black box of 0.25, with kappa = 0.6 / 2. Half of the
+    paths fly to each box, and collide with probabilities of 1 - exp(-2 sigma). 2048 paths determine the second probability to
+    2.7 %; the paths are the same in each run."""
+    sigma, light, kappa = np.array([3.0, 0.25]), np.array([0.5, 0.0]), np.array([0.0, 0.3])
+    weight = (1 - np.exp(-2 * sigma)) / (sigma + kappa) ** 2
     boxes = [medium("homogeneous", s, albedo) for s, albedo in zip(sigma, (1.0, 0.0), strict=True)]
     found = find_later_baseline(sky(0.5), *boxes, depth=-1, at=(0, 5, 0, 5))
     np.testing.assert_allclose(found, np.sum(weight * light) / weight.sum(), rtol=0.08)

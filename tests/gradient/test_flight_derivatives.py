@@ -299,7 +299,7 @@ def test_probes_are_kept_in_proportion_to_their_gain():
     def offered(probes: Probes, t: float, gain: float, depth: int, may_scatter: mi.Bool = on, found: mi.Bool = on) -> Probes:
         segment = PathSegment(ray, dr.zeros(mi.MediumPtr, n), mi.Spectrum(1), may_scatter, None, zero + depth)
         point = UniformPoint(dr.full(mi.Float64, t, n), dr.full(mi.Float, 1, n), zero, found)
-        return probes.offer(segment, FlightPoint(point, dr.full(mi.Spectrum, gain, n), (dr.arange(mi.Float, n) + 0.5) / n))
+        return probes.offer(segment, FlightPoint(point, dr.full(mi.Spectrum, gain, n)), (dr.arange(mi.Float, n) + 0.5) / n)
 
     probes = offered(Probes(Probe.empty(ray), Probe.empty(ray)), 7.0, 2.0, 0)
     for t, gain, *lanes in ((1.0, 1.0), (2.0, 3.0), (3.0, 100.0, never), (4.0, 100.0, on, never)):
@@ -325,6 +325,47 @@ def test_of_side_flights_light_is_linear_in_a_sky(whole_paths):
     start = np.array(mi.traverse(scene)["sky.data"], np.float64)
     found = vjp(scene, "sky.data", w, 16, fresh(4), integrator)
     assert np.sum(found.reshape(start.shape) * start) == pytest.approx(np.sum(w * seen), rel=1e-4)
+
+
+def _gradient(scene: mi.Scene, keys: list[str]) -> np.ndarray:
+    """The derivative of the sum of an image by the first of several followed parameters."""
+    params = mi.traverse(scene)
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
+    mi.load_dict(mivol(max_depth=4)).render_backward(scene, params, dr.ones(mi.TensorXf, (8, 8, 3)), seed=fresh(3), spp=8)
+    found = np.array(dr.grad(params[keys[0]]), np.float64)
+    for key in keys:
+        dr.disable_grad(params[key])
+    params.update()
+    return found
+
+
+@pytest.mark.parametrize("name", ["albedo.value.value", "intensity.value"])
+def test_derivatives_do_not_depend_on_what_else_is_followed(name):
+    """With a fixed extinction no probe, shadow ray or flight is differentiated by it; the other derivatives stay as they are.
+    The low albedo needs its probes all the same."""
+    fog = box_of(medium("homogeneous", 0.5, 0.05), PLACE)
+    scene = close_up({"smoke": fog, "bulb": point([1.7, -0.6, 1.4])[0]}, res=8)
+    key = next(k for k, _ in mi.traverse(scene) if k.endswith(name))
+    alone, beside = (_gradient(scene, [key, *more]) for more in ([], [MEDIUM + "sigma_t.value.value"]))
+    # Sums of some thousand terms in float32, added in another order.
+    np.testing.assert_allclose(alone, beside, rtol=1e-4)
+    assert np.all(alone != 0)
+
+
+@pytest.mark.statistical
+def test_collisions_find_the_derivatives_of_thick_media(monkeypatch):
+    """Without probes, collisions have the whole weight: the same mean as with probes."""
+    fog, bulb = box_of(medium("homogeneous", 0.75, 0.7), PLACE), point([1.2, -0.6, 1.4])[0]
+    scene = close_up({"smoke": fog, "bulb": bulb, "sky": scenes.sky(0.3)}, res=8)
+    key, integrator = MEDIUM + "sigma_t.value.value", mi.load_dict(mivol(max_depth=4))
+    found = []
+    for bound in (0.5, np.inf):
+        monkeypatch.setattr(plan, "THICK", bound)
+        found.append(_along(scene, key, 1.0, integrator, 64))
+    assert_same_mean(*found, rounding=1e-4 * np.abs(found[1].mean), what="derivative")
+    assert_precise(difference(*found), 0.05 * np.abs(found[1].mean), what="derivative")
 
 
 @pytest.mark.slow

@@ -105,12 +105,10 @@ class FlightPoint:
     Attributes:
         point: the point.
         gain: throughput up to the point, times the sampled length [length].
-        chance: uniform random number in [0, 1), by which the point of one flight of a path is kept.
     """
 
     point: UniformPoint
     gain: mi.Spectrum
-    chance: mi.Float
 
 
 @dataclass
@@ -123,7 +121,9 @@ class SegmentEstimate:
         light: light of the media; None if they add no light.
         transmittance: factor on the light behind the segment.
         collision: collision with a medium before the end; None from estimators without collisions.
-        probe: point of the flight for derivatives; None in images and from estimators without probes.
+        probe: point of the flight for derivatives; None in images, from estimators without probes, and if collisions suffice.
+        chance: uniform random number in [0, 1), by which a path keeps one of its probes and one of its shadow rays; None in
+            images and from estimators without collisions.
     """
 
     end: SegmentEnd
@@ -132,6 +132,7 @@ class SegmentEstimate:
     transmittance: Factor
     collision: Collision | None = None
     probe: FlightPoint | None = None
+    chance: mi.Float | None = None
 
 
 class SegmentEstimator(Protocol):

@@ -46,6 +46,9 @@ class Body:
         estimates_shadows: whether shadow rays through grids with known block ranges are estimated instead of exact.
         hole: a box without the medium, in a level of a nested field; None without a hole.
         cuts_grids: whether the boundary is smaller than its content, so intervals must be clipped to the boundary.
+        follows: whether each part, and the albedo (``follows_albedo``), is differentiated (:meth:`find_followed`).
+        is_thick: whether collisions alone find the derivatives of the extinction (see the probes of free flights).
+        has_low_albedo: whether some albedo may be too low for its derivatives to be found at collisions.
     """
 
     def __init__(self, view: MediumView, box: Box | None, estimates_shadows: bool = False, hole: Box | None = None) -> None:
@@ -58,6 +61,8 @@ class Body:
         self.edge = dr.opaque(mi.Float, box.edge) if box is not None else None
         self.exact_parts = [p for p in view.parts if p.exact_line]
         self.flight_parts = flight_parts(view.parts)
+        self.follows, self.follows_albedo = [True] * len(view.parts), True
+        self.is_thick, self.has_low_albedo = False, True
         self.gradients: list[Any] = []
         self.tangents: list[Any] = []
         self.has_tangent: list[bool] = []
@@ -68,6 +73,23 @@ class Body:
     def is_bounded(self) -> bool:
         """Whether some part has no known integral along a ray."""
         return len(self.exact_parts) < len(self.view.parts)
+
+    def find_followed(self) -> None:
+        """Find the parts, and whether the albedo, have derivatives enabled, so that only these are differentiated."""
+        with dr.resume_grad():
+            # A bounded part differentiates its field at points; its product does not tell whether its field is followed.
+            self.follows = [not p.exact_line or dr.grad_enabled(p.scaled(self.view.scale)) for p in self.view.parts]
+            self.follows_albedo = dr.grad_enabled(self.view.albedo_arrays)
+
+    @property
+    def follows_extinction(self) -> bool:
+        """Whether some part, or the microflakes, are differentiated."""
+        return any(self.follows) or is_followed(self.view.microflakes)
+
+    @property
+    def needs_probes(self) -> bool:
+        """Whether points besides collisions must estimate derivatives: by an extinction that may be thin, or a low albedo."""
+        return (self.follows_extinction and not self.is_thick) or (self.follows_albedo and self.has_low_albedo)
 
     def area(self, d: mi.Vector3f) -> mi.Float | float:
         """A(d) [1], the factor on the extinction for light along the unit vector ``d``; 1 without microflakes."""
@@ -155,7 +177,7 @@ class Body:
             amount = self.optical_depth(interval, len(weight))
             self._vjp_microflakes(interval.ray.d, weight, amount, interval.active)
         weight = [self.area(interval.ray.d) * w for w in weight]
-        for part, gradient in zip(self.view.parts, self.gradients, strict=True):
+        for part, gradient in self._parts_with_gradients():
             if part.exact_line:
                 part.vjp(gradient, to_part_channels(weight, part.channels), interval)
 
@@ -170,6 +192,14 @@ class Body:
         """The parts with a tangent, and their tangents. Other parts are not walked: their derivative is 0."""
         rows = zip(self.view.parts, self.tangents, self.has_tangent, strict=True)
         return [(part, change) for part, change, has_tangent in rows if has_tangent]
+
+    def _parts_with_gradients(self) -> list[tuple[Extinction, Any]]:
+        """The parts that are differentiated, and their gradients."""
+        return [
+            (part, gradient)
+            for part, gradient, follows in zip(self.view.parts, self.gradients, self.follows, strict=True)
+            if follows
+        ]
 
     def vjp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d coefficient of each channel) at a point: the transpose of :meth:`jvp_part_at`."""
@@ -203,7 +233,7 @@ class Body:
         if self.microflakes_gradient is not None:
             self._vjp_microflakes(ray.d, weight, self.extinction_at(ray, t, len(weight), active, name), active)
         weight = [self.area(ray.d) * w for w in weight]
-        for part, gradient in zip(self.view.parts, self.gradients, strict=True):
+        for part, gradient in self._parts_with_gradients():
             if part.name.startswith(name):
                 part.vjp_at(gradient, to_part_channels(weight, part.channels), ray, t, active)
 

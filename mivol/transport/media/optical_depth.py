@@ -102,6 +102,8 @@ def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectru
 def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
     """Like :func:`vjp_optical_depth`, with a ``weight`` for each channel."""
 
+    if not media.follows_extinction:
+        return
     bounded = bounded_parts(media.bodies)
 
     def visit(points: list[PointReservoir], interval: MediumInterval) -> list[PointReservoir]:

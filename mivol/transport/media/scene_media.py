@@ -77,6 +77,11 @@ class SceneMedia:
         return all(part.is_constant for body in self.bodies for part in body.view.parts)
 
     @property
+    def follows_extinction(self) -> bool:
+        """Whether the extinction of some medium is differentiated."""
+        return any(body.follows_extinction for body in self.bodies)
+
+    @property
     def is_single(self) -> bool:
         """Whether a single walk of cells passes all extinction in order: one medium, whose grids share their cells."""
         return len(self.bodies) == 1 and len(self.bodies[0].flight_parts) == len(self.bodies[0].view.parts)
@@ -122,6 +127,11 @@ class SceneMedia:
         if self.locates_camera:
             return _locate(self.scene, ray, self.size)
         return dr.zeros(mi.MediumPtr, n)
+
+    def find_followed(self) -> None:
+        """Find what is differentiated in each medium."""
+        for body in self.bodies:
+            body.find_followed()
 
     def start_gradients(self) -> None:
         """Begin a reverse pass: set the gradient of each part to zero."""

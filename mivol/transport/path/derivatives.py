@@ -198,7 +198,7 @@ def prepare_derivatives(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point
     """
     segment = estimators.segment
     segment.prepare_derivatives(ray)
-    if segment.ends_in_media:
+    if segment.ends_in_media and estimators.media.follows_extinction:
         segment.baseline = _estimate_baseline(estimators, ray, on_film)
 
 

@@ -50,8 +50,7 @@ class PathEvent:
         """The event at the end of a segment."""
         end, collision = estimate.end, estimate.collision
         reaches_end = active if collision is None else active & ~collision.on
-        chance = None if estimate.probe is None else estimate.probe.chance
-        return cls(end.si, end.t, end.medium, reaches_end & end.si.is_valid(), collision, chance)
+        return cls(end.si, end.t, end.medium, reaches_end & end.si.is_valid(), collision, estimate.chance)
 
     @classmethod
     def from_collision(cls, collision: Collision, chance: mi.Float | None = None) -> PathEvent:

@@ -154,7 +154,7 @@ def estimate_side_flight(
     lit = on & direct.on
     light = SideFlightLight(value, flight.transmittance, lit)
     shadow = DirectLight(media, direct.ray_segment, value, lit)
-    return SideFlight(light, shadow, None if flight.probe is None else flight.probe.chance)
+    return SideFlight(light, shadow, flight.chance)
 
 
 def weigh_emitter_sample(

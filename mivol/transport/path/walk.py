@@ -323,7 +323,7 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
         path = _add_near_light(estimators, path, segment, estimate.end.t)
     path.score = path.score.scale(estimate.transmittance)
     if estimate.probe is not None:
-        path.probes = path.probes.offer(segment, estimate.probe)
+        path.probes = path.probes.offer(segment, estimate.probe, estimate.chance)
     path.beta *= estimate.T
     path.T *= estimate.T
     path.medium = estimate.end.medium
@@ -538,15 +538,16 @@ def _add_side_flight(
 
 
 def _start_reservoirs(estimators: Estimators, path: Path, *probes: str) -> Path:
-    """Give a path empty reservoirs for derivatives, if it scatters in media.
+    """Give a path the empty reservoirs that its derivatives need, if it scatters in media.
 
     Args:
         probes: "first": keep a point of the first segment; "later": keep a point of a later segment, and a shadow ray.
     """
     if not estimators.segment.ends_in_media or path.score.purpose == IMAGE:
         return path
-    path.probes = Probes(*(Probe.empty(path.ray) if name in probes else None for name in ("first", "later")))
-    if "later" in probes:
+    if any(body.needs_probes for body in estimators.media.bodies):
+        path.probes = Probes(*(Probe.empty(path.ray) if name in probes else None for name in ("first", "later")))
+    if "later" in probes and estimators.media.follows_extinction:
         path.shadow = ShadowReservoir.empty(estimators.media, path.ray)
     return path
 

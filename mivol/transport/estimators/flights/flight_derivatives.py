@@ -14,6 +14,9 @@ length l of the flight in the media. Both are unbiased, since the mean over all 
 integral of T times its integrand. The baseline b does not change the mean, since the same two terms without L have the mean 0.
 A baseline about as bright as L removes most of the noise.
 
+A homogeneous medium that is thick enough to make paths collide needs no probes: kappa is 0. Without followed extinction there
+are neither probes nor kept shadow rays.
+
 For an albedo below ``MIN_ALBEDO``, the probe estimates the derivative by the albedo, in place of L / albedo.
 
 A path keeps few of these points and shadow rays, by weighted reservoir sampling (Chao 1982): one probe from its flights before
@@ -258,12 +261,12 @@ class Probe:
         nothing = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
         return cls(FineRay.from_ray(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
 
-    def offer(self, segment: PathSegment, flight_point: FlightPoint, on: mi.Bool) -> Probe:
-        """Offer the point of another flight to the reservoir."""
+    def offer(self, segment: PathSegment, flight_point: FlightPoint, chance: mi.Float, on: mi.Bool) -> Probe:
+        """Offer the point of another flight to the reservoir; it is kept if ``chance`` is below weight / (total weight)."""
         point, gain = flight_point.point, flight_point.gain
         weight = dr.select(point.on & segment.may_scatter & on, dr.max(gain), 0)
         total = self.total + weight
-        keep = flight_point.chance * total < weight
+        keep = chance * total < weight
         return Probe(
             dr.select(keep, segment.ray, self.ray),
             dr.select(keep, point.t, self.t),
@@ -290,11 +293,11 @@ class Probes:
     first: Probe | None
     later: Probe | None
 
-    def offer(self, segment: PathSegment, flight_point: FlightPoint) -> Probes:
+    def offer(self, segment: PathSegment, flight_point: FlightPoint, chance: mi.Float) -> Probes:
         """Offer the point of another flight to the reservoir of its kind."""
         on = segment.depth == 0
-        first = None if self.first is None else self.first.offer(segment, flight_point, on)
-        return Probes(first, None if self.later is None else self.later.offer(segment, flight_point, ~on))
+        first = None if self.first is None else self.first.offer(segment, flight_point, chance, on)
+        return Probes(first, None if self.later is None else self.later.offer(segment, flight_point, chance, ~on))
 
 
 @dataclass
@@ -471,7 +474,9 @@ def _collision_weight(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on
 
 
 def _probe_extinction(media: SceneMedia, body: Body) -> mi.Float:
-    """The extinction kappa [1/length]: an optical depth of ``PROBE_TAU`` across the medium."""
+    """The extinction kappa [1/length]: an optical depth of ``PROBE_TAU`` across the medium; 0 if collisions suffice."""
+    if body.is_thick:
+        return mi.Float(0)
     return PROBE_TAU / (media.size if body.edge is None else body.edge)
 
 

@@ -130,7 +130,7 @@ class FreeFlight:
         # -- The light of the media on the way --------------------------------------------------------------------------
         emission = None
         if self.emitting:
-            emission = self._sample_point(segment, passed, self.emitting, at_emission, chance, active)
+            emission = self._sample_point(segment, passed, self.emitting, at_emission, active)
         if segment.emission_weight is not None:
             emission.gain *= segment.emission_weight
         gaussian_light = None
@@ -142,8 +142,12 @@ class FreeFlight:
         baseline = None if segment.is_side_flight else self.baseline
         shared = FlightSegment(media, segment, passed, collision, weight, baseline, emission, gaussian_light, active)
         light = SegmentLight(shared, shared.emitted, is_replayed=True)
-        probe = self._sample_point(segment, passed, self.bodies, at_probe, chance, active) if purpose != IMAGE else None
-        return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)
+        transmittance = SegmentTransmittance(shared)
+        if purpose == IMAGE:
+            return SegmentEstimate(end, weight, light, transmittance, collision)
+        probed = [body for body in self.bodies if body.needs_probes]
+        probe = self._sample_point(segment, passed, probed, at_probe, active) if probed else None
+        return SegmentEstimate(end, weight, light, transmittance, collision, probe, chance)
 
     def _channel_weight(
         self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None
@@ -170,13 +174,13 @@ class FreeFlight:
         return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
 
     def _sample_point(
-        self, segment: PathSegment, passed: RaySegment, among: list[Body], u: mi.Float, chance: mi.Float, active: mi.Bool
+        self, segment: PathSegment, passed: RaySegment, among: list[Body], u: mi.Float, active: mi.Bool
     ) -> FlightPoint:
         """Draw a point uniformly from the intervals of a flight in some media."""
         point = draw_uniform_point(self.media, passed, among, u, active)
         front = RaySegment.upto(segment.ray, segment.medium, dr.select(point.on, point.t, 0))
         gain = segment.beta * self._channel_weight(segment, front, point.on, None) * point.length
-        return FlightPoint(point, gain, chance)
+        return FlightPoint(point, gain)
 
 
 def make_collision(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, on: mi.Bool) -> Collision:
