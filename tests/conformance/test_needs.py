@@ -144,9 +144,12 @@ def test_boxes_trace_no_acceleration_structure():
 
 def test_depth_1_shades_no_surface():
     """What a surface would need (light sampling, its shadow ray) is not in the kernel of depth 1."""
-    scene = scene_of(wall={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])})
-    assert traced_rays(kernels(scene, depth=1)) == 1
-    assert traced_rays(kernels(scene, depth=2)) == 2
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}
+    lamp = {"type": "point", "position": [0, 0, 3]}
+    assert traced_rays(kernels(scene_of(wall=wall, lamp=lamp), depth=1)) == 1
+    assert traced_rays(kernels(scene_of(wall=wall, lamp=lamp), depth=2)) == 2
+    # A sky of one radiance is found by the directions of the BSDF alone.
+    assert traced_rays(kernels(scene_of(wall=wall), depth=2)) == 1
 
 
 def test_explain_gives_a_reason_for_each_choice():
