@@ -265,7 +265,7 @@ def choose_successive_paths(needs: Needs, settings: Settings, segment: str) -> t
         return 1, []
     subject = "lanes"
     if not needs.are_samples_independent:
-        return 1, [Choice(subject, "one path each", "the sampler stratifies one path per lane")]
+        return 1, [Choice(subject, "one path each", "the scene's sampler has numbers for one path per lane")]
     many = f"up to {SUCCESSIVE_PATHS} paths one after the other"
     return SUCCESSIVE_PATHS, [Choice(subject, many, "path lengths differ, and lanes would wait for the longest path")]
 

@@ -281,7 +281,7 @@ class Needs(ShapeFacts):
         parameters: keys of the parameters with gradients enabled.
         places: keys among ``parameters`` that place shapes and sensors.
         film_samples: pixels times samples per pixel of the sensor.
-        are_samples_independent: whether the sampler stratifies nothing, so that other random numbers may replace its own.
+        are_samples_independent: whether the sensor has Mitsuba's independent sampler, whose numbers others may replace.
         nearness: distance of the nearest emitter with a position to a medium that scatters, over the longest edge of the box
             around the medium [1]; 0 for an emitter inside, or for a medium without a known end; infinite without such an
             emitter.

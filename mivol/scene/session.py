@@ -89,7 +89,7 @@ class Session:
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, for_images=True)
-            samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
+            samples = RenderSamples(sensor, seed, spp, plan.pass_rays)
             image = render_on_film(samples, self.aovs, lambda rays: self._primal(estimators, rays, plan.successive_paths))
         if evaluate:
             dr.eval(image)
@@ -103,7 +103,7 @@ class Session:
                 estimators, plan = self._open(scene, sensor, spp)
                 estimators.media.find_followed()
                 estimators.media.start_tangent()
-            samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
+            samples = RenderSamples(sensor, seed, spp, plan.pass_rays)
             return render_on_film(samples, self.aovs, lambda rays: self._tangent(estimators, rays))
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
@@ -118,7 +118,7 @@ class Session:
                 estimators, plan = self._open(scene, sensor, spp)
             media = estimators.media
             media.find_followed()
-            samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
+            samples = RenderSamples(sensor, seed, spp, plan.pass_rays)
             media.start_gradients()
             # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only
             # once.
@@ -162,7 +162,7 @@ class Session:
             L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
         else:
             score = Primal(_zero_radiance(rays.ray))
-            score, alpha = walk_path(estimators, rays.sampler, rays.ray, score, strata=rays.strata)
+            score, alpha = walk_path(estimators, rays.sampler, rays.ray, score)
             L = score.L
         return L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
 
@@ -170,7 +170,7 @@ class Session:
         prepare_derivatives(estimators, rays.ray, rays.on_film)
         black = _zero_radiance(rays.ray)
         score = Tangent(black, black)
-        score, _ = walk_path(estimators, rays.sampler, rays.ray, score, strata=rays.strata)
+        score, _ = walk_path(estimators, rays.sampler, rays.ray, score)
         return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
 
     def _replay(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float], branches: bool) -> None:
@@ -186,9 +186,9 @@ class Session:
         again, L = rays.sampler.clone(), None
         if not has_one_segment(estimators):
             known = Primal(_zero_radiance(rays.ray))
-            L = walk_path(estimators.replayed(), rays.sampler, rays.ray, known, strata=rays.strata)[0].L
+            L = walk_path(estimators.replayed(), rays.sampler, rays.ray, known)[0].L
             dr.eval(L)
-        walk_path(estimators, again, rays.ray, Replay(L, dL), strata=rays.strata)
+        walk_path(estimators, again, rays.ray, Replay(L, dL))
 
 
 def _find_renderable_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

@@ -106,7 +106,7 @@ def at_smoke(found: mi.Scene) -> tuple[DirectLighting, MediumVertex]:
 
 def samples() -> EventSamples:
     u, uv = mi.Float(0.75), mi.Point2f(0.25, 0.125)
-    return EventSamples(u, uv, u, uv, u, uv, u)
+    return EventSamples(mi.UInt32(5), uv, u, uv, u, uv, u)
 
 
 def test_a_point_of_smoke_under_two_emitters():

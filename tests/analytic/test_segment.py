@@ -53,8 +53,8 @@ def test_absorption_draws_for_the_estimator_whose_path_it_follows():
     """Absorption draws the numbers of the other estimator, and returns none."""
     other = Recorder()
     absorption = Absorption(None, other)
-    assert absorption.draw("sampler", "active", "strata") is None and other.said == [("sampler", "active", "strata")]
-    assert Absorption(None).draw("sampler", "active", None) is None
+    assert absorption.draw("sampler", "active") is None and other.said == [("sampler", "active")]
+    assert Absorption(None).draw("sampler", "active") is None
     assert absorption.replayed() is absorption
 
 

@@ -223,6 +223,12 @@ def lane_generators(seed: int) -> mi.UInt32:
     return seed_pcg32((dr.arange(mi.Float, N) + 0.5) / N, N, fresh(seed))
 
 
+def fly(part: GridExtinction, interval: RayInterval, seed: int) -> mi.Float64:
+    """Distances of collisions; the first number of each lane's generator is that of the first tentative collision."""
+    rng, (u,) = draw_pcg32(lane_generators(seed), 1)
+    return delta_tracking_in_blocks(part, mi.Float(SCALE), interval, u, rng)[0]
+
+
 def make_grid(values: np.ndarray, shift: int) -> GridExtinction:
     lattice = make_lattice(values, PLACE)
     lattice.block_ranges = find_block_ranges(lattice.values, shift)
@@ -260,7 +266,7 @@ def depths(values: np.ndarray, t: mi.Float64, t0: float) -> np.ndarray:
 def test_flights_through_a_grid(shift):
     """Rough values, in blocks of 4 and of 8 cells."""
     values = rough_grid(1, 2.0, (9, 12, 17))
-    t, _ = delta_tracking_in_blocks(make_grid(values, shift), mi.Float(SCALE), ray_interval(), lane_generators(1))
+    t = fly(make_grid(values, shift), ray_interval(), 1)
     T = np.exp(-SCALE * tau_twin(values, PLACE, START, D)[0])
     assert_flights(t, depths(values, t, 0.0), T)
 
@@ -269,19 +275,17 @@ def test_flights_through_a_grid(shift):
 def test_flights_that_begin_and_end_in_the_grid():
     """Flights from 2.2 to 3.1 have no collisions outside."""
     values = rough_grid(1, 2.0, (9, 12, 17))
-    t, _ = delta_tracking_in_blocks(make_grid(values, 2), mi.Float(SCALE), ray_interval(2.2, 3.1), lane_generators(2))
+    t = fly(make_grid(values, 2), ray_interval(2.2, 3.1), 2)
     assert_flights(t, depths(values, t, 2.2), np.exp(-SCALE * tau_twin(values, PLACE, START, D, 2.2, 3.1)[0]))
     assert np.nanmin(np.array(t)) >= 2.2 and not np.any((np.array(t) > 3.1 + 1e-6) & np.isfinite(np.array(t)))
 
 
 def test_every_collision_is_real_where_blocks_have_one_value():
-    """The first random number u determines the collision: -log u over the extinction, behind the face of the box."""
-    t, _ = delta_tracking_in_blocks(
-        make_grid(np.full((9, 12, 17), 0.8), 2), mi.Float(SCALE), ray_interval(), lane_generators(3)
-    )
+    """The first random number u determines the collision: -log(1 - u) over the extinction, behind the face of the box."""
+    t = fly(make_grid(np.full((9, 12, 17), 0.8), 2), ray_interval(), 3)
     _, (u,) = draw_pcg32(lane_generators(3), 1)
     start, end = face()
-    expected = start - np.log(np.array(u, np.float64)) / (0.8 * SCALE)
+    expected = start - np.log(1 - np.array(u, np.float64)) / (0.8 * SCALE)
     expected[expected > end] = np.inf
     # The lengths of 15 blocks, and as many optical depths, are subtracted from numbers of up to 16.
     np.testing.assert_allclose(np.array(t), expected, atol=15 * 16 * 2.0**-24 / 0.8)
@@ -290,10 +294,8 @@ def test_every_collision_is_real_where_blocks_have_one_value():
 def test_lanes_that_are_off_and_vacuum_have_no_collision():
     """Blocks of 0 have a majorant of 0: the next tentative collision is at infinity."""
     part, empty = make_grid(rough_grid(1), 2), make_grid(np.zeros((5, 4, 6)), 2)
-    assert np.isinf(
-        np.array(delta_tracking_in_blocks(part, mi.Float(SCALE), ray_interval(on=False), lane_generators(4))[0])
-    ).all()
-    assert np.isinf(np.array(delta_tracking_in_blocks(empty, mi.Float(SCALE), ray_interval(), lane_generators(4))[0])).all()
+    assert np.isinf(np.array(fly(part, ray_interval(on=False), 4))).all()
+    assert np.isinf(np.array(fly(empty, ray_interval(), 4))).all()
 
 
 def ball(slack: float, sigma: float = 0.6) -> BoundedExtinction:

@@ -11,7 +11,7 @@ from scattering_scenes import close_up, mivol, moments, rough_grid, smoke
 from volpath_scenes import EMITTERS, same
 
 from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, SceneEmitters, make_ball_sampler
-from mivol.transport.traversal.random_numbers import Strata
+from mivol.transport.traversal.random_numbers import fork_state
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -60,9 +60,9 @@ def test_what_is_sampled_and_what_is_seen_through() -> None:
         assert not found.samples_phase and found.is_near == at_hand
 
 
-def samples(strata: Strata | None = None) -> EventSamples:
+def samples() -> EventSamples:
     u, uv = mi.Float(0.3), mi.Point2f(0.6, 0.9)
-    return EventSamples(u, uv, u, uv, u, uv, u, strata)
+    return EventSamples(mi.UInt32(5), uv, u, uv, u, uv, u)
 
 
 def test_each_event_draws_directions_from_its_part_of_the_square():
@@ -80,10 +80,14 @@ def test_events_of_a_ray_share_the_emitter_and_little_else():
     assert np.array(second.inside).ravel() == pytest.approx([(0.6 + 0.7548776662) % 1, (0.9 + 0.5698402910) % 1], abs=2.0**-22)
 
 
-def test_a_single_event_has_the_strata_of_its_lane():
-    only = samples(Strata(mi.UInt32(3), 2, 2)).for_event(mi.UInt32(0), 1)
-    assert np.array(only.direction).ravel() == pytest.approx([0.8, 0.95], abs=2.0**-23)
-    assert only.strata is None and only.component[0] == np.float32(0.3)
+def test_walks_of_a_ray_and_of_its_events_have_generators_of_their_own():
+    """Of two events: two for the pieces of the ray, and two for the shadow rays of each event. Of one: one, and two."""
+    for count in (1, 2):
+        events = [samples().for_event(mi.UInt32(k), count) for k in range(count)]
+        states = [fork_state(samples().generator, k) for k in range(count)]
+        states += [fork_state(event.generator, k) for event in events for k in range(2)]
+        assert len({state[0] for state in states}) == 3 * count
+    assert events[0].which_emitter[0] == np.float32(0.3)
 
 
 ROUNDING = 2.0**-22

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from false_alarms import Estimate, assert_same_mean, assert_same_spread, fresh
+from false_alarms import Estimate, assert_precise, assert_same_mean, assert_same_spread, difference, fresh, over_pixels
 from scattering_scenes import cases
 
 import scenes
@@ -104,11 +104,24 @@ def test_split_into_passes(kind, monkeypatch):
     assert_same_mean(whole, split, rounding=1e-5, what=kind)
 
 
+def draw_independently(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let films draw independent numbers in place of spread points."""
+
+    def independent(pixel: mi.Vector2i, seed: mi.UInt32, sample: mi.UInt32, count: mi.UInt32) -> mi.Sampler:
+        sampler = mi.load_dict({"type": "independent"})
+        # The first sample of the first pixel is the first of the pass.
+        sampler.seed(seed[0] + (sample[0] << 16), dr.width(sample))
+        return sampler
+
+    monkeypatch.setattr(film.SpreadSampler, "of_pixels", independent)
+
+
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_passes_of_stratified_samples_stay_stratified(monkeypatch):
     """A step across a pixel: n strata leave about n^-1/2 of the variance of n independent samples, whatever the passes."""
     grey = {}
+    draw_independently(monkeypatch)
     for kind in ("independent", "multijitter"):
         made = sensor_of(width=24, height=24)
         made["sampler"] = {"type": kind, "sample_count": 9}
@@ -120,31 +133,110 @@ def test_passes_of_stratified_samples_stay_stratified(monkeypatch):
     assert_same_spread(grey["multijitter"], grey["independent"], expected=1 / 3, high=0.75, what="strata")
 
 
-@pytest.mark.slow
+def points(sensor: dict, spp: int, pass_rays: int, seed: int = 5) -> dict[tuple[int, int], np.ndarray]:
+    """The numbers (samples, 8) of each pixel of the film: on the film, and those of a path; as their bits."""
+    found = {}
+    for rays in film.film_passes(film.RenderSamples(mi.load_dict(sensor), seed, spp, pass_rays)):
+        draws = (*rays.position, rays.sampler.next_lead(), *rays.sampler.next_2d(), rays.sampler.next_1d())
+        state = np.array(rays.sampler.next_state())
+        values = np.stack([np.array(x).view(np.uint32) for x in draws] + [state], axis=-1)
+        for x, y, row in zip(*(np.floor(np.array(v)).astype(int) for v in rays.position), values, strict=True):
+            found.setdefault((x, y), []).append(row)
+    return {pixel: np.array(rows) for pixel, rows in found.items()}
+
+
+def test_neither_passes_nor_a_crop_change_the_points_of_a_pixel():
+    """To the last bit, in passes of 4 and of 2 samples a pixel, and in a crop; of another seed all numbers differ."""
+    whole = points(sensor_of(rfilter="gaussian"), 12, 1 << 20)
+    crop = {"crop_width": 7, "crop_height": 5, "crop_offset_x": 3, "crop_offset_y": 2}
+    assert len(whole) == 144 and len(points(sensor_of(rfilter="gaussian", **crop), 12, 1 << 20)) == 35
+    for made, pass_rays in (
+        ({}, 4 * 144),
+        ({}, 2 * 144),
+        (crop, 1 << 20),
+        (crop, 35),
+        (crop | {"sample_border": True}, 1 << 20),
+    ):
+        found = points(sensor_of(rfilter="gaussian", **made), 12, pass_rays)
+        inside = found.keys() & whole.keys()
+        assert len(inside) >= 35
+        assert all(np.array_equal(found[pixel], whole[pixel]) for pixel in inside)
+    other = points(sensor_of(rfilter="gaussian"), 12, 1 << 20, seed=6)
+    assert not any((other[pixel] == whole[pixel]).any() for pixel in whole)
+
+
+def test_the_samples_of_a_pixel_are_a_net():
+    """Of 16 samples, the cells of 4 x 4, 2 x 8 and 16 x 1 hold one each, in every pixel and in its own order."""
+    samples = film.RenderSamples(mi.load_dict(sensor_of(rfilter="gaussian")), 5, 16, 4 * 144)
+    position = np.concatenate([np.array(rays.position).T.reshape(144, 4, 2) for rays in film.film_passes(samples)], axis=1) % 1
+    for shape in ((4, 4), (2, 8), (16, 1)):
+        cell = np.floor(position * shape).astype(int) @ (1, shape[0])
+        assert np.array_equal(np.sort(cell), np.broadcast_to(np.arange(16), (144, 16)))
+        assert len({tuple(c) for c in cell}) > 100
+
+
+@pytest.mark.parametrize("kind", ["multijitter", "stratified", "orthogonal", "ldsampler"])
+def test_a_sampler_of_the_scene_is_honoured(kind):
+    """Positions on the film are the first numbers of that sampler."""
+    sensor = mi.load_dict(sensor_of(rfilter="gaussian") | {"sampler": {"type": kind, "sample_count": 9}})
+    (rays,) = film.film_passes(film.RenderSamples(sensor, 5, 0, 1 << 20))
+    sampler = sensor.sampler().clone()
+    sampler.set_samples_per_wavefront(sampler.sample_count())
+    sampler.seed(5, dr.width(rays.ray))
+    np.testing.assert_allclose(np.array(rays.position) % 1, np.array(sampler.next_2d()), atol=2.0**-20)
+
+
+def floor_in_smoke(res: int = 8) -> mi.Scene:
+    """A floor under a panel of light, and smoke beside it; the camera looks at both."""
+    smoke = medium("heterogeneous", grid_volume("gridvolume", np.full((3, 3, 3, 1), 0.7, np.float32), PLACE), 0.6)
+    look, T = mi.ScalarTransform4f().look_at, mi.ScalarTransform4f
+    made = camera((3.0, 3.0, 5.0), (1.6, 0.0, -1.0), res=res, fov=50.0)
+    light = {"type": "rectangle", "to_world": look([2, 0, 4], [2, 0, 0], [0, 1, 0]), "emitter": {"type": "area"}}
+    floor = {"type": "rectangle", "to_world": T().translate([0, 0, -1.001]).scale(8.0)}
+    return mi.load_dict({"type": "scene", "box": box_of(smoke, PLACE), "light": light, "floor": floor, "sensor": made})
+
+
 @pytest.mark.statistical
-def test_pixels_are_not_correlated_between_passes(monkeypatch):
-    """Each pass draws its own numbers: the variance of the mean falls as 1/passes."""
-    scene = mi.load_dict(parts(sensor_of()))
-    integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
-    monkeypatch.setitem(plan.PASS_RAYS, mi.variant().split("_")[0], 1)
-    one, many = (moments(scene, integrator, spp, first, 64) for spp, first in ((1, 0), (4, 5000)))
-    one, many = (Estimate(m.mean[..., 0], m.variance_of_mean[..., 0], m.n - 1) for m in (one, many))
-    # The pixels at the edges bring some 700 degrees of freedom: each variance is known to 5 %; a repeated pass would give 1.
-    assert_same_spread(many, one, expected=1 / 4, low=0.6 / 4, high=1.7 / 4, what="passes")
+def test_spread_points_keep_the_mean(monkeypatch):
+    """Of free flights and surfaces: 16 images of 64 pixels, beside as many of independent numbers."""
+    scene, integrator = floor_in_smoke(), mi.load_dict({"type": "mivol", "max_depth": 4})
+    spread = moments(scene, integrator, 32, 0, 16)
+
+    draw_independently(monkeypatch)
+    truth = moments(scene, integrator, 32, 7000, 16)
+    assert_same_mean(spread, truth, tile=4, what="tiles")
+    assert_same_mean(over_pixels(spread), over_pixels(truth), what="all pixels")
+    assert_precise(difference(over_pixels(spread), over_pixels(truth)), 0.02 * over_pixels(truth).mean, what="all pixels")
 
 
-@pytest.mark.parametrize("layout", [film.SPREAD, film.TILED])
-def test_samples_of_a_pixel_share_it_out(layout):
-    """Of 12 samples, each cell of 3 x 4 holds one, in an order of its own in each tile or pixel."""
-    # A box filter would count all samples of a pixel at its corner.
-    samples = film.RenderSamples(mi.load_dict(sensor_of(rfilter="gaussian")), 5, 12, 1 << 20, layout)
-    (rays,) = film.film_passes(samples)
-    x, y = (np.array(v) for v in (rays.position.x, rays.position.y))
-    pixel = np.floor(x).astype(int) + 12 * np.floor(y).astype(int)
-    cell = np.floor(x % 1 * 3).astype(int) + 3 * np.floor(y % 1 * 4).astype(int)
-    order = [cell[pixel == p] for p in range(144)]
-    assert all(np.array_equal(np.sort(c), np.arange(12)) for c in order)
-    assert len({tuple(c) for c in order}) == (9 if layout == film.TILED else 144)
+@pytest.mark.statistical
+def test_the_error_of_a_floor_falls_faster_than_by_chance():
+    """Light of a panel, by two dimensions of a smooth function, from positions on the film by two more: of 16 times as many
+    samples a variance of 16^-1.5 or less is left; independent numbers would leave 1/16.
+    """
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1]).scale(8.0)}
+    look = mi.ScalarTransform4f().look_at
+    light = {"type": "rectangle", "to_world": look([2, 0, 4], [2, 0, 0], [0, 1, 0]), "emitter": {"type": "area"}}
+    made = camera((3.0, 3.0, 5.0), (1.6, 0.0, -1.0), res=8, fov=50.0)
+    scene = mi.load_dict({"type": "scene", "light": light, "floor": floor, "sensor": made})
+    integrator = mi.load_dict({"type": "mivol", "max_depth": 2})
+    few, many = (moments(scene, integrator, spp, first, 16) for spp, first in ((16, 0), (256, 3000)))
+    few, many = (Estimate(m.mean[..., 0], m.variance_of_mean[..., 0], m.n - 1) for m in (few, many))
+    # 64 pixels of 16 images bring at least 200 degrees of freedom: each variance is known to 10 %.
+    assert_same_spread(many, few, expected=16.0**-1.5, high=1 / 30, what="variances")
+
+
+@pytest.mark.statistical
+def test_seeds_are_not_correlated():
+    """The errors of two seeds in each of 64 pixels have no common part, nor do those of neighbouring pixels."""
+    scene, integrator = floor_in_smoke(), mi.load_dict({"type": "mivol", "max_depth": 4})
+    images = np.stack([np.array(mi.render(scene, integrator=integrator, spp=4, seed=fresh(s)))[..., 0] for s in range(64)])
+    error = images - images.mean(axis=0)
+    # Errors from the mean of 64 images have a correlation of -1/63.
+    share = np.sum(error[::2] * error[1::2], axis=0) + np.sum(error**2, axis=0) / 2 / 63
+    beside = error[:, :, ::2] * error[:, :, 1::2]
+    assert_same_mean(Moments.from_values(share.reshape(-1, 1)), 0, what="seeds")
+    assert_same_mean(Moments.from_values(beside.mean(axis=(1, 2))[:, None]), 0, what="pixels")
 
 
 def test_a_new_seed_compiles_nothing():

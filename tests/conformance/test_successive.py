@@ -69,7 +69,7 @@ def test_lanes_of_all_threads_have_work(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_plan_takes_them_where_lengths_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Successive paths need unlimited scattering and a sampler without strata, which has numbers for one path in each lane
+    """Successive paths need unlimited scattering and the independent sampler; others have numbers for one path in each lane
     only.
     """
     scene, counts = peaked(), []

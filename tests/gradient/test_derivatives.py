@@ -148,9 +148,10 @@ def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     monkeypatch.setattr(derivatives, "BALANCE", 100.0)
     gradient_of_mean_image(smoky(), KEYS["density"], 64, fresh(3))
-    stem, seeds = np.array(made[0].stem), np.array(made[0].seeds[:2])
+    stem, sampler = np.array(made[0].stem), made[0].sampler
+    numbers = np.array([sampler.state, sampler.bits])
     assert np.array_equal(np.unique(stem, return_counts=True)[1], np.full(len(stem) // 4, 4))
-    assert np.unique(seeds, axis=1).shape[1] == seeds.shape[1]
+    assert np.unique(numbers, axis=1).shape[1] == numbers.shape[1]
 
 
 def test_branches_walk_side_by_side_by_their_length() -> None:
@@ -175,7 +176,7 @@ def test_without_collisions_probes_give_the_derivative(replays: list) -> None:
 
 
 def test_plan_branches_paths_with_free_flights(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Branches need free flights and a sampler without strata; images and recordings have none."""
+    """Branches need free flights and the independent sampler; images and recordings have none."""
     scene = smoky()
     facts = find_needs(scene, scene.sensors()[0])
     choose = lambda facts, depth, segment="free_flight": plan.choose_branches(facts, Settings(max_depth=depth), segment)[0]  # noqa: E731

@@ -19,7 +19,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.lighting.shadow_rays import estimate_transmittance
@@ -33,7 +32,7 @@ from mivol.transport.media.optical_depth import (
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.uniform_points import UniformPoint
-from mivol.transport.traversal.random_numbers import Strata, draw_pcg32, seed_pcg32
+from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state, fork_state
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [
@@ -139,14 +138,12 @@ class SegmentEstimator(Protocol):
     """An estimator of the light and the transmittance of a segment.
 
     Attributes:
-        directions: layout of lanes required by its directions (:class:`mivol.transport.path.film.RenderSamples`).
         ends_in_media: segments may end at collisions with media, where the path scatters.
     """
 
-    directions: str
     ends_in_media: bool
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
+    def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> Any:
         """Draw the random numbers of a segment, for ``PathSegment.samples``."""
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
@@ -242,15 +239,14 @@ class Absorption:
     Bias: none but rounding. Variance: none. Cost: one walk of each medium.
     """
 
-    directions = "none"
     ends_in_media = False
 
     def __init__(self, media: SceneMedia, drawn_by: SegmentEstimator | None = None) -> None:
         self.media, self.drawn_by = media, drawn_by
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
+    def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> Any:
         if self.drawn_by is not None:
-            self.drawn_by.draw(sampler, active, strata)
+            self.drawn_by.draw(sampler, active)
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         end, tau, passages = integrate_optical_depth(self.media, segment.ray, segment.medium, active)
@@ -274,25 +270,22 @@ class TrackedAbsorption:
     each exact medium; look-ups in proportion to the majorants of the others.
     """
 
-    directions = "none"
     ends_in_media = False
 
     def __init__(self, media: SceneMedia) -> None:
         self.media = media
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> mi.Float:
-        """Draw one number in every lane.
+    def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> mi.UInt32:
+        """Draw a generator in every lane.
 
         ``active`` lanes are the lanes allowed to scatter once more. A sampler does not advance in other lanes, and would return
         the same number there at each segment.
         """
-        return sampler.next_1d()
+        return draw_state(sampler)
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        width = dr.width(segment.ray)
-        rng = seed_pcg32(segment.samples, width)
-        end, T = estimate_transmittance(self.media, segment.ray, segment.medium, active, rng)
-        _, (u,) = draw_pcg32(seed_pcg32(segment.samples, width, 1), 1)
+        end, T = estimate_transmittance(self.media, segment.ray, segment.medium, active, segment.samples)
+        _, (u,) = draw_pcg32(fork_state(segment.samples, 1), 1)
         passed = RaySegment(segment.ray, segment.medium, end.t, u=u)
         return SegmentEstimate(end, T, None, Transmittance(self.media, passed, active))
 

@@ -34,7 +34,6 @@ from mivol.transport.media.ray_intervals import RaySegment, find_end
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
 from mivol.transport.traversal.interpolation import GAUSS_POINT
-from mivol.transport.traversal.random_numbers import Strata
 
 __all__ = ["integrate_emission", "vjp_emission", "Emission"]
 
@@ -287,13 +286,12 @@ class Emission:
     Bias and cost: as :func:`integrate_emission`. Variance: none.
     """
 
-    directions = "none"
     ends_in_media = False
 
     def __init__(self, media: SceneMedia) -> None:
         self.media = media
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
+    def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Any:
         """Draw nothing: the estimate is deterministic."""
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:

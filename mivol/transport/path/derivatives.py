@@ -33,7 +33,7 @@ from mivol.transport.media.channels import to_components
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
 from mivol.transport.path.walk import FirstCollision, gather_lanes, walk_branch, walk_path, walk_stem
-from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
+from mivol.transport.traversal.random_numbers import SpreadSampler
 from mivol.transport.traversal.rays import FineRay, clip_camera_ray
 
 __all__ = ["count_branches", "prepare_derivatives", "replay_branches"]
@@ -80,22 +80,21 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
 
     Args:
         estimators: estimators of the render, prepared for derivatives along these rays; their segments end in media.
-        rays: camera rays, with a sampler of independent numbers.
+        rays: camera rays, with a sampler of spread numbers.
         dL: d loss / d radiance of each ray.
     """
     n, sampler = dr.width(rays.ray), rays.sampler
-    seeds = draw_seeds(sampler)
-    replayed_sampler, replayed = sampler.clone(), estimators.replayed()
+    first, replayed_sampler, replayed = sampler.clone(), sampler.clone(), estimators.replayed()
 
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
     stems, collision = walk_stem(replayed, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
-    dr.eval(seeds, stems.L, collision)
+    dr.eval(first, stems.L, collision)
     collided = dr.compress(collision.on)
     if (count := dr.width(collided)) == 0:
         replay_in_one_kernel(n, lambda: walk_stem(estimators, replayed_sampler, rays.ray, Replay(stems.L, dL)))
         return
     k = count_branches(n, count)
-    share, branches = dr.opaque(mi.Float, 1 / k), _Branches.split(collision, collided, seeds, k)
+    share, branches = dr.opaque(mi.Float, 1 / k), _Branches.split(collision, collided, first, k)
     primal, depth = branches.walk(replayed, Primal(dr.zeros(mi.Spectrum, count * k)))
     dr.eval(primal.L, depth)
     for L_stem, L_branch in zip(stems.L, primal.L, strict=True):
@@ -139,36 +138,34 @@ class _Branches:
     Attributes:
         stem: index of the stem of each branch.
         collision: collision at the end of the stem.
-        seeds: two seeds and the sequence number of each branch's random numbers.
+        sampler: random numbers of each branch.
     """
 
     stem: mi.UInt32
     collision: FirstCollision
-    seeds: tuple[mi.UInt32, mi.UInt32, mi.UInt32]
+    sampler: SpreadSampler
 
     @classmethod
-    def split(cls, collision: FirstCollision, collided: mi.UInt32, seeds: tuple[mi.UInt32, mi.UInt32], k: int) -> _Branches:
-        """Split each stem with a collision into k branches, side by side."""
+    def split(cls, collision: FirstCollision, collided: mi.UInt32, sampler: SpreadSampler, k: int) -> _Branches:
+        """Split each stem with a collision into k branches, side by side; ``sampler`` has the numbers of the stems."""
         number = dr.arange(mi.UInt32, dr.width(collided) * k)
-        stem = dr.gather(mi.UInt32, collided, number // dr.opaque(mi.UInt32, k))
-        a, b = (dr.gather(mi.UInt32, seed, stem) for seed in seeds)
-        # The branches of a stem differ by their number only. Its hash seeds the generator; otherwise their random numbers would
-        # be correlated.
-        seeds = (*mi.sample_tea_32(a ^ (b << 8), number), number)
-        branches = cls(stem, _gather_collisions(collision, stem), seeds)
+        each = dr.opaque(mi.UInt32, k)
+        stem = dr.gather(mi.UInt32, collided, number // each)
+        sampler = sampler.gather(stem).branch(number % each, each)
+        branches = cls(stem, _gather_collisions(collision, stem), sampler)
         dr.eval(branches)
         return branches
 
     def reorder(self, order: mi.UInt32) -> _Branches:
         """The branches in another order."""
-        stem, *seeds = (dr.gather(mi.UInt32, values, order) for values in (self.stem, *self.seeds))
-        branches = _Branches(stem, _gather_collisions(self.collision, order), tuple(seeds))
+        stem = dr.gather(mi.UInt32, self.stem, order)
+        branches = _Branches(stem, _gather_collisions(self.collision, order), self.sampler.gather(order))
         dr.eval(branches)
         return branches
 
     def walk(self, estimators: Estimators, score: Primal | Replay) -> tuple[Primal | Replay, mi.UInt32]:
         """Walk the branches to their ends; return the score and the number of scattering events of each."""
-        return walk_branch(estimators, LaneSampler.seeded(*self.seeds), self.collision, score)
+        return walk_branch(estimators, self.sampler.clone(), self.collision, score)
 
 
 def _gather_collisions(collision: FirstCollision, index: mi.UInt32) -> FirstCollision:
@@ -259,7 +256,7 @@ def _film_tile(on_film: mi.Point2f) -> mi.UInt32:
 def _find_first_collisions(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f) -> Collision:
     """Find the collisions on the first segments of paths walked with the same random numbers."""
     on, segment = dr.full(mi.Bool, True, dr.width(ray)), estimators.segment
-    samples = segment.draw(sampler, on, None)
+    samples = segment.draw(sampler, on)
     beta = dr.full(mi.Spectrum, 1, dr.width(ray))
     first = PathSegment(ray, estimators.media.medium_at(ray), beta, on, samples, mi.UInt32(0))
     return segment.estimate(first, IMAGE, on).collision

@@ -4,7 +4,10 @@ r"""The rays of a sensor, the film averaging their radiance, and the transpose f
 
 Conventions. The samples of a render are split into passes of at most ``pass_rays`` rays. The film sums all passes before
 dividing by the filter weights, so the image depends on the split only through the order of sums, and a render may have more
-than the 2^32 samples of a launch. The samples of a stratifying sampler stay stratified over all passes.
+than the 2^32 samples of a launch. A sensor's ``independent`` sampler, Mitsuba's default, is replaced by points spread over the
+samples of a pixel (:class:`mivol.transport.traversal.random_numbers.SpreadSampler`). They depend on the seed, the pixel's place
+on the film and the index of the sample over all passes, so neither passes nor a crop change them. A scene's other samplers
+draw their own numbers, stratified over all passes.
 """
 
 from __future__ import annotations
@@ -16,16 +19,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.transport.traversal.random_numbers import Strata
+from mivol.transport.traversal.random_numbers import SpreadSampler
 
 __all__ = ["CameraRays", "RenderSamples", "adjoint_rays", "film_passes", "render_on_film"]
-
-
-PLAIN, SPREAD, TILED = "none", "spread", "tiled"
-"""Layouts of the lanes of a pass (:class:`RenderSamples`)."""
-
-TILE_EDGE = 4
-"""Edge of a tile [pixels]; its 16 pixels fill the lanes of one packet."""
 
 
 @dataclass
@@ -37,17 +33,12 @@ class RenderSamples:
         seed: seed of the sampler.
         spp: samples per pixel; 0 for the sample count of the sensor's sampler.
         pass_rays: largest number of rays in a pass.
-        layout: ``PLAIN``: independent positions in a pixel. ``SPREAD``: the samples of a pixel are stratified over its area.
-            ``TILED``: additionally, the lanes of a tile of pixels lie side by side, and directions are stratified. ``SPREAD``
-            and ``TILED`` need an independent sampler, and ``TILED`` a film of whole tiles; without these, the next simpler
-            layout applies.
     """
 
     sensor: mi.Sensor
     seed: int
     spp: int
     pass_rays: int
-    layout: str = PLAIN
 
 
 @dataclass
@@ -56,19 +47,19 @@ class CameraRays:
 
     Attributes:
         sampler: source of the random numbers of the pass.
+        per_pixel: rays of a pixel in the pass.
         ray: rays in world space.
         weight: importance of the sensor.
         position: position of the sample on the film [pixel].
         on_film: position as a share of the crop [1], in [0, 1); samples in the border of a wide filter lie outside.
-        strata: stratum of each lane for drawing directions; None without strata.
     """
 
-    sampler: mi.Sampler
+    sampler: mi.Sampler | SpreadSampler
+    per_pixel: int
     ray: mi.RayDifferential3f
     weight: mi.Spectrum
     position: mi.Point2f
     on_film: mi.Point2f
-    strata: Strata | None = None
 
 
 RadianceFunction = Callable[[CameraRays], tuple]
@@ -81,26 +72,10 @@ def film_passes(samples: RenderSamples) -> Iterator[CameraRays]:
     Raises:
         MivolError: one sample per pixel exceeds a launch (2^32 samples).
     """
-    base, pixels, per_pass = _plan_passes(samples.sensor, samples.spp, samples.pass_rays)
+    base, _, per_pass = _plan_passes(samples.sensor, samples.spp, samples.pass_rays)
     base.set_samples_per_wavefront(per_pass)
     for index in range(base.sample_count() // per_pass):
-        sampler = base.clone()
-        _seed_pass(sampler, samples.seed, index, pixels * per_pass)
-        yield _camera_rays(samples, sampler, pixels * per_pass, per_pass)
-
-
-def _seed_pass(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
-    """Seed a sampler for one pass, independently of the numbers drawn by earlier passes.
-
-    A replay may draw fewer numbers than the pass it repeats.
-    """
-    if sampler.class_name() == "IndependentSampler":
-        sampler.seed(seed if index == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0], count)
-        return
-    # A stratifying sampler has one permutation for all passes; ``advance`` moves on to the next pass.
-    sampler.seed(seed, count)
-    for _ in range(index):
-        sampler.advance()
+        yield _camera_rays(samples, base, index, per_pass)
 
 
 def count_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> int:
@@ -130,38 +105,31 @@ def _sampled_size(film: mi.Film) -> tuple[int, int]:
     return int(width) + border, int(height) + border
 
 
-def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pass: int) -> CameraRays:
-    sensor, layout = samples.sensor, samples.layout
+def _camera_rays(samples: RenderSamples, base: mi.Sampler, index: int, per_pass: int) -> CameraRays:
+    """The rays of the pass with an index."""
+    sensor = samples.sensor
     film = sensor.film()
     width, height = _sampled_size(film)
-    lane, strata = dr.arange(mi.UInt32, count), None
-    # Opaque: with the seed as a literal, the kernel would be compiled anew in every render.
-    salt = mi.UInt32(samples.seed)
-    dr.make_opaque(salt)
-    salt += 0x9E3779B9
-    across = max(a for a in range(1, int(per_pass**0.5) + 1) if per_pass % a == 0)
-    shares = layout != PLAIN and sampler.class_name() == "IndependentSampler"
-    if layout == TILED and shares and width % TILE_EDGE == 0 and height % TILE_EDGE == 0:
-        lanes, tiles = TILE_EDGE * TILE_EDGE, width // TILE_EDGE
-        tile, rest = lane // (lanes * dr.opaque(mi.UInt32, per_pass)), lane % (lanes * dr.opaque(mi.UInt32, per_pass))
-        sample, inside = rest // lanes, rest % lanes
-        pixel = mi.Vector2i(TILE_EDGE * (tile % tiles) + inside % TILE_EDGE, TILE_EDGE * (tile // tiles) + inside // TILE_EDGE)
-        turn, other = mi.sample_tea_32(tile, salt)
-        strata = Strata((sample + turn % per_pass) % per_pass, across, per_pass // across)
-    else:
-        index, sample = lane // dr.opaque(mi.UInt32, per_pass), lane % dr.opaque(mi.UInt32, per_pass)
-        pixel = mi.Vector2i(index % width, index // width)
-        _, other = mi.sample_tea_32(index, salt)
+    count = width * height * per_pass
+    lane, each = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, per_pass)
+    number = lane // each
+    pixel = mi.Vector2i(number % width, number // width)
     if film.sample_border():
         pixel -= film.rfilter().border_size()
     pixel += mi.Vector2i(film.crop_offset())
-    u = sampler.next_2d()
-    if shares:
-        # Each tile (or pixel) visits the strata of its pixels in its own order. In a common order, each stratum of directions
-        # would belong to one part of the pixel.
-        cell = mi.permute_kensler(sample, per_pass, other)
-        u = Strata(cell, across, per_pass // across).jitter(u)
-    position = mi.Vector2f(pixel) + u
+    if base.class_name() == "IndependentSampler":
+        # Opaque: with the seed as a literal, the kernel would be compiled anew in every render.
+        seed, first = mi.UInt32(samples.seed), dr.opaque(mi.UInt32, index * per_pass)
+        dr.make_opaque(seed)
+        total = dr.opaque(mi.UInt32, base.sample_count())
+        sampler = SpreadSampler.of_pixels(pixel, seed, first + lane % each, total)
+    else:
+        # One permutation for all passes; ``advance`` moves on to the next pass.
+        sampler = base.clone()
+        sampler.seed(samples.seed, count)
+        for _ in range(index):
+            sampler.advance()
+    position = mi.Vector2f(pixel) + sampler.next_2d()
 
     scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
     offset = -mi.ScalarVector2f(film.crop_offset()) * scale
@@ -173,7 +141,7 @@ def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pa
     ray, weight = sensor.sample_ray_differential(time, mi.Float(0), on_film, aperture)
     # A box filter adds a sample to its pixel, for any position inside the pixel.
     place = mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
-    return CameraRays(sampler, ray, weight, place, mi.Point2f(on_film), strata)
+    return CameraRays(sampler, per_pass, ray, weight, place, mi.Point2f(on_film))
 
 
 def render_on_film(samples: RenderSamples, names: list[str], sample: RadianceFunction) -> mi.TensorXf:
@@ -254,9 +222,8 @@ def _sum_filter_weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlo
 
 def _new_block(film: mi.Film, rays: CameraRays) -> mi.ImageBlock:
     block = film.create_block()
-    # Coalescing sums the samples of a pixel before writing. It pays from 4 samples on (Mitsuba's rule), and needs them in
-    # neighbouring lanes; tiles have them apart.
-    block.set_coalesce(block.coalesce() and rays.sampler.sample_count() >= 4 and rays.strata is None)
+    # Coalescing sums the samples of a pixel, in neighbouring lanes, before writing. It pays from 4 samples on (Mitsuba's rule).
+    block.set_coalesce(block.coalesce() and rays.per_pixel >= 4)
     return block
 
 

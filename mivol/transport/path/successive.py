@@ -4,9 +4,9 @@ A packet of lanes (8 or 16 on a CPU, 32 on a GPU) walks until its longest path e
 wait: the longest of 16 exponentially distributed lengths is 3.4 times the mean. Here a lane starts its next path as soon as a
 path ends, and waits only after its last path. Sums of 16 such lengths deviate by a quarter of their mean.
 
-Each path has its own random number generator, so no path depends on earlier paths of its lane.
+Each path draws its own random numbers, so no path depends on earlier paths of its lane.
 
-References: Novák et al. 2010 (path regeneration); O'Neill 2014 (generators).
+References: Novák et al. 2010 (path regeneration).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import mitsuba as mi
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.walk import Path, advance_path, film_alpha, gather_lanes, leave_camera, start_path
-from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
+from mivol.transport.traversal.random_numbers import SpreadSampler
 from mivol.transport.traversal.rays import clip_camera_ray
 
 __all__ = ["paths_per_lane", "walk_successively"]
@@ -37,20 +37,20 @@ class _PathStarts:
     Attributes:
         ray: camera rays, ended at the sensor's ``far_clip``.
         medium: media around their origins.
-        seeds: two seeds of the random numbers of each path.
+        sampler: random numbers of each path.
     """
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
-    seeds: tuple[mi.UInt32, mi.UInt32]
+    sampler: SpreadSampler
 
-    def gather(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, LaneSampler]:
+    def gather(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, SpreadSampler]:
         """Gather ray, medium and sampler of paths by their numbers."""
         ray = self.ray
         o, d, maxt, time = (gather_lanes(values, index, active) for values in (ray.o, ray.d, ray.maxt, ray.time))
-        seeds = [gather_lanes(seed, index, active) for seed in self.seeds]
+        sampler = self.sampler.gather(index, active)
         ray = mi.Ray3f(o, d, maxt, time, ray.wavelengths)
-        return ray, gather_lanes(self.medium, index, active), LaneSampler.seeded(*seeds, index)
+        return ray, gather_lanes(self.medium, index, active), sampler
 
 
 def paths_per_lane(limit: int, paths: int) -> int:
@@ -59,12 +59,14 @@ def paths_per_lane(limit: int, paths: int) -> int:
     return max(1, min(limit, paths // MIN_LANES[backend]))
 
 
-def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f, count: int) -> tuple[mi.Spectrum, mi.Float]:
+def walk_successively(
+    estimators: Estimators, sampler: SpreadSampler, ray: mi.Ray3f, count: int
+) -> tuple[mi.Spectrum, mi.Float]:
     """Walk paths from the camera, ``count`` in succession in each lane.
 
     Args:
         estimators: estimators of the render.
-        sampler: random numbers: two for each path, seeding the path's own generator.
+        sampler: random numbers of each path.
         ray: camera rays in world space with unit directions, one for each path.
         count: number of paths in a lane.
 
@@ -75,8 +77,7 @@ def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f
     """
     n = dr.width(ray)
     lanes, per_lane = -(-n // count), dr.opaque(mi.UInt32, count)
-    seeds = draw_seeds(sampler)
-    starts = _PathStarts(clip_camera_ray(ray), estimators.media.medium_at(ray), seeds)
+    starts = _PathStarts(clip_camera_ray(ray), estimators.media.medium_at(ray), sampler.clone())
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
     dr.eval(starts, L, alpha)
     index = dr.arange(mi.UInt32, lanes) * per_lane
@@ -84,7 +85,7 @@ def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f
 
     def start(index: mi.UInt32, active: mi.Bool) -> Path:
         ray, medium, sampler = starts.gather(index, active)
-        path = start_path(estimators, ray, Primal(dr.zeros(mi.Spectrum, lanes)), sampler, None, active)
+        path = start_path(estimators, ray, Primal(dr.zeros(mi.Spectrum, lanes)), sampler, active)
         return leave_camera(estimators, path, medium)
 
     def advance(path: Path, index: mi.UInt32) -> tuple[Path, mi.UInt32]:

@@ -43,7 +43,7 @@ from mivol.transport.path.side_flight import (
     estimate_side_flight,
     weigh_emitter_sample,
 )
-from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_state
+from mivol.transport.traversal.random_numbers import SpreadSampler, draw_state
 from mivol.transport.traversal.rays import FineRay, Ray, clip_camera_ray, point_along
 
 __all__ = [
@@ -97,7 +97,7 @@ class Path:
         T: transmittance of the media along the path so far, for the film's alpha [1].
         active: lanes that continue.
         score: accumulator of radiance or derivatives (:mod:`mivol.transport.estimators.scores`).
-        sampler, strata: random numbers.
+        sampler: random numbers.
         probes: points kept from the flights so far, for derivatives; None in images.
         shadow: shadow ray kept for derivatives; None in images and for paths scattering at surfaces only.
         emitter_sample: emitter sample of the next vertex; None without side flights (each vertex then draws its own sample).
@@ -118,8 +118,7 @@ class Path:
     T: mi.Spectrum
     active: mi.Bool
     score: Any
-    sampler: mi.Sampler | LaneSampler
-    strata: Strata | None
+    sampler: mi.Sampler | SpreadSampler
     probes: Probes | None = None
     shadow: ShadowReservoir | None = None
     emitter_sample: WeightedEmitterSample | None = None
@@ -150,8 +149,7 @@ def start_path(
     estimators: Estimators,
     ray: Ray,
     score: Score,
-    sampler: mi.Sampler | LaneSampler,
-    strata: Strata | None,
+    sampler: mi.Sampler | SpreadSampler,
     active: mi.Bool,
 ) -> Path:
     """A path before its first segment, outside all media."""
@@ -170,7 +168,6 @@ def start_path(
         active=active,
         score=score,
         sampler=sampler,
-        strata=strata,
         emission_pdf=None if estimators.emission is None else dr.zeros(mi.Float, n),
         left_medium=None if estimators.near is None else dr.full(mi.Bool, False, n),
     )
@@ -211,11 +208,10 @@ def gather_lanes(values: T, index: mi.UInt32, active: mi.Bool = True) -> T:
 
 def walk_path(
     estimators: Estimators,
-    sampler: mi.Sampler,
+    sampler: mi.Sampler | SpreadSampler,
     ray: Ray,
     score: Score,
     active: mi.Bool = True,
-    strata: Strata | None = None,
 ) -> tuple[Score, mi.Float]:
     """Walk a path from the camera and report its terms and factors to a score.
 
@@ -225,7 +221,6 @@ def walk_path(
         ray: camera ray in world space, with a unit direction.
         score: accumulator of radiance or derivatives (:mod:`mivol.transport.estimators.scores`).
         active: lanes to walk.
-        strata: stratum of each lane for directions in media.
 
     Returns:
         The score, and the alpha for the film, in [0, 1].
@@ -234,7 +229,7 @@ def walk_path(
     emitter and BSDF samples at surfaces.
     """
     active = mi.Bool(active) & (estimators.settings.depth_limit > 0)
-    path = start_path(estimators, clip_camera_ray(ray), score, sampler, strata, active)
+    path = start_path(estimators, clip_camera_ray(ray), score, sampler, active)
     path = leave_camera(estimators, path, estimators.media.medium_at(ray))
     if has_one_segment(estimators):
         path, event = _follow_segment(estimators, path)
@@ -246,7 +241,7 @@ def walk_path(
     return path.score, film_alpha(path)
 
 
-def walk_stem(estimators: Estimators, sampler: mi.Sampler, ray: Ray, score: Score) -> tuple[Score, FirstCollision]:
+def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Score) -> tuple[Score, FirstCollision]:
     """Walk a path from the camera, and stop at a collision on its first segment.
 
     Args:
@@ -257,7 +252,7 @@ def walk_stem(estimators: Estimators, sampler: mi.Sampler, ray: Ray, score: Scor
         The score, and the first collisions, from which :func:`walk_branch` continues.
     """
     media, n = estimators.media, dr.width(ray)
-    path = start_path(estimators, clip_camera_ray(ray), score, sampler, None, dr.full(mi.Bool, True, n))
+    path = start_path(estimators, clip_camera_ray(ray), score, sampler, dr.full(mi.Bool, True, n))
     path = leave_camera(estimators, path, media.medium_at(ray))
     path = _start_reservoirs(estimators, path, *(("first", "later") if media.has_surfaces else ("first",)))
     path, event = _follow_segment(estimators, path)
@@ -272,7 +267,7 @@ def walk_stem(estimators: Estimators, sampler: mi.Sampler, ray: Ray, score: Scor
 
 
 def walk_branch(
-    estimators: Estimators, sampler: LaneSampler, collision: FirstCollision, score: Score
+    estimators: Estimators, sampler: SpreadSampler, collision: FirstCollision, score: Score
 ) -> tuple[Score, mi.UInt32]:
     """Walk a path from its first collision to its end.
 
@@ -284,7 +279,7 @@ def walk_branch(
     Returns:
         The score, and the number of scattering events of the path.
     """
-    path = start_path(estimators, collision.ray, score, sampler, None, mi.Bool(collision.on))
+    path = start_path(estimators, collision.ray, score, sampler, mi.Bool(collision.on))
     path.beta = mi.Spectrum(collision.beta)
     path = _sample_first_emitter(estimators, _start_reservoirs(estimators, path, "later"))
     hit = make_collision(estimators.media, collision.ray, collision.t, collision.body, collision.on)
@@ -311,7 +306,7 @@ def _walk_to_end(estimators: Estimators, path: Path) -> Path:
 def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent]:
     """Follow the next segment: report the light of its media as a term and their transmittance as a factor."""
     may_scatter = path.active & (path.depth + 1 < estimators.settings.depth_limit)
-    samples = estimators.segment.draw(path.sampler, may_scatter, path.strata)
+    samples = estimators.segment.draw(path.sampler, may_scatter)
     # Copies: throughput and depth change in place below, and derivatives read the values at the start of the segment later.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples, mi.UInt32(path.depth))
     if estimators.emission is not None:
@@ -512,7 +507,7 @@ def _sample_first_emitter(estimators: Estimators, path: Path) -> Path:
 
 
 def _sample_distant_emitter(
-    estimators: Estimators, ray: FineRay, sampler: mi.Sampler | LaneSampler, active: mi.Bool
+    estimators: Estimators, ray: FineRay, sampler: mi.Sampler | SpreadSampler, active: mi.Bool
 ) -> DistantEmitterSample:
     """Sample an emitter for a later vertex. All emitters are at infinity, so the sample is valid at any point."""
     it = dr.zeros(mi.Interaction3f, dr.width(ray))
@@ -525,7 +520,7 @@ def _add_side_flight(
 ) -> Path:
     """Add the light of an emitter sample that reaches the path through the end of a side flight."""
     sampler = path.sampler
-    lobe, flight = sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
+    lobe, flight = sampler.next_2d(active), estimators.segment.draw(sampler, active)
     samples = SideFlightSamples(lobe, flight, draw_state(sampler, active) if estimators.draws_shadows else None)
     side = estimate_side_flight(estimators, event.collision, path.beta, path.depth, sample, samples, path.score.purpose, active)
     path.score = path.score.add(side.light)
@@ -569,7 +564,7 @@ def _estimate_probe(estimators: Estimators, probe: Probe, sampler: mi.Sampler) -
     on = probe.weight > 0
     mei = medium_interaction(probe.ray, dr.select(on, probe.t, 0))
     mei.medium = media.medium_of(probe.body, on)
-    path = start_path(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
+    path = start_path(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, on)
     path.depth = mi.UInt32(probe.depth)
     collision = Collision(mei, point_along(probe.ray, probe.t), dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
     path = _walk_to_end(estimators, _scatter(estimators, path, PathEvent.from_collision(collision)))

@@ -53,7 +53,7 @@ from mivol.transport.media.ray_intervals import (
 )
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.uniform_points import draw_uniform_point
-from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_pcg32, draw_state
+from mivol.transport.traversal.random_numbers import SpreadSampler, draw_lead, draw_pcg32, draw_state
 from mivol.transport.traversal.rays import Ray, point_along
 
 __all__ = ["FreeFlight", "make_collision"]
@@ -66,12 +66,14 @@ class _Flight:
     Attributes:
         t: distance of the collision on the ray [length]; infinite without a collision.
         body: index of its medium.
+        u: uniform random number of the next flight, in [0, 1).
         rng: state of the random number generator.
         passages: length up to the collision in each of ``media.traced``, as in ``RaySegment``.
     """
 
     t: mi.Float64
     body: mi.UInt32
+    u: mi.Float
     rng: mi.UInt32
     passages: list[mi.Float] | None
 
@@ -92,7 +94,6 @@ class FreeFlight:
     extinction or an emitting medium.
     """
 
-    directions = "spread"
     ends_in_media = True
 
     def __init__(self, media: SceneMedia) -> None:
@@ -101,9 +102,9 @@ class FreeFlight:
         self.emitting = [body for body in self.bodies if body.view.emits and not body.view.shows_gaussians]
         self.has_gaussian_light = any(body.view.shows_gaussians for body in self.bodies)
 
-    def draw(self, sampler: mi.Sampler | LaneSampler, active: mi.Bool, strata: Strata | None) -> tuple[mi.Float, mi.UInt32]:
+    def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
         """Draw the number of the flight and the generator of the other numbers, in every lane, since all lanes fly."""
-        return sampler.next_1d(), draw_state(sampler)
+        return draw_lead(sampler), draw_state(sampler)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Needs no preparation here: the path estimates the baseline (:mod:`mivol.transport.path.derivatives`)."""
@@ -220,11 +221,9 @@ def _find_first_collision(
 ) -> tuple[SegmentEnd, _Flight]:
     """Follow a ray to the first opaque surface, and find the first collision in front of the surface."""
     bodies = media.bodies
-    # A ray may enter a traced boundary several times; each entry needs its own random number.
-    first = next((p for b in media.boxed for p in b.view.parts if not _draws_many_numbers(p)), None)
 
     def visit(flight: _Flight, interval: MediumInterval) -> _Flight:
-        body, t, index, rng = interval.body, flight.t, flight.body, flight.rng
+        body, t, index, u, rng = interval.body, flight.t, flight.body, flight.u, flight.rng
         number = next(k for k, other in enumerate(bodies) if other is body)
         scale = dr.detach(body.view.scale) * body.area(ray.d)
         for part in body.view.parts:
@@ -235,25 +234,22 @@ def _find_first_collision(
                 hit, rng = delta_tracking(part, scale, ahead, rng)
             elif isinstance(part, GaussianExtinction):
                 hit, rng = sample_gaussian_flight(part, scale, ahead, rng)
-            elif _uses_delta_tracking(part):
-                hit, rng = delta_tracking_in_blocks(part, scale, ahead, rng)
             else:
+                if _uses_delta_tracking(part):
+                    hit, rng = delta_tracking_in_blocks(part, scale, ahead, u, rng)
+                else:
+                    hit = regular_tracking(part, scale, ahead, -dr.log(1 - u), channel)
+                # The first flight takes the spread number of the segment. Each other part, and each further entry into a
+                # traced boundary, needs its own.
                 rng, (other,) = draw_pcg32(rng, 1)
-                # The flight of the first part takes the sampler's own number, which may be stratified.
-                goal = -dr.log(1 - u if part is first else other)
-                hit = regular_tracking(part, scale, ahead, goal, channel)
+                u = dr.select(ahead.active, other, u)
             nearer = ahead.active & (hit < t)
             t, index = dr.select(nearer, hit, t), dr.select(nearer, mi.UInt32(number), index)
-        return _Flight(t, index, rng, add_passage(media, flight.passages, interval, t))
+        return _Flight(t, index, u, rng, add_passage(media, flight.passages, interval, t))
 
     width = dr.width(ray)
-    start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), rng, start_passages(media, width))
+    start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), u, rng, start_passages(media, width))
     return visit_media(media, ray, medium, visit, start, active, reach=lambda flight: flight.t)
-
-
-def _draws_many_numbers(part: Extinction) -> bool:
-    """Whether flights through a part draw a variable number of random numbers."""
-    return _uses_delta_tracking(part) or isinstance(part, GaussianExtinction)
 
 
 def _uses_delta_tracking(part: Extinction) -> bool:

@@ -217,6 +217,7 @@ def delta_tracking_in_blocks(
     part: GridExtinction,
     scale: mi.Float,
     interval: RayInterval,
+    u: mi.Float,
     rng: mi.UInt32,
 ) -> tuple[mi.Float64, mi.UInt32]:
     """Find the first collision with a grey grid with block ranges.
@@ -225,7 +226,8 @@ def delta_tracking_in_blocks(
         part: the grid.
         scale: factor on its values.
         interval: interval of the ray.
-        rng: state of the random number generator.
+        u: uniform random number in [0, 1) of the first tentative collision.
+        rng: state of the random number generator of all others.
 
     Returns:
         Distance of the collision on the ray [length], infinite without a collision, and the next state of the generator.
@@ -253,8 +255,7 @@ def delta_tracking_in_blocks(
         return (ahead, dr.select(real, cell.s + dt, s), collides | real, rng), dt
 
     width = dr.width(interval.ray)
-    rng, (u,) = draw_pcg32(rng, 1)
-    start = (-dr.log(u), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width), rng)
+    start = (-dr.log(1 - u), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width), rng)
     coarse = BlockLattice(tuple(n - 1 for n in blocks.res))
     _, s, collides, rng = walk_cells(
         coarse,
@@ -275,7 +276,7 @@ def delta_tracking(
     interval: RayInterval,
     rng: mi.UInt32,
 ) -> tuple[mi.Float64, mi.UInt32]:
-    """Find the first collision with a grey bounded field; arguments and result as for :func:`delta_tracking_in_blocks`.
+    """Find the first collision with a grey bounded field; result as for :func:`delta_tracking_in_blocks`.
 
     Cost: int M dt look-ups in the field's box.
     """

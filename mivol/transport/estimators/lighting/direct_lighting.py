@@ -37,7 +37,7 @@ from mivol.transport.estimators.scores import TrackedTerm
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.random_numbers import seed_pcg32
+from mivol.transport.traversal.random_numbers import fork_state
 from mivol.transport.traversal.rays import FineRay
 
 __all__ = ["DirectLight", "DirectLighting", "DirectSample", "DistantEmitterSample", "EmitterSample", "power_heuristic"]
@@ -267,9 +267,7 @@ class DirectLighting:
         Bias: none. Variance: one emitter sample and one phase sample. Cost: a shadow ray for each.
         """
         directs = []
-        # Only images estimate shadows, and images choose no shadow ray to differentiate: the random number of this choice seeds
-        # the generators of the trackers.
-        rngs = [seed_pcg32(samples.which_shadow_ray, dr.width(active), k) if estimates else None for k in range(2)]
+        rngs = [fork_state(samples.generator, k) if estimates else None for k in range(2)]
         if self.emitters.sampled:
             mei = vertex.interaction
             direct, weight = _sample_chosen_emitter(mei, chosen, samples.emitter, active)

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.transport.estimators.lighting.emitter_grid import EmitterDistribution, tabulate_emitters
-from mivol.transport.traversal.random_numbers import Strata
+from mivol.transport.traversal.random_numbers import SpreadSampler, draw_state, fork_state
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [
@@ -75,17 +75,16 @@ class SceneEmitters:
         """Centre and radius of a ``sampled`` emitter [length]; None if the emitter is at infinity."""
         return self._balls[number]
 
-    def draw_event_samples(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> EventSamples:
+    def draw_event_samples(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> EventSamples:
         """Draw the random numbers of a scattering event."""
         return EventSamples(
-            sampler.next_1d(active),
+            draw_state(sampler, active),
             sampler.next_2d(active),
             sampler.next_1d(active),
             sampler.next_2d(active),
             sampler.next_1d(active),
             sampler.next_2d(active),
             sampler.next_1d(active),
-            strata,
         )
 
     def choose_emitter(self, ray: Ray, u: mi.Float) -> ChosenEmitter:
@@ -265,35 +264,34 @@ class EventSamples:
     """The random numbers of a scattering event, uniform in [0, 1).
 
     Attributes:
-        piece: seed of the reservoir choosing a piece of the ray.
+        generator: state of the generator that chooses pieces of the ray and estimates shadows.
         inside: numbers for the technique of distance sampling, and for the distance inside the piece.
         which_emitter: number for the emitter.
         emitter: numbers for the point or direction on the emitter.
         component: number for the component of the phase function.
         direction: numbers for the direction of the phase sample.
         which_shadow_ray: number for the differentiated shadow ray.
-        strata: strata of directions; None means the whole square.
     """
 
-    piece: mi.Float
+    generator: mi.UInt32
     inside: mi.Point2f
     which_emitter: mi.Float
     emitter: mi.Point2f
     component: mi.Float
     direction: mi.Point2f
     which_shadow_ray: mi.Float
-    strata: Strata | None = None
 
     def for_event(self, number: mi.UInt32, count: int) -> EventSamples:
         """The numbers of one of ``count`` events on a ray.
 
         An additive recurrence shifts the numbers of the first event; directions are stratified over the events.
         """
+        # The first ``count`` forks choose the pieces of the ray; each event has two for its shadow rays.
+        generator = fork_state(self.generator, count + 2 * number)
         if count == 1:
-            return self.with_directions(self.emitter, self.direction)
+            return replace(self, generator=generator)
         # Additive recurrences with the generalised golden ratios have low discrepancy in one and two dimensions (Roberts 2018).
         k, across = mi.Float(number), max(a for a in range(1, int(count**0.5) + 1) if count % a == 0)
-        part = Strata(number, across, count // across)
 
         def one(u: mi.Float) -> mi.Float:
             return fractional_part(dr.fma(k, 0.6180339887, u))
@@ -301,23 +299,20 @@ class EventSamples:
         def two(u: mi.Point2f) -> mi.Point2f:
             return mi.Point2f(fractional_part(dr.fma(k, 0.7548776662, u.x)), fractional_part(dr.fma(k, 0.5698402910, u.y)))
 
-        moved = EventSamples(
-            self.piece,
+        def in_part(u: mi.Point2f) -> mi.Point2f:
+            """Into the event's own cell of a grid over the square."""
+            i, j = number % across, number // across
+            return mi.Point2f((mi.Float(i) + u.x) / across, (mi.Float(j) + u.y) / (count // across))
+
+        return EventSamples(
+            generator,
             two(self.inside),
             self.which_emitter,
-            self.emitter,
+            in_part(two(self.emitter)),
             one(self.component),
-            self.direction,
+            in_part(two(self.direction)),
             one(self.which_shadow_ray),
-            self.strata,
         )
-        return moved.with_directions(part.jitter(two(self.emitter)), part.jitter(two(self.direction)))
-
-    def with_directions(self, emitter: mi.Point2f, direction: mi.Point2f) -> EventSamples:
-        """The same numbers with others for directions, which are moved into their strata."""
-        if self.strata is not None:
-            emitter, direction = self.strata.jitter(emitter), self.strata.jitter(direction)
-        return replace(self, emitter=emitter, direction=direction, strata=None)
 
 
 def fractional_part(x: mi.Float) -> mi.Float:

@@ -197,7 +197,7 @@ def _estimate_node_light(
     first, second = (turn + 0.5) / DIRECTIONS, fractional_part(turn * 0.6180340)
     flat = mi.Point2f(fractional_part(first + shift[0]), fractional_part(second + shift[1]))
     which, component = fractional_part(turn * 0.7548776 + shift[2]), fractional_part(turn * 0.5698403)
-    samples = EventSamples(mi.Float(0), mi.Point2f(0), which, flat, component, flat, mi.Float(0))
+    samples = EventSamples(mi.UInt32(0), mi.Point2f(0), which, flat, component, flat, mi.Float(0))
     ray = mi.Ray3f(p, -mei.wi, dr.inf, mi.Float(0), mi.Color0f())
     chosen = direct.emitters.choose_emitter(ray, samples.which_emitter)
     everywhere = dr.full(mi.Bool, True, dr.width(lane))

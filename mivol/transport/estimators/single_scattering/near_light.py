@@ -37,7 +37,7 @@ from mivol.transport.estimators.single_scattering.scattering_derivatives import 
 )
 from mivol.transport.media.optical_depth import segment_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import RaySegment
-from mivol.transport.traversal.random_numbers import LaneSampler, draw_pcg32, draw_state
+from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state
 from mivol.transport.traversal.rays import point_along
 
 __all__ = ["NearLight", "NearLightSamples", "NearLighting"]
@@ -96,7 +96,7 @@ class NearLighting:
         self.emitters = direct.near_emitters
         self.lights_vertices = bool(direct.far_emitters.sampled)
 
-    def draw(self, sampler: mi.Sampler | LaneSampler, active: mi.Bool) -> NearLightSamples:
+    def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> NearLightSamples:
         """Draw the random numbers of a segment."""
         return NearLightSamples(
             sampler.next_1d(active), sampler.next_2d(active), sampler.next_2d(active), draw_state(sampler, active)

@@ -45,7 +45,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, walk_cells
 from mivol.transport.traversal.interpolation import GAUSS_POINT
 from mivol.transport.traversal.lattice import clip_to_grid
-from mivol.transport.traversal.random_numbers import Strata
+from mivol.transport.traversal.random_numbers import SpreadSampler
 from mivol.transport.traversal.rays import Ray, point_along
 
 __all__ = ["ScatteringQuadrature"]
@@ -87,14 +87,13 @@ class ScatteringQuadrature:
     Cost: one walk for each emitter, and two shadow rays (or look-ups) for each piece.
     """
 
-    directions = "spread"
     ends_in_media = False
 
     def __init__(self, drawn: SingleScattering, transmittance_grid: TransmittanceGrid | None) -> None:
         self.drawn, self.media, self.emitters, self.transmittance_grid = drawn, drawn.media, drawn.emitters, transmittance_grid
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
-        return self.drawn.draw(sampler, active, strata)
+    def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> EventSamples:
+        return self.drawn.draw(sampler, active)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find a control variate for the derivatives along camera rays; later calls keep the first one."""

@@ -52,7 +52,7 @@ from mivol.transport.estimators.single_scattering.scattering_derivatives import 
 from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
 from mivol.transport.media.optical_depth import segment_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
-from mivol.transport.traversal.random_numbers import Strata, seed_pcg32
+from mivol.transport.traversal.random_numbers import SpreadSampler, fork_state
 from mivol.transport.traversal.rays import point_along
 
 __all__ = ["PROBE_DEPTH", "SingleScattering"]
@@ -99,13 +99,8 @@ class SingleScattering:
         self.grid_control: GridControl | None = None
         self.constant_control: mi.Spectrum | None = None
 
-    @property
-    def directions(self) -> str:
-        """Layout of the film's lanes: strata over tiles of pixels pay for phase samples, and not for small emitters."""
-        return "tiled" if self.emitters.samples_phase else "spread"
-
-    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
-        return self.emitters.draw_event_samples(sampler, active, strata)
+    def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> EventSamples:
+        return self.emitters.draw_event_samples(sampler, active)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find a control variate for the derivatives along camera rays; later calls keep the first one."""
@@ -160,7 +155,7 @@ class SingleScattering:
         """Choose an emitter, walk the segment to its end, and fill a reservoir with candidates of scattering points."""
         ray, samples = segment.ray, segment.samples
         chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
-        reservoir = start_reservoir(self.media, [seed_pcg32(samples.piece, dr.width(ray), k) for k in range(count)])
+        reservoir = start_reservoir(self.media, [fork_state(samples.generator, k) for k in range(count)])
         proposal = DistanceProposal(self.media, ray, chosen, self.visibility_cache, probe_depth)
         end, reservoir = fill_reservoir(proposal, segment.medium, reservoir, active)
         return _WalkedSegment(end, reservoir, proposal)
