@@ -211,19 +211,20 @@ def test_spread_points_keep_the_mean(monkeypatch):
 
 @pytest.mark.statistical
 def test_the_error_of_a_floor_falls_faster_than_by_chance():
-    """Light of a panel, by two dimensions of a smooth function, from positions on the film by two more: of 16 times as many
-    samples a variance of 16^-1.5 or less is left; independent numbers would leave 1/16.
+    """Light of a panel on a floor, in pixels so small that it depends on the two numbers of the emitter, and on the two of the
+    BSDF: directions that meet the panel or miss it, a step. Of 16 times as many samples a variance of 16^-1.5 is left;
+    independent numbers would leave 1/16.
     """
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1]).scale(8.0)}
     look = mi.ScalarTransform4f().look_at
     light = {"type": "rectangle", "to_world": look([2, 0, 4], [2, 0, 0], [0, 1, 0]), "emitter": {"type": "area"}}
-    made = camera((3.0, 3.0, 5.0), (1.6, 0.0, -1.0), res=8, fov=50.0)
+    made = camera((3.0, 3.0, 5.0), (1.6, 0.0, -1.0), res=8, fov=2.0)
     scene = mi.load_dict({"type": "scene", "light": light, "floor": floor, "sensor": made})
     integrator = mi.load_dict({"type": "mivol", "max_depth": 2})
     few, many = (moments(scene, integrator, spp, first, 16) for spp, first in ((16, 0), (256, 3000)))
     few, many = (Estimate(m.mean[..., 0], m.variance_of_mean[..., 0], m.n - 1) for m in (few, many))
     # 64 pixels of 16 images bring at least 200 degrees of freedom: each variance is known to 10 %.
-    assert_same_spread(many, few, expected=16.0**-1.5, high=1 / 30, what="variances")
+    assert_same_spread(many, few, expected=16.0**-1.5, high=1 / 24, what="variances")
 
 
 @pytest.mark.statistical
