@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.special import logit
 
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points.gaussians import Gaussians
+from mivol.transport.path.film import CameraRays, RenderSamples, film_passes
 
 SIDE = 12
 """Of the pictures [pixels]."""
@@ -58,11 +58,13 @@ def render(found: mi.Scene, depth: int = 1, spp: int = 1, seed: int = 0, **more:
     return np.array(mi.render(found, integrator=integrator, spp=spp, seed=seed), np.float64)
 
 
+def camera_samples(found: mi.Scene, seed: int) -> CameraRays:
+    """The samples of the film, one a pixel: they do not depend on what they meet."""
+    (samples,) = film_passes(RenderSamples(found.sensors()[0], seed, 1, SIDE * SIDE))
+    return samples
+
+
 def camera_rays(found: mi.Scene, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The rays of one sample a pixel with a seed: they do not depend on what they meet."""
-    sampler = found.sensors()[0].sampler().clone()
-    sampler.seed(seed, SIDE * SIDE)
-    index = dr.arange(mi.UInt32, SIDE * SIDE)
-    place = (mi.Vector2f(index % SIDE, index // SIDE) + sampler.next_2d()) / SIDE
-    ray, _ = found.sensors()[0].sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    """Origins and directions of :func:`camera_samples`."""
+    ray = camera_samples(found, seed).ray
     return np.array(ray.o, np.float64).T, np.array(ray.d, np.float64).T

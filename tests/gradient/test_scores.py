@@ -226,4 +226,5 @@ def test_replay_counts_down_to_zero():
         left = walk_path(estimators, sampler, ray, Replay(L, dr.zeros(mi.Spectrum, n)))[0].L
     # Five additions and subtractions of float32 numbers of the size of L.
     assert np.abs(np.array(left)).max() <= 1e-6 * np.abs(np.array(L)).max()
-    assert np.array(L).max() > 0.5
+    # Some paths find more than the sky's 0.3.
+    assert np.array(L).max() > 0.4

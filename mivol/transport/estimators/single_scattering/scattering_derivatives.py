@@ -112,6 +112,7 @@ class ScatteredLight:
 
     @property
     def value(self) -> mi.Spectrum:
+        """Radiance at the camera, 0 in lanes without an event."""
         return dr.select(self.event.event.on, self.event.sigma_s * self.event.weight, 0)
 
     def vjp(self, dL: mi.Spectrum) -> None:
