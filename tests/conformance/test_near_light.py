@@ -160,7 +160,7 @@ PLACES = {
     "lamp over a grid": lambda: {"smoke": smoke(rough_grid(1, 4.0), 0.8)[0], "lamp": lamp(), "floor": floor()},
     "peaked phase function": lambda: {"smoke": fog(1.5, 0.9, name="hg", g=0.8)[0], "lamp": lamp()},
     "colours": lambda: {
-        "fog": box_of(medium("homogeneous", {"type": "rgb", "value": [0.5, 1.0, 2.0]}, 0.8), PLACE),
+        "fog": box_of(medium("homogeneous", {"type": "rgb", "value": [0.25, 0.5, 1.0]}, 0.8), PLACE),
         "lamp": lamp(),
         "envmap": {"type": "envmap", "bitmap": mi.Bitmap(np.random.default_rng(1).random((4, 8, 3)).astype(np.float32))},
     },
