@@ -33,7 +33,7 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Photo, Photos, rectify
-from mivol.validate import metrics
+from mivol.validate.metrics import ImageScore, average_scores, score_image
 
 __all__ = [
     "PhotoFit",
@@ -129,11 +129,11 @@ class PhotoProblem:
 
     def score(self, views: Iterable[Photo], metrics: tuple[str, ...] = ("psnr",)) -> dict[str, float]:
         """Mean metrics of views."""
-        return metrics.average_scores([self.judge(self.show(view), view, metrics) for view in map(rectify, views)]).values
+        return average_scores([self.judge(self.show(view), view, metrics) for view in map(rectify, views)]).values
 
-    def judge(self, image: np.ndarray, view: Photo, metrics: tuple[str, ...] = ("psnr",)) -> metrics.ImageScore:
+    def judge(self, image: np.ndarray, view: Photo, metrics: tuple[str, ...] = ("psnr",)) -> ImageScore:
         """Compare an image with the photograph of the same view."""
-        return metrics.score_image(image, view.image, space=self.judged.space, mask=view.mask, metrics=metrics)
+        return score_image(image, view.image, space=self.judged.space, mask=view.mask, metrics=metrics)
 
 
 def prepare_fit(
