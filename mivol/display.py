@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -38,6 +38,11 @@ def summarize(value: object) -> str:
             return f"[{len(value)} x {type(value[0]).__name__}]"
         return f"[{', '.join(map(summarize, value))}]"
     return type(value).__name__
+
+
+def format_point(values: Iterable[float]) -> str:
+    """Write coordinates with four digits: ``(1, 2.5, -0.3333)``."""
+    return f"({', '.join(f'{value:.4g}' for value in values)})"
 
 
 def with_short_repr(cls: type[T]) -> type[T]:

@@ -259,15 +259,15 @@ def export_flags() -> list:
 
 def convert_flags() -> list:
     """Flags of ``mivol convert``."""
-    from mivol.files.formats import FORMATS, SHARED_SUFFIXES, WRITERS
+    from mivol.files.formats import VOLUME_SUFFIXES, WRITERS
     from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS
     from mivol.points.gaussian_files import GAUSSIAN_READERS, GAUSSIAN_WRITERS
     from mivol.points.summary import KINDS
 
-    volumes = [suffix for suffix in FORMATS if suffix not in SHARED_SUFFIXES]
     readable, writable = ({**GAUSSIAN_READERS, **CLOUD_READERS}, {**GAUSSIAN_WRITERS, **CLOUD_WRITERS})
     return [
-        flag("source", type=Path, help=f"file to read: {', '.join(readable)}, .npz (field); volumes: {', '.join(volumes)}"),
+        flag("source", type=Path,
+             help=f"file to read: {', '.join(readable)}, .npz (field); volumes: {', '.join(VOLUME_SUFFIXES)}"),
         flag("output", type=Path,
              help=f"file to write: {', '.join(writable)}, .npz (field), .obj (mesh); volumes: {', '.join(WRITERS)}"),
         DATASET,

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from mivol.display import format_point
 from mivol.files import hdf5, les, metaimage, nifti, npy, nrrd, pbrt, vdb, vol, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
@@ -165,9 +166,13 @@ SHARED_SUFFIXES = (".npy", ".npz", ".csv", ".txt")
 """Suffixes of volumes and of other contents: points, radiance fields, tables."""
 
 
+VOLUME_SUFFIXES = tuple(suffix for suffix in FORMATS if suffix not in SHARED_SUFFIXES)
+"""Suffixes of volumes alone."""
+
+
 def is_volume_file(path: Path) -> bool:
     """Whether a suffix belongs to volumes alone."""
-    return path.name.lower().endswith(tuple(suffix for suffix in FORMATS if suffix not in SHARED_SUFFIXES))
+    return path.name.lower().endswith(VOLUME_SUFFIXES)
 
 
 def describe_volume(path: Path, dataset: str | None = None) -> str:
@@ -179,16 +184,16 @@ def describe_volume(path: Path, dataset: str | None = None) -> str:
     volume = read_volume(path, dataset)
     values, finite = volume.values, np.isfinite(volume.values)
     size = " x ".join(str(n) for n in volume.size)
-    corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ volume.to_world.T
+    corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ volume.to_world[:3].T
     is_turned = np.count_nonzero(volume.to_world[:3, :3]) > 3
     array = volume.meta.get("grid") or volume.meta.get("dataset")
     lines = [
         f"{path}: {FORMATS[_find_suffix(path, FORMATS)].name}" + (f", array {array!r}" if array else ""),
         f"voxels (x, y, z): {size}, {values.shape[3]} channel{'s' if values.shape[3] > 1 else ''} of {volume.meta['dtype']}, "
         f"{values.nbytes / 2**20:.3g} MiB in memory",
-        f"box: {_format_point(corners.min(axis=0))} to {_format_point(corners.max(axis=0))}"
+        f"box: {format_point(corners.min(axis=0))} to {format_point(corners.max(axis=0))}"
         + (" around the turned axes" if is_turned else "")
-        + f"; voxel {_format_point(volume.spacing)}",
+        + f"; voxel {format_point(volume.spacing)}",
     ]
     if finite.any():
         inside = values[finite]
@@ -222,10 +227,6 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None) -> st
     write_volume(target, volume.values, place, metadata=space)
     size = " x ".join(str(n) for n in volume.size)
     return f"{target}: {size} voxels" + (f"; {suffix} does not hold {' and '.join(lost)}" if lost else "")
-
-
-def _format_point(values: np.ndarray) -> str:
-    return f"({', '.join(f'{value:.4g}' for value in values[:3])})"
 
 
 def _find_suffix(path: Path, table: Mapping[str, Any]) -> str:

@@ -191,7 +191,7 @@ def _read_grid(stream: _Stream, grids: dict[str, _Descriptor], name: str) -> Vol
         kind = _parse_type(path, name, owner)
         compression = _read_grid_head(stream, owner)[0]
     is_half = owner.type.endswith("_HalfFloat")
-    tree = _TreeReader(stream, TYPES[kind], kind, compression, is_half)
+    tree = _TreeReader(stream, kind, compression, is_half)
     values, low, active = tree.read(name)
     is_level_set = facts.get("class") == "level set"
     steps = index_to_world[:3, :3]
@@ -271,7 +271,6 @@ class _TreeReader:
 
     Attributes:
         stream: position at the tree.
-        type: number type and number of components of a value.
         kind: key of ``TYPES``.
         compression: bits of the grid's compression.
         is_half: whether blocks of values are stored as float16.
@@ -279,7 +278,6 @@ class _TreeReader:
     """
 
     stream: _Stream
-    type: tuple[str, int]
     kind: str
     compression: int
     is_half: bool
@@ -299,7 +297,7 @@ class _TreeReader:
         if not active:
             raise refusal(stream.path, f"no active voxel in the grid {name!r}", "at least one", "choose another grid")
         shape = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
-        dtype, components = self.type
+        dtype, components = TYPES[self.kind]
         check_memory(stream.path, int(np.prod([*map(int, shape), components])) * max(np.dtype(dtype).itemsize, 4))
         values = np.empty((*shape, components), dtype)
         values[:] = self.background
@@ -308,7 +306,7 @@ class _TreeReader:
         return values, low, active
 
     def _read_value(self) -> np.ndarray:
-        dtype, components = self.type
+        dtype, components = TYPES[self.kind]
         return np.frombuffer(self.stream.take(np.dtype(dtype).itemsize * components), dtype)
 
     def _read_root_tile(self) -> _Node:
@@ -368,7 +366,7 @@ class _TreeReader:
 
     def _read_block(self, count: int) -> np.ndarray:
         """Read ``count`` stored values (count, C)."""
-        dtype, components = self.type
+        dtype, components = TYPES[self.kind]
         stored = "<f2" if self.is_half else dtype
         size, stream = np.dtype(stored).itemsize * components * count, self.stream
         if self.is_half and count == 0:
@@ -473,8 +471,7 @@ def write_vdb(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
     name = str(metadata.get("grid", name))
     leaves = _cut_leaves(np.ascontiguousarray(values.transpose(2, 1, 0, 3), "<f4"))
     topology, blocks = _pack_tree(leaves, channels)
-    count = sum(int(np.count_nonzero(mask)) for mask, _ in leaves.values())
-    low, high, _ = _active_box([_Node(origin, LEAF, None, mask) for origin, (mask, _) in leaves.items()])
+    low, high, count = _active_box([_Node(origin, LEAF, None, mask) for origin, (mask, _) in leaves.items()])
     facts = [
         ("name", "string", name.encode()),
         ("class", "string", b"fog volume"),

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.display import with_short_repr
+from mivol.display import format_point, with_short_repr
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos import region
@@ -104,7 +104,7 @@ class PhotoSurvey:
         lines = [
             f"{self.path}: {self.format}, {len(cameras)} photographs ({counts}), {', '.join(sizes)} pixels, {lens}",
             f"focal length {_format_range(focal)} pixels, horizontal field of view {angle} degrees",
-            f"box {_format_corner(self.box[0])} to {_format_corner(self.box[1])}, {self.box_from}",
+            f"box {format_point(self.box[0])} to {format_point(self.box[1])}, {self.box_from}",
             f"near {self.near_far[0]:.4g}, far {self.near_far[1]:.4g} from the cameras",
         ]
         if self.skipped:
@@ -270,7 +270,3 @@ def _lens_name(camera: Camera) -> str:
     if camera.distortion.is_wide:
         return type(camera.distortion).__name__.lower()
     return "with distortion" if camera.distortion else "pinhole"
-
-
-def _format_corner(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x:.4g}" for x in point) + ")"

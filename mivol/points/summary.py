@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mivol.display import format_point
 from mivol.errors import MivolError
 from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS, PointCloud, read_points, write_points
@@ -114,12 +115,8 @@ def _describe_extent(positions: np.ndarray) -> list[str]:
     if not len(finite):
         return ["nothing in it has a place"]
     corners = np.quantile(finite, [0, 1, 0.01, 0.99], axis=0)
-    low, high, inner_low, inner_high = (_format_corner(corner) for corner in corners)
+    low, high, inner_low, inner_high = (format_point(corner) for corner in corners)
     return [f"box {low} to {high}; 98 % along each axis {inner_low} to {inner_high}"]
-
-
-def _format_corner(values: np.ndarray) -> str:
-    return f"({', '.join(f'{value:.4g}' for value in values)})"
 
 
 def _describe_spread(values: np.ndarray) -> str:
