@@ -26,6 +26,7 @@ def means(values: np.ndarray, light: Light, seed: int, spp: int) -> tuple[float,
     return float(result.mean()), float(derivative.mean())
 
 
+@pytest.mark.slow_for(*(name for name in DEEP_LIGHTS if name != CONSTANT))
 @pytest.mark.parametrize("name", DEEP_LIGHTS)
 def test_the_derivative_is_that_of_the_same_paths(variant_rgb: str, name: str) -> None:
     """Up to a quarter of the majorant collisions are as likely whatever the extinction is: equal seeds give the same paths, and
@@ -40,6 +41,7 @@ def test_the_derivative_is_that_of_the_same_paths(variant_rgb: str, name: str) -
     assert abs(result) > 1e-3 * at[1]
 
 
+@pytest.mark.slow_for(*(name for name in TABLES["deep estimators"] if name != "emitter inside, depth 6"))
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", TABLES["deep estimators"])
 def test_its_light_is_that_of_volpath(variant_rgb: str, name: str) -> None:
@@ -55,6 +57,7 @@ def test_its_light_is_that_of_volpath(variant_rgb: str, name: str) -> None:
     assert_same_mean(light_of_theirs, Moments.from_values(paths))
 
 
+@pytest.mark.slow_for("6")
 @pytest.mark.parametrize("depth", [6, -1])
 def test_white_smoke_in_a_furnace(variant_rgb: str, depth: int) -> None:
     """Paths of unlimited depth leave with the weight 1, each of them, where collisions are as likely as the extinction says;
@@ -79,6 +82,7 @@ def test_levels_take_noise_and_no_light(variant_rgb: str) -> None:
     assert np.max(np.abs(result)) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_what_takes_the_noise_has_the_mean_0(variant_rgb: str) -> None:
     """After each number of scatterings, in glass, where paths are long and half of the box is empty."""
@@ -88,6 +92,7 @@ def test_what_takes_the_noise_has_the_mean_0(variant_rgb: str) -> None:
         assert_same_mean(Moments.from_values(row), 0.0)
 
 
+@pytest.mark.slow
 def test_levels_of_each_number_of_scatterings_take_more_noise(variant_rgb: str) -> None:
     """In constant light, half of the box empty: they leave 0.63 of the variance that the end of a path alone leaves; the first
     of them alone 0.73."""
@@ -100,6 +105,7 @@ def test_levels_of_each_number_of_scatterings_take_more_noise(variant_rgb: str) 
     assert np.var(result - levels @ controls) < 0.68 * left
 
 
+@pytest.mark.slow
 def test_the_camera_does_not_see_a_hidden_emitter(variant_rgb: str) -> None:
     """Nothing scatters, so that nothing else could bring its light."""
     light = DEEP_LIGHTS["emitter inside"]

@@ -153,6 +153,7 @@ def test_as_in_volpath(lights: Callable[[], dict], depth: int) -> None:
     assert_same_images(scene, (64, 256), rounding=LEAK, ours=mivol(**more), stock={"type": "volpath", **more}, precision=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_the_variance_of_a_lamp_beside_a_dark_one() -> None:
     """A second lamp of no light takes half of the even share.
@@ -176,6 +177,7 @@ def test_the_variance_of_a_lamp_beside_a_dark_one() -> None:
 # -- Derivatives ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("3")
 @pytest.mark.statistical
 @pytest.mark.parametrize("depth", [2, 3])
 def test_a_dark_lamp_has_its_derivative(depth: int) -> None:

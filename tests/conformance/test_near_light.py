@@ -86,7 +86,7 @@ def test_one_scattering(flies, media, emitter):
     assert_twin(seen, [m], [known], mivol(**SEGMENTS), 512, rounding=2e-5 * top)
 
 
-@pytest.mark.slow_for("rough")
+@pytest.mark.slow_for("empty", "rough")
 @pytest.mark.statistical
 @pytest.mark.parametrize("density", ["empty", "half empty", "rough"])
 def test_gradient_of_one_scattering(flies, density):
@@ -174,7 +174,7 @@ PLACES = {
 }
 
 
-@pytest.mark.slow_for("colours")
+@pytest.mark.slow_for("colours", "two lights, a ball", "peaked phase function")
 @pytest.mark.statistical
 @pytest.mark.parametrize("place", PLACES)
 def test_paths_have_the_mean_of_volpath(place):

@@ -79,6 +79,7 @@ def lines(count: int) -> tuple[np.ndarray, np.ndarray]:
     return o, np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
+@pytest.mark.slow
 def test_rays_of_a_scene_see_what_the_field_shows_its_own_cameras(tmp_path: Path) -> None:
     """The same cells and points of them, so what differs are roundings: sums of some 60 cells of colours below 1."""
     field = rough()

@@ -80,9 +80,12 @@ def _along(scene: mi.Scene, key: str, v: np.ndarray | float, integrator: dict, s
     return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
 
 
-@pytest.mark.slow_for("over a floor-sigma_t")
+@pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.parametrize(("name", "what"), CASES)
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [QUICK, ("in fog", "sigma_t"), ("by itself", "albedo"), ("radiance field", "density"), ("balls", "emission")],
+)
 def test_draws_keep_the_mean_of_derivatives(name: str, what: str) -> None:
     """Sampling of the emission keeps the mean derivative of paths meeting the emission by chance."""
     scene, key = seen(name), KEYS[name, what]

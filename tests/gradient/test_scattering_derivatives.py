@@ -508,7 +508,7 @@ def test_forward_against_reverse(key):
     assert np.abs(jv).max() > 1e-4
 
 
-DIFFERENCES = [("sigma_t.data", "own"), ("albedo", "stock"), ("g", "own")]
+DIFFERENCES = [("sigma_t.data", "own"), ("g", "own")]
 
 
 @pytest.mark.slow

@@ -60,6 +60,7 @@ def test_linear_reals_are_logarithmic_far_from_0(variant_rgb: str) -> None:
         assert np.array_equal(np.array(same), colours)
 
 
+@pytest.mark.slow
 def test_initial_fog_is_not_brighter_than_the_photographs(variant_rgb: str) -> None:
     """Half of the brightest hundredth of each colour, at most grey.
 

@@ -96,6 +96,7 @@ def test_depth_gradient_of_a_fog_matches_a_closed_form(variant_rgb: str, sighted
     np.testing.assert_allclose(found["density"].sum(), 0.7 * by_s.mean(), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_depth_supervision_moves_ray_ends_to_the_points(variant_rgb: str, photos: list[Photo]) -> None:
     """Three views, and points of the ball's surface that face them: more of the light of a ray comes from about its point."""
     rng, few = np.random.default_rng(4), []

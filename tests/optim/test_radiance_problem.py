@@ -120,6 +120,7 @@ def test_removing_nodes_takes_no_more_memory_than_steps(variant_rgb: str, cpu_ba
     assert held < estimate_bytes(plan, plan.stages[0], BOX, rows)
 
 
+@pytest.mark.slow
 def test_invisible_nodes_are_removed(variant_rgb: str, photos: list[Photo]) -> None:
     """What is left are the nodes of seen cells and their neighbours, with the values and the squares that they had; Dr.Jit
     holds nothing back of what was there before."""
