@@ -77,7 +77,9 @@ def find_needs(
         places=tuple(k for k in differentiated if _is_placement(k, params.properties[k][2])),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
-        nearness=_find_nearness(scene, [b for b, m in zip(boundaries, media, strict=True) if m.is_scattering]),
+        emitter_distances=_find_emitter_distances(
+            scene, [b for b, m in zip(boundaries, media, strict=True) if m.is_scattering]
+        ),
     )
     scatters = needs.surfaces or any(m.is_scattering for m in media)
     refused = any(m.bounded or m.gaussians for m in media)
@@ -89,10 +91,12 @@ def find_needs(
     return replace(needs, media_light=light)
 
 
-def _find_nearness(scene: mi.Scene, boundaries: Sequence[Boundary]) -> float:
-    """``Needs.nearness`` of the emitters to the media in some boundaries."""
-    balls = [ball for e in scene.emitters() if (ball := find_bounding_ball(e)) is not None]
-    return min((_relative_distance(b, ball) for b in boundaries for ball in balls), default=math.inf)
+def _find_emitter_distances(scene: mi.Scene, boundaries: Sequence[Boundary]) -> tuple[float, ...]:
+    """``Needs.emitter_distances`` of the emitters to the media in some boundaries."""
+    balls = [find_bounding_ball(e) for e in scene.emitters()]
+    return tuple(
+        math.inf if ball is None else min((_relative_distance(b, ball) for b in boundaries), default=math.inf) for ball in balls
+    )
 
 
 def _relative_distance(boundary: Boundary, ball: list[float]) -> float:
@@ -282,9 +286,8 @@ class Needs(ShapeFacts):
         places: keys among ``parameters`` that place shapes and sensors.
         film_samples: pixels times samples per pixel of the sensor.
         are_samples_independent: whether the sensor has Mitsuba's independent sampler, whose numbers others may replace.
-        nearness: distance of the nearest emitter with a position to a medium that scatters, over the longest edge of the box
-            around the medium [1]; 0 for an emitter inside, or for a medium without a known end; infinite without such an
-            emitter.
+        emitter_distances: distance of each emitter to the nearest medium that scatters, over the longest edge of the box around
+            the medium [1]; 0 for an emitter inside, or for a medium without a known end; infinite for an emitter at infinity.
         near_gain: measured gain of drawing the light of near emitters along segments [1] (:mod:`mivol.scene.previews`); None
             before a measurement.
         media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
@@ -300,9 +303,14 @@ class Needs(ShapeFacts):
     places: tuple[str, ...]
     film_samples: int
     are_samples_independent: bool = True
-    nearness: float = math.inf
+    emitter_distances: tuple[float, ...] = ()
     near_gain: float | None = None
     media_light: MediaLight | None = None
+
+    @property
+    def nearness(self) -> float:
+        """The smallest of ``emitter_distances`` [1]; infinite without emitters."""
+        return min(self.emitter_distances, default=math.inf)
 
     def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
         """Build the media of the scene among its surfaces.

@@ -267,7 +267,10 @@ def build_estimators(
     lobe = None if plan.side_flight_cosine is None else dr.opaque(mi.Float, plan.side_flight_cosine)
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)
-    near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH) if plan.draws_near_light else None
+    near = None
+    if plan.draws_near_light:
+        inside = [e for e, distance in zip(scene.emitters(), needs.emitter_distances, strict=True) if distance == 0]
+        near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside)
     return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count, near)
 
 

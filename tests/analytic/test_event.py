@@ -6,17 +6,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import assert_precise, assert_same_mean, fresh
 
 from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.vertex import MediumVertex, MixedVertex
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
+from mivol.transport.estimators.single_scattering.near_light import AimedDirections
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.ray_intervals import SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.event import NextDirection, PathEvent, sample_next_direction
 from mivol.transport.traversal.rays import point_along
+from mivol.validate.moments import Moments
 from scenes import box_of, camera, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -86,6 +89,19 @@ class FallingRays:
         zero = dr.zeros(mi.Float, 4)
         self.ray = mi.Ray3f(mi.Point3f(zero, 0, 2), mi.Vector3f(0, 0, -1), mi.Float(7), zero, mi.Color0f())
 
+    def turn_many(self, u: np.ndarray, aimed: AimedDirections | None, in_medium: bool) -> NextDirection:
+        """Directions of one lane for each column of three uniform random numbers, all of them colliding or none."""
+        n = u.shape[1]
+        ray = dr.gather(mi.Ray3f, self.ray, dr.zeros(mi.UInt32, n))
+        mei, on = medium_interaction(ray, mi.Float(0.5), self.fog), dr.full(mi.Bool, in_medium, n)
+        hit = Collision(mei, mi.Point3d(mei.p), mi.Spectrum(ALBEDO), on, mi.Float64(0.5), mi.UInt32(0))
+        si = self.estimators.media.scene.ray_intersect(ray)
+        event, numbers = PathEvent(si, si.t, mi.MediumPtr(self.fog), ~on, hit), [mi.Float(row) for row in u]
+        with dr.suspend_grad():
+            return sample_next_direction(
+                self.estimators, ray, event, numbers[0], mi.Point2f(*numbers[1:]), mi.Bool(True), aimed
+            )
+
     def turn(self, in_medium: list[bool] | None, may_scatter: list[bool], component: list[float]) -> NextDirection:
         """Directions of four lanes; lanes ``in_medium`` have collided at the distance 0.5."""
         ray, si = self.ray, self.estimators.media.scene.ray_intersect(self.ray)
@@ -151,3 +167,69 @@ def test_lanes_in_media_and_at_surfaces_scatter_together():
             np.testing.assert_array_equal(np.array(found)[:, lane], np.array(expected)[:, lane])
         assert np.array(both.pdf)[lane] == np.array(alone.pdf)[lane]
     assert len(both.factors) == 2 and np.array(both.on).all()
+
+
+# -- Directions around a near emitter ------------------------------------------------------------------------------------
+
+
+def aimed_at(axis: list[float], share: float, u: np.ndarray) -> AimedDirections:
+    """Directions around an axis, drawn in the lanes in which ``u`` is below the share."""
+    n = len(u)
+    return AimedDirections(
+        dr.normalize(mi.Vector3f(*axis)) + dr.zeros(mi.Float, n), dr.full(mi.Float, share, n), mi.Float(u) < share
+    )
+
+
+def test_aimed_directions_have_their_density():
+    """The angle theta has the distribution 1 - (1 - theta / pi)^2; sin(theta) q(theta) 2 pi is its derivative."""
+    u = np.linspace(0.05, 0.95, 91)
+    aimed = aimed_at([0.3, -0.5, 0.8], 0.4, u)
+    d = aimed.draw(mi.Point2f(mi.Float(u), mi.Float(np.roll(u, 7))))
+    theta = np.arccos(np.clip(np.array(dr.dot(d, aimed.axis), np.float64), -1, 1))
+    # Four roundings of a cosine of at most 1 move an angle of at least 0.079 by 4 x 2^-24 / 0.079 = 3e-6.
+    np.testing.assert_allclose(theta, np.pi * (1 - np.sqrt(1 - u)), atol=1e-5)
+    np.testing.assert_allclose(2 * np.pi * np.sin(theta) * np.array(aimed.pdf(d)), 2 * (np.pi - theta) / np.pi**2, rtol=1e-3)
+    mixed = np.array(aimed.mix(mi.Float(2.0), d))
+    np.testing.assert_allclose(mixed, 0.6 * 2.0 + 0.4 * np.array(aimed.pdf(d)), rtol=ROUNDING)
+
+
+def test_no_sample_of_an_aimed_direction_finds_much_light():
+    """The light along a ray is in proportion to (pi - theta) / sin(theta), and its weight is at most f / (share q)."""
+    theta = np.concatenate([np.geomspace(2e-6, 1, 100), np.linspace(1, np.pi - 1e-3, 100)])
+    d = mi.Vector3f(mi.Float(np.sin(theta)), 0, mi.Float(np.cos(theta)))
+    mixed = np.array(aimed_at([0, 0, 1], 0.4, theta).mix(mi.Float(1 / (4 * np.pi)), d), np.float64)
+    assert ((np.pi - theta) / np.sin(theta) / mixed).max() < np.pi**3 / 0.4 * 1.001
+
+
+SURFACES = {
+    "diffuse": DIFFUSE,
+    "plastic": {"type": "plastic", "diffuse_reflectance": 0.5},
+    "rough conductor": {"type": "roughconductor", "alpha": 0.5},
+    "blend": {"type": "blendbsdf", "weight": 0.3, "a": DIFFUSE, "b": {"type": "conductor"}},
+}
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", [*SURFACES, "medium"])
+def test_aimed_directions_keep_the_reflected_light(name):
+    """The mean of weight x (1 + d_x + d_z) is an integral over all directions of the BSDF or phase function."""
+    bench, rng = FallingRays(SURFACES.get(name, DIFFUSE)), np.random.default_rng(fresh(3))
+    found = []
+    for share in (0.0, 0.4):
+        u = rng.random((4, 1 << 16))
+        turn = bench.turn_many(u[:3], aimed_at([0.5, 0.2, 1.0], share, u[3]), name == "medium")
+        light = np.array(turn.weight, np.float64)[1] * (1 + np.array(turn.ray.d.x) + np.array(turn.ray.d.z))
+        found.append(Moments.from_values(light[:, None]))
+    assert_same_mean(*found, rounding=1e-5)
+    assert_precise(found[0], 0.01)
+
+
+@pytest.mark.parametrize(
+    "bsdf", [MASK, {"type": "dielectric"}, {"type": "roughdielectric", "alpha": 0.3}, {"type": "conductor"}]
+)
+def test_surfaces_that_transmit_or_mirror_draw_their_own_directions(bsdf):
+    """Where a path transmits, it has another index of refraction; a mirror has one direction only."""
+    bench, u = FallingRays(bsdf), np.random.default_rng(1).random((4, 64))
+    alone, beside = (bench.turn_many(u[:3], aimed, False) for aimed in (None, aimed_at([0, 0, 1], 0.4, u[3])))
+    for a, b in ((alone.ray.d, beside.ray.d), (alone.weight, beside.weight), (alone.pdf, beside.pdf), (alone.eta, beside.eta)):
+        np.testing.assert_array_equal(np.array(a), np.array(b))

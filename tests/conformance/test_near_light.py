@@ -164,6 +164,13 @@ PLACES = {
         "lamp": lamp(),
         "envmap": {"type": "envmap", "bitmap": mi.Bitmap(np.random.default_rng(1).random((4, 8, 3)).astype(np.float32))},
     },
+    "a small lamp inside": lambda: {
+        "fog": fog(1.0, 0.9)[0],
+        "bulb": {"type": "sphere", "center": [0.3, -0.2, 0.2], "radius": 0.1, "emitter": {"type": "area", "radiance": 9.0}},
+        "spot": spot([1.0, -2, 2.5], [0, 0, 0], 12.0, 40.0)[0],
+        "mirror": {"type": "sphere", "center": [-0.5, 0.4, 0], "radius": 0.3, "bsdf": {"type": "plastic"}},
+        "floor": floor(),
+    },
     "two lights, a ball": lambda: {
         "fog": ball_of(medium("homogeneous", 1.0, 0.8), (0, 0, 0), 1.0),
         "spot": spot([0.6, -0.4, 1.8], [0, 0, 0], 12.0, 40.0)[0],
@@ -202,7 +209,7 @@ def test_samples_are_bounded():
         ray = mi.Ray3f(mi.Point3f(h, 0, -2), mi.Vector3f(0, 0, 1))
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(fresh(1), n)
-        on, near = dr.full(mi.Bool, True, n), NearLighting(DirectLighting(media), 0.0)
+        on, near = dr.full(mi.Bool, True, n), NearLighting(DirectLighting(media), 0.0, [])
         segment = PathSegment(ray, media.medium_at(ray), mi.Spectrum(1), on, None, dr.zeros(mi.UInt32, n))
         light = near.estimate(segment, mi.Float(dr.inf), near.draw(sampler, on), False, on).light.value
     share = np.array(light.x, np.float64) * 2 * np.array(h, np.float64) / (sigma * albedo * intensity)

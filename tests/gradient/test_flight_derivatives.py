@@ -234,6 +234,7 @@ LAMPS = {
     "point": lambda: point([0.4, -0.3, 1.4])[0],
     "spot": lambda: small.spot([0.5, -0.4, 1.8], [0, 0, 0], 9.0)[0],
     "area": _area_lamp,
+    "inside": lambda: point([0.2, -0.1, 0.15])[0],
 }
 
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 from mivol.transport.estimators.lighting.vertex import MediumVertex, MixedVertex, SurfaceVertex, Vertex, sample_phase
 from mivol.transport.estimators.scores import TrackedFactor
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
+from mivol.transport.estimators.single_scattering.near_light import AimedDirections
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay, Ray, spawn_ray
@@ -69,6 +70,15 @@ class PathEvent:
         return MixedVertex(SurfaceVertex(media, self.si, self.si.bsdf(), self.medium), inside, self.collision.on)
 
 
+TRANSMISSION = int(
+    mi.BSDFFlags.Null
+    | mi.BSDFFlags.DiffuseTransmission
+    | mi.BSDFFlags.GlossyTransmission
+    | mi.BSDFFlags.DeltaTransmission
+)
+"""Flags of BSDFs that transmit light."""
+
+
 # -- The direction onwards -----------------------------------------------------------------------------------------------
 
 
@@ -79,8 +89,8 @@ class NextDirection:
     Attributes:
         ray: ray of the next segment.
         medium: medium around the origin of the ray.
-        weight: BSDF (times cosine) or phase function times albedo, over ``pdf`` [1].
-        pdf: density of the sampled direction [1/sr].
+        weight: BSDF (times cosine) or phase function times albedo, over the density of the direction [1].
+        pdf: density of the sampled direction among directions of the BSDF or phase function [1/sr].
         delta: lanes in which no emitter sample can find the light from this direction.
         eta: relative index of refraction [1].
         origin: interaction at which the direction was sampled.
@@ -106,7 +116,13 @@ PER_LANE = ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "t
 
 
 def sample_next_direction(
-    estimators: Estimators, ray: Ray, event: PathEvent, u: mi.Float, u2: mi.Point2f, may_scatter: mi.Bool
+    estimators: Estimators,
+    ray: Ray,
+    event: PathEvent,
+    u: mi.Float,
+    u2: mi.Point2f,
+    may_scatter: mi.Bool,
+    aimed: AimedDirections | None = None,
 ) -> NextDirection:
     """Sample the direction in which a path continues.
 
@@ -117,24 +133,33 @@ def sample_next_direction(
         u: uniform random number in [0, 1) for the component of the BSDF or phase function.
         u2: two uniform random numbers in [0, 1) for the direction.
         may_scatter: lanes allowed to scatter once more; paths of other lanes pass through a surface or end.
+        aimed: directions around a near emitter, drawn for a share of the samples; None for no such directions.
     """
     if event.collision is None:
-        return _sample_bsdf(estimators, ray, event, u, u2, may_scatter)
-    inside = _sample_phase_function(estimators, event.collision, u, u2, may_scatter)
+        return _sample_bsdf(estimators, ray, event, u, u2, may_scatter, aimed)
+    inside = _sample_phase_function(estimators, event.collision, u, u2, may_scatter, aimed)
     if not estimators.media.has_surfaces:
         return inside
-    outside = _sample_bsdf(estimators, ray, event, u, u2, may_scatter)
+    outside = _sample_bsdf(estimators, ray, event, u, u2, may_scatter, aimed)
     selected = {name: dr.select(event.in_medium, getattr(inside, name), getattr(outside, name)) for name in PER_LANE}
     return NextDirection(**selected, factors=outside.factors + inside.factors)
 
 
 def _sample_bsdf(
-    estimators: Estimators, ray: Ray, event: PathEvent, u: mi.Float, u2: mi.Point2f, may_scatter: mi.Bool
+    estimators: Estimators,
+    ray: Ray,
+    event: PathEvent,
+    u: mi.Float,
+    u2: mi.Point2f,
+    may_scatter: mi.Bool,
+    aimed: AimedDirections | None,
 ) -> NextDirection:
     """Sample a direction of the BSDF; a null component transmits the ray without deviation."""
     media, si = estimators.media, event.si
     bsdf = si.bsdf()
     sample, weight = bsdf.sample(mi.BSDFContext(), si, u, u2, event.at_surface)
+    if aimed is not None:
+        sample, weight = _mix_bsdf(si, sample, weight, aimed, u2, event.at_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
     # A sampled direction of density 0 has weight 0; its path ends at the roulette, where beta is 0.
     on = event.at_surface & (may_scatter | through)
@@ -155,13 +180,48 @@ def _sample_bsdf(
     )
 
 
+def _mix_bsdf(
+    si: mi.SurfaceInteraction3f,
+    sample: mi.BSDFSample3f,
+    weight: mi.Spectrum,
+    aimed: AimedDirections,
+    u: mi.Point2f,
+    active: mi.Bool,
+) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+    """Replace a share of BSDF samples by directions around a near emitter, at surfaces that reflect only."""
+    bsdf, context = si.bsdf(), mi.BSDFContext()
+    can_mix = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & ((bsdf.flags() & TRANSMISSION) == 0)
+    takes = can_mix & aimed.is_drawn
+    is_smooth = can_mix & (takes | ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta))
+    sample.wo = dr.select(takes, si.to_local(aimed.draw(u)), sample.wo)
+    f, pdf = bsdf.eval_pdf(context, si, sample.wo, is_smooth)
+    density = aimed.mix(pdf, si.to_world(sample.wo))
+    # Only the BSDF draws its delta components.
+    weight = dr.select(can_mix & ~is_smooth, weight * dr.rcp(1 - aimed.share), weight)
+    weight = dr.select(is_smooth, f * dr.rcp(dr.select(density > 0, density, 1)), weight)
+    sample.pdf = dr.select(is_smooth, pdf, sample.pdf)
+    sample.eta = dr.select(takes, 1, sample.eta)
+    sample.sampled_type = dr.select(takes, mi.UInt32(int(mi.BSDFFlags.DiffuseReflection)), sample.sampled_type)
+    return sample, dr.detach(weight)
+
+
 def _sample_phase_function(
-    estimators: Estimators, collision: Collision, u: mi.Float, u2: mi.Point2f, may_scatter: mi.Bool
+    estimators: Estimators,
+    collision: Collision,
+    u: mi.Float,
+    u2: mi.Point2f,
+    may_scatter: mi.Bool,
+    aimed: AimedDirections | None,
 ) -> NextDirection:
     """Sample a direction of the phase function. The flight ending here differentiates the albedo."""
     media, mei = estimators.media, collision.mei
     on = collision.on & may_scatter
     wo, weight, pdf = sample_phase(media, mei, u, u2, on)
+    if aimed is not None:
+        wo = dr.select(aimed.is_drawn, aimed.draw(u2), wo)
+        f, pdf = MediumVertex(media, mei, collision.p).eval_and_pdf(wo, on)
+        density = aimed.mix(pdf, wo)
+        weight = dr.select(density > 0, f * dr.rcp(dr.select(density > 0, density, 1)), 0)
     n = dr.width(wo)
     return NextDirection(
         ray=FineRay.from_point(collision.p, wo, mei),

@@ -371,7 +371,12 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
 
     # -- The next direction --------------------------------------------------------------------------------------------
     u, u2 = sampler.next_1d(arrives), sampler.next_2d(arrives)
-    onward = sample_next_direction(estimators, path.ray, event, u, u2, may_scatter)
+    aimed = None
+    if estimators.near is not None and estimators.near.aims:
+        # The last segment of a path finds emitters by chance only.
+        aims = may_scatter & (path.depth + 2 < limit)
+        aimed = estimators.near.aim(mi.Point3f(event.vertex(estimators.media).interaction.p), sampler.next_1d(aims), aims)
+    onward = sample_next_direction(estimators, path.ray, event, u, u2, may_scatter, aimed)
     path.is_opaque |= arrives & ~onward.through
     for factor in onward.factors:
         path.score = path.score.scale(factor)

@@ -28,6 +28,7 @@ __all__ = [
     "find_bounding_ball",
     "fractional_part",
     "is_among",
+    "join_arrays",
     "EventSamples",
     "EquiangularSampler",
     "make_ball_sampler",
@@ -102,6 +103,22 @@ class SceneEmitters:
             equiangular = make_equiangular_sampler(ray, mi.Point3f(x, y, z), dr.square(r), finite)
         return ChosenEmitter(number, self._table.pointer(number), equiangular, distribution)
 
+    def choose_at_point(self, p: mi.Point3f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        """Choose one of the ``sampled`` emitters by its light at a point, by ``u`` in [0, 1).
+
+        Returns:
+            The number of the emitter, and a uniform random number for another choice.
+        """
+        return self._grid.at_point(p).sample(u)
+
+    def ball(self, number: mi.UInt32) -> tuple[mi.Point3f, mi.Float]:
+        """Centre and radius of a ``sampled`` emitter [length]; 0 for an emitter at infinity."""
+        if len(self.sampled) == 1:
+            x, y, z, r = self._balls[0] or [mi.Float(0)] * 4
+        else:
+            x, y, z, r, _ = self._table.ball(number)
+        return mi.Point3f(x, y, z), r
+
     def sample_direction(
         self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.EmitterPtr, mi.Point2f]:
@@ -168,7 +185,7 @@ class _EmitterTable:
         if len(left_out) == 1:
             place = dr.select(number < left_out[0], number, number + 1)
         elif left_out:
-            place = _join([dr.opaque(mi.UInt32, k) for k, e in enumerate(everyone) if id(e) in chosen])
+            place = join_arrays([dr.opaque(mi.UInt32, k) for k, e in enumerate(everyone) if id(e) in chosen])
         pointers = dr.gather(mi.EmitterPtr, scene.emitters_dr(), place)
         size = max(int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0]) for e in everyone) + 1
         numbers = dr.full(mi.UInt32, count, size)
@@ -176,7 +193,7 @@ class _EmitterTable:
         far = [dr.opaque(mi.Float, 0)] * 4
         rows = zip(*(far if b is None else b for b in balls), strict=True)
         finite = [dr.opaque(mi.Float, float(b is not None)) for b in balls]
-        columns = [_join(list(row)) for row in (*rows, finite)]
+        columns = [join_arrays(list(row)) for row in (*rows, finite)]
         dr.eval(pointers, numbers, columns)
         return cls(emitters, pointers, numbers, columns)
 
@@ -200,7 +217,7 @@ class _EmitterTable:
         return x, y, z, r, finite > 0
 
 
-def _join(values: list[mi.Float] | list[mi.UInt32], at_once: int = 16) -> mi.Float | mi.UInt32:
+def join_arrays(values: list[mi.Float] | list[mi.UInt32], at_once: int = 16) -> mi.Float | mi.UInt32:
     """Join arrays, few at once: a kernel with hundreds of inputs would take a second to compile."""
     while len(values) > 1:
         values = [dr.concat(values[k : k + at_once]) for k in range(0, len(values), at_once)]

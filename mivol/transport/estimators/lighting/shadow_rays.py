@@ -16,19 +16,27 @@ from mivol.numerics import minimum
 from mivol.transport.estimators.flights.tracking import ratio_tracking, residual_ratio_tracking
 from mivol.transport.media.channels import to_scene_channels, to_spectrum
 from mivol.transport.media.grid_extinction import clip_interval
-from mivol.transport.media.optical_depth import integrate_optical_depth, transmittance
+from mivol.transport.media.optical_depth import integrate_optical_depth, segment_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import (
     OWN_SURFACE,
     MediumInterval,
     RaySegment,
     SegmentEnd,
+    revisit_media,
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.random_numbers import draw_pcg32
 from mivol.transport.traversal.rays import FineRay, Ray
 
-__all__ = ["NEGLIGIBLE_TAU", "ROULETTE_TAU", "estimate_transmittance", "find_transmittance", "trace_shadow_ray"]
+__all__ = [
+    "NEGLIGIBLE_TAU",
+    "ROULETTE_TAU",
+    "estimate_transmittance",
+    "find_transmittance",
+    "segment_transmittance",
+    "trace_shadow_ray",
+]
 
 
 NEGLIGIBLE_TAU = 30.0
@@ -79,6 +87,14 @@ def estimate_transmittance(
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
     end, (T, _) = visit_media(media, ray, medium, _multiply_transmittance, start, active, passes_null)
     return end, to_spectrum(T)
+
+
+def segment_transmittance(media: SceneMedia, segment: RaySegment, active: mi.Bool, rng: mi.UInt32) -> mi.Spectrum:
+    """Transmittance of the media along a segment of known length [1]: estimated if the media estimate shadows, else exact."""
+    if not media.tracks_shadows:
+        return transmittance(segment_optical_depth(media, segment, active))
+    start = ([mi.Float(1) for _ in range(media.channels)], rng)
+    return to_spectrum(revisit_media(media, segment, _multiply_transmittance, start, active, anywhere=True)[0])
 
 
 def _multiply_transmittance(state: tuple, interval: MediumInterval) -> tuple:

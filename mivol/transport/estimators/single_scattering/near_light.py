@@ -7,8 +7,17 @@ a position falls as 1 / r^2, so its light at collisions has a heavy tail. Here e
 extinguished light and the angle seen from the emitter together (:mod:`.distance_sampling`), and adds the light of near emitters
 there. The collision adds none. So the variance is the variance of single scattering, for every order of scattering.
 
+Directions. The light of a point emitter that is scattered along a ray falls as 1 / sin(theta) with the angle between the ray
+and the direction towards the emitter. Directions of a phase function or BSDF alone would find its square as 1 / sin^2(theta),
+and the variance would be infinite. So a share of the directions is drawn with the density
+
+.. math:: q(\omega) = \frac{\pi - \theta}{\pi^3 \sin\theta},
+
+in proportion to the integral of 1 / r^2 along the ray. Each sample is weighted by the density of the mixture.
+
 The path may hit an extended emitter after a collision. That path and the sample at the drawn distance estimate the same light
-from the same point and direction. The power heuristic weights both, by the densities of their directions at that point.
+from the same point and direction. The power heuristic weights both, by the densities of their directions at that point; of the
+path's directions, by their density without the mixture. Any two weights with the sum 1 are unbiased.
 
 References: Kulla & Fajardo 2012 (equiangular sampling); Veach 1997, Eq. 9.13 (the power heuristic).
 """
@@ -21,6 +30,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting
+from mivol.transport.estimators.lighting.emitters import join_arrays
+from mivol.transport.estimators.lighting.shadow_rays import segment_transmittance
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.estimators.single_scattering.distance_sampling import (
@@ -35,12 +46,53 @@ from mivol.transport.estimators.single_scattering.scattering_derivatives import 
     event_coefficients,
     event_interaction,
 )
-from mivol.transport.media.optical_depth import segment_optical_depth, transmittance
+from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment
-from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state
+from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state, fork_state
 from mivol.transport.traversal.rays import point_along
 
-__all__ = ["NearLight", "NearLightSamples", "NearLighting"]
+__all__ = ["AimedDirections", "NearLight", "NearLightSamples", "NearLighting"]
+
+
+MAX_AIMED_SHARE = 0.4
+"""Largest share of directions drawn around an emitter [1]. Light of other emitters then has at most 1 / (1 - 0.4) = 1.7 times
+the variance. (Variance with a lamp in smoke, depth 8, and shares of 0, 1/4, 0.4 and 1/2: 1.9e-2, 4.3e-3, 3.7e-3, 3.1e-3.)"""
+
+MIN_AIMED_DISTANCE = 3.0
+"""Distance of an emitter over its radius [1] up to which no direction is aimed: light is even over so wide an angle."""
+
+MIN_SINE = 1e-6
+"""Smallest sine in the density of directions [1], so that the density is finite in float32."""
+
+
+@dataclass
+class AimedDirections:
+    """Directions around the direction towards an emitter, drawn in place of a share of the directions at a vertex.
+
+    Attributes:
+        axis: direction towards the emitter.
+        share: probability of drawing such a direction [1].
+        is_drawn: lanes that draw such a direction.
+    """
+
+    axis: mi.Vector3f
+    share: mi.Float
+    is_drawn: mi.Bool
+
+    def draw(self, u: mi.Point2f) -> mi.Vector3f:
+        """Draw a direction by two uniform random numbers in [0, 1)."""
+        sin_theta, cos_theta = dr.sincos(dr.pi * (1 - dr.sqrt(1 - u.x)))
+        sin_phi, cos_phi = dr.sincos(dr.two_pi * u.y)
+        return mi.Frame3f(self.axis).to_world(mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta))
+
+    def pdf(self, d: mi.Vector3f) -> mi.Float:
+        """Density of a direction of :meth:`draw` [1/sr]."""
+        sine = dr.norm(dr.cross(d, self.axis))
+        return (dr.pi - dr.atan2(sine, dr.dot(d, self.axis))) / (dr.pi**3 * dr.maximum(sine, MIN_SINE))
+
+    def mix(self, pdf: mi.Float, d: mi.Vector3f) -> mi.Float:
+        """Density of a direction in the mixture with another density, ``pdf`` [1/sr]."""
+        return dr.lerp(pdf, self.pdf(d), self.share)
 
 
 @dataclass
@@ -81,26 +133,51 @@ class NearLighting:
     Args:
         direct: estimator of direct lighting.
         probe_depth: optical depth added over a medium for derivatives [1]; 0 for images.
+        inside: emitters inside media that scatter. Directions are drawn around these emitters only.
 
     Attributes:
         emitters: the emitters with a position.
         lights_vertices: collisions draw the other emitters, at infinity.
+        aims: some emitter lies inside a medium.
 
     Bias: none. Variance: one distance and one point on one emitter. Cost: a walk of the segment, one up to the drawn distance,
     and a shadow ray.
     """
 
-    def __init__(self, direct: DirectLighting, probe_depth: float) -> None:
+    def __init__(self, direct: DirectLighting, probe_depth: float, inside: list[mi.Emitter]) -> None:
         self.direct, self.media, self.probe_depth = direct, direct.media, probe_depth
         # Their tables are made here, outside of recorded loops.
         self.emitters = direct.near_emitters
         self.lights_vertices = bool(direct.far_emitters.sampled)
+        aimed = [any(e is other for other in inside) for e in direct.emitters.sampled]
+        self.aims = any(aimed)
+        self._aimed_share = None if all(aimed) else join_arrays([dr.opaque(mi.Float, MAX_AIMED_SHARE * a) for a in aimed])
 
     def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> NearLightSamples:
         """Draw the random numbers of a segment."""
         return NearLightSamples(
             sampler.next_1d(active), sampler.next_2d(active), sampler.next_2d(active), draw_state(sampler, active)
         )
+
+    def aim(self, p: mi.Point3f, u: mi.Float, active: mi.Bool) -> AimedDirections:
+        """Choose an emitter by its light at a vertex, and the share of directions around this emitter.
+
+        Args:
+            p: the vertex.
+            u: uniform random number in [0, 1) for the emitter, and for drawing such a direction.
+            active: lanes that may aim; the share of other lanes is 0.
+        """
+        number, u = self.direct.emitters.choose_at_point(p, u)
+        centre, radius = self.direct.emitters.ball(number)
+        share = mi.Float(MAX_AIMED_SHARE)
+        if self._aimed_share is not None:
+            share = dr.gather(mi.Float, self._aimed_share, number, active)
+        axis = mi.Vector3f(centre - p)
+        distance = dr.norm(axis)
+        is_far = active & (distance > MIN_AIMED_DISTANCE * radius)
+        share = dr.select(is_far, share * (1 - MIN_AIMED_DISTANCE * radius * dr.rcp(dr.select(is_far, distance, 1))), 0)
+        axis = dr.select(is_far, axis * dr.rcp(dr.select(is_far, distance, 1)), mi.Vector3f(0, 0, 1))
+        return AimedDirections(axis, share, u < share)
 
     def estimate(
         self, segment: PathSegment, length: mi.Float, samples: NearLightSamples, attached: bool, active: mi.Bool
@@ -116,10 +193,11 @@ class NearLighting:
         reservoir = refill_reservoir(proposal, passed, start_reservoir(media, [rng]), on)
         (candidate,) = reservoir.candidates
         event = sample_distance(proposal, candidate, reservoir.total, samples.inside, on)
-        mei, tau = event_interaction(media, ray, event), event.tau
+        mei, T = event_interaction(media, ray, event), transmittance(event.tau)
         if not proposal.is_exact:
-            tau = segment_optical_depth(media, RaySegment.upto(ray, segment.medium, event.t), event.on)
-        gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
+            before = RaySegment.upto(ray, segment.medium, event.t)
+            T = segment_transmittance(media, before, event.on, fork_state(candidate.rng, 1))
+        gain = dr.select(event.on, segment.beta * T / event.pdf, 0)
         # -- Direct light ------------------------------------------------------------------------------------------------
         sample = self.direct.sample_near_emitter(mei, chosen, samples.emitter, event.on)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
