@@ -122,6 +122,12 @@ def cpu_back_end(variant_rgb: str) -> None:
 
 
 @pytest.fixture
+def traced_balls(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Null spheres are traced, as boundaries of all other shapes are; their balls are not clipped in closed form."""
+    monkeypatch.setattr("mivol.scene.survey.fit_ball", lambda shape: None)
+
+
+@pytest.fixture
 def two_threads(variant_rgb: str) -> None:
     """The pool has two threads at least, as a user's has: both add to one gradient; Mitsuba reads an EXR with the second."""
     set_thread_count(max(2, drjit.thread_count()))

@@ -214,7 +214,9 @@ def _describe_depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
     lines = []
     light = "collimated" if "delta" in needs.emitter_kinds else "constant"
     for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
-        box, traced = (boundary.box, None) if boundary.box is not None else (_padded_box(scene, boundary.medium), scene)
+        box, traced = boundary.box, None
+        if box is None or box.is_round:
+            box, traced = _padded_box(scene, boundary.medium), scene
         if not facts.is_scattering or facts.bounded or box is None:
             continue
         tau, albedo = scattering_depth(view, box, scene=traced), mean_albedo(view)

@@ -185,7 +185,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
 
 def _describe_boundary(boundary: Boundary) -> str:
     if boundary.box is not None:
-        return "a box"
+        return "a ball" if boundary.box.is_round else "a box"
     return f"{OUTSIDE_SHAPES}, traced" if boundary.shape == OUTSIDE_SHAPES else f"a {boundary.shape}, traced"
 
 
@@ -197,16 +197,14 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
 
 
 def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridReading]) -> float | None:
-    """Bound the optical depth of a medium by its largest extinction times the diagonal of its box."""
+    """Bound the optical depth of a medium by its largest extinction times the diameter of its box or ball."""
     bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
     bounds += [p.field.bound()[0] for p in view.parts if isinstance(p, GaussianExtinction)]
     constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.is_constant]
     if boundary.box is None:
         return None
-    corners = boundary.box.corners()
-    diagonal = max(np.linalg.norm(corners[i] - corners[7 - i]) for i in range(4))
     scale = float(np.max(np.array(dr.detach(view.scale))))
-    return scale * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * float(diagonal)
+    return scale * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * boundary.box.diameter
 
 
 def _find_thinnest(boundary: Boundary, view: MediumView) -> float:

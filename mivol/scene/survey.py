@@ -15,7 +15,7 @@ from mivol.scene_graph import traverse
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
-from mivol.transport.traversal.box import Box, fit_box
+from mivol.transport.traversal.box import Box, fit_ball, fit_box
 
 OUTSIDE_SHAPES = "space around shapes"
 """Class of shape of a medium that fills no shape."""
@@ -102,11 +102,12 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     boundaries, surfaces, refractive, has_null = [], [], [], False
     shapes = scene.shapes()
     boxes = {s.ptr: oriented_box(s) for s in shapes if s.is_medium_transition()}
+    named = {s.get_medium().ptr for s in scene.sensors() if s.get_medium() is not None}
     for index, shape in enumerate(shapes):
         if shape.is_medium_transition():
             name = shape.id() or f"shape {index}"
             if shape.interior_medium() is not None:
-                boundaries.append(_make_boundary(shape, name, boxes))
+                boundaries.append(_make_boundary(shape, name, boxes, named))
             if int(shape.bsdf().flags()) & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)):
                 refractive.append(f"{name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
@@ -194,10 +195,16 @@ def is_instance(shape: mi.Shape) -> bool:
     return shape.class_name() == "Instance"
 
 
-def _make_boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox]) -> Boundary:
+def _make_boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox], named: set[int]) -> Boundary:
+    """Find the boundary made by a shape; ``named`` has the pointers of media named by sensors."""
     alone = not any(box.shares(boxes[shape.ptr]) for other, box in boxes.items() if other != shape.ptr)
-    is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
-    box = fit_box(shape) if is_box else None
+    box = None
+    if alone and shape.exterior_medium() is None and _is_bare(shape) and not shape.has_flipped_normals():
+        if shape.class_name() == "Cube":
+            box = fit_box(shape)
+        elif shape.class_name() == "Sphere" and shape.interior_medium().ptr not in named:
+            # Outside of the sphere, the medium of a sensor inside it has no end until a boundary is met.
+            box = fit_ball(shape)
     return Boundary(shape.interior_medium(), name, shape.class_name(), box, around=boxes[shape.ptr])
 
 
@@ -219,7 +226,7 @@ def _split_levels(boundary: Boundary) -> list[Boundary]:
     field = nested_field(boundary.medium)
     if field is None:
         return [boundary]
-    if boundary.box is None:
+    if boundary.box is None or boundary.box.is_round:
         raise MivolError(
             f"the medium in {boundary.name} is a nested field, whose levels are boxes, but {boundary.shape} is not a "
             "separate box: give the medium a cube with a null BSDF that overlaps no other medium's shape."
@@ -249,7 +256,7 @@ class Boundary:
         medium: Mitsuba's object.
         name: name of the shape.
         shape: class of the shape; ``OUTSIDE_SHAPES`` for a medium around shapes, around the camera or in instances.
-        box: the shape as a box overlapped by no other boundary; None if rays must be traced to the shape.
+        box: the shape as a box or ball overlapped by no other boundary; None if rays must be traced to the shape.
         level: level of a nested radiance field; each level is a medium of its own.
         hole: box of the inner level, left out by this level; None for other media.
         around: box around the shape; None if the medium fills no shape or also surrounds a shape.
@@ -269,7 +276,8 @@ class Boundary:
         Raises:
             MivolError: a medium that mivol does not render.
         """
-        return view_medium(self.medium, self.box, places, self.level)
+        box = None if self.box is None or self.box.is_round else self.box
+        return view_medium(self.medium, box, places, self.level)
 
     def body(self, view: MediumView, estimates_shadows: bool = False) -> Body:
         """Place a view of the medium inside its boundary."""

@@ -1,12 +1,16 @@
-"""Boxes: corners, containment, and boxes of cubes."""
+"""Boxes: corners, containment, and boxes of cubes; balls, and where rays enter and leave them."""
 
 from __future__ import annotations
+
+import math
+from fractions import Fraction
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.traversal.box import Box, fit_box
+from mivol.transport.traversal.box import Box, clip_to_ball, fit_ball, fit_box, is_in_box
+from scenes import camera
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -39,3 +43,79 @@ def test_box_of_a_sheared_cube():
     cube = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f(shear)})
     ends = np.array([[x, y, z, 1] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)])
     np.testing.assert_allclose(fit_box(cube).corners(), (ends @ shear.T)[:, :3], atol=8 * 2.0**-24 * 6)
+
+
+# -- Balls -----------------------------------------------------------------------------------------------------------------
+
+
+def ball_around(centre: list[float], radius: float) -> Box:
+    """The ball of a ``sphere`` shape."""
+    return fit_ball(mi.load_dict({"type": "sphere", "center": centre, "radius": radius}))
+
+
+def chord(o: np.ndarray, d: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """Both ends of the chord of a ray in exact rational arithmetic up to the square root."""
+    o, d, c, r = ([Fraction(float(x)) for x in np.atleast_1d(v)] for v in (o, d, centre, radius))
+    away = [a - b for a, b in zip(o, c, strict=True)]
+    dd, ad, aa = (sum(x * y for x, y in zip(a, b, strict=True)) for a, b in ((d, d), (away, d), (away, away)))
+    root = math.sqrt((ad * ad - dd * (aa - r[0] ** 2)) / dd**2)
+    return np.array([float(-ad / dd) - root, float(-ad / dd) + root])
+
+
+@pytest.mark.parametrize("away", [2.0, 100.0, 1e4])
+def test_a_ray_enters_and_leaves_a_ball_where_its_equation_says(away: float) -> None:
+    """Seen from afar the ends keep their digits: coordinates of the size ``away`` are rounded in float64 a few times."""
+    rng, centre, radius = np.random.default_rng(3), np.array([0.3, -0.2, 0.5]), 0.7
+    target = centre + rng.uniform(-0.3, 0.3, (16, 3))
+    o = np.float32(target + away * np.array([0.48, -0.6, 0.64]))
+    d = np.float32((target - o) / np.linalg.norm(target - o, axis=1, keepdims=True))
+    box = ball_around(centre.tolist(), radius)
+    c, r = box.to_world[:3, 3] + box.to_world[0, 0] / 2, box.to_world[0, 0] / 2
+    rows, ray = box.rows(), (mi.Point3f(o.T), mi.Vector3f(d.T))
+    t0, t1 = clip_to_ball(rows, *ray, mi.Float64(0), mi.Float64(np.inf))
+    truth = np.array([chord(a, b, c, r) for a, b in zip(o, d, strict=True)])
+    found = np.stack([np.array(t0), np.array(t1)], axis=1)
+    np.testing.assert_allclose(found, truth, rtol=0, atol=64 * 2.0**-52 * away)
+    middle = truth.mean(axis=1)
+    t0, t1 = clip_to_ball(rows, *ray, mi.Float64(middle), mi.Float64(middle + 0.1))
+    np.testing.assert_array_equal(np.array(t0), middle)
+    np.testing.assert_array_equal(np.array(t1), middle + 0.1)
+
+
+@pytest.mark.parametrize("start", [0.0, 1.0])
+def test_rays_beside_behind_and_without_a_ball(start: float) -> None:
+    """A ray beside the ball, one that leaves it behind, a direction of length 0, and NaN have no interval inside."""
+    rows = ball_around([0.0, 0.0, 0.0], 0.5).rows()
+    o = mi.Point3f([0.6, 0, 0, 0], 0, [-2, 2, -2, -2])
+    d = mi.Vector3f(0, 0, [1, 1, 0, np.nan])
+    t0, t1 = clip_to_ball(rows, o, d, mi.Float64(start), mi.Float64(np.inf))
+    assert not np.any(np.array(t1) > np.array(t0))
+
+
+def test_points_in_a_ball() -> None:
+    box = ball_around([1.0, 0.0, 0.0], 0.5)
+    p = mi.Point3f([1.0, 1.49, 1.51, 1.4, 0.49], [0, 0, 0, 0.4, 0], 0)
+    assert np.array(is_in_box(box.rows(), True, p)).tolist() == [True, True, False, False, False]
+    assert np.array(is_in_box(box.rows(), False, p)).tolist() == [True, True, False, True, False]
+    assert box.diameter == pytest.approx(1, rel=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["mivol", "stock"])
+def test_a_ball_in_closed_form_looks_as_when_it_is_traced(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A constant, and a grid in the box around the ball, which the ball cuts; a traced boundary is known to a few float32 roundings of its coordinates."""
+    noise = np.random.default_rng(1).random((5, 6, 7, 1)).astype(np.float32)
+    place = mi.ScalarTransform4f().translate(-1).scale(2)
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(noise), "to_world": place}
+    medium = {"type": "heterogeneous" if kind == "stock" else "mivol_medium", "sigma_t": grid, "albedo": 0.0}
+    ball = {"type": "sphere", "radius": 1.0, "bsdf": {"type": "null"}, "interior": medium}
+    fog = ball | {"center": [2.5, 0, 0], "radius": 1.0, "interior": {"type": "homogeneous", "sigma_t": 0.7, "albedo": 0.0}}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "fog": fog, "sky": {"type": "constant"},
+                          "sensor": camera([4, 6, 2], [1, 0, 0], res=16, fov=40)})  # fmt: skip
+    images = []
+    for fit in (fit_ball, lambda shape: None):
+        monkeypatch.setattr("mivol.scene.survey.fit_ball", fit)
+        images.append(np.array(mi.render(scene, integrator=mi.load_dict({"type": "mivol", "max_depth": 2}), spp=4, seed=1)))
+    assert images[0].min() < 0.5
+    # Far from the rim; a ray that grazes the ball has a chord of any length below sqrt(8 r eps).
+    np.testing.assert_allclose(*images, rtol=0, atol=1e-3)
+    assert np.median(np.abs(images[0] - images[1])) < 1e-6

@@ -20,7 +20,7 @@ SIDE, SPP, SKY, SCALE = 12, 256, 0.8, 1.2
 BATCHES = SIDE * SIDE
 """Pixels see the same line: each is a batch of SPP samples of a number between 0 and SKY, whose mean is nearly normal."""
 
-pytestmark = pytest.mark.usefixtures("ball_plugin")
+pytestmark = pytest.mark.usefixtures("ball_plugin", "traced_balls")
 
 
 @pytest.fixture

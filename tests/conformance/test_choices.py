@@ -163,7 +163,7 @@ def test_channels_emission_skipping_and_tracing():
     assert [choices.choose_skipping(grey, skip).choice for skip in (True, False)] == ["skipped", "walked"]
     scene = needs(grey, rgb)
     scene.boundaries = (SimpleNamespace(box=1), SimpleNamespace(box=None))
-    assert choices.choose_tracing(scene).reason == "not a box, or overlapping another boundary: smoke"
+    assert choices.choose_tracing(scene).reason == "not a box or ball, or overlapping another boundary: smoke"
     scene.boundaries = (SimpleNamespace(box=1), SimpleNamespace(box=1))
     assert choices.choose_tracing(scene).choice == "not traced"
     scene.surfaces = ("Sphere", "Rectangle", "Sphere")

@@ -40,7 +40,8 @@ def test_a_grid_says_its_voxels_and_a_bounded_field_its_name():
 
 
 def test_surfaces_emitters_and_a_camera_inside():
-    inside = ball_of(medium("homogeneous", 0.5), (0, -9, 0), 2.0)
+    inside = ball_of(medium("homogeneous", 0.5), (0, -9, 0), 2.0) | {"type": "cylinder", "p0": [0, -11, 0], "p1": [0, -7, 0]}
+    del inside["center"]
     found = facts(medium("homogeneous", 0.5), wall={"type": "rectangle"}, sky={"type": "constant"}, around=inside)
     assert found["surfaces"] == "Rectangle" and found["emitters"].startswith("ConstantBackgroundEmitter")
     assert found["camera"] == "may be inside a medium"

@@ -135,11 +135,30 @@ def test_no_phase_function_and_no_light_sampling():
 
 
 def test_boxes_trace_no_acceleration_structure():
-    """A box is a slab test; a sphere is traced, and so is a box with a surface beside it."""
+    """A box is a slab test, a ball a quadratic equation; a cylinder is traced, and so is a box with a surface beside it."""
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}
     assert traced_rays(kernels(scene_of())) == 0
-    assert traced_rays(kernels(scene_of(boundary=ball_of, where=((0, 0, 0), 1.0)))) == 1
+    assert traced_rays(kernels(scene_of(boundary=ball_of, where=((0, 0, 0), 1.0)))) == 0
+    tube = lambda interior: {"type": "cylinder", "bsdf": {"type": "null"}, "interior": interior}  # noqa: E731
+    assert traced_rays(kernels(scene_of(boundary=tube, where=()))) == 1
     assert traced_rays(kernels(scene_of(wall=wall))) == 1
+
+
+@pytest.mark.parametrize("kind", ["plain", "inside out", "named by the sensor", "over another", "lit"])
+def test_balls_that_are_clipped_in_closed_form(kind: str) -> None:
+    """Not a sphere whose inside is out, whose medium also surrounds the camera, that shares space, or that is a lamp."""
+    fog = medium("homogeneous", 1.0) | {"id": "fog"}
+    parts = {"ball": ball_of(fog, (0, 0, 0), 1.0), "sensor": camera((0, 0, 5), (0, 0, 0))}
+    if kind == "inside out":
+        parts["ball"]["flip_normals"] = True
+    elif kind == "named by the sensor":
+        parts["sensor"]["medium"] = {"type": "ref", "id": "fog"}
+    elif kind == "over another":
+        parts["other"] = ball_of(medium("homogeneous", 2.0), (0, 0, 0), 0.5) | {"exterior": {"type": "ref", "id": "fog"}}
+    elif kind == "lit":
+        parts["ball"]["emitter"] = {"type": "area", "radiance": 1.0}
+    boxes = [b.box for b in survey_scene(mi.load_dict({"type": "scene", **parts})).boundaries]
+    assert [b is not None and b.is_round for b in boxes] == [kind == "plain"] * len(boxes)
 
 
 def test_depth_1_shades_no_surface():
@@ -417,6 +436,7 @@ SENSORS = {
 }
 
 
+@pytest.mark.usefixtures("traced_balls")
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_camera_is_inside_where_its_rays_may_begin_in_a_boundary(name: str) -> None:
     """A ball of radius 1, which is traced, with or without a box: rays begin up to four near planes to the side of the eye."""

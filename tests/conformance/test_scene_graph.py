@@ -46,7 +46,7 @@ from mivol.splatting import Splatter, to_tensors
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 
-pytestmark = pytest.mark.usefixtures("test_ball")
+pytestmark = pytest.mark.usefixtures("test_ball", "traced_balls")
 
 BOXED = scenes.centred(2 * np.eye(3))
 

@@ -18,7 +18,7 @@ from mivol.points.gaussians import CONSTANT_HARMONIC
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
+pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
 
 SIDE, BATCHES = 8, 16
 

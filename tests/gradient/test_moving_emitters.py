@@ -120,8 +120,8 @@ def test_place_of_an_emitter_over_a_floor(depth):
     assert_precise(m, 0.02 * level, what="floor")
 
 
-def traced_media() -> dict[str, dict]:
-    """Black media with traced boundaries, over a floor."""
+def round_media() -> dict[str, dict]:
+    """Black media in balls, of which one is traced since its medium touches another."""
     grid, haze = medium("mivol_medium", grid_volume("mivol_voxels", 0.2 + rough_grid(1), PLACE)), medium("homogeneous", 0.4)
     turned = mi.ScalarTransform4f().rotate([1, 0, 0], 35).scale([0.7, 1.1, 0.8])
     egg = {"type": "sphere", "to_world": turned, "bsdf": {"type": "null"}, "interior": medium("homogeneous", 1.2)}
@@ -136,7 +136,7 @@ def traced_media() -> dict[str, dict]:
     }
 
 
-TRACED = ("an egg", "a ball in its grid", "a ball around its grid", "a ball in a box")
+ROUND = ("an egg", "a ball in its grid", "a ball around its grid", "a ball in a box")
 
 
 @pytest.mark.slow_for(
@@ -147,12 +147,12 @@ TRACED = ("an egg", "a ball in its grid", "a ball around its grid", "a ball in a
     "an egg-emitter1",
 )
 @pytest.mark.parametrize("emitter", [(0.3, -0.2, 3.0), (0.05, 0.1, 0.2)])
-@pytest.mark.parametrize("name", TRACED)
-def test_place_of_an_emitter_behind_boundaries_that_are_traced(name, emitter):
+@pytest.mark.parametrize("name", ROUND)
+def test_place_of_an_emitter_behind_balls(name, emitter):
     """The floor has no noise: differences of the same pencils. One emitter is outside the medium, one inside."""
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2.2]).scale(3)}
     o = np.column_stack([np.random.default_rng(4).uniform(-0.3, 0.3, (6, 2)), np.full(6, -2.0)])
-    parts = {**traced_media()[name], "floor": floor, "emitter": point(emitter)[0]}
+    parts = {**round_media()[name], "floor": floor, "emitter": point(emitter)[0]}
     seen = pencils(parts, as_float32(o), as_float32([0, 0, -1]))
     params, integrator, w = mi.traverse(seen.scene), mi.load_dict(mivol()), weights(6)[0]
 

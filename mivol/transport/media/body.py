@@ -20,7 +20,7 @@ from mivol.transport.media.channels import to_part_channels, to_scene_channels, 
 from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval
 from mivol.transport.media.grid_extinction import SummedExtinction, add_to_cell, have_same_cells
 from mivol.transport.media.medium_view import MediumView
-from mivol.transport.traversal.box import Box
+from mivol.transport.traversal.box import UNIT_CUBE, Box, clip_to_ball, clip_to_box, is_in_box
 from mivol.transport.traversal.rays import Ray, point_along
 
 __all__ = [
@@ -39,7 +39,7 @@ class Body:
 
     Attributes:
         view: extinction of the medium.
-        box: the boundary, if the boundary is a box; None for a traced boundary.
+        box: the boundary, if the boundary is a box or a ball; None for a traced boundary.
         edge: mean length of an edge of the box [length], as an opaque array; None without a box.
         exact_parts: the parts with a known integral along a ray.
         flight_parts: the parts from which a single walk draws free flights: constants, and grids that share their cells.
@@ -54,7 +54,10 @@ class Body:
     def __init__(self, view: MediumView, box: Box | None, estimates_shadows: bool = False, hole: Box | None = None) -> None:
         self.view, self.box, self.estimates_shadows, self.hole = view, box, estimates_shadows, hole
         self.cuts_grids = box is not None and (
-            hole is not None or view.emission_density is not None or not all(_fits(part, box) for part in view.parts)
+            box.is_round
+            or hole is not None
+            or view.emission_density is not None
+            or not all(_fits(part, box) for part in view.parts)
         )
         self.rows = box.rows() if box is not None else None
         self.hole_rows = hole.rows() if hole is not None else None
@@ -68,6 +71,17 @@ class Body:
         self.has_tangent: list[bool] = []
         self.microflakes_gradient: mi.Float | None = None
         self.microflakes_tangent: list[mi.Float] | None = None
+
+    def clip(self, ray: Ray, t0: mi.Float64, t1: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
+        """The part of the interval [t0, t1] of a ray inside the box or ball [length]; t1 <= t0 if the ray misses it."""
+        if self.box.is_round:
+            return clip_to_ball(self.rows, ray.o, ray.d, t0, t1)
+        return clip_to_box(self.rows, *UNIT_CUBE, ray.o, ray.d, t0, t1)[2:]
+
+    def contains(self, p: mi.Point3f) -> mi.Bool:
+        """Whether a point lies in the box or ball, and not in the hole."""
+        inside = is_in_box(self.rows, self.box.is_round, p)
+        return inside if self.hole is None else inside & ~is_in_box(self.hole_rows, False, p)
 
     @property
     def is_bounded(self) -> bool:

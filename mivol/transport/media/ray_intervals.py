@@ -1,8 +1,8 @@
 """The media along a ray: the interval of each medium, and the surface at the end of the ray.
 
-A ray is followed to the first opaque surface, and each medium on the way is visited with its interval [t0, t1]. Slab tests in
-float64 find the intervals of media in boxes; the intervals behind other boundaries are traced. Media are disjoint, so the
-middles of their intervals order them.
+A ray is followed to the first opaque surface, and each medium on the way is visited with its interval [t0, t1]. Intervals of
+media in boxes and balls are found in closed form, in float64; the intervals behind other boundaries are traced. Media are
+disjoint, so the middles of their intervals order them.
 
 Dr.Jit records a loop by calling its body once. A loop over boundaries is a recorded loop of unknown length, so
 :func:`visit_media` takes the function for an interval as an argument; for media in boxes the function is called from a Python
@@ -24,7 +24,7 @@ import mitsuba as mi
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.box import clip_to_box
+from mivol.transport.traversal.box import UNIT_CUBE, clip_to_box
 from mivol.transport.traversal.rays import FineRay, Ray, hit_distance, spawn_ray, to_mitsuba_ray
 
 __all__ = [
@@ -41,10 +41,6 @@ __all__ = [
     "trace_boundaries",
     "visit_media",
 ]
-
-
-UNIT = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-"""Two corners of the unit cube, in the coordinates of a boundary's rows."""
 
 
 @dataclass
@@ -130,7 +126,7 @@ class MediumInterval(RayInterval):
         """The interval inside the boundary [length]; the end is not behind the start if the ray misses the boundary."""
         t0, t1 = mi.Float64(self.t0), mi.Float64(self.t1)
         if self.body.box is not None and not self.body.cuts_grids:
-            _, _, t0, t1 = clip_to_box(self.body.rows, *UNIT, self.ray.o, self.ray.d, t0, t1)
+            t0, t1 = self.body.clip(self.ray, t0, t1)
         return t0, t1
 
 
@@ -226,10 +222,10 @@ def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: m
     for body in media.boxed:
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.cuts_grids:
-            _, _, t0, t1 = clip_to_box(body.rows, *UNIT, ray.o, ray.d, t0, t1)
+            t0, t1 = body.clip(ray, t0, t1)
         ends = [(t0, t1)]
         if body.hole is not None:
-            _, _, enter, leave = clip_to_box(body.hole_rows, *UNIT, ray.o, ray.d, t0, t1)
+            _, _, enter, leave = clip_to_box(body.hole_rows, *UNIT_CUBE, ray.o, ray.d, t0, t1)
             misses = leave <= enter
             ends = [(t0, dr.select(misses, t1, enter)), (dr.select(misses, t1, leave), t1)]
         intervals += [MediumInterval(ray, a, b, active & (b > a), body) for a, b in ends]

@@ -1,6 +1,6 @@
 """The media of a scene, and the start and end of a pass of derivatives with respect to them.
 
-Conventions. A body is a medium behind a boundary. Slab tests clip rays to boundaries that are boxes; other boundaries are
+Conventions. A body is a medium behind a boundary. Rays are clipped to boundaries that are boxes or balls; other boundaries are
 traced.
 """
 

@@ -1,4 +1,4 @@
-"""Boxes in the world (parallelepipeds), and the slab test that clips a ray to a box.
+"""Boxes in the world (parallelepipeds), balls inside boxes, and the tests that clip a ray to a box or a ball.
 
 References: Kay & Kajiya 1986 (slab test).
 """
@@ -13,14 +13,24 @@ import numpy as np
 
 from mivol.scene_graph import traverse
 
-__all__ = ["Box", "fit_box", "clip_to_box"]
+__all__ = ["UNIT_CUBE", "Box", "clip_to_ball", "clip_to_box", "fit_ball", "fit_box", "is_in_box"]
+
+
+UNIT_CUBE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+"""Two corners of the unit cube, in the coordinates of :meth:`Box.rows`."""
 
 
 @dataclass
 class Box:
-    """A parallelepiped in the world: the unit cube under ``to_world`` (4x4, float64)."""
+    """A parallelepiped in the world: the unit cube under ``to_world`` (4x4, float64).
+
+    Attributes:
+        to_world: the map.
+        is_round: the ball (ellipsoid) that touches all faces stands in the place of the box.
+    """
 
     to_world: np.ndarray
+    is_round: bool = False
 
     def rows(self) -> list[list[mi.Float64]]:
         """The (3, 4) map from the world to the unit cube, as opaque arrays, so that boxes in different places share a kernel.
@@ -34,6 +44,15 @@ class Box:
     def edge(self) -> float:
         """Edge length of the cube of the same volume."""
         return float(abs(np.linalg.det(self.to_world[:3, :3])) ** (1 / 3))
+
+    @property
+    def diameter(self) -> float:
+        """Length of the longest straight line inside [length]."""
+        axes = self.to_world[:3, :3]
+        if self.is_round:
+            return float(np.linalg.norm(axes, 2))
+        corners = self.corners()
+        return float(max(np.linalg.norm(corners[k] - corners[7 - k]) for k in range(4)))
 
     def corners(self) -> np.ndarray:
         """The 8 corners, (8, 3)."""
@@ -61,6 +80,15 @@ def fit_box(shape: mi.Shape) -> Box:
     to_world = np.eye(4)
     to_world[:3] = fit.T
     return Box(to_world)
+
+
+def fit_ball(shape: mi.Shape) -> Box:
+    """Fit the ball of a ``sphere`` shape. Mitsuba takes the radius from the first axis of its transform."""
+    placed = np.array(traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    radius = np.linalg.norm(placed[:3, 0])
+    to_world = np.diag([2 * radius, 2 * radius, 2 * radius, 1.0])
+    to_world[:3, 3] = placed[:3, 3] - radius
+    return Box(to_world, is_round=True)
 
 
 def _vertices(shape: mi.Shape) -> np.ndarray:
@@ -99,3 +127,35 @@ def clip_to_box(
     # The comparison is false for NaN, so rays with NaN get an empty interval; so do directions of length 0, whose interval
     # would be infinite.
     return q, v, t0, dr.select((t1 > t0) & dr.isfinite(t1 - t0), t1, t0)
+
+
+def clip_to_ball(rows: list, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
+    """Clip [t0, t1] of a ray to the ball in the unit cube of ``rows``, in float64.
+
+    Arguments as for :func:`clip_to_box`.
+
+    Returns:
+        The interval inside; t1 <= t0 if the ray misses the ball.
+    """
+    # In coordinates in which the ball has the radius 1/2 and lies around the origin.
+    o, d = [mi.Float64(o[a]) for a in range(3)], [mi.Float64(d[a]) for a in range(3)]
+    q = [row[0] * o[0] + row[1] * o[1] + row[2] * o[2] + (row[3] - 0.5) for row in rows]
+    v = [row[0] * d[0] + row[1] * d[1] + row[2] * d[2] for row in rows]
+    speed2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    middle = -(q[0] * v[0] + q[1] * v[1] + q[2] * v[2]) / speed2
+    # The square of the distance of the nearest point keeps its digits far away; the discriminant b^2 - a c would not.
+    nearest = [dr.fma(middle, b, a) for a, b in zip(q, v, strict=True)]
+    inside = 0.25 - (nearest[0] * nearest[0] + nearest[1] * nearest[1] + nearest[2] * nearest[2])
+    half = dr.sqrt(dr.maximum(inside, 0) / speed2)
+    t0, t1 = dr.maximum(t0, middle - half), dr.minimum(t1, middle + half)
+    # False for NaN: rays with NaN, and directions of length 0, get an empty interval.
+    return t0, dr.select((t1 > t0) & dr.isfinite(t1 - t0), t1, t0)
+
+
+def is_in_box(rows: list, is_round: bool, p: mi.Point3f) -> mi.Bool:
+    """Whether a point lies in the unit cube of ``rows``, or in the ball inside the cube."""
+    p = [mi.Float64(p[a]) for a in range(3)]
+    local = [dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3]))) for row in rows]
+    if is_round:
+        return sum(dr.square(x - 0.5) for x in local) <= 0.25
+    return (local[0] >= 0) & (local[0] <= 1) & (local[1] >= 0) & (local[1] <= 1) & (local[2] >= 0) & (local[2] <= 1)

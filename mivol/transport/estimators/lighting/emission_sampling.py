@@ -90,11 +90,8 @@ class EmittingBox:
         return abs(float(np.linalg.det(self.box.to_world[:3, :3]))) / CELLS_PER_AXIS**3
 
     def contains(self, p: mi.Point3f) -> mi.Bool:
-        """Whether a point lies in the medium, as far as known without tracing (its boundary is a box)."""
-        if self.body.box is None:
-            return dr.full(mi.Bool, True, dr.width(p))
-        hole = mi.Bool(False) if self.body.hole is None else _is_in_box(self.body.hole_rows, p)
-        return _is_in_box(self.body.rows, p) & ~hole
+        """Whether a point lies in the medium, as far as known without tracing (its boundary is a box or a ball)."""
+        return dr.full(mi.Bool, True, dr.width(p)) if self.body.box is None else self.body.contains(p)
 
     def point_at(self, cell: mi.Point3f) -> mi.Point3f:
         """World position of a point given in cells."""
@@ -202,15 +199,6 @@ class EmissionTable:
 
             state = walk_box_cells(box.rows, CELLS_PER_AXIS, ray, visit_cell, state, active)
         return state
-
-
-def _is_in_box(rows: list[list[mi.Float64]], p: mi.Point3f) -> mi.Bool:
-    """Whether a point lies in the box mapped to the unit cube by ``rows``."""
-    inside = mi.Bool(True)
-    for row in rows:
-        local = dr.fma(row[0], mi.Float64(p.x), dr.fma(row[1], mi.Float64(p.y), dr.fma(row[2], mi.Float64(p.z), row[3])))
-        inside &= (local >= 0) & (local <= 1)
-    return inside
 
 
 def _integrate_square(t0: mi.Float, t1: mi.Float) -> mi.Float:

@@ -24,6 +24,7 @@ from mivol.transport.media.channels import to_spectrum
 from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.box import UNIT_CUBE
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, walk_cells
 from mivol.transport.traversal.interpolation import GAUSS_POINT, gauss_points
 from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
@@ -131,8 +132,8 @@ def _part_gradient(
     if part.is_constant:
         value = dr.detach(part.constant)
         each = [value] if part.channels == 1 else [value.x, value.y, value.z]
-        leaving = _face_direction(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t1) if body.box is not None else mi.Vector3f(0)
-        entering = _face_direction(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t0) if body.box is not None else mi.Vector3f(0)
+        leaving = _boundary_direction(body, ray, t1) if body.box is not None else mi.Vector3f(0)
+        entering = _boundary_direction(body, ray, t0) if body.box is not None else mi.Vector3f(0)
         shift = dr.select(on & (t0 > 0), entering * mi.Float(t0), 0) - dr.select(on & (t1 < end), leaving * mi.Float(t1), 0)
         return [v * shift for v in each]
     lattice = replace(part.lattice, empty_distances=None)
@@ -151,7 +152,7 @@ def _part_gradient(
         if body.cuts_grids:
             # A boundary cutting the grid: the ray leaves (or enters) the medium through a face of the boundary.
             cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
-            face = dr.select(cut, _face_direction(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
+            face = dr.select(cut, _boundary_direction(body, ray, t), face)
         values = part.eval_at(1.0, ray, mi.Float(t), lanes)
         vectors = [v + dr.select(lanes, sign * mi.Float(t) * s * face, 0) for v, s in zip(vectors, values, strict=True)]
     return vectors
@@ -186,6 +187,18 @@ def _trilinear_gradient(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:
     dy = mix(x[1] - x[0], x[3] - x[2], p.z)
     dz = mix(x[2], x[3], p.y) - mix(x[0], x[1], p.y)
     return mi.Vector3f(dx, dy, dz)
+
+
+def _boundary_direction(body: Body, ray: Ray, t: mi.Float64) -> mi.Vector3f:
+    """n / (n . w) of the box or ball around a medium at a point of a ray."""
+    if not body.box.is_round:
+        return _face_direction(body.rows, *UNIT_CUBE, ray, t)
+    p, d = point_along(ray, t), [mi.Float64(ray.d[k]) for k in range(3)]
+    # The normal is the gradient of the squared distance from the middle, in the coordinates of the unit cube.
+    q = [row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + (row[3] - 0.5) for row in body.rows]
+    n = [sum(q[a] * body.rows[a][k] for a in range(3)) for k in range(3)]
+    slope = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+    return mi.Vector3f(*(mi.Float(x / dr.select(slope != 0, slope, 1)) for x in n))
 
 
 def _face_direction(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64) -> mi.Vector3f:
