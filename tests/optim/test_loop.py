@@ -206,7 +206,8 @@ def test_passes_sum_to_the_samples(variant_rgb) -> None:
 def test_nonlinear_loss_is_independent_of_passes(variant_rgb) -> None:
     """Parallel rays through a constant cube: each sample is exp(-2 sigma), so loss and gradient are known whatever the
     passes. A loss taken pass by pass would be the same here for any noise-free image; so noise is put in by cameras at
-    the silhouette: there the split may change the image only as much as another seed does."""
+    the silhouette. There 4 passes of one sample have a quarter of the excess loss that single samples have, to 3 %: the loss is
+    quadratic but for residuals above 0.02."""
     scene = absorbing_scene(np.full((2, 2, 2, 1), 0.4))
     wanted = mi.TensorXf(np.full((4, 4, 3), 0.6, "f"))
     parameter = Parameter(KEY, domain=(0.0, np.inf))
@@ -217,14 +218,15 @@ def test_nonlinear_loss_is_independent_of_passes(variant_rgb) -> None:
         weight = 0.36 / (0.36 + 1e-6)
         assert np.isclose(loss, weight * r**2, rtol=1e-5)
         assert np.isclose(np.asarray(gradients[KEY]).sum(), weight * 2 * r * -2.0, rtol=1e-5)
-    coverage = []
-    for most in (1 << 20, 3 * 64):
-        problem = small_problem(spp=4, samples_per_pass=most, loss=Huber(delta=0.02))
+    losses = {}
+    for spp, most in ((1, 1 << 20), (4, 3 * 64), (256, 1 << 20)):
+        problem = small_problem(spp=spp, samples_per_pass=most, loss=Huber(delta=0.02))
         problem.set_reals(problem.initial_reals())
-        coverage.append(Moments.from_values(np.array([problem.mean_loss(fresh(i)) for i in range(24)])))
-    # One pass of 4 samples and 4 passes of one: a mean of losses of single passes would be about 4 times as large.
-    assert_same_mean(*coverage, what="losses")
-    assert_precise(coverage[0], 0.1 * float(coverage[0].mean), what="losses")
+        losses[spp] = np.array([problem.mean_loss(fresh(i)) for i in range(24)])
+    clean = losses[256].mean()
+    single, split = (Moments.from_values(losses[spp] - clean) for spp in (1, 4))
+    assert_same_mean(Moments.from_values(4 * (losses[4] - clean)), single, rounding=0.03 * single.mean, what="excess losses")
+    assert_precise(split, 0.1 * float(single.mean), what="losses")
 
 
 def test_views_side_by_side_are_the_views(variant_rgb) -> None:
