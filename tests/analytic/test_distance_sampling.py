@@ -15,7 +15,7 @@ import scenes
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_media, make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.lighting.emitters import ChosenEmitter
+from mivol.transport.estimators.lighting.emitters import ChosenEmitter, make_ball_sampler
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU
 from mivol.transport.estimators.single_scattering.distance_sampling import (
     Candidate,
@@ -61,6 +61,37 @@ def test_collisions_in_a_cell_of_linear_extinction(ends):
     # Its density is sigma exp(-tau) over what the cell takes; tau is off by sigma times the error of the distance.
     density = sigma * np.exp(-goal) / -np.expm1(-length * (a + b) / 2)
     np.testing.assert_allclose(np.array(event.pdf), density, rtol=1e-4)
+
+
+@pytest.mark.parametrize("lamp", [(0.6, 1e-3), (0.6, 0.3), (-2.0, 1e-3), (1.5, 5.0)], ids=["near", "beside", "behind", "far"])
+@pytest.mark.parametrize("sigma", [0.01, 3.0])
+def test_collisions_and_angle_share_the_distances(sigma, lamp):
+    """Between z = -1 and 1 in a fog, the density is a mixture of the densities of collisions and angle. The share of collisions
+    is (1 - w) / 2 for w = e^-s (1 - f) > 0.5, else 1/2, with f the smallest over the mean 1 / r^2, and s the optical depth over
+    the smaller of the length and the distance to the lamp at (z, h)."""
+    z, h = map(float, np.float32(lamp))
+    scene = close_up({"fog": box_of(medium("homogeneous", sigma, 0.8), PLACE), "lamp": point([0.1 + h, 0.2, z])[0]})
+    n, length = 64, 2.0
+    with dr.suspend_grad():
+        media = media_of(scene)
+        zero, one = dr.zeros(mi.Float, n), dr.full(mi.Float, 1, n)
+        ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -1 + zero), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
+        kept = Candidate(one, zero, zero, length * one, [zero], zero, mi.UInt32(zero), mi.Bool(True), mi.UInt32(1))
+        numbers = mi.Point2f(mi.Float(np.float32((np.arange(n) * 0.618) % 1)), mi.Float(np.float32((np.arange(n) + 0.5) / n)))
+        chosen = ChosenEmitter(mi.UInt32(0), None, make_ball_sampler(ray, [0.1 + h, 0.2, z, 0.0]), None)
+        event = sample_distance(DistanceProposal(media, ray, chosen, None, 0.0), kept, one, numbers, mi.Bool(True))
+    t, t0 = np.array(event.t), z + 1
+    square = h**2 + 4e-12 * (h**2 + t0**2)
+    rho = np.sqrt(square)
+    angle = np.arctan((length - t0) / rho) + np.arctan(t0 / rho)
+    even = rho * length / angle / (square + max(abs(t0), abs(length - t0)) ** 2)
+    nearest = np.hypot(rho, t0 - np.clip(t0, 0, length))
+    weight = np.exp(-sigma * min(length, nearest)) * (1 - even)
+    share = 0.5 * (1 - weight * (weight > 0.5))
+    collisions = sigma * np.exp(-sigma * t) / -np.expm1(-sigma * length)
+    density = share * collisions + (1 - share) * rho / angle / (square + (t - t0) ** 2)
+    # Coordinates near 1 have errors of 2^-24: 1e-4 of h, of a distance and of an angle.
+    np.testing.assert_allclose(np.array(event.pdf), density, rtol=1e-3)
 
 
 @pytest.mark.statistical

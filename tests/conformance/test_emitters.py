@@ -97,7 +97,7 @@ def pieces(n: int = 2000) -> tuple[np.ndarray, ...]:
     """Pieces [a, a + dt] of rays, the nearest distance t0 and rho of an emitter, and numbers u, as float32."""
     rng = np.random.default_rng(5)
     a, t0 = rng.uniform(0, 4, (2, n))
-    dt, rho = 10 ** rng.uniform(-2, 1, (2, n))
+    dt, rho = 10 ** rng.uniform([[-2], [-5]], 1, (2, n))
     return tuple(x.astype(np.float32).astype(np.float64) for x in (a, dt, t0, rho, rng.uniform(0.01, 0.99, n)))
 
 
@@ -136,10 +136,20 @@ def test_density_is_the_derivative_of_the_angle():
     np.testing.assert_array_less(np.abs(found - exact), relative * exact)
 
 
+def test_smallest_distance_and_inverse_square():
+    """Before, in and behind the piece [1, 3], and at infinity."""
+    t0, rho = np.array([0.5, 1.5, 4.0]), np.array([0.25, 1e-3, 2.0])
+    sampler, a, dt = sampler_of(t0, rho), mi.Float(1), mi.Float(2)
+    assert np.array(sampler.nearest(a, dt)) == pytest.approx(np.hypot(rho, [0.5, 0, 1]), rel=1e-6)
+    mean = (np.arctan((3 - t0) / rho) - np.arctan((1 - t0) / rho)) / (2 * rho)
+    assert np.array(sampler.evenness(a, dt)) == pytest.approx(1 / (rho**2 + [6.25, 2.25, 9]) / mean, rel=1e-5)
+    assert EquiangularSampler(mi.Float(0), mi.Float(1), mi.Bool(False)).evenness(a, dt)[0] == 1
+
+
 def test_mean_of_the_inverse_square():
     """theta / (rho dt) where the emitter has a place, 1 where it is at infinity."""
     ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     found = make_ball_sampler(ray, [3.0, 0.0, 4.0, 0.0]).mean(mi.Float(4), mi.Float(3))
-    assert found[0] == pytest.approx(np.arctan(1) / 9, rel=1e-5)  # 1e-8 of the squared distance is added to rho^2: 1.4e-8
+    assert found[0] == pytest.approx(np.arctan(1) / 9, rel=1e-5)  # 4e-12 of the squared distance is added to rho^2
     assert make_ball_sampler(ray, None) is None
     assert EquiangularSampler(mi.Float(0), mi.Float(1), mi.Bool(False)).mean(mi.Float(4), mi.Float(3))[0] == 1

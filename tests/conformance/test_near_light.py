@@ -194,10 +194,12 @@ def test_paths_have_the_mean_of_volpath(place):
 
 
 def test_samples_are_bounded():
-    """In a homogeneous medium every sample of a segment is at most sigma_s I / (2 h) for a lamp at the distance h from the ray.
+    """In a homogeneous box, samples of a segment are at most e^-2 sigma_s I / (2 h) for a lamp at the distance h from the ray.
 
-    Half of the distances are drawn uniformly in the angle seen from the lamp, of at most pi, so their density is at least
-    h / (2 pi d^2) at the distance d from the lamp. The phase function is 1 / (4 pi), and no transmittance exceeds 1.
+    At least half of the distances are drawn uniformly in the angle seen from the lamp, of at most pi, so their density is at
+    least h / (2 pi d^2) at the distance d from the lamp. The phase function is 1 / (4 pi). The way from the box's face to the
+    lamp has an optical depth of at least 2. For h below 0.05, at least 0.93 of the distances are drawn by the angle: the
+    collisions' share is (1 - e^(-2 h) (1 - 2 h / 3)) / 2, since the angle is above 3.
     """
     n, sigma, intensity, albedo = 1 << 16, 2.0, 3.0, 0.7
     scene = close_up({"fog": fog(sigma, albedo)[0], "lamp": point([0, 0, 0], intensity)[0]})
@@ -213,8 +215,10 @@ def test_samples_are_bounded():
         segment = PathSegment(ray, media.medium_at(ray), mi.Spectrum(1), on, None, dr.zeros(mi.UInt32, n))
         light = near.estimate(segment, mi.Float(dr.inf), near.draw(sampler, on), False, on).light.value
     share = np.array(light.x, np.float64) * 2 * np.array(h, np.float64) / (sigma * albedo * intensity)
-    # The sampler rounds h up by 1e-8 of the squared distance to the origin of the ray, which is 2.2 at most.
-    assert 0.1 < share.max() <= 1 + 1e-8 * 2.2**2 / 1e-2**2 / 2 + 1e-4
+    # The sampler increases h^2 by 4e-12 of the squared distance to the origin of the ray, which is 2.2 at most.
+    bound = np.exp(-sigma) * (1 + 4e-12 * 2.2**2 / 1e-2**2 / 2 + 1e-4)
+    assert 0.4 * bound < share.max() <= bound
+    assert share[np.array(h) < 0.05].max() <= 0.5 * bound / 0.93
 
 
 # -- The plan --------------------------------------------------------------------------------------------------------------

@@ -351,9 +351,9 @@ def make_equiangular_sampler(ray: Ray, centre: mi.Point3f, radius2: mi.Float, fi
     away = centre - mi.Point3f(ray.o)
     t0 = dr.dot(away, ray.d)
     h2 = dr.squared_norm(away - t0 * ray.d)
-    # A ray may pass through a point light. The distance is at least 1e-4 of the distance to the light, so the angle stays in
-    # the range of float32. The bound changes the density, and with it the variance, but no mean.
-    rho = dr.sqrt(h2 + radius2 + 1e-8 * dr.squared_norm(away) + 1e-30)
+    # A ray may pass through a point light. h has an error of 1e-7 of the distance to the light, so rho is at least 2e-6 of this
+    # distance. The bound changes the density, and with it the variance, but no mean.
+    rho = dr.sqrt(h2 + radius2 + 4e-12 * dr.squared_norm(away) + 1e-30)
     return EquiangularSampler(t0, dr.select(finite, rho, 1), finite)
 
 
@@ -379,6 +379,16 @@ class EquiangularSampler:
     def mean(self, a: mi.Float, dt: mi.Float) -> mi.Float:
         """Mean of 1 / (rho^2 + (t - t0)^2) over [a, a + dt] [1/length^2]; 1 for an emitter at infinity."""
         return dr.select(self.finite, self.angle(a, dt) * dr.rcp(self.rho * dt), 1)
+
+    def nearest(self, a: mi.Float, dt: mi.Float) -> mi.Float:
+        """Smallest distance from [a, a + dt] to the emitter [length]."""
+        return dr.hypot(self.rho, dr.clip(self.t0 - a, 0, dt) - (self.t0 - a))
+
+    def evenness(self, a: mi.Float, dt: mi.Float) -> mi.Float:
+        """Smallest over mean 1 / (rho^2 + (t - t0)^2) in [a, a + dt] [1]; in (0, 1], and 1 for an emitter at infinity."""
+        far = dr.maximum(dr.abs(a - self.t0), dr.abs((a - self.t0) + dt))
+        least = dr.rcp(dr.square(self.rho) + dr.square(far))
+        return dr.select(self.finite, dr.minimum(least / self.mean(a, dt), 1), 1)
 
     def sample(self, a: mi.Float, dt: mi.Float, u: mi.Float) -> mi.Float:
         """Distance from ``a`` at the fraction ``u`` of the angle [length], by the addition theorem of the tangent."""
