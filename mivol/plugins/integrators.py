@@ -31,7 +31,8 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
             hits; met: by chance hits only; auto: the method with the smaller error in a small preview. Default auto.
         near_light: where emitters with a position (point, spot, area) light media that scatter several times. segments: every
             segment of a path draws a distance by the emitter; vertices: at collisions; auto: along segments if an emitter lies
-            inside or near a medium, and a small preview finds less noise. Default auto.
+            inside a medium, or near a medium and a small preview finds less noise; for derivatives by a grid, then only if the
+            grid is dense. Default auto.
         aovs: comma-separated list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the given order.
     """
 

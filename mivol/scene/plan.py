@@ -6,7 +6,7 @@ runs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -98,7 +98,8 @@ class Plan:
         draws_emission: whether scattering points sample the light emitted by media.
         successive_paths: most paths per lane, walked one after the other.
         branches: whether paths branch at their first collision for derivatives.
-        draws_near_light: whether segments of paths draw the light of emitters with a position.
+        draws_near_light: whether segments of paths draw the light of emitters with a position, in images.
+        near_light_in_derivatives: the same, in derivatives.
     """
 
     choices: tuple[Choice, ...]
@@ -113,6 +114,7 @@ class Plan:
     successive_paths: int = 1
     branches: bool = False
     draws_near_light: bool = False
+    near_light_in_derivatives: bool = False
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -162,7 +164,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     branches, why = choose_branches(needs, settings, segment)
     choices += why
-    near, why = choose_near_light(needs, settings, segment)
+    near, near_in_derivatives, why = choose_near_light(needs, settings, segment)
     choices += why
     return Plan(
         tuple(choices),
@@ -177,6 +179,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         successive,
         branches,
         near,
+        near_in_derivatives,
     )
 
 
@@ -250,6 +253,8 @@ def build_estimators(
     scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: SceneSurvey, for_images: bool
 ) -> Estimators:
     """Build the planned estimators, for images or for derivatives."""
+    if not for_images:
+        plan = replace(plan, draws_near_light=plan.near_light_in_derivatives)
     media = build_media(scene, needs, plan, survey)
     direct = DirectLighting(media)
     choice = SegmentInputs(direct, plan.scattering_points)

@@ -135,7 +135,7 @@ def check_near_light(needs: Needs, settings: Settings, segment: str) -> None:
     if settings.near_light not in NEAR_LIGHT:
         known = f"{', '.join(NEAR_LIGHT[:-1])} or {NEAR_LIGHT[-1]}"
         raise MivolError(f"near_light is {settings.near_light!r}; {known} is expected.")
-    draws, why = choose_near_light(needs, settings, segment)
+    draws, _, why = choose_near_light(needs, settings, segment)
     if settings.near_light == "segments" and why and not draws:
         raise MivolError(f"near_light is 'segments', and {why[0].reason}: leave it at auto.")
 

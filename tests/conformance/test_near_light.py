@@ -34,7 +34,7 @@ from mivol.errors import MivolError
 from mivol.scene import plan
 from mivol.scene.explain import explain_scene
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import build_media, make_plan
+from mivol.scene.plan import build_estimators, build_media, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.segment import PathSegment
@@ -248,6 +248,32 @@ def test_a_preview_decides_for_emitters_close_by():
     scene = close_up({"smoke": smoke(rough_grid(1))[0], "lamp": point([0, 0, 2.0])[0]}, res=8)
     text = explain_scene(scene, max_depth=4).text
     assert "0.5 edges away from a medium; a distance on each segment reaches the same error" in text
+
+
+@pytest.mark.parametrize(
+    ("medium_of", "gain", "setting", "images", "derivatives"),
+    [
+        (lambda: smoke(rough_grid(1, 10.0))[0], 1.5, "auto", True, False),
+        (lambda: smoke(rough_grid(1, 10.0))[0], 40.0, "auto", True, False),
+        (lambda: smoke(rough_grid(1, 10.0))[0], 1.5, "segments", True, True),
+        (lambda: smoke(rough_grid(1, 100.0))[0], 1.5, "auto", True, True),
+        (lambda: smoke(rough_grid(1, 100.0))[0], 0.9, "auto", False, False),
+        (lambda: fog(1.0)[0], 1.5, "auto", True, True),
+    ],
+    ids=["thin grid", "thin grid, large gain", "set", "dense grid", "dense grid, no gain", "homogeneous"],
+)
+def test_derivatives_have_a_choice_of_their_own(medium_of, gain, setting, images, derivatives):
+    """Half an edge above a medium, with a measured gain: the plan, its words, and the estimators built by it."""
+    scene = close_up({"body": medium_of(), "lamp": point([0, 0, 2.0])[0]}, res=8)
+    survey, settings = survey_scene(scene), Settings(max_depth=4, near_light=setting)
+    needs = replace(find_needs(scene, scene.sensors()[0], survey), near_gain=gain)
+    made = make_plan(needs, settings)
+    (choice,) = [c.choice for c in made.choices if c.subject == "near emitters"]
+    assert (made.draws_near_light, made.near_light_in_derivatives) == (images, derivatives)
+    assert ("in derivatives, lit at collisions" in choice) == (images != derivatives)
+    with dr.suspend_grad():
+        built = [build_estimators(scene, needs, made, settings, survey, for_images=on).near for on in (True, False)]
+    assert [near is not None for near in built] == [images, derivatives]
 
 
 @pytest.mark.parametrize(("setting", "words"), [("everywhere", "auto, segments or vertices is expected"), ("segments", "auto")])
