@@ -102,7 +102,8 @@ def test_points_in_a_ball() -> None:
 
 @pytest.mark.parametrize("kind", ["mivol", "stock"])
 def test_a_ball_in_closed_form_looks_as_when_it_is_traced(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A constant, and a grid in the box around the ball, which the ball cuts; a traced boundary is known to a few float32 roundings of its coordinates."""
+    """A constant, and a grid in the box around the ball, which the ball cuts; a traced boundary is known to a few float32
+    roundings of its coordinates."""
     noise = np.random.default_rng(1).random((5, 6, 7, 1)).astype(np.float32)
     place = mi.ScalarTransform4f().translate(-1).scale(2)
     grid = {"type": "gridvolume", "grid": mi.VolumeGrid(noise), "to_world": place}
