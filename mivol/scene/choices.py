@@ -196,8 +196,10 @@ def choose_tracing(needs: Needs) -> Choice:
     if needs.surfaces:
         return Choice("acceleration structure", "traced", f"surfaces may stop a ray: {', '.join(sorted(set(needs.surfaces)))}")
     if traced:
-        return Choice("acceleration structure", "traced", f"not a box or ball, or overlapping another boundary: {', '.join(traced)}")
-    return Choice("acceleration structure", "not traced", "every shape is the box or ball of a medium: rays are clipped in float64")
+        why = f"not a box or ball, or overlapping another boundary: {', '.join(traced)}"
+        return Choice("acceleration structure", "traced", why)
+    why = "every shape is the box or ball of a medium: rays are clipped in float64"
+    return Choice("acceleration structure", "not traced", why)
 
 
 def choose_channels(needs: Needs) -> Choice:
