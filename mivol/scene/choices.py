@@ -321,7 +321,7 @@ def choose_near_light(needs: Needs, settings: Settings, segment: str) -> tuple[b
         return draws, draws, [Choice(subject, segments if draws else vertices, "set by the user")]
     if needs.nearness == 0:
         why = "an emitter with a position lies inside a medium, and its light at collisions has a heavy tail"
-        return True, True, [Choice(subject, segments, why)]
+        return True, True, [Choice(subject, f"{segments}; directions are drawn around emitters inside", why)]
     where = f"the nearest emitter with a position is {needs.nearness:.2g} edges away from a medium"
     if needs.nearness >= NEAR_DISTANCE:
         return False, False, [Choice(subject, vertices, where)]

@@ -136,7 +136,7 @@ def _find_warnings(scene: mi.Scene) -> list[str]:
     """Warn of media without light: media behind an opaque BSDF, such as Mitsuba's default BSDF."""
     lines, open_ = [], int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Transmission)
     for shape in scene.shapes():
-        if not shape.is_medium_transition():
+        if shape.interior_medium() is None:
             continue
         bsdf = shape.bsdf()
         flags = 0 if bsdf is None else int(mi.BSDFFlags.Null) if bsdf.class_name() == "NullBSDF" else _flags(bsdf)

@@ -56,3 +56,13 @@ def test_what_one_scattering_leaves_out(value: float, doubtful: bool) -> None:
     assert "of the light that fog scatters (albedo 0.90, optical depth" in text and "constant light, isotropic phase)" in text
     assert ("depth 2 is a poor model of this medium" in text) == doubtful
     assert "one scattering" not in explain(scene, max_depth=1)
+
+
+def test_a_surface_in_a_medium_does_not_hide_it():
+    """A diffuse ball whose exterior is the fog: the warning is about media inside opaque shapes only."""
+    fog = medium("homogeneous", 0.5) | {"id": "fog"}
+    stone = {"type": "sphere", "radius": 0.2, "exterior": {"type": "ref", "id": "fog"}}
+    parts = {"smoke": box_of(fog, PLACE), "stone": stone, "sensor": camera([0, -9, 0], [0, 0, 0])}
+    assert "opaque" not in explain(mi.load_dict({"type": "scene", **parts}))
+    parts["stone"] = {"type": "sphere", "radius": 0.2, "interior": medium("homogeneous", 0.7)}
+    assert "the medium of stone lies behind an opaque" in explain(mi.load_dict({"type": "scene", **parts}))

@@ -71,10 +71,7 @@ class PathEvent:
 
 
 TRANSMISSION = int(
-    mi.BSDFFlags.Null
-    | mi.BSDFFlags.DiffuseTransmission
-    | mi.BSDFFlags.GlossyTransmission
-    | mi.BSDFFlags.DeltaTransmission
+    mi.BSDFFlags.Null | mi.BSDFFlags.DiffuseTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DeltaTransmission
 )
 """Flags of BSDFs that transmit light."""
 
