@@ -125,13 +125,15 @@ def test_errors_of_images() -> None:
     """Pixels of 2, 4 and 0 that swing by 1, 2 and 0, and one of 100 that does not count: variances 4/3, 16/3 and 0."""
     swing = np.array([-1.0, 1, -1, 1])
     images = np.stack([2 + swing, 4 + 2 * swing, 0 * swing, 100 + 9 * swing], axis=1)[:, None]
-    errors = contests.image_errors(make_contest({"mivol": images}), "mivol", 1, np.array([[True, True, True, False]]))
+    contest = make_contest({"mivol": images})
+    contest.spp["mivol", 1] = 3
+    errors = contests.image_errors(contest, "mivol", 1, np.array([[True, True, True, False]]))
     assert errors["mean"] == pytest.approx(2)
     assert errors["variance_mean_over_pixels"] == pytest.approx(20 / 9)
     assert errors["variance_median_over_pixels"] == pytest.approx(4 / 3)
     assert errors["relative_error_mean_over_pixels"] == pytest.approx(math.sqrt(20 / 9) / 2)
     assert errors["relative_error_median_over_pixels"] == pytest.approx(math.sqrt(4 / 3) / 2)
-    assert errors["samples_per_second_median"] == 4 / 5
+    assert errors["samples_per_second_median"] == 4 * 3 / 5
 
 
 def test_pixels_at_the_emitter_do_not_count(variant_rgb: str) -> None:
