@@ -16,6 +16,7 @@ from mivol.validate.moments import Moments
 
 SIDE = 6
 NOISE = np.random.default_rng(2).uniform(0.5, 1.5, (3, 4, 5))
+ENDLESS = [name for name in TABLES["deep estimators"] if name.endswith("unlimited")]
 UNLIMITED = {name: replace(light, depth=-1) for name, light in DEEP_LIGHTS.items()}
 
 
@@ -41,9 +42,9 @@ def test_the_derivative_is_that_of_the_same_paths(variant_rgb: str, name: str) -
     assert abs(result) > 1e-3 * at[1]
 
 
-@pytest.mark.slow_for(*(name for name in TABLES["deep estimators"] if name != "emitter inside, depth 6"))
+@pytest.mark.slow_for(*ENDLESS)
 @pytest.mark.statistical
-@pytest.mark.parametrize("name", TABLES["deep estimators"])
+@pytest.mark.parametrize("name", ["emitter inside, depth 6", *ENDLESS])
 def test_its_light_is_that_of_volpath(variant_rgb: str, name: str) -> None:
     """Half the box is empty, the other one has an optical depth of 3."""
     light = TABLES["deep estimators"][name]

@@ -145,7 +145,7 @@ SCENES = {
     "near light": (_everything, PARAMETERS, {"max_depth": 5, "rr_depth": 3, "near_light": "segments"}),
     "rgb near light": (lambda: _everything(True), PARAMETERS, {"max_depth": 4, "near_light": "segments"}),
 }
-PAIRS = [(place, name) for place in ("grey", "rgb") for name in PARAMETERS]
+PAIRS = [("grey", name) for name in PARAMETERS] + [("rgb", name) for name in ("density", "albedo", "scale")]
 PAIRS += [("side flights", name) for name in ("density", "albedo", "g", "emitter")]
 PAIRS += [("near light", name) for name in ("density", "albedo", "g", "scale", "emitter")] + [("rgb near light", "density")]
 
