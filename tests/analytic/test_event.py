@@ -17,7 +17,7 @@ from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.ray_intervals import SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.event import NextDirection, PathEvent, sample_next_direction
+from mivol.transport.path.event import DirectionSamples, NextDirection, PathEvent, sample_next_direction
 from mivol.transport.traversal.rays import point_along
 from mivol.validate.moments import Moments
 from scenes import box_of, camera, media_of, medium
@@ -99,7 +99,7 @@ class FallingRays:
         event, numbers = PathEvent(si, si.t, mi.MediumPtr(self.fog), ~on, hit), [mi.Float(row) for row in u]
         with dr.suspend_grad():
             return sample_next_direction(
-                self.estimators, ray, event, numbers[0], mi.Point2f(*numbers[1:]), mi.Bool(True), aimed
+                self.estimators, ray, event, DirectionSamples(numbers[0], mi.Point2f(*numbers[1:]), aimed), mi.Bool(True)
             )
 
     def turn(self, in_medium: list[bool] | None, may_scatter: list[bool], component: list[float]) -> NextDirection:
@@ -112,7 +112,7 @@ class FallingRays:
         event = PathEvent(si, si.t, around, ~on & si.is_valid(), hit)
         with dr.suspend_grad():
             return sample_next_direction(
-                self.estimators, ray, event, mi.Float(component), mi.Point2f(0.3, 0.6), mi.Bool(may_scatter)
+                self.estimators, ray, event, DirectionSamples(mi.Float(component), mi.Point2f(0.3, 0.6)), mi.Bool(may_scatter)
             )
 
 

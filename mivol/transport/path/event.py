@@ -15,7 +15,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay, Ray, spawn_ray
 
-__all__ = ["NextDirection", "PathEvent", "sample_next_direction"]
+__all__ = ["DirectionSamples", "NextDirection", "PathEvent", "sample_next_direction"]
 
 
 # -- The end of a segment ------------------------------------------------------------------------------------------------
@@ -108,18 +108,27 @@ class NextDirection:
     factors: list[TrackedFactor]
 
 
+@dataclass
+class DirectionSamples:
+    """The random numbers of a direction.
+
+    Attributes:
+        component: uniform random number in [0, 1) for the component of the BSDF or phase function.
+        direction: two uniform random numbers in [0, 1) for the direction.
+        aimed: directions around a near emitter, drawn for a share of the samples; None for no such directions.
+    """
+
+    component: mi.Float
+    direction: mi.Point2f
+    aimed: AimedDirections | None = None
+
+
 PER_LANE = ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "through")
 """Attributes of :class:`NextDirection` with a value for each lane."""
 
 
 def sample_next_direction(
-    estimators: Estimators,
-    ray: Ray,
-    event: PathEvent,
-    u: mi.Float,
-    u2: mi.Point2f,
-    may_scatter: mi.Bool,
-    aimed: AimedDirections | None = None,
+    estimators: Estimators, ray: Ray, event: PathEvent, samples: DirectionSamples, may_scatter: mi.Bool
 ) -> NextDirection:
     """Sample the direction in which a path continues.
 
@@ -127,36 +136,28 @@ def sample_next_direction(
         estimators: estimators of the render.
         ray: ray of the segment ending in the event.
         event: end of the segment.
-        u: uniform random number in [0, 1) for the component of the BSDF or phase function.
-        u2: two uniform random numbers in [0, 1) for the direction.
+        samples: random numbers.
         may_scatter: lanes allowed to scatter once more; paths of other lanes pass through a surface or end.
-        aimed: directions around a near emitter, drawn for a share of the samples; None for no such directions.
     """
     if event.collision is None:
-        return _sample_bsdf(estimators, ray, event, u, u2, may_scatter, aimed)
-    inside = _sample_phase_function(estimators, event.collision, u, u2, may_scatter, aimed)
+        return _sample_bsdf(estimators, ray, event, samples, may_scatter)
+    inside = _sample_phase_function(estimators, event.collision, samples, may_scatter)
     if not estimators.media.has_surfaces:
         return inside
-    outside = _sample_bsdf(estimators, ray, event, u, u2, may_scatter, aimed)
+    outside = _sample_bsdf(estimators, ray, event, samples, may_scatter)
     selected = {name: dr.select(event.in_medium, getattr(inside, name), getattr(outside, name)) for name in PER_LANE}
     return NextDirection(**selected, factors=outside.factors + inside.factors)
 
 
 def _sample_bsdf(
-    estimators: Estimators,
-    ray: Ray,
-    event: PathEvent,
-    u: mi.Float,
-    u2: mi.Point2f,
-    may_scatter: mi.Bool,
-    aimed: AimedDirections | None,
+    estimators: Estimators, ray: Ray, event: PathEvent, samples: DirectionSamples, may_scatter: mi.Bool
 ) -> NextDirection:
     """Sample a direction of the BSDF; a null component transmits the ray without deviation."""
     media, si = estimators.media, event.si
     bsdf = si.bsdf()
-    sample, weight = bsdf.sample(mi.BSDFContext(), si, u, u2, event.at_surface)
-    if aimed is not None:
-        sample, weight = _mix_bsdf(si, sample, weight, aimed, u2, event.at_surface)
+    sample, weight = bsdf.sample(mi.BSDFContext(), si, samples.component, samples.direction, event.at_surface)
+    if samples.aimed is not None:
+        sample, weight = _mix_bsdf(si, sample, weight, samples, event.at_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
     # A sampled direction of density 0 has weight 0; its path ends at the roulette, where beta is 0.
     on = event.at_surface & (may_scatter | through)
@@ -178,24 +179,18 @@ def _sample_bsdf(
 
 
 def _mix_bsdf(
-    si: mi.SurfaceInteraction3f,
-    sample: mi.BSDFSample3f,
-    weight: mi.Spectrum,
-    aimed: AimedDirections,
-    u: mi.Point2f,
-    active: mi.Bool,
+    si: mi.SurfaceInteraction3f, sample: mi.BSDFSample3f, weight: mi.Spectrum, samples: DirectionSamples, active: mi.Bool
 ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
     """Replace a share of BSDF samples by directions around a near emitter, at surfaces that reflect only."""
-    bsdf, context = si.bsdf(), mi.BSDFContext()
+    bsdf, aimed = si.bsdf(), samples.aimed
     can_mix = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & ((bsdf.flags() & TRANSMISSION) == 0)
     takes = can_mix & aimed.is_drawn
     is_smooth = can_mix & (takes | ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta))
-    sample.wo = dr.select(takes, si.to_local(aimed.draw(u)), sample.wo)
-    f, pdf = bsdf.eval_pdf(context, si, sample.wo, is_smooth)
-    density = aimed.mix(pdf, si.to_world(sample.wo))
+    sample.wo = dr.select(takes, si.to_local(aimed.draw(samples.direction)), sample.wo)
+    f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, sample.wo, is_smooth)
     # Only the BSDF draws its delta components.
     weight = dr.select(can_mix & ~is_smooth, weight * dr.rcp(1 - aimed.share), weight)
-    weight = dr.select(is_smooth, f * dr.rcp(dr.select(density > 0, density, 1)), weight)
+    weight = dr.select(is_smooth, aimed.weigh(f, pdf, si.to_world(sample.wo)), weight)
     sample.pdf = dr.select(is_smooth, pdf, sample.pdf)
     sample.eta = dr.select(takes, 1, sample.eta)
     sample.sampled_type = dr.select(takes, mi.UInt32(int(mi.BSDFFlags.DiffuseReflection)), sample.sampled_type)
@@ -203,22 +198,16 @@ def _mix_bsdf(
 
 
 def _sample_phase_function(
-    estimators: Estimators,
-    collision: Collision,
-    u: mi.Float,
-    u2: mi.Point2f,
-    may_scatter: mi.Bool,
-    aimed: AimedDirections | None,
+    estimators: Estimators, collision: Collision, samples: DirectionSamples, may_scatter: mi.Bool
 ) -> NextDirection:
     """Sample a direction of the phase function. The flight ending here differentiates the albedo."""
     media, mei = estimators.media, collision.mei
     on = collision.on & may_scatter
-    wo, weight, pdf = sample_phase(media, mei, u, u2, on)
-    if aimed is not None:
-        wo = dr.select(aimed.is_drawn, aimed.draw(u2), wo)
+    wo, weight, pdf = sample_phase(media, mei, samples.component, samples.direction, on)
+    if (aimed := samples.aimed) is not None:
+        wo = dr.select(aimed.is_drawn, aimed.draw(samples.direction), wo)
         f, pdf = MediumVertex(media, mei, collision.p).eval_and_pdf(wo, on)
-        density = aimed.mix(pdf, wo)
-        weight = dr.select(density > 0, f * dr.rcp(dr.select(density > 0, density, 1)), 0)
+        weight = aimed.weigh(f, pdf, wo)
     n = dr.width(wo)
     return NextDirection(
         ray=FineRay.from_point(collision.p, wo, mei),

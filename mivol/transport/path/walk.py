@@ -36,7 +36,7 @@ from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import to_components
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.event import PathEvent, sample_next_direction
+from mivol.transport.path.event import DirectionSamples, PathEvent, sample_next_direction
 from mivol.transport.path.side_flight import (
     SideFlightSamples,
     WeightedEmitterSample,
@@ -370,13 +370,13 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
         path = _add_side_flight(estimators, path, event, emitter_sample, flies_aside)
 
     # -- The next direction --------------------------------------------------------------------------------------------
-    u, u2 = sampler.next_1d(arrives), sampler.next_2d(arrives)
-    aimed = None
+    samples = DirectionSamples(sampler.next_1d(arrives), sampler.next_2d(arrives))
     if estimators.near is not None and estimators.near.aims:
         # The last segment of a path finds emitters by chance only.
         aims = may_scatter & (path.depth + 2 < limit)
-        aimed = estimators.near.aim(mi.Point3f(event.vertex(estimators.media).interaction.p), sampler.next_1d(aims), aims)
-    onward = sample_next_direction(estimators, path.ray, event, u, u2, may_scatter, aimed)
+        p = mi.Point3f(event.vertex(estimators.media).interaction.p)
+        samples.aimed = estimators.near.aim(p, sampler.next_1d(aims), aims)
+    onward = sample_next_direction(estimators, path.ray, event, samples, may_scatter)
     path.is_opaque |= arrives & ~onward.through
     for factor in onward.factors:
         path.score = path.score.scale(factor)

@@ -9,8 +9,8 @@ extinction) to a reservoir, which keeps one piece in proportion to its weight W_
 piece (mean over the channels), times the mean of 1 / r^2 as seen from the chosen emitter (equiangular sampling), times the
 piece's entry in the visibility cache. In the kept piece, the distance is drawn with the density p_c: by inverting the exact
 optical depth (free flight), or uniformly in the angle seen from the emitter. If 1 / r^2 varies within a thin piece, the angle
-draws nearly all distances, otherwise half of them. The density of both steps together is exact, so
-any weights give an unbiased estimate.
+draws nearly all distances, otherwise half of them. The density of both steps together is exact, so any weights give an unbiased
+estimate.
 
 Conventions. For derivatives, ``probe_depth`` is added to the optical depth of each medium. Such a probe also samples regions
 without extinction, where the derivative is not zero.
@@ -402,13 +402,12 @@ def sample_distance(
     front = [dr.exp(-f) for f in candidate.front]
 
     # -- The technique: free flight, or uniform (in angle where the emitter is finite, in length for probes) -----------
-    by_collision = mi.Float(1)
+    by_collision, mean = mi.Float(1), sum(whole) / len(whole)
     if proposal.probe_depth:
-        mean = sum(whole) / len(whole)
         by_collision = mean * bounded_inverse(mean + candidate.probe_sigma * dt)
     begin = candidate.begin + candidate.s
     if equiangular is not None:
-        by_collision *= _collision_share(equiangular, begin, dt, sum(whole) / len(whole))
+        by_collision *= _collision_share(equiangular, begin, dt, mean)
     collides = u.x < by_collision
     even = u.y * dt if equiangular is None else dr.select(equiangular.finite, equiangular.sample(begin, dt, u.y), u.y * dt)
     x = dr.select(collides, _invert_collision_cdf(curve, whole, front, dt, u), even * dr.rcp(dt))

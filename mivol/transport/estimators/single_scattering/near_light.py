@@ -94,6 +94,11 @@ class AimedDirections:
         """Density of a direction in the mixture with another density, ``pdf`` [1/sr]."""
         return dr.lerp(pdf, self.pdf(d), self.share)
 
+    def weigh(self, f: mi.Spectrum, pdf: mi.Float, d: mi.Vector3f) -> mi.Spectrum:
+        """A value over the density of its direction in the mixture with ``pdf``; 0 for a density of 0."""
+        density = self.mix(pdf, d)
+        return dr.select(density > 0, f * dr.rcp(dr.select(density > 0, density, 1)), 0)
+
 
 @dataclass
 class NearLightSamples:
@@ -175,8 +180,9 @@ class NearLighting:
         axis = mi.Vector3f(centre - p)
         distance = dr.norm(axis)
         is_far = active & (distance > MIN_AIMED_DISTANCE * radius)
-        share = dr.select(is_far, share * (1 - MIN_AIMED_DISTANCE * radius * dr.rcp(dr.select(is_far, distance, 1))), 0)
-        axis = dr.select(is_far, axis * dr.rcp(dr.select(is_far, distance, 1)), mi.Vector3f(0, 0, 1))
+        inverse = dr.rcp(dr.select(is_far, distance, 1))
+        share = dr.select(is_far, share * (1 - MIN_AIMED_DISTANCE * radius * inverse), 0)
+        axis = dr.select(is_far, axis * inverse, mi.Vector3f(0, 0, 1))
         return AimedDirections(axis, share, u < share)
 
     def estimate(
