@@ -5,6 +5,7 @@ References: Kay & Kajiya 1986 (slab test).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -13,7 +14,7 @@ import numpy as np
 
 from mivol.scene_graph import traverse
 
-__all__ = ["UNIT_CUBE", "Box", "clip_to_ball", "clip_to_box", "fit_ball", "fit_box", "is_in_box"]
+__all__ = ["UNIT_CUBE", "Box", "clip_to_ball", "clip_to_box", "fit_ball", "fit_box", "is_in_box", "map_point", "map_vector"]
 
 
 UNIT_CUBE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -95,6 +96,16 @@ def _vertices(shape: mi.Shape) -> np.ndarray:
     return np.array(traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
 
 
+def map_point(row: list, p: Sequence) -> mi.Float64:
+    """A coordinate of a point, by a row of a (3, 4) map, in float64."""
+    return dr.fma(row[0], mi.Float64(p[0]), dr.fma(row[1], mi.Float64(p[1]), dr.fma(row[2], mi.Float64(p[2]), row[3])))
+
+
+def map_vector(row: list, d: Sequence) -> mi.Float64:
+    """A coordinate of a direction, by a row of a (3, 4) map, in float64."""
+    return dr.fma(row[0], mi.Float64(d[0]), dr.fma(row[1], mi.Float64(d[1]), row[2] * mi.Float64(d[2])))
+
+
 def clip_to_box(
     rows: list, low: tuple, high: tuple, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: mi.Float64
 ) -> tuple[list[mi.Float64], list[mi.Float64], mi.Float64, mi.Float64]:
@@ -110,12 +121,8 @@ def clip_to_box(
         Origin and direction of the ray in the coordinates of the box, and the interval inside; t1 <= t0 if the ray misses the
         box.
     """
-    f64 = mi.Float64
-    o, d = [f64(o[a]) for a in range(3)], [f64(d[a]) for a in range(3)]
-    q, v = [], []
-    for a, row in enumerate(rows):
-        q.append(dr.fma(row[0], o[0], dr.fma(row[1], o[1], dr.fma(row[2], o[2], row[3]))))
-        v.append(dr.fma(row[0], d[0], dr.fma(row[1], d[1], row[2] * d[2])))
+    q, v = [map_point(row, o) for row in rows], [map_vector(row, d) for row in rows]
+    for a in range(3):
         parallel = v[a] == 0
         inv = 1 / dr.select(parallel, 1, v[a])
         near, far = (low[a] - q[a]) * inv, (high[a] - q[a]) * inv
@@ -138,9 +145,7 @@ def clip_to_ball(rows: list, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: 
         The interval inside; t1 <= t0 if the ray misses the ball.
     """
     # In coordinates in which the ball has the radius 1/2 and lies around the origin.
-    o, d = [mi.Float64(o[a]) for a in range(3)], [mi.Float64(d[a]) for a in range(3)]
-    q = [row[0] * o[0] + row[1] * o[1] + row[2] * o[2] + (row[3] - 0.5) for row in rows]
-    v = [row[0] * d[0] + row[1] * d[1] + row[2] * d[2] for row in rows]
+    q, v = [map_point(row, o) - 0.5 for row in rows], [map_vector(row, d) for row in rows]
     speed2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     middle = -(q[0] * v[0] + q[1] * v[1] + q[2] * v[2]) / speed2
     # The square of the distance of the nearest point keeps its digits far away; the discriminant b^2 - a c would not.
@@ -154,8 +159,7 @@ def clip_to_ball(rows: list, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: 
 
 def is_in_box(rows: list, is_round: bool, p: mi.Point3f) -> mi.Bool:
     """Whether a point lies in the unit cube of ``rows``, or in the ball inside the cube."""
-    p = [mi.Float64(p[a]) for a in range(3)]
-    local = [dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3]))) for row in rows]
+    local = [map_point(row, p) for row in rows]
     if is_round:
         return sum(dr.square(x - 0.5) for x in local) <= 0.25
     return (local[0] >= 0) & (local[0] <= 1) & (local[1] >= 0) & (local[1] <= 1) & (local[2] >= 0) & (local[2] <= 1)

@@ -18,7 +18,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.traversal.box import clip_to_box
+from mivol.transport.traversal.box import clip_to_box, map_point
 from mivol.transport.traversal.rays import Ray
 
 __all__ = ["Lattice", "Mask3", "Segment", "clip_to_grid", "locate_cell", "points_of_piece", "segment_between", "split_float64"]
@@ -158,7 +158,7 @@ def locate_cell(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) ->
     cell, frac, inside = mi.Vector3i(), mi.Vector3f(), mi.Bool(True)
     p = [dr.fma(t, mi.Float64(d[a]), mi.Float64(o[a])) for a in range(3)]
     for a, row in enumerate(lattice.from_world):
-        q = dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3])))
+        q = map_point(row, p)
         # A distance that was drawn inside the box may, once rounded to float32, lie outside it by 1e-7 of itself.
         inside &= dr.abs(q - 0.5 * (n[a] - 1)) < 0.5 * n[a] + 1e-3
         q = dr.clip(q, -0.5, n[a] - 0.5)

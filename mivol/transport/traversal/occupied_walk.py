@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import fast_max, fast_min
-from mivol.transport.traversal.box import clip_to_box
+from mivol.transport.traversal.box import clip_to_box, map_point, map_vector
 from mivol.transport.traversal.interpolation import GAUSS_POINT
 from mivol.transport.traversal.lattice import Segment, clip_to_grid, segment_between
 from mivol.transport.traversal.occupied_cells import OccupiedCells
@@ -205,9 +205,8 @@ def find_piece(cells: OccupiedCells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Fl
     # The ray's origin as seen from the middle at 2^-level of its distance; the direction is the same in own lengths.
     place = []
     for row, m in zip(cells.from_world, middle, strict=True):
-        q = dr.fma(row[0], f64(o[0]), dr.fma(row[1], f64(o[1]), dr.fma(row[2], f64(o[2]), row[3])))
-        place.append(dr.fma(q - m, shrink, m))
-    speed = [dr.fma(row[0], f64(d[0]), dr.fma(row[1], f64(d[1]), row[2] * f64(d[2]))) for row in cells.from_world]
+        place.append(dr.fma(map_point(row, o) - m, shrink, m))
+    speed = [map_vector(row, d) for row in cells.from_world]
     own = [[f64(a == b) for b in range(3)] + [f64(0)] for a in range(3)]
     q, v, start, end = clip_to_box(own, (-0.5,) * 3, tuple(k - 0.5 for k in n), place, speed, f64(0), f64(t_max) * shrink)
     inner = [tuple(m + sign * 0.25 * k for m, k in zip(middle, n, strict=True)) for sign in (-1, 1)]

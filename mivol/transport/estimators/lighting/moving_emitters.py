@@ -24,7 +24,7 @@ from mivol.transport.media.channels import to_spectrum
 from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.box import UNIT_CUBE
+from mivol.transport.traversal.box import UNIT_CUBE, map_point, map_vector
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, walk_cells
 from mivol.transport.traversal.interpolation import GAUSS_POINT, gauss_points
 from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
@@ -193,11 +193,11 @@ def _boundary_direction(body: Body, ray: Ray, t: mi.Float64) -> mi.Vector3f:
     """n / (n . w) of the box or ball around a medium at a point of a ray."""
     if not body.box.is_round:
         return _face_direction(body.rows, *UNIT_CUBE, ray, t)
-    p, d = point_along(ray, t), [mi.Float64(ray.d[k]) for k in range(3)]
+    p = point_along(ray, t)
     # The normal is the gradient of the squared distance from the middle, in the coordinates of the unit cube.
-    q = [row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + (row[3] - 0.5) for row in body.rows]
+    q = [map_point(row, p) - 0.5 for row in body.rows]
     n = [sum(q[a] * body.rows[a][k] for a in range(3)) for k in range(3)]
-    slope = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+    slope = map_vector(n, ray.d)
     return mi.Vector3f(*(mi.Float(x / dr.select(slope != 0, slope, 1)) for x in n))
 
 
@@ -206,7 +206,7 @@ def _face_direction(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64
     best, normal = mi.Float64(dr.inf), mi.Vector3f(0)
     p = point_along(ray, t)
     for row, a, b in zip(rows, low, high, strict=True):
-        q = dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3])))
+        q = map_point(row, p)
         speed = sum(row[k] * mi.Float64(ray.d[k]) for k in range(3))
         off = dr.minimum(dr.abs(q - a), dr.abs(q - b)) / (b - a)
         nearer = (off < best) & (speed != 0)
