@@ -1,4 +1,4 @@
-"""Scenes in which gradients of prbvolpath are wrong: docs/scripts/biased_gradients.py and its page."""
+"""Scenes in which gradients of prbvolpath are wrong: scripts/biased_gradients.py and its page."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from false_alarms import Estimate, assert_precise, assert_same_mean, difference,
 
 from mivol.validate.moments import Moments
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-SCRIPT = runpy.run_path(str(DOCS / "scripts" / "biased_gradients.py"))
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+SCRIPT = runpy.run_path(str(ROOT / "scripts" / "biased_gradients.py"))
 SCENES = tuple(SCRIPT["SCENES"])
 
 
 def test_page_has_a_row_for_each_scene() -> None:
     """In the order of the script, each with the command that prints it."""
-    rows = re.findall(r"^\| `(\w+)` .*\| `python docs/scripts/biased_gradients.py --scene (\w+)` \|$",
+    rows = re.findall(r"^\| `(\w+)` .*\| `python scripts/biased_gradients.py --scene (\w+)` \|$",
                       (DOCS / "biased_gradients.md").read_text(), re.MULTILINE)  # fmt: skip
     assert rows == [(name, name) for name in SCENES]
 

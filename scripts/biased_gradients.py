@@ -1,14 +1,12 @@
 """Scenes in which gradients of Mitsuba's prbvolpath differ from finite differences of volpath images.
 
-    python biased_gradients.py                      # all scenes, a minute each on two cores
-    python biased_gradients.py --scene god_rays     # one scene
+    python scripts/biased_gradients.py                      # all scenes, a minute each on two cores
+    python scripts/biased_gradients.py --scene god_rays     # one scene
 
 The script needs Mitsuba 3 with its LLVM or CUDA backend. If mivol is installed, it prints its gradients
 too. Each figure is the derivative of the mean of the image along log sigma_t, as mean +- standard error
 of the rounds; z is the difference to the finite differences of volpath in standard errors.
 """
-
-# ruff: noqa: I001
 
 from __future__ import annotations
 
