@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import one_blas_thread  # noqa: F401  (before NumPy)
+import quick_kernels  # (before Dr.Jit)
 
 # isort: split
 import mivol  # noqa: F401  (before Mitsuba: it chooses the LLVM library)
@@ -36,12 +37,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Chances of false alarms are counted. Workers of pytest-xdist share the cores, so that more threads would only spin. Two
-    there must be: with one, Mitsuba waits for ever for a second to read an EXR, and has done so to load a scene."""
+    """Chances of false alarms are counted. Workers of pytest-xdist share the cores: a thread more than a worker has cores spins
+    for 20 ms after each kernel, and takes the time from the worker beside."""
     config.pluginmanager.register(false_alarms.Count())
+    quick_kernels.leave_out_passes()
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
     if workers > 1:
-        drjit.set_thread_count(max(2, machine.count_cores() // workers))
+        drjit.set_thread_count(max(1, machine.count_cores() // workers))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -167,7 +169,7 @@ def whole_paths(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def _same_threads() -> Iterator[None]:
-    """Forget how many threads a test asked for: with one left over, Mitsuba waits for ever for a second, to read an EXR."""
+    """Forget how many threads a test asked for."""
     threads = drjit.thread_count()
     yield
     if drjit.thread_count() != threads:

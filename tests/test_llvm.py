@@ -5,12 +5,14 @@ Each test of an import order runs in a child process, since a process can import
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import threading
 from pathlib import Path
 
 import pytest
+import quick_kernels
 
 import mivol
 from mivol import llvm, machine, threads
@@ -303,3 +305,34 @@ def test_the_pool_changes_once_its_kernels_have_ended(monkeypatch: pytest.Monkey
     monkeypatch.setattr(dr, "set_thread_count", done.append)
     threads.set_thread_count(3)
     assert done == ["ended", 3]
+
+
+# -- The tests' own kernels ----------------------------------------------------------------------------------------------------
+
+
+def optimise(text: bytes) -> str:
+    """An LLVM module after the passes that Dr.Jit asks for, run by the library that Dr.Jit loaded."""
+    lib = ctypes.CDLL(os.environ[llvm.VARIABLE])
+    for name in ("ContextCreate", "CreateMemoryBufferWithMemoryRangeCopy", "RunPasses", "CreatePassBuilderOptions"):
+        getattr(lib, f"LLVM{name}").restype = ctypes.c_void_p
+    lib.LLVMPrintModuleToString.restype = ctypes.c_char_p
+    lib.LLVMCreateMemoryBufferWithMemoryRangeCopy.argtypes = ctypes.c_char_p, ctypes.c_size_t, ctypes.c_char_p
+    context, module, options = ctypes.c_void_p(lib.LLVMContextCreate()), ctypes.c_void_p(), lib.LLVMCreatePassBuilderOptions()
+    buffer = ctypes.c_void_p(lib.LLVMCreateMemoryBufferWithMemoryRangeCopy(text, len(text), b"sum"))
+    assert not lib.LLVMParseIRInContext(context, buffer, ctypes.byref(module), None)
+    assert not lib.LLVMRunPasses(module, b"default<O2>", None, ctypes.c_void_p(options))
+    return lib.LLVMPrintModuleToString(module).decode()
+
+
+def test_kernels_of_tests_are_compiled_quickly_and_kept_apart(cpu_back_end: None) -> None:
+    """LLVM leaves a sum with 0 as it is, and a kernel that no run has seen adds a file to the folder of the tests."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not quick_kernels.can_leave_out(os.environ[llvm.VARIABLE]):
+        pytest.skip("kernels are optimised: MIVOL_TESTS asks for it, or LLVM is old")
+    assert "add i32" in optimise(b"define i32 @sum(i32 %x) {\n  %y = add i32 %x, 0\n  ret i32 %y\n}\n")
+    folder = Path(os.environ["DRJIT_CACHE_DIR"])
+    before = set(folder.iterdir())
+    dr.eval(dr.arange(mi.Float, 3) * dr.opaque(mi.Float, 2.0) + int.from_bytes(os.urandom(3)) / 7)
+    assert set(folder.iterdir()) > before and folder == quick_kernels.folder

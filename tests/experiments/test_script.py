@@ -184,7 +184,7 @@ def test_the_first_example_has_a_derivative(variant_rgb: str) -> None:
 
 
 @pytest.mark.slow
-def test_photographs_of_the_docs_become_a_scene(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photographs_of_the_docs_become_a_scene(two_threads: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twelve views of a ball, with alpha: the scene shows something other than its floor, and what the photographs showed."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "photographs").mkdir()
