@@ -267,10 +267,24 @@ class Readings(Section):
 
 
 class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
-    """A Data Exchange file (HDF5) with flat and dark fields."""
+    """An HDF5 file with flat and dark fields: NXtomo (NeXus), Data Exchange, or datasets by name."""
 
-    file: Annotated[str, setting("path", "HDF5 file", min_length=1)]
-    group: Annotated[str, setting("1", "group with data, data_white, data_dark and theta")] = "exchange"
+    file: Annotated[str, setting("path", "HDF5 file of any suffix", min_length=1)]
+    group: Annotated[
+        str,
+        setting("1", "entry with image_key, or group with data, data_white, data_dark; empty: the first entry, else exchange"),
+    ] = ""
+    data: Annotated[str, setting("1", "dataset (views, rows, columns); empty: the layout's; a name: only named datasets")] = ""
+    flats: Annotated[str, setting("1", "dataset of light without object: name, or other.h5:name; empty: the layout's")] = ""
+    darks: Annotated[str, setting("1", "dataset without light, as flats")] = ""
+    angles: Annotated[str, setting("1", "dataset with one angle per view, as flats; empty and none: evenly over scan.arc")] = ""
+    angle_unit: Annotated[
+        Literal["degree", "radian"] | None, setting("1", "unit of the angles; absent: their attribute units, else by the arc")
+    ] = None
+    rows: Annotated[
+        tuple[Annotated[int, msgspec.Meta(ge=0)], Count] | None,
+        setting("pixel", "first row, and row after the last, of a parallel beam; absent: all"),
+    ] = None
 
 
 class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
@@ -379,6 +393,8 @@ class ScanExperiment(Section):
     def __post_init__(self) -> None:
         if isinstance(self.scan, OfData) != isinstance(self.data, Nikon):
             raise ValueError('scan.beam = "data" and data.source = "nikon" go together: give both, or neither')
+        if getattr(self.data, "rows", None) and not isinstance(self.scan, Parallel):
+            raise ValueError('data.rows cuts the detector of a beam = "parallel": leave it out')
         if self.grid is None and not isinstance(self.data, Nikon):
             raise ValueError('the key "grid" is missing: give it')
 

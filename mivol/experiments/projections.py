@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, Measured, Nikon, OfData, Parallel, Stack, Table
+from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, OfData, Parallel, Readings, Table
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.experiments.readings import ScanReadings, nikon_grid, note_order, note_rows, read_scan
@@ -106,7 +106,7 @@ def make_data(settings: config.ScanExperiment, base: Path, grid: VoxelGrid) -> P
     Raises:
         MivolError: unreadable files, files of different sizes, rays that all miss the grid, or more rays than memory.
     """
-    is_measured = isinstance(settings.data, Measured | Stack | Nikon)
+    is_measured = isinstance(settings.data, Readings)
     if is_measured:
         data = read_measured(settings, base)
     else:

@@ -9,6 +9,7 @@ displaced along v, a helix, or another trajectory breaks the symmetry.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,16 +57,25 @@ def read_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
     Raises:
         MivolError: an unreadable file, or files of different sizes.
     """
-    data = settings.data
-    if isinstance(data, Nikon):
-        transmission, geometry, notes = read_nikon_scan(data, base)
-        return ScanReadings(transmission, geometry=geometry, notes=tuple(notes))
-    if isinstance(data, Measured):
-        scan = read_projections(resolve_path(base, data.file), data.group)
-        fields = scan.projections, scan.flats, scan.darks
-        check_unit(np.degrees(scan.angles), "degree", "write theta in degrees")
-        return ScanReadings(correct_transmission(*fields, data.saturation), scan.angles, intensity=fields)
-    return read_stack_scan(settings, base)
+    return READERS[type(settings.data)](settings, base)
+
+
+def read_hdf5_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
+    """Read a scan in an HDF5 file.
+
+    Raises:
+        MivolError: as :func:`read_scan`.
+    """
+    data: Measured = settings.data
+    names = {role: getattr(data, role) for role in ("data", "flats", "darks", "angles")}
+    scan = read_projections(resolve_path(base, data.file), data.group, names, data.angle_unit, data.rows)
+    fields = scan.projections, scan.flats, scan.darks
+    angles = scan.angles
+    if angles is None and not isinstance(settings.scan, Table | Matrices):
+        angles = np.radians(settings.scan.arc) * np.arange(len(scan.projections)) / len(scan.projections)
+    elif angles is not None:
+        check_unit(np.degrees(angles), "degree", 'set data.angle_unit = "radian"')
+    return ScanReadings(correct_transmission(*fields, data.saturation), angles, intensity=fields, notes=scan.notes)
 
 
 def read_stack_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
@@ -142,20 +152,26 @@ def note_order(angles: np.ndarray) -> list[str]:
     return [f"the angles turn back {len(back)} times ({turned}): they are used as given"]
 
 
-def read_nikon_scan(settings: Nikon, base: Path) -> tuple[Transmission, ConeBeam | PanelViews, list[str]]:
-    """Read a Nikon scan: transmission, geometry and notes.
+def read_nikon_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
+    """Read a Nikon scan.
 
     Raises:
         MivolError: as :mod:`mivol.files.nikon`.
     """
-    scan = read_nikon(base / settings.file)
-    angles = read_nikon_angles(base / settings.angles, len(scan.images)) if settings.angles else scan.angles
+    data: Nikon = settings.data
+    scan = read_nikon(base / data.file)
+    angles = read_nikon_angles(base / data.angles, len(scan.images)) if data.angles else scan.angles
     geometry = geometry_from_nikon(scan, angles)
-    return (
-        assume_quantum_noise(read_nikon_transmission(scan, settings.saturation)),
-        geometry,
-        describe_nikon_settings(scan, geometry),
-    )
+    transmission = assume_quantum_noise(read_nikon_transmission(scan, data.saturation))
+    return ScanReadings(transmission, geometry=geometry, notes=tuple(describe_nikon_settings(scan, geometry)))
+
+
+READERS: dict[type, Callable[[config.ScanExperiment, Path], ScanReadings]] = {
+    Measured: read_hdf5_scan,
+    Stack: read_stack_scan,
+    Nikon: read_nikon_scan,
+}
+"""Reader of measured projections by the type of ``settings.data``."""
 
 
 def describe_nikon_settings(scan: NikonScan, geometry: ConeBeam | PanelViews) -> list[str]:

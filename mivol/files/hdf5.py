@@ -1,124 +1,56 @@
-"""HDF5 through h5py: volumes by dataset name, and projections in the Data Exchange layout.
+"""HDF5 through h5py: opening, links, storage, and volumes by dataset name.
 
-Conventions. Projections are counts (views, rows, columns). Flat fields (beam without sample) and dark fields (no beam) are
-stacks of the same rows and columns. ``theta`` is in degrees unless its ``units`` say radians; angles are returned in radians.
-h5py is imported at the first use.
-
-Reference: De Carlo et al. 2014, "Scientific data exchange: a schema for HDF5-based storage of raw and analyzed data".
+Soft and external links, virtual datasets and compressed chunks are followed. What cannot be followed is refused, because HDF5
+would read zeros from a missing part. h5py is imported at the first use.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files.source import check_file, refusal, select_dataset
 from mivol.files.volume import VolumeData, to_values
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 
-#: units of theta -> factor to radians.
-ANGLES: dict[str, float] = {
-    "degrees": np.pi / 180,
-    "degree": np.pi / 180,
-    "deg": np.pi / 180,
-    "radians": 1.0,
-    "radian": 1.0,
-    "rad": 1.0,
-}
-
-
-@with_short_repr
-@dataclasses.dataclass(frozen=True)
-class ProjectionData:
-    """The counts of a tomographic scan.
-
-    Attributes:
-        projections: counts with sample, float32 (views, rows, columns).
-        flats: counts of the beam without sample, float32 (n, rows, columns).
-        darks: counts without beam, float32 (m, rows, columns).
-        angles: rotation of the sample, float64 (views,) [rad].
-        meta: ``path``, ``format``, ``group``, ``dtype`` and ``unit`` of the counts.
-    """
-
-    projections: np.ndarray
-    flats: np.ndarray
-    darks: np.ndarray
-    angles: np.ndarray
-    meta: dict[str, Any] = dataclasses.field(default_factory=dict)
-
 
 def read_hdf5(path: Path, dataset: str | None = None) -> VolumeData:
     """Read a dataset (Z, Y, X) or (Z, Y, X, C), on the unit cube because HDF5 stores no placement."""
-    with _opened(path) as file:
-        grids = _grids(file)
+    with opened(path) as file:
+        grids = list_grids(file)
         name = select_dataset(path, dataset.strip("/") if dataset else None, list(grids))
+        check_storage(path, file[grids[name]])
         array = np.asarray(file[grids[name]])
     meta = {"path": str(path), "format": "hdf5", "dtype": str(array.dtype), "space": None, "dataset": name}
     return VolumeData(to_values(array, path), np.eye(4), meta)
 
 
-def read_projections(path: str | os.PathLike, group: str = "exchange") -> ProjectionData:
-    """Read a Data Exchange file: ``data``, ``data_white``, ``data_dark`` and ``theta`` of a group.
+def is_hdf5(path: Path) -> bool:
+    """Whether a file begins as HDF5 does; a block of the user's may come first."""
+    with suppress(OSError), path.open("rb") as file:
+        for offset in (0, 512, 1024, 2048, 4096):
+            file.seek(offset)
+            if file.read(len(MAGIC)) == MAGIC:
+                return True
+    return False
 
-    Args:
-        path: HDF5 file.
-        group: group of the four datasets.
+
+# -- Opening -----------------------------------------------------------------------------------------------------------------
+
+
+def import_h5py(path: Path) -> ModuleType:
+    """Import h5py.
 
     Raises:
-        MivolError: no HDF5 file, a missing h5py or dataset, inconsistent shapes, or angles or counts that are not finite.
+        MivolError: h5py is not installed.
     """
-    path = check_file(path)
-    with _opened(path) as file:
-        data = _dataset(file, path, group, "data")
-        projections, flats, darks = (
-            to_values(np.asarray(_dataset(file, path, group, name)), f"{path}:{group}/{name}")[..., 0]
-            for name in ("data", "data_white", "data_dark")
-        )
-        theta = _dataset(file, path, group, "theta")
-        angles = np.asarray(theta, np.float64).ravel()
-        unit = _text(theta.attrs.get("units", "degrees"))
-        meta = {
-            "path": str(path),
-            "format": "data-exchange",
-            "group": group,
-            "dtype": str(data.dtype),
-            "unit": _text(data.attrs.get("units", "")),
-        }
-    if unit.lower() not in ANGLES:
-        raise refusal(path, f"theta in {unit!r}", "degrees or radians", "correct the attribute 'units' of theta")
-    _check_projections(path, projections, flats, darks, angles)
-    return ProjectionData(projections, flats, darks, angles * ANGLES[unit.lower()], meta)
-
-
-def _check_projections(path: Path, projections: np.ndarray, flats: np.ndarray, darks: np.ndarray, angles: np.ndarray) -> None:
-    for name, stack in (("data_white", flats), ("data_dark", darks)):
-        if stack.shape[1:] != projections.shape[1:]:
-            raise refusal(
-                path,
-                f"{name} of {stack.shape[1]} x {stack.shape[2]} pixels",
-                f"{projections.shape[1]} x {projections.shape[2]} as in data",
-                "crop both to the same pixels",
-            )
-    if len(angles) != len(projections):
-        raise refusal(path, f"{len(angles)} angles", f"{len(projections)}, one per view", "correct theta")
-    for name, numbers in (("theta", angles), ("data", projections), ("data_white", flats), ("data_dark", darks)):
-        bad = ~np.isfinite(numbers)
-        if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise refusal(path, f"{numbers[index]} in {name} at {index}", "finite numbers", "repair the file")
-
-
-def _h5py(path: Path) -> ModuleType:
     try:
         import h5py
     except ImportError as error:
@@ -127,35 +59,131 @@ def _h5py(path: Path) -> ModuleType:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    h5py = _h5py(path)
+def opened(path: Path) -> Iterator[Any]:
+    """Open a file to read.
+
+    Raises:
+        MivolError: no HDF5, a truncated file, or no h5py.
+    """
+    h5py = import_h5py(path)
     try:
         with h5py.File(path, "r") as file:
             yield file
     except MivolError:
         raise
     except (OSError, RuntimeError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise refusal(
-            path, f"a damaged or foreign file ({reason})", "HDF5", "the file may be truncated: copy it again"
-        ) from error
+        raise damaged(path, error) from error
 
 
-def _grids(file: Any) -> dict[str, str | bytes]:
+def damaged(path: Path, error: Exception) -> MivolError:
+    """Return the error that refuses a file that h5py cannot read."""
+    reason = " ".join(str(error).split())
+    return refusal(path, f"a damaged or foreign file ({reason})", "HDF5", "the file may be truncated: copy it again")
+
+
+def list_grids(file: Any) -> dict[str, str | bytes]:
     """The arrays of 3 or 4 dimensions: names as text -> names in the file (bytes if not UTF-8)."""
     names: list[str | bytes] = []
     file.visititems(lambda name, item: names.append(name) if getattr(item, "ndim", 0) in (3, 4) else None)
-    return {_text(name): name for name in names}
+    return {to_text(name): name for name in names}
 
 
-def _dataset(file: Any, path: Path, group: str, name: str) -> Any:
-    full = f"{group}/{name}"
-    if full not in file or not hasattr(file[full], "shape"):
-        holder = file[group] if group in file and hasattr(file[group], "keys") else file
-        present = ", ".join(sorted(map(_text, holder.keys())))
-        raise refusal(path, f"no dataset {full} (present: {present})", "the dataset", "name another group or add the dataset")
-    return file[full]
+# -- Links -------------------------------------------------------------------------------------------------------------------
 
 
-def _text(value: Any) -> str:
+def has_link(holder: Any, name: str) -> bool:
+    """Whether a name stands in a file, even as a link whose target is missing."""
+    *steps, last = name.split("/")
+    for step in steps:
+        if not is_group(holder, step):
+            return False
+        holder = holder[step]
+    return holder.get(last, getlink=True) is not None
+
+
+def is_group(holder: Any, name: str) -> bool:
+    """Whether a name is a group, or a link to one."""
+    try:
+        return hasattr(holder[name], "keys")
+    except (KeyError, OSError):
+        return False
+
+
+def find_item(file: Any, path: Path, name: str) -> Any:
+    """The dataset of a name.
+
+    Raises:
+        MivolError: a link to nothing, no such name, or a group.
+    """
+    holder, steps = file, [step for step in name.split("/") if step]
+    for depth, step in enumerate(steps):
+        link = holder.get(step, getlink=True) if hasattr(holder, "keys") else None
+        here = "/".join(steps[: depth + 1])
+        if link is None:
+            present = ", ".join(sorted(map(to_text, holder))) if hasattr(holder, "keys") else "a dataset"
+            raise refusal(path, f"no dataset {name} (present: {present})", "the dataset", "name another")
+        try:
+            holder = holder[step]
+        except (KeyError, OSError):
+            raise _broken_link(path, here, link) from None
+    if not hasattr(holder, "shape"):
+        raise refusal(path, f"a group {name} ({', '.join(sorted(map(to_text, holder)))})", "a dataset", "name one in it")
+    return holder
+
+
+def _broken_link(path: Path, name: str, link: Any) -> MivolError:
+    target = getattr(link, "path", "")
+    where = f"{link.filename}:{target}" if hasattr(link, "filename") else target
+    way_out = "copy that file to the place that the link names, or name another dataset"
+    return refusal(path, f"a link from {name} to {where or 'nothing'}, which cannot be read", "its target", way_out)
+
+
+def broken_links(file: Any, path: Path) -> Iterator[MivolError]:
+    """Yield an error for each link at the top of a file whose target is missing."""
+    for name in map(to_text, file):
+        try:
+            file[name]
+        except (KeyError, OSError):
+            yield _broken_link(path, name, file.get(name, getlink=True))
+
+
+def read_name(file: Any, path: Path, name: str) -> Any:
+    """The dataset of a name given by the user: ``name``, or ``other.h5:name`` for a dataset of another file."""
+    other, colon, inner = name.rpartition(":")
+    if not colon or has_link(file, name):
+        return find_item(file, path, name)
+    beside = check_file(path.parent / other)
+    try:
+        return find_item(import_h5py(beside).File(beside, "r"), beside, inner)
+    except OSError as error:
+        raise damaged(beside, error) from error
+
+
+def check_storage(path: Path, dataset: Any) -> None:
+    """Refuse a dataset of which h5py cannot read all: a compression without its filter, or a virtual one without a source."""
+    h5py = import_h5py(path)
+    plist = dataset.id.get_create_plist()
+    for number in range(plist.get_nfilters()):
+        code, _, _, label = plist.get_filter(number)
+        if not h5py.h5z.filter_avail(code):
+            with suppress(ImportError):
+                import hdf5plugin  # noqa: F401
+        if not h5py.h5z.filter_avail(code):
+            raise refusal(
+                path,
+                f"{dataset.name} compressed by filter {code} ({to_text(label) or 'no name'})",
+                "an installed filter",
+                'install hdf5plugin: pip install "mivol[lab]"',
+            )
+    if not dataset.is_virtual:
+        return
+    folder = Path(dataset.file.filename).parent
+    for source in dataset.virtual_sources():
+        if source.file_name != "." and "%" not in source.file_name and not (folder / source.file_name).is_file():
+            found = f"a virtual dataset {dataset.name} with a part in {source.file_name}, which is not there"
+            raise refusal(path, found, "all its parts", "copy that file to the place that the dataset names")
+
+
+def to_text(value: Any) -> str:
+    """Decode a text of HDF5; invalid bytes are replaced."""
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

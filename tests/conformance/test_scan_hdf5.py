@@ -1,0 +1,160 @@
+"""Scans in HDF5 files as beamlines write them: found by content, read by name, refused in a sentence."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from beamline_files import DARKS, DEGREES, FLATS, FRAMES, KEY, VIEWS, write_named, write_nxtomo
+
+from mivol.errors import MivolError
+from mivol.files import read_projections
+from mivol.files.scan_hdf5 import half_turns_in_radians, is_scan
+
+
+@pytest.mark.parametrize("name", ["a.nxs", "a.hdf", "a.he5", "a.h5", "a.hdf5", "a"])
+def test_frames_are_told_apart_by_their_key(tmp_path: Path, name: str) -> None:
+    """By any suffix, through an external link; an invalid frame is left out and said; lengths are in mm."""
+    path = write_nxtomo(tmp_path / name)
+    scan = read_projections(path)
+    for found, frames in ((scan.projections, VIEWS), (scan.flats, FLATS), (scan.darks, DARKS)):
+        np.testing.assert_array_equal(found, FRAMES[frames])
+        assert found.dtype == np.float32
+    np.testing.assert_allclose(scan.angles, np.radians([0, 36, 72, 108, 144]), rtol=1e-15)
+    assert scan.pitch == pytest.approx((4e-3, 2e-3)) and scan.distances == pytest.approx((55e3, 50))
+    assert (scan.meta["format"], scan.meta["group"]) == ("nxtomo", "entry")
+    assert scan.notes == ("1 of 10 frames are called invalid or of the alignment: they are not used",)
+    assert is_scan(path) and not is_scan(tmp_path / "no file")
+
+
+def test_frames_of_the_alignment_are_no_views(tmp_path: Path) -> None:
+    """They are called views (0) in image_key, and -1 in image_key_control; a control of another length tells nothing."""
+    path = write_nxtomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        file["entry/instrument/detector/image_key_control"] = np.where(np.arange(10) == 7, -1, KEY)
+    scan = read_projections(path)
+    np.testing.assert_array_equal(scan.projections, FRAMES[VIEWS[:-1]])
+    assert len(scan.angles) == 4 and scan.notes[0].startswith("2 of 10 frames")
+    change(path, "entry/instrument/detector/image_key_control", KEY[:3])
+    assert len(read_projections(path).angles) == 5
+
+
+def test_the_first_of_several_scans_is_read(tmp_path: Path) -> None:
+    """And the sentence names the others; GDA's entry lies in another entry."""
+    path = write_nxtomo(write_nxtomo(tmp_path / "a.nxs", "entry1/tomo_entry"), "entry0000", angles=DEGREES + 1)
+    scan = read_projections(path)
+    assert scan.meta["group"] == "entry0000" and np.degrees(scan.angles[0]) == pytest.approx(1)
+    assert scan.notes[0].startswith("the file has 2 scans, entry0000, entry1/tomo_entry: entry0000 is read, data.group")
+    assert read_projections(path, "entry1/tomo_entry").angles[0] == 0
+    with pytest.raises(MivolError, match=r"no dataset nowhere/data \(present: entry0000, entry1\)"):
+        read_projections(path, "nowhere")
+
+
+def test_datasets_by_name(tmp_path: Path) -> None:
+    """One flat may be an image; the attribute tells the unit; without angles there are none; rows are cut."""
+    path = write_named(tmp_path / "b.he5")
+    names = {"data": "scan/camera/frames", "flats": "/before/reference", "darks": "before/background", "angles": "scan/stage"}
+    scan = read_projections(path, names=names)
+    np.testing.assert_array_equal(scan.projections, FRAMES[VIEWS])
+    np.testing.assert_array_equal(scan.flats, FRAMES[[0]])
+    np.testing.assert_allclose(scan.angles, np.radians(DEGREES[VIEWS]), rtol=1e-15)
+    assert read_projections(path, names=names | {"angles": ""}).angles is None
+    for part in ("projections", "flats", "darks"):
+        cut = getattr(read_projections(path, names=names, rows=(1, 2)), part)
+        np.testing.assert_array_equal(cut, getattr(scan, part)[:, 1:2])
+    scan = read_projections(path, names=names | {"darks": ""})
+    assert not scan.darks.any() and scan.notes == ("no darks: a reading of 0 is taken as no light",)
+    other = {"flats": "b.he5:before/background"}
+    np.testing.assert_array_equal(read_projections(write_nxtomo(tmp_path / "a.nxs"), names=other).flats, FRAMES[DARKS])
+
+
+@pytest.mark.parametrize(("arc", "turns"), [(np.pi, "half a turn"), (2 * np.pi, "a turn")])
+def test_radians_called_degrees_are_seen_by_the_arc(tmp_path: Path, arc: float, turns: str) -> None:
+    """With the last view at the end of the arc or a step before, to a hundredth; a setting decides otherwise."""
+    angles = np.linspace(0, arc, 40)
+    assert half_turns_in_radians(angles) == half_turns_in_radians(angles[:-1]) == turns
+    assert not half_turns_in_radians(0.95 * angles) and not half_turns_in_radians(np.degrees(angles))
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["d"], file["f"], file["t"] = np.ones((40, 1, 2)), np.ones((1, 2)), angles
+        file["t"].attrs["units"] = "degrees"
+    names = {"data": "d", "flats": "f", "angles": "t"}
+    scan = read_projections(path, names=names)
+    np.testing.assert_array_equal(scan.angles, angles)
+    assert scan.notes[0].startswith(f"the angles are called degrees and span {arc:.4f}, {turns} in radians: they are taken as")
+    np.testing.assert_allclose(read_projections(path, names=names, angle_unit="degree").angles, np.radians(angles))
+
+
+def change(path: Path, name: str, value: object) -> None:
+    with h5py.File(path, "a") as file:
+        del file[name]
+        if value is not None:
+            file[name] = value
+
+
+BROKEN = {
+    "target": lambda path: path.with_name("a_frames.h5").unlink(),
+    "soft": lambda path: change(path, "entry/instrument/detector/data", h5py.SoftLink("/gone")),
+    "short key": lambda path: change(path, "entry/instrument/detector/image_key", KEY[:-1]),
+    "no views": lambda path: change(path, "entry/instrument/detector/image_key", np.ones(10, int)),
+    "no flats": lambda path: change(path, "entry/instrument/detector/image_key", np.array([0] * 8 + [2, 2])),
+    "angles": lambda path: change(path, "entry/sample/rotation_angle", np.arange(7.0)),
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[:2500]),
+    "truncated target": lambda path: (p := path.with_name("a_frames.h5")).write_bytes(p.read_bytes()[:700]),
+    "nothing": lambda path: change(path, "entry", None),
+}
+SENTENCES = {
+    "target": r"a link from entry/instrument/detector/data to a_frames.h5:entry/data/data, which cannot be read, expected its",
+    "soft": "a link from entry/instrument/detector/data to /gone, which cannot be read",
+    "short key": r"9 numbers of image_key for entry/instrument/detector/data of shape \(10, 2, 3\), expected one for each",
+    "no views": r"no view \(0\) in entry/instrument/detector/image_key",
+    "no flats": r"no flat \(light without sample\), expected at least one; name a dataset: data.flats",
+    "angles": "7 angles in entry/sample/rotation_angle, expected 10, one for each frame, or 5, one for each view",
+    "truncated": "a damaged or foreign file .*truncated",
+    "truncated target": "a link from entry/instrument/detector/data to a_frames.h5",
+    "nothing": r"neither an image_key \(NXtomo\) nor a group exchange .* name the datasets: data.data",
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path, case: str) -> None:
+    path = write_nxtomo(tmp_path / "a.nxs")
+    BROKEN[case](path)
+    with pytest.raises(MivolError, match=SENTENCES[case]) as refused:
+        read_projections(path)
+    assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
+
+
+def test_a_part_that_is_missing_is_no_zero(tmp_path: Path) -> None:
+    """HDF5 reads zeros from a virtual dataset without its file."""
+    path = tmp_path / "v.h5"
+    layout = h5py.VirtualLayout((4, 1, 2), "u2")
+    layout[:] = h5py.VirtualSource("part.h5", "d", (4, 1, 2))
+    with h5py.File(path, "w") as file:
+        file.create_virtual_dataset("d", layout)
+        file["f"] = np.ones((1, 2))
+    names = {"data": "d", "flats": "f"}
+    with pytest.raises(MivolError, match="a virtual dataset /d with a part in part.h5, which is not there"):
+        read_projections(path, names=names)
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file["d"] = np.full((4, 1, 2), 7, "u2")
+    assert (read_projections(path, names=names).projections == 7).all()
+
+
+def test_a_compression_without_its_filter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sentence names the filter and the package."""
+    path = tmp_path / "c.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("d", data=np.ones((4, 1, 2)), chunks=True, compression="gzip")
+        file["f"] = np.ones((1, 2))
+    names = {"data": "d", "flats": "f"}
+    assert read_projections(path, names=names).projections.shape == (4, 1, 2)
+    monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: False)
+    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
+    with pytest.raises(
+        MivolError, match=r"/d compressed by filter 1 \(deflate\), .*: pip install .mivol\[lab"
+    ):
+        read_projections(path, names=names)
