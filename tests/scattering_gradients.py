@@ -7,7 +7,8 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from false_alarms import assert_precise, assert_same_mean, fresh
+import pytest
+from false_alarms import Estimate, assert_precise, assert_same_mean, fresh
 from scattering_scenes import Pencils, mivol, rough_grid
 
 from mivol.validate.moments import Moments
@@ -34,6 +35,51 @@ def vjp(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrato
     gradient = np.array(dr.grad(variable), dtype=np.float64)
     release(scene, key, variable)
     return gradient
+
+
+def backward(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+    """J^T w, by the integrator's own pass."""
+    params, variable = watched(scene, key)
+    integrator.render_backward(scene, params, mi.TensorXf(np.asarray(w, dtype=np.float32)), seed=seed, spp=spp)
+    found = np.array(dr.grad(variable), dtype=np.float64)
+    release(scene, key, variable)
+    return found
+
+
+def forward(scene: mi.Scene, key: str, v: np.ndarray | float, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+    """J v with the same random numbers."""
+    params, variable = watched(scene, key)
+    kind = type(variable)
+    dr.set_grad(variable, kind(np.asarray(v, dtype=np.float32)) if np.ndim(v) else kind(float(v)))
+    found = np.array(integrator.render_forward(scene, params, seed=seed, spp=spp), dtype=np.float64)
+    release(scene, key, variable)
+    return found
+
+
+def along(scene: mi.Scene, key: str, v: np.ndarray | float, integrator: mi.Integrator, spp: int) -> Estimate:
+    """The derivative of the mean of an image of 8 x 8 pixels along v, from independent reverse passes."""
+    w = np.full((8, 8, 3), 1 / 192)
+    found = [np.sum(backward(scene, key, w, spp, fresh(k), integrator) * v) for k in range(BATCHES)]
+    return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
+
+
+def upper_half(scene: mi.Scene, key: str) -> np.ndarray | float:
+    """A random direction that changes the upper half of a grid; light of both halves may nearly cancel. 1 for a number."""
+    shape = np.shape(mi.traverse(scene)[key])
+    if len(shape) < 4:
+        return 1.0
+    v = np.random.default_rng(2).uniform(0.5, 1.5, shape)
+    v[: shape[0] // 2] = 0
+    return v
+
+
+def assert_transposed(there: np.ndarray, back: np.ndarray) -> None:
+    """The terms of <J v, w> and of <v, J^T w> of one seed have one sum, and not 0: the same terms in another order.
+
+    Of some 1000 paths of ten terms each, summed in float32; they are of both signs, so the sum of sizes counts.
+    """
+    assert np.sum(there) == pytest.approx(np.sum(back), abs=1e-4 * max(np.abs(there).sum(), np.abs(back).sum()))
+    assert np.sum(there) != 0
 
 
 def release(scene: mi.Scene, key: str, parameter: object) -> None:

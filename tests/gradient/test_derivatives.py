@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean, difference, fresh
-from scattering_gradients import BATCHES, release, watched
+from scattering_gradients import along, backward, upper_half
 from scattering_scenes import PLACE, cases, close_up, mivol, rough_grid, sun
 
 from mivol.experiments.script import explain
@@ -24,8 +24,6 @@ from mivol.transport.estimators.scores import Replay
 from mivol.transport.path import derivatives
 from mivol.transport.path.derivatives import count_branches, prepare_derivatives
 from mivol.transport.path.estimators import Settings
-from mivol.validate.moments import Moments
-from mivol.validate.statistics import Estimate
 from scenes import ball_of, box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -81,12 +79,7 @@ SCENES = {"sun": smoky, "floor": lambda: smoky(floor=floor()), "rgb": coloured, 
 
 def gradient_of_mean_image(scene: mi.Scene, key: str, spp: int, seed: int, depth: int = 5) -> np.ndarray:
     """The derivative of the mean image."""
-    params, variable = watched(scene, key)
-    w = mi.TensorXf(np.full((8, 8, 3), 1 / 192, dtype=np.float32))
-    mi.load_dict(mivol(max_depth=depth, rr_depth=3)).render_backward(scene, params, w, seed=seed, spp=spp)
-    found = np.array(dr.grad(variable), dtype=np.float64)
-    release(scene, key, variable)
-    return found
+    return backward(scene, key, np.full((8, 8, 3), 1 / 192), spp, seed, mi.load_dict(mivol(max_depth=depth, rr_depth=3)))
 
 
 @pytest.fixture
@@ -194,20 +187,12 @@ def test_plan_branches_paths_with_free_flights(monkeypatch: pytest.MonkeyPatch) 
 )
 def test_branches_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean derivative equals the mean of whole paths, along a random direction in the upper half."""
-    scene = SCENES[name]()
-    shape = np.shape(mi.traverse(scene)[KEYS[key]])
-    v = np.random.default_rng(2).uniform(0.5, 1.5, shape) if len(shape) == 4 else np.ones(shape)
-    if len(shape) == 4:
-        v[: shape[0] // 2] = 0
-
-    def along(spp: int) -> Estimate:
-        found = [np.sum(gradient_of_mean_image(scene, KEYS[key], spp, fresh(k), depth) * v) for k in range(BATCHES)]
-        return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
-
+    scene, integrator = SCENES[name](), mi.load_dict(mivol(max_depth=depth, rr_depth=3))
+    v = upper_half(scene, KEYS[key])
     monkeypatch.setattr(derivatives, "BALANCE", 2.0)
-    found = along(512)
+    found = along(scene, KEYS[key], v, integrator, 512)
     monkeypatch.setattr(plan, "choose_branches", lambda *_: (False, []))
-    whole = along(1024)
+    whole = along(scene, KEYS[key], v, integrator, 1024)
     assert_same_mean(found, whole, rounding=1e-4 * np.abs(whole.mean), what="derivative")
     assert_precise(difference(found, whole), 0.1 * np.abs(whole.mean), what="derivative")
 

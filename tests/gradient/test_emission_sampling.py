@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh
+from false_alarms import assert_precise, assert_same_mean, difference, fresh
 from media_light_scenes import drawn, met, seen
-from scattering_gradients import BATCHES, release, watched
-
-from mivol.validate.moments import Moments
+from scattering_gradients import along, assert_transposed, backward, forward
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -41,43 +38,13 @@ def _step(scene: mi.Scene, key: str) -> np.ndarray | float:
     return np.random.default_rng(2).uniform(0.5, 1.5, shape) if np.prod(shape) > 3 else 1.0
 
 
-def _backward(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: dict) -> np.ndarray:
-    """J^T w."""
-    params, variable = watched(scene, key)
-    mi.load_dict(integrator).render_backward(scene, params, mi.TensorXf(np.asarray(w, np.float32)), seed=seed, spp=spp)
-    found = np.array(dr.grad(variable), dtype=np.float64)
-    release(scene, key, variable)
-    return found
-
-
-def _forward(scene: mi.Scene, key: str, v: np.ndarray | float, spp: int, seed: int, integrator: dict) -> np.ndarray:
-    """J v."""
-    params, variable = watched(scene, key)
-    kind = type(variable)
-    dr.set_grad(variable, kind(np.asarray(v, dtype=np.float32)) if np.ndim(v) else kind(float(v)))
-    found = np.array(mi.load_dict(integrator).render_forward(scene, params, seed=seed, spp=spp), dtype=np.float64)
-    release(scene, key, variable)
-    return found
-
-
 @pytest.mark.slow_for("over a floor-sigma_t")
 @pytest.mark.parametrize(("name", "what"), CASES)
 def test_forward_is_the_transpose_of_reverse(name: str, what: str, whole_paths: None) -> None:
-    """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
-    scene, key, integrator = seen(name), KEYS[name, what], drawn(3)
+    scene, key, integrator = seen(name), KEYS[name, what], mi.load_dict(drawn(3))
     w, v, seed = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3)), _step(scene, key), fresh(5)
-    there, back = _forward(scene, key, v, 16, seed, integrator), _backward(scene, key, w, 16, seed, integrator)
-    a, b = np.sum(there * w), np.sum(back * v)
-    # As in test_flight_derivatives: paths of some ten terms each, summed in float32.
-    assert a == pytest.approx(b, abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum()))
-    assert a != 0
-
-
-def _along(scene: mi.Scene, key: str, v: np.ndarray | float, integrator: dict, spp: int) -> Estimate:
-    """The derivative of the mean image along v, from independent reverse passes."""
-    w = np.full((8, 8, 3), 1 / 192)
-    found = [np.sum(_backward(scene, key, w, spp, fresh(k), integrator) * v) for k in range(BATCHES)]
-    return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
+    there, back = forward(scene, key, v, 16, seed, integrator), backward(scene, key, w, 16, seed, integrator)
+    assert_transposed(there * w, back * v)
 
 
 @pytest.mark.slow
@@ -90,6 +57,6 @@ def test_draws_keep_the_mean_of_derivatives(name: str, what: str) -> None:
     """Sampling of the emission keeps the mean derivative of paths meeting the emission by chance."""
     scene, key = seen(name), KEYS[name, what]
     v, (few, many) = _step(scene, key), (16, 64) if (name, what) == QUICK else (64, 256)
-    found, truth = _along(scene, key, v, drawn(3), few), _along(scene, key, v, met(3), many)
+    found, truth = (along(scene, key, v, mi.load_dict(i), spp) for i, spp in ((drawn(3), few), (met(3), many)))
     assert_same_mean(found, truth, rounding=1e-5 * np.abs(truth.mean), what="derivative")
     assert_precise(difference(found, truth), 0.15 * np.abs(truth.mean), what="derivative")

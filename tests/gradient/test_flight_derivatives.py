@@ -11,7 +11,20 @@ import oracle_scattering as twins
 import pytest
 import scattering_scenes as small
 from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh
-from scattering_gradients import BATCHES, DENSITIES, GRID, assert_gradient, gradients, release, vjp, watched, weights
+from scattering_gradients import (
+    BATCHES,
+    DENSITIES,
+    GRID,
+    along,
+    assert_gradient,
+    assert_transposed,
+    backward,
+    forward,
+    gradients,
+    upper_half,
+    vjp,
+    weights,
+)
 from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
@@ -67,34 +80,15 @@ def test_density(flies, density, emitter):
 # -- Any number ----------------------------------------------------------------------------------------------------------
 
 
-def _backward(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
-    """J^T w, by the integrator's own pass."""
-    params, variable = watched(scene, key)
-    integrator.render_backward(scene, params, mi.TensorXf(np.asarray(w, dtype=np.float32)), seed=seed, spp=spp)
-    found = np.array(dr.grad(variable), dtype=np.float64)
-    release(scene, key, variable)
-    return found
-
-
-def _forward(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
-    """J v with the same random numbers."""
-    params, variable = watched(scene, key)
-    kind = type(variable)
-    dr.set_grad(variable, kind(np.asarray(v, dtype=np.float32)) if np.ndim(v) else kind(float(v)))
-    found = np.array(integrator.render_forward(scene, params, seed=seed, spp=spp), dtype=np.float64)
-    release(scene, key, variable)
-    return found
-
-
 @pytest.mark.slow_for("0.0")
 @pytest.mark.parametrize("g", [0.0, 0.6])
 def test_a_white_furnace_has_no_derivative(g):
     """The light at the end of a flight and at a probe equals the baseline, sample by sample."""
     scene = close_up({"smoke": smoke(rough_grid(2, 5.0), 1.0, "own", name="hg", g=g)[0], "sky": scenes.sky(1.0)}, res=8)
     integrator = mi.load_dict(mivol(max_depth=-1, rr_depth=100))
-    found = _backward(scene, GRID, np.ones((8, 8, 3)), 16, fresh(3), integrator)
+    found = backward(scene, GRID, np.ones((8, 8, 3)), 16, fresh(3), integrator)
     # A white surface in place of the sky's light has the derivative of the optical depth: some samples a voxel of size 1.
-    plain = _backward(scene, GRID, np.ones((8, 8, 3)), 16, fresh(3), mi.load_dict({"type": "mivol", "max_depth": 1}))
+    plain = backward(scene, GRID, np.ones((8, 8, 3)), 16, fresh(3), mi.load_dict({"type": "mivol", "max_depth": 1}))
     assert np.abs(found).max() <= 1e-5 * np.abs(plain).max()
 
 
@@ -153,23 +147,13 @@ PAIRS += [("near light", name) for name in ("density", "albedo", "g", "scale", "
 @pytest.mark.slow
 @pytest.mark.parametrize(("place", "name"), PAIRS)
 def test_forward_is_the_transpose_of_reverse(place, name, whole_paths):
-    """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
     build, keys, settings = SCENES[place]
     scene, key, integrator, seed = build(), keys[name], mi.load_dict(mivol(**settings)), fresh(5)
     w = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3))
     params = mi.traverse(scene)
     v = np.random.default_rng(2).uniform(0.5, 1.5, np.shape(params[key])) if np.size(params[key]) > 3 else 1.0
-    there, back = _forward(scene, key, v, 16, seed, integrator), _backward(scene, key, w, 16, seed, integrator)
-    # 1024 paths of some ten terms each, summed in float32; they are of both signs, so the sum of sizes counts.
-    assert np.sum(there * w) == pytest.approx(np.sum(back * v), abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum()))
-    assert np.sum(there * w) != 0
-
-
-def _along(scene: mi.Scene, key: str, v: np.ndarray, integrator: mi.Integrator, spp: int) -> Estimate:
-    """The derivative of the mean image along v, from 16 reverse passes."""
-    w = np.full((8, 8, 3), 1 / 192)
-    found = [np.sum(_backward(scene, key, w, spp, fresh(k), integrator) * v) for k in range(BATCHES)]
-    return Estimate.from_result(Moments.from_values(np.array(found)[:, None]))
+    there, back = forward(scene, key, v, 16, seed, integrator), backward(scene, key, w, 16, seed, integrator)
+    assert_transposed(there * w, back * v)
 
 
 def _difference(scene: mi.Scene, key: str, v: np.ndarray, h: float, integrator: mi.Integrator, spp: int) -> Estimate:
@@ -219,7 +203,7 @@ def test_density_by_differences(room, depth):
     density = rough_grid(4, 3.0)
     scene = close_up(ROOMS[room](density), res=8)
     integrator = mi.load_dict(mivol(max_depth=depth, rr_depth=50))
-    found = _along(scene, GRID, density, integrator, 1024)
+    found = along(scene, GRID, density, integrator, 1024)
     truth = _difference(scene, GRID, density, 0.05, integrator, 4096)
     assert_same_mean(found, truth, rounding=2e-3 * np.abs(truth.mean), what="derivative")
     assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean) + 1e-4, what="derivative")
@@ -260,7 +244,7 @@ def test_near_light_by_differences(lamp, kind, depth):
     start = np.array(mi.traverse(scene)[key])
     # Not below 0: empty voxels grow only in the derivative; the difference follows the full ones.
     v = np.where(start > 0.05, 1.0, 0.0) if start.size > 1 else 1.0
-    found, truth = _along(scene, key, v, integrator, 512), _difference(scene, key, v, 0.02, integrator, 4096)
+    found, truth = along(scene, key, v, integrator, 512), _difference(scene, key, v, 0.02, integrator, 4096)
     assert_same_mean(found, truth, rounding=3e-3 * np.abs(truth.mean), what="derivative")
     assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean) + 1e-3, what="derivative")
 
@@ -367,7 +351,7 @@ def test_collisions_find_the_derivatives_of_thick_media(monkeypatch):
     found = []
     for bound in (0.5, np.inf):
         monkeypatch.setattr(plan, "THICK", bound)
-        found.append(_along(scene, key, 1.0, integrator, 64))
+        found.append(along(scene, key, 1.0, integrator, 64))
     assert_same_mean(*found, rounding=1e-4 * np.abs(found[1].mean), what="derivative")
     assert_precise(difference(*found), 0.05 * np.abs(found[1].mean), what="derivative")
 
@@ -376,15 +360,11 @@ def test_collisions_find_the_derivatives_of_thick_media(monkeypatch):
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", ["density", "albedo", "g"])
 def test_side_flights_keep_the_mean_of_derivatives(name, monkeypatch):
-    """With and without side flights, along a random direction in the upper half: the light of both halves nearly cancels."""
     scene, key, integrator = _in_the_sun(), OF_A_SUN[name], mi.load_dict(mivol(max_depth=4))
-    shape = np.shape(mi.traverse(scene)[key])
-    v = np.random.default_rng(2).uniform(0.5, 1.5, shape) if len(shape) == 4 else 1.0
-    if len(shape) == 4:
-        v[: shape[0] // 2] = 0
-    with_them = _along(scene, key, v, integrator, 512)
+    v = upper_half(scene, key)
+    with_them = along(scene, key, v, integrator, 512)
     monkeypatch.setattr(plan, "choose_side_flights", lambda *_: (None, []))
-    without = _along(scene, key, v, integrator, 1024)
+    without = along(scene, key, v, integrator, 1024)
     assert_same_mean(with_them, without, rounding=1e-4 * np.abs(without.mean), what="derivative")
     assert_precise(difference(with_them, without), 0.1 * np.abs(without.mean), what="derivative")
 
@@ -397,7 +377,7 @@ def test_light_is_linear_in_what_emits(name, depth):
     integrator, params = mi.load_dict(mivol(max_depth=depth, rr_depth=3)), mi.traverse(scene)
     kind, value = type(params[key]), np.array(params[key], dtype=np.float32)
     seed = fresh(7)
-    tangent = _forward(scene, key, value if value.size > 3 else float(value.ravel()[0]), 16, seed, integrator)
+    tangent = forward(scene, key, value if value.size > 3 else float(value.ravel()[0]), 16, seed, integrator)
     images = []
     for factor in (1.0, 0.0):
         params[key] = kind(value * np.float32(factor)) if value.size > 3 else kind(float(value.ravel()[0]) * factor)
@@ -417,9 +397,9 @@ def test_albedo_of_zero(monkeypatch):
     interior = medium("mivol_medium", density, albedo)
     scene = close_up({"smoke": box_of(interior, PLACE), "bulb": point([1.5, 1, 2.0])[0]}, res=8)
     at_zero, integrator = 1.0 * (values == 0), mi.load_dict(mivol())
-    truth = _along(scene, MEDIUM + "albedo.data", at_zero, integrator, 64)
+    truth = along(scene, MEDIUM + "albedo.data", at_zero, integrator, 64)
     monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight")
-    found = _along(scene, MEDIUM + "albedo.data", at_zero, integrator, 512)
+    found = along(scene, MEDIUM + "albedo.data", at_zero, integrator, 512)
     assert_same_mean(found, truth, rounding=1e-7, what="derivative")
     assert_precise(difference(found, truth), 0.05 * np.abs(truth.mean), what="derivative")
 
@@ -435,8 +415,8 @@ def test_coefficients_are_those_of_density_and_albedo():
     interior = {"type": "mivol_medium", **parts}
     split = close_up({"smoke": box_of(interior, PLACE), "bulb": point([1.5, 1, 2.0])[0]}, res=8)
     integrator = mi.load_dict(mivol(max_depth=4))
-    by_density = _along(whole, GRID, density, integrator, 256)
-    a, s = (_along(split, f"{MEDIUM}{name}.data", as_float32(c * density), integrator, 256) for name, c in shares)
+    by_density = along(whole, GRID, density, integrator, 256)
+    a, s = (along(split, f"{MEDIUM}{name}.data", as_float32(c * density), integrator, 256) for name, c in shares)
     total = Estimate(a.mean + s.mean, a.var + s.var, np.minimum(a.dof, s.dof))
     assert_same_mean(total, by_density, rounding=1e-6, what="derivative")
     assert_precise(difference(total, by_density), 0.2 * np.abs(by_density.mean) + 1e-3, what="derivative")
