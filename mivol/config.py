@@ -293,18 +293,18 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
     file: Annotated[str, setting("path", "TIFF, .npy, .npz, HDF5 (views, rows, cols), or a TIFF pattern", min_length=1)]
     reading: Annotated[
         Literal["intensity", "transmission", "line_integral"],
-        setting("1", "quantity of a pixel; an intensity needs flats and darks"),
+        setting("1", "quantity of a pixel; an intensity needs flats"),
     ]
     dataset: Annotated[str, setting("1", "name of the array in an .npz or HDF5 file")] = ""
     flats: Annotated[str, setting("path", "readings of light without object, as file")] = ""
-    darks: Annotated[str, setting("path", "readings without light, as file")] = ""
+    darks: Annotated[str, setting("path", "readings without light, as file; empty: 0")] = ""
     angles: Annotated[str, setting("path", "text with one angle per view; empty: evenly over scan.arc")] = ""
     angle_unit: Annotated[Literal["degree", "radian"], setting("1", "unit of the angles in the file")] = "degree"
     first_row: Annotated[Literal["lowest", "highest"], setting("1", "row of the detector that the file has first")] = "lowest"
 
     def __post_init__(self) -> None:
-        if (self.reading == "intensity") != bool(self.flats and self.darks):
-            raise ValueError("an intensity needs flats and darks, and nothing else takes them: give both, or change reading")
+        if (self.reading == "intensity") != bool(self.flats) or (self.darks and not self.flats):
+            raise ValueError("an intensity needs flats, and nothing else takes flats and darks: give flats, or change reading")
         if self.reading != "intensity" and self.saturation < INFINITY:
             raise ValueError("only readings of an intensity saturate: leave saturation out, or change reading")
 

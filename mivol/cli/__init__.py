@@ -18,6 +18,7 @@ from mivol.errors import MivolError
 from mivol.optim.interrupt import Signals
 
 if TYPE_CHECKING:
+    from mivol.experiments.found_scan import ScanDraft
     from mivol.scene.load import LoadedScene
 
 USAGE, STOPPED = 2, 130
@@ -150,8 +151,8 @@ def explain_flags() -> list:
     """Flags of ``mivol explain``."""
     return [
         *scene_flags(
-            "scene (.xml), experiment (.toml), points or Gaussians (.ply, .spz, ...), volume (.vdb, .nrrd, ...), or "
-            "photographs (folder, file)"
+            "scene (.xml), experiment (.toml), points or Gaussians (.ply, .spz, ...), volume (.vdb, .nrrd, ...), "
+            "scan (HDF5, .xtekct, folder), or photographs (folder, file)"
         ),
         flag("-o", "--output", type=Path, help="image (.png, .svg) of the cameras of photographs, and of the boxes"),
         flag("--preset", help="for photographs: explain the fit of mivol optimize --preset (capture, cpu, ...)"),
@@ -210,7 +211,11 @@ def reference_flags() -> list:
 def optimize_flags() -> list:
     """Flags of ``mivol optimize``."""
     return [
-        flag("experiment", type=Path, help="experiment (.toml), or posed photographs: a folder or a file of cameras"),
+        flag(
+            "experiment",
+            type=Path,
+            help="experiment (.toml), a scan (HDF5, .xtekct, folder), or posed photographs: a folder or a file of cameras",
+        ),
         flag("--preset", help="for photographs without a TOML file: capture for a place around the cameras, cpu for an object"),
         list_flag("--set", "key=value", "override a setting of the experiment"),
         flag("-o", "--output", type=Path, help="run folder (default: the experiment's output)"),
@@ -305,13 +310,12 @@ def explain(arguments: argparse.Namespace) -> int:
     Gaussians, it prints their number, extent, sizes and opacities; for a volume, its size, values and place. A refusal comes
     after the facts, with exit code 1.
     """
-    from mivol.files.formats import describe_volume, is_volume_file
     from mivol.photos import find_format
     from mivol.points.summary import is_points_file, summarize_file
 
-    if is_volume_file(_check_dataset(arguments.scene, arguments.dataset)):
-        print(describe_volume(arguments.scene, arguments.dataset))
-        return 0
+    code = explain_array(arguments)
+    if code is not None:
+        return code
     if _is_experiment(arguments):
         from mivol.experiments.kinds import explain_experiment
 
@@ -326,6 +330,47 @@ def explain(arguments: argparse.Namespace) -> int:
         answer = explain_scene(load_named_scene(arguments).scene, arguments.max_depth, noise=arguments.noise)
     print(answer.text)
     return int(bool(answer.refusal))
+
+
+def explain_array(arguments: argparse.Namespace) -> int | None:
+    """Explain a scan or describe a volume, and return the exit code; None for anything else."""
+    from mivol.files.formats import describe_volume, is_volume_file
+
+    is_volume = is_volume_file(_check_dataset(arguments.scene, arguments.dataset))
+    if draft := draft_of(arguments.scene, arguments, is_volume):
+        return explain_scan(draft)
+    if not is_volume:
+        return None
+    print(describe_volume(arguments.scene, arguments.dataset))
+    return 0
+
+
+def explain_scan(draft: ScanDraft) -> int:
+    """Print what was found, the steps of the fit, and the TOML file that says the same."""
+    from mivol import config
+    from mivol.experiments.kinds import explain_experiment
+
+    answer = explain_experiment(config.from_dict(draft.raw), Path())
+    print("\n".join([*draft.lines, answer.text, "", "# the same as a TOML file, for mivol optimize", draft.toml]))
+    return int(bool(answer.refusal))
+
+
+def draft_of(path: Path, arguments: argparse.Namespace, is_volume: bool = False) -> ScanDraft | None:
+    """Return the settings of a scan without a TOML file; None for anything else.
+
+    An HDF5 file without the layout of a scan counts as one if its suffix is not that of a volume, or with ``--set``;
+    ``--dataset`` makes it a volume.
+
+    Raises:
+        MivolError: as :func:`mivol.experiments.found_scan.draft_scan`.
+    """
+    from mivol.experiments.found_scan import draft_scan, find_scan
+    from mivol.files.hdf5 import is_hdf5
+
+    if arguments.preset is not None or getattr(arguments, "dataset", None) is not None or path.suffix.lower() == ".toml":
+        return None
+    is_named = path.is_file() and is_hdf5(path) and (arguments.set or not is_volume)
+    return draft_scan(path, arguments.set) if is_named or find_scan(path) else None
 
 
 def _is_experiment(arguments: argparse.Namespace) -> bool:
@@ -463,15 +508,22 @@ def reference(arguments: argparse.Namespace) -> None:
 def optimize(arguments: argparse.Namespace) -> None:
     """Fit a volume, scene parameters, a radiance field or Gaussians to images, projections or photographs.
 
-    All results are written into the run folder.
+    The projections of a scan need no TOML file: an HDF5 file (NXtomo, Data Exchange), an .xtekct file, or a folder of TIFF
+    files. optimize says what was found, assumed and chosen. All results are written into the run folder.
     """
+    from mivol import config
     from mivol.cli.progress import TerminalProgress
     from mivol.experiments.fit_kind import RunContext
     from mivol.experiments.kinds import run_experiment
 
-    settings, base = load_experiment(arguments.experiment, arguments)
+    progress, notes = TerminalProgress(), ()
+    if draft := draft_of(arguments.experiment, arguments):
+        settings, base, notes = config.from_dict(draft.raw, str(arguments.experiment)), Path(), draft.lines
+        progress.say(notes)
+    else:
+        settings, base = load_experiment(arguments.experiment, arguments)
     folder = arguments.output or Path(settings.output)
-    print(run_experiment(RunContext(settings, base, folder, arguments.resume, TerminalProgress(), arguments.command)))
+    print(run_experiment(RunContext(settings, base, folder, arguments.resume, progress, arguments.command, notes)))
 
 
 def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path]:

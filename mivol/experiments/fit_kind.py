@@ -62,6 +62,7 @@ class RunContext:
         resume: whether to continue from the folder's checkpoint.
         progress: display of the run's progress.
         command: command line, for the record; empty for a run from Python.
+        notes: how the settings came about, for the report.
     """
 
     settings: config.Experiment
@@ -70,6 +71,7 @@ class RunContext:
     resume: bool = False
     progress: Progress = field(default_factory=NullProgress)
     command: str = ""
+    notes: tuple[str, ...] = ()
 
 
 class Stages(NamedTuple):

@@ -50,6 +50,7 @@ def run_experiment(context: RunContext) -> Path:
         checkpoint.check_settings(context.folder / CHECKPOINT, config.flat(config.resolved(settings)))
     choose_back_end(settings.variant, settings.threads)
     kind = KINDS[type(settings)](context)
+    kind.record.notes += context.notes
     run = RunFolder(context.folder, kind.record, context.resume)
     with run.at_work():
         with run.stage(kind.stages.load):

@@ -22,6 +22,7 @@ from mivol.errors import MivolError
 from mivol.files import read_columns, read_projections, read_stack
 from mivol.files.fetch import resolve_path
 from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
+from mivol.files.scan_hdf5 import NO_DARKS
 from mivol.files.source import refusal
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.solvers import SOLVERS
@@ -91,12 +92,16 @@ def read_stack_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings
         return values[:, ::-1] if data.first_row == "highest" else values
 
     readings = stack(data.file)
-    fields = (readings, stack(data.flats), stack(data.darks)) if data.reading == "intensity" else None
+    fields, notes = None, ()
+    if data.reading == "intensity":
+        darks = stack(data.darks) if data.darks else np.zeros((1, *readings.shape[1:]), np.float32)
+        notes = () if data.darks else (NO_DARKS,)
+        fields = readings, stack(data.flats), darks
     if fields:
         transmission = correct_transmission(*fields, data.saturation)
     else:
         transmission = assume_quantum_noise(np.exp(-readings.astype(float)) if data.reading == "line_integral" else readings)
-    return ScanReadings(transmission, read_angles(settings, base, len(readings)), intensity=fields)
+    return ScanReadings(transmission, read_angles(settings, base, len(readings)), intensity=fields, notes=notes)
 
 
 def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.ndarray | None:

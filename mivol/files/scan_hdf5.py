@@ -61,6 +61,8 @@ LENGTHS: dict[str, float] = {
 VIEW, FLAT, DARK = 0, 1, 2
 """Values of ``image_key``."""
 
+NO_DARKS = "no darks: a reading of 0 is taken as no light"
+
 READING_BYTES = 36
 """Memory per reading of a scan [byte]: the reading in float32, and four numbers computed from it in float64."""
 
@@ -121,16 +123,61 @@ def read_projections(
         data = scan.frames["data"].dataset
         meta = {"path": str(path), "format": scan.format, "group": scan.group, "dtype": str(data.dtype)}
         meta["unit"] = to_text(data.attrs.get("units", ""))
-    for role, found in (("flats", "flat"), ("darks", "dark")):
-        if role == "flats" and not len(stacks.get(role, ())):
-            raise refusal(path, f"no {found} (light without sample)", "at least one", f"name a dataset: data.{role}")
-        if not len(stacks.get(role, ())):
-            notes += (f"no {found}s: a reading of 0 is taken as no light",)
-            stacks[role] = np.zeros((1, *projections.shape[1:]), np.float32)
+    if not len(stacks.get("flats", ())):
+        raise refusal(path, "no flat (light without sample)", "at least one", "name a dataset: data.flats")
+    if not len(stacks.get("darks", ())):
+        notes += (NO_DARKS,)
+        stacks["darks"] = np.zeros((1, *projections.shape[1:]), np.float32)
     _check_projections(path, stacks, {role: frames.name for role, frames in scan.frames.items()}, angles)
     return ProjectionData(
         projections, stacks["flats"], stacks["darks"], angles, meta, (*scan.notes, *notes), scan.pitch, scan.distances
     )
+
+
+class ScanFacts(NamedTuple):
+    """What a scan's file tells without its readings: layout, numbers of frames (views, flats, darks), pixels (rows, columns).
+
+    ``angles`` [rad], ``pitch`` and ``distances`` [mm], and ``notes`` are as in :class:`ProjectionData`.
+    """
+
+    layout: str
+    frames: tuple[int, int, int]
+    pixels: tuple[int, int]
+    angles: np.ndarray | None
+    pitch: tuple[float, float] | None
+    distances: tuple[float | None, float | None]
+    notes: tuple[str, ...]
+
+
+def survey_projections(
+    path: str | os.PathLike, group: str = "", names: Mapping[str, str] | None = None, angle_unit: str | None = None
+) -> ScanFacts:
+    """Find what a scan's file tells without its readings.
+
+    Args, raises: as :func:`read_projections`.
+    """
+    path = check_file(path)
+    with opened(path) as file:
+        scan = _find_scan(file, path, group, names or {})
+        angles, notes = _read_angles(path, scan.angles, angle_unit)
+        counts = [_count(scan.frames.get(role)) for role in ("data", "flats", "darks")]
+        layout = {"nxtomo": f"NXtomo, entry {scan.group}", "data-exchange": f"Data Exchange, group {scan.group}"}
+        return ScanFacts(
+            layout.get(scan.format, "datasets by name"),
+            (counts[0], counts[1], counts[2]),
+            scan.frames["data"].dataset.shape[-2:],
+            angles,
+            scan.pitch,
+            scan.distances,
+            (*scan.notes, *notes),
+        )
+
+
+def _count(frames: Frames | None) -> int:
+    if frames is None:
+        return 0
+    dataset, _, indices = frames
+    return len(indices) if indices is not None else len(dataset) if dataset.ndim == 3 else 1
 
 
 def is_scan(path: Path) -> bool:

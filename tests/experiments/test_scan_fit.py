@@ -464,7 +464,7 @@ REFUSED = {
     "volume of another shape": (['data={source="volume", file="v.npz"}'], "make them equal"),
     "grid that no ray meets": (["grid.centre=[0,0,400]"], "no ray meets the grid, which reaches 1.732 from (0.0, 0.0, 400.0)"),
     "stack that is not there": (['data={source="stack", file="a.npy", reading="line_integral"}'], "a.npy"),
-    "intensity alone": (['data={source="stack", file="a.npy", reading="intensity"}'], "needs flats and darks"),
+    "intensity alone": (['data={source="stack", file="a.npy", reading="intensity"}'], "an intensity needs flats"),
     "stack with a hole": (
         ['data={source="stack", file="hole.npy", reading="line_integral"}'],
         "1 pixels that are not finite, the first at (view, row, column) = (1, 2, 3)",
@@ -479,7 +479,7 @@ REFUSED = {
     ),
     "radians in Data Exchange": (
         ['data={source="measured", file="radians.h5"}', 'scan={beam="parallel"}'],
-        "18 views span 5.934 degrees: they seem to be radians, write theta in degrees",
+        '18 views span 5 degrees: they seem to be radians, set data.angle_unit = "radian"',
     ),
     "angles of another scan": (
         ['data={source="stack", file="y.npy", reading="line_integral", angles="few.txt"}'],
@@ -525,7 +525,7 @@ def test_scans_that_are_refused(variant_rgb, folder: Path, capsys: pytest.Captur
     np.savetxt(folder / "radians.txt", np.radians(20.0 * np.arange(18)))
     if case == "radians in Data Exchange":
         with h5py.File(folder / "radians.h5", "w") as file:
-            file["exchange/data"], file["exchange/theta"] = np.ones((18, 4, 14), "f"), np.radians(20.0 * np.arange(18))
+            file["exchange/data"], file["exchange/theta"] = np.ones((18, 4, 14), "f"), np.linspace(0, 5, 18)
             file["exchange/data_white"], file["exchange/data_dark"] = 2 * np.ones((2, 4, 14), "f"), np.zeros((2, 4, 14), "f")
     np.savetxt(folder / "few.txt", np.arange(3))
     np.savetxt(folder / "table.txt", circle_table(3))

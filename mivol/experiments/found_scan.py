@@ -1,0 +1,406 @@
+"""A scan without a TOML file: what its files tell, what is assumed, what is chosen, and the TOML that says the same.
+
+Kinds of scans (``SCAN_KINDS``) are recognised by content: a file of settings of a Nikon scanner, an HDF5 file with a layout of
+a scan, a folder with one of both, or a folder of TIFF files without cameras.
+
+Conventions. Paths in the settings are relative to the working directory. Lengths are in mm if the files tell the size of a
+pixel, in pixels otherwise.
+"""
+
+from __future__ import annotations
+
+import glob
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mivol import config
+from mivol.errors import MivolError
+from mivol.files.hdf5 import is_hdf5
+from mivol.files.image_stack import TIFF, natural_order, read_images
+from mivol.files.nikon import SECTION, read_nikon
+from mivol.files.scan_hdf5 import half_turns_in_radians, is_scan, survey_projections
+from mivol.files.source import read_columns, refusal
+from mivol.machine import available_memory
+from mivol.photos import find_format
+
+FLAT_WORDS = {
+    *("flat", "flats", "flatfield", "ff", "white", "whites", "bright", "open", "openbeam", "ob", "empty", "gain", "air"),
+    *("ref", "refs", "reference", "io", "i0"),
+}
+DARK_WORDS = {"dark", "darks", "darkfield", "df", "dc", "di", "offset", "bias", "background"}
+"""Words in the names of files and folders of light without a sample, and of no light."""
+
+ANGLE_FILES = (".txt", ".csv", ".ang", ".tlt", ".rawtlt")
+
+VOXEL_BYTES = 8 * 4 * 10
+"""Memory per voxel of the default solver [byte]: eight unknowns, and about ten numbers each."""
+
+HELD_OUT, FEW_VIEWS = 20, 60
+"""Every twentieth view is predicted and not fitted, in scans of at least sixty views."""
+
+
+class ScanDraft(NamedTuple):
+    """Settings of a scan, as in TOML, and lines on what was found, assumed and chosen."""
+
+    raw: dict[str, Any]
+    lines: tuple[str, ...]
+
+    @property
+    def toml(self) -> str:
+        """The settings as the text of a TOML file."""
+        tables = {key: value for key, value in self.raw.items() if isinstance(value, dict)}
+        lines = [f"{key} = {_value(value)}" for key, value in self.raw.items() if key not in tables]
+        for name, table in tables.items():
+            lines += ["", f"[{name}]", *(f"{key} = {_value(value)}" for key, value in table.items())]
+        return "\n".join(lines)
+
+
+def find_scan(path: Path) -> str | None:
+    """Return the key of ``SCAN_KINDS`` of a file or folder; None for other paths, such as photographs with cameras."""
+    if not path.exists() or (path.is_dir() and find_format(path)):
+        return None
+    return next((name for name, (recognise, _) in SCAN_KINDS.items() if recognise(path)), None)
+
+
+def draft_scan(path: Path, changes: Sequence[str] = ()) -> ScanDraft:
+    """Make settings for a scan from its files.
+
+    Args:
+        path: file or folder.
+        changes: as in :func:`mivol.config.load`; they come before what is found.
+
+    Raises:
+        MivolError: no scan, files that cannot be read, or several scans in a folder.
+    """
+    given: dict[str, Any] = {}
+    for change in changes:
+        config.apply_change(given, change)
+    kind = find_scan(path)
+    if kind is None and not (path.is_file() and is_hdf5(path)):
+        expected = "a scan in HDF5, an .xtekct file, or a folder of TIFF files"
+        raise refusal(path, "no scan", expected, "name one of them, or write a TOML file")
+    draft = SCAN_KINDS[kind or HDF5][1](path, given)
+    name = path.resolve().stem
+    raw = _merge({"title": name, "output": f"runs/{name}"} | draft.raw, given)
+    return ScanDraft(raw, draft.lines)
+
+
+def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """The tables of both; ``over`` wins."""
+    merged = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = base[key] | value if both else value
+    return merged
+
+
+def _value(value: Any) -> str:
+    """A value of TOML: texts, numbers, truth values and lists are written as in JSON."""
+    if isinstance(value, float):
+        return repr(value) if math.isfinite(value) else str(value)
+    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
+
+
+# -- HDF5 ------------------------------------------------------------------------------------------------------------------
+
+
+def _draft_hdf5(path: Path, given: dict[str, Any]) -> ScanDraft:
+    path, lines = _one_file(path, is_scan)
+    data = given.get("data", {})
+    names = {role: data.get(role, "") for role in ("data", "flats", "darks", "angles")}
+    scan = survey_projections(path, data.get("group", ""), names, data.get("angle_unit"))
+    views, flats, darks = scan.frames
+    height, columns = scan.pixels
+    rows = data["rows"][1] - data["rows"][0] if isinstance(data.get("rows"), list) and len(data["rows"]) == 2 else height
+    lines += [
+        f"found: {scan.layout}: {_count(views, 'view')} of {height} x {columns} pixels, {_count(flats, 'flat')}, "
+        f"{_count(darks, 'dark')}"
+    ]
+    lines += [f"found: {note}" for note in scan.notes]
+    raw_scan: dict[str, Any] = {"beam": "parallel"}
+    if scan.angles is None:
+        lines.append("assumed: no angles: the views are spread evenly over 180 degrees; scan.arc = 360 for a whole turn")
+        raw_scan["arc"] = 180.0
+    else:
+        first, last = np.degrees(scan.angles[[0, -1]])
+        lines.append(f"found: angles from {first:.4g} to {last:.4g} degrees")
+    lines += _draft_beam(raw_scan, scan.pitch, scan.distances, (height, columns))
+    grid, more = _draft_grid(raw_scan, rows, columns)
+    return _finish({"scan": raw_scan, "data": {"source": "measured", "file": str(path)}, "grid": grid}, [*lines, *more], views)
+
+
+def _draft_beam(
+    scan: dict[str, Any],
+    pitch: tuple[float, float] | None,
+    distances: tuple[float | None, float | None],
+    pixels: tuple[int, int],
+) -> list[str]:
+    """Put pitch and beam into ``scan``; return lines.
+
+    A cone beam magnifies the near and the far end of an object of half width R by factors that differ by ``2 R / D``, with the
+    distance D of the axis from the source. Below half a pixel at the edge of the detector, the beam counts as parallel.
+    """
+    if pitch is None:
+        return [
+            "assumed: a parallel beam, and pixels of edge 1, since the files tell neither; scan.beam and scan.pitch set them"
+        ]
+    scan["pitch"] = pitch[1] if pitch[0] == pitch[1] else list(pitch)
+    lines = [f"found: pixels of {pitch[0]:.6g} x {pitch[1]:.6g} mm (rows, columns)"]
+    source, detector = distances
+    if source is None:
+        return [*lines, "assumed: a parallel beam, since the file has no distance of the source; scan.beam sets it"]
+    reach = pixels[1] / 2 * pitch[1]
+    parted = reach * reach / (source + (detector or 0.0)) / pitch[1]
+    lines.append(f"found: source {source:.6g} mm before the sample" + (f", detector {detector:.6g} mm behind" * bool(detector)))
+    if parted < 0.5 or detector is None:
+        why = (
+            f"rays of the cone part by {parted:.2g} pixels within the sample"
+            if detector
+            else "the detector's distance is unknown"
+        )
+        return [*lines, f"chosen: a parallel beam, because {why}"]
+    scan |= {"beam": "cone", "source_to_axis": source, "source_to_detector": source + detector}
+    return [*lines, f"chosen: a cone beam, because its rays part by {parted:.2g} pixels within the sample"]
+
+
+def _draft_grid(scan: dict[str, Any], rows: int, columns: int) -> tuple[dict[str, Any], list[str]]:
+    """Voxels as large as a pixel at the axis, or larger by a whole factor if the memory does not hold them."""
+    pitch = np.broadcast_to(scan.get("pitch", 1.0), (2,)).astype(float)
+    if scan["beam"] == "cone":
+        pitch = pitch * scan["source_to_axis"] / scan["source_to_detector"]
+    free = available_memory()
+    factor = 1 if free is None else max(1, math.ceil((2 * VOXEL_BYTES * rows * columns**2 / free) ** (1 / 3)))
+    shape = [max(1, -(-rows // factor)), -(-columns // factor), -(-columns // factor)]
+    # A scan of few rows keeps their height: the box must not become higher than what the rows see.
+    height = pitch[0] * rows / shape[0]
+    edges = [float(f"{edge:.8g}") for edge in (pitch[1] * factor, pitch[1] * factor, height)]
+    size = f"{shape[0]} x {shape[1]} x {shape[2]} voxels of {factor} pixel" + "s" * (factor > 1)
+    why = "the whole detector" if factor == 1 else f"voxels of a pixel need more than half of {free / 2**30:.0f} GiB"
+    return {"shape": shape, "voxel_size": edges if len(set(edges)) > 1 else edges[0]}, [f"chosen: {size}, {why}"]
+
+
+def _finish(raw: dict[str, Any], lines: list[str], views: int) -> ScanDraft:
+    if views >= FEW_VIEWS:
+        raw = {"held_out_every": HELD_OUT} | raw
+        lines = [*lines, f"chosen: every {HELD_OUT}th view is predicted and not fitted, to judge the result"]
+    return ScanDraft(raw, tuple(lines))
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + "s" * (number != 1)
+
+
+def _one_file(path: Path, recognise: Callable[[Path], bool]) -> tuple[Path, list[str]]:
+    """The file itself, or the only file of its kind in a folder.
+
+    Raises:
+        MivolError: several files.
+    """
+    if path.is_file():
+        return path, []
+    files = [file for file in sorted(path.iterdir(), key=natural_order) if recognise(file)]
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files[:4])
+        raise refusal(path, f"{len(files)} scans ({names})", "one", "name the file")
+    return files[0], [f"found: {files[0].name} in {path}"]
+
+
+# -- Nikon -----------------------------------------------------------------------------------------------------------------
+
+
+def _is_nikon(path: Path) -> bool:
+    if not path.is_file() or path.suffix.lower() != ".xtekct":
+        return False
+    with path.open("rb") as file:
+        return f"[{SECTION}]".encode() in file.read(4096).lower()
+
+
+def _draft_nikon(path: Path, given: dict[str, Any]) -> ScanDraft:
+    path, lines = _one_file(path, _is_nikon)
+    scan = read_nikon(path)
+    rows, columns = scan.detector
+    lines += [
+        f"found: a Nikon scan of {_count(len(scan.images), 'view')} of {rows} x {columns} pixels of {scan.pitch[1]:.6g} mm",
+        f"found: {scan.source_to_axis:.6g} mm from source to axis, {scan.source_to_detector:.6g} mm to the detector",
+        f"found: white level {scan.white_level:g}, angles from {scan.angles[0]:.4g} to {scan.angles[-1]:.4g} degrees",
+    ]
+    raw: dict[str, Any] = {"scan": {"beam": "data"}, "data": {"source": "nikon", "file": str(path)}}
+    if scan.shape is None:
+        beam = {"beam": "cone", "pitch": scan.pitch} | {
+            "source_to_axis": scan.source_to_axis, "source_to_detector": scan.source_to_detector
+        }  # fmt: skip
+        raw["grid"], more = _draft_grid(beam, rows, columns)
+        lines += more
+    return _finish(raw, lines, len(scan.images))
+
+
+# -- TIFF ------------------------------------------------------------------------------------------------------------------
+
+
+class ImageGroup(NamedTuple):
+    """Images whose names differ in their numbers: a name with "#" for numbers, and the files."""
+
+    name: str
+    files: list[Path]
+
+    @property
+    def words(self) -> set[str]:
+        """Words of the name, in lower case; "i0" is one."""
+        return set(re.findall(r"i0|[a-z]+", self.name.lower().rpartition(".")[0].replace("#", "0")))
+
+    @property
+    def size(self) -> int:
+        """Size of all files [byte]."""
+        return sum(file.stat().st_size for file in self.files)
+
+    def pattern(self) -> str:
+        """The pattern that finds these files and no others.
+
+        Raises:
+            MivolError: no such pattern.
+        """
+        first = self.files[0]
+        if len(self.files) == 1:
+            return str(first)
+        name, folder = glob.escape(first.name), first.parent
+        for number in ("*", "[0-9]*"):
+            pattern = re.sub(r"\d+", number, name)
+            if sorted(folder.glob(pattern)) == sorted(self.files):
+                return str(folder / pattern)
+        raise refusal(folder, f"other images between {first.name} and its like", "one folder a kind", "move them apart")
+
+
+def group_images(folder: Path) -> list[ImageGroup]:
+    """Group the TIFF files of a folder and of the folders in it by their names without numbers; the largest groups first."""
+    groups: dict[str, list[Path]] = {}
+    inner = [entry for entry in folder.iterdir() if entry.is_dir()]
+    for file in (file for place in (folder, *inner) for file in place.iterdir()):
+        if file.suffix.lower() in TIFF:
+            groups.setdefault(re.sub(r"\d+", "#", str(file.relative_to(folder))), []).append(file)
+    found = [ImageGroup(name, sorted(files, key=natural_order)) for name, files in groups.items()]
+    return sorted(found, key=lambda group: -group.size)
+
+
+def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
+    groups = group_images(path)
+    darks = [group for group in groups if group.words & DARK_WORDS]
+    flats = [group for group in groups if group.words & FLAT_WORDS and group not in darks]
+    views = [group for group in groups if group not in darks and group not in flats]
+    if not views:
+        names = ", ".join(group.name for group in groups[:4])
+        raise refusal(path, f"images of flats and darks alone ({names})", "views", 'write a TOML file with source = "stack"')
+    chosen = {"views": views[0], "flats": flats[0] if flats else None, "darks": darks[0] if darks else None}
+    images = {role: read_images(group.files[:1]) for role, group in chosen.items() if group}
+    counts = {role: len(group.files) * len(images[role]) if group else 0 for role, group in chosen.items()}
+    rows, columns = images["views"].shape[1:]
+    lines = [f"found: {chosen['views'].name}: {_count(counts['views'], 'view')} of {rows} x {columns} pixels"]
+    lines += [f"found: {g.name}: {_count(counts[role], role[:-1])}" for role, g in chosen.items() if g and role != "views"]
+    left = [group.name for group in groups if group not in chosen.values()]
+    lines += [f"found: {', '.join(left)}: not used; data.file, data.flats and data.darks name others"] if left else []
+    data: dict[str, Any] = {"source": "stack", "file": chosen["views"].pattern()}
+    if flats:
+        data |= {"reading": "intensity", "flats": flats[0].pattern()} | ({"darks": darks[0].pattern()} if darks else {})
+    else:
+        data["reading"], why = guess_reading(path, images["views"][0])
+        lines.append(f"assumed: no flats, and {why}: the pixels are taken as {data['reading']}s; data.reading sets it")
+    lines.append("assumed: the first row of an image is the highest; data.first_row sets it")
+    data["first_row"] = "highest"
+    scan: dict[str, Any] = {"beam": "parallel"}
+    three = _three_views(
+        chosen["views"].files, *(images[role].mean(0) if role in images else None for role in ("flats", "darks"))
+    )
+    lines += _draft_angles(path, scan, data, counts["views"], three)
+    lines += _draft_beam(scan, None, (None, None), (rows, columns))
+    grid, more = _draft_grid(scan, rows, columns)
+    return _finish({"scan": scan, "data": data, "grid": grid}, [*lines, *more], counts["views"])
+
+
+def _draft_angles(folder: Path, scan: dict[str, Any], data: dict[str, Any], views: int, three: np.ndarray) -> list[str]:
+    """Put a file of angles, or an arc, into the settings; return lines."""
+    for file in sorted(folder.iterdir(), key=natural_order):
+        if file.suffix.lower() not in ANGLE_FILES:
+            continue
+        try:
+            angles = read_columns(file, 1)[:, 0]
+        except MivolError:
+            continue
+        if len(angles) == views:
+            unit = "radian" if half_turns_in_radians(angles) else "degree"
+            data |= {"angles": str(file), "angle_unit": unit}
+            return [f"found: {file.name}: angles from {angles[0]:.4g} to {angles[-1]:.4g}, taken as {unit}s by their arc"]
+    arc, why = guess_arc(three)
+    scan["arc"] = arc
+    lead = f"assumed: no file with {views} angles: views evenly over {arc:g} degrees, because"
+    return [f"{lead} {why}; scan.arc sets it"]
+
+
+def guess_reading(path: Path, view: np.ndarray) -> tuple[str, str]:
+    """Guess the quantity of a pixel from the air at both edges of a view (rows, columns): near 1, or near 0.
+
+    Raises:
+        MivolError: neither.
+    """
+    width = max(1, view.shape[1] // 20)
+    air = float(np.median(np.concatenate([view[:, :width], view[:, -width:]], axis=1)))
+    middle = float(np.median(view[:, view.shape[1] // 3 : -(view.shape[1] // 3) or None]))
+    if 0.7 < air < 1.3 and middle < air:
+        return "transmission", f"the edges have a median of {air:.3g}"
+    if abs(air) < 0.1 * middle:
+        return "line_integral", f"the edges have a median of {air:.3g}, the middle of {middle:.3g}"
+    raise refusal(
+        path,
+        f"no flats, and edges with a median of {air:.4g}",
+        "flats (light without sample), transmissions near 1 or line integrals near 0 at the edges",
+        "put flats beside the views, with flat in their names",
+    )
+
+
+def guess_arc(views: np.ndarray) -> tuple[float, str]:
+    """Guess the arc [degree] by three views (first, middle and last; rows; columns), corrected by flats.
+
+    After a turn the last view resembles the first, and the middle one the first's mirror image. After half a turn the last view
+    resembles the mirror image. Mirror images are compared at their best shift along the columns.
+    """
+    slopes = np.gradient(views, axis=-1)
+    first, middle, last = slopes
+    mirrored = -first[:, ::-1]
+    turn = min(_correlation(first, last)[0], _correlation(mirrored, middle).max())
+    half = _correlation(mirrored, last).max()
+    if turn > half:
+        return 360.0, f"the last view resembles the first (correlation {turn:.2f}; mirrored {half:.2f})"
+    return 180.0, f"the last view resembles the mirror image of the first (correlation {half:.2f}; a whole turn {turn:.2f})"
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Correlation of two images (rows, columns) by their shift along the columns."""
+    size = 2 * a.shape[1]
+    product = np.fft.irfft((np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))).sum(0), size)
+    return product / (np.linalg.norm(a) * np.linalg.norm(b) or 1.0)
+
+
+def _three_views(files: list[Path], flat: np.ndarray | None, dark: np.ndarray | None) -> np.ndarray:
+    """The first, the middle and the last view, divided by a flat if there is one."""
+    pages = [read_images([files[0]])] if len(files) == 1 else [read_images([file]) for file in (files[0], files[-1])]
+    if len(files) == 1:
+        three = pages[0][[0, len(pages[0]) // 2, -1]]
+    else:
+        three = np.stack([pages[0][0], read_images([files[len(files) // 2]])[0], pages[-1][-1]])
+    if flat is None:
+        return three
+    dark = np.zeros_like(flat) if dark is None else dark
+    return (three - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
+
+
+HDF5 = "hdf5"
+SCAN_KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, dict[str, Any]], ScanDraft]]] = {
+    "nikon": (lambda path: any(map(_is_nikon, path.iterdir() if path.is_dir() else [path])), _draft_nikon),
+    HDF5: (lambda path: any(map(is_scan, path.iterdir() if path.is_dir() else [path])), _draft_hdf5),
+    "tiff": (lambda path: path.is_dir() and bool(group_images(path)), _draft_tiff),
+}
+"""Recognition and draft of each kind of scan, in this order."""

@@ -1,0 +1,187 @@
+"""Scans without a TOML file: found by content, told from photographs, and the TOML that says the same."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from beamline_files import write_named, write_nxtomo
+from photo_sets import write_blender
+from PIL import Image
+
+from mivol import config
+from mivol.cli import main
+from mivol.errors import MivolError
+from mivol.experiments import found_scan, kinds
+from mivol.experiments.found_scan import draft_scan, find_scan
+from mivol.scene.explain import Explanation
+
+FLATS = np.full((2, 2, 32), 1000) + np.arange(2)[:, None, None]
+DARKS = np.full((2, 2, 32), 100) + np.arange(2)[:, None, None]
+
+
+def write_tiffs(folder: Path, views: int = 12) -> Path:
+    """A block of 10 columns, a little left of the middle at first, over half a turn; flats near 1000, darks near 100."""
+    folder.mkdir(parents=True)
+    angle = np.pi * np.arange(views) / views
+    place = 15.5 - 4 * np.cos(angle)
+    light = np.where(abs(np.arange(32) - place[:, None]) < 4 + np.arange(2)[:, None, None], 0.4, 1.0).transpose(1, 0, 2)
+    for name, stack in {
+        "scan12": 100 + 900 * light,
+        "flat": FLATS,
+        "dark": DARKS,
+    }.items():
+        for number, image in enumerate(stack):
+            Image.fromarray(image.astype("u2")).save(folder / f"{name}_{number:04d}.tif")
+    return folder
+
+
+def test_settings_of_a_nexus_file(tmp_path: Path) -> None:
+    """What is found, assumed and chosen; a change of the command line comes first."""
+    path = write_nxtomo(write_nxtomo(tmp_path / "a.nxs"), "entry2")
+    draft = draft_scan(path)
+    assert draft.raw["scan"] == {"beam": "parallel", "pitch": [0.004, 0.002]}
+    assert draft.raw["data"] == {"source": "measured", "file": str(path)}
+    assert draft.raw["grid"] == {"shape": [2, 3, 3], "voxel_size": [0.002, 0.002, 0.004]}
+    assert draft.lines[:2] == (
+        "found: NXtomo, entry entry: 5 views of 2 x 3 pixels, 2 flats, 2 darks",
+        "found: the file has 2 scans, entry, entry2: entry is read, data.group names another",
+    )
+    assert "found: angles from 0 to 144 degrees" in draft.lines
+    assert "chosen: a parallel beam, because rays of the cone part by 8.2e-08 pixels within the sample" in draft.lines
+    changed = draft_scan(path, ["data.group=entry2", "data.rows=[1, 2]", "title=mine"]).raw
+    assert changed["data"]["group"] == "entry2" and changed["grid"]["shape"] == [1, 3, 3] and changed["title"] == "mine"
+
+
+def test_a_source_nearby_makes_a_cone(tmp_path: Path) -> None:
+    """3 pixels of 2 um: rays at the edge, 3 um off, part by 9e-6 mm^2 / D within the sample, half a pixel for D = 9e-3 mm."""
+    path = write_nxtomo(tmp_path / "a.nxs")
+    for source, beam in ((8e-6, "cone"), (10e-6, "parallel")):
+        with h5py.File(path, "a") as file:
+            del file["entry/instrument/source/distance"], file["entry/instrument/detector/distance"]
+            file["entry/instrument/source/distance"], file["entry/instrument/detector/distance"] = -source, 1e-9
+        raw = draft_scan(path).raw
+        assert raw["scan"]["beam"] == beam
+
+
+@pytest.mark.parametrize("kind", ["nxtomo", "named", "tiff"])
+def test_the_toml_says_the_same(tmp_path: Path, kind: str) -> None:
+    names = ["data.data=scan/camera/frames", "data.flats=before/reference", "data.angles=scan/stage", 'title=a "b"']
+    if kind == "tiff":
+        path, changes = write_tiffs(tmp_path / "scan"), []
+    elif kind == "named":
+        path, changes = write_named(tmp_path / "a.h5"), names
+    else:
+        path, changes = write_nxtomo(tmp_path / "a.he5"), []
+    draft = draft_scan(path, changes)
+    assert tomllib.loads(draft.toml) == draft.raw
+    (tmp_path / "fit.toml").write_text(draft.toml)
+    assert config.load(tmp_path / "fit.toml") == config.from_dict(draft.raw)
+
+
+def test_a_folder_of_images(tmp_path: Path) -> None:
+    """Flats and darks by words of their names, whatever else lies there; folders of a kind each serve as well."""
+    folder = write_tiffs(tmp_path / "hair_flat")
+    Image.fromarray(np.zeros((2, 3), "u2")).save(folder / "preview.tif")
+    draft = draft_scan(folder)
+    assert draft.raw["data"] == {
+        **{"source": "stack", "file": f"{folder}/scan*_*.tif", "reading": "intensity", "first_row": "highest"},
+        **{"flats": f"{folder}/flat_*.tif", "darks": f"{folder}/dark_*.tif"},
+    }
+    assert draft.raw["scan"] == {"beam": "parallel", "arc": 180.0} and "held_out_every" not in draft.raw
+    assert any("preview.tif: not used" in line for line in draft.lines)
+    (folder / "theta.txt").write_text("\n".join(map(str, np.linspace(0, np.pi, 16)[:12])))
+    assert draft_scan(folder).raw["data"]["angle_unit"] == "degree"
+    for name in ("proj", "Flats", "dark_field"):
+        (tmp_path / "two" / name).mkdir(parents=True)
+        for file in folder.glob(f"{ {'proj': 'scan12'}.get(name, name[:4].lower()) }_*.tif"):
+            file.rename(tmp_path / "two" / name / file.name.replace(file.name[:4], "img_"))
+    data = draft_scan(tmp_path / "two").raw["data"]
+    assert {Path(data[role]).parent.name for role in ("file", "flats", "darks")} == {"proj", "Flats", "dark_field"}
+
+
+def test_names_that_no_pattern_tells_apart(tmp_path: Path) -> None:
+    """``a_*.tif`` and ``a_[0-9]*.tif`` find both ``a_1.tif`` and ``a_1x2.tif``."""
+    for name in ("a_1.tif", "a_2.tif", "a_1x2.tif"):
+        Image.fromarray(np.zeros((2, 3), "u2")).save(tmp_path / name)
+    groups = {group.name: group for group in found_scan.group_images(tmp_path)}
+    with pytest.raises(MivolError, match="other images between a_1.tif and its like"):
+        groups["a_#.tif"].pattern()
+    (tmp_path / "a_1x2.tif").rename(tmp_path / "a_x2.tif")
+    (group,) = (group for group in found_scan.group_images(tmp_path) if group.name == "a_#.tif")
+    assert group.pattern() == f"{tmp_path}/a_[0-9]*.tif"
+
+
+BLOCKS = {"unlike": ((1, 12, 0), (2, 9, 2)), "even at first": ((1, 12, np.pi / 2), (1, 12, -np.pi / 2), (1, 6, np.pi / 2))}
+
+
+@pytest.mark.parametrize(("arc", "blocks"), [(180.0, "unlike"), (360.0, "unlike"), (180.0, "even at first")])
+def test_the_arc_is_guessed_by_likeness(arc: float, blocks: str) -> None:
+    """Blocks of a density, at a distance from an axis off the middle, 90 views of three rows.
+
+    An object that is its own mirror image at first resembles itself after half a turn; only the middle view tells.
+    """
+    angle = np.radians(arc) * np.array([0, 45, 89])[:, None] / 90
+    views = sum(h * np.exp(-(((np.arange(64) - 34 - r * np.cos(angle + p)) / 3) ** 2)) for h, r, p in BLOCKS[blocks])
+    assert found_scan.guess_arc(np.stack([views] * 3, axis=1))[0] == arc
+
+
+def test_readings_without_flats(tmp_path: Path) -> None:
+    """Air near 1 is a transmission, air near 0 a line integral, and readings of a camera are refused."""
+    view = np.ones((2, 40))
+    view[:, 10:30] = 0.3
+    assert found_scan.guess_reading(tmp_path, view)[0] == "transmission"
+    assert found_scan.guess_reading(tmp_path, -np.log(view))[0] == "line_integral"
+    with pytest.raises(MivolError, match="no flats, and edges with a median of 1000"):
+        found_scan.guess_reading(tmp_path, 1000 * view)
+
+
+def test_photographs_are_no_scan(tmp_path: Path) -> None:
+    """Cameras decide, even beside TIFF files; neither are other files, and a folder of several scans is asked about."""
+    photos = write_blender(tmp_path / "photos")
+    Image.fromarray(np.zeros((2, 3), "u2")).save(photos / "a.tif")
+    assert find_scan(photos) is None and find_scan(tmp_path / "nothing") is None
+    (tmp_path / "notes.txt").write_text("0")
+    assert find_scan(tmp_path / "notes.txt") is None
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    path = write_nxtomo(folder / "a.nxs")
+    assert find_scan(folder) == find_scan(path) == "hdf5"
+    assert draft_scan(folder).raw["data"]["file"] == str(path)
+    write_nxtomo(folder / "b.nxs")
+    with pytest.raises(MivolError, match=r"2 scans \(a.nxs, b.nxs\), expected one"):
+        draft_scan(folder)
+
+
+def test_a_grid_that_the_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice 320 bytes for each of 8 x 16 x 16 voxels: half of the edge needs an eighth. Rows keep their whole height."""
+    scan = {"beam": "parallel", "pitch": 0.5}
+    for free, shape, edges in ((2 * 320 * 2048, [8, 16, 16], 0.5), (2 * 320 * 2047, [4, 8, 8], 1.0)):
+        monkeypatch.setattr(found_scan, "available_memory", lambda free=free: free)
+        assert found_scan._draft_grid(scan, 8, 16)[0] == {"shape": shape, "voxel_size": edges}
+    assert found_scan._draft_grid(scan, 9, 17)[0] == {"shape": [5, 9, 9], "voxel_size": [1.0, 1.0, 0.9]}
+
+
+def test_the_verbs_take_a_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """explain prints the TOML after the facts; optimize says the lines and keeps them for the page."""
+    path, contexts = write_nxtomo(tmp_path / "a.nxs"), []
+    monkeypatch.setattr(kinds, "run_experiment", lambda context: contexts.append(context) or "page")
+    monkeypatch.setattr(kinds, "explain_experiment", lambda *asked: Explanation(("steps",)))
+    draft = draft_scan(path)
+    assert main(["explain", str(path)]) == main(["optimize", str(path), "--set", "title=a"]) == 0
+    said = capsys.readouterr()
+    assert said.out.startswith("\n".join([*draft.lines, "steps"])) and said.out.endswith(f"{draft.toml}\npage\n")
+    assert contexts[0].notes == draft.lines and all(line in said.err for line in draft.lines)
+    assert main(["explain", str(write_named(tmp_path / "b.he5"))]) == 1
+    assert "name the datasets: data.data" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_folder_becomes_a_volume(tmp_path: Path, variant_rgb) -> None:
+    folder = write_tiffs(tmp_path / "scan", views=48)
+    assert main(["optimize", str(folder), "--set", "solve.iterations=1", "-o", str(tmp_path / "run")]) == 0
+    assert (tmp_path / "run" / "volumes" / "reconstruction.npz").is_file()
+    assert "evenly over 180 degrees" in (tmp_path / "run" / "run.json").read_text()
