@@ -193,7 +193,7 @@ def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
         MivolError: an unreadable file, or files of different sizes.
     """
     data, readings = settings.data, read_scan(settings, base)
-    notes, angles = list(readings.notes), readings.angles
+    notes, angles = [*readings.notes, *readings.transmission.notes], readings.angles
     if angles is not None:
         notes += note_order(angles)
     y, weights = to_line_integrals(normalise_air(readings.transmission, data.air) if data.air else readings.transmission)
@@ -209,8 +209,9 @@ def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
         geometry = make_beam(settings, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
+    is_noise_known = readings.intensity is not None and readings.transmission.is_noise_known
     quanta = count_measured_quanta(settings, readings) if ALL_SOLVERS[settings.solve.solver].problem is PoissonCounts else None
-    return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=readings.intensity is not None)
+    return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=is_noise_known)
 
 
 def resolve_axis(

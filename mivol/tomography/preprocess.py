@@ -17,10 +17,15 @@ from mivol.errors import MivolError
 
 @dataclass(frozen=True, eq=False)
 class Transmission:
-    """Transmission and its variance, both (views, rows, cols) float64; not finite for readings that are not finite."""
+    """Transmission and its variance, both (views, rows, cols) float64; not finite for readings that are not finite.
+
+    Without ``is_noise_known``, only ratios of variances are known. ``notes`` say what the flats and darks do not tell.
+    """
 
     value: np.ndarray
     variance: np.ndarray
+    is_noise_known: bool = True
+    notes: tuple[str, ...] = ()
 
 
 # -- Readings to line integrals -----------------------------------------------------------------------------------------
@@ -35,7 +40,7 @@ def assume_quantum_noise(transmission: np.ndarray) -> Transmission:
     The size of the noise, ``UNKNOWN_NOISE``, matters only to a solver with a prior.
     """
     t = np.asarray(transmission, np.float64)
-    return Transmission(t, np.maximum(t, 0.0) * UNKNOWN_NOISE)
+    return Transmission(t, np.maximum(t, 0.0) * UNKNOWN_NOISE, is_noise_known=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +49,11 @@ class Calibration:
 
     Attributes:
         dark, light: (rows, cols) mean reading without light, and the reading added by light; ``light`` is NaN at a dead pixel.
-        dark_variance: variance of a reading without light, pooled over all pixels.
-        gain: reading per quantum, from the additional scatter of the flats, pooled over all pixels.
+        dark_variance: variance of a reading without light, pooled over all pixels; 0 for a single dark.
+        gain: reading per quantum, from the additional scatter of the flats, pooled over all pixels; NaN without scatter.
         n_flats, n_darks: numbers of flats and darks.
         saturation: smallest saturated reading.
+        notes: what the flats and darks do not tell.
     """
 
     dark: np.ndarray
@@ -57,6 +63,7 @@ class Calibration:
     n_flats: int
     n_darks: int
     saturation: float = np.inf
+    notes: tuple[str, ...] = ()
 
     def signal(self, readings: np.ndarray) -> np.ndarray:
         """Readings minus the dark reading; NaN at dead or saturated pixels."""
@@ -69,22 +76,20 @@ def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, satura
 
     Args:
         readings: (views, rows, cols); only the shape is used.
-        flats: (n_flats, rows, cols), at least 2.
-        darks: (n_darks, rows, cols), at least 2.
+        flats: (n_flats, rows, cols), at least 1. The scatter of 2 or more gives the noise; copies of one flat count as one.
+        darks: (n_darks, rows, cols), at least 1. Without the scatter of 2 or more, the flats' scatter is all of quanta.
         saturation: smallest saturated reading.
 
     Raises:
-        MivolError: shapes that do not fit, too few fields, or at least half of the pixels dead.
+        MivolError: shapes that do not fit, no flat or dark, or at least half of the pixels dead.
     """
     if readings.ndim != 3 or not readings.shape[1:] == flats.shape[1:] == darks.shape[1:]:
         raise MivolError(
             f"Found readings {readings.shape}, flats {flats.shape} and darks {darks.shape}, "
             "expected three stacks (n, rows, cols) of one detector."
         )
-    if len(flats) < 2 or len(darks) < 2:
-        raise MivolError(
-            f"Found {len(flats)} flats and {len(darks)} darks, expected at least 2 of each: their spread is the noise."
-        )
+    if not len(flats) or not len(darks):
+        raise MivolError(f"Found {len(flats)} flats and {len(darks)} darks, expected at least 1 of each.")
     dark, light = darks.mean(0), flats.mean(0) - darks.mean(0)
     alive = (light > 0) & (flats < saturation).all(0)
     if 2 * alive.sum() <= alive.size:
@@ -93,9 +98,16 @@ def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, satura
             f"Found no light, or too much, at detector pixel {pixel} and at half of all pixels or more, "
             "expected flats above darks."
         )
-    dark_variance = float(darks.var(0, ddof=1)[alive].mean())
-    gain = max(float(flats.var(0, ddof=1)[alive].mean()) - dark_variance, 0.0) / float(light[alive].mean())
-    return Calibration(dark, np.where(alive, light, np.nan), dark_variance, gain, len(flats), len(darks), saturation)
+    dark_variance = float(darks.var(0, ddof=1)[alive].mean()) if len(darks) > 1 else 0.0
+    gain, notes = np.nan, ()
+    if (np.ptp(flats, axis=0)[alive] == 0).all():
+        found = "one flat tells" if len(flats) == 1 else f"the {len(flats)} flats are copies of one image, which tell"
+        notes = (f"the noise is unknown: {found} no scatter; the noise is taken as quanta's, of a size that the fit finds",)
+    else:
+        gain = max(float(flats.var(0, ddof=1)[alive].mean()) - dark_variance, 0.0) / float(light[alive].mean())
+        if len(darks) == 1:
+            notes = ("one dark: its noise is unknown, and the scatter of the flats counts as noise of quanta",)
+    return Calibration(dark, np.where(alive, light, np.nan), dark_variance, gain, len(flats), len(darks), saturation, notes)
 
 
 def correct_transmission(
@@ -107,7 +119,7 @@ def correct_transmission(
 
     ``var T = (var(reading) + T^2 var(flat) / n_flats + (1 - T)^2 var(dark) / n_darks) / (flat - dark)^2``.
 
-    Dead and saturated pixels are NaN.
+    Dead and saturated pixels are NaN. If the flats have no scatter, the noise is that of :func:`assume_quantum_noise`.
 
     Args, raises: as :func:`calibrate`.
     """
@@ -115,10 +127,12 @@ def correct_transmission(
     known = calibrate(readings, flats, darks, saturation)
     signal = known.signal(readings)
     t = signal / known.light
+    if np.isnan(known.gain):
+        return replace(assume_quantum_noise(t), notes=known.notes)
     reading_variance = known.dark_variance + known.gain * np.maximum(signal, 0.0)
     flat_variance = known.dark_variance + known.gain * known.light
     variance = reading_variance + t**2 * flat_variance / known.n_flats + (1 - t) ** 2 * known.dark_variance / known.n_darks
-    return Transmission(t, variance / known.light**2)
+    return Transmission(t, variance / known.light**2, notes=known.notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +172,7 @@ def count_quanta(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, sat
     """
     readings, flats, darks = (np.asarray(a, np.float64) for a in (readings, flats, darks))
     known = calibrate(readings, flats, darks, saturation)
-    if known.gain <= 0:
+    if not known.gain > 0:
         raise MivolError("found flats that scatter no more than darks, expected quanta's noise: choose pcg.")
     shift = known.dark_variance / known.gain**2
     signal = known.signal(readings)

@@ -58,8 +58,8 @@ def test_transmission_and_its_variance() -> None:
         (READINGS[..., :3], FLATS, DARKS, "three stacks"),
         (READINGS, FLATS[..., :3], DARKS, "three stacks"),
         (READINGS, FLATS, DARKS[..., :3], "three stacks"),
-        (READINGS, FLATS[:1], DARKS, "Found 1 flats and 3 darks"),
-        (READINGS, FLATS, DARKS[:1], "Found 2 flats and 1 darks"),
+        (READINGS, FLATS[:0], DARKS, "Found 0 flats and 3 darks, expected at least 1"),
+        (READINGS, FLATS, DARKS[:0], "Found 2 flats and 0 darks, expected at least 1"),
         (READINGS[..., 1:3], FLATS[..., 1:3], DARKS[..., 1:3], r"at detector pixel \(0, 1\)"),
     ],
 )
@@ -68,6 +68,31 @@ def test_fields_that_calibrate_nothing(readings: np.ndarray, flats: np.ndarray, 
     with pytest.raises(MivolError, match=sentence):
         preprocess.calibrate(readings, flats, darks)
     preprocess.calibrate(READINGS[..., 1:], FLATS[..., 1:], DARKS[..., 1:])
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_flats_without_scatter_tell_no_noise(copies: int) -> None:
+    """One flat, or copies of one: transmissions as ever, the noise of quanta in ratios alone, and no quanta to count."""
+    flats = np.repeat(FLATS[:1], copies, axis=0)
+    found = preprocess.correct_transmission(READINGS, flats, DARKS, 131)
+    light = np.array([88.0, 97, 78, 68])
+    alive = [0, 1, 3, 4]
+    t = (READINGS[:, 0, alive] - [12, 13, 12, 12]) / light
+    np.testing.assert_allclose(found.value[:, 0, alive], t, rtol=1e-14)
+    np.testing.assert_allclose(found.variance[:, 0, alive], np.maximum(t, 0) * preprocess.UNKNOWN_NOISE, rtol=1e-14)
+    assert np.isnan(found.value[:, 0, 2]).all() and not found.is_noise_known
+    reason = "one flat tells" if copies == 1 else "the 3 flats are copies of one image, which tell"
+    assert found.notes[0].startswith(f"the noise is unknown: {reason} no scatter")
+    with pytest.raises(MivolError, match="choose pcg"):
+        count_quanta(READINGS, flats, DARKS)
+    assert preprocess.correct_transmission(READINGS, FLATS, DARKS).is_noise_known
+
+
+def test_one_dark_leaves_its_noise_to_the_quanta() -> None:
+    found = preprocess.calibrate(READINGS, FLATS, DARKS[1:2])
+    assert (found.dark_variance, found.gain, found.n_darks) == (0, pytest.approx(200 / (371 / 4)), 1)
+    assert found.notes == ("one dark: its noise is unknown, and the scatter of the flats counts as noise of quanta",)
+    assert preprocess.correct_transmission(READINGS, FLATS, DARKS[1:2]).notes == found.notes
 
 
 def test_quanta_of_a_pixel() -> None:
