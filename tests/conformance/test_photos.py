@@ -44,7 +44,7 @@ from mivol.photos import (
     survey_photos,
     undistort,
 )
-from mivol.photos.photo_file import decode_srgb, read_photo, read_photo_header, shrink
+from mivol.photos.photo_file import decode_srgb, read_photo, read_photo_header
 
 EPS = float(np.finfo(np.float32).eps)
 
@@ -160,11 +160,6 @@ def overlaps(old: int, new: int) -> np.ndarray:
     return np.maximum(high - low, 0) * new / old
 
 
-def test_shrink_keeps_the_mean() -> None:
-    image = np.random.default_rng(1).random((7, 11, 3))
-    assert shrink(image, (4, 5)).mean() == pytest.approx(image.mean(), abs=4 * EPS)
-
-
 def test_missing_photographs_are_skipped_and_listed(blender: Path) -> None:
     (blender / "train" / "r_1.png").unlink()
     photos = load_photos(blender, background="white")
@@ -172,10 +167,6 @@ def test_missing_photographs_are_skipped_and_listed(blender: Path) -> None:
     assert [view.name for view in photos.views] == ["r_0.png", "r_2.png", "r_3.png"]
     assert "./train/r_1" in photos.describe()
     assert describe_photos(photos)[-1] == "1 listed photographs are missing: ./train/r_1 ..."
-
-
-def test_a_whole_data_set_misses_nothing(blender: Path) -> None:
-    assert not any("missing" in note for note in describe_photos(load_photos(blender, background="white")))
 
 
 def test_held_out_photographs_leave_the_training_split(blender: Path) -> None:
@@ -268,12 +259,6 @@ def test_invalid_angles_of_view_are_refused(tmp_path: Path, angle: float) -> Non
     folder = write_transforms(tmp_path / "set", {"camera_angle_x": angle})
     with pytest.raises(MivolError, match=f"camera_angle_x = {angle:g}, expected an angle between 0 and pi"):
         load_photos(folder)
-
-
-def test_transforms_with_lists_of_splits(tmp_path: Path) -> None:
-    folder = write_transforms(tmp_path / "set", {"fl_x": 20, "test_filenames": ["images/0002.png"]})
-    assert [view.name for view in load_photos(folder, split="test").views] == ["0002.png"]
-    assert len(load_photos(folder).views) == 3
 
 
 @pytest.mark.parametrize("prefix", ["", "./", "../set/"])

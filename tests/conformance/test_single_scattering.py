@@ -23,7 +23,7 @@ from false_alarms import (
     fresh,
     over_pixels,
 )
-from scattering_scenes import PLACE, assert_same_images, close_up, fog, mivol, moments, point, rough_grid, smoke, volpath
+from scattering_scenes import PLACE, assert_same_images, close_up, mivol, moments, point, rough_grid, smoke, volpath
 from volpath_scenes import BARE, FOG, LEAK, RED, area, behind_a_mask, cube, floor, grid_in, lit, same, square, turn
 
 import scenes
@@ -32,9 +32,6 @@ from mivol.validate.reference import render_reference
 from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, rotation
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
-
-
-# -- Emitters -----------------------------------------------------------------------------------------------------------
 
 
 # -- Boundaries, media, places of the camera -------------------------------------------------------------------------
@@ -77,16 +74,6 @@ def mirrors() -> dict:
 
 
 PLACES = {
-    "homogeneous box": lambda: {"fog": fog(0.9, name="hg", g=0.3)[0]},
-    "homogeneous ball": lambda: {"fog": ball_of(medium("homogeneous", 1.3, 0.8, phase={"type": "rayleigh"}), (0, 0, 0), 0.9)},
-    "rgb albedo": lambda: {"smoke": grid_in(cube(PLACE), albedo={"type": "rgb", "value": [0.0, 0.5, 1.0]})},
-    "rgb albedo, own": lambda: {"smoke": grid_in(cube(PLACE), "own", albedo={"type": "rgb", "value": [0.0, 0.5, 1.0]})},
-    "albedo grid": lambda: {
-        "smoke": grid_in(cube(PLACE), albedo=grid_volume("gridvolume", rough_grid(9, 1.0, (3, 2, 7)), PLACE))
-    },
-    "albedo grid, own": lambda: {
-        "smoke": grid_in(cube(PLACE), "own", albedo=grid_volume("mivol_voxels", rough_grid(9, 1.0, (3, 2, 7)), PLACE))
-    },
     "albedo grid in a homogeneous": lambda: {
         "fog": box_of(medium("homogeneous", 0.8, grid_volume("gridvolume", rough_grid(9, 1.0, (3, 2, 7)), PLACE)), PLACE)
     },
@@ -251,14 +238,6 @@ def test_depth_2_is_one_turn():
     # Measured once: 0.07, 0.33 and 0.56.
     assert_apart(two, one, expected=0.26, what="one turn and none")
     assert_apart(deeper, two, expected=0.23, what="four turns and one")
-
-
-@pytest.mark.statistical
-@pytest.mark.slow
-def test_a_medium_that_only_absorbs_may_go_deeper():
-    box, _ = smoke(rough_grid(8), albedo=0.0)
-    parts = {"smoke": box, "sky": scenes.sky(1.0), "floor": square(0, 0, -1.5, 3.0) | {"bsdf": RED}}
-    assert_same_images(close_up(parts), ours=mivol(max_depth=5), stock=volpath(max_depth=5), rounding=LEAK)
 
 
 # -- Samplers, recordings, variants --------------------------------------------------------------------------------------

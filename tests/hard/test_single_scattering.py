@@ -14,7 +14,6 @@ from hard_scattering import BATCHES, holds_twin
 from scattering_scenes import PLACE, aimed, fog, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
-from mivol.errors import MivolError
 from scenes import as_float32, box_of, centred, grid_volume, medium, refused, tensor
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -226,11 +225,3 @@ def test_surfaces_shine_on_the_medium_only_directly():
     assert not scenes.render(dark.scene, mivol(), 64).any()
     lit = pencils({"smoke": box, "floor": floor | {"emitter": {"type": "area", "radiance": 1.0}}}, *ray)
     assert scenes.render(lit.scene, mivol(), 64).min() > 0.01
-
-
-def test_refusals_are_of_our_kind():
-    """A refusal is a MivolError with one sentence."""
-    box, _ = smoke(rough_grid(14))
-    seen = pencils({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, *aimed(14, 1))
-    with pytest.raises(MivolError, match=r"^[^.]*(\.[^ ][^.]*)*\.$"):
-        mi.load_dict(mivol(max_depth=5, deterministic=True)).render(seen.scene)
