@@ -131,7 +131,8 @@ def traced_balls(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def two_threads(variant_rgb: str) -> None:
-    """The pool has two threads at least, as a user's has: both add to one gradient; Mitsuba reads an EXR with the second."""
+    """The pool has two threads at least, as a user's has, whose scripts a test may run: both add to one gradient. Mitsuba waits
+    for ever for the second to read an EXR or to write one."""
     set_thread_count(max(2, drjit.thread_count()))
 
 

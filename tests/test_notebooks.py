@@ -56,7 +56,7 @@ def test_each_is_run() -> None:
 
 
 @pytest.mark.slow
-def test_light_in_a_smoke(variant_rgb: str, no_window: None, capsys: pytest.CaptureFixture[str]) -> None:
+def test_light_in_a_smoke(two_threads: None, no_window: None, capsys: pytest.CaptureFixture[str]) -> None:
     """No ray through the cube is longer than its diagonal; a white sky is given back by what scatters; all is finite."""
     left = executed("light_in_a_smoke")
     assert left["image"].min() >= np.exp(-2 * np.sqrt(3)) * (1 - 1e-5)  # float32, a hundred roundings
@@ -67,7 +67,7 @@ def test_light_in_a_smoke(variant_rgb: str, no_window: None, capsys: pytest.Capt
 
 @pytest.mark.slow
 def test_mivol_in_ten_minutes(
-    variant_rgb: str, no_window: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    two_threads: None, no_window: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """mivol halves the error of the start and ends below ``prbvolpath``; the plan is printed; the curves hold finite times."""
     monkeypatch.chdir(tmp_path)

@@ -152,7 +152,7 @@ Script = Callable[..., str]
 
 
 @pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, variant_rgb: str) -> Script:
+def script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, two_threads: None) -> Script:
     """A function that runs a script of a scene as a program, in this process, and returns what it prints."""
 
     def run(name: str, *arguments: object, file: str = "", **environment: str) -> str:

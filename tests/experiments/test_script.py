@@ -150,7 +150,7 @@ def test_scripts_of_the_docs_are_short(path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_scripts_of_the_docs_run(variant_rgb: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scripts_of_the_docs_run(two_threads: None, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten pictures of a denser cube: its density is found to a tenth, and the light that is put in its place is orange."""
     monkeypatch.chdir(folder)
     sky = '<emitter type="constant" id="sky"><rgb name="radiance" value="1"/></emitter>'
@@ -174,7 +174,7 @@ def test_scripts_of_the_docs_run(variant_rgb: str, folder: Path, monkeypatch: py
 
 
 @pytest.mark.slow
-def test_the_first_example_has_a_derivative(variant_rgb: str) -> None:
+def test_the_first_example_has_a_derivative(two_threads: None) -> None:
     """Before a white sky more smoke of albedo 0.8 darkens the picture: on the whole the derivative is below 0."""
     made = runpy.run_path(str(SCRIPTS / "gradient.py"))
     slope = np.array(dr.grad(made["params"]["smoke.interior_medium.sigma_t.data"]))
