@@ -405,7 +405,7 @@ class ScanExperiment(Section):
 class Photographs(Section):
     """Posed photographs."""
 
-    path: Annotated[str, setting("path", "folder or cameras: Blender, nerfstudio, instant-ngp, COLMAP", min_length=1)]
+    path: Annotated[str, setting("path", "folder or cameras: Blender, nerfstudio, instant-ngp, COLMAP, LLFF", min_length=1)]
     scale: Annotated[float, setting("1", "factor on width and height, by exact area means", gt=0, le=1)] = 1.0
     largest: Annotated[int, setting("pixel", "longest edge of a photograph; absent: scale", ge=16)] | None = None
     background: Annotated[
@@ -413,8 +413,8 @@ class Photographs(Section):
         setting(
             "1",
             "colour behind the model: white, black or an rgb triple; with alpha also random (a colour per image); without "
-            "alpha also sky (fitted with the field) or nested (a sky, and boxes of twice the extent each); empty: no alpha, "
-            "and the preset's, else black",
+            "alpha also sky (fitted with the field) or nested (a sky, and boxes of twice the extent each); empty: white with "
+            "alpha, else the preset's, or black",
         ),
     ] = ""
     held_out: Annotated[int, setting("view", "step between training views that are not fitted; 0: none", ge=0)] = 8
@@ -643,18 +643,26 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
         raise MivolError(f"{name}: {reason}") from None
 
 
-def of_photographs(path: Path, preset: str, changes: Sequence[str] = ()) -> FieldExperiment:
+MODELS = {"gaussians": "gaussians", "grid": "field"}
+"""Table of a model's settings, by the word of ``mivol optimize --as``; the first word is the default."""
+
+
+def of_photographs(
+    path: Path, model: str = "gaussians", preset: str | None = None, changes: Sequence[str] = ()
+) -> PhotoExperiment:
     """Make the experiment of photographs without a TOML file.
 
     Args:
         path: folder of photographs, or file of cameras.
-        preset: value of ``field.preset``.
+        model: key of ``MODELS``.
+        preset: preset of that model; by default ``gaussians.preset`` or ``field.preset`` of an empty file.
         changes: as in :func:`load`.
 
     Raises:
         MivolError: as :func:`load`.
     """
-    raw = {"title": path.resolve().name, "photos": {"path": str(path)}, "field": {"preset": preset}}
+    table = {} if preset is None else {"preset": preset}
+    raw = {"title": path.resolve().name, "photos": {"path": str(path)}, MODELS[model]: table}
     for change in changes:
         apply_change(raw, change)
     return from_dict(raw, str(path))

@@ -22,6 +22,7 @@ IMPORTED_AS = {
     "scikit-image": "skimage",
     "flip-evaluator": "flip_evaluator",
     "imageio-ffmpeg": "imageio_ffmpeg",
+    "pillow-heif": "pillow_heif",
 }
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

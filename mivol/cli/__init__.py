@@ -147,6 +147,20 @@ def scene_flags(text: str = "scene: Mitsuba XML") -> list[tuple[tuple[str, ...],
     ]
 
 
+def model_flags(text: str) -> list[tuple[tuple[str, ...], dict[str, Any]]]:
+    """Flags for the model of a fit to photographs."""
+    from mivol.config import MODELS
+
+    return [
+        flag("--as", dest="model", choices=tuple(MODELS), help=f"for photographs: {text}"),
+        flag(
+            "--preset",
+            help="preset of that model; of Gaussians: minute (default), minutes, fine, ...; of a grid: cpu (default) for an "
+            "object, capture for a place around the cameras, ...",
+        ),
+    ]
+
+
 def explain_flags() -> list:
     """Flags of ``mivol explain``."""
     return [
@@ -155,7 +169,7 @@ def explain_flags() -> list:
             "scan (HDF5, .xtekct, folder), or photographs (folder, file)"
         ),
         flag("-o", "--output", type=Path, help="image (.png, .svg) of the cameras of photographs, and of the boxes"),
-        flag("--preset", help="for photographs: explain the fit of mivol optimize --preset (capture, cpu, ...)"),
+        *model_flags("explain the fit of mivol optimize with this --as"),
         list_flag("--set", "key=value", "override a setting of the experiment"),
         DATASET,
         MAX_DEPTH,
@@ -216,7 +230,7 @@ def optimize_flags() -> list:
             type=Path,
             help="experiment (.toml), a scan (HDF5, .xtekct, folder), or posed photographs: a folder or a file of cameras",
         ),
-        flag("--preset", help="for photographs without a TOML file: capture for a place around the cameras, cpu for an object"),
+        *model_flags("without a TOML file: the fitted model (default: gaussians)"),
         list_flag("--set", "key=value", "override a setting of the experiment"),
         flag("-o", "--output", type=Path, help="run folder (default: the experiment's output)"),
         flag("--resume", action="store_true", help="continue from the checkpoint in the run folder"),
@@ -367,7 +381,8 @@ def draft_of(path: Path, arguments: argparse.Namespace, is_volume: bool = False)
     from mivol.experiments.found_scan import draft_scan, find_scan
     from mivol.files.hdf5 import is_hdf5
 
-    if arguments.preset is not None or getattr(arguments, "dataset", None) is not None or path.suffix.lower() == ".toml":
+    is_photographs = arguments.preset is not None or arguments.model is not None
+    if is_photographs or getattr(arguments, "dataset", None) is not None or path.suffix.lower() == ".toml":
         return None
     is_named = path.is_file() and is_hdf5(path) and (arguments.set or not is_volume)
     return draft_scan(path, arguments.set) if is_named or find_scan(path) else None
@@ -375,9 +390,10 @@ def draft_of(path: Path, arguments: argparse.Namespace, is_volume: bool = False)
 
 def _is_experiment(arguments: argparse.Namespace) -> bool:
     """Whether a fit is to be explained; refuse ``--set`` for anything else."""
-    is_experiment = arguments.scene.suffix.lower() == ".toml" or arguments.preset is not None
+    has_model = arguments.preset is not None or arguments.model is not None
+    is_experiment = arguments.scene.suffix.lower() == ".toml" or has_model
     if arguments.set and not is_experiment:
-        raise MivolError(f"--set is for fits, and {arguments.scene} is not a fit: give --preset, or the file of an experiment.")
+        raise MivolError(f"--set is for fits, and {arguments.scene} is not a fit: give --as, or the file of an experiment.")
     return is_experiment
 
 
@@ -400,7 +416,7 @@ def explain_photos(path: Path, picture: Path | None) -> int:
     print(survey.describe())
     if note := note_on_alpha(survey):
         print(note)
-    print("--preset capture explains a fit of a place around the cameras, --preset cpu a fit of an object")
+    print("--as gaussians or --as grid explains a fit; --as grid --preset capture is for a place around the cameras")
     if picture is not None:
         plot_cameras(survey, picture)
         print(picture)
@@ -533,21 +549,33 @@ def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Pat
         The settings, and the folder from which their relative paths start.
 
     Raises:
-        MivolError: photographs without a preset, a preset for another file, or as ``config.load``.
+        MivolError: a preset of the other model, a model for a file that is no data set, or as ``config.load``.
     """
     from mivol import config
     from mivol.photos import find_format
 
     if path.is_dir() or (path.suffix.lower() == ".json" and find_format(path)):
-        if arguments.preset is None:
-            raise MivolError(f"{path} holds photographs and no experiment: say how to fit them, --preset capture or cpu.")
-        return config.of_photographs(path, arguments.preset, arguments.set), Path()
-    if arguments.preset is not None:
+        model = arguments.model or next(iter(config.MODELS))
+        _check_preset(model, arguments.preset)
+        return config.of_photographs(path, model, arguments.preset, arguments.set), Path()
+    if arguments.preset is not None or arguments.model is not None:
         is_experiment = path.suffix.lower() == ".toml"
-        fault = f"--preset is for photographs, and {path} {'is an experiment' if is_experiment else 'holds none'}"
-        advice = f"--set field.preset={arguments.preset} changes it" if is_experiment else "leave it out"
+        fault = f"--as and --preset are for photographs, and {path} {'is an experiment' if is_experiment else 'holds none'}"
+        advice = "its tables [gaussians] or [field] name model and preset" if is_experiment else "leave them out"
         raise MivolError(f"{fault}: {advice}.")
     return config.load(path, arguments.set), path.parent
+
+
+def _check_preset(model: str, preset: str | None) -> None:
+    """Refuse a preset that only the other model has; a preset of no model is refused with the settings."""
+    from mivol.optim.gaussians.gaussian_plan import PRESETS as GAUSSIANS
+    from mivol.optim.photographs.radiance_plan import PRESETS as GRIDS
+
+    presets = {"gaussians": GAUSSIANS, "grid": GRIDS}
+    other = next((name for name, known in presets.items() if preset in known), model)
+    if preset not in presets[model] and other != model:
+        known = ", ".join(presets[model])
+        raise MivolError(f"--preset {preset} is a preset of --as {other}, and --as {model} has {known}: add --as {other}.")
 
 
 def validate(arguments: argparse.Namespace) -> int:

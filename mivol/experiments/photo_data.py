@@ -122,10 +122,11 @@ def note_on_alpha(survey: PhotoSurvey) -> str:
     """
     if not check_alpha(survey.frames):
         return ""
+    colour = "the colour behind them is white, or photos.background"
     if any(frame.camera.distortion.is_wide for frame in survey.frames):
-        return "alpha in all photographs: photos.background sets the colour behind them"
+        return f"alpha in all photographs: {colour}"
     box = "a fit takes the box around the opaque pixels, unless photos.box names another box"
-    return f"alpha in all photographs: photos.background sets the colour behind them; {box}"
+    return f"alpha in all photographs: {colour}; {box}"
 
 
 def add_box(settings: PhotoExperiment, photos: Photos) -> Photos:
@@ -177,6 +178,7 @@ def describe_photos(photos: Photos, judged: Photos | None = None) -> list[str]:
             f"{len(judged.views)} views are judged, the first at {width} x {height} pixels; PSNR is the mean over them, of "
             "sRGB codes of 8 bits, with the peak 1."
         )
+    notes += [f"{note[:1].upper()}{note[1:]}." for note in photos.survey.notes]
     if photos.skipped:
         notes.append(f"{len(photos.skipped)} listed photographs are missing: {', '.join(photos.skipped[:5])} ...")
     return notes

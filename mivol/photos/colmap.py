@@ -20,7 +20,8 @@ import numpy as np
 from mivol.files.source import parse_reals, read_bytes, refusal
 from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Fisheye, Lens
-from mivol.photos.listing import Entry, Listing, check_points
+from mivol.photos.listing import SHRUNK, Entry, Listing, check_points, find_image
+from mivol.photos.photo_file import SUFFIXES
 
 MODEL_NUMBERS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
@@ -90,10 +91,10 @@ def find_model(path: Path) -> Path | None:
 
 
 def read_colmap(path: Path) -> Listing:
-    """Read a sparse model with photographs in ``images/`` beside ``sparse/`` and masks in ``masks/NAME.png``.
+    """Read a sparse model with photographs in ``images/`` beside ``sparse/``.
 
     Returns:
-        Photographs sorted by name, and the points of the model.
+        Photographs sorted by name, the points of the model, and a note on photographs without a pose.
 
     Raises:
         MivolError: a camera model outside ``CAMERA_MODELS``, a truncated file, invalid numbers, an unknown camera, or a point
@@ -108,12 +109,35 @@ def read_colmap(path: Path) -> Listing:
     if points is not None:
         check_points(points.rows, points_file, "export the model again")
     visible = {} if points is None else points.by_image()
-    base = next((folder for folder in (path, *model.parents[:2]) if (folder / "images").is_dir()), path)
+    folders = ["images", *(f"images_{k}" for k in SHRUNK[1:])]
+    bases = (folder for folder in (path, *model.parents[:2]) if any((folder / name).is_dir() for name in folders))
+    base = next(bases, path)
     file = model / f"images{suffix}"
     entries = [
         _entry(base, pose, sensors, file, visible.get(pose.number)) for pose in sorted(poses, key=lambda pose: pose.name)
     ]
-    return Listing(entries, None if points is None else points.rows[:, :3])
+    notes = _note_unposed(base / "images", model, {pose.name for pose in poses}, suffix)
+    return Listing(entries, None if points is None else points.rows[:, :3], notes=notes)
+
+
+def _note_unposed(folder: Path, model: Path, posed: set[str], suffix: str) -> tuple[str, ...]:
+    """A sentence on the photographs of a folder without a pose in the model, and on larger models beside it."""
+    files = (file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES)
+    unposed = sorted({file.relative_to(folder).as_posix() for file in files} - posed)
+    if not unposed:
+        return ()
+    named = ", ".join(unposed[:5]) + (" ..." if len(unposed) > 5 else "")
+    note = f"{len(posed)} of {len(posed) + len(unposed)} photographs have a pose in {model}; without a pose: {named}"
+    others = {other: _count_poses(other / f"images{suffix}") for other in model.parent.iterdir() if other.name.isdecimal()}
+    largest = max(others, key=others.get, default=model)
+    if others.get(largest, 0) > len(posed):
+        note += f"; {largest} has poses of {others[largest]} photographs: name that folder"
+    return (note,)
+
+
+def _count_poses(file: Path) -> int:
+    """Number of photographs of a model; 0 without a file."""
+    return len(READERS[file.suffix].images(file)) if file.is_file() else 0
 
 
 def read_points3d(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -151,9 +175,7 @@ def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, point
     def camera(size: tuple[int, int]) -> Camera:
         return Camera(sensor.K, size, pose.to_world, sensor.lens, f"{file.name} {pose.name}")
 
-    mask = base / "masks" / f"{pose.name}.png"
-    image = base / "images" / pose.name
-    return Entry(pose.name, image, camera, "train", sensor.size, mask if mask.is_file() else None, points)
+    return Entry(pose.name, find_image(base / "images" / pose.name), camera, "train", sensor.size, points=points)
 
 
 def _sensor(path: Path, model: str, size: tuple[int, int], parameters: tuple[float, ...]) -> Sensor:

@@ -21,6 +21,7 @@ from mivol.files.source import refusal
 from mivol.machine import available_memory
 from mivol.photos.camera import Camera, intrinsics, is_seen, pixel_centres
 from mivol.photos.lens import Lens, distort
+from mivol.photos.listing import find_shrink
 from mivol.photos.photo_file import find_colour_space, read_mask, read_photo, read_photo_header, shrink
 from mivol.photos.region import silhouette_box
 from mivol.photos.survey import PhotoFrame, PhotoSurvey, survey_photos
@@ -116,7 +117,12 @@ class Photos:
     def describe(self) -> str:
         """Describe the photographs in a paragraph."""
         width, height = self.views[0].camera.size
-        return f"{self.survey.describe()}\nread as {width} x {height} pixels of {self.space} values"
+        lines = [self.survey.describe(), f"read as {width} x {height} pixels of {self.space} values"]
+        if self.views[0].alpha is not None:
+            colours = {tuple(view.background.tolist()) for view in self.views}
+            colour = "(" + ", ".join(f"{c:g}" for c in colours.pop()) + ")" if len(colours) == 1 else "a colour of its own"
+            lines.append(f"transparent pixels show {colour}; photos.background chooses another colour")
+        return "\n".join(lines)
 
 
 def load_photos(
@@ -140,7 +146,7 @@ def load_photos(
         split: one of :data:`mivol.photos.survey.SPLITS`.
         scale: scale of the images in (0, 1]; 0.5 halves width and height by exact means over area.
         background: colour behind images with alpha: "white", "black", "random" (one colour per view; :meth:`Photo.over`
-            blends over other colours) or (r, g, b). None for images without alpha.
+            blends over other colours) or (r, g, b). None is "white", as in NeRF's protocol. Only for images with alpha.
         space: colour space of the values, "srgb" or "linear"; by default the space of the files.
         stored: colour space of PNG and JPEG files, "srgb" or "linear"; by default srgb, or linear for a PNG with a gAMA of 1.
         held_out: n for every n-th training photograph, or file names (:func:`survey_photos`).
@@ -150,8 +156,8 @@ def load_photos(
         limit: memory limit [bytes], by default the available memory.
 
     Raises:
-        MivolError: errors of :func:`survey_photos`; more pixels than the memory holds; images with alpha but no background,
-            or the reverse; NaN; a damaged file.
+        MivolError: errors of :func:`survey_photos`; more pixels than the memory holds; a background for images without
+            alpha; NaN; a damaged file.
 
     Example:
         >>> photos = load_photos("chair", scale=0.25, background="white")
@@ -165,7 +171,10 @@ def load_photos(
     if largest is not None:
         scale = min(scale, largest / max(max(frame.camera.size) for frame in survey.frames))
     _check_memory(survey, scale, available_memory() if limit is None else limit)
-    _check_background(check_alpha(survey.frames), background, survey.frames[0].file)
+    has_alpha = check_alpha(survey.frames)
+    if background is not None and not has_alpha:
+        raise _without_alpha(survey.frames[0].file)
+    background = "white" if has_alpha and background is None else background
     colours = _backgrounds(background, len(survey.frames), seed)
     views = [_load_photo(frame, scale, colour, (space, stored)) for frame, colour in zip(survey.frames, colours, strict=True)]
     return Photos(tuple(views), space, survey, stored=frozenset(stored_spaces))
@@ -209,13 +218,6 @@ def check_alpha(frames: Sequence[PhotoFrame]) -> bool:
     return next(iter(kinds))
 
 
-def _check_background(has_alpha: bool, background: Background, first: Path) -> None:
-    if has_alpha and background is None:
-        raise refusal(first, "an image with alpha", "a background behind the image", 'set background="white", for instance')
-    if not has_alpha and background is not None:
-        raise _without_alpha(first)
-
-
 def _find_stored_spaces(frames: Sequence[PhotoFrame], stored: str | None) -> dict[str, Path]:
     """The colour spaces of the files, each with an example."""
     _check_space("stored", stored)
@@ -252,7 +254,7 @@ def _backgrounds(background: Background, n: int, seed: int) -> Sequence[np.ndarr
 
 def _load_photo(frame: PhotoFrame, scale: float, background: np.ndarray | None, spaces: tuple[str, str | None]) -> Photo:
     """Read a photograph; ``spaces`` holds the requested colour space and the declared space of the file."""
-    image, alpha = read_photo(frame.file, *spaces)
+    image, alpha = read_photo(frame.file, *spaces, frame.orientation)
     camera = _shrunk_camera(frame.camera, scale)
     mask = None if frame.mask is None else _read_mask(frame, camera.size)
     inside = is_seen(camera, pixel_centres(camera.size))
@@ -274,7 +276,7 @@ def _shrunk_camera(camera: Camera, scale: float) -> Camera:
 def _read_mask(frame: PhotoFrame, size: tuple[int, int]) -> np.ndarray:
     """Read and shrink a mask. A new pixel is valid if all pixels below it are valid."""
     mask = read_mask(frame.mask)
-    if mask.shape != frame.camera.size[::-1]:
+    if find_shrink(frame.camera.size, mask.shape[::-1]) is None:
         found, expected = (f"{w} x {h}" for h, w in (mask.shape, frame.camera.size[::-1]))
         raise refusal(frame.mask, f"a mask of {found}", f"{expected} as in the photograph", "scale the mask")
     return shrink((~mask).astype(np.float32), size) == 0

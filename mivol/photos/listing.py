@@ -10,6 +10,7 @@ import numpy as np
 
 from mivol.files.source import refusal
 from mivol.photos.camera import Camera
+from mivol.photos.photo_file import SUFFIXES
 
 UNLISTED = "in no list"
 """Split of the photographs outside the lists of the data set."""
@@ -45,10 +46,61 @@ class Listing:
     Attributes:
         entries: photographs in the order of the data set.
         points: points (N, 3) of a sparse reconstruction [length], if known.
+        box: (2, 3) box of the visible matter [length], if the data set has distances.
+        notes: sentences on the data set for the user.
     """
 
     entries: list[Entry]
     points: np.ndarray | None = None
+    box: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+
+SHRUNK = (1, 2, 4, 8)
+"""Sizes in the file of cameras over the sizes of photographs: the folders ``images_2``, ``images_4`` and ``images_8``."""
+
+
+def find_shrink(size: tuple[int, int], listed: tuple[int, int]) -> int | None:
+    """Return the entry k of ``SHRUNK`` for which width and height are 1/k of a listed size, rounded up or down; else None."""
+    return next((k for k in SHRUNK if all(abs(k * n - m) < k for n, m in zip(size, listed, strict=True))), None)
+
+
+def find_image(path: Path) -> Path:
+    """Return the existing file of a photograph; without a match the path, or the path with the first of ``SUFFIXES``.
+
+    The name may lack its suffix. A missing folder ``images`` is replaced by ``images_2``, ``images_4`` or ``images_8``, whose
+    files may have another suffix.
+    """
+    has_suffix = path.suffix.lower() in SUFFIXES
+    if has_suffix and path.is_file():
+        return path
+    names = [path, *([] if has_suffix else [path.with_name(path.name + suffix) for suffix in SUFFIXES])]
+    for name in list(names):
+        names += [small for k in SHRUNK[1:] for small in _in_small_folder(name, k)]
+    return next((file for file in names if file.is_file()), path if has_suffix else names[1])
+
+
+def _in_small_folder(path: Path, shrink: int) -> list[Path]:
+    """Files of a photograph in ``images_2``, ... in the place of the missing folder ``images``."""
+    at = next((n for n, folder in enumerate(path.parents) if folder.name == "images"), None)
+    if at is None or path.parents[at].is_dir():
+        return []
+    folder = path.parents[at]
+    small = folder.with_name(f"images_{shrink}") / path.relative_to(folder)
+    return [small, *(small.with_suffix(suffix) for suffix in SUFFIXES)]
+
+
+def find_mask(image: Path) -> Path | None:
+    """Return the mask of a photograph in a folder ``masks`` beside its folder, or beside a folder above; None without a mask.
+
+    The mask of ``images/left/a.jpg`` is ``masks/left/a.jpg.png``, ``masks/left/a.png`` or ``masks/left/a.jpg``.
+    """
+    for folder in image.parents[1:4]:
+        if (folder / "masks").is_dir():
+            mask = folder / "masks" / Path(*image.relative_to(folder).parts[1:])
+            files = (mask.with_name(f"{mask.name}.png"), mask.with_suffix(".png"), mask)
+            return next((file for file in files if file.is_file()), None)
+    return None
 
 
 def check_points(rows: np.ndarray, file: Path, way_out: str) -> None:

@@ -25,7 +25,7 @@ from mivol.files import encode_srgb, read_exr, read_exr_header
 from mivol.files.source import check_file, refusal
 
 #: suffixes of photographs, in the order of the trials for a name without suffix.
-SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".heic", ".heif", ".avif")
 
 #: mode of Pillow with 8 bits per channel -> mode after reading.
 MODES = {"1": "RGB", "L": "RGB", "LA": "RGBA", "P": "RGBA", "RGB": "RGB", "RGBA": "RGBA", "RGBX": "RGB"}
@@ -35,6 +35,18 @@ GREY_16 = ("I;16", "I")
 
 ORIENTATION = 0x0112
 """EXIF tag of the rotation by image viewers (CIPA DC-008, section 4.6.4): 1 none, 6 a quarter turn, ..."""
+
+#: orientation of EXIF -> function from stored pixels (rows, columns, ...) to upright pixels.
+TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda image: image,
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: np.swapaxes(image, 0, 1),
+    6: lambda image: np.rot90(image, -1),
+    7: lambda image: np.swapaxes(image[::-1, ::-1], 0, 1),
+    8: lambda image: np.rot90(image),
+}
 
 
 def decode_srgb(code: np.ndarray) -> np.ndarray:
@@ -84,6 +96,11 @@ class PhotoHeader:
     has_alpha: bool
     orientation: int = 1
 
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """(width, height) after the turn by the orientation."""
+        return self.size[::-1] if self.orientation > 4 else self.size
+
 
 def read_photo_header(path: Path) -> PhotoHeader:
     """Read the header of a photograph.
@@ -99,13 +116,14 @@ def read_photo_header(path: Path) -> PhotoHeader:
         return PhotoHeader(image.size, _read_mode(image) == "RGBA", orientation)
 
 
-def read_photo(path: Path, space: str, stored: str | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+def read_photo(path: Path, space: str, stored: str | None = None, orientation: int = 1) -> tuple[np.ndarray, np.ndarray | None]:
     """Read the pixels of a photograph.
 
     Args:
-        path: PNG, JPEG or OpenEXR.
+        path: OpenEXR, or any image that Pillow reads.
         space: requested colour space, "srgb" or "linear".
-        stored: colour space of PNG and JPEG files, by default the result of :func:`find_colour_space`.
+        stored: colour space of other files than OpenEXR, by default the result of :func:`find_colour_space`.
+        orientation: key of ``TURNS``, by which the stored pixels are turned.
 
     Returns:
         Colour multiplied by alpha (rows, columns, 3), and alpha (rows, columns), or None for a file without alpha.
@@ -119,7 +137,8 @@ def read_photo(path: Path, space: str, stored: str | None = None) -> tuple[np.nd
         if space == "linear":
             return colour, alpha
         colour = colour / np.where(alpha > 0, alpha, 1)[..., None]
-    colour = CONVERSIONS[stored, space](colour).astype(np.float32)
+    colour = np.ascontiguousarray(TURNS[orientation](CONVERSIONS[stored, space](colour)), np.float32)
+    alpha = None if alpha is None else np.ascontiguousarray(TURNS[orientation](alpha))
     return (colour if alpha is None else colour * alpha[..., None]), alpha
 
 
@@ -215,6 +234,8 @@ def _read_exr(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Open an image and read its header. The size is unlimited, because the caller checks the memory before reading pixels."""
+    if path.suffix.lower() in (".heic", ".heif"):
+        _register_heif(path)
     bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         image = Image.open(check_file(path))
@@ -226,6 +247,23 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         yield image
 
 
+def _register_heif(path: Path) -> None:
+    """Teach Pillow to read HEIC.
+
+    Raises:
+        MivolError: a machine without pillow-heif.
+    """
+    try:
+        import pillow_heif
+    except ImportError:
+        found, advice = (
+            "a HEIC image, which Pillow does not read alone",
+            'install it with pip install "mivol[heic]", or convert the file',
+        )
+        raise refusal(path, found, "the package pillow-heif", advice) from None
+    pillow_heif.register_heif_opener()
+
+
 def _loaded(image: Image.Image, path: Path) -> Image.Image:
     try:
         image.load()
@@ -235,4 +273,4 @@ def _loaded(image: Image.Image, path: Path) -> Image.Image:
 
 
 def _damaged(path: Path) -> Exception:
-    return refusal(path, "a damaged or foreign file", "a PNG, JPEG or OpenEXR image", "copy the file again")
+    return refusal(path, "a damaged or foreign file", "a PNG, JPEG, WebP or OpenEXR image", "copy the file again")

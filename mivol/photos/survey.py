@@ -22,7 +22,8 @@ from mivol.files.source import refusal
 from mivol.photos import region
 from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
-from mivol.photos.listing import UNLISTED, Entry, Listing
+from mivol.photos.listing import UNLISTED, Entry, Listing, find_mask, find_shrink
+from mivol.photos.llff import read_llff
 from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
 
@@ -44,6 +45,7 @@ DATA_SET_FORMATS: dict[str, DataSetFormat] = {
         lambda path: (path / "transforms.json").is_file() or path.suffix == ".json", read_transforms
     ),
     "COLMAP": DataSetFormat(lambda path: find_model(path) is not None, read_colmap),
+    "LLFF": DataSetFormat(lambda path: (path / "poses_bounds.npy").is_file() or path.name == "poses_bounds.npy", read_llff),
 }
 
 
@@ -57,6 +59,7 @@ class PhotoFrame:
         split: one of ``SPLITS`` or ``UNLISTED``.
         mask: file of the mask, optional.
         points: points (K, 3) of a sparse reconstruction visible in the photograph [length], if known.
+        orientation: orientation of EXIF by which the pixels are turned, since the camera describes upright pixels.
     """
 
     file: Path
@@ -64,6 +67,7 @@ class PhotoFrame:
     split: str
     mask: Path | None = None
     points: np.ndarray | None = None
+    orientation: int = 1
 
 
 @with_short_repr
@@ -81,6 +85,7 @@ class PhotoSurvey:
         near_far: smallest and largest distance of the box from the cameras [length].
         points: points (N, 3) of a sparse reconstruction, if known.
         levels: number of nested boxes of a fit, with ``box`` as the innermost.
+        notes: sentences on photographs that were turned or are smaller than listed, on masks, and on missing poses.
     """
 
     path: Path
@@ -92,6 +97,7 @@ class PhotoSurvey:
     near_far: tuple[float, float]
     points: np.ndarray | None = None
     levels: int = 1
+    notes: tuple[str, ...] = ()
 
     def describe(self) -> str:
         """Describe the data set in a paragraph."""
@@ -110,7 +116,7 @@ class PhotoSurvey:
         if self.skipped:
             named = ", ".join(self.skipped[:5]) + (" ..." if len(self.skipped) > 5 else "")
             lines.append(f"skipped {len(self.skipped)} missing photographs: {named}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self.notes])
 
 
 def survey_photos(
@@ -138,17 +144,19 @@ def survey_photos(
     absent = [entry.name for entry in entries if not entry.file.is_file() and split in ("all", entry.split)]
     if not chosen:
         raise _no_photographs(path, split, absent, entries)
-    cameras = {id(entry): camera for entry, camera in zip(present, _cameras(present), strict=True)}
+    placed = {id(entry): place for entry, place in zip(present, _place_cameras(present), strict=True)}
+    cameras = {key: place.camera for key, place in placed.items()}
     if split in ("held_out", "val", "test"):
         _check_unseen(chosen, [entry for entry in present if entry.split == "train"], cameras)
-    frames = [PhotoFrame(entry.file, cameras[id(entry)], entry.split, _mask(entry), entry.points) for entry in chosen]
+    frames = [PhotoFrame(e.file, cameras[id(e)], e.split, _mask(e), e.points, placed[id(e)].orientation) for e in chosen]
     training = [entry for entry in present if entry.split in ("train", "held_out")]
     looking = [cameras[id(entry)] for entry in training or chosen]
-    found_box, box_from = _box(box, listing.points, looking, path)
+    found_box, box_from = _box(box, listing, looking, path)
     if not isinstance(box, str):
         region.check_views([frame.camera for frame in frames], found_box)
     near_far = region.near_and_far([*looking, *(frame.camera for frame in frames)], found_box)
-    return PhotoSurvey(path, name, tuple(frames), tuple(absent), found_box, box_from, near_far, listing.points)
+    notes = (*listing.notes, *_note_changes(frames, [placed[id(entry)] for entry in chosen]))
+    return PhotoSurvey(path, name, tuple(frames), tuple(absent), found_box, box_from, near_far, listing.points, notes=notes)
 
 
 def find_format(path: Path) -> str | None:
@@ -190,39 +198,83 @@ def _no_photographs(path: Path, split: str, absent: list[str], entries: list[Ent
     return refusal(path, f"no photograph in the split {split}", f"one of {splits}", "choose one, or set held_out")
 
 
-def _cameras(entries: Sequence[Entry]) -> list[Camera]:
-    """Cameras of photographs; each size must agree with the file of cameras, or with the first photograph of the split."""
-    cameras, first = [], {}
-    for entry in entries:
-        header = read_photo_header(entry.file)
-        size = header.size
+@dataclass(frozen=True)
+class _Place:
+    """The camera of a photograph at the size of its pixels, the orientation that turns them, and the factor of its size."""
+
+    camera: Camera
+    orientation: int = 1
+    shrink: int = 1
+
+
+def _place_cameras(entries: Sequence[Entry]) -> list[_Place]:
+    """Place the cameras of photographs.
+
+    Each size must agree with the file of cameras, up to a factor of ``listing.SHRUNK``, or with the first photograph of the
+    split. Photographs with an orientation of EXIF are turned if the cameras describe upright pixels (:func:`_are_turned`).
+    """
+    headers = [read_photo_header(entry.file) for entry in entries]
+    are_turned = _are_turned(entries, headers)
+    places, first = [], {}
+    for entry, header in zip(entries, headers, strict=True):
+        turned = header.orientation != 1 and _is_turned(entry, header, are_turned)
+        size = header.upright_size if turned else header.size
         listed, source = (
             (entry.size, "the file of cameras") if entry.size else first.setdefault(entry.split, (size, entry.name))
         )
-        if size != listed:
+        shrink = find_shrink(size, listed) if entry.size else int(size == listed)
+        if not shrink:
             found, expected = (f"{w} x {h} pixels" for w, h in (size, listed))
-            turned = f" (EXIF orientation {header.orientation} turns them)" if header.orientation != 1 else ""
-            advice = "turn the pixels" if turned else "scale the image"
-            raise refusal(entry.file, found + turned, f"{expected} as {source}", f"{advice}, or correct the cameras")
-        _check_orientation(entry, header)
-        cameras.append(entry.camera(size))
-    return cameras
+            expected += f" as {source}" + (", or 1/2, 1/4 or 1/8" if entry.size else "")
+            raise refusal(entry.file, found, expected, "scale the image, or correct the cameras")
+        camera = entry.camera(listed) if shrink == 1 else entry.camera(listed).resized(size)
+        places.append(_Place(camera, header.orientation if turned else 1, shrink))
+    return places
 
 
-def _check_orientation(entry: Entry, header: PhotoHeader) -> None:
-    """Refuse a photograph rotated by image viewers, unless the cameras clearly describe the stored pixels.
+def _proves_turn(entry: Entry, header: PhotoHeader) -> bool | None:
+    """Whether the size in the file of cameras is the size of upright pixels; None without a proof.
 
-    A size in the file of cameras proves this if a quarter turn (orientation 5 to 8) would change the size.
+    A proof is a quarter turn (orientation 5 to 8) after which only one of both sizes fits.
+    """
+    if header.orientation < 5 or entry.size is None:
+        return None
+    stored, upright = (find_shrink(size, entry.size) is not None for size in (header.size, header.upright_size))
+    return None if stored == upright else upright
+
+
+def _are_turned(entries: Sequence[Entry], headers: Sequence[PhotoHeader]) -> bool | None:
+    """Whether the cameras of a data set describe upright pixels; None without a proof, or with proofs of both."""
+    proofs = {_proves_turn(entry, header) for entry, header in zip(entries, headers, strict=True)} - {None}
+    return proofs.pop() if len(proofs) == 1 else None
+
+
+def _is_turned(entry: Entry, header: PhotoHeader, are_turned: bool | None) -> bool:
+    """Whether the camera describes upright pixels: by the size of this photograph, else by the sizes of the others.
 
     Raises:
-        MivolError: a rotation without this proof.
+        MivolError: no photograph proves this.
     """
-    is_quarter = header.orientation > 4 and header.size[0] != header.size[1]
-    if header.orientation == 1 or (is_quarter and entry.size is not None):
-        return
-    found = f"EXIF orientation {header.orientation}, by which viewers turn the image"
-    way_out = "turn the pixels if the cameras describe upright images, else remove the tag"
-    raise refusal(entry.file, found, "pixels in the orientation of the cameras", way_out)
+    own = _proves_turn(entry, header)
+    if own is None and are_turned is None:
+        found = f"EXIF orientation {header.orientation}, by which viewers turn the image"
+        expected = "a size in the file of cameras that shows whether they describe upright pixels"
+        way_out = "turn the pixels if the cameras describe upright images, else remove the tag"
+        raise refusal(entry.file, found, expected, way_out)
+    return are_turned if own is None else own
+
+
+def _note_changes(frames: Sequence[PhotoFrame], places: Sequence[_Place]) -> list[str]:
+    """Sentences on photographs that were turned or are smaller than listed, and on masks."""
+    notes = []
+    for shrink in sorted({place.shrink for place in places} - {1}):
+        count = sum(place.shrink == shrink for place in places)
+        notes.append(f"{count} photographs have 1/{shrink} of the size in the file of cameras; their cameras are scaled")
+    if turned := sum(place.orientation != 1 for place in places):
+        notes.append(f"{turned} photographs are turned by their EXIF orientation, since the cameras describe upright images")
+    if masked := sum(frame.mask is not None for frame in frames):
+        notes.append(f"{masked} of {len(frames)} photographs have masks, whose black pixels do not count")
+    return notes
 
 
 def _check_unseen(judged: Sequence[Entry], fitted: Sequence[Entry], cameras: Mapping[int, Camera]) -> None:
@@ -241,14 +293,15 @@ def _check_unseen(judged: Sequence[Entry], fitted: Sequence[Entry], cameras: Map
 
 
 def _mask(entry: Entry) -> Path | None:
-    if entry.mask is not None and not entry.mask.is_file():
+    if entry.mask is None:
+        return find_mask(entry.file)
+    if not entry.mask.is_file():
         raise refusal(entry.mask, "no file", f"the mask of {entry.name}", "copy the mask, or remove its entry")
     return entry.mask
 
 
-def _box(
-    box: np.ndarray | str | None, points: np.ndarray | None, cameras: Sequence[Camera], path: Path
-) -> tuple[np.ndarray, str]:
+def _box(box: np.ndarray | str | None, listing: Listing, cameras: Sequence[Camera], path: Path) -> tuple[np.ndarray, str]:
+    points = listing.points
     if isinstance(box, str):
         if box != "middle":
             raise refusal("box", f'"{box}"', '"middle", or two corners', "choose one")
@@ -256,6 +309,8 @@ def _box(
         return cube, f"{region.MIDDLE:g} of the median distance of the cameras from their focus, on each side"
     if box is not None:
         return region.check_box(box), "as given"
+    if listing.box is not None:
+        return listing.box, "around what the photographs show between their nearest and farthest distance"
     if points is not None and len(points) >= region.FEWEST_POINTS:
         return region.box_of_points(points), f"98 % of {len(points)} points, enlarged by 5 % on each side"
     return region.shared_box(cameras, path), f"in view of at least {100 * region.VIEW_SHARE:.0f} % of {len(cameras)} cameras"

@@ -25,8 +25,7 @@ from mivol.files.ply import read_vertices, vertex_positions
 from mivol.files.source import read_bytes, refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Fisheye, Lens, Panorama
-from mivol.photos.listing import UNLISTED, Entry, Listing, check_points
-from mivol.photos.photo_file import SUFFIXES
+from mivol.photos.listing import UNLISTED, Entry, Listing, check_points, find_image
 
 #: file of a Blender data set -> split.
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "val", "transforms_test.json": "test"}
@@ -191,20 +190,12 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
         raise refusal(settings.name, f"mask_path = {mask!r}", "the name of a file", "correct it")
     return Entry(
         name,
-        _photograph(file.parent / name),
+        find_image(file.parent / name),
         camera,
         split,
         settings.size(),
         file.parent / to_forward_slashes(file.parent, mask) if mask else None,
     )
-
-
-def _photograph(path: Path) -> Path:
-    """The existing file of a name with or without suffix; without a match the file with the first of ``SUFFIXES``."""
-    if path.suffix.lower() in SUFFIXES or path.is_file():
-        return path
-    tried = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
-    return next((file for file in tried if file.is_file()), tried[0])
 
 
 @dataclass(frozen=True)
@@ -246,14 +237,18 @@ class Settings:
     def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
         """Return K (3, 3). Focal lengths precede angles; the default principal point is the image centre.
 
+        One focal length or angle serves both axes.
+
         Raises:
             MivolError: neither a focal length nor an angle.
         """
         fx = self._focal("fl_x", "camera_angle_x", size[0])
-        if fx is None:
-            raise refusal(self.name, "no focal length", "fl_x or camera_angle_x", "add it to the file of cameras")
         fy = self._focal("fl_y", "camera_angle_y", size[1])
-        fy = fx if fy is None else fy
+        if fx is None and fy is None:
+            raise refusal(
+                self.name, "no focal length", "fl_x, fl_y, camera_angle_x or camera_angle_y", "add it to the file of cameras"
+            )
+        fx, fy = fy if fx is None else fx, fx if fy is None else fy
         return intrinsics(fx, fy, self.number("cx", size[0] / 2), self.number("cy", size[1] / 2))
 
     def panorama(self, size: tuple[int, int]) -> np.ndarray:
@@ -301,13 +296,14 @@ class Settings:
         return kind(**{key: given[key] for key in terms})
 
     def matrix(self) -> np.ndarray:
-        """Return ``transform_matrix`` without checks of its shape.
+        """Return ``transform_matrix`` without checks of its shape; 3 rows get the last row 0, 0, 0, 1.
 
         Raises:
             MivolError: entries other than numbers.
         """
         try:
-            return np.array(self.values["transform_matrix"], np.float64)
+            matrix = np.array(self.values["transform_matrix"], np.float64)
+            return np.vstack([matrix, [0, 0, 0, 1]]) if matrix.shape == (3, 4) else matrix
         except (ValueError, TypeError) as error:
             raise refusal(
                 self.name, "a transform_matrix that is not a matrix", "4 rows of 4 numbers", "correct the matrix"

@@ -19,6 +19,7 @@ open-source converter splat-transform.
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,15 +27,17 @@ import numpy as np
 
 from mivol.files import ply
 from mivol.files.source import refusal
-from mivol.points.gaussians import Gaussians, complete_quaternions, logit, to_base_harmonics
+from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, complete_quaternions, logit, to_base_harmonics
 
 MEANS = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
 COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")
+CODES = ("red", "green", "blue")
+"""Colours in the place of ``COLOURS``, as nerfstudio writes them in its mode rgb: 0 to 1, or whole numbers from 0."""
 SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-REST_COUNTS = (0, 9, 24, 45)
-"""Numbers of properties ``f_rest`` in files of degree 0, 1, 2, 3."""
+REST_COUNTS = (0, 9, 24, 45, 72)
+"""Numbers of properties ``f_rest`` in files of degree 0, 1, 2, 3, 4; degree 4 is cut to ``HIGHEST_DEGREE``."""
 
 
 def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaussians:
@@ -45,7 +48,9 @@ def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaus
     """
     vertex = tables.get("vertex")
     names = () if vertex is None else vertex.dtype.names
-    missing = [name for name in (*MEANS, *COLOURS, "opacity", *SCALES, *ROTATION) if name not in names]
+    has_codes = COLOURS[0] not in names and set(CODES) <= set(names)
+    colours = CODES if has_codes else COLOURS
+    missing = [name for name in (*MEANS, *colours, "opacity", *SCALES, *ROTATION) if name not in names]
     if missing:
         raise refusal(
             Path(path),
@@ -53,7 +58,7 @@ def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaus
             "the properties of 3D Gaussians (x, f_dc_0, opacity, scale_0, rot_0, ...)",
             "name a file of Gaussians (a cloud of points is read by read_points)",
         )
-    constant = _stack_columns(vertex, COLOURS)
+    constant = _parse_codes(vertex) if has_codes else _stack_columns(vertex, COLOURS)
     return Gaussians(
         _stack_columns(vertex, MEANS),
         _stack_columns(vertex, SCALES),
@@ -61,6 +66,13 @@ def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaus
         vertex["opacity"].astype(np.float32),
         np.concatenate([constant[:, None], _parse_higher_harmonics(vertex, path)], axis=1),
     )
+
+
+def _parse_codes(table: np.ndarray) -> np.ndarray:
+    """Coefficients of degree 0, (N, 3), from the properties ``CODES``; the largest whole number of a type stands for 1."""
+    kind = table.dtype[CODES[0]]
+    largest = np.iinfo(kind).max if kind.kind in "iu" else 1
+    return to_base_harmonics(_stack_columns(table, CODES) / np.float32(largest))
 
 
 def _parse_higher_harmonics(table: np.ndarray, path: str | os.PathLike) -> np.ndarray:
@@ -76,7 +88,10 @@ def _parse_higher_harmonics(table: np.ndarray, path: str | os.PathLike) -> np.nd
         raise refusal(Path(path), found, f"f_rest_0, f_rest_1, ...: {REST_COUNTS} of them", "write the file again")
     if not count:
         return np.empty((len(table), 0, 3), np.float32)
-    return np.swapaxes(_stack_columns(table, names).reshape(len(table), 3, count // 3), 1, 2)
+    kept = (HIGHEST_DEGREE + 1) ** 2 - 1
+    if count > 3 * kept:
+        warnings.warn(f"{path}: harmonics of degree 4 are cut to degree {HIGHEST_DEGREE}.", RuntimeWarning, stacklevel=2)
+    return np.swapaxes(_stack_columns(table, names).reshape(len(table), 3, count // 3), 1, 2)[:, :kept]
 
 
 def write_gaussian_ply(file: BinaryIO, gaussians: Gaussians) -> None:

@@ -63,7 +63,7 @@ def test_explain_says_what_a_fit_would_do_and_draws_its_boxes(tmp_path: Path, ca
     with Image.open(picture) as image:
         plain = image.size
     assert "--preset capture" in capsys.readouterr().out
-    few = ["--preset", "capture", "--set", "field.longest=16"]
+    few = ["--as", "grid", "--preset", "capture", "--set", "field.longest=16"]
     assert main(["explain", *few, str(folder), "-o", str(picture)]) == 0
     said = capsys.readouterr().out
     for fact in ("judged by 2 photographs", "5 nested boxes", "cameras stand in the innermost", "16 nodes", str(picture)):
@@ -82,9 +82,9 @@ def test_explain_draws_the_cameras_of_a_fit_of_gaussians(tmp_path: Path, capsys:
 
 
 REFUSED = {
-    "a scene with a preset": (["--preset", "cpu", "scene.xml"], "scene.xml holds none: leave it out"),
+    "a scene with a preset": (["--preset", "cpu", "scene.xml"], "scene.xml holds none: leave them out"),
     "a scene with settings": (["--set", "field.sky=8", "scene.xml"], "--set is for fits, and .*scene.xml is not a fit"),
-    "an experiment with a preset": (["--preset", "cpu", "fit.toml"], "--set field.preset=cpu changes it"),
+    "an experiment with a preset": (["--preset", "cpu", "fit.toml"], "name model and preset"),
     "a picture of no cameras": (["fit.toml", "-o", "cameras.png"], "only cameras of photographs are drawn"),
 }
 

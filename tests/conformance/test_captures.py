@@ -105,10 +105,11 @@ def test_a_preset_brings_what_captures_need_and_the_file_overrides_it() -> None:
 
 def test_a_folder_of_photographs_is_an_experiment(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     folder = write_capture(tmp_path / "my photographs", 3)
-    made = config.of_photographs(folder, "capture", ["field.longest=16"])
+    made = config.of_photographs(folder, "grid", "capture", ["field.longest=16"])
     assert (made.title, made.photos.path, made.field.longest, made.photos.box) == ("my photographs", str(folder), 16, "middle")
-    assert main(["optimize", str(folder)]) == 1
-    assert "--preset capture" in capsys.readouterr().err
+    assert config.of_photographs(folder).gaussians.preset == "minute"
+    assert main(["optimize", "--preset", "capture", str(folder)]) == 1
+    assert "--preset capture is a preset of --as grid" in capsys.readouterr().err
     (tmp_path / "fit.toml").write_text("")
     assert main(["optimize", "--preset", "cpu", str(tmp_path / "fit.toml")]) == 1
-    assert "--set field.preset=cpu" in capsys.readouterr().err
+    assert "its tables [gaussians] or [field] name model and preset" in capsys.readouterr().err

@@ -68,7 +68,7 @@ def test_a_folder_of_photographs_becomes_a_page(tmp_path: Path) -> None:
     """With the command alone: all held-out views are on the page with their own figures, the worst first."""
     folder, run = write_capture(tmp_path / "photos", 16), tmp_path / "run"
     few = ["--set", "field.longest=16", "--set", "field.effort=0.1", "--set", "show.frames=0"]
-    assert main(["optimize", "--preset", "capture", str(folder), "-o", str(run), *few]) == 0
+    assert main(["optimize", "--as", "grid", "--preset", "capture", str(folder), "-o", str(run), *few]) == 0
     record = json.loads((run / "run.json").read_text())
     table = next(t for t in record["tables"] if t["title"].startswith("Judged views, at 32 x 24"))
     assert {row[0] for row in table["rows"]} == {"view_00.png", "view_08.png"}

@@ -1,0 +1,213 @@
+"""Data sets of photographs as strangers have them: smaller folders, turned or masked photographs, poses of other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photo_sets import edit, pixels, png_of_16_bits, ring, write_colmap, write_transforms
+from PIL import Image
+
+from mivol.errors import MivolError
+from mivol.files import ply
+from mivol.photos import load_photos, survey_photos
+from mivol.photos.listing import find_shrink
+from mivol.photos.photo_file import ORIENTATION, TURNS
+from mivol.points import read_gaussians
+from mivol.points.gaussian_ply import write_gaussian_ply
+from mivol.points.gaussians import Gaussians
+
+BOX = np.array([[-1.0] * 3, [1.0] * 3])
+
+
+def test_sizes_are_a_half_a_quarter_or_an_eighth_rounded_up_or_down() -> None:
+    sizes = {(33, 25): 1, (16, 12): 2, (17, 13): 2, (8, 6): 4, (9, 7): 4, (5, 4): 8, (18, 13): None, (11, 8): None}
+    assert {size: find_shrink(size, (33, 25)) for size in sizes} == sizes
+
+
+@pytest.mark.parametrize("shrink", [2, 4])
+def test_a_folder_of_smaller_photographs_scales_the_cameras(tmp_path: Path, shrink: int) -> None:
+    """``images_2`` in the place of ``images``, with another suffix: each pixel keeps its rays."""
+    folder = write_colmap(tmp_path / "set", "PINHOLE")
+    whole = survey_photos(folder, box=BOX).frames
+    small = folder / f"images_{shrink}"
+    (folder / "images").rename(small)
+    for file in list(small.iterdir()):
+        with Image.open(file) as image:
+            image.resize((64 // shrink, 48 // shrink)).save(file.with_suffix(".jpg"))
+        file.unlink()
+    survey = survey_photos(folder, box=BOX)
+    assert f"4 photographs have 1/{shrink} of the size in the file of cameras" in survey.describe()
+    for frame, before in zip(survey.frames, whole, strict=True):
+        assert frame.camera.size == (64 // shrink, 48 // shrink)
+        np.testing.assert_allclose(frame.camera.K[:2] * shrink, before.camera.K[:2])
+
+
+def test_three_rows_of_a_transform_are_enough(tmp_path: Path) -> None:
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20})
+    before = survey_photos(folder).frames
+    edit(folder / "transforms.json", lambda t: [f.update(transform_matrix=f["transform_matrix"][:3]) for f in t["frames"]])
+    for frame, old in zip(survey_photos(folder).frames, before, strict=True):
+        np.testing.assert_array_equal(frame.camera.to_world, old.camera.to_world)
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+def test_pixels_are_turned_as_pillow_turns_them(tmp_path: Path, orientation: int) -> None:
+    """Half turns and mirrors follow the quarter turn of another photograph, whose size shows what the cameras describe."""
+    from PIL import ImageOps
+
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20})
+    files = sorted((folder / "images").iterdir())
+    for file, turn in zip(files, (orientation, 6, 6, 6), strict=True):
+        size = (8, 12) if turn > 4 else (12, 8)
+        image = Image.fromarray(pixels(*size, 3, alpha=False))
+        tags = image.getexif()
+        tags[ORIENTATION] = turn
+        image.save(file, exif=tags)
+    with Image.open(files[0]) as image:
+        expected = np.asarray(ImageOps.exif_transpose(image))
+    np.testing.assert_array_equal(np.round(load_photos(folder).views[0].image * 255), expected)
+
+
+def test_photographs_without_a_pose_are_named(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "set")
+    assert "without a pose" not in survey_photos(folder, box=BOX).describe()
+    (folder / "images" / "left").mkdir()
+    for name in ("left/b.jpg", "a view 7.png"):
+        Image.fromarray(pixels(64, 48, alpha=False)).save(folder / "images" / name)
+    said = survey_photos(folder, box=BOX).describe()
+    assert "4 of 6 photographs have a pose in" in said and "without a pose: a view 7.png, left/b.jpg" in said
+    write_colmap(tmp_path / "other", n=5)
+    (tmp_path / "other" / "sparse" / "0").rename(folder / "sparse" / "1")
+    larger = folder / "sparse" / "1"
+    assert f"{larger} has poses of 5 photographs: name that folder" in survey_photos(folder, box=BOX).describe()
+
+
+@pytest.mark.parametrize("name", ["left/0001.png", "left/0001.jpg.png", "left/0001.jpg"])
+def test_masks_stand_in_a_folder_beside_nested_photographs(tmp_path: Path, name: str) -> None:
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20})
+    (folder / "images" / "left").mkdir()
+    (folder / "images" / "0001.png").unlink()
+    Image.fromarray(pixels(12, 8, 1, alpha=False)).save(folder / "images" / "left" / "0001.jpg")
+    edit(folder / "transforms.json", lambda table: table["frames"][1].update(file_path="images/left/0001.jpg"))
+    mask = np.full((16, 24), 255, np.uint8)
+    mask[:, :5] = 0
+    path = folder / "masks" / name
+    path.parent.mkdir(parents=True)
+    Image.fromarray(mask).save(path, format="png")
+    photos = load_photos(folder)
+    assert [view.mask is None for view in photos.views] == [True, False, True, True]
+    np.testing.assert_array_equal(photos.views[1].mask, np.broadcast_to(np.arange(12) >= 3, (8, 12)))
+    assert "1 of 4 photographs have masks" in photos.describe()
+
+
+def write_llff(folder: Path, n: int = 5) -> Path:
+    """Poses on a ring in LLFF's axes (down, right, backwards), photographs of 24 x 16 pixels at half size, distances 3 to 5."""
+    (folder / "images_2").mkdir(parents=True)
+    rows = []
+    for k, pose in enumerate(ring(n)):
+        Image.fromarray(pixels(12, 8, k, alpha=False)).save(folder / "images_2" / f"{k}.png")
+        matrix = np.column_stack([-pose[:3, 1], pose[:3, 0], pose[:3, 2], pose[:3, 3], [16, 24, 20]])
+        rows.append([*matrix.ravel(), 3.0, 5.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder
+
+
+def test_poses_of_llff(tmp_path: Path) -> None:
+    folder = write_llff(tmp_path / "set")
+    photos = load_photos(folder)
+    assert photos.survey.format == "LLFF"
+    for view, pose in zip(photos.views, ring(5), strict=True):
+        np.testing.assert_allclose(view.camera.to_world, pose, atol=1e-15)
+        np.testing.assert_allclose(view.camera.K, [[10, 0, 6], [0, 10, 4], [0, 0, 1]])
+    assert "in view of at least" in photos.survey.box_from
+
+
+def test_parallel_cameras_of_llff_have_a_box_by_their_distances(tmp_path: Path) -> None:
+    """Frusta from 3 to 5 along -z, whose corners are 5 * 12 / 20 and 5 * 8 / 20 across; cameras stand 0 to 4 along x."""
+    folder = write_llff(tmp_path / "set")
+    rows = np.load(folder / "poses_bounds.npy")
+    for k, row in enumerate(rows):
+        row[:15].reshape(3, 5)[:, :4] = [[0, 1, 0, k], [-1, 0, 0, 0], [0, 0, 1, 0]]
+    np.save(folder / "poses_bounds.npy", rows)
+    survey = survey_photos(folder)
+    np.testing.assert_allclose(survey.box, [[-3, -2, -5], [7, 2, -3]])
+    assert "nearest and farthest distance" in survey.describe()
+
+
+BAD_ROWS = {
+    "photographs": (lambda rows: rows[:4], "found 4 poses and 5 photographs in images_2"),
+    "columns": (lambda rows: rows[:, :15], r"float64 of shape \(5, 15\), expected 17 numbers"),
+    "distances": (
+        lambda rows: rows * np.where(np.arange(17) == 15, 2, 1),
+        "row 0 with .* expected finite numbers and 0 < near",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ROWS)
+def test_wrong_poses_of_llff_are_refused(tmp_path: Path, case: str) -> None:
+    folder, (change, message) = write_llff(tmp_path / "set"), BAD_ROWS[case]
+    np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
+    with pytest.raises(MivolError, match=message):
+        load_photos(folder)
+
+
+@pytest.mark.parametrize("suffix", ["webp", "png"])
+def test_names_without_suffix_are_webp_or_png_of_16_bits(tmp_path: Path, suffix: str) -> None:
+    folder, image = write_transforms(tmp_path / "set", {"fl_x": 20}), pixels(12, 8, 5, alpha=False)
+    (folder / "images" / "0001.png").unlink()
+    edit(folder / "transforms.json", lambda table: table["frames"][1].update(file_path="images/0001"))
+    file = folder / "images" / f"0001.{suffix}"
+    if suffix == "png":
+        file.write_bytes(png_of_16_bits(257 * image.astype(np.uint16)))
+    else:
+        Image.fromarray(image).save(file, lossless=True)
+    np.testing.assert_allclose(load_photos(folder).views[1].image * 255, image, atol=1e-4)
+
+
+# -- Gaussians -----------------------------------------------------------------------------------------------------
+
+
+def make_gaussians(n: int = 6) -> Gaussians:
+    rng = np.random.default_rng(0)
+    turns = np.eye(4, dtype=np.float32)[np.zeros(n, int)]
+    reals = [rng.normal(size=shape).astype(np.float32) for shape in ((n, 3), (n, 3), n, (n, 16, 3))]
+    return Gaussians(reals[0], reals[1], turns, reals[2], reals[3])
+
+
+def write_columns(path: Path, drop: tuple[str, ...], more: dict[str, np.ndarray]) -> Gaussians:
+    """Write Gaussians without some properties, and with other columns."""
+    gaussians = make_gaussians()
+    with path.open("wb") as file:
+        write_gaussian_ply(file, gaussians)
+    table = ply.read_tables(path)["vertex"]
+    kept = [name for name in table.dtype.names if not name.startswith(drop)] if drop else list(table.dtype.names)
+    new = np.empty(len(table), [*((name, "<f4") for name in kept), *((name, column.dtype) for name, column in more.items())])
+    for name in kept:
+        new[name] = table[name]
+    for name, column in more.items():
+        new[name] = column
+    with path.open("wb") as file:
+        ply.write_table(file, new)
+    return gaussians
+
+
+def test_gaussians_with_colours_in_bytes(tmp_path: Path) -> None:
+    """nerfstudio's mode rgb has red, green, blue of 0..255 in the place of f_dc and f_rest."""
+    codes = np.array([[0, 51, 255]] * 6, np.uint8)
+    write_columns(tmp_path / "a.ply", ("f_dc", "f_rest"), dict(zip(("red", "green", "blue"), codes.T, strict=True)))
+    read = read_gaussians(tmp_path / "a.ply")
+    assert read.degree == 0
+    np.testing.assert_allclose(read.base_colours(), codes / 255, atol=1e-6)
+
+
+def test_harmonics_of_degree_4_are_cut_and_the_cut_is_said(tmp_path: Path) -> None:
+    """24 numbers a channel, channel by channel; the first 15 of each are those of degree 3."""
+    rest = np.random.default_rng(1).normal(size=(6, 3, 24)).astype(np.float32)
+    columns = {f"f_rest_{k}": column for k, column in enumerate(rest.reshape(6, 72).T)}
+    write_columns(tmp_path / "a.ply", ("f_rest",), columns)
+    with pytest.warns(RuntimeWarning, match="degree 4 are cut to degree 3"):
+        read = read_gaussians(tmp_path / "a.ply")
+    np.testing.assert_array_equal(read.harmonics[:, 1:], np.swapaxes(rest[:, :, :15], 1, 2))
