@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.files import write_png
+from mivol.files.image_files import decode_srgb
 from mivol.photos import Camera, Photo, aim_camera, intrinsics, pixel_centres, rays
-from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 
 SIZE = (32, 24)

@@ -185,16 +185,17 @@ def render_flags() -> list:
     from mivol.experiments.render import DRAWN_AS
 
     return [
-        *scene_flags("scene (.xml), radiance field (.npz) with --look-at, or points or Gaussians (.ply, .npy, .spz, ...)"),
+        *scene_flags("scene (.xml), radiance field (.npz), or points or Gaussians (.ply, .npy, .spz, ...)"),
         flag(
             "--look-at", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
-            help="for a field or points: positions of camera and target [length] (default for points: a view of all points)",
+            help="for a field or points: positions of camera and target [length] (default: the view that a fit keeps in its "
+            "file, or a view of all points)",
         ),
-        flag("--up", type=float, nargs=3, metavar=("x", "y", "z"), default=[0.0, 0.0, 1.0],
-             help="upward direction of that camera (default: 0 0 1)"),
-        flag("--fov", type=float, default=50.0, help="horizontal field of view of that camera [degree] (default: %(default)s)"),
-        flag("--size", type=int, nargs=2, metavar=("width", "height"), default=[640, 480],
-             help="image size of that camera [pixel] (default: 640 480)"),
+        flag("--up", type=float, nargs=3, metavar=("x", "y", "z"),
+             help="upward direction of that camera (default: up in the photographs of a fit, else 0 0 1)"),
+        flag("--fov", type=float, help="horizontal field of view of that camera [degree] (default: of the kept view, or 50)"),
+        flag("--size", type=int, nargs=2, metavar=("width", "height"),
+             help="image size of that camera [pixel] (default: proportions of the kept view, or 640 480)"),
         flag("--points", choices=DRAWN_AS, default=DRAWN_AS[0], help="shape of drawn points (default: %(default)s)"),
         flag("--radius", type=float,
              help="radius of discs, or standard deviation of splats [length] (default: half the median distance of points)"),
@@ -295,7 +296,8 @@ def convert_flags() -> list:
              help="for a field or a mesh: voxels along the longest edge (default: 128); for Gaussians from a field: Gaussians "
              "along that edge (default: one per two voxels)"),
         flag("--box", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
-             help="box of a field or a mesh [length] (default: three standard deviations around all Gaussians)"),
+             help="box of a field or a mesh (default: three standard deviations around all Gaussians), or box that crops "
+             "Gaussians or points [length]"),
         MODE,
     ]  # fmt: skip
 
@@ -478,27 +480,26 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
     """Return the function to render a radiance field, points or Gaussians; None if the file is a scene.
 
     Raises:
-        MivolError: a camera for a scene, or no camera for a field.
+        MivolError: a camera for a scene.
     """
     from mivol.back_end import set_variant
-    from mivol.experiments.render import PointLook, render_field, render_points
+    from mivol.experiments.render import Framing, PointLook, render_field, render_points
     from mivol.points.summary import SUFFIXES
 
     suffix = arguments.scene.suffix.lower()
     is_field, is_cloud = suffix == ".npz", suffix in SUFFIXES
-    if not is_cloud and is_field != (arguments.look_at is not None):
-        fault = "a radiance field needs --look-at" if is_field else "--look-at is for a radiance field (.npz) or points"
-        raise MivolError(f"{arguments.scene}: {fault}; a scene has its own cameras.")
+    if not (is_cloud or is_field) and arguments.look_at is not None:
+        raise MivolError(f"{arguments.scene}: --look-at is for a radiance field (.npz) or points; a scene has its own cameras.")
     look = PointLook(arguments.points, arguments.radius, arguments.opacity)
     if not is_cloud and look != PointLook():
         raise MivolError(f"{arguments.scene}: --points, --radius and --opacity are for clouds of points: leave them out.")
     if not (is_field or is_cloud):
         return None
     set_variant(arguments.mode)
-    camera = arguments.look_at, arguments.up, arguments.fov, tuple(arguments.size)
+    camera = Framing(arguments.look_at, arguments.up, arguments.fov, arguments.size and tuple(arguments.size))
     if is_cloud:
-        return lambda: render_points(arguments.scene, *camera, look)
-    return lambda: render_field(arguments.scene, *camera)
+        return lambda: render_points(arguments.scene, camera, look)
+    return lambda: render_field(arguments.scene, camera)
 
 
 def reference(arguments: argparse.Namespace) -> None:
@@ -598,11 +599,12 @@ def export(arguments: argparse.Namespace) -> None:
     """Write a radiance field as a mesh, volumes, a scene with its sky, or a file of another program."""
     from mivol.back_end import set_variant
     from mivol.experiments.render import sky_beside
+    from mivol.fields.field_archives import read_field_view
     from mivol.fields.field_files import read_field, write_field
 
     set_variant(arguments.mode)
-    field, sky = read_field(arguments.field), sky_beside(arguments.field)
-    print("\n".join(str(path) for path in write_field(arguments.output, field, arguments.level, sky)))
+    field, sky, view = read_field(arguments.field), sky_beside(arguments.field), read_field_view(arguments.field)
+    print("\n".join(str(path) for path in write_field(arguments.output, field, arguments.level, sky, view=view)))
 
 
 def convert(arguments: argparse.Namespace) -> None:
@@ -639,7 +641,7 @@ def _convert_cloud(arguments: argparse.Namespace) -> str:
     if source.suffix.lower() == ".npz":
         return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
     if kind not in ("field", "mesh"):
-        return convert_file(source, target, kind)
+        return convert_file(source, target, kind, arguments.box)
     make = gaussian_conversion.convert_to_field if kind == "field" else gaussian_conversion.convert_to_mesh
     return make(source, target, 128 if resolution is None else resolution, arguments.box, arguments.mode)
 
@@ -656,9 +658,10 @@ def _check_conversion(arguments: argparse.Namespace) -> str | None:
             f"{source}: a radiance field becomes Gaussians (.ply) here; mivol export writes it as a mesh and more."
         )
     is_gridded = kind in ("field", "mesh")
-    has_box, has_resolution = arguments.box is not None, arguments.resolution is not None
-    if (has_box and not is_gridded) or (has_resolution and not (is_gridded or from_field)):
-        raise MivolError(f"{target}: --resolution and --box are for a radiance field (.npz) or a mesh: leave them out.")
+    if arguments.box is not None and from_field:
+        raise MivolError(f"{source}: --box crops Gaussians and points, not a radiance field: leave it out.")
+    if arguments.resolution is not None and not (is_gridded or from_field):
+        raise MivolError(f"{target}: --resolution is for a radiance field (.npz) or a mesh: leave it out.")
     return kind
 
 

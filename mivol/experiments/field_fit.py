@@ -24,6 +24,7 @@ from mivol.fields.field_files import write_field
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_exr, write_png, write_volume
+from mivol.files.image_files import decode_srgb
 from mivol.optim.photographs.field_view import FieldView, render_view
 from mivol.optim.photographs.radiance_plan import (
     FEW_PHOTOGRAPHS,
@@ -37,7 +38,8 @@ from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, rectify
-from mivol.photos.photo_file import CONVERSIONS, decode_srgb
+from mivol.photos.camera_path import HomeView
+from mivol.photos.photo_file import CONVERSIONS
 from mivol.photos.region import FEWEST_POINTS, count_levels, nested_boxes, points_in_box
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
 from mivol.report.record import Image, PlanLine, Table, Volume
@@ -83,7 +85,7 @@ class FieldFit(PhotoFit):
 
     def best_files(self) -> BestFiles:
         names = ("field_best.npz", *(["sky_best.exr"] if self.problem.sky is not None else []))
-        return BestFiles(names, lambda folder: write_result(folder, self.problem, "_best", self.photos.white))
+        return BestFiles(names, lambda folder: write_result(folder, self.problem, self.home_view, "_best", self.photos.white))
 
     def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, ImageScore]:
         return judge_view(self.problem, self.judged, photo, metrics)
@@ -95,7 +97,7 @@ class FieldFit(PhotoFit):
     def write_model(self, run: RunFolder) -> dict[str, float]:
         run.make("volumes")
         field, record = self.problem.field, self.record
-        write_result(run.path, self.problem, white=self.photos.white)
+        write_result(run.path, self.problem, self.home_view, white=self.photos.white)
         record.tables = [tabulate_storage(field, run.path / "field.npz")]
         record.volumes += [write_density(run.path, field.extract_level(number), number) for number in range(field.levels)]
         self.levels = field.levels
@@ -108,14 +110,16 @@ class FieldFit(PhotoFit):
         return write_geometry(run.path, view, photo.camera, self.judged.near_far)
 
 
-def write_result(folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0) -> None:
+def write_result(
+    folder: Path, problem: RadianceProblem, view: HomeView | None = None, which: str = "", white: float = 1.0
+) -> None:
     """Write the field of a problem, and the fitted sky if present.
 
     Args:
-        folder, problem, which: folder, problem, and a suffix of the file names.
+        folder, problem, view, which: folder, problem, first view, and a suffix of the file names.
         white: factor on the colours: the radiance of the value 1 in the fit.
     """
-    write_field(folder / f"field{which}.npz", problem.field.scale_colours(white))
+    write_field(folder / f"field{which}.npz", problem.field.scale_colours(white), view=view)
     if problem.sky is not None:
         write_exr(folder / f"sky{which}.exr", {"": white * problem.sky.image()})
 

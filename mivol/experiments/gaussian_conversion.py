@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.back_end import set_variant
+from mivol.fields.field_archives import read_field_view
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.gaussian_field import MAX_OPACITY
 from mivol.fields.gaussian_grid import gaussian_box, gaussian_masses, gaussians_to_grid, grid_to_gaussians
@@ -22,7 +23,13 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics, pixel_centres, rays
 from mivol.points.cloud import read_points
 from mivol.points.conversions import points_to_gaussians
-from mivol.points.gaussian_files import GAUSSIAN_WRITERS, is_gaussian_file, read_gaussians, write_gaussians
+from mivol.points.gaussian_files import (
+    GAUSSIAN_WRITERS,
+    is_gaussian_file,
+    read_gaussian_view,
+    read_gaussians,
+    write_gaussians,
+)
 from mivol.points.gaussians import Gaussians
 from mivol.scene_graph import traverse
 from mivol.splatting.splatter import Splatter, to_tensors
@@ -62,7 +69,8 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     set_variant(variant)
     cloud = read_as_gaussians(source)
     low, high = corners_of_box(cloud, box)
-    write_field(target, gaussians_to_grid(cloud, low, high, resolution))
+    view = read_gaussian_view(source)
+    write_field(target, gaussians_to_grid(cloud, low, high, resolution), view=view)
     field = read_field(target)  # as it will be read: half floats
     mass = float(field.values()[0].sum(dtype=np.float64) * np.linalg.det(field.to_world[:3, :3]) / math.prod(field.res))
     lines = [
@@ -97,7 +105,7 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
     set_variant(variant)
     field = read_field(source)
     made = grid_to_gaussians(field, resolution)
-    write_gaussians(target, made)
+    write_gaussians(target, made, read_field_view(source))
     lines = [f"{target}: {made.count} Gaussians of degree {made.degree}"]
     if field.space == "linear":
         return "\n".join([*lines, "their colours are code values of the field's radiance, so views of the two do not compare"])

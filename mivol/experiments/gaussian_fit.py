@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -76,7 +77,13 @@ class GaussianFit(PhotoFit):
 
     def best_files(self) -> BestFiles:
         name = "gaussians_best.ply"
-        return BestFiles((name,), lambda folder: write_gaussians(folder / name, Gaussians(**self.problem.cloud)))
+        return BestFiles((name,), lambda folder: self.write_gaussians(folder / name))
+
+    def write_gaussians(self, path: Path) -> Gaussians:
+        """Write the Gaussians of the newest iterate with their first view, and return them."""
+        gaussians = Gaussians(**self.problem.cloud)
+        write_gaussians(path, gaussians, self.home_view)
+        return gaussians
 
     def rectified(self, photo: Photo) -> Photo:
         return rectify(photo)
@@ -89,8 +96,8 @@ class GaussianFit(PhotoFit):
         return render_gaussians(self.problem, camera, self.photos.views[0].background, low_pass)
 
     def write_model(self, run: RunFolder) -> dict[str, float]:
-        gaussians, path = Gaussians(**self.problem.cloud), run.path / FILE
-        write_gaussians(path, gaussians)
+        path = run.path / FILE
+        gaussians = self.write_gaussians(path)
         self.record.tables = [tabulate_gaussians(gaussians, path.stat().st_size)]
         return {"gaussians": float(gaussians.count)}
 

@@ -32,6 +32,7 @@ from mivol.optim.loop import Course, Fit
 from mivol.optim.optimizer import Optimizer
 from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, Photo
+from mivol.photos.camera_path import HomeView, find_home_view
 from mivol.report.cameras import draw_photo_cameras, plot_cameras, survey_all_cameras
 from mivol.report.record import Image, PlanLine, Table
 from mivol.scene.explain import Explanation
@@ -84,6 +85,11 @@ class PhotoFit(FitKind):
         self.record.notes = [*describe_photos(self.photos, self.judged), *self.film.notes]
         for line in self.record.plan:
             say(f"  {line.choice}: {line.reason}")
+
+    @property
+    def home_view(self) -> HomeView:
+        """The first view that files of the model keep."""
+        return find_home_view([view.camera for view in self.photos.views], self.photos.box)
 
     def announcement(self) -> list[str]:
         return [self.photos.describe(), *(f"{line.choice}: {line.reason}" for line in self.record.plan)]

@@ -11,24 +11,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib as mpl
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.field_archives import read_field_view
 from mivol.fields.field_files import read_field
 from mivol.fields.sky import Sky, read_sky
 from mivol.files import write_exr, write_png
 from mivol.files.atomic import check_destination
+from mivol.files.image_files import decode_srgb
 from mivol.files.source import check_file
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.scenes.views import derive_seed
 from mivol.photos import Camera, aim_camera, intrinsics
-from mivol.photos.photo_file import decode_srgb
+from mivol.photos.camera_path import HomeView
 from mivol.points.cloud import PointCloud, read_points
 from mivol.points.conversions import points_to_gaussians
-from mivol.points.gaussian_files import is_gaussian_file, read_gaussians
+from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.scene.description import describe_error
 from mivol.scene.explain import read_settings
@@ -125,21 +128,47 @@ SKY_FILE = "sky.exr"
 """Name of the fitted sky beside the field."""
 
 
-def render_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> np.ndarray:
-    """Render a field through a pinhole, over the sky beside the file or black: linear light (height, width, 3).
+class Framing(NamedTuple):
+    """What a user says about a camera; None stands for the first view in the file, or a default.
 
-    Args:
-        path: file of the field.
+    Attributes:
         look_at: positions of camera and target, six numbers [length].
         up: upward direction, three numbers.
         fov: horizontal field of view [degree].
         size: (width, height) [pixel].
+    """
+
+    look_at: Sequence[float] | None = None
+    up: Sequence[float] | None = None
+    fov: float | None = None
+    size: tuple[int, int] | None = None
+
+    def complete(self, view: HomeView | None) -> Framing:
+        """Return the framing with nothing missing but perhaps ``look_at``, by the first view in a file.
+
+        The kept field of view and proportions belong to the kept place, so ``look_at`` brings the defaults of both.
+        """
+        place, up, fov, size = self.look_at, (0.0, 0.0, 1.0) if view is None else view.up, 50.0, (640, 480)
+        if view is not None and place is None:
+            place, fov, size = [*view.origin, *view.target], view.fov, view.scaled(max(size))
+        return Framing(place, up if self.up is None else self.up, self.fov or fov, self.size or size)
+
+
+def render_field(path: Path, framing: Framing) -> np.ndarray:
+    """Render a field through a pinhole, over the sky beside the file or black: linear light (height, width, 3).
+
+    Args:
+        path: file of the field.
+        framing: the camera.
 
     Raises:
-        MivolError: as :func:`mivol.fields.field_files.read_field`, or an invalid camera.
+        MivolError: as :func:`mivol.fields.field_files.read_field`, no camera in the file and none given, or an invalid camera.
     """
-    camera = make_camera(look_at, up, fov, size)
     field, sky = read_field(path), sky_beside(path)
+    framing = framing.complete(read_field_view(path))
+    if framing.look_at is None:
+        raise MivolError(f"{path} keeps no camera, as the field of a fit to photographs does: give --look-at.")
+    camera = make_camera(*framing)
     image = render_view(field, camera, np.zeros(3) if sky is None else sky).image
     return np.maximum(image, 0) if field.space == "linear" else decode_srgb(image)
 
@@ -204,9 +233,7 @@ class PointLook:
             raise MivolError(f"points of radius {self.radius:g}: expected a length above 0; choose a positive radius.")
 
 
-def render_points(
-    path: Path, look_at: Sequence[float] | None, up: Sequence[float], fov: float, size: tuple[int, int], look: PointLook
-) -> np.ndarray:
+def render_points(path: Path, framing: Framing, look: PointLook) -> np.ndarray:
     """Render points or Gaussians through a pinhole over black: linear light (height, width, 3).
 
     Points are sorted by depth and composited front to back. A point smaller than a pixel covers a share of the pixel. The
@@ -214,10 +241,7 @@ def render_points(
 
     Args:
         path: file of points or Gaussians in a known format; points without colours are coloured by their local density.
-        look_at: positions of camera and target, six numbers [length]; None means a view of nearly all points.
-        up: upward direction, three numbers.
-        fov: horizontal field of view [degree].
-        size: (width, height) [pixel].
+        framing: the camera; without a place, and without one in the file, it sees nearly all points.
         look: appearance of points; Gaussians have their own sizes and opacities.
 
     Raises:
@@ -227,7 +251,8 @@ def render_points(
     if not is_cloud and look != PointLook():
         raise MivolError(f"{path} holds Gaussians, which have their own shapes: leave out the options for points.")
     gaussians = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)
-    camera = make_camera(look_at or frame_points(gaussians.means, up, fov, size), up, fov, size)
+    place, up, fov, size = framing.complete(None if is_cloud else read_gaussian_view(path))
+    camera = make_camera(place or frame_points(gaussians.means, up, fov, size), up, fov, size)
     return decode_srgb(splat_points(gaussians, camera, is_cloud, is_cloud and look.drawn_as == "discs"))
 
 

@@ -18,8 +18,9 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole
-from mivol.files.npy import check_memory
+from mivol.files.npy import check_memory, read_archive
 from mivol.files.source import refusal
+from mivol.photos.camera_path import HomeView
 
 FORMAT = "mivol spherical grid 2"
 
@@ -47,13 +48,14 @@ SVOX2_KINDS = {"links": "iu", "density_data": "f", "sh_data": "f", "radius": "fi
 # -- The format of mivol -----------------------------------------------------------------------------------------------
 
 
-def write_archive(path: Path, field: SphericalGrid, half: bool = True) -> None:
+def write_archive(path: Path, field: SphericalGrid, half: bool = True, view: HomeView | None = None) -> None:
     """Write a field in mivol's own format.
 
     Args:
         path: destination.
         field: radiance field, nested or not.
         half: store half floats (11 bits). Arrays with a value above 65504, or with all values below 2^-12, stay float32.
+        view: first view of the field, optional.
 
     Raises:
         MivolError: the disk refuses the file.
@@ -63,9 +65,25 @@ def write_archive(path: Path, field: SphericalGrid, half: bool = True) -> None:
     arrays |= {"res": np.array(field.res), "to_world": field.to_world}
     if field.nodes is not None:
         arrays["nodes"] = np.array(field.nodes)
+    if view is not None:
+        arrays[VIEW] = np.array(view.numbers)
     arrays["format"] = np.array(FORMAT)
     arrays |= {name: np.array(getattr(field, name)) for name in ("activation", "offset", "clamp", "levels", "space")}
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+VIEW = "view"
+"""Array with the numbers of the first view."""
+
+
+def read_field_view(path: Path) -> HomeView | None:
+    """Read the first view in a field's file; None without a view.
+
+    Raises:
+        MivolError: no archive of NumPy, or numbers of no camera.
+    """
+    arrays = read_archive(path, VIEW)
+    return HomeView.from_numbers(arrays[VIEW], path) if VIEW in arrays else None
 
 
 def _to_half(values: np.ndarray, half: bool) -> np.ndarray:

@@ -29,10 +29,11 @@ from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import extract_surface
 from mivol.files import write_exr, write_volume, write_whole
+from mivol.files.image_files import decode_srgb
 from mivol.files.mesh import write_mesh
 from mivol.files.npy import read_archive
 from mivol.files.source import refusal
-from mivol.photos.photo_file import decode_srgb
+from mivol.photos.camera_path import HomeView
 from mivol.points.gaussians import CONSTANT_HARMONIC
 
 FOREIGN = {".vdb": "a name for OpenVDB, for which no package can be installed"}
@@ -50,11 +51,13 @@ class WriteOptions:
         level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surfaces.default_level`.
         sky: background that a scene shows; other formats leave it out.
         half: whether ``.npz`` stores half floats.
+        view: first view, which ``.npz`` keeps and a scene shows; other formats leave it out.
     """
 
     level: float | None = None
     sky: Sky | None = None
     half: bool = True
+    view: HomeView | None = None
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,12 @@ def read_field(path: str | os.PathLike) -> SphericalGrid:
 
 
 def write_field(
-    path: str | os.PathLike, field: SphericalGrid, level: float | None = None, sky: Sky | None = None, half: bool = True
+    path: str | os.PathLike,
+    field: SphericalGrid,
+    level: float | None = None,
+    sky: Sky | None = None,
+    half: bool = True,
+    view: HomeView | None = None,
 ) -> list[Path]:
     """Write a radiance field in the format of the suffix (:data:`FIELD_FORMATS`), whole or not at all.
 
@@ -104,6 +112,7 @@ def write_field(
         sky: background of the field, in the space of its colours. Only a scene (``.xml``) holds it.
         half: store half floats in ``.npz`` (11 bits). Arrays with a value above 65504, or with all values below 2^-12, stay
             float32.
+        view: first view of the field (:func:`mivol.photos.camera_path.find_home_view`), kept by ``.npz`` and used by ``.xml``.
 
     Returns:
         Paths of the files written.
@@ -121,11 +130,11 @@ def write_field(
     kind = FIELD_FORMATS[suffix]
     if level is not None and kind.write is not _write_mesh:
         raise refusal(path, f"a level for a {kind.name}", "none", "levels are for meshes: write .ply or .obj")
-    return kind.write(path, field, WriteOptions(level, sky, half))
+    return kind.write(path, field, WriteOptions(level, sky, half, view))
 
 
 def _write_npz(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
-    write_archive(path, field, options.half)
+    write_archive(path, field, options.half, options.view)
     return [path]
 
 
@@ -157,7 +166,7 @@ def _write_mesh(path: Path, field: SphericalGrid, options: WriteOptions) -> list
 
 
 def _write_scene(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
-    return write_scene(path, field, options.sky)
+    return write_scene(path, field, options.sky, options.view)
 
 
 FIELD_FORMATS: dict[str, FieldFormat] = {
@@ -186,13 +195,13 @@ SCENE = """<scene version="3.0.0">
         <integer name="max_depth" value="2"/>
     </integrator>
     <sensor type="perspective">
-        <float name="fov" value="60"/>
+        <float name="fov" value="{fov}"/>
         <transform name="to_world">
-            <lookat origin="{eye}" target="{middle}" up="{up}"/>
+            <lookat origin="{eye}" target="{target}" up="{up}"/>
         </transform>
         <film type="hdrfilm">
-            <integer name="width" value="480"/>
-            <integer name="height" value="360"/>
+            <integer name="width" value="{width}"/>
+            <integer name="height" value="{height}"/>
         </film>
         <sampler type="independent">
             <integer name="sample_count" value="16"/>
@@ -218,13 +227,18 @@ ENVIRONMENT = """    <emitter type="envmap">
 """
 
 
-def write_scene(path: Path, field: SphericalGrid, sky: Sky | None = None) -> list[Path]:
+LONGEST_EDGE = 480
+"""Longest edge of the image of a scene [pixel]."""
+
+
+def write_scene(path: Path, field: SphericalGrid, sky: Sky | None = None, view: HomeView | None = None) -> list[Path]:
     """Write a scene of Mitsuba with the field in a cube, a camera, and an environment map of the sky.
 
     Args:
         path: ends in .xml.
         field: content of the cube, with all its levels.
         sky: background, in the space of the field's colours; None: black.
+        view: the camera of the scene; None: before the box, with up along its z.
 
     Returns:
         Paths of the files written, the scene first.
@@ -233,23 +247,28 @@ def write_scene(path: Path, field: SphericalGrid, sky: Sky | None = None) -> lis
         MivolError: a full disk, or a missing folder.
     """
     field_path, sky_path = path.with_name(f"{path.stem}-field.npz"), path.with_name(f"{path.stem}-sky.exr")
-    write_archive(field_path, field)
+    write_archive(field_path, field, view=view)
     written = [path, field_path]
     if sky is not None:
         colours = np.maximum(sky.image(), 0)
         write_exr(sky_path, {"": colours if field.space == "linear" else decode_srgb(colours)})
         written.append(sky_path)
     place = field.to_world
+    if view is None:
+        eye = place[:3, :3] @ EYE + place[:3, 3]
+        view = HomeView(tuple(place[:3, 2]), tuple(eye), tuple(field.middle), 60.0, (4, 3))
+    width, height = view.scaled(LONGEST_EDGE)
     numbers = {
-        "eye": place[:3, :3] @ EYE + place[:3, 3],
-        "middle": field.middle,
-        "up": place[:3, 2],
+        "eye": view.origin,
+        "target": view.target,
+        "up": view.up,
+        "fov": view.fov,
         "place": field.level_to_world(field.levels - 1) @ CUBE_TO_UNIT,
     }
     texts = {name: " ".join(f"{value:.9g}" for value in np.ravel(values)) for name, values in numbers.items()}
     commas = {name: text.replace(" ", ", ") for name, text in texts.items() if name != "place"}
     environment = "" if sky is None else ENVIRONMENT.format(name=sky_path.name)
-    text = SCENE.format(field=field_path.name, sky=environment, place=texts["place"], **commas)
+    text = SCENE.format(field=field_path.name, sky=environment, place=texts["place"], width=width, height=height, **commas)
     write_whole(path, lambda file: file.write(text.encode()))
     return written
 

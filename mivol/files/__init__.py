@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from mivol.files.atomic import whole_file, write_whole, write_whole_bytes, write_whole_text
 from mivol.files.formats import FORMATS, FRAMES, WRITERS, read_volume, write_volume
-from mivol.files.image_files import encode_srgb, read_exr, read_exr_header, stack_layers, write_exr, write_png
+from mivol.files.image_files import decode_srgb, encode_srgb, read_exr, read_exr_header, stack_layers, write_exr, write_png
 from mivol.files.image_stack import read_slices, read_stack
 from mivol.files.scan_hdf5 import ProjectionData, read_projections
 from mivol.files.source import read_columns
@@ -21,6 +21,7 @@ __all__ = [
     "VolumeData",
     "check_frame",
     "check_volume",
+    "decode_srgb",
     "encode_srgb",
     "frame_from_box",
     "frame_from_steps",

@@ -174,3 +174,9 @@ def encode_srgb(linear: np.ndarray) -> np.ndarray:
     """Convert linear light, clipped to 0..1, to code values 0..1 by the sRGB curve, in the same shape."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def decode_srgb(code: np.ndarray) -> np.ndarray:
+    """Convert code values 0..1 to linear light by the sRGB curve, in the same shape."""
+    code = np.clip(code, 0, 1)
+    return np.where(code <= 0.04045, code / 12.92, ((np.maximum(code, 0.04045) + 0.055) / 1.055) ** 2.4)

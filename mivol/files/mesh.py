@@ -3,9 +3,9 @@
 Own reader and writers: plyfile is under the GPL.
 
 Conventions. Faces list their corners counterclockwise as seen from outside, from 0; an ``.obj`` counts from 1. Colours are
-code values 0..1. A ``.ply`` stores colours in 8 bits, as most programs expect. Mitsuba's ``ply`` reads these as linear numbers
-with a warning, so divide its ``vertex_color`` by 255 and invert the sRGB curve. An ``.obj`` has colours after the coordinates,
-a common extension of the format.
+code values 0..1. A ``.ply`` stores them twice: ``red green blue`` are code values of 8 bits, as most programs expect; ``r g b``
+are linear reflectances in float32, which Mitsuba's ``ply`` reads as ``vertex_color`` (it says that it ignores the others). An
+``.obj`` has colours after the coordinates, a common extension of the format.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 
 from mivol.files import source
 from mivol.files.atomic import write_whole
+from mivol.files.image_files import decode_srgb
 from mivol.files.source import refusal
 
 PLY_HEAD = "ply\nformat binary_little_endian 1.0\n"
@@ -93,13 +94,15 @@ def read_ply(path: str | os.PathLike) -> Mesh:
 def _point_type(normals: bool, colours: bool) -> np.dtype:
     """The record of a point in a ``.ply``."""
     numbers = [*"xyz", *(("nx", "ny", "nz") if normals else ())]
-    return np.dtype([(c, "<f4") for c in numbers] + [(c, "u1") for c in (("red", "green", "blue") if colours else ())])
+    coloured = [*((c, "u1") for c in ("red", "green", "blue")), *((c, "<f4") for c in "rgb")] if colours else []
+    return np.dtype([(c, "<f4") for c in numbers] + coloured)
 
 
 def _write_ply(file: BinaryIO, mesh: Mesh) -> None:
     points = np.empty(len(mesh.points), _point_type(mesh.normals is not None, mesh.colours is not None))
     codes = None if mesh.colours is None else np.rint(np.clip(mesh.colours, 0, 1) * 255)
-    values = [a for a in (mesh.points, mesh.normals, codes) if a is not None]
+    linear = None if mesh.colours is None else decode_srgb(mesh.colours)
+    values = [a for a in (mesh.points, mesh.normals, codes, linear) if a is not None]
     for name, column in zip(points.dtype.names, np.concatenate(values, axis=1).T, strict=True):
         points[name] = column
     faces = np.empty(len(mesh.faces), FACE)

@@ -121,8 +121,8 @@ DAMAGE = (
 """Errors of the parsers of ZIP files and array headers for foreign bytes."""
 
 
-def read_archive(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an archive by name.
+def read_archive(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
+    """Read the arrays of an archive by name: all of them, or the named one if it is there.
 
     Raises:
         FileNotFoundError: a missing file.
@@ -134,6 +134,7 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
                 raise refusal(path, "one array (.npy)", "an archive of arrays (.npz)", "rename the file to .npy")
             with zipfile.ZipFile(file) as archive:
                 members = {m.filename.removesuffix(".npy"): m for m in archive.infolist() if not m.is_dir()}
+                members = {name: member for name, member in members.items() if only in (None, name)}
                 check_memory(path, sum(member.file_size for member in members.values()))
                 return {name: _read_member(path, archive, name, member) for name, member in members.items()}
     except (MivolError, FileNotFoundError):

@@ -63,6 +63,17 @@ def read_layout(path: str | os.PathLike) -> dict[str, tuple[str, ...]]:
     return {element.name: tuple(name for name, _ in element.properties) for element in _header(head, path)[1]}
 
 
+def read_comments(path: str | os.PathLike) -> list[str]:
+    """Read the comments of the header.
+
+    Raises:
+        MivolError: another format, or an endless header.
+    """
+    with source.check_file(path).open("rb") as file:
+        head, _ = _split(file.read(LONGEST_HEADER), path)
+    return [line.removeprefix("comment ") for line in head.splitlines() if line.startswith("comment ")]
+
+
 def read_tables(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """Read all elements before the first element with lists.
 

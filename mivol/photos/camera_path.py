@@ -1,4 +1,4 @@
-"""Camera paths for films of a photographed subject: around it, from view to view, or through keyframes.
+"""Camera paths for films of a photographed subject (around it, from view to view, through keyframes), and its first view.
 
 Conventions. Every camera of a path is a pinhole with the size and focal length of the first given camera (a field of view of
 ``WIDE`` degrees for a wide lens), without distortion, and with the optical axis through the image centre.
@@ -7,13 +7,15 @@ Conventions. Every camera of a path is a pinhole with the size and focal length 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from mivol.errors import MivolError
 from mivol.files.source import refusal
-from mivol.photos.camera import Camera, intrinsics
+from mivol.photos.camera import Camera, field_of_view, intrinsics
 from mivol.photos.lens import Lens
 
 ALL_ROUND = np.radians(90)
@@ -136,3 +138,73 @@ def _azimuths(photographed: np.ndarray, n: int) -> np.ndarray:
         return ordered[0] + 2 * np.pi * np.arange(n) / n
     start = ordered[(widest + 1) % len(ordered)]
     return start + (2 * np.pi - gaps[widest]) * (1 - np.cos(2 * np.pi * np.arange(n) / n)) / 2
+
+
+# -- First view ------------------------------------------------------------------------------------------------------------
+
+
+HOME_NUMBERS = 12
+"""Numbers of a first view."""
+
+
+@dataclass(frozen=True)
+class HomeView:
+    """The first view of a model fitted to photographs: upright, from the place of a photograph, at the middle of the box.
+
+    Attributes:
+        up: upward direction (3,) of the photographs.
+        origin: position (3,) of the camera [length].
+        target: point (3,) in the image centre [length].
+        fov: horizontal field of view [degree].
+        size: (width, height) [pixel].
+    """
+
+    up: tuple[float, ...]
+    origin: tuple[float, ...]
+    target: tuple[float, ...]
+    fov: float
+    size: tuple[int, int]
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The ``HOME_NUMBERS`` numbers of a file: up, origin, target, field of view, width and height."""
+        return (*self.up, *self.origin, *self.target, self.fov, *map(float, self.size))
+
+    @staticmethod
+    def from_numbers(numbers: Sequence[float], name: object) -> HomeView:
+        """Make a view from the numbers of a file.
+
+        Raises:
+            MivolError: another count, or numbers of no camera; ``name`` is the subject.
+        """
+        values = np.asarray(numbers, np.float64)
+        is_valid = values.shape == (HOME_NUMBERS,) and np.isfinite(values).all()
+        if not is_valid or not 0 < values[9] < 180 or not (values[10:] >= 1).all():
+            found, expected = f"a first view of {values.tolist()}", f"{HOME_NUMBERS} numbers: up, origin, target, fov, size"
+            raise refusal(name, found, expected, "write the file again")
+        up, origin, target = (tuple(row) for row in values[:9].reshape(3, 3).tolist())
+        return HomeView(up, origin, target, float(values[9]), (int(values[10]), int(values[11])))
+
+    def scaled(self, longest: int) -> tuple[int, int]:
+        """(width, height) with another longest edge [pixel]."""
+        width, height = (max(1, round(n * longest / max(self.size))) for n in self.size)
+        return width, height
+
+
+def find_home_view(cameras: Sequence[Camera], box: np.ndarray) -> HomeView:
+    """Return the view of the photograph that aims best at the middle of a box (2, 3) [length].
+
+    Up is the common upward direction of the photographs, or the photograph's own without a common direction.
+    """
+    middle = np.mean(box, axis=0)
+    aims = [float((middle - c.origin) @ c.forward / max(np.linalg.norm(middle - c.origin), 1e-30)) for c in cameras]
+    best = cameras[int(np.argmax(aims))]
+    try:
+        up = _mean_up(cameras)
+    except MivolError:
+        up = best.to_world[:3, 1]
+    along = float((middle - best.origin) @ best.forward)
+    reach = along if along > 0 else float(np.linalg.norm(box[1] - box[0]))
+    fov = min(field_of_view(best), WIDE) if best.distortion.is_wide else field_of_view(best)
+    target = best.origin + reach * best.forward
+    return HomeView(tuple(up.tolist()), tuple(best.origin.tolist()), tuple(target.tolist()), fov, best.size)

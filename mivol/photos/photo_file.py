@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from mivol.files import encode_srgb, read_exr, read_exr_header
+from mivol.files import decode_srgb, encode_srgb, read_exr, read_exr_header
 from mivol.files.source import check_file, refusal
 
 #: suffixes of photographs, in the order of the trials for a name without suffix.
@@ -47,12 +47,6 @@ TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: np.swapaxes(image[::-1, ::-1], 0, 1),
     8: lambda image: np.rot90(image),
 }
-
-
-def decode_srgb(code: np.ndarray) -> np.ndarray:
-    """Convert code values 0..1 to linear light by the sRGB curve, in the same shape."""
-    code = np.clip(code, 0, 1)
-    return np.where(code <= 0.04045, code / 12.92, ((np.maximum(code, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 #: (space of the file, requested space) -> conversion.

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 from mivol.files.atomic import write_whole
-from mivol.files.ply import read_layout, read_tables
-from mivol.files.source import check_file, select_by_suffix
+from mivol.files.ply import read_comments, read_layout, read_tables
+from mivol.files.source import check_file, parse_reals, select_by_suffix
+from mivol.photos.camera_path import HomeView
 from mivol.points.gaussian_ply import is_compressed, parse_compressed_tables, parse_tables, write_gaussian_ply
 from mivol.points.gaussians import Gaussians
 from mivol.points.splat import read_ksplat, read_splat
@@ -62,8 +64,13 @@ def read_gaussians(path: str | os.PathLike) -> Gaussians:
     return select_by_suffix(path, GAUSSIAN_READERS)(path).check(path)
 
 
-def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
+def write_gaussians(path: str | os.PathLike, gaussians: Gaussians, view: HomeView | None = None) -> None:
     """Write Gaussians, whole or not at all; the suffix selects the format (:data:`GAUSSIAN_WRITERS`).
+
+    Args:
+        path: destination.
+        gaussians: contents.
+        view: first view; a ``.ply`` keeps it as a comment, other formats leave it out.
 
     Raises:
         MivolError: an unknown suffix, numbers that no renderer can draw, or a full disk.
@@ -71,4 +78,25 @@ def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
     path = Path(path)
     writer = select_by_suffix(path, GAUSSIAN_WRITERS)
     gaussians.check(path)
+    if view is not None and writer is write_gaussian_ply:
+        comment = " ".join([VIEW_COMMENT, *(f"{number:.9g}" for number in view.numbers)])
+        writer = partial(write_gaussian_ply, comment=comment)
     write_whole(path, lambda file: writer(file, gaussians))
+
+
+VIEW_COMMENT = "mivol_view"
+"""First word of the comment with the first view in a ``.ply``."""
+
+
+def read_gaussian_view(path: Path) -> HomeView | None:
+    """Read the first view in a file of Gaussians; None without a view.
+
+    Raises:
+        MivolError: a ``.ply`` with an unreadable header, or numbers of no camera.
+    """
+    if path.suffix.lower() != ".ply":
+        return None
+    words = next((comment.split() for comment in read_comments(path) if comment.startswith(f"{VIEW_COMMENT} ")), None)
+    if words is None:
+        return None
+    return HomeView.from_numbers(parse_reals(" ".join(words[1:]), len(words) - 1, path, VIEW_COMMENT), path)

@@ -94,8 +94,8 @@ def _parse_higher_harmonics(table: np.ndarray, path: str | os.PathLike) -> np.nd
     return np.swapaxes(_stack_columns(table, names).reshape(len(table), 3, count // 3), 1, 2)[:, :kept]
 
 
-def write_gaussian_ply(file: BinaryIO, gaussians: Gaussians) -> None:
-    """Write Gaussians in the format of the authors' program."""
+def write_gaussian_ply(file: BinaryIO, gaussians: Gaussians, comment: str = "") -> None:
+    """Write Gaussians in the format of the authors' program, with a comment in the header unless it is empty."""
     rest = np.swapaxes(gaussians.harmonics[:, 1:], 1, 2).reshape(gaussians.count, -1)
     parts = {
         MEANS: gaussians.means,
@@ -110,7 +110,7 @@ def write_gaussian_ply(file: BinaryIO, gaussians: Gaussians) -> None:
     for names, values in parts.items():
         for name, column in zip(names, values.T, strict=True):
             table[name] = column
-    ply.write_table(file, table)
+    ply.write_table(file, table, comment)
 
 
 def _stack_columns(table: np.ndarray, names: tuple[str, ...] | list[str]) -> np.ndarray:

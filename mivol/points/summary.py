@@ -6,7 +6,8 @@ and left out of the extents.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,14 @@ from mivol.errors import MivolError
 from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS, PointCloud, read_points, write_points
 from mivol.points.conversions import gaussians_to_points, points_to_gaussians
-from mivol.points.gaussian_files import GAUSSIAN_READERS, GAUSSIAN_WRITERS, is_gaussian_file, read_gaussians, write_gaussians
+from mivol.points.gaussian_files import (
+    GAUSSIAN_READERS,
+    GAUSSIAN_WRITERS,
+    is_gaussian_file,
+    read_gaussian_view,
+    read_gaussians,
+    write_gaussians,
+)
 from mivol.points.gaussians import Gaussians
 
 KINDS = ("gaussians", "points")
@@ -61,13 +69,14 @@ def summarize_file(path: Path) -> FileSummary:
     return FileSummary("\n".join([*lines(path, contents), *([f"refused\n{refused}"] if refused else [])]), refused)
 
 
-def convert_file(source: Path, target: Path, kind: str | None = None) -> str:
+def convert_file(source: Path, target: Path, kind: str | None = None, box: Sequence[float] | None = None) -> str:
     """Write the Gaussians or points of a file in another format.
 
     Args:
         source: file in any format of :func:`read_gaussians` or :func:`read_points`.
         target: destination; its suffix selects the format.
         kind: one of :data:`KINDS`; None: the kind of the source, or points for a suffix without Gaussians.
+        box: two corners, six numbers [length]: only what has its middle inside is written; None: everything.
 
     Returns:
         A line that describes the written file.
@@ -82,13 +91,33 @@ def convert_file(source: Path, target: Path, kind: str | None = None) -> str:
     select_by_suffix(target, {**CLOUD_WRITERS, **GAUSSIAN_WRITERS})
     kind = kind or ("gaussians" if has_gaussians and target.suffix.lower() in GAUSSIAN_WRITERS else "points")
     contents = read_gaussians(source) if has_gaussians else read_points(source)
+    if box is not None:
+        contents = _crop(contents, box, source)
     if kind == "gaussians":
         gaussians = points_to_gaussians(contents) if isinstance(contents, PointCloud) else contents
-        write_gaussians(target, gaussians)
+        write_gaussians(target, gaussians, read_gaussian_view(source))
         return f"{target}: {gaussians.count} Gaussians of degree {gaussians.degree}"
     cloud = contents if isinstance(contents, PointCloud) else gaussians_to_points(contents)
     write_points(target, cloud)
     return f"{target}: {cloud.count} points"
+
+
+def _crop(contents: Gaussians | PointCloud, box: Sequence[float], source: Path) -> Gaussians | PointCloud:
+    """The Gaussians or points inside a box.
+
+    Raises:
+        MivolError: corners in the wrong order, or nothing inside.
+    """
+    low, high = np.array(box, np.float64).reshape(2, 3)
+    if not (low < high).all():
+        raise refusal("--box", f"{list(box)}", "a lower corner, then a higher corner", "exchange numbers")
+    places = contents.positions if isinstance(contents, PointCloud) else contents.means
+    inside = ((places >= low) & (places <= high)).all(axis=1)
+    if not inside.any():
+        raise refusal(source, f"nothing of {len(places)} inside --box", "a box around some of it", "see mivol explain")
+    if isinstance(contents, Gaussians):
+        return contents.select(inside)
+    return replace(contents, positions=places[inside], colours=None if contents.colours is None else contents.colours[inside])
 
 
 def _describe_gaussians(path: Path, contents: Gaussians) -> list[str]:

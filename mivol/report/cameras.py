@@ -1,8 +1,8 @@
 """Figures of cameras and scanners around their box, from the side and from above.
 
 Conventions. The colour shows the split. A camera is drawn as its pinhole with the four edges of its field of view. The up axis
-is the world axis nearest to the mean upward direction of the cameras. Of nested boxes, the side view and the plan show the
-boxes up to the farthest camera; a third panel shows all boxes.
+is the world axis, of either sign, nearest to the mean upward direction of the cameras. Of nested boxes, the side view and the
+plan show the boxes up to the farthest camera; a third panel shows all boxes.
 
 Scanners. A small pyramid marks a view. The pyramid of a point source opens towards the detector, like the pyramid of a camera;
 the apex of a pyramid of parallel light points in the direction of the light. A few detectors are drawn at their true size.
@@ -77,6 +77,7 @@ class Arrangement(NamedTuple):
         points: points (N, 3) of a reconstruction inside the largest box [length].
         up: index of the up axis of the world.
         levels: number of nested boxes.
+        is_down: whether up is the negative direction of that axis.
     """
 
     strokes: list[Strokes]
@@ -84,6 +85,7 @@ class Arrangement(NamedTuple):
     points: NDArray
     up: int
     levels: int = 1
+    is_down: bool = False
 
     @property
     def near(self) -> int:
@@ -124,12 +126,13 @@ def arrange_cameras(survey: PhotoSurvey) -> Arrangement:
     """Arrange the cameras of a data set around their box, with a colour per split."""
     middle = survey.box.mean(axis=0)
     length = EDGE * float(np.median([np.linalg.norm(f.camera.origin - middle) for f in survey.frames]))
-    up = int(np.argmax(np.abs(np.mean([f.camera.to_world[:3, 1] for f in survey.frames], axis=0))))
+    mean_up = np.mean([f.camera.to_world[:3, 1] for f in survey.frames], axis=0)
+    up = int(np.argmax(np.abs(mean_up)))
     strokes = [
         Strokes(LABELS[split], _colour(split), np.concatenate([outline(f, length) for f in frames]))
         for split, frames in _by_split(survey).items()
     ]
-    return Arrangement(strokes, survey.box, _points(survey), up, survey.levels)
+    return Arrangement(strokes, survey.box, _points(survey), up, survey.levels, bool(mean_up[up] < 0))
 
 
 def plot_arrangement(arranged: Arrangement, title: str, path: str | Path | None = None, part: str | None = None) -> Figure:
@@ -225,7 +228,9 @@ def _draw_side(axes: Axes, arranged: Arrangement) -> None:
     axes.scatter(*points[:, order].T, s=0.3, color=FAINT, linewidths=0)
     everything = everything[:, order]
     low, high = everything.min(axis=0), everything.max(axis=0)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    # With up along a negative axis, both the upright and a horizontal axis are reversed, which is a half turn and no mirror.
+    turned = (lambda k: (high[k], low[k])) if arranged.is_down else (lambda k: (low[k], high[k]))
+    axes.set(xlim=(low[0], high[0]), ylim=turned(1), zlim=turned(2))
     axes.set_box_aspect(high - low, zoom=ZOOM)
     for k, (name, axis) in enumerate(zip(order, (axes.xaxis, axes.yaxis, axes.zaxis), strict=True)):
         axis.set_label_text(f"{'xyz'[name]} [length]")
@@ -247,7 +252,10 @@ def _draw_plan(axes: Axes, arranged: Arrangement, levels: int) -> None:
     axes.scatter(*points.T, s=0.3, color=FAINT, linewidths=0)
     axes.set_aspect("equal", adjustable="datalim")
     view = "from above" if levels == arranged.near else "all boxes from above"
-    axes.set(title=f"{view} ({'xyz'[up]} is up)", xlabel=f"{'xyz'[first]} [length]", ylabel=f"{'xyz'[second]} [length]")
+    if arranged.is_down:
+        axes.invert_yaxis()
+    sign = "-" if arranged.is_down else ""
+    axes.set(title=f"{view} ({sign}{'xyz'[up]} is up)", xlabel=f"{'xyz'[first]} [length]", ylabel=f"{'xyz'[second]} [length]")
 
 
 def _box_style(number: int) -> dict:

@@ -29,6 +29,9 @@ PAGE = "report.html"
 SHOWN_VIEWS = 4
 """Views visible at once; the page folds the others."""
 
+PHOTOGRAPHS = "photos"
+"""Table of the settings of a fit to photographs: its page begins with the film, and its volumes are the last figures."""
+
 VERDICTS = {"finished": "Reconstructed in", "stopped": "Stopped after", "running": "Still running after"}
 
 
@@ -62,6 +65,7 @@ def write_page(folder: str | Path) -> Path:
         "views": groups,
         "shown": SHOWN_VIEWS,
         "volumes": volumes,
+        "of_photographs": PHOTOGRAPHS in record.config,
         "profiles": draw_profiles(folder, record.volumes),
         "curves": _curves(rows, record.units),
         "timings": _timings(record.timings),

@@ -372,6 +372,18 @@ def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):
     assert "voxels, 4 × 3 × 2" in found.text
 
 
+def test_a_fit_to_photographs_begins_with_its_film(tmp_path):
+    """The volume is the last figure; the navigation has the order of the sections."""
+    write_volume(tmp_path / "found.npz", np.ones((2, 3, 4, 1), np.float32))
+    (tmp_path / "film.mp4").write_bytes(b"mp4")
+    film, volume = Image(path="film.mp4", role="film"), Volume(path="found.npz", role="reconstruction")
+    for config, first in (({"photos": {"path": "p"}}, ["film", "volume"]), ({}, ["volume", "film"])):
+        found = page_of(tmp_path, "A fit", images=[film], volumes=[volume], config=config)
+        sections = [attributes["id"] for tag, attributes in found.tags if tag == "section" and "id" in attributes]
+        links = [attributes["href"][1:] for tag, attributes in found.tags if tag == "a" and attributes["href"][0] == "#"]
+        assert sections[:2] == first and links[: len(sections)] == sections
+
+
 def test_projections_are_measured_and_modelled(tmp_path):
     """The sinogram has the first section, images have the names of a scan, and the volume has profiles."""
     layers = {"Y": np.full((2, 3), 0.8), "reference.Y": np.full((2, 3), 0.5), "noise.Y": np.full((2, 3), np.inf)}

@@ -63,9 +63,10 @@ def test_convert_says_which_flags_are_of_fields(tmp_path: Path, capsys: pytest.C
     for source, target, flags, said in (
         ("a.ply", "b.npz", ["--to", "points"], "leave out --to points"),
         ("a.ply", "b.ply", ["--to", "field"], "leave out --to field"),
-        ("a.ply", "b.ply", ["--resolution", "9"], "are for a radiance field"),
-        ("a.ply", "b.ply", ["--box", *"000111"], "are for a radiance field"),
-        ("a.npz", "b.ply", ["--box", *"000111"], "are for a radiance field"),
+        ("a.ply", "b.ply", ["--resolution", "9"], "--resolution is for a radiance field"),
+        ("a.ply", "b.ply", ["--box", *"111000"], "expected a lower corner, then a higher corner"),
+        ("a.ply", "b.ply", ["--box", *"888999"], "found nothing of 2 inside --box"),
+        ("a.npz", "b.ply", ["--box", *"000111"], "--box crops Gaussians and points, not a radiance field"),
         ("a.npz", "b.obj", [], "mivol export writes it as a mesh"),
         ("a.npz", "b.npy", [], "expected one of .ply"),
         ("a.ply", "b.stl", ["--to", "mesh"], "expected one of .ply, .obj"),

@@ -10,12 +10,14 @@ import pytest
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments.render import make_camera
-from mivol.fields.field_files import write_field
+from mivol.fields.field_archives import read_field_view
+from mivol.fields.field_files import read_field, write_field
 from mivol.fields.sky import read_sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr
+from mivol.files.image_files import decode_srgb
 from mivol.photos import project
-from mivol.photos.photo_file import decode_srgb
+from mivol.photos.camera_path import HomeView
 
 Y0 = 0.28209479177387814
 
@@ -50,6 +52,26 @@ def test_a_field_is_seen_from_where_one_likes(field: Path, capsys: pytest.Captur
     assert str(field.with_name("view.exr")) in capsys.readouterr().out
 
 
+def test_a_field_keeps_its_first_view(field: Path, tmp_path: Path) -> None:
+    """The kept camera looks at a corner with -y up: its picture and the scene's are those of the same camera by hand."""
+    view = HomeView((0.0, -1.0, 0.0), (0.0, -1.0, -4.0), (1.0, -1.0, 0.0), 40.0, (8, 4))
+    write_field(field, read_field(field), half=False, view=view)
+    assert read_field_view(field) == view
+    pictures = []
+    by_hand = ["--look-at", "0", "-1", "-4", "1", "-1", "0", "--fov", "40", "--size", "640", "320"]
+    for options in ([], [*by_hand], [*by_hand, "--up", "0", "0.5", "0"]):
+        assert main(["render", str(field), *options, "-o", str(tmp_path / "view.exr")]) == 0
+        pictures.append(read_exr(tmp_path / "view.exr")[0]["R"])
+    assert pictures[0].shape == (320, 640) and pictures[0].max() > 0.5
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    np.testing.assert_allclose(pictures[2], pictures[0][::-1, ::-1], atol=1e-6)
+    assert main(["export", str(field), str(tmp_path / "scene.xml")]) == 0
+    text = (tmp_path / "scene.xml").read_text()
+    for said in ('origin="0, -1, -4" target="1, -1, 0" up="0, -1, 0"', 'name="fov" value="40"', 'name="height" value="240"'):
+        assert said in text
+    assert read_field_view(tmp_path / "scene-field.npz") == view
+
+
 def test_the_camera_stands_where_it_is_told() -> None:
     camera = make_camera([1.0, 2.0, 3.0, 4.0, 2.0, 3.0], [0.0, 0.0, 1.0], 90.0, (40, 20))
     np.testing.assert_allclose(camera.origin, [1, 2, 3])
@@ -76,7 +98,7 @@ def test_cameras_that_cannot_be_are_refused(up: list[float], fov: float, size: t
 
 def test_what_is_no_field_has_its_own_cameras(field: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["render", str(field), "-o", str(tmp_path / "a.png")]) == 1
-    assert "needs --look-at" in capsys.readouterr().err
+    assert "keeps no camera, as the field of a fit to photographs does: give --look-at" in capsys.readouterr().err
     assert main(["render", "scene.xml", "--look-at", *"123456", "-o", str(tmp_path / "a.png")]) == 1
     assert "is for a radiance field" in capsys.readouterr().err
     write_exr(tmp_path / "sky.exr", {"": np.zeros((4, 4, 3), np.float32)})

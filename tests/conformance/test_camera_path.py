@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from photo_sets import look_at, ring
+from scipy.spatial.transform import Rotation
 
 from mivol.errors import MivolError
 from mivol.photos import Camera, aim_camera, interpolate_cameras, intrinsics, project, turntable
+from mivol.photos.camera_path import HomeView, find_home_view
 
 LIKE = Camera(intrinsics(90, 100, 30, 20), (64, 48), np.eye(4))
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -66,3 +68,28 @@ def test_turntable_needs_a_common_upward_direction() -> None:
     turned = [pose @ np.diag([-1.0, -1, 1, 1]) for pose in ring(4)]
     with pytest.raises(MivolError, match="common upward direction"):
         turntable(cameras_of(ring(4) + turned), BOX, 4)
+
+
+def test_the_first_view_is_upright_and_looks_at_the_box() -> None:
+    """Cameras of a ring in a tilted world, one of them turned away from the middle: the others' up, and not that camera."""
+    tilt = Rotation.from_rotvec([2.0, 0.3, -0.4]).as_matrix()
+    poses = ring(5)
+    poses[0] = look_at(poses[0][:3, 3], (0.0, 1.0, 0.5))
+    cameras = []
+    for k, pose in enumerate(poses):
+        turned = np.eye(4)
+        turned[:3] = tilt @ pose[:3]
+        cameras.append(Camera(intrinsics(20, 20, 6, 4), (12, 8), turned, name=f"{k}"))
+    view = find_home_view(cameras, np.array([[-1.0] * 3, [1.0] * 3]))
+    np.testing.assert_allclose(view.up, tilt @ [0, 0, 1], atol=1e-6)  # the weight of the vertical image axes
+    np.testing.assert_allclose(view.target, 0, atol=1e-9)
+    assert not np.allclose(view.origin, cameras[0].origin)
+    assert (view.size, view.scaled(120)) == ((12, 8), (120, 80))
+    np.testing.assert_allclose(view.fov, 2 * np.degrees(np.arctan(6 / 20)))
+    assert HomeView.from_numbers(view.numbers, "file") == view
+
+
+@pytest.mark.parametrize("numbers", [(1.0,) * 11, (np.nan,) * 12, (1.0,) * 9 + (0.0, 4.0, 4.0)])
+def test_numbers_of_no_view_are_refused(numbers: tuple[float, ...]) -> None:
+    with pytest.raises(MivolError, match="found a first view of .* expected 12 numbers"):
+        HomeView.from_numbers(numbers, "file")

@@ -140,6 +140,8 @@ def test_meshes_on_disk(variant_rgb: None, tmp_path: Path, suffix: str) -> None:
         assert again.points == pytest.approx(mesh.points, abs=1e-6)
         assert again.normals == pytest.approx(mesh.normals, abs=1e-6)
         assert np.abs(again.colours - mesh.colours).max() <= 0.5 / 255 + 1e-6
+        reflectances = np.array(mi.traverse(read)["vertex_color"]).reshape(-1, 3)
+        assert encode_srgb(reflectances) == pytest.approx(mesh.colours, abs=1e-6)
     else:
         lines = [line.split() for line in path.read_text().splitlines()]
         values = {k: np.array([w[1:] for w in lines if w[0] == k], float) for k in ("v", "vn")}

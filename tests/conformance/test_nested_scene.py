@@ -19,7 +19,7 @@ from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import extract_surface
 from mivol.files import read_exr, read_volume, write_exr
-from mivol.photos.photo_file import decode_srgb
+from mivol.files.image_files import decode_srgb
 from mivol.scene.load import load_scene
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import make_exact

@@ -9,12 +9,15 @@ import pytest
 from photo_sets import edit, pixels, png_of_16_bits, ring, write_colmap, write_transforms
 from PIL import Image
 
+from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.files import ply
 from mivol.photos import load_photos, survey_photos
+from mivol.photos.camera_path import HomeView
 from mivol.photos.listing import find_shrink
 from mivol.photos.photo_file import ORIENTATION, TURNS
-from mivol.points import read_gaussians
+from mivol.points import read_gaussians, write_gaussians
+from mivol.points.gaussian_files import read_gaussian_view
 from mivol.points.gaussian_ply import write_gaussian_ply
 from mivol.points.gaussians import Gaussians
 
@@ -211,3 +214,18 @@ def test_harmonics_of_degree_4_are_cut_and_the_cut_is_said(tmp_path: Path) -> No
     with pytest.warns(RuntimeWarning, match="degree 4 are cut to degree 3"):
         read = read_gaussians(tmp_path / "a.ply")
     np.testing.assert_array_equal(read.harmonics[:, 1:], np.swapaxes(rest[:, :, :15], 1, 2))
+
+
+def test_a_file_of_gaussians_keeps_its_first_view_and_a_box_crops_it(tmp_path: Path) -> None:
+    """Other programs skip comments; a converted file keeps the view."""
+    view = HomeView((0.0, -1.0, 0.0), (0.0, -1.0, -4.0), (1.0, -1.0, 0.0), 40.0, (8, 4))
+    gaussians = make_gaussians()
+    write_gaussians(tmp_path / "a.ply", gaussians, view)
+    inside = (np.abs(gaussians.means) <= 1).all(axis=1)
+    assert 0 < inside.sum() < len(inside)
+    box = ["--box", "-1", "-1", "-1", "1", "1", "1"]
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), *box]) == 0
+    assert read_gaussian_view(tmp_path / "b.ply") == view
+    np.testing.assert_array_equal(read_gaussians(tmp_path / "b.ply").means, gaussians.means[inside])
+    write_gaussians(tmp_path / "c.ply", gaussians)
+    assert read_gaussian_view(tmp_path / "c.ply") is None

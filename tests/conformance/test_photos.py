@@ -29,6 +29,7 @@ from mivol import photos
 from mivol.errors import MivolError
 from mivol.experiments.photo_data import describe_photos
 from mivol.files import write_exr
+from mivol.files.image_files import decode_srgb
 from mivol.photos import (
     Camera,
     Lens,
@@ -44,7 +45,7 @@ from mivol.photos import (
     survey_photos,
     undistort,
 )
-from mivol.photos.photo_file import decode_srgb, read_photo, read_photo_header
+from mivol.photos.photo_file import read_photo, read_photo_header
 
 EPS = float(np.finfo(np.float32).eps)
 

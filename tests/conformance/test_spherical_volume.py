@@ -16,7 +16,7 @@ from mivol.fields.field_files import read_field, write_field
 from mivol.fields.harmonics import decode_srgb_code
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
-from mivol.photos.photo_file import decode_srgb
+from mivol.files.image_files import decode_srgb
 from scenes import box_of, camera, centred, refused, render, rotation, sky, tensor, transform
 
 PLACE = centred(2 * np.eye(3))

@@ -21,10 +21,10 @@ from mivol.errors import MivolError
 from mivol.experiments.gaussian_fit import find_start_points, make_gaussian_plan, make_start_cloud
 from mivol.experiments.photo_fit import PhotoFit
 from mivol.files import write_png
+from mivol.files.image_files import decode_srgb
 from mivol.optim.gaussians.gaussian_plan import PRESETS
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.photos import Camera, Photo, intrinsics, load_photos, project
-from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.points import read_gaussians
 from mivol.splatting import Splatter

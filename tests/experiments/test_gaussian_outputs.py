@@ -66,7 +66,9 @@ def finished_fit(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, show
     camera = SimpleNamespace(size=(1600, 1200))
     background = np.array([0.1, 0.2, 0.3])
     photos = SimpleNamespace(
-        views=[SimpleNamespace(camera=camera, background=background, name=f"{k}") for k in range(views)], space="srgb"
+        views=[SimpleNamespace(camera=camera, background=background, name=f"{k}") for k in range(views)],
+        space="srgb",
+        box="box",
     )
     fit = object.__new__(outputs.GaussianFit)
     fit.record = SimpleNamespace(results={}, images=[], tables=[], volumes=[])
@@ -76,7 +78,8 @@ def finished_fit(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, show
     fit.plan = SimpleNamespace(low_pass=0.3, low_pass_at=lambda shrink: ("low pass at", shrink))
     arrays = {name: getattr(cloud(), name) for name in outputs.Gaussians.__dataclass_fields__}
     fit.problem = SimpleNamespace(exposure=None, cloud=arrays)
-    monkeypatch.setattr(outputs, "write_gaussians", lambda path, gaussians: path.write_bytes(bytes(100)))
+    monkeypatch.setattr(outputs, "write_gaussians", lambda path, gaussians, view: path.write_bytes(view))
+    monkeypatch.setattr(photo_fit, "find_home_view", lambda cameras, box: {("box", views): bytes(100)}[box, len(cameras)])
     monkeypatch.setattr(outputs, "rectify", lambda photo: photo)
     monkeypatch.setattr(photo_fit, "draw_photo_cameras", lambda *given: run.written.append(given) or [])
     written = lambda folder, photo, number, seen, space, caption, edge=None: [(photo.name, seen.tolist(), caption, edge)]  # noqa: E731

@@ -25,11 +25,11 @@ from mivol.experiments.photo_fit import PhotoFit
 from mivol.fields.field_files import read_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr, write_png
+from mivol.files.image_files import decode_srgb
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS, PRESETS, RadiancePlan, RadianceStage, scale_longest
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photos, intrinsics
-from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.validate.metrics import score_image
 

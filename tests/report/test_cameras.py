@@ -42,7 +42,7 @@ from mivol.scene.camera_rigs import find_media_box
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews
 
-TURNS = {"x": [0, 90, 0], "y": [-90, 0, 0], "z": [0, 0, 0]}
+TURNS = {"x": [0, 90, 0], "y": [-90, 0, 0], "z": [0, 0, 0], "-y": [90, 0, 0]}
 """Angles about x, y and z that take z to an axis."""
 
 
@@ -61,15 +61,21 @@ def survey(tmp_path: Path) -> PhotoSurvey:
     return replace(found, box=np.array([[-1.0, -2.0, -3.0], [1.5, 2.5, 3.5]]))
 
 
-@pytest.mark.parametrize(("up", "order"), [("x", (1, 2, 0)), ("y", (2, 0, 1)), ("z", (0, 1, 2))])
+@pytest.mark.parametrize(("up", "order"), [("x", (1, 2, 0)), ("y", (2, 0, 1)), ("z", (0, 1, 2)), ("-y", (2, 0, 1))])
 def test_up_is_vertical_and_the_axes_are_right_handed(survey: PhotoSurvey, up: str, order: tuple[int, int, int]) -> None:
-    """Cameras on a ring around the up axis: vertical in the side view, and the plan shows the other axes."""
+    """Cameras on a ring around the up axis: vertical in the side view, and the plan shows the other axes.
+
+    With -y up, the values of y and of a horizontal axis fall: a half turn.
+    """
     stands = turned(survey, up)
     side, plan = plot_cameras(stands).axes
     assert [side.get_xlabel(), side.get_ylabel(), side.get_zlabel()] == [f"{'xyz'[k]} [length]" for k in order]
     assert plan.get_title(loc="left") == f"from above ({up} is up)"
     assert (plan.get_xlabel(), plan.get_ylabel()) == tuple(f"{'xyz'[k]} [length]" for k in order[:2])
     assert np.linalg.det(np.eye(3)[list(order)]) == 1
+    is_down = up.startswith("-")
+    ends = (side.get_xlim(), side.get_ylim(), side.get_zlim(), plan.get_xlim(), plan.get_ylim())
+    assert [low > high for low, high in ends] == [False, is_down, is_down, False, is_down]
     cameras = np.array([frame.camera.origin for frame in stands.frames])
     drawn = {line.get_label(): np.array(line.get_data()).T for line in plan.lines}
     lifted = {label: np.array(line.get_data_3d()).T for label, line in zip(drawn, side.lines, strict=True)}

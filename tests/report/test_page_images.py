@@ -11,7 +11,7 @@ import pytest
 from matplotlib.image import imread
 
 from mivol.files import write_png, write_volume
-from mivol.photos.photo_file import decode_srgb
+from mivol.files.image_files import decode_srgb
 from mivol.report import pixel_scale
 from mivol.report.page_images import LAYER_EDGE, LAYERS, PageImage, encode_film, encode_image, make_view_rows, make_volume_views
 from mivol.report.record import Image, Volume
