@@ -261,7 +261,18 @@ class Readings(Section):
     find_axis: Annotated[
         bool | None, setting("1", "find the rotation axis; false: scan.axis_offset holds; absent: find it if that offset is 0")
     ] = None
-    air: Annotated[int, setting("pixel", "columns without object at each edge, for the drift of the light", ge=0)] = 0
+    air: (
+        Annotated[
+            int,
+            setting(
+                "pixel",
+                "columns without object at each edge, for the drift of the light; 0: none; absent: air is looked for there, "
+                "and used if it is not as bright as the flats",
+                ge=0,
+            ),
+        ]
+        | None
+    ) = None
     drift: Annotated[int, setting("iteration", "fits of a drift of the light to each pixel; 0: none", ge=0)] = 0
     saturation: Annotated[float, setting("reading", "smallest saturated reading, not used", gt=0)] = INFINITY
 

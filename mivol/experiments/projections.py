@@ -21,7 +21,7 @@ from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
-from mivol.tomography.preprocess import Quanta, count_quanta, fit_air, normalise_air, to_line_integrals
+from mivol.tomography.preprocess import Quanta, Transmission, count_quanta, find_air, fit_air, normalise_air, to_line_integrals
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import axis_from_fans, cone_axis_offset, find_axis
 
@@ -196,7 +196,9 @@ def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
     notes, angles = [*readings.notes, *readings.transmission.notes], readings.angles
     if angles is not None:
         notes += note_order(angles)
-    y, weights = to_line_integrals(normalise_air(readings.transmission, data.air) if data.air else readings.transmission)
+    transmission, light, air_notes = correct_air(readings.transmission, data.air)
+    notes += air_notes
+    y, weights = to_line_integrals(transmission)
     offset = None
     if isinstance(settings.scan, Parallel | Cone):
         offset, axis_notes = resolve_axis(settings, base, y, weights, angles)
@@ -210,8 +212,33 @@ def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
     is_noise_known = readings.intensity is not None and readings.transmission.is_noise_known
-    quanta = count_measured_quanta(settings, readings) if ALL_SOLVERS[settings.solve.solver].problem is PoissonCounts else None
+    quanta = (
+        count_measured_quanta(settings, readings, light)
+        if ALL_SOLVERS[settings.solve.solver].problem is PoissonCounts
+        else None
+    )
     return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=is_noise_known)
+
+
+def correct_air(transmission: Transmission, columns: int | None) -> tuple[Transmission, np.ndarray | None, list[str]]:
+    """Divide a transmission by the light of the air at the edges of the detector, and say so.
+
+    Args:
+        transmission: transmission of a scan.
+        columns: columns without object at each edge; 0: no correction; None: air is looked for.
+
+    Returns:
+        The corrected transmission; the light, to broadcast against it, or None; notes.
+    """
+    if columns:
+        return normalise_air(transmission, columns), fit_air(transmission.value, columns), []
+    air = find_air(transmission) if columns is None else None
+    if air is None or not air.is_needed:
+        return transmission, None, []
+    least, most = air.factor.min(), air.factor.max()
+    size = f"{most:.4g} +- {air.uncertainty:.2g}" if least == most else f"{least:.4g} to {most:.4g}"
+    said = f"the air at both edges of the detector has {size} of the flats' light: views are divided by it (data.air = 0: not)"
+    return air.normalise(transmission), air.factor[:, None, None], [said]
 
 
 def resolve_axis(
@@ -251,8 +278,8 @@ def find_rotation_axis(
     return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
 
 
-def count_measured_quanta(settings: config.ScanExperiment, readings: ScanReadings) -> Quanta:
-    """Return the numbers of quanta of a measured scan; named air columns correct the brightness of the light without an object.
+def count_measured_quanta(settings: config.ScanExperiment, readings: ScanReadings, light: np.ndarray | None = None) -> Quanta:
+    """Return the numbers of quanta of a measured scan; ``light`` is that of the air over the flats'.
 
     Raises:
         MivolError: data without flats and darks, or with a drift, which only line integrals have.
@@ -263,9 +290,7 @@ def count_measured_quanta(settings: config.ScanExperiment, readings: ScanReading
             "and no data.drift, or choose pcg."
         )
     quanta = count_quanta(*readings.intensity, settings.data.saturation)
-    if not settings.data.air:
-        return quanta
-    return replace(quanta, blank=quanta.blank * fit_air(readings.transmission.value, settings.data.air))
+    return quanta if light is None else replace(quanta, blank=quanta.blank * light)
 
 
 def held_out_views(settings: config.ScanExperiment, count: int) -> np.ndarray:

@@ -8,6 +8,7 @@ References: delta method for the variance of a ratio (textbooks).
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -218,6 +219,82 @@ def fit_air(transmission: np.ndarray, n_columns: int) -> np.ndarray:
     middle = (n_columns - 1) / 2
     f = (np.arange(columns) - middle) / (columns - 1 - 2 * middle)
     return left[..., None] * (1 - f) + right[..., None] * f
+
+
+@dataclass(frozen=True, eq=False)
+class Air:
+    """Light of the air at both edges of the detector, over the light of the flats.
+
+    Attributes:
+        factor: (views,) mean over rows and columns; one number for all views if they differ by no more than noise.
+        columns: columns at each edge.
+        uncertainty: standard deviation of the mean factor.
+        is_needed: whether the factor differs from 1, or between views, by more than noise and a hundredth.
+    """
+
+    factor: np.ndarray
+    columns: int
+    uncertainty: float
+    is_needed: bool
+
+    def normalise(self, transmission: Transmission) -> Transmission:
+        """Divide each view by its factor."""
+        factor = self.factor[:, None, None]
+        return replace(transmission, value=transmission.value / factor, variance=transmission.variance / factor**2)
+
+
+AIR_RANGE = 0.4, 1.25
+"""Smallest and largest air that is believed: less is absorption, more is another scan's flat."""
+
+AIR_TOLERANCE = 0.01
+"""Errors of flats as a share of the light, which no view averages out: of the air between edges, columns and views."""
+
+
+def find_air(transmission: Transmission) -> Air | None:
+    """Measure the air at both edges of the detector, such as of flats taken at another current.
+
+    The outer columns count as air if they are as bright at both edges in each view, do not rise or fall towards the middle, and
+    if the sum of the line integrals over the detector, which is the mass of the object, is the same in all views. An object
+    that reaches beyond the detector fails at least one of the three, unless it is round and much wider than the detector, when
+    ``AIR_RANGE`` excludes it.
+
+    Returns:
+        The air, or None if the edges are not air.
+    """
+    value = np.where(np.isfinite(transmission.value), transmission.value, np.nan)
+    views, _, columns = value.shape
+    width = max(4, columns // 20)
+    if columns < 4 * width:
+        return None
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        light = np.nanmean(value, axis=1)
+        log = np.log(np.maximum(light, 1e-6))
+        edges = log[:, :width], log[:, -width:]
+        means = np.stack([np.nanmean(edge, axis=1) for edge in edges])
+        # The scatter of a column over the views, less what the whole edge does, is noise.
+        noise = np.sqrt(np.nanmean([np.nanvar(e - m[:, None], axis=0) for e, m in zip(edges, means, strict=True)]))
+        profile = np.nanmean(log - means.mean(0)[:, None], axis=0)
+        mass = -np.nansum(log - means.mean(0)[:, None], axis=1)
+    air = means.mean()
+    if not np.isfinite([air, noise, mass.sum()]).all() or not AIR_RANGE[0] < np.exp(air) < AIR_RANGE[1]:
+        return None
+    at_edges = noise / np.sqrt(width)
+    falls = [abs(np.nanmean(side[: width // 2]) - np.nanmean(side[width // 2 : width])) for side in (profile, profile[::-1])]
+    between = np.std(means[0] - means[1])
+    limit = 4 * noise / np.sqrt(views * width / 2) + AIR_TOLERANCE
+    is_even = max(falls) < limit and abs(means[0].mean() - means[1].mean()) < 2 * limit
+    is_alike = between < 2 * at_edges + AIR_TOLERANCE
+    is_whole = np.std(mass) < 0.1 * np.mean(mass) + 4 * noise * np.sqrt(columns)
+    if not (is_even and is_alike and is_whole):
+        return None
+    sides = [int(np.argmax(np.append(side < -limit, True))) for side in (profile, profile[::-1])]
+    over_views = np.std(means.mean(0))
+    drifts = over_views > 3 * at_edges / np.sqrt(2) + AIR_TOLERANCE / 2
+    factor = np.exp(means.mean(0)) if drifts else np.full(views, np.exp(air))
+    sigma = float(np.exp(air) * noise / np.sqrt(2 * views * width))
+    is_needed = drifts or abs(air) > AIR_TOLERANCE + 5 * sigma
+    return Air(factor, min(*sides, columns // 8), sigma, bool(is_needed))
 
 
 def to_line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np.ndarray, np.ndarray]:

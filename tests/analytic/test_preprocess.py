@@ -112,6 +112,58 @@ def test_quanta_of_a_pixel() -> None:
     assert preprocess.Quanta(found.counts, 3.0, 0.0, found.used).select_views(np.array([0])).blank == 3.0
 
 
+def disc(air: np.ndarray | float, radius: float = 20.0, orbit: float = 8.0, density: float = 0.05) -> Transmission:
+    """Views of a disc that goes around, 100 columns, under a light of ``air`` (a number a view), with a noise of .003."""
+    noise = 0.003
+    angle = np.linspace(0, np.pi, 30)[:, None, None]
+    chord = 2 * np.sqrt(np.maximum(radius**2 - (np.arange(100) - 49.5 - orbit * np.cos(angle)) ** 2, 0))
+    t = np.broadcast_to(air, 30)[:, None, None] * np.exp(-density * chord) * np.ones((1, 2, 1))
+    return Transmission(t + noise * np.random.default_rng(3).normal(size=t.shape), np.full(t.shape, noise**2))
+
+
+@pytest.mark.parametrize("level", [0.5, 0.7, 1.0, 1.1])
+def test_air_is_measured_at_the_edges(level: float) -> None:
+    """To five deviations of its own, and needed unless it is that of the flats; a view's dead pixel tells nothing."""
+    light = disc(level)
+    light.value[3, 1, 2] = np.nan
+    air = preprocess.find_air(light)
+    assert air is not None and air.is_needed == (level != 1.0)
+    assert np.ptp(air.factor) == 0 and abs(air.factor[0] - level) < 5 * air.uncertainty
+    # Two edges of five columns, two rows and thirty views; the scatter over views is known to a few percent.
+    assert air.uncertainty == pytest.approx(0.003 / np.sqrt(2 * 2 * 5 * 30), rel=0.2)
+    found = air.normalise(light)
+    np.testing.assert_allclose(found.value[0], light.value[0] / air.factor[0])
+    np.testing.assert_allclose(found.variance[0], light.variance[0] / air.factor[0] ** 2)
+    # The disc reaches to column 22 and 78 at most; an eighth of the columns is the most that is asked for.
+    assert air.columns == 12
+
+
+def test_air_that_drifts_is_measured_in_each_view() -> None:
+    drift = np.linspace(0.8, 0.9, 30)
+    air = preprocess.find_air(disc(drift))
+    assert air is not None and air.is_needed
+    # The mean of 20 pixels in each of 30 views, six deviations.
+    np.testing.assert_allclose(air.factor, drift, atol=6 * 0.003 / np.sqrt(20))
+
+
+EDGES = {
+    "a disc wider than the detector": disc(1.0, 90.0),
+    "a disc around the axis, wider than the detector": disc(1.0, 70.0, 0.0, 0.005),
+    "a disc that reaches one edge": Transmission(disc(1.0).value[..., 25:], disc(1.0).variance[..., 25:]),
+    "absorption alone": disc(0.3),
+    "few columns": Transmission(disc(1.0).value[..., :15], disc(1.0).variance[..., :15]),
+    "nothing finite": Transmission(np.full((30, 2, 100), np.nan), np.ones((30, 2, 100))),
+    "mass that comes and goes": Transmission(
+        disc(1.0).value * np.where(abs(np.arange(100) - 50) < 9, np.linspace(0.2, 1, 30)[:, None, None], 1), disc(1.0).variance
+    ),
+}
+
+
+@pytest.mark.parametrize("case", EDGES)
+def test_edges_that_are_no_air(case: str) -> None:
+    assert preprocess.find_air(EDGES[case]) is None
+
+
 def test_air_is_a_straight_line_through_both_edges() -> None:
     """Means of 2 and of 4 of the finite pixels in two columns at either edge, between their middles and beyond."""
     value = np.array([[[1.0, 3, 9, 9, np.nan, 4]]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ from mivol.errors import MivolError
 from mivol.experiments import projections, readings
 from mivol.experiments.readings import ScanReadings, note_order, to_radians
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
-from mivol.tomography.preprocess import Quanta, Transmission
+from mivol.tomography.preprocess import Air, Quanta, Transmission
 from mivol.tomography.rotation_axis import Axis
 
 
@@ -109,7 +110,23 @@ def test_readings_become_line_integrals(measured: ScanReadings, monkeypatch: pyt
     assert found.geometry.angles.tolist() == [0, 1] and found.geometry.pitch == (1.0, 0.5)
     # Through the middle of air of 0.5 at either edge nothing is left to see.
     monkeypatch.setattr(projections, "normalise_air", lambda t, n: Transmission(t.value * n, t.variance))
+    monkeypatch.setattr(projections, "fit_air", lambda value, n: None)
     np.testing.assert_allclose(projections.read_measured(scan(air=2), Path()).y[0], 0, atol=1e-15)
+
+
+def test_air_is_looked_for_unless_the_settings_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is found is said and used if it is needed; 0 leaves the light, and nothing that is not needed changes a bit."""
+    light = Transmission(np.full((2, 2, 3), 0.5), np.full((2, 2, 3), 1e-4))
+    air = Air(np.array([0.5, 0.5]), 4, 0.001, True)
+    monkeypatch.setattr(projections, "find_air", lambda t: air)
+    found, factor, (note,) = projections.correct_air(light, None)
+    assert (found.value == 1).all() and (factor == 0.5).all() and factor.shape == (2, 1, 1)
+    assert note.startswith("the air at both edges of the detector has 0.5 +- 0.001 of the flats' light: views are divided")
+    assert projections.correct_air(light, 0) == (light, None, [])
+    air = replace(air, is_needed=False)
+    assert projections.correct_air(light, None) == (light, None, [])
+    air = replace(air, is_needed=True, factor=np.array([0.5, 0.6]))
+    assert "has 0.5 to 0.6 of" in projections.correct_air(light, None)[2][0]
 
 
 def test_an_axis_that_is_found_takes_the_place_of_the_settings(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,9 +182,8 @@ def test_quanta_are_those_of_the_readings(measured: ScanReadings, monkeypatch: p
     blank = np.full((2, 2, 3), 8.0)
     made = Quanta(np.ones((2, 2, 3)), blank, 0.5, np.ones((2, 2, 3), bool))
     monkeypatch.setattr(projections, "count_quanta", lambda *asked: made if asked == ("r", "f", "d", 99.0) else None)
-    monkeypatch.setattr(projections, "fit_air", lambda value, n: np.full((2, 2, 3), n / 4))
     assert projections.count_measured_quanta(scan(), measured) is made
-    assert (projections.count_measured_quanta(scan(air=2), measured).blank == 4).all()
+    assert (projections.count_measured_quanta(scan(), measured, np.full((2, 1, 1), 0.5)).blank == 4).all()
     for chosen, found in ((scan(drift=1), measured), (scan(), ScanReadings(measured.transmission))):
         with pytest.raises(MivolError, match="ml-tr needs counts of quanta"):
             projections.count_measured_quanta(chosen, found)

@@ -181,14 +181,11 @@ def test_axis_is_found_three_ways(simulated):
 
 
 def test_mirrors_on_both_sides_of_half_a_turn():
-    """Over 183 degrees some pairs fall short of half a turn and some go beyond: the signed miss is what the line is over.
-
-    Expected: without noise the axis to 0.03 (interpolation); a line over |miss| would be pulled by the slope.
-    """
+    """Over 183 degrees opposite views lie between views: without noise the axis to 0.03 (interpolation)."""
     angles = np.radians(1.22 * np.arange(151))
     beam = ParallelBeam(angles, (1, 96), pitch=1.0, axis_offset=44.25 - 47.5)
     y = random_ellipsoids(1, seed=4).scaled(40.0).project(beam)
-    assert abs(axis_from_mirrors(y, angles, n_pairs=9).column - 44.25) < 0.03
+    assert abs(axis_from_mirrors(y, angles, n_views=9).column - 44.25) < 0.03
 
 
 def test_mirror_pairs_need_half_a_turn():
