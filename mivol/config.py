@@ -393,7 +393,9 @@ class ScanExperiment(Section):
     title: Title
     scan: Annotated[Parallel | Cone | Table | Matrices | OfData, setting("1", "beam and detector")]
     data: Annotated[Ellipsoids | Known | Measured | Stack | Nikon, setting("1", "the projections")]
-    grid: Annotated[Grid | None, setting("1", "the voxels; absent: the grid of a Nikon file")] = None
+    grid: Annotated[
+        Grid | None, setting("1", "the voxels; absent: those of a Nikon file, or a voxel a pixel of measured circular scans")
+    ] = None
     solve: Annotated[SolveSettings, setting("1", "the inversion")] = SolveSettings()
     held_out_every: Annotated[int, setting("view", "step between views that are not fitted; 0: none", ge=0)] = 0
     checkpoint_every: Annotated[int, setting("iteration", "iterations between two checkpoints", ge=1)] = 5
@@ -406,7 +408,8 @@ class ScanExperiment(Section):
             raise ValueError('scan.beam = "data" and data.source = "nikon" go together: give both, or neither')
         if getattr(self.data, "rows", None) and not isinstance(self.scan, Parallel):
             raise ValueError('data.rows cuts the detector of a beam = "parallel": leave it out')
-        if self.grid is None and not isinstance(self.data, Nikon):
+        is_measured = isinstance(self.data, Measured | Stack) and isinstance(self.scan, Detector)
+        if self.grid is None and not (isinstance(self.data, Nikon) or is_measured):
             raise ValueError('the key "grid" is missing: give it')
 
 

@@ -131,8 +131,8 @@ def _draft_hdf5(path: Path, given: dict[str, Any]) -> ScanDraft:
         first, last = np.degrees(scan.angles[[0, -1]])
         lines.append(f"found: angles from {first:.4g} to {last:.4g} degrees")
     lines += _draft_beam(raw_scan, scan.pitch, scan.distances, (height, columns))
-    grid, more = _draft_grid(raw_scan, rows, columns)
-    return _finish({"scan": raw_scan, "data": {"source": "measured", "file": str(path)}, "grid": grid}, [*lines, *more], views)
+    raw = {"scan": raw_scan, "data": {"source": "measured", "file": str(path)}}
+    return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], views)
 
 
 def _draft_beam(
@@ -170,7 +170,7 @@ def _draft_beam(
 
 
 def _draft_grid(scan: dict[str, Any], rows: int, columns: int) -> tuple[dict[str, Any], list[str]]:
-    """Voxels as large as a pixel at the axis, or larger by a whole factor if the memory does not hold them."""
+    """The voxels, larger than a pixel at the axis by a whole factor if the memory does not hold voxels of a pixel."""
     pitch = np.broadcast_to(scan.get("pitch", 1.0), (2,)).astype(float)
     if scan["beam"] == "cone":
         pitch = pitch * scan["source_to_axis"] / scan["source_to_detector"]
@@ -180,9 +180,19 @@ def _draft_grid(scan: dict[str, Any], rows: int, columns: int) -> tuple[dict[str
     # A scan of few rows keeps their height: the box must not become higher than what the rows see.
     height = pitch[0] * rows / shape[0]
     edges = [float(f"{edge:.8g}") for edge in (pitch[1] * factor, pitch[1] * factor, height)]
-    size = f"{shape[0]} x {shape[1]} x {shape[2]} voxels of {factor} pixel" + "s" * (factor > 1)
-    why = "the whole detector" if factor == 1 else f"voxels of a pixel need more than half of {free / 2**30:.0f} GiB"
-    return {"shape": shape, "voxel_size": edges if len(set(edges)) > 1 else edges[0]}, [f"chosen: {size}, {why}"]
+    grid = {"shape": shape, "voxel_size": edges if len(set(edges)) > 1 else edges[0]}
+    if factor == 1:
+        return grid, ["chosen: voxels as large as a pixel, as many as the detector sees"]
+    size = f"{shape[0]} x {shape[1]} x {shape[2]} voxels of {factor} pixels"
+    return grid, [f"chosen: {size}: voxels of a pixel need more than half of the {free / 2**30:.0f} GiB that are free"]
+
+
+def _put_grid(raw: dict[str, Any], rows: int, columns: int) -> list[str]:
+    """Put the voxels into the settings if they are larger than a pixel; without them, the axis decides their number."""
+    grid, lines = _draft_grid(raw["scan"], rows, columns)
+    if grid["shape"][1] != columns:
+        raw["grid"] = grid
+    return lines
 
 
 def _finish(raw: dict[str, Any], lines: list[str], views: int) -> ScanDraft:
@@ -317,8 +327,8 @@ def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
     )
     lines += _draft_angles(path, scan, data, counts["views"], three)
     lines += _draft_beam(scan, None, (None, None), (rows, columns))
-    grid, more = _draft_grid(scan, rows, columns)
-    return _finish({"scan": scan, "data": data, "grid": grid}, [*lines, *more], counts["views"])
+    raw = {"scan": scan, "data": data}
+    return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], counts["views"])
 
 
 def _draft_angles(folder: Path, scan: dict[str, Any], data: dict[str, Any], views: int, three: np.ndarray) -> list[str]:

@@ -18,6 +18,7 @@ from mivol.files.fetch import resolve_path
 from mivol.machine import check_memory
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
+from mivol.tomography.filtered import covers_circle
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
@@ -100,23 +101,43 @@ def make_grid(settings: config.ScanExperiment, base: Path) -> VoxelGrid:
     return nikon_grid(settings.data, base) if voxels is None else VoxelGrid(voxels.shape, voxels.voxel_size, voxels.centre)
 
 
+def grid_of_detector(beam: ParallelBeam | ConeBeam) -> VoxelGrid:
+    """Voxels as large as a pixel at the axis, as many rows and columns as the detector has.
+
+    If views cover a whole turn and the axis lies more than an eighth of the columns beside the middle, the wider side of the
+    detector sees the whole object in half of the views each: the voxels reach as far on both sides.
+    """
+    rows, columns = beam.detector
+    scale = beam.source_to_detector / beam.source_to_axis if isinstance(beam, ConeBeam) else 1.0
+    offset = abs(beam.axis_offset * scale - beam.detector_offset[1]) / beam.pitch[1]
+    if offset > columns / 8 and covers_circle(beam.angles, 2 * np.pi):
+        columns = 2 * int(np.ceil(columns / 2 + offset))
+    height, edge = (float(pitch) / scale for pitch in beam.pitch)
+    return VoxelGrid((rows, columns, columns), (edge, edge, height))
+
+
 def make_data(settings: config.ScanExperiment, base: Path, grid: VoxelGrid) -> Projections:
     """Read or compute the projections.
 
     Raises:
         MivolError: unreadable files, files of different sizes, rays that all miss the grid, or more rays than memory.
     """
-    is_measured = isinstance(settings.data, Readings)
-    if is_measured:
-        data = read_measured(settings, base)
-    else:
-        check_rays(settings)
-        geometry = make_geometry(settings, base)
-        exact, truth = SIMULATED[type(settings.data)](settings.data, base, geometry, grid)
-        data = add_noise(geometry, exact, truth, settings.data.photons, settings.data.seed)
+    if isinstance(settings.data, Readings):
+        return check_data(settings, read_measured(settings, base), grid)
+    check_rays(settings)
+    geometry = make_geometry(settings, base)
+    exact, truth = SIMULATED[type(settings.data)](settings.data, base, geometry, grid)
+    check_hits(Projector(geometry, grid))
+    return add_noise(geometry, exact, truth, settings.data.photons, settings.data.seed)
+
+
+def check_data(settings: config.ScanExperiment, data: Projections, grid: VoxelGrid) -> Projections:
+    """Check measured projections against the grid, and note rows that are upside down.
+
+    Raises:
+        MivolError: rays that all miss the grid.
+    """
     check_hits(Projector(data.geometry, grid))
-    if not is_measured:
-        return data
     return replace(data, notes=(*data.notes, *note_rows(settings.data, data.geometry, grid, data.y, data.weights)))
 
 

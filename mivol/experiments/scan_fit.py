@@ -18,7 +18,17 @@ from mivol.config import ScanExperiment
 from mivol.errors import MivolError
 from mivol.experiments.film import film_of_volume
 from mivol.experiments.fit_kind import Evaluation, FitKind, Say, Stages
-from mivol.experiments.projections import Projections, describe_beam, fitted_views, held_out_views, make_data, make_grid
+from mivol.experiments.projections import (
+    Projections,
+    check_data,
+    describe_beam,
+    fitted_views,
+    grid_of_detector,
+    held_out_views,
+    make_data,
+    make_grid,
+    read_measured,
+)
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.solver_choice import (
     check_grid,
@@ -77,11 +87,10 @@ class ScanFit(FitKind):
 
     def load(self, say: Say) -> None:
         base = self.context.base
-        self.grid = grid = make_grid(self.settings, base)
+        self.grid, self.data = load_scan(self.settings, base)
+        grid = self.grid
         edges = grid.voxel_size if len(set(grid.voxel_size)) > 1 else grid.voxel_size[:1]
         say(f"  grid      {' x '.join(map(str, grid.shape))} voxels of {' x '.join(f'{edge:g}' for edge in edges)}")
-        check_grid(self.settings, grid)
-        self.data = make_data(self.settings, base, grid)
         views, rows, columns = self.data.y.shape
         say(f"  scan      {views} views of {rows} x {columns} pixels, {describe_beam(self.settings)}")
         for note in self.data.notes:
@@ -160,6 +169,22 @@ class ScanFit(FitKind):
         if settings.solve.tv:
             say(f"  total variation: {settings.solve.tv:g} in units of the {settings.solve.tv_unit}")
         return Explanation((f"  solver    {settings.solve.name}, at most {settings.solve.iterations} iterations",))
+
+
+def load_scan(settings: config.ScanExperiment, base: Path) -> tuple[VoxelGrid, Projections]:
+    """Return the voxels and the projections; without a table ``grid``, the voxels hold what the detector sees.
+
+    Raises:
+        MivolError: as :func:`make_grid` and :func:`make_data`, or voxels beyond the memory.
+    """
+    if settings.grid is not None or isinstance(settings.data, config.Nikon):
+        grid = make_grid(settings, base)
+        check_grid(settings, grid)
+        return grid, make_data(settings, base, grid)
+    data = read_measured(settings, base)
+    grid = grid_of_detector(data.geometry)
+    check_grid(settings, grid)
+    return grid, check_data(settings, data, grid)
 
 
 def make_projector(settings: config.ScanExperiment, data: Projections, grid: VoxelGrid) -> Projector:

@@ -15,6 +15,7 @@ from mivol.errors import MivolError
 from mivol.experiments import projections, readings
 from mivol.experiments.readings import ScanReadings, note_order, to_radians
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
+from mivol.tomography.geometry import ConeBeam, ParallelBeam
 from mivol.tomography.preprocess import Air, Quanta, Transmission
 from mivol.tomography.rotation_axis import Axis
 
@@ -112,6 +113,18 @@ def test_readings_become_line_integrals(measured: ScanReadings, monkeypatch: pyt
     monkeypatch.setattr(projections, "normalise_air", lambda t, n: Transmission(t.value * n, t.variance))
     monkeypatch.setattr(projections, "fit_air", lambda value, n: None)
     np.testing.assert_allclose(projections.read_measured(scan(air=2), Path()).y[0], 0, atol=1e-15)
+
+
+def test_voxels_that_hold_what_the_detector_sees() -> None:
+    """A voxel a pixel at the axis; twice the wider side of the detector after a turn with the axis far from the middle."""
+    turn = np.arange(40) * np.pi / 20
+    for angles, offset, columns in ((turn / 2, 20.0, 60), (turn, 3.0, 60), (turn, 20.0, 100), (turn, -20.0, 100)):
+        grid = projections.grid_of_detector(ParallelBeam(angles, (3, 60), (2.0, 0.5), axis_offset=offset / 2))
+        assert (grid.shape, tuple(grid.voxel_size)) == ((3, columns, columns), (0.5, 0.5, 2.0))
+    cone = ConeBeam(turn, (3, 60), 4.0, 8.0, (2.0, 0.5), axis_offset=5.0)
+    grid = projections.grid_of_detector(cone)
+    # Magnified twice, 5 is 20 columns of .5 beside the middle.
+    assert (grid.shape, tuple(grid.voxel_size)) == ((3, 100, 100), (0.25, 0.25, 1.0))
 
 
 def test_air_is_looked_for_unless_the_settings_say(monkeypatch: pytest.MonkeyPatch) -> None:
