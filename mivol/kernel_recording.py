@@ -9,7 +9,8 @@ aborts: callables of several targets and of one target have different keys (``Gl
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -35,6 +36,107 @@ def record_kernels(function: Callable, *settings: Any) -> Callable:
         settings: first arguments, without arrays.
     """
     return dr.freeze(lambda *given: function(*settings, *given))
+
+
+class CannotRecordError(Exception):
+    """Dr.Jit cannot record a task. The task has run in part: gradients may have been added."""
+
+
+class RecordedTask:
+    """A function whose kernels are recorded, with all that is the same in every call.
+
+    Subclasses define ``__call__(*inputs)``. They hold no arrays: a recording keeps what an array was.
+    """
+
+    _numbers = itertools.count()
+
+    def __init__(self) -> None:
+        # Dr.Jit tells objects apart by their hash. By default the hash is an address, which a later object may have too.
+        self._number = next(RecordedTask._numbers)
+        # What ended the last call, in words: an exception would hold all arrays of its frames.
+        self.failure, self.is_interrupted = "", False
+
+    def __hash__(self) -> int:
+        return self._number
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __call__(self, *inputs: Any) -> Any:
+        raise NotImplementedError
+
+
+MAX_FAILURES = 2
+"""Failures after which tasks of a class are recorded no more. A plugin that makes its tables at the first use, such as a
+textured emitter, fails once."""
+
+
+class Recordings:
+    """Tasks that Dr.Jit records in their first call and replays in later calls.
+
+    Args:
+        most: largest number of recordings; the least recently used is dropped.
+
+    Attributes:
+        failures: why Dr.Jit could not record tasks, by the class of the task.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.failures: dict[type[RecordedTask], list[str]] = {}
+        self._tasks: dict[Hashable, RecordedTask] = {}
+        # dr.freeze defines a class in each call, which only Python's collector can free.
+        self._frozen = dr.detail.FrozenFunction(_run_task, most, 1 << 30, dr.JitBackend.Invalid, True)
+
+    @property
+    def count(self) -> int:
+        """Number of recordings made so far."""
+        return self._frozen.n_recordings
+
+    def clear(self) -> None:
+        """Drop all recordings."""
+        self.failures, self._tasks = {}, {}
+        self._frozen.clear()
+
+    def call(self, kind: type[RecordedTask], key: Hashable, make: Callable[[], RecordedTask], *inputs: Any) -> Any:
+        """Replay the recording of a task, or record it.
+
+        Args:
+            kind: class of the task.
+            key: tells tasks of a class apart. Tasks with the same key must do the same with the same inputs.
+            make: makes the task, called for a new key.
+            inputs: PyTrees and Mitsuba objects. Their arrays may differ from call to call.
+
+        Returns:
+            The result of the task.
+
+        Raises:
+            CannotRecordError: the task failed, perhaps only because Dr.Jit recorded it.
+        """
+        failures = self.failures.setdefault(kind, [])
+        if len(failures) >= MAX_FAILURES:
+            raise CannotRecordError(failures[-1])
+        # The key of the last call is the last.
+        task = self._tasks.pop((kind, key), None) or make()
+        self._tasks[kind, key] = task
+        self._tasks = dict(list(self._tasks.items())[-self.most :])
+        try:
+            return self._frozen({"task": task, "inputs": inputs})
+        except RuntimeError as error:
+            if task.is_interrupted:
+                raise KeyboardInterrupt from None
+            failures.append(task.failure or str(error.__cause__ or error))
+        raise CannotRecordError(failures[-1])
+
+
+def _run_task(given: dict[str, Any]) -> Any:
+    """Run a task inside of a recording. Dr.Jit replaces every exception by its own."""
+    task = given["task"]
+    try:
+        return task(*given["inputs"])
+    except BaseException as error:
+        task.failure, task.is_interrupted = str(error), isinstance(error, KeyboardInterrupt)
+        raise
 
 
 @contextmanager

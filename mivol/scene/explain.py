@@ -14,12 +14,13 @@ import numpy as np
 
 from mivol.cite import list_citations
 from mivol.errors import MivolError
-from mivol.scene.choices import is_scattering_visible, shares_cells
+from mivol.scene.choices import Choice, is_scattering_visible, shares_cells
 from mivol.scene.depth_two import depth_two_error, mean_albedo, scattering_depth
 from mivol.scene.needs import MediumFacts, Needs, find_needs, mean_cosine
 from mivol.scene.nesting import shape_bounds
 from mivol.scene.plan import Plan, build_media, make_plan
 from mivol.scene.previews import find_sufficient_depth, measure_media_light, measure_near_light
+from mivol.scene.render_tasks import find_unrecorded
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
@@ -155,8 +156,9 @@ def _flags(bsdf: mi.BSDF) -> int:
 
 def _describe_plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Settings, noise: float | None) -> list[str]:
     plan = make_plan(needs, settings)
-    width = max(len(c.subject) for c in plan.choices)
-    lines = ["plan", *(f"  {c.subject:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices)]
+    choices = [*plan.choices, *(choose_recording(scene, eye, needs, plan, for_images) for for_images in (True, False))]
+    width = max(len(c.subject) for c in choices)
+    lines = ["plan", *(f"  {c.subject:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in choices)]
     lines += [f"  table     {text}" for text in _describe_transfer_tables(needs)]
     if settings.scatterings == 1:
         lines += [f"  model     {text}" for text in _describe_depth_two(scene, needs)]
@@ -166,6 +168,14 @@ def _describe_plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Sett
         depth = "without a limit (-1)" if answer.depth < 0 else answer.depth
         lines += [f"  depth     {depth} is enough\n              because {answer.reason}"]
     return [*lines, "references", *(f"  {source}" for source in list_citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
+
+
+def choose_recording(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, plan: Plan, for_images: bool) -> Choice:
+    """Whether images, or gradients, are recorded in their first call and replayed in later ones."""
+    reason = find_unrecorded(scene, sensor, 0, needs, plan, for_images)
+    choice = "recorded in the first call, then replayed" if reason is None else "traced in every call"
+    followed = "a recording follows values, cameras and seeds that change between calls"
+    return Choice("images" if for_images else "gradients", choice, reason or followed)
 
 
 def _describe_light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:

@@ -195,4 +195,4 @@ class MediaLight:
 
     density: mi.Float
     cumulative: mi.Float
-    gain: float
+    gain: float = 0.0

@@ -310,6 +310,10 @@ class Needs(ShapeFacts):
         """The smallest of ``emitter_distances`` [1]; infinite without emitters."""
         return min(self.emitter_distances, default=math.inf)
 
+    def with_views(self, survey: SceneSurvey) -> Needs:
+        """The same facts with the media viewed anew: a recording reads their arrays from the scene."""
+        return replace(self, views=tuple(b.view(survey.places) for b in self.boundaries))
+
     def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
         """Build the media of the scene among its surfaces.
 

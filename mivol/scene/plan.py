@@ -6,7 +6,8 @@ runs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -34,7 +35,7 @@ from mivol.scene.choices import (
 )
 from mivol.scene.media_light import find_emitting_boxes
 from mivol.scene.needs import Needs
-from mivol.scene.readings import read_block_ranges, read_coarse_grid, read_empty_distances, read_rough_extinction
+from mivol.scene.readings import PartReading, read_coarse_grid, read_part
 from mivol.scene.refusals import (
     check_bounded,
     check_emission_cells,
@@ -57,6 +58,7 @@ from mivol.transport.estimators.single_scattering.shadow_tables import (
     build_visibility_cache,
 )
 from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
+from mivol.transport.media.extinction import Extinction
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import (
@@ -77,6 +79,12 @@ PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
 PASS_STEPS = {"llvm": 1 << 29, "cuda": 1 << 34, "metal": 1 << 32}
 """Most cells crossed by all rays of a pass: a second or two of work, so that Ctrl-C acts soon."""
 
+
+SMALL_STEP = 1 << 28
+"""Memory of a gradient step [byte] up to which it is not compared with the free memory."""
+
+OCCUPIED_STEP = 0.125
+"""Step of the share of occupied blocks [1]."""
 
 THICK = 1.0
 """Optical depth across a homogeneous medium [1] from which collisions alone give its derivatives."""
@@ -100,6 +108,10 @@ class Plan:
         branches: whether paths branch at their first collision for derivatives.
         draws_near_light: whether segments of paths draw the light of emitters with a position, in images.
         near_light_in_derivatives: the same, in derivatives.
+        near_emitters: numbers of the emitters inside of media.
+        are_thick: whether collisions alone find the derivatives of each medium's extinction.
+        have_low_albedo: whether some albedo of each medium may be too low for derivatives to be found at collisions.
+        occupied: share of occupied blocks of the first medium's grid, in steps of ``OCCUPIED_STEP`` [1]; None if unknown.
     """
 
     choices: tuple[Choice, ...]
@@ -115,6 +127,16 @@ class Plan:
     branches: bool = False
     draws_near_light: bool = False
     near_light_in_derivatives: bool = False
+    near_emitters: tuple[int, ...] = ()
+    are_thick: tuple[bool, ...] = ()
+    have_low_albedo: tuple[bool, ...] = ()
+    occupied: float | None = None
+
+    @property
+    def decisions(self) -> tuple:
+        """All that a kernel depends on, without the reasons: equal plans give the same kernels."""
+        skipped = {"choices", "gradient_bytes"}
+        return tuple(value for name, value in vars(self).items() if name not in skipped)
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -180,7 +202,18 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         branches,
         near,
         near_in_derivatives,
+        tuple(k for k, distance in enumerate(needs.emitter_distances) if distance == 0),
+        tuple(m.tau_min >= THICK for m in needs.media),
+        tuple(m.albedo_min < MIN_ALBEDO for m in needs.media),
+        _round_occupied(needs),
     )
+
+
+def _round_occupied(needs: Needs) -> float | None:
+    """``Plan.occupied``: in steps, so that a grid that changes a little keeps its plan."""
+    if not needs.media or any(m.unread for m in needs.media):
+        return None
+    return math.ceil(needs.media[0].occupied / OCCUPIED_STEP) * OCCUPIED_STEP
 
 
 def choose_segment(needs: Needs, settings: Settings) -> str:
@@ -215,8 +248,10 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
             fits = needs.variant.startswith("llvm") and packed <= PACKED_LIMIT
             memory += (packed if fits else 0) + 8 * z * y * x * channels
             ways.add("packed corners, one copy per thread" if fits else "added to the nodes")
-    free = available_memory()
-    if needs.parameters and needs.variant.startswith("llvm") and free is not None and memory > free:
+    # Asking for the free memory takes as long as all other choices: a small step is not asked about.
+    asks = needs.parameters and needs.variant.startswith("llvm") and memory > SMALL_STEP
+    free = available_memory() if asks else None
+    if free is not None and memory > free:
         raise MivolError(
             f"a gradient step would take {memory / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free; lower the resolution "
             "of the grids."
@@ -226,36 +261,53 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
     return memory, Choice("gradient step", size, f"parameters: {parameters}")
 
 
-def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) -> SceneMedia:
-    """Build the media for transport as planned."""
+Readings = list[list[PartReading]]
+"""What transport reads of the values of each part of each medium before a render."""
+
+
+def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) -> Readings:
+    """Read the values that the planned estimators need besides the values themselves."""
+    near = plan.draws_near_light if for_images else plan.near_light_in_derivatives
+    return [
+        [read_part(part, survey, boundary.name, skip, tracks or _flies_through(part, plan), near) for part in view.parts]
+        for boundary, view, skip, tracks in zip(
+            needs.boundaries, needs.views, plan.skips_empty, plan.estimates_shadows, strict=True
+        )
+    ]
+
+
+def _flies_through(part: Extinction, plan: Plan) -> bool:
+    return plan.segment == "free_flight" and part.channels == 1
+
+
+def build_media(
+    scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey, readings: Readings | None = None, for_images: bool = True
+) -> SceneMedia:
+    """Build the media for transport as planned; ``readings`` are read if they are not given."""
+    if readings is None:
+        readings = read_parts(needs, plan, survey, for_images)
     bodies = []
-    for boundary, view, facts, skip, tracks in zip(
-        needs.boundaries, needs.views, needs.media, plan.skips_empty, plan.estimates_shadows, strict=True
-    ):
-        for part in view.parts:
-            if skip and part.lattice is not None:
-                part.lattice.empty_distances = read_empty_distances(part, survey, boundary.name)
-            # A grey variant averages an rgb extinction over the channels; the transmittance of the mean is not the mean
-            # transmittance.
-            mixes = mi.is_monochromatic and part.channels > 1
-            flies = plan.segment == "free_flight" and part.channels == 1
-            if (tracks or flies) and part.lattice is not None and part.activation is None and not mixes:
-                part.lattice.block_ranges = read_block_ranges(part, survey)
-            if plan.draws_near_light and part.lattice is not None and part.activation is None:
-                part.rough = read_rough_extinction(part, survey)
-        body = boundary.body(view, tracks)
-        body.is_thick, body.has_low_albedo = facts.tau_min >= THICK, facts.albedo_min < MIN_ALBEDO
+    for index, (boundary, view, read) in enumerate(zip(needs.boundaries, needs.views, readings, strict=True)):
+        for part, reading in zip(view.parts, read, strict=True):
+            reading.apply(part)
+        body = boundary.body(view, plan.estimates_shadows[index])
+        body.is_thick, body.has_low_albedo = plan.are_thick[index], plan.have_low_albedo[index]
         bodies.append(body)
     return needs.make_media(scene, bodies, survey.size)
 
 
 def build_estimators(
-    scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: SceneSurvey, for_images: bool
+    scene: mi.Scene,
+    needs: Needs,
+    plan: Plan,
+    settings: Settings,
+    survey: SceneSurvey,
+    for_images: bool,
+    readings: Readings | None = None,
 ) -> Estimators:
-    """Build the planned estimators, for images or for derivatives."""
-    if not for_images:
-        plan = replace(plan, draws_near_light=plan.near_light_in_derivatives)
-    media = build_media(scene, needs, plan, survey)
+    """Build the planned estimators, for images or for derivatives; ``readings`` are read if they are not given."""
+    draws_near_light = plan.draws_near_light if for_images else plan.near_light_in_derivatives
+    media = build_media(scene, needs, plan, survey, readings, for_images)
     direct = DirectLighting(media)
     choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
@@ -273,8 +325,8 @@ def build_estimators(
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)
     near = None
-    if plan.draws_near_light:
-        inside = [e for e, distance in zip(scene.emitters(), needs.emitter_distances, strict=True) if distance == 0]
+    if draws_near_light:
+        inside = [scene.emitters()[number] for number in plan.near_emitters]
         near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside)
     return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count, near)
 
@@ -292,8 +344,7 @@ def _make_visibility_cache(
     """Make the cache of emitter visibility. Derivatives are nonzero in empty blocks, and only values that were read tell the
     empty blocks.
     """
-    blind = not for_images or any(m.unread for m in needs.media)
     rays = needs.film_samples * (plan.scattering_points if for_images else 1)
-    occupied = None if blind else needs.media[0].occupied
+    occupied = plan.occupied if for_images else None
     take = lambda *arguments: read_coarse_grid(survey, *arguments)  # noqa: E731
     return build_visibility_cache(direct.media, direct.emitters, rays, occupied, take)

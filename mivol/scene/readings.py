@@ -21,7 +21,7 @@ from mivol.files import check_volume
 from mivol.kernel_recording import is_recording
 from mivol.scene.coefficients import check_constant
 from mivol.scene.survey import SceneSurvey
-from mivol.transport.media.extinction import ExactExtinction
+from mivol.transport.media.extinction import ExactExtinction, Extinction
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.grid_blocks import (
@@ -32,6 +32,7 @@ from mivol.transport.traversal.grid_blocks import (
     coarsen_grid,
     find_block_ranges,
     find_distances_of_bounds,
+    place_blocks,
 )
 from mivol.transport.traversal.grid_walk import corner_nodes
 from mivol.transport.traversal.interpolation import interpolate
@@ -99,9 +100,7 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
 
     reading = _read_once(survey, ("part",), array, make)
     if reading.floored is not None:
-        values = part.lattice.values
-        # Do not evaluate the stock grid from here on: the stock grid still interpolates negative values.
-        part.lattice.values, part.volume = mi.TensorXf(dr.replace_grad(reading.floored, values.array), values.shape), None
+        part.floor(reading.floored)
     return reading
 
 
@@ -186,6 +185,64 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
         survey.looked_up.add(volume.ptr)
 
 
+@dataclass
+class PartReading:
+    """What transport reads of the values of a part before a render. Each is None if the plan does not need it.
+
+    Attributes:
+        floored: the values with 0 in place of negative values; None without negative values.
+        empty_distances, block_ranges: as in :class:`mivol.transport.traversal.lattice.Lattice`.
+        rough, rough_distances: means of blocks of voxels, and their own ``empty_distances``.
+    """
+
+    floored: mi.Float | None = None
+    empty_distances: mi.UInt8 | None = None
+    block_ranges: BlockRanges | None = None
+    rough: mi.TensorXf | None = None
+    rough_distances: mi.UInt8 | None = None
+
+    def apply(self, part: ExactExtinction) -> None:
+        """Give the reading to a part."""
+        if self.floored is not None:
+            part.floor(self.floored)
+        if self.empty_distances is not None:
+            part.lattice.empty_distances = self.empty_distances
+        if self.block_ranges is not None:
+            part.lattice.block_ranges = self.block_ranges
+        if self.rough is not None:
+            shift = block_shift(part.lattice.res)
+            part.rough = GridExtinction(part.name, place_blocks(part.lattice, self.rough, shift, self.rough_distances))
+
+
+def read_part(
+    part: Extinction, survey: SceneSurvey, name: str, skips_empty: bool, tracks: bool, draws_near_light: bool
+) -> PartReading:
+    """Read what transport needs of a part, once for each state of its array.
+
+    Args:
+        part: a part of the extinction of the medium in ``name``.
+        survey: keeps what was read.
+        skips_empty: whether walks skip empty blocks.
+        tracks: whether tracking needs the range of values of each block.
+        draws_near_light: whether the light of near emitters is drawn along segments.
+    """
+    lattice, reading = part.lattice, PartReading()
+    if lattice is None:
+        return reading
+    if skips_empty:
+        reading.empty_distances = lattice.empty_distances = read_empty_distances(part, survey, name)
+    if part.activation is not None:
+        return reading
+    reading.floored = part.floored
+    # A grey variant averages an rgb extinction over the channels; the transmittance of the mean is not the mean transmittance.
+    if tracks and not (mi.is_monochromatic and part.channels > 1):
+        reading.block_ranges = read_block_ranges(part, survey)
+    if draws_near_light:
+        coarse = read_coarse_grid(survey, lattice, block_shift(lattice.res), False).lattice
+        reading.rough, reading.rough_distances = coarse.values, coarse.empty_distances
+    return reading
+
+
 def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt8:
     """Measure the distance of each block to the nearest occupied block, once for each state of the array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
@@ -204,11 +261,6 @@ def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, lists: b
     """Coarsen a grid, once for each state of the array and each placement."""
     kind = ("coarse", shift, lists, lattice.empty_distances is None, lattice.to_world.tobytes())
     return _read_once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
-
-
-def read_rough_extinction(part: GridExtinction, survey: SceneSurvey) -> GridExtinction:
-    """The means of blocks of voxels of a grid, as a grid of their own."""
-    return GridExtinction(part.name, read_coarse_grid(survey, part.lattice, block_shift(part.lattice.res), False).lattice)
 
 
 def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:

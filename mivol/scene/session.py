@@ -13,29 +13,37 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.kernel_recording import is_recording, without_garbage_collection
+from mivol.kernel_recording import CannotRecordError, Recordings, is_recording, without_garbage_collection
 from mivol.scene.needs import find_needs, warn_of_misplaced_grids
-from mivol.scene.plan import Plan, build_estimators, make_plan
+from mivol.scene.plan import make_plan, read_parts
 from mivol.scene.previews import measure_media_light, measure_near_light, warn_of_last_order
 from mivol.scene.refusals import parse_aovs
+from mivol.scene.render_tasks import (
+    GradientTask,
+    ImageTask,
+    PlannedScene,
+    RenderTask,
+    find_unrecorded,
+    render_tangent,
+    zero_radiance,
+)
+from mivol.scene.scene_state import SceneState, find_differentiated
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.scene_graph import list_values, traverse
-from mivol.transport.estimators.scores import Primal, Replay, Tangent
-from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
+from mivol.transport.estimators.scores import Primal
+from mivol.transport.line_integrals.aovs import integrate_aovs
 from mivol.transport.media.medium_view import traverse_medium
-from mivol.transport.path.derivatives import prepare_derivatives, replay_branches
-from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, render_on_film
-from mivol.transport.path.successive import paths_per_lane, walk_successively
-from mivol.transport.path.walk import has_one_segment, walk_path
+from mivol.transport.path.estimators import Settings
+from mivol.transport.path.film import RenderSamples, render_on_film
+from mivol.transport.path.walk import walk_path
 
 
 @dataclass
@@ -53,6 +61,10 @@ class _SurveyedScene:
         return len(parts) == len(self.parts) and all(a is b for a, b in zip(parts, self.parts, strict=True))
 
 
+MAX_RECORDINGS = 64
+"""Largest number of recordings: an image and a gradient from each of 32 cameras."""
+
+
 class Session:
     """Renders scenes with one set of settings.
 
@@ -62,6 +74,9 @@ class Session:
         is_depth_given: whether the user has chosen ``max_depth``. If not, and the last order of scattering still carries light,
             a warning says so.
 
+    Attributes:
+        recordings: recorded images and gradients of the last scene.
+
     Raises:
         MivolError: an unknown AOV, or a repeated name.
     """
@@ -70,7 +85,9 @@ class Session:
         self.settings = settings
         self.is_depth_given = is_depth_given
         self.aovs = parse_aovs(aovs)
+        self.recordings = Recordings(MAX_RECORDINGS)
         self._surveyed: _SurveyedScene | None = None
+        self._opened: dict[bool, PlannedScene] = {}
 
     def __repr__(self) -> str:
         s = self.settings
@@ -88,9 +105,8 @@ class Session:
             raise MivolError("found develop=False, expected True: mivol returns only developed images.")
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
-            estimators, plan = self._open(scene, sensor, spp, for_images=True)
-            samples = RenderSamples(sensor, seed, spp, plan.pass_rays)
-            image = render_on_film(samples, self.aovs, lambda rays: self._primal(estimators, rays, plan.successive_paths))
+            opened = self._open(scene, sensor, spp, SceneState.of(scene, sensor), for_images=True)
+            image = self._run(ImageTask, opened, scene, sensor, _opaque_seed(seed))
         if evaluate:
             dr.eval(image)
         return image
@@ -100,11 +116,13 @@ class Session:
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad(), carry_tangents(scene):
             with dr.resume_grad():
-                estimators, plan = self._open(scene, sensor, spp)
+                opened = self._open(scene, sensor, spp, SceneState.of(scene, sensor), for_images=False)
+                task = RenderTask(opened, self.settings, self.aovs, for_images=False)
+                estimators = task.build_estimators(scene, opened.readings, opened.light)
                 estimators.media.find_followed()
                 estimators.media.start_tangent()
-            samples = RenderSamples(sensor, seed, spp, plan.pass_rays)
-            return render_on_film(samples, self.aovs, lambda rays: self._tangent(estimators, rays))
+            samples = RenderSamples(sensor, seed, spp, opened.plan.pass_rays)
+            return render_on_film(samples, self.aovs, lambda rays: render_tangent(estimators, rays, self.aovs))
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
@@ -112,83 +130,73 @@ class Session:
         Cost: a render and its replay. Memory: a single pass, independent of the number of samples.
         """
         sensor = _find_renderable_sensor(scene, sensor)
-        with without_garbage_collection(), dr.suspend_grad():
+        with without_garbage_collection():
             with dr.resume_grad():
                 recompute_derived(scene)
-                estimators, plan = self._open(scene, sensor, spp)
-            media = estimators.media
-            media.find_followed()
-            samples = RenderSamples(sensor, seed, spp, plan.pass_rays)
-            media.start_gradients()
-            # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only
-            # once.
-            with dr.isolate_grad():
-                for rays, dL, daovs in adjoint_rays(samples, self.aovs, grad_in):
-                    self._replay(estimators, rays, dL, daovs, plan.branches)
-                    dr.eval()
-            with dr.resume_grad():
-                media.deliver_gradients()
+                state = SceneState.of(scene, sensor)
+                opened = self._open(scene, sensor, spp, state, for_images=False)
+            self._run(GradientTask, opened, scene, sensor, _opaque_seed(seed), grad_in)
 
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
         """Estimate the radiance along given rays, for integrators that nest this integrator and do not name a sensor."""
         with dr.suspend_grad():
-            estimators, _ = self._open(scene, find_sensor(scene, 0), 1, for_images=True)
+            sensor = find_sensor(scene, 0)
+            opened = self._open(scene, sensor, 1, SceneState.of(scene, sensor), for_images=True)
+            task = RenderTask(opened, self.settings, self.aovs, for_images=True)
+            estimators = task.build_estimators(scene, opened.readings, opened.light)
             media = estimators.media
             named = [sensor.get_medium() for sensor in scene.sensors()]
             media.start = named[0] if all(medium is named[0] for medium in named) else None
             media.locates_camera = bool(media.traced)
-            score, alpha = walk_path(estimators, sampler, ray, Primal(_zero_radiance(ray)), active)
+            score, alpha = walk_path(estimators, sampler, ray, Primal(zero_radiance(ray)), active)
             # An integrator that nests this integrator treats alpha as a mask: sample the mask with probability alpha.
             return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
-    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, for_images: bool = False) -> tuple[Estimators, Plan]:
-        """Survey a new scene, find the needs, plan, and build the estimators for images or for derivatives."""
+    def _run(self, kind: type[RenderTask], opened: PlannedScene, scene: mi.Scene, sensor: mi.Sensor, *inputs: Any) -> Any:
+        """Run a task: record it, replay its recording, or trace it if it cannot be recorded."""
+
+        def make() -> RenderTask:
+            return kind(opened, self.settings, self.aovs)
+
+        given = (scene, sensor, opened.readings, opened.light, *inputs)
+        if is_recording() or opened.unrecorded is not None:
+            return make()(*given)
+        gradients = [(value, dr.grad(value)) for value in find_differentiated(scene)] if kind is GradientTask else []
+        try:
+            return self.recordings.call(kind, (opened.spp, *opened.key), make, *given)
+        except CannotRecordError:
+            # The task has run up to the fault.
+            for value, gradient in gradients:
+                dr.set_grad(value, gradient)
+        return make()(*given)
+
+    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
+        """Survey a new scene, find the needs, plan, and read values; all of it is kept while the scene stays the same."""
         parts = [*scene.shapes(), *scene.emitters()]
-        if self._surveyed is None or not self._surveyed.is_of(parts) or not self._surveyed.survey.is_current:
+        is_known = self._surveyed is not None and self._surveyed.is_of(parts)
+        if not is_recording() and is_known and for_images in self._opened and self._opened[for_images].is_for(state, spp):
+            return self._opened[for_images]
+        if not is_known or not self._surveyed.survey.is_current:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
+            self._opened = {}
+            self.recordings.clear()
         survey = self._surveyed.survey
         needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
         warn_of_misplaced_grids(needs, survey)
-        needs = measure_media_light(scene, sensor, needs, survey, self.settings)
-        needs = measure_near_light(scene, sensor, needs, survey, self.settings)
+        with dr.suspend_grad():
+            needs = measure_media_light(scene, sensor, needs, survey, self.settings)
+            needs = measure_near_light(scene, sensor, needs, survey, self.settings)
         plan = make_plan(needs, self.settings, self.aovs)
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
-        return build_estimators(scene, needs, plan, self.settings, survey, for_images), plan
-
-    def _primal(self, estimators: Estimators, rays: CameraRays, successive: int) -> tuple:
-        count = paths_per_lane(successive, dr.width(rays.ray))
-        if count > 1:
-            L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
-        else:
-            score = Primal(_zero_radiance(rays.ray))
-            score, alpha = walk_path(estimators, rays.sampler, rays.ray, score)
-            L = score.L
-        return L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
-
-    def _tangent(self, estimators: Estimators, rays: CameraRays) -> tuple:
-        prepare_derivatives(estimators, rays.ray, rays.on_film)
-        black = _zero_radiance(rays.ray)
-        score = Tangent(black, black)
-        score, _ = walk_path(estimators, rays.sampler, rays.ray, score)
-        return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
-
-    def _replay(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float], branches: bool) -> None:
-        prepare_derivatives(estimators, rays.ray, rays.on_film)
-        # The number of branches is read on the host, which is impossible while Dr.Jit records.
-        if branches and not is_recording():
-            replay_branches(estimators, rays, dL)
-        else:
-            self._replay_whole(estimators, rays, dL)
-        vjp_aovs(estimators.media, rays.ray, self.aovs, daovs)
-
-    def _replay_whole(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
-        again, L = rays.sampler.clone(), None
-        if not has_one_segment(estimators):
-            known = Primal(_zero_radiance(rays.ray))
-            L = walk_path(estimators.replayed(), rays.sampler, rays.ray, known)[0].L
-            dr.eval(L)
-        walk_path(estimators, again, rays.ray, Replay(L, dL))
+        readings = read_parts(needs, plan, survey, for_images)
+        light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
+        unrecorded = find_unrecorded(scene, sensor, spp, needs, plan, for_images)
+        needs = replace(needs, views=(), media_light=None)
+        opened = PlannedScene(state, spp, survey, needs, plan, readings, light, unrecorded)
+        if not is_recording():
+            self._opened[for_images] = opened
+        return opened
 
 
 def _find_renderable_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
@@ -198,8 +206,11 @@ def _find_renderable_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sens
     return found
 
 
-def _zero_radiance(ray: mi.Ray3f) -> mi.Spectrum:
-    return dr.zeros(mi.Spectrum, dr.width(ray))
+def _opaque_seed(seed: int | mi.UInt32) -> mi.UInt32:
+    """A seed as an argument of kernels: with a literal, a kernel would be compiled anew in every render."""
+    opaque = mi.UInt32(seed)
+    dr.make_opaque(opaque)
+    return opaque
 
 
 # -- Derived values --------------------------------------------------------------------------------------------------------

@@ -117,12 +117,15 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     homogeneous = fog(occupied=0.0)
     asked = needs(thin, thick, homogeneous, film_samples=2**24 + 1, emitter_kinds=("extended",), surfaces=("Rectangle",),
-                  boundaries=[SimpleNamespace(box="a box", hole=None)] * 3, are_emitters_far=False)  # fmt: skip
+                  boundaries=[SimpleNamespace(box="a box", hole=None)] * 3, are_emitters_far=False,
+                  emitter_distances=(0.2, 0.0, math.inf, 0.0))  # fmt: skip
     made = plan.make_plan(asked, Settings(max_depth=2))
     assert made.skips_empty == (True, False, False)
     assert made.estimates_shadows == (False, True, False)
     assert (made.segment, made.scattering_points, made.side_flight_cosine) == ("single_scattering", 1, None)
     assert made.pass_rays == min(2**22, 2**29 // 1500)
+    assert made.near_emitters == (1, 3)
+    assert made.occupied == math.ceil(8 * (plan.MAX_SKIPPED_SHARE - 1e-9)) / 8
     passes = math.ceil((2**24 + 1) / made.pass_rays)
     said = {choice.subject: choice.choice for choice in made.choices}
     assert said["passes"] == f"{passes} of at most {made.pass_rays} rays"

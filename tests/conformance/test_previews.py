@@ -137,7 +137,7 @@ def test_no_light_beyond_the_depth_is_mentioned_without_reason(variant_rgb: str,
     look(fog(5.0, 0.95), "picture", max_depth=6)
     assert measured == []
     look(fog(5.0, 0.95), "picture")
-    assert len(measured) == 2
+    assert len(measured) == 1  # of two renders of the same state
 
 
 def test_noise_alone_is_not_mentioned() -> None:

@@ -13,8 +13,8 @@ from scattering_scenes import PLACE, close_up, mivol, moments, rough_grid, smoke
 
 from mivol.experiments.script import explain
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
-from mivol.scene.session import Session
+from mivol.scene.plan import build_estimators, make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.path import successive
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.film import RenderSamples, film_passes
@@ -28,9 +28,10 @@ ENDLESS = mivol(max_depth=-1)
 
 def radiance(scene: mi.Scene, count: int) -> np.ndarray:
     """Radiance and alpha (4, 3 * 8 * 8) of three samples per pixel."""
-    session, sensor = Session(Settings(max_depth=-1)), scene.sensors()[0]
+    settings, sensor, survey = Settings(max_depth=-1), scene.sensors()[0], survey_scene(scene)
     with dr.suspend_grad():
-        estimators, _ = session._open(scene, sensor, 3, for_images=True)
+        needs = find_needs(scene, sensor, survey, 3)
+        estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
         rays = next(film_passes(RenderSamples(sensor, 5, 3, 1 << 20)))
         L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
     return np.array([*L, alpha])
@@ -75,7 +76,7 @@ def test_a_plan_takes_them_where_lengths_differ(monkeypatch: pytest.MonkeyPatch)
     scene, counts = peaked(), []
     monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 64)
     walk = walk_successively
-    monkeypatch.setattr("mivol.scene.session.walk_successively", lambda *args: counts.append(args[-1]) or walk(*args))
+    monkeypatch.setattr("mivol.scene.render_tasks.walk_successively", lambda *args: counts.append(args[-1]) or walk(*args))
     for depth in (-1, 17, 16):
         mi.render(scene, integrator=mi.load_dict(mivol(max_depth=depth)), spp=8)
     assert counts == [8, 8]  # 512 paths

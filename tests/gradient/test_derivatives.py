@@ -15,7 +15,7 @@ from scattering_gradients import along, backward, upper_half
 from scattering_scenes import PLACE, cases, close_up, mivol, rough_grid, sun
 
 from mivol.experiments.script import explain
-from mivol.scene import plan
+from mivol.scene import choices, plan
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
@@ -80,6 +80,12 @@ SCENES = {"sun": smoky, "floor": lambda: smoky(floor=floor()), "rgb": coloured, 
 def gradient_of_mean_image(scene: mi.Scene, key: str, spp: int, seed: int, depth: int = 5) -> np.ndarray:
     """The derivative of the mean image."""
     return backward(scene, key, np.full((8, 8, 3), 1 / 192), spp, seed, mi.load_dict(mivol(max_depth=depth, rr_depth=3)))
+
+
+@pytest.fixture(autouse=True)
+def paths_branch(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Paths branch with few samples too."""
+    monkeypatch.setitem(choices.MIN_BRANCHING, mi.variant().split("_")[0], 0)
 
 
 @pytest.fixture
@@ -177,6 +183,10 @@ def test_plan_branches_paths_with_free_flights(monkeypatch: pytest.MonkeyPatch) 
     assert not choose(facts, 1) and not choose(facts, 3, "single_scattering")
     assert not choose(replace(facts, are_samples_independent=False), 3)
     assert "paths branch where they first collide" in explain(scene, 6)
+    monkeypatch.setitem(choices.MIN_BRANCHING, mi.variant().split("_")[0], facts.film_samples)
+    assert choose(facts, 3)
+    monkeypatch.setitem(choices.MIN_BRANCHING, mi.variant().split("_")[0], facts.film_samples + 1)
+    assert not choose(facts, 3)
 
 
 @pytest.mark.slow

@@ -271,10 +271,15 @@ def coarsen_grid(lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
         flat = _mean_along(flat, shape[axis], inner, edge)
         shape[axis] = -(-shape[axis] // edge)
     values = mi.TensorXf(flat, (*shape, c))
-    scale = np.diag([edge * m / n for m, n in zip(shape[::-1], lattice.res[::-1], strict=True)] + [1.0])
     empty_distances = find_empty_distances(values) if lattice.empty_distances is not None else None
     occupied_blocks = _list_occupied(values, lattice.res, shift) if lists else None
-    return CoarseGrid(Lattice(values, lattice.to_world @ scale, empty_distances), occupied_blocks)
+    return CoarseGrid(place_blocks(lattice, values, shift, empty_distances), occupied_blocks)
+
+
+def place_blocks(lattice: Lattice, means: mi.TensorXf, shift: int, empty_distances: mi.UInt8 | None = None) -> Lattice:
+    """Place the means of blocks of 2^shift voxels of a lattice as a grid of their own."""
+    ratios = [(m << shift) / n for m, n in zip(means.shape[2::-1], lattice.res[::-1], strict=True)]
+    return Lattice(means, lattice.to_world @ np.diag([*ratios, 1.0]), empty_distances)
 
 
 def _mean_along(flat: mi.Float, n: int, inner: int, edge: int) -> mi.Float:

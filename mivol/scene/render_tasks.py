@@ -1,0 +1,189 @@
+"""Renders of a planned scene as tasks: what Dr.Jit traces, records and replays.
+
+Conventions. A task holds facts and choices, and no arrays. In each call it views the media of the scene anew, so that a
+recording reads the arrays of that call.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.kernel_recording import RecordedTask, is_recording
+from mivol.scene.media_light import MediaLight
+from mivol.scene.needs import Needs
+from mivol.scene.plan import Plan, Readings, build_estimators
+from mivol.scene.scene_state import SceneState, find_hidden_arrays
+from mivol.scene.survey import SceneSurvey
+from mivol.transport.estimators.scores import Primal, Replay, Tangent
+from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
+from mivol.transport.path.derivatives import prepare_derivatives, replay_branches
+from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, count_passes, render_on_film
+from mivol.transport.path.successive import paths_per_lane, walk_successively
+from mivol.transport.path.walk import has_one_segment, walk_path
+
+
+@dataclass
+class PlannedScene:
+    """The facts of a scene, its plan, and what transport reads of its values. Valid while no parameter changes.
+
+    Attributes:
+        state: state of the parameters.
+        spp: samples per pixel.
+        survey: where the media, surfaces and emitters are.
+        needs: facts without arrays: a kept view of a medium would keep the derivatives of an earlier step.
+        plan: choices for the scene.
+        readings: what transport reads of the values of media.
+        light: table of the light of media (density, cumulative); None without a table.
+        unrecorded: why renders are not recorded; None if they are.
+    """
+
+    state: SceneState
+    spp: int
+    survey: SceneSurvey
+    needs: Needs
+    plan: Plan
+    readings: Readings
+    light: tuple[mi.Float, mi.Float] | None
+    unrecorded: str | None
+
+    def is_for(self, state: SceneState, spp: int) -> bool:
+        """Whether a scene in this state, with so many samples, has the same facts."""
+        return self.spp == spp and self.state.is_same(state)
+
+    @property
+    def key(self) -> tuple:
+        """All that a recording depends on and does not follow."""
+        return (*self.plan.decisions, self.needs.camera_inside, *self.state.key)
+
+
+def find_unrecorded(scene: mi.Scene, sensor: mi.Sensor, spp: int, needs: Needs, plan: Plan, for_images: bool) -> str | None:
+    """Why images, or derivatives, of a scene are traced in every call; None if they are recorded."""
+    if count_passes(sensor, spp, plan.pass_rays) > 1:
+        # A recording launches all its passes at once: Ctrl-C would act after the last.
+        return "tracing takes little of a render of several passes"
+    if plan.branches and not for_images:
+        return "the host counts the branches of paths"
+    if any(m.bounded or m.gaussians for m in needs.media):
+        return "the host reads majorants and lists Gaussians"
+    return find_hidden_arrays(scene, sensor)
+
+
+class RenderTask(RecordedTask):
+    """A render of a scene whose plan is made.
+
+    Args:
+        opened: facts and plan of the scene, and the samples per pixel.
+        settings, aovs: as in :class:`mivol.scene.session.Session`.
+        for_images: whether the estimators are those of images or of derivatives.
+    """
+
+    def __init__(self, opened: PlannedScene, settings: Settings, aovs: list[str], for_images: bool) -> None:
+        super().__init__()
+        self.survey, self.needs, self.plan = opened.survey, opened.needs, opened.plan
+        self.spp, self.settings, self.aovs, self.for_images = opened.spp, settings, aovs, for_images
+
+    def build_estimators(self, scene: mi.Scene, readings: Readings, light: tuple[mi.Float, mi.Float] | None) -> Estimators:
+        """Build the planned estimators over the arrays of the scene."""
+        needs = self.needs.with_views(self.survey)
+        if light is not None:
+            needs = replace(needs, media_light=MediaLight(*light))
+        return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, readings)
+
+    def samples(self, sensor: mi.Sensor, seed: mi.UInt32) -> RenderSamples:
+        """The samples of the render."""
+        return RenderSamples(sensor, seed, self.spp, self.plan.pass_rays)
+
+
+class ImageTask(RenderTask):
+    """An image."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given, for_images=True)
+
+    def __call__(
+        self, scene: mi.Scene, sensor: mi.Sensor, readings: Readings, light: tuple | None, seed: mi.UInt32
+    ) -> mi.TensorXf:
+        estimators = self.build_estimators(scene, readings, light)
+        return render_on_film(
+            self.samples(sensor, seed), self.aovs, lambda rays: _render_primal(estimators, rays, self.plan, self.aovs)
+        )
+
+
+class GradientTask(RenderTask):
+    """The derivatives of an image, added to the gradients of the parameters."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given, for_images=False)
+
+    def __call__(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        readings: Readings,
+        light: tuple | None,
+        seed: mi.UInt32,
+        grad_in: mi.TensorXf,
+    ) -> None:
+        with dr.suspend_grad():
+            with dr.resume_grad():
+                estimators = self.build_estimators(scene, readings, light)
+            media = estimators.media
+            media.find_followed()
+            media.start_gradients()
+            # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only
+            # once.
+            with dr.isolate_grad():
+                for rays, dL, daovs in adjoint_rays(self.samples(sensor, seed), self.aovs, grad_in):
+                    _replay(estimators, rays, dL, self.plan.branches)
+                    vjp_aovs(media, rays.ray, self.aovs, daovs)
+                    dr.eval()
+            with dr.resume_grad():
+                media.deliver_gradients()
+
+
+def _render_primal(estimators: Estimators, rays: CameraRays, plan: Plan, aovs: list[str]) -> tuple:
+    count = paths_per_lane(plan.successive_paths, dr.width(rays.ray))
+    if count > 1:
+        L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
+    else:
+        score = Primal(zero_radiance(rays.ray))
+        score, alpha = walk_path(estimators, rays.sampler, rays.ray, score)
+        L = score.L
+    return L, alpha, integrate_aovs(estimators.media, rays.ray, aovs)
+
+
+def render_tangent(estimators: Estimators, rays: CameraRays, aovs: list[str]) -> tuple:
+    """The derivative of the radiance along camera rays, alpha and AOVs, for the film."""
+    prepare_derivatives(estimators, rays.ray, rays.on_film)
+    black = zero_radiance(rays.ray)
+    score = Tangent(black, black)
+    score, _ = walk_path(estimators, rays.sampler, rays.ray, score)
+    return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, aovs)
+
+
+def _replay(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, branches: bool) -> None:
+    prepare_derivatives(estimators, rays.ray, rays.on_film)
+    # The number of branches is read on the host, which is impossible while Dr.Jit records.
+    if branches and not is_recording():
+        replay_branches(estimators, rays, dL)
+    else:
+        _replay_whole(estimators, rays, dL)
+
+
+def _replay_whole(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
+    again, L = rays.sampler.clone(), None
+    if not has_one_segment(estimators):
+        known = Primal(zero_radiance(rays.ray))
+        L = walk_path(estimators.replayed(), rays.sampler, rays.ray, known)[0].L
+        dr.eval(L)
+    walk_path(estimators, again, rays.ray, Replay(L, dL))
+
+
+def zero_radiance(ray: mi.Ray3f) -> mi.Spectrum:
+    """No light along each ray."""
+    return dr.zeros(mi.Spectrum, dr.width(ray))

@@ -1,0 +1,135 @@
+"""The state of a scene's parameters: what has changed since a plan was made, and what a recording follows by itself.
+
+Conventions. A plan holds as long as no parameter has changed. A recording (:mod:`mivol.kernel_recording`) holds longer: it
+reads the values of volumes and textures anew in every call. All other parameters are part of its key, since some of them decide
+on the host what is traced: the place of a shape, the ``scale`` of a stock medium, the ``g`` of a stock ``hg``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.scene_graph import list_values, traverse
+
+FOLLOWED = ("data", "value")
+"""Names of the parameters of volumes and textures whose values a recording follows."""
+
+FOLLOWED_SENSORS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
+"""Sensors that can be recorded, with all their parameters. Recording a ``batch`` aborts the process (Dr.Jit 1.5)."""
+
+
+@dataclass
+class SceneState:
+    """The state of all parameters of a scene and of a sensor.
+
+    Attributes:
+        sensor: the sensor.
+        values: the arrays that a recording follows, by their indices in Dr.Jit and with their shapes.
+        others: all other arrays and numbers.
+        held: the arrays. Dr.Jit would give the index of a freed array to another array.
+    """
+
+    sensor: mi.Sensor
+    values: list = field(default_factory=list)
+    others: list = field(default_factory=list)
+    held: list = field(default_factory=list)
+
+    @classmethod
+    def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> SceneState:
+        """Read the state of a scene and of the sensor to render, which may lie outside of the scene."""
+        state = cls(sensor)
+        params = traverse(scene)
+        state._add(params)
+        if sensor not in params.hierarchy:
+            state._add(traverse(sensor))
+        state.others.append(_describe_sensor(sensor))
+        return state
+
+    @property
+    def key(self) -> tuple:
+        """The part of the state that a recording does not follow."""
+        shapes = tuple(shape for _, shape, _ in self.values)
+        followed = tuple(is_followed for _, _, is_followed in self.values)
+        return (*self.others, shapes, followed)
+
+    def is_same(self, other: SceneState) -> bool:
+        """Whether no parameter differs, and the sensor is the same."""
+        return self.sensor is other.sensor and self.values == other.values and self.others == other.others
+
+    def _add(self, params: mi.SceneParameters) -> None:
+        for key in params.properties:
+            _, _, owner, _ = params.properties[key]
+            value = params[key]
+            numbers = value if dr.is_array_v(value) else getattr(value, "matrix", None)
+            if numbers is None or not dr.is_jit_v(numbers):
+                self.others.append(value if isinstance(value, int | float | str | bool) else str(value))
+                continue
+            kept = dr.detach(numbers)
+            self.held.append(kept)
+            state = (tuple(dr.detail.collect_indices(kept)), dr.shape(kept), dr.grad_enabled(numbers))
+            (self.values if _is_followed(owner, key) else self.others).append(state)
+
+
+def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
+    """Why a recording would miss arrays or derivatives of a scene; None if it finds all.
+
+    A recording must find all arrays. Dr.Jit finds those of Mitsuba's plugins, and those that are attributes of a Python plugin.
+    It aborts the process for an array that it does not find.
+    """
+    if sensor.class_name() not in FOLLOWED_SENSORS:
+        return f"the sensor is a {sensor.class_name()}"
+    params = traverse(scene)
+    kinds = {type(node) for node in params.hierarchy if not _is_of_mivol(node)}
+    foreign = sorted(kind.__name__ for kind in kinds if kind.__module__.partition(".")[0] != "mitsuba")
+    if foreign:
+        return f"{foreign[0]} is a Python plugin, whose arrays may be hidden"
+    owners = ((key, params.properties[key][2], value) for key, value in list_values(params))
+    lost = [key for key, owner, value in owners if _find_gradient(value) is not None and not _is_followed(owner, key)]
+    return f"a recording does not follow the derivative by {lost[0]}" if lost else None
+
+
+def find_differentiated(scene: mi.Scene) -> list[Any]:
+    """The arrays, and the matrices of transforms, with gradients enabled among the parameters of a scene."""
+    found = (_find_gradient(value) for _, value in list_values(traverse(scene)))
+    return [array for array in found if array is not None]
+
+
+def _find_gradient(value: Any) -> Any | None:
+    """The array of a parameter, or the matrix of a transform, if its gradients are enabled."""
+    array = value if dr.is_array_v(value) else getattr(value, "matrix", None)
+    return array if array is not None and dr.is_diff_v(array) and dr.grad_enabled(array) else None
+
+
+def _is_followed(owner: mi.Object, key: str) -> bool:
+    """Whether a recording follows the values of a parameter."""
+    if _is_of_mivol(owner):
+        return True
+    if isinstance(owner, mi.Volume | mi.Texture):
+        return key.rpartition(".")[2] in FOLLOWED
+    return isinstance(owner, mi.Sensor) and owner.class_name() in FOLLOWED_SENSORS
+
+
+def _is_of_mivol(node: mi.Object) -> bool:
+    """Whether an object is a plugin of mivol, which decides nothing by values while Dr.Jit records."""
+    return type(node).__module__.partition(".")[0] == "mivol"
+
+
+def _describe_sensor(sensor: mi.Sensor) -> tuple:
+    """What the samples of a sensor depend on besides arrays."""
+    film, sampler = sensor.film(), sensor.sampler()
+    return (
+        sensor.class_name(),
+        sensor.needs_aperture_sample(),
+        sensor.get_medium().ptr if sensor.get_medium() is not None else None,
+        tuple(film.size()),
+        tuple(film.crop_size()),
+        tuple(film.crop_offset()),
+        film.class_name(),
+        str(film.rfilter()),
+        sampler.class_name(),
+        sampler.sample_count(),
+    )

@@ -1,0 +1,370 @@
+"""Renders and gradients that are recorded give the numbers of traced ones, whatever changes between calls.
+
+Kernels are recorded while Python's collector is paused.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import PLACE, cases, close_up, mivol, point, rough_grid, smoke, sun
+
+import scenes
+from mivol.errors import MivolError
+from mivol.kernel_recording import CannotRecordError, RecordedTask, Recordings, without_garbage_collection
+from mivol.scene import choices, plan, render_tasks, session
+from mivol.scene.scene_state import SceneState, find_hidden_arrays
+from mivol.threads import set_thread_count
+from scenes import ball_of, box_of, camera, grid_volume, medium, sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+INSIDE = "smoke.interior_medium."
+
+
+def smoke_under(kind: str = "mivol_medium", phase: dict | None = None, **more: dict) -> mi.Scene:
+    volume = "mivol_voxels" if kind == "mivol_medium" else "gridvolume"
+    given = {} if phase is None else {"phase": phase}
+    smoke = medium(kind, grid_volume(volume, rough_grid(4, 3.0).astype(np.float32), PLACE), 0.8, **given)
+    return close_up({"smoke": box_of(smoke, PLACE), **(more or {"sky": sky(0.7)})}, res=6)
+
+
+def lamp_in_fog() -> mi.Scene:
+    """A lamp in a ball over a floor: light of near emitters along segments, and traced surfaces."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
+    fog = ball_of(medium("homogeneous", 1.5, 0.8), (0, 0, 0), 1.2)
+    return close_up({"smoke": fog, "lamp": point((0.2, 0.1, 0.3))[0], "floor": floor}, res=6)
+
+
+def fire() -> mi.Scene:
+    light = grid_volume("mivol_voxels", rough_grid(6, 1.0, (5, 4, 6)).astype(np.float32), PLACE)
+    smoke = medium("mivol_medium", grid_volume("mivol_voxels", rough_grid(4, 3.0).astype(np.float32), PLACE), 0.8)
+    return close_up({"smoke": box_of(smoke | {"emission_density": light}, PLACE)}, res=6)
+
+
+SCENES: dict[str, tuple[Callable[[], mi.Scene], int, list[str]]] = {
+    "grid": (smoke_under, 4, [INSIDE + "sigma_t.data", INSIDE + "albedo.value.value", "sky.radiance.value"]),
+    "one scattering": (lambda: smoke_under(sun=sun([0.3, 0.2, -1.0])[0]), 2, [INSIDE + "sigma_t.data", "sun.irradiance.value"]),
+    "stock grid": (lambda: smoke_under("heterogeneous"), 4, [INSIDE + "sigma_t.data", INSIDE + "albedo.value.value"]),
+    "phase": (lambda: smoke_under(phase={"type": "mivol_hg", "g": 0.5}), 4, [INSIDE + "phase_function.g"]),
+    "lamp": (lamp_in_fog, 5, [INSIDE + "sigma_t.value.value", "floor.bsdf.reflectance.value"]),
+    "fire": (fire, 3, [INSIDE + "emission_density.data", INSIDE + "sigma_t.data"]),
+}
+
+
+class Pair:
+    """The same renders by recordings, and traced anew in each call."""
+
+    def __init__(self, scene: mi.Scene, depth: int) -> None:
+        self.scene, self.params = scene, mi.traverse(scene)
+        self.recorded, self.traced = (mi.load_dict(mivol(max_depth=depth)) for _ in range(2))
+
+        def refuse(*_: object) -> None:
+            raise CannotRecordError
+
+        self.traced.session.recordings.call = refuse
+        set_thread_count(1)  # sums over lanes then have one order
+
+    @property
+    def recordings(self) -> Recordings:
+        return self.recorded.session.recordings
+
+    def scale(self, key: str, factor: float) -> None:
+        self.params[key] = type(self.params[key])(self.params[key] * factor)
+        self.params.update()
+
+    def images(self, seed: int, **more: object) -> list[np.ndarray]:
+        return [
+            np.array(mi.render(self.scene, integrator=integrator, seed=seed, spp=2, **more))
+            for integrator in (self.recorded, self.traced)
+        ]
+
+    def gradients(self, key: str, seed: int) -> list[np.ndarray]:
+        return [self.gradient(integrator, key, seed) for integrator in (self.recorded, self.traced)]
+
+    def gradient(self, integrator: mi.Integrator, key: str, seed: int) -> np.ndarray:
+        value = type(self.params[key])(dr.detach(self.params[key]))
+        dr.enable_grad(value)
+        self.params[key] = value
+        self.params.update()
+        dr.backward(dr.mean(mi.render(self.scene, self.params, integrator=integrator, seed=seed, spp=2), axis=None))
+        found = np.array(dr.ravel(dr.grad(self.params[key])))
+        self.params[key] = type(value)(dr.detach(value))
+        self.params.update()
+        return found
+
+    def assert_same(self, seed: int, **more: object) -> None:
+        found, truth = self.images(seed, **more)
+        assert np.array_equal(found, truth) and truth.max() > 0
+
+
+@pytest.mark.parametrize("name", cases(SCENES, slow=("stock grid", "phase", "fire")))
+def test_images_follow_values(name: str) -> None:
+    """To the last bit, and after the first calls without another recording."""
+    make, depth, keys = SCENES[name]
+    pair = Pair(make(), depth)
+    for key in keys:
+        for call in range(4):
+            pair.scale(key, 0.9)
+            pair.assert_same(call)
+            if call == 1:
+                count = pair.recordings.count
+        assert pair.recordings.count == count, key
+    assert not any(pair.recordings.failures.values())
+
+
+@pytest.mark.parametrize("name", cases(SCENES, slow=("stock grid", "phase", "fire", "one scattering")))
+def test_gradients_follow_values(name: str) -> None:
+    make, depth, keys = SCENES[name]
+    pair = Pair(make(), depth)
+    for key in keys:
+        for call in range(3):
+            pair.scale(key, 0.9)
+            found, truth = pair.gradients(key, call)
+            # Kernels of other inputs may round and sum in another order: at most some 200 terms in a voxel.
+            assert np.abs(found - truth).max() <= 200 * 2**-24 * np.abs(truth).max(), key
+            assert np.abs(truth).max() > 0, key
+    assert not any(pair.recordings.failures.values())
+
+
+def test_a_gradient_flows_on_to_what_a_parameter_was_made_from() -> None:
+    """A grid made from one number, again in each step."""
+    pair = Pair(smoke_under(), 3)
+    base = mi.TensorXf(dr.detach(pair.params[INSIDE + "sigma_t.data"]))
+    for step in range(3):
+        found = []
+        for integrator in (pair.recorded, pair.traced):
+            factor = dr.opaque(mi.Float, 1 + 0.1 * step)
+            dr.enable_grad(factor)
+            pair.params[INSIDE + "sigma_t.data"] = base * factor
+            pair.params.update()
+            dr.backward(dr.mean(mi.render(pair.scene, pair.params, integrator=integrator, seed=step, spp=2), axis=None))
+            found.append(float(dr.grad(factor)[0]))
+        assert found[0] == found[1] != 0
+    assert pair.recordings.count <= 4
+
+
+def test_cameras_move_between_calls() -> None:
+    pair = Pair(smoke_under(), 3)
+    for angle in np.linspace(0, 1, 4):
+        sensor = mi.load_dict(camera((4 * np.sin(angle), -4 * np.cos(angle), 1.0), (0.0, 0.0, 0.0), res=6, fov=35.0))
+        pair.assert_same(1, sensor=sensor)
+
+
+def test_each_camera_of_a_scene_has_its_own_facts() -> None:
+    """One camera stands outside of a traced ball, one inside: a plan is made for each."""
+    ball = ball_of(medium("homogeneous", 1.5, 0.0), (0, 0, 0), 1.2) | {"bsdf": {"type": "thindielectric"}}
+    eyes = {f"eye{k}": camera((0.0, y, 0.0), (0.0, 0.1, 0.0), res=6, fov=35.0) for k, y in enumerate((-4.0, 0.0))}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "sky": sky(1.0), **eyes})
+    outside, inside = (SceneState.of(scene, sensor) for sensor in scene.sensors())
+    assert outside.key == inside.key and not outside.is_same(inside)
+    pair = Pair(scene, 3)
+    for sensor in (0, 1, 0):
+        pair.assert_same(1, sensor=sensor)
+
+
+@pytest.mark.parametrize(
+    ("make", "key", "value"),
+    [
+        (lambda: smoke_under("heterogeneous"), INSIDE + "scale", lambda: 2.0),
+        (lambda: smoke_under(phase={"type": "hg", "g": 0.4}), INSIDE + "phase_function.g", lambda: mi.Float(-0.4)),
+        (lamp_in_fog, "lamp.position", lambda: mi.Point3f(-0.3, 0.2, 0.1)),
+        (lamp_in_fog, "smoke.to_world", lambda: mi.AffineTransform4f().translate([0.2, 0, 0])),
+    ],
+    ids=["scale", "g", "lamp", "boundary"],
+)
+def test_what_a_recording_does_not_follow_is_recorded_anew(make: Callable, key: str, value: Callable) -> None:
+    pair = Pair(make(), 4)
+    pair.assert_same(1)
+    before = pair.images(1)[0]
+    pair.params[key] = value()
+    pair.params.update()
+    pair.assert_same(1)
+    assert not np.array_equal(pair.images(1)[0], before)
+
+
+def test_a_bad_value_is_refused_after_good_ones() -> None:
+    """A kept plan holds for the values that it was made for."""
+    pair = Pair(smoke_under("heterogeneous"), 3)
+    pair.assert_same(1)
+    values = np.array(pair.params[INSIDE + "albedo.value.value"]) * 2
+    pair.params[INSIDE + "albedo.value.value"] = mi.Float(values)
+    pair.params.update()
+    with scenes.refused("the albedo of the medium in smoke lies in"):
+        pair.images(1)
+
+
+@pytest.mark.filterwarnings("ignore:.*values of sigma_t.* are below 0:RuntimeWarning")
+def test_negative_voxels_count_as_zero_in_a_recording() -> None:
+    pair = Pair(smoke_under(), 1)
+    values = np.array(pair.params[INSIDE + "sigma_t.data"])
+    for part in (values - 2.0, values - 2.5, values):
+        images = []
+        for grid in (part, np.maximum(part, 0)):
+            pair.params[INSIDE + "sigma_t.data"] = mi.TensorXf(grid)
+            pair.params.update()
+            images += pair.images(1)
+        assert all(np.array_equal(image, images[-1]) for image in images)
+
+
+# -- What is traced ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_recorded_is_named() -> None:
+    scene = smoke_under("heterogeneous", phase={"type": "hg", "g": 0.4})
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    batch = mi.load_dict({"type": "batch", "film": film, "one": camera((0, -4, 0), (0, 0, 0))})
+    assert find_hidden_arrays(scene, scene.sensors()[0]) is None
+    assert find_hidden_arrays(scene, batch) == "the sensor is a BatchSensor"
+    params = mi.traverse(scene)
+    dr.enable_grad(params[INSIDE + "sigma_t.data"])
+    assert find_hidden_arrays(scene, scene.sensors()[0]) is None
+    dr.enable_grad(params[INSIDE + "phase_function.g"])
+    expected = f"a recording does not follow the derivative by {INSIDE}phase_function.g"
+    assert find_hidden_arrays(scene, scene.sensors()[0]) == expected
+
+
+def test_long_renders_are_traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of several passes, between which Ctrl-C ends a render."""
+    pair = Pair(smoke_under(), 3)
+    monkeypatch.setitem(plan.PASS_RAYS, mi.variant().split("_")[0], 40)
+    pair.assert_same(1)
+    assert pair.recordings.count == 0
+
+
+def test_branches_are_traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = Pair(smoke_under(), 3)
+    monkeypatch.setitem(choices.MIN_BRANCHING, mi.variant().split("_")[0], 0)
+    assert np.abs(pair.gradient(pair.recorded, INSIDE + "sigma_t.data", 1)).max() > 0
+    assert set(pair.recordings.failures) == {render_tasks.ImageTask}
+
+
+def test_a_task_that_fails_is_traced_and_adds_its_gradient_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Dr.Jit fails: at the end, with the gradient in place."""
+    pair = Pair(smoke_under(), 3)
+    truth = pair.gradient(pair.traced, INSIDE + "sigma_t.data", 1)
+    work, calls = render_tasks.GradientTask.__call__, []
+
+    def work_and_fail(self: RecordedTask, *inputs: object) -> None:
+        work(self, *inputs)
+        calls.append(render_tasks.is_recording())
+        if calls[-1]:
+            raise RuntimeError("as Dr.Jit says")
+
+    monkeypatch.setattr(render_tasks.GradientTask, "__call__", work_and_fail)
+    for _ in range(3):
+        assert np.array_equal(pair.gradient(pair.recorded, INSIDE + "sigma_t.data", 1), truth)
+    # After two failures nothing is recorded any more.
+    assert calls == [True, False, True, False, False]
+    assert pair.recordings.failures[render_tasks.GradientTask] == ["as Dr.Jit says"] * 2
+
+
+# -- Recordings -------------------------------------------------------------------------------------------------------------
+
+
+class Times(RecordedTask):
+    def __init__(self, factor: float) -> None:
+        super().__init__()
+        self.factor, self.calls = factor, 0
+
+    def __call__(self, x: mi.Float) -> mi.Float:
+        self.calls += 1
+        return x * self.factor
+
+
+def test_a_recording_is_kept_by_its_key_and_the_oldest_is_dropped() -> None:
+    recordings, made = Recordings(2), []
+
+    def call(key: int, x: float) -> float:
+        return float(recordings.call(Times, key, lambda: made.append(Times(key)) or made[-1], dr.opaque(mi.Float, x))[0])
+
+    assert [call(2, 5.0), call(2, 6.0), call(3, 5.0), call(2, 7.0)] == [10, 12, 15, 14]
+    assert [task.factor for task in made] == [2, 3]
+    assert [call(4, 1.0), call(2, 1.0), call(3, 1.0)] == [4, 2, 3]
+    assert [task.factor for task in made] == [2, 3, 4, 3]
+    recordings.clear()
+    assert call(2, 1.0) == 2 and len(made) == 5
+
+
+def test_an_interrupt_ends_a_recording() -> None:
+    class Interrupted(Times):
+        def __call__(self, x: mi.Float) -> mi.Float:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Recordings(2).call(Interrupted, 1, lambda: Interrupted(1), dr.opaque(mi.Float, 1.0))
+
+
+def test_the_state_of_a_scene_tells_values_from_the_rest() -> None:
+    scene = smoke_under("heterogeneous")
+    params, sensor = mi.traverse(scene), scene.sensors()[0]
+    before = SceneState.of(scene, sensor)
+    assert before.is_same(SceneState.of(scene, sensor))
+    for key, value, is_followed in (
+        (INSIDE + "sigma_t.data", params[INSIDE + "sigma_t.data"] * 2, True),
+        (INSIDE + "scale", 3.0, False),
+    ):
+        params[key] = value
+        params.update()
+        after = SceneState.of(scene, sensor)
+        assert not before.is_same(after)
+        assert (before.key == after.key) == is_followed
+        before = after
+    dr.enable_grad(params[INSIDE + "sigma_t.data"])
+    after = SceneState.of(scene, sensor)
+    assert not before.is_same(after) and before.key != after.key
+
+
+def test_refusals_of_a_plan_come_before_a_recording() -> None:
+    scene = smoke_under()
+    integrator = mi.load_dict(mivol(max_depth=4, deterministic=True))
+    with pytest.raises(Exception) as caught:
+        mi.render(scene, integrator=integrator, spp=1)
+    assert isinstance(caught.value, MivolError) or isinstance(caught.value.__cause__, MivolError)
+    assert integrator.session.recordings.count == 0
+
+
+# -- Python's collector ----------------------------------------------------------------------------------------------------
+
+
+def test_collections_are_put_off_for_a_while() -> None:
+    """After an error too; and they stay off where they were."""
+    assert gc.isenabled()
+    with pytest.raises(ZeroDivisionError), without_garbage_collection():
+        assert not gc.isenabled()
+        raise ZeroDivisionError
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with without_garbage_collection():
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+@pytest.mark.slow_for("forward", "reverse")
+@pytest.mark.parametrize("way", ["picture", "reverse", "forward"])
+def test_paths_are_recorded_without_them(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    seen, room = [], session if way == "forward" else render_tasks
+    name = "render_tangent" if way == "forward" else "walk_path"
+    walk = getattr(room, name)
+    monkeypatch.setattr(room, name, lambda *a, **k: seen.append(gc.isenabled()) or walk(*a, **k))
+    scene = close_up({"smoke": smoke(rough_grid(1), 0.5)[0], "sky": scenes.sky(1.0)}, res=2)
+    params, integrator = mi.traverse(scene), mi.load_dict(mivol(max_depth=3))
+    if way != "picture":
+        dr.enable_grad(params[INSIDE + "sigma_t.data"])
+    if way == "forward":
+        dr.set_grad(params[INSIDE + "sigma_t.data"], 1.0)
+        integrator.render_forward(scene, params, seed=0, spp=1)
+    elif way == "reverse":
+        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (2, 2, 3)), seed=0, spp=1)
+    else:
+        mi.render(scene, integrator=integrator, spp=1)
+    assert seen and not any(seen)
+    assert gc.isenabled()
