@@ -1,7 +1,7 @@
 """Derivatives of the optical depth: the transpose and the tangent are those of the same matrix.
 
-tau is linear in the voxels, so finite differences need no step size and are exact but for rounding. The transpose is compared
-with the dense row of the twin.
+tau is linear in the voxels, so the tangent is the optical depth of the tangent. The transpose is compared with the dense rows
+of the twin.
 """
 
 from __future__ import annotations
@@ -106,32 +106,6 @@ def test_tangent_is_the_integral_of_the_tangent(seed, channels, skip):
     rng, values, to_world, o, d = setting(seed, "rotated", channels)
     x = as_float32(rng.normal(size=values.shape))
     assert np.array_equal(jvp(values, x, to_world, o, d, skip=skip), tau_fast(x, to_world, o, d))
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_forward_against_reverse_entry_by_entry(seed, channels):
-    # Column k of A by the jvp of a unit vector, and entry k of A^T 1 by a vjp: the same sum over rays.
-    rng, values, to_world, o, d = setting(seed, "sheared", channels, n=32)
-    aty = vjp(values, np.ones((32, channels)), to_world, o, d)
-    for _ in range(4):
-        k = tuple(rng.integers(0, values.shape))
-        unit = np.zeros(values.shape)
-        unit[k] = 1
-        column = jvp(values, unit, to_world, o, d)
-        assert column.sum(dtype=np.float64) == pytest.approx(aty[k], abs=BOUND * float(aty.max()))
-        assert np.array_equal(column[:, [c for c in range(channels) if c != k[3]]], np.zeros((32, channels - 1)))
-
-
-def test_finite_differences(seed):
-    # tau(sigma + 1/2 e_k) - tau(sigma - 1/2 e_k) is column k; each tau has a rounding of its own, 1e-6 of it.
-    _, values, to_world, o, d = setting(seed, "mirrored", 1, n=64)
-    aty = vjp(values, np.ones((64, 1)), to_world, o, d)
-    tau = tau_fast(values, to_world, o, d)
-    for k in [tuple(k) for k in np.argwhere(aty > 0.2 * aty.max())[::7]]:
-        step = np.zeros(values.shape)
-        step[k] = 0.5
-        difference = tau_fast(values + step, to_world, o, d) - tau_fast(values - step, to_world, o, d)
-        assert difference.sum(dtype=np.float64) == pytest.approx(aty[k], abs=2 * BOUND * float(tau.sum() + aty.max()))
 
 
 def test_chain_rule_through_a_map_of_the_voxels(seed):
