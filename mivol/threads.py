@@ -3,8 +3,8 @@
 Reason. Dr.Jit 1.5 keeps one copy of a small scatter target for each pool thread (reduction mode ``Expand``), and counts all
 Python threads as the same pool thread. Two Python threads then add to one copy without atomics. Up to a third of a gradient was
 missing in a test, without an error. A forked child has no pool threads at all. Therefore every function that renders or
-differentiates calls :func:`check_one_thread` first, and child processes are started by :func:`run_child`. No other module of
-mivol starts threads or processes.
+differentiates calls :func:`check_one_thread` first, and child processes are started by :func:`run_child` and
+:func:`follow_program`. No other module of mivol starts threads or processes.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 
 from .errors import MivolError
 
@@ -104,3 +105,25 @@ def run_child(
         stdin=subprocess.DEVNULL,
         check=False,
     )
+
+
+def follow_program(program: Path, *args: str, errors: Path) -> Iterator[str]:
+    """Run a Python file in a fresh interpreter, and yield the lines of its standard output as they come.
+
+    The program ends with the iteration: leaving the iterator early, or an interrupt, kills it.
+
+    Args:
+        program: file of the program.
+        args: its arguments.
+        errors: file for its error output.
+    """
+    with errors.open("w", encoding="utf-8") as stream:
+        child = subprocess.Popen(
+            [sys.executable, "-P", str(program), *args], stdout=subprocess.PIPE, stderr=stream, text=True, encoding="utf-8"
+        )
+        try:
+            yield from child.stdout
+        finally:
+            child.kill()
+            child.stdout.close()
+            child.wait()

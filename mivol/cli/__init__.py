@@ -522,6 +522,19 @@ def reference(arguments: argparse.Namespace) -> None:
     print("\n".join(result.text for result in results))
 
 
+def poses(arguments: argparse.Namespace) -> None:
+    """Find the poses of a folder of photographs, and write them to FOLDER/sparse/0 for mivol optimize.
+
+    COLMAP searches (pip install "mivol[poses]"); nothing is downloaded, and no GPU is needed.
+    """
+    from mivol.photos.poses import find_poses
+
+    found = find_poses(arguments.folder, lambda stage: print(stage, file=sys.stderr))
+    print(found.describe())
+    folder = shlex.quote(str(arguments.folder))
+    print(f"mivol explain {folder} -o cameras.png draws the cameras; mivol optimize {folder} fits Gaussians")
+
+
 def optimize(arguments: argparse.Namespace) -> None:
     """Fit a volume, scene parameters, a radiance field or Gaussians to images, projections or photographs.
 
@@ -719,6 +732,7 @@ VERBS: dict[str, Verb] = {
     "explain": Verb(explain, explain_flags),
     "render": Verb(render, render_flags),
     "reference": Verb(reference, reference_flags),
+    "poses": Verb(poses, lambda: [flag("folder", type=Path, help="folder of photographs, in images/ or in itself")]),
     "optimize": Verb(optimize, optimize_flags, describe_settings),
     "validate": Verb(validate, validate_flags),
     "export": Verb(export, export_flags),

@@ -20,8 +20,7 @@ import numpy as np
 from mivol.files.source import parse_reals, read_bytes, refusal
 from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Fisheye, Lens
-from mivol.photos.listing import SHRUNK, Entry, Listing, check_points, find_image
-from mivol.photos.photo_file import SUFFIXES
+from mivol.photos.listing import SHRUNK, Entry, Listing, check_points, find_image, list_photographs
 
 MODEL_NUMBERS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
@@ -91,7 +90,7 @@ def find_model(path: Path) -> Path | None:
 
 
 def read_colmap(path: Path) -> Listing:
-    """Read a sparse model with photographs in ``images/`` beside ``sparse/``.
+    """Read a sparse model with photographs in ``images/`` beside ``sparse/``, or beside ``sparse/`` itself.
 
     Returns:
         Photographs sorted by name, the points of the model, and a note on photographs without a pose.
@@ -111,19 +110,23 @@ def read_colmap(path: Path) -> Listing:
     visible = {} if points is None else points.by_image()
     folders = ["images", *(f"images_{k}" for k in SHRUNK[1:])]
     bases = (folder for folder in (path, *model.parents[:2]) if any((folder / name).is_dir() for name in folders))
-    base = next(bases, path)
+    base = next(bases, None)
+    if base is not None:
+        photographs = base / "images"
+    else:
+        photographs = model.parent.parent if path == model and model.parent.name == "sparse" else path
     file = model / f"images{suffix}"
     entries = [
-        _entry(base, pose, sensors, file, visible.get(pose.number)) for pose in sorted(poses, key=lambda pose: pose.name)
+        _entry(photographs, pose, sensors, file, visible.get(pose.number)) for pose in sorted(poses, key=lambda pose: pose.name)
     ]
-    notes = _note_unposed(base / "images", model, {pose.name for pose in poses}, suffix)
+    notes = _note_unposed(photographs, model, {pose.name for pose in poses}, suffix)
     return Listing(entries, None if points is None else points.rows[:, :3], notes=notes)
 
 
 def _note_unposed(folder: Path, model: Path, posed: set[str], suffix: str) -> tuple[str, ...]:
     """A sentence on the photographs of a folder without a pose in the model, and on larger models beside it."""
-    files = (file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES)
-    unposed = sorted({file.relative_to(folder).as_posix() for file in files} - posed)
+    names = list_photographs(folder.parent if folder.name == "images" else folder)[1]
+    unposed = sorted(set(names) - posed)
     if not unposed:
         return ()
     named = ", ".join(unposed[:5]) + (" ..." if len(unposed) > 5 else "")
@@ -132,6 +135,8 @@ def _note_unposed(folder: Path, model: Path, posed: set[str], suffix: str) -> tu
     largest = max(others, key=others.get, default=model)
     if others.get(largest, 0) > len(posed):
         note += f"; {largest} has poses of {others[largest]} photographs: name that folder"
+    elif len(posed) < len(unposed):
+        note += f"; without {model}, mivol poses searches again"
     return (note,)
 
 
@@ -167,7 +172,7 @@ def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
     )
 
 
-def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, points: np.ndarray | None) -> Entry:
+def _entry(folder: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, points: np.ndarray | None) -> Entry:
     if pose.camera not in sensors:
         raise refusal(file, f"camera {pose.camera} of {pose.name}", "a camera of the model", "export the model again")
     sensor = sensors[pose.camera]
@@ -175,7 +180,8 @@ def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, point
     def camera(size: tuple[int, int]) -> Camera:
         return Camera(sensor.K, size, pose.to_world, sensor.lens, f"{file.name} {pose.name}")
 
-    return Entry(pose.name, find_image(base / "images" / pose.name), camera, "train", sensor.size, points=points)
+    # COLMAP ignores the orientation of EXIF (pycolmap 4.2.1).
+    return Entry(pose.name, find_image(folder / pose.name), camera, "train", sensor.size, points=points, is_stored=True)
 
 
 def _sensor(path: Path, model: str, size: tuple[int, int], parameters: tuple[float, ...]) -> Sensor:

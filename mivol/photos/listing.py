@@ -28,6 +28,7 @@ class Entry:
         size: (width, height) in the file of cameras [pixel]; by default all photographs of the split have the same size.
         mask: path of the mask, optional.
         points: points (K, 3) of a sparse reconstruction visible in the photograph [length], if known.
+        is_stored: whether the camera describes stored pixels, not upright ones, unless sizes show otherwise.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Entry:
     size: tuple[int, int] | None = None
     mask: Path | None = None
     points: np.ndarray | None = None
+    is_stored: bool = False
 
 
 @dataclass(frozen=True)
@@ -112,3 +114,14 @@ def check_points(rows: np.ndarray, file: Path, way_out: str) -> None:
     if not np.isfinite(rows).all():
         number = int(np.argmin(np.isfinite(rows).all(axis=1)))
         raise refusal(file, f"point {number} at {rows[number, :3].tolist()}", "finite numbers", way_out)
+
+
+def list_photographs(folder: Path) -> tuple[Path, list[str]]:
+    """Return the folder of the images and the sorted names of the photographs in it, with forward slashes.
+
+    The images lie in ``images/`` and folders below, or directly in the folder.
+    """
+    images = folder / "images"
+    files = images.rglob("*") if images.is_dir() else folder.iterdir() if folder.is_dir() else ()
+    images = images if images.is_dir() else folder
+    return images, sorted(f.relative_to(images).as_posix() for f in files if f.suffix.lower() in SUFFIXES and f.is_file())

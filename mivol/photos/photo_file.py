@@ -110,6 +110,44 @@ def read_photo_header(path: Path) -> PhotoHeader:
         return PhotoHeader(image.size, _read_mode(image) == "RGBA", orientation)
 
 
+LENS_TAGS = {0x010F: None, 0x0110: None, 0xA434: 0x8769, 0x920A: 0x8769, 0xA405: 0x8769}
+"""EXIF tags of make, model, lens, focal length and its equivalent, with the directory of the tag."""
+
+
+def read_lens_facts(path: Path) -> tuple:
+    """Return what tells the lenses of photographs apart: the upright size, and the ``LENS_TAGS`` of EXIF (None if missing).
+
+    Raises:
+        MivolError: a missing or damaged file.
+    """
+    size = read_photo_header(path).upright_size
+    if path.suffix.lower() == ".exr":
+        return (size,)
+    with _opened(path) as image:
+        exif = image.getexif()
+        tables = {None: exif, 0x8769: exif.get_ifd(0x8769)}
+        return (size, *(str(tables[table].get(tag)) for tag, table in LENS_TAGS.items()))
+
+
+def write_upright(path: Path, copy: Path, orientation: int) -> None:
+    """Write sRGB codes of a photograph, turned by an orientation of ``TURNS``, as JPEG for a name of JPEG and else as PNG.
+
+    EXIF stays, for the focal length.
+
+    Raises:
+        MivolError: a damaged photograph.
+    """
+    colour, _ = read_photo(path, "srgb", orientation=orientation)
+    exif = None
+    if path.suffix.lower() != ".exr":
+        with _opened(path) as image:
+            exif = image.getexif()
+            exif[ORIENTATION] = 1
+    codes = np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)
+    kind = {"format": "JPEG", "quality": 95} if path.suffix.lower() in (".jpg", ".jpeg") else {"format": "PNG"}
+    Image.fromarray(codes).save(copy, exif=exif, **kind)
+
+
 def read_photo(path: Path, space: str, stored: str | None = None, orientation: int = 1) -> tuple[np.ndarray, np.ndarray | None]:
     """Read the pixels of a photograph.
 

@@ -22,7 +22,7 @@ from mivol.files.source import refusal
 from mivol.photos import region
 from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
-from mivol.photos.listing import UNLISTED, Entry, Listing, find_mask, find_shrink
+from mivol.photos.listing import UNLISTED, Entry, Listing, find_mask, find_shrink, list_photographs
 from mivol.photos.llff import read_llff
 from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
@@ -170,6 +170,9 @@ def _read(path: Path) -> tuple[str, Listing]:
     name = find_format(path)
     if name is None:
         known = ", ".join(DATA_SET_FORMATS)
+        if names := list_photographs(path)[1]:
+            found = f"{len(names)} photographs without cameras"
+            raise refusal(path, found, f"cameras of {known}", f"mivol poses {path} finds them")
         raise refusal(path, "no cameras", f"one of {known}", "name the folder of the file of cameras")
     return name, DATA_SET_FORMATS[name].read(path)
 
@@ -256,6 +259,8 @@ def _is_turned(entry: Entry, header: PhotoHeader, are_turned: bool | None) -> bo
         MivolError: no photograph proves this.
     """
     own = _proves_turn(entry, header)
+    if own is None and are_turned is None and entry.is_stored:
+        return False
     if own is None and are_turned is None:
         found = f"EXIF orientation {header.orientation}, by which viewers turn the image"
         expected = "a size in the file of cameras that shows whether they describe upright pixels"

@@ -1,0 +1,196 @@
+"""Poses of a folder of photographs, by structure from motion with COLMAP (the extra ``poses``).
+
+Conventions. The model is ``FOLDER/sparse/0`` in COLMAP's binary format, beside the photographs of ``FOLDER/images`` or of
+``FOLDER`` itself. Photographs with equal size, camera, lens and focal length in EXIF share one camera. If one
+photograph has a quarter turn in EXIF, all are turned upright before the search, as :mod:`mivol.photos.survey` then reads them.
+
+Reference: Schönberger and Frahm 2016 (Structure-from-Motion Revisited, CVPR).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mivol.errors import MivolError
+from mivol.files.source import refusal
+from mivol.photos.listing import list_photographs
+from mivol.photos.photo_file import read_lens_facts, read_photo_header, write_upright
+from mivol.photos.survey import find_format
+from mivol.threads import follow_program
+
+FEWEST = 3
+"""Fewest photographs of which poses are searched."""
+
+EXHAUSTIVE = 150
+"""Largest number of photographs of which all pairs are matched; of more, neighbours in the order of names."""
+
+LONGEST = 2000
+"""Longest edge of a photograph in the search for features [pixel]."""
+
+DIRECT = (".png", ".jpg", ".jpeg")
+"""Suffixes that COLMAP reads; others are converted."""
+
+AGAIN = "photograph again in small steps, with each part of the subject sharp in at least three photographs"
+
+
+@dataclass(frozen=True)
+class Poses:
+    """The result of a search for poses.
+
+    Attributes:
+        folder: the model.
+        posed: photographs with a pose.
+        unposed: photographs without a pose.
+        error: mean reprojection error of the points [pixel].
+        points: number of points.
+        cameras: number of cameras.
+        others: photographs of each further model, which has no part in common with the first.
+    """
+
+    folder: Path
+    posed: tuple[str, ...]
+    unposed: tuple[str, ...]
+    error: float
+    points: int
+    cameras: int
+    others: tuple[tuple[str, ...], ...] = ()
+
+    def describe(self) -> str:
+        """Describe the result in a paragraph."""
+        total = len(self.posed) + len(self.unposed)
+        lines = [
+            f"{self.folder}: {len(self.posed)} of {total} photographs have poses, {self.points} points, {self.cameras} "
+            f"camera{'s' * (self.cameras != 1)}, reprojection error {self.error:.2f} pixels"
+        ]
+        if self.others:
+            sizes = ", ".join(str(len(names)) for names in self.others)
+            first = self.others[0][0]
+            lines.append(
+                f"{sizes} photographs ({first}, ...) have poses in models of their own, which share nothing with it; "
+                f"photograph what lies between {first} and {self.posed[-1]}"
+            )
+        if self.unposed:
+            named = ", ".join(self.unposed[:5]) + (" ..." if len(self.unposed) > 5 else "")
+            lines.append(f"without a pose: {named}; {AGAIN}")
+        return "\n".join(lines)
+
+
+def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None) -> Poses:
+    """Find the poses of the photographs of a folder, and write them to ``sparse/0``, whole or not at all.
+
+    Args:
+        folder: folder with photographs, in ``images/`` or in itself; masks may lie in ``masks/NAME.png``.
+        say: receives the stages.
+
+    Raises:
+        MivolError: a missing pycolmap, poses that exist already, too few photographs, a damaged photograph, or photographs
+            without overlap.
+        KeyboardInterrupt: Ctrl-C; nothing is written.
+    """
+    images, names = _check_folder(folder)
+    with tempfile.TemporaryDirectory(prefix="mivol-poses-") as place:
+        work = Path(place)
+        job = {
+            "images": str(_prepare(images, names, work / "images")),
+            "names": list(_group_by_lens(images, names).values()),
+            "masks": str(folder / "masks") if (folder / "masks").is_dir() else "",
+            "database": str(work / "database.db"),
+            "models": str(work / "models"),
+            "sequential": len(names) > EXHAUSTIVE,
+            "longest": LONGEST,
+        }
+        (work / "models").mkdir()
+        models = sorted(_run(job, work, say), key=lambda model: -len(model["names"]))
+        if not models:
+            found = f"{len(names)} photographs without enough overlap"
+            raise refusal(folder, found, "photographs that show the same parts from several places", AGAIN)
+        return _keep(folder, models, names)
+
+
+def _check_folder(folder: Path) -> tuple[Path, list[str]]:
+    """The folder of the images, and the names of the photographs in it."""
+    if not folder.is_dir():
+        raise refusal(folder, "no folder", "a folder of photographs", "check the path")
+    if importlib.util.find_spec("pycolmap") is None:
+        raise MivolError('poses need pycolmap, which is not installed: pip install "mivol[poses]".')
+    kind = find_format(folder)
+    if kind is not None:
+        way_out = f"mivol optimize {folder}, or remove them first"
+        raise refusal(folder, f"poses in it already ({kind})", "photographs without poses", way_out)
+    images, names = list_photographs(folder)
+    if len(names) < FEWEST:
+        found = f"{len(names)} photograph{'s' * (len(names) != 1)} in {images}"
+        raise refusal(folder, found, f"at least {FEWEST}, and 20 or more for a fit", "photograph the subject from more sides")
+    return images, names
+
+
+def _prepare(images: Path, names: list[str], copies: Path) -> Path:
+    """Make a folder of the photographs as COLMAP is to read them: links, and copies of what is turned or in another format.
+
+    Raises:
+        MivolError: a damaged photograph.
+    """
+    headers = {name: read_photo_header(images / name) for name in names}
+    turns = any(header.orientation > 4 for header in headers.values())
+    for name in names:
+        copy = copies / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        orientation = headers[name].orientation if turns else 1
+        if orientation == 1 and Path(name).suffix.lower() in DIRECT:
+            _link((images / name).absolute(), copy)
+        else:
+            write_upright(images / name, copy, orientation)
+    return copies
+
+
+def _link(file: Path, copy: Path) -> None:
+    """Link a file, or copy it where links are not allowed."""
+    try:
+        copy.symlink_to(file)
+    except OSError:
+        shutil.copyfile(file, copy)
+
+
+def _group_by_lens(images: Path, names: list[str]) -> dict[Any, list[str]]:
+    """Photographs by size, camera, lens and focal length."""
+    groups = defaultdict(list)
+    for name in names:
+        groups[read_lens_facts(images / name)].append(name)
+    return groups
+
+
+def _run(job: dict[str, Any], work: Path, say: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Run COLMAP in a process of its own; return its models."""
+    (work / "job.json").write_text(json.dumps(job), encoding="utf-8")
+    models, program, errors = None, Path(__file__).with_name("colmap_process.py"), work / "errors.txt"
+    for line in follow_program(program, str(work / "job.json"), errors=errors):
+        facts = json.loads(line) if line.startswith("{") else {}
+        models = facts.get("models", models)
+        if "stage" in facts:
+            say(facts["stage"])
+    last = (errors.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no message"])[-1]
+    if models is None:
+        raise MivolError(f"COLMAP ended early ({last}): check that the photographs open, and the free disk and memory.")
+    return models
+
+
+def _keep(folder: Path, models: list[dict[str, Any]], names: list[str]) -> Poses:
+    """Move the largest model to ``sparse/0``."""
+    best, *others = models
+    target = folder / "sparse" / "0"
+    target.parent.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".poses-", dir=target.parent) as place:
+        shutil.copytree(best["folder"], Path(place) / "0")
+        (Path(place) / "0").replace(target)
+    posed = tuple(best["names"])
+    rest = tuple(name for name in names if name not in set(posed))
+    apart = tuple(tuple(model["names"]) for model in others)
+    return Poses(target, posed, rest, best["error"], best["points"], best["cameras"], apart)

@@ -1,0 +1,210 @@
+"""Poses of photographs: what COLMAP is given, what is kept of its models, and what is said when it finds nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photo_sets import pixels, write_colmap, write_transforms
+from PIL import Image, ImageOps
+
+from mivol.cli import main
+from mivol.errors import MivolError
+from mivol.photos import poses, survey_photos
+from mivol.photos.listing import list_photographs
+from mivol.photos.photo_file import ORIENTATION, read_lens_facts
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Five photographs of 64 x 48 pixels, three of them in a folder below."""
+    for name in ("a.jpg", "b.png", "near/c.webp", "near/d.jpg", "near/e.jpg"):
+        path = tmp_path / "walk" / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels(64, 48, len(name), alpha=False)).save(path)
+    return tmp_path / "walk"
+
+
+def set_exif(path: Path, tags: dict[int, object]) -> None:
+    """Set tags of EXIF; those of lenses lie in a directory of their own."""
+    with Image.open(path) as image:
+        exif = image.getexif()
+        for tag, value in tags.items():
+            (exif.get_ifd(0x8769) if tag in (0xA434, 0x920A, 0xA405) else exif)[tag] = value
+        image.save(path, exif=exif)
+
+
+@pytest.fixture
+def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict:
+    """What COLMAP is asked, in the place of COLMAP: two models, of three photographs and of one."""
+    asked = {}
+
+    def run(given: dict, work: Path, say: object) -> list[dict]:
+        asked.update(given)
+        for name in (name for group in given["names"] for name in group):
+            with Image.open(Path(given["images"]) / name) as image:
+                asked[name] = np.asarray(image, np.float64)
+        models = []
+        for k, names in enumerate((["near/e.jpg"], ["a.jpg", "b.png", "near/d.jpg"])):
+            model = write_colmap(tmp_path / f"model{k}") / "sparse" / "0"
+            models.append({"folder": str(model), "names": names, "error": 0.5, "points": 7, "cameras": 1})
+        return models
+
+    monkeypatch.setattr(poses, "_run", run)
+    monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: object())
+    return asked
+
+
+def test_the_largest_model_is_kept_and_the_rest_is_named(folder: Path, job: dict, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["poses", str(folder)]) == 0
+    said = capsys.readouterr().out
+    for fact in (
+        f"{folder / 'sparse' / '0'}: 3 of 5 photographs have poses, 7 points, 1 camera, reprojection error 0.50 pixels",
+        "1 photographs (near/e.jpg, ...) have poses in models of their own",
+        "photograph what lies between near/e.jpg and near/d.jpg",
+        "without a pose: near/c.webp, near/e.jpg",
+        f"mivol optimize {folder} fits Gaussians",
+    ):
+        assert fact in said
+    assert sorted(file.name for file in (folder / "sparse" / "0").iterdir()) == ["cameras.bin", "images.bin", "points3D.bin"]
+    assert [path.name for path in (folder / "sparse").iterdir()] == ["0"]
+    assert (job["masks"], job["sequential"]) == ("", False)
+    assert main(["poses", str(folder)]) == 1
+    assert "poses in it already (COLMAP)" in capsys.readouterr().err
+
+
+def test_a_lens_by_exif_is_a_camera(folder: Path, job: dict) -> None:
+    set_exif(folder / "images" / "near" / "d.jpg", {0x010F: "Maker", 0x920A: 4.2})
+    set_exif(folder / "images" / "near" / "e.jpg", {0x010F: "Maker", 0x920A: 4.2})
+    set_exif(folder / "images" / "a.jpg", {0x010F: "Maker", 0x920A: 9.0})
+    poses.find_poses(folder)
+    assert sorted(job["names"]) == [["a.jpg"], ["b.png", "near/c.webp"], ["near/d.jpg", "near/e.jpg"]]
+
+
+def test_colmap_sees_upright_photographs_in_formats_that_it_reads(folder: Path, job: dict) -> None:
+    """If a photograph has a quarter turn, also half turns are undone; the survey of the model reads the same pixels."""
+    set_exif(folder / "images" / "b.png", {ORIENTATION: 6})
+    set_exif(folder / "images" / "near" / "d.jpg", {ORIENTATION: 3})
+    poses.find_poses(folder)
+    for name in ("b.png", "near/c.webp"):
+        with Image.open(folder / "images" / name) as image:
+            np.testing.assert_array_equal(job[name], np.asarray(ImageOps.exif_transpose(image)))
+    with Image.open(folder / "images" / "near" / "d.jpg") as image:
+        turned = np.asarray(ImageOps.exif_transpose(image), np.float64)
+    seen = job["near/d.jpg"]
+    assert np.abs(seen - turned).mean() < np.abs(seen[::-1, ::-1] - turned).mean() / 2
+    assert read_lens_facts(folder / "images" / "b.png")[0] == (48, 64)
+
+
+def test_a_folder_without_poses_is_refused_with_the_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("optimize", "explain"):
+        assert main([name, str(folder)]) == 1
+        said = capsys.readouterr().err
+        assert "found 5 photographs without cameras" in said and f"mivol poses {folder} finds them" in said
+
+
+def test_what_cannot_have_poses_is_refused(folder: Path, job: dict, tmp_path: Path) -> None:
+    with pytest.raises(MivolError, match="poses in it already"):
+        poses.find_poses(write_transforms(tmp_path / "posed", {"fl_x": 20}))
+    (tmp_path / "few").mkdir()
+    Image.fromarray(pixels(8, 8)).save(tmp_path / "few" / "a.png")
+    with pytest.raises(MivolError, match="found 1 photograph in .*few, expected at least 3"):
+        poses.find_poses(tmp_path / "few")
+    with pytest.raises(MivolError, match="found no folder"):
+        poses.find_poses(tmp_path / "none")
+    (folder / "images" / "a.jpg").write_bytes(b"no image")
+    with pytest.raises(MivolError, match=r"a.jpg: found a damaged or foreign file"):
+        poses.find_poses(folder)
+
+
+def test_pycolmap_is_asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MivolError, match=r'pip install "mivol\[poses\]"'):
+        poses.find_poses(folder)
+
+
+PROGRAMS = {
+    "nothing": ('print(\'{"stage": "matches"}\\n{"models": []}\')', "found 5 photographs without enough overlap"),
+    "an error": ("raise RuntimeError('out of disk')", "COLMAP ended early .RuntimeError: out of disk."),
+}
+
+
+@pytest.mark.parametrize("case", PROGRAMS)
+def test_a_program_that_finds_nothing_or_fails(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, case: str
+) -> None:
+    program, message = PROGRAMS[case]
+    (tmp_path / "colmap_process.py").write_text(program)
+    monkeypatch.setattr(poses, "__file__", str(tmp_path / "poses.py"))
+    monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: object())
+    stages = []
+    with pytest.raises(MivolError, match=message):
+        poses.find_poses(folder, stages.append)
+    assert stages == (["matches"] if case == "nothing" else [])
+    assert not (folder / "sparse").exists()
+
+
+def test_photographs_beside_the_model(tmp_path: Path) -> None:
+    """Without a folder ``images`` the names count from the folder of ``sparse``."""
+    folder = write_colmap(tmp_path / "set")
+    for file in list((folder / "images").iterdir()):
+        file.rename(folder / file.name)
+    (folder / "images").rmdir()
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    for path in (folder, folder / "sparse" / "0"):
+        assert len(survey_photos(path, box=box).frames) == 4
+    assert list_photographs(folder) == (folder, [f"a view {k}.png" for k in range(4)])
+
+
+def test_half_turns_of_colmap_are_of_stored_pixels(tmp_path: Path) -> None:
+    """COLMAP ignores EXIF, so without another proof its cameras describe the pixels as stored."""
+    folder = write_colmap(tmp_path / "set")
+    set_exif(folder / "images" / "a view 1.png", {ORIENTATION: 3})
+    frames = survey_photos(folder, box=np.array([[-1.0] * 3, [1.0] * 3])).frames
+    assert [frame.orientation for frame in frames] == [1] * 4
+
+
+@pytest.mark.slow
+def test_rendered_photographs_have_the_poses_of_their_cameras(variant_rgb: str, tmp_path: Path) -> None:
+    """Ten views of textured boxes: all have poses, and positions equal the true ones up to a similarity.
+
+    The mean error of a feature is below 1 pixel of 440, and a camera sees hundreds of them; so positions are within 1 % of the
+    distance of 2.6.
+    """
+    if poses.importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("poses need pycolmap: pip install mivol[poses]")
+    import mitsuba as mi
+
+    def texture(seed: int) -> dict:
+        rng, image = np.random.default_rng(seed), np.zeros((256, 256, 3))
+        for n in (8, 16, 32, 64, 128):
+            image += np.kron(rng.random((n, n, 3)), np.ones((256 // n, 256 // n, 1)))
+        bitmap = mi.Bitmap((image / image.max()).astype(np.float32))
+        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap}}}
+
+    place = mi.ScalarTransform4f
+    shapes = {
+        f"box{k}": {"type": "cube", "to_world": place().translate([x, y, 0.3]).scale(0.3), "bsdf": texture(k)}
+        for k, (x, y) in enumerate([(-0.4, 0.0), (0.5, 0.3), (0.1, -0.7)])
+    }
+    floor = {"type": "rectangle", "to_world": place().scale(1.6), "bsdf": texture(9)}
+    scene = mi.load_dict({"type": "scene", "light": {"type": "constant"}, "floor": floor, **shapes})
+    (tmp_path / "images").mkdir()
+    origins = []
+    for k in range(10):
+        angle = -2.0 + 0.1 * k
+        origins.append([2.6 * np.cos(angle), 2.6 * np.sin(angle), 0.9 + 0.3 * np.sin(1.9 * k)])
+        film = {"type": "hdrfilm", "width": 480, "height": 360}
+        view = place().look_at(origins[-1], [0, 0, 0.3], [0, 0, 1])
+        sensor = mi.load_dict({"type": "perspective", "fov": 55.0, "to_world": view, "film": film})
+        image = mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "direct"}), spp=16, seed=k)
+        mi.util.write_bitmap(str(tmp_path / "images" / f"{k}.png"), image, write_async=False)
+    assert poses.find_poses(tmp_path).unposed == ()
+    found = np.array([frame.camera.origin for frame in survey_photos(tmp_path).frames])
+    true = np.array(origins)
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, s, vt = np.linalg.svd(a.T @ b)
+    signs = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    aligned = a @ (u @ signs @ vt) * (s * np.diag(signs)).sum() / (a**2).sum()
+    assert np.linalg.norm(aligned - b, axis=1).max() < 0.026
