@@ -85,7 +85,7 @@ class FieldFit(PhotoFit):
 
     def best_files(self) -> BestFiles:
         names = ("field_best.npz", *(["sky_best.exr"] if self.problem.sky is not None else []))
-        return BestFiles(names, lambda folder: write_result(folder, self.problem, self.home_view, "_best", self.photos.white))
+        return BestFiles(names, lambda folder: write_result(folder, self.problem, "_best", self.photos.white, self.home_view))
 
     def judge(self, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, ImageScore]:
         return judge_view(self.problem, self.judged, photo, metrics)
@@ -97,7 +97,7 @@ class FieldFit(PhotoFit):
     def write_model(self, run: RunFolder) -> dict[str, float]:
         run.make("volumes")
         field, record = self.problem.field, self.record
-        write_result(run.path, self.problem, self.home_view, white=self.photos.white)
+        write_result(run.path, self.problem, white=self.photos.white, view=self.home_view)
         record.tables = [tabulate_storage(field, run.path / "field.npz")]
         record.volumes += [write_density(run.path, field.extract_level(number), number) for number in range(field.levels)]
         self.levels = field.levels
@@ -111,13 +111,14 @@ class FieldFit(PhotoFit):
 
 
 def write_result(
-    folder: Path, problem: RadianceProblem, view: HomeView | None = None, which: str = "", white: float = 1.0
+    folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0, view: HomeView | None = None
 ) -> None:
     """Write the field of a problem, and the fitted sky if present.
 
     Args:
-        folder, problem, view, which: folder, problem, first view, and a suffix of the file names.
+        folder, problem, which: folder, problem, and a suffix of the file names.
         white: factor on the colours: the radiance of the value 1 in the fit.
+        view: first view of the field, optional.
     """
     write_field(folder / f"field{which}.npz", problem.field.scale_colours(white), view=view)
     if problem.sky is not None:
