@@ -11,7 +11,7 @@ import numpy as np
 
 from mivol.config import GaussianExperiment, PhotoExperiment
 from mivol.errors import MivolError
-from mivol.optim.photographs.colour_scale import EPSILON
+from mivol.optim.photographs.photo_colours import EPSILON
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Photos, PhotoSurvey, load_photos, survey_photos
 from mivol.photos.dataset import BACKGROUNDS, check_alpha

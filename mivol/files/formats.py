@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mivol.display import format_point
-from mivol.files import hdf5, les, metaimage, nifti, npy, nrrd, pbrt, vdb, vol, vti, vtk_legacy
+from mivol.files import hdf5, les, metaimage, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
 from mivol.files.volume import VolumeData, check_frame, to_values
@@ -56,7 +56,7 @@ _LES = VolumeFormat("LES cloud text", les.is_les, les.read_les)
 
 #: suffix -> format; a longer suffix is tried first.
 FORMATS: dict[str, VolumeFormat] = {
-    ".vol": VolumeFormat("Mitsuba grid", _starts_with(vol.MAGIC), vol.read_vol),
+    ".vol": VolumeFormat("Mitsuba grid", _starts_with(renderer_grids.VOL_MAGIC), renderer_grids.read_vol),
     ".npy": VolumeFormat("NumPy array", _starts_with(npy.NPY_MAGIC), npy.read_npy),
     ".npz": VolumeFormat("NumPy archive", _starts_with(npy.NPZ_MAGIC), npy.read_npz),
     ".nrrd": _NRRD,
@@ -68,7 +68,7 @@ FORMATS: dict[str, VolumeFormat] = {
     ".vti": VolumeFormat("VTK XML image", lambda head: b"<VTKFile" in head, vti.read_vti),
     ".vtk": VolumeFormat("legacy VTK", _starts_with(vtk_legacy.MAGIC), vtk_legacy.read_vtk),
     ".vdb": VolumeFormat("OpenVDB", vdb.is_vdb, vdb.read_vdb),
-    ".pbrt": VolumeFormat("pbrt volumegrid", pbrt.is_pbrt, pbrt.read_pbrt),
+    ".pbrt": VolumeFormat("pbrt volumegrid", renderer_grids.is_pbrt, renderer_grids.read_pbrt),
     ".csv": _LES,
     ".txt": _LES,
     ".h5": _HDF5,
@@ -77,7 +77,7 @@ FORMATS: dict[str, VolumeFormat] = {
 
 #: suffix -> writer(file, values, to_world, metadata).
 WRITERS: dict[str, Callable[[BinaryIO, np.ndarray, np.ndarray, dict[str, Any]], None]] = {
-    ".vol": vol.write_vol,
+    ".vol": renderer_grids.write_vol,
     ".npy": npy.write_npy,
     ".npz": npy.write_npz,
     ".nrrd": nrrd.write_nrrd,

@@ -18,6 +18,10 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording
 from mivol.phase.closed_forms import (
+    ASYMMETRY,
+    COSINE_SQUARED,
+    WEIGHT,
+    Domain,
     choose_lobe,
     eval_draine,
     eval_hg,
@@ -27,7 +31,6 @@ from mivol.phase.closed_forms import (
     sample_hg,
     sample_rayleigh,
 )
-from mivol.phase.domain import ASYMMETRY, COSINE_SQUARED, WEIGHT, Domain
 from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table, check_values
 from mivol.scene_graph import traverse

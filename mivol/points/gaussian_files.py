@@ -15,10 +15,9 @@ from mivol.files.atomic import write_whole
 from mivol.files.ply import read_comments, read_layout, read_tables
 from mivol.files.source import check_file, parse_reals, select_by_suffix
 from mivol.photos.camera_path import HomeView
+from mivol.points.compact_files import read_ksplat, read_splat, read_spz
 from mivol.points.gaussian_ply import is_compressed, parse_compressed_tables, parse_tables, write_gaussian_ply
 from mivol.points.gaussians import Gaussians
-from mivol.points.splat import read_ksplat, read_splat
-from mivol.points.spz import read_spz
 
 
 def _read_ply(path: Path) -> Gaussians:

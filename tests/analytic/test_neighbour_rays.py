@@ -22,8 +22,8 @@ from mivol.transport.line_integrals.radiance_field import (
     vjp_rays,
 )
 from mivol.transport.line_integrals.radiance_source import Baked, bake, make_exact
-from mivol.transport.traversal import neighbour_rays
-from mivol.transport.traversal.neighbour_rays import FEWEST, RayOrder
+from mivol.transport.traversal import occupied_cells
+from mivol.transport.traversal.occupied_cells import FEWEST_RAYS, RayOrder
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -55,7 +55,7 @@ def numbers(seen: RenderedRays) -> list[np.ndarray]:
 
 def stepped(field: SphericalGrid, rays: RayBundle, few: int, monkeypatch: pytest.MonkeyPatch):
     """Rendered values, derivatives of a sum with a weight for each ray, and whether rays were sorted."""
-    monkeypatch.setattr(neighbour_rays, "FEWEST", few)
+    monkeypatch.setattr(occupied_cells, "FEWEST_RAYS", few)
     rng = np.random.default_rng(3)
     active = mi.Bool(rng.uniform(size=COUNT) < 0.8)
     weights = [mi.Float(rng.normal(size=COUNT).astype(np.float32)) for _ in range(5)]
@@ -92,7 +92,7 @@ def test_numbers_for_all_rays_stay_numbers_for_all(sorts: None, monkeypatch: pyt
     field, rays = field_of(), rays_of(*aim(COUNT))
     found = []
     for few in (1, 1 << 30):
-        monkeypatch.setattr(neighbour_rays, "FEWEST", few)
+        monkeypatch.setattr(occupied_cells, "FEWEST_RAYS", few)
         cells, source, model = find_occupied_cells(field), make_exact(field, rays.d, slope=True), make_model(field)
         seen = render_rays(cells, source, model, rays)
         vjp_rays(cells, source, model, seen, RayGradient(mi.Color3f(0.3, -0.5, 0.9)))
@@ -108,14 +108,14 @@ def test_neighbours_enter_and_leave_side_by_side(levels: int, sorts: None):
     """Compared with NumPy, in the outermost box, here [-1, 1]^3."""
     cells = find_occupied_cells(field_of(levels, CUBE if levels == 1 else CUBE @ HALF))
     rng = np.random.default_rng(5)
-    o = rng.normal(size=(FEWEST, 3))
+    o = rng.normal(size=(FEWEST_RAYS, 3))
     o *= 3 / np.linalg.norm(o, axis=1, keepdims=True)
-    d = rng.uniform(-1.5, 1.5, (FEWEST, 3)) - o
+    d = rng.uniform(-1.5, 1.5, (FEWEST_RAYS, 3)) - o
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     rays = rays_of(o, d)
     order = RayOrder.find(cells, rays.o, rays.d, rays.t_max)
     places, back = np.array(order.rays), np.array(order.positions)
-    np.testing.assert_array_equal(places[back], np.arange(FEWEST))
+    np.testing.assert_array_equal(places[back], np.arange(FEWEST_RAYS))
     sides = [(side - o) / d for side in (-1, 1)]
     t0, t1 = np.minimum(*sides).max(axis=1), np.maximum(*sides).min(axis=1)
     hits = (t1 > t0)[places]
@@ -132,7 +132,7 @@ def test_neighbours_enter_and_leave_side_by_side(levels: int, sorts: None):
 def test_few_rays_and_rays_from_pinholes_stay_as_they_are(sorts: None):
     field = field_of()
     cells, model = find_occupied_cells(field), make_model(field)
-    few, many = (rays_of(*aim(n)) for n in (FEWEST - 1, FEWEST))
+    few, many = (rays_of(*aim(n)) for n in (FEWEST_RAYS - 1, FEWEST_RAYS))
     pinhole = bake(field, cells, np.float64([[0, 0, 5]]), mi.UInt32(0))
     assert render_rays(cells, make_exact(field, few.d), model, few).order is None
     assert render_rays(cells, make_exact(field, many.d), model, many).order is not None
@@ -145,7 +145,7 @@ def test_sorted_rays_keep_their_pinholes(sorts: None, monkeypatch: pytest.Monkey
     view = mi.UInt32(np.random.default_rng(6).integers(2, size=COUNT).astype(np.uint32))
     source = bake(field, find_occupied_cells(field), np.float64([[0, 0, 5], [5, 0, 0]]), view)
     plain = numbers(render_rays(find_occupied_cells(field), source, make_model(field), rays))
-    monkeypatch.setattr(neighbour_rays, "FEWEST", 1)
+    monkeypatch.setattr(occupied_cells, "FEWEST_RAYS", 1)
     monkeypatch.setattr(Baked, "gains_by_sorting", True)
     seen = render_rays(find_occupied_cells(field), source, make_model(field), rays)
     assert seen.order is not None
@@ -154,7 +154,7 @@ def test_sorted_rays_keep_their_pinholes(sorts: None, monkeypatch: pytest.Monkey
 
 
 def test_another_number_of_rays_compiles_nothing(sorts: None, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(neighbour_rays, "FEWEST", 1)
+    monkeypatch.setattr(occupied_cells, "FEWEST_RAYS", 1)
     field = field_of()
     cells, model = find_occupied_cells(field), make_model(field)
     compiled = []

@@ -17,6 +17,9 @@ from phase_angles import EPS, U, as64, cosines_of, f32, integrals, lanes, turns
 from mivol.errors import MivolError
 from mivol.phase import mie
 from mivol.phase.closed_forms import (
+    ASYMMETRY,
+    NEXT_TO_ONE,
+    WEIGHT,
     choose_lobe,
     droplets,
     eval_draine,
@@ -28,7 +31,6 @@ from mivol.phase.closed_forms import (
     sample_hg,
     sample_rayleigh,
 )
-from mivol.phase.domain import ASYMMETRY, NEXT_TO_ONE, WEIGHT
 from mivol.phase.measured import ALIASES, NAMES, named_medium
 from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table

@@ -21,7 +21,7 @@ from mivol.fields import gaussian_field
 from mivol.fields.activation import select_activation
 from mivol.fields.gaussian_field import GaussianField
 from mivol.points.gaussians import Gaussians
-from mivol.transport.estimators.flights.regular_tracking import regular_tracking, sample_gaussian_flight
+from mivol.transport.estimators.flights.free_flight import regular_tracking, sample_gaussian_flight
 from mivol.transport.media.extinction import ConstantExtinction, ExactExtinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction

@@ -16,7 +16,7 @@ from false_alarms import ALPHA, note
 from mivol.bench.harness import agreement
 from mivol.bench.harness.contests import Contest
 from mivol.bench.harness.timing import Timing
-from mivol.bench.parameter_gradient import square_error
+from mivol.bench.scenes import square_error
 from mivol.bench.studies import gradients as study
 from mivol.bench.studies.gradients import (
     CONTESTS,

@@ -15,7 +15,7 @@ import pytest
 from gaussian_sets import in_buckets, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
 
 from mivol.errors import MivolError
-from mivol.points import spz
+from mivol.points import compact_files
 from mivol.points.gaussian_files import read_gaussians
 from mivol.points.gaussians import Gaussians
 
@@ -97,7 +97,7 @@ def test_harmonics_turn_with_the_axes(variant_rgb: str) -> None:
     turned = d * np.array([[1], [-1], [-1]], np.float32)
     plain, other = (dr.sh_eval(mi.Vector3f(v), 3) for v in (d, turned))
     for number in range(1, 16):
-        assert np.array_equal(np.array(other[number]), np.float32(spz.PARITY[number]) * np.array(plain[number]))
+        assert np.array_equal(np.array(other[number]), np.float32(compact_files.PARITY[number]) * np.array(plain[number]))
 
 
 def changed(data: bytes, at: int, new: bytes) -> bytes:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mivol.experiments import gaussian_fit as outputs
-from mivol.experiments import judged_views, photo_fit
+from mivol.experiments import photo_fit
 from mivol.experiments.film import Film
 from mivol.experiments.fit_kind import NullProgress
 from mivol.points import Gaussians
@@ -83,7 +83,7 @@ def finished_fit(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, show
     monkeypatch.setattr(outputs, "rectify", lambda photo: photo)
     monkeypatch.setattr(photo_fit, "draw_photo_cameras", lambda *given: run.written.append(given) or [])
     written = lambda folder, photo, number, seen, space, caption, edge=None: [(photo.name, seen.tolist(), caption, edge)]  # noqa: E731
-    monkeypatch.setattr(judged_views, "write_view", written)
+    monkeypatch.setattr(photo_fit, "write_view", written)
     monkeypatch.setattr(
         outputs,
         "judge_view",

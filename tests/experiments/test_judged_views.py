@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mivol.experiments.judged_views import (
+from mivol.experiments.photo_fit import (
     EDGES,
     MANY,
     JudgedViews,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mivol.experiments import field_fit, judged_views
+from mivol.experiments import field_fit, photo_fit
 from mivol.fields.field_files import write_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
@@ -76,16 +76,16 @@ def test_distance_and_normals_are_pictures(tmp_path):
 
 def test_judged_views_are_told_apart_the_worst_first():
     found = [ImageScore("a.jpg", {"psnr": 23.456, "ssim": 0.71234}), ImageScore("b.jpg", {"psnr": 9.0, "ssim": 0.5})]
-    table = judged_views.tabulate_views(camera(135, 240), found, [24.0, 12.345])
+    table = photo_fit.tabulate_views(camera(135, 240), found, [24.0, 12.345])
     assert table.title == "Judged views, at 135 x 240 pixels, the worst first"
     assert table.rows == (("b.jpg", "9.00", "0.5000", "12.35"), ("a.jpg", "23.46", "0.7123", "24.00"))
     assert table.head[3] == "PSNR [dB], colours fitted to the photograph's"
-    bare = judged_views.tabulate_views(camera(135, 240), found)
+    bare = photo_fit.tabulate_views(camera(135, 240), found)
     assert bare.head == table.head[:3] and bare.rows == tuple(row[:3] for row in table.rows)
 
 
 def test_metrics_have_the_names_of_the_record():
-    assert judged_views.rename_metrics({"psnr": 30.0, "ssim": 0.9}) == {"held_out_psnr": 30.0, "ssim": 0.9}
+    assert photo_fit.rename_metrics({"psnr": 30.0, "ssim": 0.9}) == {"held_out_psnr": 30.0, "ssim": 0.9}
 
 
 def test_behind_a_field_is_its_sky_or_the_photographs_own_background():

@@ -16,8 +16,8 @@ from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan, write_result
-from mivol.experiments.judged_views import judge_colour_fitted, write_view
 from mivol.experiments.photo_data import MIDDLE_GREY, describe_photos, divide_by_white, read_photos
+from mivol.experiments.photo_fit import judge_colour_fitted, write_view
 from mivol.fields.field_files import read_field
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid

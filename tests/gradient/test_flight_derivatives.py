@@ -28,8 +28,7 @@ from scattering_gradients import (
 from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
-from mivol.bench.parameter_gradient import ParameterGradient
-from mivol.bench.scenes import box_scene, constant_light
+from mivol.bench.scenes import ParameterGradient, box_scene, constant_light
 from mivol.bench.studies.gradients.lights import Light
 from mivol.bench.studies.gradients.twin import Twin
 from mivol.scene import plan

@@ -10,8 +10,8 @@ import pytest
 from ball_photos import BOX, CUBE, PLAN, camera, fitted
 
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.optim.photographs.colour_scale import EPSILON, SCALES
 from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.photo_colours import EPSILON, SCALES
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from ball_photos import BOX, PLAN, fitted
 
-from mivol.optim.photographs.depth_supervision import (
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import (
     OUTLIERS,
     POINTS_PER_VIEW,
     UNCERTAINTY,
     DepthRays,
+    RayBatches,
     depth_loss_gradient,
     sample_depth_rays,
 )
-from mivol.optim.photographs.radiance_problem import RadianceProblem
-from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import make_exact

@@ -28,8 +28,7 @@ from mivol.bench.harness.bars import Bar, judge_agreement, say_row
 from mivol.bench.harness.contests import BudgetSize, Contest, Method, compete, contest_images
 from mivol.bench.harness.figures import new_figure, plot_errors, use_plain_ticks
 from mivol.bench.harness.study import Study, amount
-from mivol.bench.parameter_gradient import ParameterGradient
-from mivol.bench.scenes import box_scene, constant_light, make_integrator, sun_and_sky
+from mivol.bench.scenes import ParameterGradient, box_scene, constant_light, make_integrator, sun_and_sky
 from mivol.validate.moments import Moments
 
 

@@ -64,7 +64,7 @@ class GaussianPlan:
         low_pass: variance added to each ellipse in full-size images [pixel^2].
         mip: whether Gaussians smaller than a pixel keep their light (Yu et al. 2024), instead of their opacity. Renderers with
             the same filter can then render the set at other sizes.
-        exposure: a gain for each channel of each photograph (:mod:`mivol.optim.photographs.exposure`).
+        exposure: a gain for each channel of each photograph (:mod:`mivol.optim.photographs.photo_colours`).
         random_background: whether photographs with alpha get another background in each step.
         position_rate, final_position_rate: first and last rate of positions [extent], with geometric decay between.
         scale_rate, rotation_rate, opacity_rate, colour_rate: rates of log-scales, quaternions, opacity logits and constant

@@ -31,7 +31,7 @@ from mivol.optim.gaussians.density_control import (
 )
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, scene_extent
 from mivol.optim.losses import ImageShape, image_loss
-from mivol.optim.photographs.exposure import Exposure
+from mivol.optim.photographs.photo_colours import Exposure
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.problem import Reals, Refinement, StagedProblem
 from mivol.optim.strategy import suggest_name

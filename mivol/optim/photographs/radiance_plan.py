@@ -74,7 +74,7 @@ class RadiancePlan:
         matte: weight decay of the view-dependent coefficients [1 / radiance]: they fall by this / V times their learning rate
             per step, to avoid overfitting.
         few_matte: ``matte`` for fewer than ``FEW_PHOTOGRAPHS`` photographs; None takes ``matte``.
-        depth: weight of the distances to the points of a reconstruction (:mod:`mivol.optim.photographs.depth_supervision`),
+        depth: weight of the distances to the points of a reconstruction (:mod:`mivol.optim.photographs.ray_batches`),
             beside the mean squared error.
         beta: weight of log T + log(1 - T), mean over the rays, which favours rays that are opaque or empty.
         stop: transmittance at which a ray ends; the neglected light is at most this share of the brightest colour.
@@ -87,7 +87,7 @@ class RadiancePlan:
         sky: rows of a map of the background, fitted with the field (:mod:`mivol.fields.sky`); 0 takes the photographs' colour.
         sky_rate: initial learning rate of the sky [radiance]; a low rate would let the field fill the box with the background.
         sky_smooth: share by which a texel moves to its neighbours per step; no texel then stays at its start.
-        exposure: whether each photograph has a gain per channel (:mod:`mivol.optim.photographs.exposure`), if they disagree.
+        exposure: whether photographs have a gain per channel (:mod:`mivol.optim.photographs.photo_colours`), if they disagree.
         levels: number of nested boxes, each of twice the extent (:mod:`mivol.fields.spherical_grid`).
         fewer_levels: whether fewer levels suffice if the points of a reconstruction need no more.
         near: distance in medians of the camera distances from the box's centre, below which derivatives fall with the square of

@@ -1,12 +1,12 @@
 """Fit of a radiance field to photographs: a sparse grid of density and spherical harmonics, coarse stages first.
 
 Conventions. A step uses tiles of a few views. Its loss is the mean squared error over rays and rgb; for photographs of
-radiance, the error is weighted by the slope of a tone curve (:mod:`mivol.optim.photographs.colour_scale`). Densities are signed
+radiance, the error is weighted by the slope of a tone curve (:mod:`.photo_colours`). Densities are signed
 and pass a ReLU after interpolation, so a cell with negative corners only is vacuum and costs nothing. A stage begins with the
 nodes of cells around the visible nodes of the last stage.
 
 The reals are ``density`` (rows,), ``harmonics`` (rows, width) and, if the plan has a sky, ``sky`` (texels, 4). Radiance is
-stored in the scale of :mod:`mivol.optim.photographs.colour_scale`. A step depends on the reals, the listed cells, the seed and
+stored in the scale of :mod:`mivol.optim.photographs.photo_colours`. A step depends on the reals, the listed cells, the seed and
 its number.
 
 References: Fridovich-Keil, Yu et al. 2022 (Plenoxels: model, optimizer, total variation, pruning by weight); Karnewar et al.
@@ -31,11 +31,9 @@ from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.photographs.colour_scale import SCALES
-from mivol.optim.photographs.depth_supervision import DepthRays, depth_loss_gradient, sample_depth_rays
-from mivol.optim.photographs.exposure import AGREE, RATE, Exposure
+from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure
 from mivol.optim.photographs.radiance_plan import RadiancePlan, place_grid
-from mivol.optim.photographs.ray_batches import RayBatch, RayBatches
+from mivol.optim.photographs.ray_batches import DepthRays, RayBatch, RayBatches, depth_loss_gradient, sample_depth_rays
 from mivol.optim.priors import Neighbours, Rows
 from mivol.optim.problem import Reals, Refinement, SparseProblem
 from mivol.transport.line_integrals.radiance_field import (
@@ -231,7 +229,7 @@ class RadianceProblem(SparseProblem):
         density, sh = self.plan.learning_rates(iteration)
         share, colours = sh / self.plan.sh_rate, self.scale.rate
         sky = {} if self.sky is None else {"sky": colours * self.plan.sky_rate * share}
-        gains = {} if self.exposure is None else {"exposure": RATE * share}
+        gains = {} if self.exposure is None else {"exposure": GAIN_RATE * share}
         return {"density": density / self.unit, "harmonics": colours * sh} | sky | gains
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:

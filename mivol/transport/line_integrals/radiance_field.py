@@ -35,8 +35,7 @@ from mivol.transport.line_integrals.radiance_source import CellValues, Source
 from mivol.transport.traversal.cell_quadrature import share_opacity
 from mivol.transport.traversal.interpolation import GAUSS_POINT, interpolate, trilinear_weights
 from mivol.transport.traversal.lattice import Segment
-from mivol.transport.traversal.neighbour_rays import RayOrder
-from mivol.transport.traversal.occupied_cells import OccupiedCells
+from mivol.transport.traversal.occupied_cells import OccupiedCells, RayOrder
 from mivol.transport.traversal.occupied_walk import (
     OccupiedCell,
     Piece,

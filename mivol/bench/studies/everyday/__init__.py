@@ -42,7 +42,7 @@ from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, sa
 from mivol.bench.harness.contests import agreement_figures, compete, gain_figures, image_errors, render_method
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, amount
-from mivol.bench.parameter_gradient import ParameterGradient
+from mivol.bench.scenes import ParameterGradient
 from mivol.bench.studies.everyday.scenes import SCENES, EverydayScene
 from mivol.errors import MivolError
 from mivol.optim.strategy import suggest_name

@@ -63,12 +63,13 @@ from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, Promise, judge, jud
 from mivol.bench.harness.contests import SEED_STRIDE, Contest, compete
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import Study, amount, ask
-from mivol.bench.parameter_gradient import ParameterGradient, square_error
 from mivol.bench.scenes import (
+    ParameterGradient,
     constant_light,
     directional_light,
     emitter_inside,
     glass_under_a_sky,
+    square_error,
     sun_and_sky,
     sun_before_the_camera,
 )

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.parameter_gradient import ParameterGradient
-from mivol.bench.scenes import box_scene, make_integrator
+from mivol.bench.scenes import ParameterGradient, box_scene, make_integrator
 
 ALBEDO = 0.75
 INTEGRATORS = ("mivol", "prbvolpath")

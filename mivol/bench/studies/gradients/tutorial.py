@@ -23,8 +23,7 @@ from mivol.bench.harness.agreement import compare_means, mean_of_rounds
 from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.study import Size, amount
 from mivol.bench.harness.timing import Stopwatch
-from mivol.bench.parameter_gradient import DENSITY
-from mivol.bench.scenes import box_scene, constant_light, make_integrator, perspective
+from mivol.bench.scenes import DENSITY, box_scene, constant_light, make_integrator, perspective
 from mivol.bench.studies.gradients.lights import ALBEDO, INTEGRATORS
 from mivol.validate.metrics import nrmse
 from mivol.validate.statistics import Estimate

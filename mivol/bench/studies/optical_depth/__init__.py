@@ -29,9 +29,8 @@ from mivol.bench.extinctions import TO_WORLD, Extinction, ct_scan, made_up, smok
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.bench.harness.timing import peak_bytes, race, ratio_of, time_call
-from mivol.bench.parameter_gradient import ParameterGradient
 from mivol.bench.reference_walk import GridRays, camera_rays
-from mivol.bench.scenes import box_scene
+from mivol.bench.scenes import ParameterGradient, box_scene
 from mivol.bench.studies.optical_depth.peers import (
     delta_survival,
     exact_tau,

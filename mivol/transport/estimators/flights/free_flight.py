@@ -12,22 +12,34 @@ throughputs, so they stay bounded on paths of any length.
 One point of each flight, drawn uniformly over its length t, samples the emission j: the mean of t j over all flights is
 :math:`\int T j\,dt`, also in regions without extinction. The light of Gaussians is summed (:mod:`.gaussian_light`).
 
-References: Chandrasekhar 1960 (the equation of transfer); Woodcock et al. 1965, Sutton et al. 1999 (flights); Wilkie et al.
-2014, Miller et al. 2019 (channels); Spanier & Gelbard 1969 (the track-length estimator).
+Regular tracking inverts the exact optical depth of one part.
+
+.. math:: \int_{t_0}^{t} s f(x_{t'})\,dt' = -\log(1 - u), \qquad
+          t = t_p + \frac{1}{|W\omega|}\,\Phi^{-1}\!\Big(\Phi(s_0) - \frac{\log(1 - u)}{s\,\tau}\Big)
+
+The first equation is inverted cell by cell in grids. The second is its closed form for a Gaussian of optical depth tau with its
+peak at t_p. Collisions with different Gaussians are independent, so the shortest of their own flights is the flight through
+their sum: nothing is sorted, and no sum is inverted. A Gaussian is flown through in the cell where the ray enters it, so the
+walk ends in the cell of the shortest flight.
+
+References: Chandrasekhar 1960 (the equation of transfer); Woodcock et al. 1965, Sutton et al. 1999 (flights, regular
+tracking); Amanatides & Woo 1987 (the walk); Wilkie et al. 2014, Miller et al. 2019 (channels); Spanier & Gelbard 1969 (the
+track-length estimator).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import minimum
+from mivol.fields.gaussian_line import WhitenedLine
+from mivol.numerics import fast_max, fast_min, minimum
 from mivol.transport.estimators.flights.flight_derivatives import Baseline, FlightSegment
 from mivol.transport.estimators.flights.gaussian_light import GaussianLight
-from mivol.transport.estimators.flights.regular_tracking import regular_tracking, sample_gaussian_flight
 from mivol.transport.estimators.flights.tracking import delta_tracking, delta_tracking_in_blocks
 from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import (
@@ -39,9 +51,10 @@ from mivol.transport.estimators.segment import (
     SegmentTransmittance,
 )
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
-from mivol.transport.media.channels import to_components, to_spectrum
-from mivol.transport.media.extinction import Extinction, RayInterval
+from mivol.transport.media.channels import to_components, to_scene_channels, to_spectrum
+from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
+from mivol.transport.media.grid_extinction import activate, clip_interval
 from mivol.transport.media.optical_depth import segment_optical_depth
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
@@ -53,10 +66,138 @@ from mivol.transport.media.ray_intervals import (
 )
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.uniform_points import draw_uniform_point
+from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, read_nodes, walk_cells
+from mivol.transport.traversal.interpolation import (
+    fit_cubic,
+    gauss_points,
+    integrate_cubic,
+    interpolate,
+    invert_cubic_integral,
+)
+from mivol.transport.traversal.lattice import points_of_piece
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_lead, draw_pcg32, draw_state
 from mivol.transport.traversal.rays import Ray, point_along
 
-__all__ = ["FreeFlight", "make_collision"]
+__all__ = ["FreeFlight", "make_collision", "regular_tracking", "sample_gaussian_flight"]
+
+
+def regular_tracking(
+    part: ExactExtinction,
+    scale: mi.Float,
+    interval: RayInterval,
+    goal: mi.Float,
+    channel: mi.UInt32,
+) -> mi.Float64:
+    """Find the first collision with a constant or a grid on an interval of a ray.
+
+    Args:
+        part: part of the extinction.
+        scale: factor on its values.
+        interval: interval of the ray; its end may be infinite.
+        goal: optical depth up to the collision [1]: -log(1 - u) of a uniform random number u.
+        channel: channel of an rgb extinction.
+
+    Returns:
+        Distance of the collision on the ray [length]; infinite without a collision.
+
+    Bias: none, except for an extinction with an activation, interpolated by a cubic through four points of a cell. Cost: one
+    walk up to the collision.
+    """
+    if part.is_constant:
+        return _collide_in_constant(part, scale, interval, goal, channel)
+    return _collide_in_grid(part, scale, interval, goal, channel)
+
+
+def _collide_in_constant(
+    part: ExactExtinction, scale: mi.Float, interval: RayInterval, goal: mi.Float, channel: mi.UInt32
+) -> mi.Float64:
+    sigma = _select_channel(part.eval_at(scale, interval.ray, interval.t0, interval.active), channel)
+    t = mi.Float64(interval.t0) + mi.Float64(goal / sigma)
+    return dr.select(interval.active & (sigma > 0) & (t < interval.t1), t, dr.inf)
+
+
+def _collide_in_grid(
+    part: ExactExtinction,
+    scale: mi.Float,
+    interval: RayInterval,
+    goal: mi.Float,
+    channel: mi.UInt32,
+) -> mi.Float64:
+    lattice, ray = part.lattice, interval.ray
+    segment, width = clip_interval(lattice, interval), dr.width(ray)
+    reads = [NodeArray(dr.detach(part.values), part.channels)]
+
+    def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple:
+        remaining, s, dt, collides = state
+        corners = [_select_channel([row[q] for row in cell.corners[0]], channel) for q in range(8)]
+        a, b = (activate(part.activation, interpolate(corners, p)) for p in gauss_points(cell))
+        tau = 0.5 * cell.dt * scale * (a + b)
+        ends = on & (tau >= remaining)
+        s, dt = dr.select(ends, cell.s, s), dr.select(ends, cell.dt, dt)
+        return dr.select(on & ~ends, remaining - tau, remaining), s, dt, collides | ends
+
+    zero = dr.zeros(mi.Float, width)
+    start = (mi.Float(goal), zero, zero, dr.full(mi.Bool, False, width))
+    remaining, s, dt, collides = walk_cells(
+        lattice, segment, visit, start, reads, interval.active, until=lambda state: state[3]
+    )
+
+    # -- The position of the collision inside its cell ---------------------------------------------------------------------
+    begin = segment.start + mi.Float64(s)
+    cell, points, inside = points_of_piece(lattice, ray, begin, dt, collides)
+    nodes = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
+    rows = read_nodes(reads, nodes, inside)[0]
+    corners = [_select_channel([row[q] for row in rows], channel) for q in range(8)]
+    curve = fit_cubic(*(scale * activate(part.activation, interpolate(corners, p)) for p in points))
+    x = invert_cubic_integral(curve, dt, remaining, integrate_cubic(curve, dt, mi.Float(1)))
+    return dr.select(collides, begin + mi.Float64(x) * mi.Float64(dt), dr.inf)
+
+
+def _select_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
+    """Select the value of a channel; a grey part has one channel, and a mono variant uses the luminance of three."""
+    rows = to_scene_channels(rows, 1) if mi.is_monochromatic else rows
+    value = rows[0]
+    for k, row in enumerate(rows[1:], 1):
+        value = dr.select(channel == k, row, value)
+    return value
+
+
+def sample_gaussian_flight(
+    part: GaussianExtinction, scale: mi.Float, interval: RayInterval, rng: mi.UInt32
+) -> tuple[mi.Float64, mi.UInt32]:
+    """Find the first collision with Gaussians on an interval of a ray.
+
+    Args:
+        part: the Gaussians.
+        scale: factor on their extinction.
+        interval: interval of the ray; its end may be infinite.
+        rng: state of the random number generator.
+
+    Returns:
+        Distance of the collision on the ray [length], infinite without a collision, and the next state of the generator.
+
+    Bias: none but rounding. Cost: one walk up to the collision, and one random number for each Gaussian on the way.
+    """
+    passage = part.enter(interval)
+
+    def add(state: tuple, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
+        nearest, reached, rng = state
+        rng, (u,) = draw_pcg32(rng, 1)
+        before = line.share_up_to(ends[0])
+        goal = before - dr.log(1 - u) / (scale * line.depth)
+        hits = goal < before + line.share(*ends)
+        t = line.peak + math.sqrt(2) * dr.erfinv(dr.select(hits, 2 * goal - 1, 0)) / line.speed
+        # Clamp to the ends: in the tails, a share of 1e-7 is a long way.
+        t = fast_min(fast_max(t, ends[0]), ends[1])
+        return dr.select(hits & (t < nearest), t, nearest), reached, rng
+
+    def leave(state: tuple, cell: Cell) -> tuple:
+        return state[0], cell.s + cell.dt, state[2]
+
+    width = dr.width(passage.d)
+    start = (dr.full(mi.Float, dr.inf, width), dr.zeros(mi.Float, width), mi.UInt32(rng))
+    nearest, _, rng = part.visit_gaussians(passage, start, add, lambda state: state[0] <= state[1], leave)
+    return dr.select(dr.isfinite(nearest), passage.segment.start + mi.Float64(nearest), dr.inf), rng
 
 
 @dataclass
