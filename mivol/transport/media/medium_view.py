@@ -129,7 +129,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     values = list_values(params)
     names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if n in children]
     places = {} if places is None else places
-    scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
+    scale = _read_scale(params["scale"]) if "scale" in params.properties else mi.Float(1)
     parts = [
         _field_part(name, children[name].mivol_extinction, scale)
         if hasattr(children[name], "mivol_extinction")
@@ -162,6 +162,11 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
         stock_boxes,
         numbers,
     )
+
+
+def _read_scale(scale: float | mi.Float) -> mi.Float:
+    """A scale as an array. A literal other than 1 would make a new kernel for each number of a stock medium."""
+    return dr.opaque(mi.Float, scale) if isinstance(scale, float) and scale != 1 else mi.Float(scale)
 
 
 def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
