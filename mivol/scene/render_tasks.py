@@ -28,6 +28,21 @@ from mivol.transport.path.walk import has_one_segment, walk_path
 
 
 @dataclass
+class PreparedArrays:
+    """The arrays made before a render, which a recording takes as inputs.
+
+    Attributes:
+        readings: what transport reads of the values of media.
+        light: table of the light of media (density, cumulative); None without a table.
+        views: sensors of a ``batch``; None for another sensor.
+    """
+
+    readings: Readings
+    light: tuple[mi.Float, mi.Float] | None
+    views: mi.SensorPtr | None
+
+
+@dataclass
 class PlannedScene:
     """The facts of a scene, its plan, and what transport reads of its values. Valid while no parameter changes.
 
@@ -37,8 +52,7 @@ class PlannedScene:
         survey: where the media, surfaces and emitters are.
         needs: facts without arrays: a kept view of a medium would keep the derivatives of an earlier step.
         plan: choices for the scene.
-        readings: what transport reads of the values of media.
-        light: table of the light of media (density, cumulative); None without a table.
+        arrays: arrays made for the plan.
         unrecorded: why renders are not recorded; None if they are.
     """
 
@@ -47,8 +61,7 @@ class PlannedScene:
     survey: SceneSurvey
     needs: Needs
     plan: Plan
-    readings: Readings
-    light: tuple[mi.Float, mi.Float] | None
+    arrays: PreparedArrays
     unrecorded: str | None
 
     def is_for(self, state: SceneState, spp: int) -> bool:
@@ -87,16 +100,16 @@ class RenderTask(RecordedTask):
         self.survey, self.needs, self.plan = opened.survey, opened.needs, opened.plan
         self.spp, self.settings, self.aovs, self.for_images = opened.spp, settings, aovs, for_images
 
-    def build_estimators(self, scene: mi.Scene, readings: Readings, light: tuple[mi.Float, mi.Float] | None) -> Estimators:
+    def build_estimators(self, scene: mi.Scene, arrays: PreparedArrays) -> Estimators:
         """Build the planned estimators over the arrays of the scene."""
         needs = self.needs.with_views(self.survey)
-        if light is not None:
-            needs = replace(needs, media_light=MediaLight(*light))
-        return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, readings)
+        if arrays.light is not None:
+            needs = replace(needs, media_light=MediaLight(*arrays.light))
+        return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, arrays.readings)
 
-    def samples(self, sensor: mi.Sensor, seed: mi.UInt32) -> RenderSamples:
+    def samples(self, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> RenderSamples:
         """The samples of the render."""
-        return RenderSamples(sensor, seed, self.spp, self.plan.pass_rays)
+        return RenderSamples(sensor, seed, self.spp, self.plan.pass_rays, arrays.views)
 
 
 class ImageTask(RenderTask):
@@ -105,12 +118,10 @@ class ImageTask(RenderTask):
     def __init__(self, *given: Any) -> None:
         super().__init__(*given, for_images=True)
 
-    def __call__(
-        self, scene: mi.Scene, sensor: mi.Sensor, readings: Readings, light: tuple | None, seed: mi.UInt32
-    ) -> mi.TensorXf:
-        estimators = self.build_estimators(scene, readings, light)
+    def __call__(self, scene: mi.Scene, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> mi.TensorXf:
+        estimators = self.build_estimators(scene, arrays)
         return render_on_film(
-            self.samples(sensor, seed), self.aovs, lambda rays: _render_primal(estimators, rays, self.plan, self.aovs)
+            self.samples(sensor, arrays, seed), self.aovs, lambda rays: _render_primal(estimators, rays, self.plan, self.aovs)
         )
 
 
@@ -121,24 +132,18 @@ class GradientTask(RenderTask):
         super().__init__(*given, for_images=False)
 
     def __call__(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        readings: Readings,
-        light: tuple | None,
-        seed: mi.UInt32,
-        grad_in: mi.TensorXf,
+        self, scene: mi.Scene, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32, grad_in: mi.TensorXf
     ) -> None:
         with dr.suspend_grad():
             with dr.resume_grad():
-                estimators = self.build_estimators(scene, readings, light)
+                estimators = self.build_estimators(scene, arrays)
             media = estimators.media
             media.find_followed()
             media.start_gradients()
             # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only
             # once.
             with dr.isolate_grad():
-                for rays, dL, daovs in adjoint_rays(self.samples(sensor, seed), self.aovs, grad_in):
+                for rays, dL, daovs in adjoint_rays(self.samples(sensor, arrays, seed), self.aovs, grad_in):
                     _replay(estimators, rays, dL, self.plan.branches)
                     vjp_aovs(media, rays.ray, self.aovs, daovs)
                     dr.eval()

@@ -13,13 +13,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.scene_graph import list_values, traverse
+from mivol.scene_graph import find_children, list_values, traverse
+from mivol.transport.path.film import find_batch_views
 
 FOLLOWED = ("data", "value")
 """Names of the parameters of volumes and textures whose values a recording follows."""
 
 FOLLOWED_SENSORS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
-"""Sensors that can be recorded, with all their parameters. Recording a ``batch`` aborts the process (Dr.Jit 1.5)."""
+"""Sensors that can be recorded, with all their parameters."""
 
 
 @dataclass
@@ -80,8 +81,10 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     A recording must find all arrays. Dr.Jit finds those of Mitsuba's plugins, and those that are attributes of a Python plugin.
     It aborts the process for an array that it does not find.
     """
-    if sensor.class_name() not in FOLLOWED_SENSORS:
-        return f"the sensor is a {sensor.class_name()}"
+    views = [sensor] if find_batch_views(sensor) is None else find_children(sensor).values()
+    strange = sorted({v.class_name() for v in views if isinstance(v, mi.Sensor)} - set(FOLLOWED_SENSORS))
+    if strange:
+        return f"the sensor is a {strange[0]}"
     params = traverse(scene)
     kinds = {type(node) for node in params.hierarchy if not _is_of_mivol(node)}
     foreign = sorted(kind.__name__ for kind in kinds if kind.__module__.partition(".")[0] != "mitsuba")

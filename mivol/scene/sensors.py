@@ -24,6 +24,9 @@ FILM_NUMBERS = 5
 PIXEL_BYTES = 4 * (FILM_NUMBERS + 4)
 """Memory of a rendered image per pixel [byte]: the sums and the developed image."""
 
+SMALL_FILM = 1 << 24
+"""Memory of a film [byte] up to which it is not compared with the free memory."""
+
 MOST_ENTRIES = 2**32
 """Limit of Dr.Jit, which counts entries of an array in 32 bits."""
 
@@ -53,8 +56,12 @@ def check_film(sensor: mi.Sensor, kept: int = 0) -> None:
         MivolError: a film that does not fit; the sentence names its size.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
+    # Asking for the free memory takes half of the time of a recorded render.
+    needed = (PIXEL_BYTES + kept) * width * height
+    if needed < SMALL_FILM:
+        return
     what, way_out = f"a film of {width} x {height} pixels", "give it fewer pixels, or render it in crops"
-    check_memory((PIXEL_BYTES + kept) * width * height, what, way_out)
+    check_memory(needed, what, way_out)
     if FILM_NUMBERS * width * height >= MOST_ENTRIES:
         raise MivolError(f"{what} has more numbers than Dr.Jit can count in one array (2^32): {way_out}.")
 

@@ -29,6 +29,7 @@ from mivol.scene.render_tasks import (
     GradientTask,
     ImageTask,
     PlannedScene,
+    PreparedArrays,
     RenderTask,
     find_unrecorded,
     render_tangent,
@@ -42,7 +43,7 @@ from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
 from mivol.transport.media.medium_view import traverse_medium
 from mivol.transport.path.estimators import Settings
-from mivol.transport.path.film import RenderSamples, render_on_film
+from mivol.transport.path.film import find_batch_views, render_on_film
 from mivol.transport.path.walk import walk_path
 
 
@@ -118,10 +119,10 @@ class Session:
             with dr.resume_grad():
                 opened = self._open(scene, sensor, spp, SceneState.of(scene, sensor), for_images=False)
                 task = RenderTask(opened, self.settings, self.aovs, for_images=False)
-                estimators = task.build_estimators(scene, opened.readings, opened.light)
+                estimators = task.build_estimators(scene, opened.arrays)
                 estimators.media.find_followed()
                 estimators.media.start_tangent()
-            samples = RenderSamples(sensor, seed, spp, opened.plan.pass_rays)
+            samples = task.samples(sensor, opened.arrays, seed)
             return render_on_film(samples, self.aovs, lambda rays: render_tangent(estimators, rays, self.aovs))
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
@@ -143,7 +144,7 @@ class Session:
             sensor = find_sensor(scene, 0)
             opened = self._open(scene, sensor, 1, SceneState.of(scene, sensor), for_images=True)
             task = RenderTask(opened, self.settings, self.aovs, for_images=True)
-            estimators = task.build_estimators(scene, opened.readings, opened.light)
+            estimators = task.build_estimators(scene, opened.arrays)
             media = estimators.media
             named = [sensor.get_medium() for sensor in scene.sensors()]
             media.start = named[0] if all(medium is named[0] for medium in named) else None
@@ -158,7 +159,7 @@ class Session:
         def make() -> RenderTask:
             return kind(opened, self.settings, self.aovs)
 
-        given = (scene, sensor, opened.readings, opened.light, *inputs)
+        given = (scene, sensor, opened.arrays, *inputs)
         if is_recording() or opened.unrecorded is not None:
             return make()(*given)
         gradients = [(value, dr.grad(value)) for value in find_differentiated(scene)] if kind is GradientTask else []
@@ -189,11 +190,11 @@ class Session:
         plan = make_plan(needs, self.settings, self.aovs)
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
-        readings = read_parts(needs, plan, survey, for_images)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
+        arrays = PreparedArrays(read_parts(needs, plan, survey, for_images), light, find_batch_views(sensor))
         unrecorded = find_unrecorded(scene, sensor, spp, needs, plan, for_images)
         needs = replace(needs, views=(), media_light=None)
-        opened = PlannedScene(state, spp, survey, needs, plan, readings, light, unrecorded)
+        opened = PlannedScene(state, spp, survey, needs, plan, arrays, unrecorded)
         if not is_recording():
             self._opened[for_images] = opened
         return opened

@@ -20,7 +20,8 @@ from mivol.kernel_recording import CannotRecordError, RecordedTask, Recordings, 
 from mivol.scene import choices, plan, render_tasks, session
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.threads import set_thread_count
-from scenes import ball_of, box_of, camera, grid_volume, medium, sky
+from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views
+from scenes import ball_of, box_of, camera, grid_volume, medium, pencil, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -156,6 +157,28 @@ def test_cameras_move_between_calls() -> None:
         pair.assert_same(1, sensor=sensor)
 
 
+def batch_of(*views: dict) -> dict:
+    film = {"type": "hdrfilm", "width": 6 * len(views), "height": 6, "rfilter": {"type": "box"}}
+    return {"type": "batch", "film": film, "sampler": {"type": "independent"}, **{f"eye{k}": v for k, v in enumerate(views)}}
+
+
+def test_views_of_a_batch_are_seen_side_by_side() -> None:
+    """With the rays that Mitsuba's ``batch`` makes, to the last bit."""
+    eyes = [camera((4 * np.sin(a), -4 * np.cos(a), 1.0), (0.0, 0.0, 0.0), res=6, fov=35.0) for a in (0.0, 1.0, 2.0)]
+    pair, batch = Pair(smoke_under(), 3), mi.load_dict(batch_of(*eyes))
+    for call in range(4):
+        pair.scale(INSIDE + "sigma_t.data", 0.9)
+        pair.assert_same(call, sensor=batch)
+        if call == 1:
+            count = pair.recordings.count
+    assert pair.recordings.count == count
+    rays = [next(film_passes(RenderSamples(batch, 3, 2, 1 << 20, views))) for views in (find_batch_views(batch), None)]
+    for part in ("o", "d", "maxt"):
+        mine, mitsubas = (np.array(getattr(found.ray, part)) for found in rays)
+        assert np.array_equal(mine, mitsubas)
+    assert np.unique(np.array(rays[0].ray.o), axis=1).shape[1] > 3
+
+
 def test_each_camera_of_a_scene_has_its_own_facts() -> None:
     """One camera stands outside of a traced ball, one inside: a plan is made for each."""
     ball = ball_of(medium("homogeneous", 1.5, 0.0), (0, 0, 0), 1.2) | {"bsdf": {"type": "thindielectric"}}
@@ -217,10 +240,9 @@ def test_negative_voxels_count_as_zero_in_a_recording() -> None:
 
 def test_what_cannot_be_recorded_is_named() -> None:
     scene = smoke_under("heterogeneous", phase={"type": "hg", "g": 0.4})
-    film = {"type": "hdrfilm", "width": 4, "height": 4}
-    batch = mi.load_dict({"type": "batch", "film": film, "one": camera((0, -4, 0), (0, 0, 0))})
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
-    assert find_hidden_arrays(scene, batch) == "the sensor is a BatchSensor"
+    pencils = mi.load_dict(batch_of(pencil((0, -4, 0), (0, 1, 0))))
+    assert find_hidden_arrays(scene, pencils) == "the sensor is a RadianceMeter"
     params = mi.traverse(scene)
     dr.enable_grad(params[INSIDE + "sigma_t.data"])
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None

@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
+from mivol.scene_graph import find_children
 from mivol.transport.traversal.random_numbers import SpreadSampler
 
 __all__ = ["CameraRays", "RenderSamples", "adjoint_rays", "film_passes", "render_on_film"]
@@ -33,12 +34,14 @@ class RenderSamples:
         seed: seed of the sampler.
         spp: samples per pixel; 0 for the sample count of the sensor's sampler.
         pass_rays: largest number of rays in a pass.
+        views: sensors of a ``batch`` (:func:`find_batch_views`); None for another sensor.
     """
 
     sensor: mi.Sensor
     seed: int
     spp: int
     pass_rays: int
+    views: mi.SensorPtr | None = None
 
 
 @dataclass
@@ -138,10 +141,40 @@ def _camera_rays(samples: RenderSamples, base: mi.Sampler, index: int, per_pass:
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     on_film = dr.fma(position, scale, offset)
-    ray, weight = sensor.sample_ray_differential(time, mi.Float(0), on_film, aperture)
+    ray, weight = _sample_rays(samples, time, on_film, aperture)
     # A box filter adds a sample to its pixel, for any position inside the pixel.
     place = mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
     return CameraRays(sampler, per_pass, ray, weight, place, mi.Point2f(on_film))
+
+
+def find_batch_views(sensor: mi.Sensor) -> mi.SensorPtr | None:
+    """The sensors of a ``batch`` in their order, side by side on the film; None for another sensor."""
+    if sensor.class_name() != "BatchSensor":
+        return None
+    views = [child for child in find_children(sensor).values() if isinstance(child, mi.Sensor)]
+    # Mitsuba gives each view a film of its part. Views with the same name could not be told apart.
+    if len(views) * views[0].film().size()[0] != sensor.film().size()[0]:
+        return None
+    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.SensorPtr(view))[0]) for view in views]
+    found = dr.reinterpret_array(mi.SensorPtr, mi.UInt32(numbers))
+    dr.eval(found)
+    return found
+
+
+def _sample_rays(samples: RenderSamples, time: mi.Float, on_film: mi.Point2f, aperture: mi.Point2f) -> tuple:
+    """Mitsuba's rays of a sensor, and their weights.
+
+    A ``batch`` keeps the index of the last view in an array that Dr.Jit does not find, and a later recording aborts the
+    process. So the view of each ray is chosen here, as in Mitsuba.
+    """
+    sensor, wavelength = samples.sensor, mi.Float(0)
+    if samples.views is not None:
+        count = dr.width(samples.views)
+        along = on_film.x * count
+        index = mi.UInt32(along)
+        sensor = dr.gather(mi.SensorPtr, samples.views, dr.minimum(index, count - 1))
+        on_film = mi.Point2f(along - mi.Float(index), on_film.y)
+    return sensor.sample_ray_differential(time, wavelength, on_film, aperture)
 
 
 def render_on_film(samples: RenderSamples, names: list[str], sample: RadianceFunction) -> mi.TensorXf:
