@@ -15,6 +15,7 @@ import pytest
 from scattering_scenes import PLACE, cases, close_up, mivol, point, rough_grid, smoke, sun
 
 import scenes
+from mivol.bench.studies.steps import count_launches
 from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, RecordedTask, Recordings, without_garbage_collection
 from mivol.scene import choices, plan, render_tasks, session
@@ -233,6 +234,17 @@ def test_negative_voxels_count_as_zero_in_a_recording() -> None:
             pair.params.update()
             images += pair.images(1)
         assert all(np.array_equal(image, images[-1]) for image in images)
+
+
+def test_a_replay_launches_few_kernels() -> None:
+    """At depth 6. Most launches are fills of one number; a traced gradient of whole paths has as many, and compiles none."""
+    pair = Pair(smoke_under(), 6)
+    key = INSIDE + "sigma_t.data"
+    for _ in range(3):
+        pair.images(1), pair.gradient(pair.recorded, key, 1)
+    image = lambda: dr.eval(mi.render(pair.scene, integrator=pair.recorded, seed=2, spp=2))  # noqa: E731
+    assert count_launches(image) <= 45
+    assert count_launches(lambda: pair.gradient(pair.recorded, key, 2)) <= 170
 
 
 # -- What is traced ---------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ with the distance h of a ray. With 6 rounds, ratios of such scenes scatter by 10
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -71,16 +71,16 @@ class EverydaySize(Size):
     seed: int = amount(0, doc="seed of all renders")
 
 
-def chosen_scenes(size: EverydaySize) -> dict[str, EverydayScene]:
-    """The scenes to measure.
+def chosen_scenes(names: Sequence[str]) -> dict[str, EverydayScene]:
+    """The scenes of the given names.
 
     Raises:
         MivolError: an unknown scene.
     """
-    for name in size.scenes:
+    for name in names:
         if name not in SCENES:
             raise MivolError(f'there is no scene "{name}": {suggest_name(name, SCENES)}')
-    return {name: SCENES[name] for name in size.scenes}
+    return {name: SCENES[name] for name in names}
 
 
 def measure_images(size: EverydaySize) -> dict:
@@ -95,7 +95,7 @@ def measure_gradients(size: EverydaySize) -> dict:
 
 def _measure_scenes(contend: Callable[[EverydayScene, EverydaySize], dict], size: EverydaySize) -> dict:
     rows = {}
-    for name, scene in chosen_scenes(size).items():
+    for name, scene in chosen_scenes(size.scenes).items():
         rows[name] = row = contend(scene, size)
         say_row(name, ratio=row["ratio"], z=row["z"])
         dr.flush_malloc_cache()

@@ -1,0 +1,60 @@
+"""Study of steps: the same loop by two integrators, with the launches of each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.bench.studies import steps as study
+from mivol.errors import MivolError
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+
+def test_launches_are_those_of_the_call() -> None:
+    """Two kernels and a sum, none of what is computed before or after."""
+    x = dr.arange(mi.Float, 1000)
+    dr.eval(x * 2)
+
+    def call() -> None:
+        a, b = x + 1, dr.sin(x)
+        dr.eval(a)
+        dr.eval(b)
+
+    assert study.count_launches(call) == 2
+    assert study.count_launches(lambda: None) == 0
+
+
+def test_a_step_renders_another_value_and_its_gradient() -> None:
+    loop = study._Loop(study.chosen_scenes(["jade_null_sun"])["jade_null_sun"], "mivol", 4, 1)
+    values = []
+    for differentiates in (False, True, True):
+        loop.step(differentiates)
+        value = loop.params[loop.key]
+        values.append(np.array(value).ravel()[0])
+        if differentiates:
+            assert np.abs(np.array(dr.grad(value))).max() > 0
+    assert np.allclose(values, np.array(loop.start).ravel()[0] * (1 - 1e-4 * np.arange(1, 4)))
+
+
+def test_a_study_counts_and_compares(tmp_path: Path) -> None:
+    size = study.StepsSize(scenes=("jade_null_sun",), sides=(4,), steps=2)
+    answer = study.STUDY.questions["gradients"](size)
+    (row,) = answer["rows"].values()
+    assert row["ratio"] == answer["least_ratio"] > 0 and row["milliseconds"]["mivol"] > 0
+    # A replay of three kernels: the image, the light again, and its derivatives, with their fills and sums.
+    assert 0 < row["launches"]["mivol"] < 250
+    assert len(study.table("gradients", answer)) == 3
+    study.draw({"gradients": answer}, tmp_path / "steps.png")
+    assert (tmp_path / "steps.png").stat().st_size > 1000
+    (bar,) = study.compare("gradients", {"least_ratio": 0.9})
+    assert not bar["met"]
+
+
+def test_a_scene_that_is_misspelt_is_named() -> None:
+    with pytest.raises(MivolError, match='there is no scene "jade_null_sum": .*jade_null_sun'):
+        study.measure_steps(False, study.StepsSize(scenes=("jade_null_sum",)))
