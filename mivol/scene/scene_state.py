@@ -22,6 +22,9 @@ FOLLOWED = ("data", "value")
 FOLLOWED_SENSORS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 """Sensors that can be recorded, with all their parameters."""
 
+UNRECORDED_PHASES = {"BlendPhaseFunction": "mivol_mixture", "TabulatedPhaseFunction": "mivol_tabulated"}
+"""Phase functions of Mitsuba whose arrays Dr.Jit 1.5 does not find, each with one that can be recorded."""
+
 
 @dataclass
 class SceneState:
@@ -90,6 +93,9 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     foreign = sorted(kind.__name__ for kind in kinds if kind.__module__.partition(".")[0] != "mitsuba")
     if foreign:
         return f"{foreign[0]} is a Python plugin, whose arrays may be hidden"
+    phases = {node.class_name() for node in params.hierarchy if isinstance(node, mi.PhaseFunction)}
+    if lost := sorted(phases & set(UNRECORDED_PHASES)):
+        return f"Dr.Jit cannot record a {lost[0]}; {UNRECORDED_PHASES[lost[0]]} can be recorded"
     owners = ((key, params.properties[key][2], value) for key, value in list_values(params))
     lost = [key for key, owner, value in owners if _find_gradient(value) is not None and not _is_followed(owner, key)]
     return f"a recording does not follow the derivative by {lost[0]}" if lost else None

@@ -255,6 +255,10 @@ def test_what_cannot_be_recorded_is_named() -> None:
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
     pencils = mi.load_dict(batch_of(pencil((0, -4, 0), (0, 1, 0))))
     assert find_hidden_arrays(scene, pencils) == "the sensor is a RadianceMeter"
+    lobes = {"type": "blendphase", "weight": 0.3, "a": {"type": "isotropic"}, "b": {"type": "hg"}}
+    blend = smoke_under(phase=lobes)
+    expected = "Dr.Jit cannot record a BlendPhaseFunction; mivol_mixture can be recorded"
+    assert find_hidden_arrays(blend, blend.sensors()[0]) == expected
     params = mi.traverse(scene)
     dr.enable_grad(params[INSIDE + "sigma_t.data"])
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
