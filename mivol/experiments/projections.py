@@ -18,13 +18,14 @@ from mivol.files.fetch import resolve_path
 from mivol.machine import check_memory
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
+from mivol.tomography.cone_axis import axis_from_fans, cone_axis_offset
 from mivol.tomography.filtered import covers_circle
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import Quanta, Transmission, count_quanta, find_air, fit_air, normalise_air, to_line_integrals
 from mivol.tomography.projector import Projector
-from mivol.tomography.rotation_axis import axis_from_fans, cone_axis_offset, find_axis
+from mivol.tomography.rotation_axis import find_axis
 
 RAY_BYTES = 3 * 8
 """Memory per ray of a computed scan [byte]: exact value, noisy value and weight, in float64."""

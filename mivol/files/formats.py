@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mivol.display import format_point
-from mivol.files import hdf5, les, metaimage, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
+from mivol.files import hdf5, metaimage, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
 from mivol.files.volume import VolumeData, check_frame, to_values
@@ -52,7 +52,7 @@ def _is_metaimage(head: bytes) -> bool:
 _METAIMAGE = VolumeFormat("MetaImage", _is_metaimage, metaimage.read_metaimage)
 _NRRD = VolumeFormat("NRRD", _starts_with(nrrd.MAGIC), nrrd.read_nrrd)
 _HDF5 = VolumeFormat("HDF5", _starts_with(hdf5.MAGIC), hdf5.read_hdf5)
-_LES = VolumeFormat("LES cloud text", les.is_les, les.read_les)
+_LES = VolumeFormat("LES cloud text", renderer_grids.is_les, renderer_grids.read_les)
 
 #: suffix -> format; a longer suffix is tried first.
 FORMATS: dict[str, VolumeFormat] = {

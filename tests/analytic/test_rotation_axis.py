@@ -15,6 +15,7 @@ from false_alarms import assert_same_mean, assert_same_variance, fresh
 
 from mivol.errors import MivolError
 from mivol.files import write_volume
+from mivol.tomography import cone_axis
 from mivol.tomography import rotation_axis as axes
 from mivol.tomography.geometry import ConeBeam
 from mivol.tomography.phantoms import shepp_logan
@@ -257,8 +258,8 @@ def test_a_line_is_seen_from_both_ends(shift: float) -> None:
     beam = beam_of(0.4, detector_offset=(0.0, shift))
     alpha = np.arctan((np.arange(48) - 23.5) * beam.pitch[1] / 9.0 + shift / 9.0)
     epsilon = np.arctan(0.4 / 6.0)
-    mirrored = axes._mirrored_columns(beam, alpha, column_of(beam))
-    np.testing.assert_allclose(axes._fan_angles(beam), alpha, rtol=1e-14)
+    mirrored = cone_axis._mirrored_columns(beam, alpha, column_of(beam))
+    np.testing.assert_allclose(cone_axis._fan_angles(beam), alpha, rtol=1e-14)
     for column in (0, 11, 30):
         here = replace(beam, angles=np.array([0.7])).rays()
         away = beam.pitch[1] * (mirrored[column] - 23.5)
@@ -290,10 +291,10 @@ def test_the_axis_is_where_it_was_put(case: str) -> None:
     """
     beam = SCANS[case]
     light = light_of(beam)
-    axis = axes.axis_from_fans(-np.log(light), light, replace(beam, axis_offset=9.0))
+    axis = cone_axis.axis_from_fans(-np.log(light), light, replace(beam, axis_offset=9.0))
     assert abs(axis.column - column_of(beam)) < 2 * axis.uncertainty
     assert axes.SAMPLING_ERROR <= axis.uncertainty < 5 * axes.SAMPLING_ERROR
-    assert axes.cone_axis_offset(axis, beam) == pytest.approx(beam.axis_offset, abs=2 * axis.uncertainty * beam.pitch[1])
+    assert cone_axis.cone_axis_offset(axis, beam) == pytest.approx(beam.axis_offset, abs=2 * axis.uncertainty * beam.pitch[1])
     rows = "2 rows" if case == "rows beside the plane" else "1 row"
     assert axis.method == f"rays measured from both ends, {rows}"
 
@@ -311,7 +312,7 @@ def test_the_uncertainty_is_that_of_repeated_noise() -> None:
     for seed in range(64):
         counts = np.random.default_rng(fresh(seed)).poisson(300.0 * light).astype(float)
         y = -np.log(np.maximum(counts, 1.0) / 300.0)
-        axis = axes.axis_from_fans(y, counts, beam)
+        axis = cone_axis.axis_from_fans(y, counts, beam)
         found.append((axis.column, axis.uncertainty**2 - axes.SAMPLING_ERROR**2))
     columns, claimed = np.transpose(found)
     assert_same_variance(columns, claimed.mean(), what="axes of cone beams")
@@ -326,7 +327,7 @@ def test_pixels_that_are_not_used_tell_nothing() -> None:
     y, weights = -np.log(light), light.copy()
     weights[..., 9] = weights[20:22] = 0.0
     y[weights == 0] = 50.0
-    assert abs(axes.axis_from_fans(y, weights, beam).column - column_of(beam)) < 2 * axes.SAMPLING_ERROR
+    assert abs(cone_axis.axis_from_fans(y, weights, beam).column - column_of(beam)) < 2 * axes.SAMPLING_ERROR
 
 
 REFUSED = {
@@ -341,23 +342,23 @@ def test_scans_that_do_not_tell_the_axis(case: str) -> None:
     beam, sentence = REFUSED[case]
     light = light_of(beam, 1)
     with pytest.raises(MivolError, match=sentence):
-        axes.axis_from_fans(-np.log(light), light, beam)
+        cone_axis.axis_from_fans(-np.log(light), light, beam)
 
 
 @pytest.mark.parametrize("y", [np.zeros((60, 1, 48)), np.random.default_rng(1).normal(size=(60, 1, 48))])
 def test_air_and_noise_have_no_axis(y: np.ndarray) -> None:
     """The correlation of noise with its mirror image is far below a half (24 directions of 5 independent columns)."""
     with pytest.raises(MivolError, match="no structure visible"):
-        axes.axis_from_fans(y, np.ones_like(y), beam_of(0.0))
+        cone_axis.axis_from_fans(y, np.ones_like(y), beam_of(0.0))
 
 
 def test_the_least_of_sectors() -> None:
     """Two sectors of 3 (x - 7 -+ 0.2)^2: least at 7, and their slopes of -+1.2 there make 0.2; a ridge is refused."""
-    found = axes._sector_minimum(lambda x: np.array([3 * (x - 7.2) ** 2, 3 * (x - 6.8) ** 2]), 6.5, 1.0)
+    found = axes.sector_minimum(lambda x: np.array([3 * (x - 7.2) ** 2, 3 * (x - 6.8) ** 2]), 6.5, 1.0)
     assert found == pytest.approx((7.0, np.sqrt(2 * 2 * 1.2**2) / 12))
     for ridge in (lambda x: np.array([-(x**2), 0.0]), lambda x: np.array([x, (x - 9) ** 2])):
         with pytest.raises(MivolError, match="no column near 0"):
-            axes._sector_minimum(ridge, 0.0, 1.0)
+            axes.sector_minimum(ridge, 0.0, 1.0)
 
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scenes" / "bonsai" / "scan.py"

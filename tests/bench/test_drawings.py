@@ -23,7 +23,7 @@ from mivol.bench.studies import (
 )
 from mivol.bench.studies.depth import TABLES
 from mivol.bench.studies.gradients import CONTESTS
-from mivol.bench.studies.gradients.lights import INTEGRATORS
+from mivol.bench.studies.gradients.twin import INTEGRATORS
 
 
 def contest(names: dict, stocks: tuple[str, ...]) -> dict:

@@ -10,8 +10,7 @@ import pytest
 from false_alarms import assert_precise, assert_same_mean, fresh, over_pixels
 
 from mivol.bench.studies.gradients import CONSTANT, DEEP_LIGHTS, TABLES, make_deep_cases, twin
-from mivol.bench.studies.gradients.lights import Light
-from mivol.bench.studies.gradients.twin import Twin
+from mivol.bench.studies.gradients.twin import Light, Twin
 from mivol.validate.moments import Moments
 
 SIDE = 6

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from false_alarms import ALPHA, note
 
-from mivol.bench.harness import agreement
+from mivol.bench.harness import contests
 from mivol.bench.harness.contests import Contest
 from mivol.bench.harness.timing import Timing
 from mivol.bench.scenes import square_error
@@ -245,7 +245,7 @@ def test_times_to_a_loss_are_read_off_the_clocks() -> None:
 @pytest.mark.slow
 def test_mivol_learns_in_the_tutorial(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The image loss falls to half at least within 2 x 2 iterations, and the references agree with volpath's."""
-    monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
+    monkeypatch.setattr(contests, "FALSE_ALARM", ALPHA)
     note(ALPHA, "references")
     answer = measure_tutorial(2, replace(TINY, side=12, reference_spp=64, loss_spp=16, resolutions=(4, 8), steps=(2, 2)))
     loss = answer["runs"][MIVOL]["loss"]

@@ -12,8 +12,8 @@ from bench_figures import drawn
 from false_alarms import ALPHA, note
 from scene_numbers import add_up
 
-from mivol.bench.harness import agreement
-from mivol.bench.harness.agreement import mean_of_rounds
+from mivol.bench.harness import contests
+from mivol.bench.harness.contests import mean_of_rounds
 from mivol.bench.studies import random_scenes
 from mivol.bench.studies.random_scenes import (
     STUDY,
@@ -135,7 +135,7 @@ def test_samples_that_are_no_radiance_are_counted(variant_rgb: str, monkeypatch:
 @pytest.mark.statistical
 def test_a_sample_of_scenes_agrees_with_volpath(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Ten that the quoted run does not have."""
-    monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
+    monkeypatch.setattr(contests, "FALSE_ALARM", ALPHA)
     note(ALPHA, "random scenes")
     result = measure_trials(replace(RandomSize.quick(), scenes=10, first=10_000))
     assert not result["refusals"]
@@ -147,7 +147,7 @@ def test_a_sample_of_scenes_agrees_with_volpath(variant_rgb: str, monkeypatch: p
 @pytest.mark.statistical
 def test_a_sample_of_built_scenes_agrees_with_volpath(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Six that the quoted run does not have."""
-    monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
+    monkeypatch.setattr(contests, "FALSE_ALARM", ALPHA)
     note(ALPHA, "random scenes as people build them")
     result = measure_built(replace(RandomSize.quick(), built_scenes=6, first=10_000))
     assert len(result["trials"]) == 6 and not result["refusals"]
@@ -195,7 +195,7 @@ def test_a_scene_is_judged_by_what_differs_most(monkeypatch: pytest.MonkeyPatch,
     channels = (0, 1, 2) if is_rgb else (None,)
     assert calls == [(None, "mivol", 4, 2), *((c, "volpath", 4, 3) for c in channels)]
     one, other = (mean_of_rounds(p[:, 2:, 2:, 1].mean(axis=(1, 2))) for p in (mivol, noise))
-    wanted = agreement.compare_means(one, other, 12 * 5)
+    wanted = contests.compare_means(one, other, 12 * 5)
     assert result == {"features": ["f"], "not_a_radiance": 0, "mean": pytest.approx(noise.mean()), **wanted}
     mivol[0, 0, 0, 0], mivol[0, 0, 0, 1] = 0.0, -1e-30
     assert try_scene(9, size, draw)["not_a_radiance"] == 1

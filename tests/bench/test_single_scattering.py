@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from false_alarms import ALPHA, fresh, note
 
-from mivol.bench.harness import agreement, contests
+from mivol.bench.harness import contests
 from mivol.bench.harness.contests import Contest
 from mivol.bench.harness.timing import Timing
 from mivol.bench.scenes import box_scene, make_integrator, milk_in_a_glass
@@ -54,7 +54,7 @@ def test_integrators_agree_in_a_sky(variant_rgb: str, tmp_path: Path, monkeypatc
     """Radiance is at most 1 and samples are many: t has hundreds of degrees of freedom. A bound on z says nothing if the
     standard error is as large as the mean."""
     comparisons = len(study.VOLUMES) * len(LIGHTS) * len(PEERS)
-    monkeypatch.setattr(agreement, "FALSE_ALARM", comparisons * ALPHA)
+    monkeypatch.setattr(contests, "FALSE_ALARM", comparisons * ALPHA)
     note(len(PEERS) * ALPHA, "images")
     figures = contend(make_fog(), LIGHTS["constant light"], replace(TINY, seed=fresh(0) % 40_000), (1, 4))
     assert figures["pixels_that_count"] > 0
@@ -224,7 +224,7 @@ def test_only_volpath_has_a_bar() -> None:
 @pytest.mark.statistical
 def test_integrators_agree_at_each_depth(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a small fog in each light of the smoke, at the false-alarm rate of the suite."""
-    monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
+    monkeypatch.setattr(contests, "FALSE_ALARM", ALPHA)
     values = np.pad(np.random.default_rng(1).uniform(0.5, 1.5, (3, 4, 5)), 1).astype(np.float32)
     for name, light in CONTESTS["smoke"].items():
         figures = contend(values, light, replace(TINY, seed=fresh(0) % 40_000))

@@ -17,7 +17,6 @@ from scipy import stats
 from tiny_experiment import refused, run
 
 from mivol.bench.harness import catalogue, contests, timing
-from mivol.bench.harness.agreement import FALSE_ALARM, compare_means, finite_or_none, mean_of_pixels, mean_of_rounds
 from mivol.bench.harness.bars import (
     AT_LEAST,
     AT_MOST,
@@ -28,7 +27,16 @@ from mivol.bench.harness.bars import (
     judge_promises,
     say_row,
 )
-from mivol.bench.harness.contests import Contest, compete, find_samples
+from mivol.bench.harness.contests import (
+    FALSE_ALARM,
+    Contest,
+    compare_means,
+    compete,
+    find_samples,
+    finite_or_none,
+    mean_of_pixels,
+    mean_of_rounds,
+)
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, amount, ask, without_arrays
 from mivol.bench.harness.timing import Stopwatch, Timing, race, ratio_of

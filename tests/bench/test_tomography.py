@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from mivol.bench.studies import tomography as study
-from mivol.bench.studies.tomography import peers, slices
-from mivol.bench.studies.tomography.slices import MeasuredSlice, Slice, centre_axis, load_tooth, make_slice
+from mivol.bench.studies.tomography import peers
+from mivol.bench.studies.tomography.peers import MeasuredSlice, Slice, centre_axis, load_tooth, make_slice
 from mivol.files import write_volume
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.solvers import ALL_SOLVERS
@@ -211,7 +211,7 @@ def test_everyone_finds_the_object(variant_rgb: str, monkeypatch: pytest.MonkeyP
         pytest.skip(f"{who} is not installed")
     monkeypatch.setattr(peers, "STEPS", dict.fromkeys(peers.STEPS, 12))
     # Ellipsoids that lie anywhere: a head is nearly its own mirror image.
-    monkeypatch.setattr(slices, "shepp_logan", lambda table, half: random_ellipsoids(5, seed=8).scaled(0.8 * half))
+    monkeypatch.setattr(peers, "shepp_logan", lambda table, half: random_ellipsoids(5, seed=8).scaled(0.8 * half))
     scan = make_slice(33, 40, 0.0)
     for turned in (scan.truth[:, ::-1], scan.truth[:, :, ::-1], scan.truth.transpose(0, 2, 1)):
         assert scan.error(turned) > 0.75

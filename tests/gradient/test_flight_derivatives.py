@@ -29,8 +29,7 @@ from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rou
 
 import scenes
 from mivol.bench.scenes import ParameterGradient, box_scene, constant_light
-from mivol.bench.studies.gradients.lights import Light
-from mivol.bench.studies.gradients.twin import Twin
+from mivol.bench.studies.gradients.twin import Light, Twin
 from mivol.scene import plan
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes, ShadowReservoir, ShadowTerm
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight

@@ -37,9 +37,17 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.agreement import compare_means, finite_or_none, mean_of_rounds
 from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, say_row
-from mivol.bench.harness.contests import agreement_figures, compete, gain_figures, image_errors, render_method
+from mivol.bench.harness.contests import (
+    agreement_figures,
+    compare_means,
+    compete,
+    finite_or_none,
+    gain_figures,
+    image_errors,
+    mean_of_rounds,
+    render_method,
+)
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.bench.scenes import ParameterGradient

@@ -58,9 +58,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mivol.bench.extinctions import Extinction, fine_smoke, les_cloud, smoke
-from mivol.bench.harness.agreement import compare_means, finite_or_none, mean_of_rounds
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, Promise, judge, judge_agreement, say_row
-from mivol.bench.harness.contests import SEED_STRIDE, Contest, compete
+from mivol.bench.harness.contests import SEED_STRIDE, Contest, compare_means, compete, finite_or_none, mean_of_rounds
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.scenes import (
@@ -73,9 +72,8 @@ from mivol.bench.scenes import (
     sun_and_sky,
     sun_before_the_camera,
 )
-from mivol.bench.studies.gradients.lights import INTEGRATORS, Light
 from mivol.bench.studies.gradients.tutorial import TutorialSize, measure_tutorial
-from mivol.bench.studies.gradients.twin import Twin
+from mivol.bench.studies.gradients.twin import INTEGRATORS, Light, Twin
 from mivol.report.figures import MARKERS, SERIES
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate

@@ -12,7 +12,7 @@ head. Its projections are sums of ellipsoid chords (float64, no grid), so no ope
 volume is projected at twice the resolution of the reconstruction. nRMSE is |x - truth| / |truth|, with the truth averaged over
 voxels. TIGRE's tests accept 0.2 after 20 iterations (0.3 for SIRT) of a head projected by the tested operator itself.
 
-peers, tooth: see :mod:`mivol.bench.studies.tomography.peers` and :mod:`mivol.bench.studies.tomography.slices`.
+peers, tooth: see :mod:`mivol.bench.studies.tomography.peers`.
 
 volume256: one product with A and one with its transpose, of random voxels (none is empty), for cone beams and for parallel
 beams. Beside it astra-toolbox on the processor, which has no cones there: its parallel projector (``linear``, Joseph's), layer
