@@ -62,7 +62,7 @@ class PlannedScene:
     needs: Needs
     plan: Plan
     arrays: PreparedArrays
-    unrecorded: str | None
+    unrecorded: str | None = None
 
     def is_for(self, state: SceneState, spp: int) -> bool:
         """Whether a scene in this state, with so many samples, has the same facts."""

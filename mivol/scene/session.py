@@ -192,9 +192,12 @@ class Session:
             warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
         arrays = PreparedArrays(read_parts(needs, plan, survey, for_images), light, find_batch_views(sensor))
-        unrecorded = find_unrecorded(scene, sensor, spp, needs, plan, for_images)
-        needs = replace(needs, views=(), media_light=None)
-        opened = PlannedScene(state, spp, survey, needs, plan, arrays, unrecorded)
+        opened = PlannedScene(state, spp, survey, replace(needs, views=(), media_light=None), plan, arrays)
+        known = self._opened.get(for_images)
+        if known is not None and (known.spp, known.key) == (spp, opened.key):
+            opened.unrecorded = known.unrecorded
+        else:
+            opened.unrecorded = find_unrecorded(scene, sensor, spp, needs, plan, for_images)
         if not is_recording():
             self._opened[for_images] = opened
         return opened
