@@ -22,6 +22,10 @@ FOLLOWED = ("data", "value")
 FOLLOWED_SENSORS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 """Sensors that can be recorded, with all their parameters."""
 
+RECORDED_BACK_ENDS = ("llvm",)
+"""Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that a texture
+without hardware support leaves uninitialised, and aborts the process; nobody has tried recordings there."""
+
 UNRECORDED_PHASES = {"BlendPhaseFunction": "mivol_mixture", "TabulatedPhaseFunction": "mivol_tabulated"}
 """Phase functions of Mitsuba whose arrays Dr.Jit 1.5 does not find, each with one that can be recorded."""
 
@@ -84,6 +88,8 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     A recording must find all arrays. Dr.Jit finds those of Mitsuba's plugins, and those that are attributes of a Python plugin.
     It aborts the process for an array that it does not find.
     """
+    if mi.variant().partition("_")[0] not in RECORDED_BACK_ENDS:
+        return f"recordings have not been tried with {mi.variant()}"
     views = [sensor] if find_batch_views(sensor) is None else find_children(sensor).values()
     strange = sorted({v.class_name() for v in views if isinstance(v, mi.Sensor)} - set(FOLLOWED_SENSORS))
     if strange:

@@ -18,7 +18,7 @@ import scenes
 from mivol.bench.studies.steps import count_launches
 from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, RecordedTask, Recordings, without_garbage_collection
-from mivol.scene import choices, plan, render_tasks, session
+from mivol.scene import choices, plan, render_tasks, scene_state, session
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.threads import set_thread_count
 from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views
@@ -265,6 +265,12 @@ def test_what_cannot_be_recorded_is_named() -> None:
     dr.enable_grad(params[INSIDE + "phase_function.g"])
     expected = f"a recording does not follow the derivative by {INSIDE}phase_function.g"
     assert find_hidden_arrays(scene, scene.sensors()[0]) == expected
+
+
+def test_only_back_ends_that_were_tried_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = smoke_under()
+    monkeypatch.setattr(scene_state, "RECORDED_BACK_ENDS", ("none",))
+    assert find_hidden_arrays(scene, scene.sensors()[0]) == f"recordings have not been tried with {mi.variant()}"
 
 
 def test_long_renders_are_traced(monkeypatch: pytest.MonkeyPatch) -> None:
