@@ -23,8 +23,8 @@ FOLLOWED_SENSORS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 """Sensors that can be recorded, with all their parameters."""
 
 RECORDED_BACK_ENDS = ("llvm",)
-"""Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that a texture
-without hardware support leaves uninitialised, and aborts the process; nobody has tried recordings there."""
+"""Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that other
+textures leave uninitialised, and aborts the process; nobody has tried recordings there."""
 
 UNRECORDED_PHASES = {"BlendPhaseFunction": "mivol_mixture", "TabulatedPhaseFunction": "mivol_tabulated"}
 """Phase functions of Mitsuba whose arrays Dr.Jit 1.5 does not find, each with one that can be recorded."""

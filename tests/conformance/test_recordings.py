@@ -24,7 +24,7 @@ from mivol.threads import set_thread_count
 from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views
 from scenes import ball_of, box_of, camera, grid_volume, medium, pencil, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
+pytestmark = pytest.mark.usefixtures("cpu_back_end")
 
 INSIDE = "smoke.interior_medium."
 
