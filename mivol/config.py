@@ -266,8 +266,8 @@ class Readings(Section):
             int,
             setting(
                 "pixel",
-                "columns without object at each edge, for the drift of the light; 0: none; absent: air is looked for there, "
-                "and used if it is not as bright as the flats",
+                "columns of air at each edge, by which the views are divided; 0: none; absent: mivol looks for air, and uses it "
+                "if its brightness differs from the flats",
                 ge=0,
             ),
         ]

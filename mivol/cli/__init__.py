@@ -231,7 +231,7 @@ def optimize_flags() -> list:
             type=Path,
             help="experiment (.toml), a scan (HDF5, .xtekct, folder), or posed photographs: a folder or a file of cameras",
         ),
-        *model_flags("without a TOML file: the fitted model (default: gaussians)"),
+        *model_flags("the model to fit, if there is no TOML file (default: gaussians)"),
         list_flag("--set", "key=value", "override a setting of the experiment"),
         flag("-o", "--output", type=Path, help="run folder (default: the experiment's output)"),
         flag("--resume", action="store_true", help="continue from the checkpoint in the run folder"),

@@ -56,7 +56,7 @@ def resolve_solver(settings: config.SolveSettings, walk: Projector) -> tuple[con
     start, start_line = resolve_start(settings, walk)
     parts, parts_line = resolve_supersampling(settings, walk)
     settled = msgspec.structs.replace(settings, name=name, tv=tv_strength(settings), start=start, supersampling=parts)
-    by_table = "the least error of few, noisy and many views in the table of docs/benchmarks.md"
+    by_table = "it has the least error with few, noisy and many views in the table of docs/benchmarks.md"
     reason = by_table if settings.name == AUTO else ALL_SOLVERS[name].promises
     return settled, [PlanLine(choice=f"solver: {name}", reason=reason), *start_line, *parts_line]
 
@@ -69,7 +69,7 @@ def resolve_start(settings: config.SolveSettings, walk: Projector) -> tuple[str,
         check_directions(walk)
     except MivolError as error:
         return "empty", [PlanLine(choice="start: empty", reason=f"filtered back-projection refuses: {error}")]
-    return "filtered", [PlanLine(choice="start: filtered back-projection", reason="half of the iterations are saved")]
+    return "filtered", [PlanLine(choice="start: filtered back-projection", reason="it saves half of the iterations")]
 
 
 def resolve_supersampling(settings: config.SolveSettings, walk: Projector) -> tuple[int, list[PlanLine]]:

@@ -313,7 +313,12 @@ def select_dataset(path: object, dataset: str | None, names: Sequence[str]) -> s
     if dataset is None:
         if len(names) == 1:
             return names[0]
-        raise refusal(path, f"{len(names)} arrays ({listed})", "a single array", "choose an array with dataset=")
+        raise refusal(
+            path,
+            f"{len(names)} arrays ({listed})",
+            "a single array",
+            "name one by dataset= in Python, by --dataset in mivol explain, or by --set data.data= for a scan",
+        )
     if dataset not in names:
         near = difflib.get_close_matches(dataset, names, 1)
         way_out = f"did you mean {near[0]!r}" if near else "choose another array"

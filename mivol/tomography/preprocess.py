@@ -103,7 +103,7 @@ def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, satura
     gain, notes = np.nan, ()
     if (np.ptp(flats, axis=0)[alive] == 0).all():
         found = "one flat tells" if len(flats) == 1 else f"the {len(flats)} flats are copies of one image, which tell"
-        notes = (f"the noise is unknown: {found} no scatter; the noise is taken as quanta's, of a size that the fit finds",)
+        notes = (f"the noise is unknown, because {found} no scatter; photon noise is assumed, and the fit finds its size",)
     else:
         gain = max(float(flats.var(0, ddof=1)[alive].mean()) - dark_variance, 0.0) / float(light[alive].mean())
         if len(darks) == 1:

@@ -82,7 +82,7 @@ def test_flats_without_scatter_tell_no_noise(copies: int) -> None:
     np.testing.assert_allclose(found.variance[:, 0, alive], np.maximum(t, 0) * preprocess.UNKNOWN_NOISE, rtol=1e-14)
     assert np.isnan(found.value[:, 0, 2]).all() and not found.is_noise_known
     reason = "one flat tells" if copies == 1 else "the 3 flats are copies of one image, which tell"
-    assert found.notes[0].startswith(f"the noise is unknown: {reason} no scatter")
+    assert found.notes[0].startswith(f"the noise is unknown, because {reason} no scatter")
     with pytest.raises(MivolError, match="choose pcg"):
         count_quanta(READINGS, flats, DARKS)
     assert preprocess.correct_transmission(READINGS, FLATS, DARKS).is_noise_known
