@@ -266,8 +266,8 @@ class Readings(Section):
             int,
             setting(
                 "pixel",
-                "columns of air at each edge, by which the views are divided; 0: none; absent: mivol looks for air, and uses it "
-                "if its brightness differs from the flats",
+                "columns of air at each edge, by which the views are divided; 0: none; absent: mivol looks for air, and uses "
+                "it if its brightness differs from the flats",
                 ge=0,
             ),
         ]
