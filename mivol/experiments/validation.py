@@ -29,10 +29,9 @@ from mivol.scene.explain import read_settings
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.scene_graph import traverse
-from mivol.validate.compare import Comparison, compare
 from mivol.validate.moments import BATCHES, Moments
 from mivol.validate.reference import render_reference
-from mivol.validate.reference_file import ReferenceResult
+from mivol.validate.reference_file import Comparison, ReferenceResult, compare
 from mivol.validate.statistics import Estimate, Significance, effective_dof, z_bound
 from mivol.validate.trust import Doubt, find_doubts
 

@@ -12,9 +12,8 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.files import encode_srgb
-from mivol.validate.compare import Comparison, compare
 from mivol.validate.metrics import METRICS, average_scores, nrmse, psnr, quantise, score_image, ssim
-from mivol.validate.reference_file import ReferenceResult, relative_error
+from mivol.validate.reference_file import Comparison, ReferenceResult, compare, relative_error
 from mivol.validate.statistics import Estimate, Significance, estimate_bias, smallest_detectable_bias, z_bound
 
 SHAPE = (4, 6, 3)

@@ -33,10 +33,9 @@ from mivol.photos import Camera, Lens, intrinsics, load_photos, project, rays
 from mivol.scene.camera_rigs import Ring
 from mivol.scene.sensors import to_camera, to_sensor
 from mivol.validate import reference
-from mivol.validate.compare import compare
 from mivol.validate.moments import Moments
 from mivol.validate.reference import render_photographs, render_reference
-from mivol.validate.reference_file import ReferenceResult, read_reference
+from mivol.validate.reference_file import ReferenceResult, compare, read_reference
 from mivol.validate.trust import find_doubts
 
 SIZE = 8
