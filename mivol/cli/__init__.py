@@ -399,6 +399,14 @@ def _is_experiment(arguments: argparse.Namespace) -> bool:
     return is_experiment
 
 
+def _check_contents(path: Path) -> None:
+    """Refuse binary data that no reader of a scene, an experiment, a cloud or a volume takes."""
+    from mivol.files.formats import is_unread, refuse_unread
+
+    if is_unread(path):
+        raise refuse_unread(path)
+
+
 def _check_dataset(path: Path, dataset: str | None) -> Path:
     """Return the file; refuse ``--dataset`` for a file that is no volume."""
     from mivol.files.formats import is_volume_file
@@ -436,6 +444,7 @@ def load_named_scene(arguments: argparse.Namespace) -> LoadedScene:
     from mivol.back_end import choose_back_end
     from mivol.scene.load import load_scene
 
+    _check_contents(arguments.scene)
     choose_back_end(arguments.mode, arguments.threads)
     mi.set_log_level(mi.LogLevel.Debug if arguments.verbose else mi.LogLevel.Warn)
     for folder in filter(None, arguments.a.split(";")):
@@ -577,6 +586,7 @@ def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Pat
         fault = f"--as and --preset are for photographs, and {path} {'is an experiment' if is_experiment else 'holds none'}"
         advice = "its tables [gaussians] or [field] name model and preset" if is_experiment else "leave them out"
         raise MivolError(f"{fault}: {advice}.")
+    _check_contents(path)
     return config.load(path, arguments.set), path.parent
 
 
@@ -647,9 +657,11 @@ def _convert_volume(arguments: argparse.Namespace) -> str:
 def _convert_cloud(arguments: argparse.Namespace) -> str:
     """Convert points, Gaussians or a field; return the lines to print."""
     from mivol.experiments import gaussian_conversion
-    from mivol.points.summary import convert_file
+    from mivol.points.summary import convert_file, is_points_file
 
     source, target, resolution = arguments.source, arguments.output, arguments.resolution
+    if not is_points_file(source) and source.suffix.lower() != ".npz":
+        _check_contents(source)
     kind = _check_conversion(arguments)
     if source.suffix.lower() == ".npz":
         return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mivol.display import format_point
+from mivol.errors import MivolError
 from mivol.files import hdf5, metaimage, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
@@ -75,6 +76,19 @@ FORMATS: dict[str, VolumeFormat] = {
     ".hdf5": _HDF5,
 }
 
+#: name of a kind of file without a reader here -> (test of the first ``HEAD`` bytes, way out).
+UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
+    "an MRC file": (lambda head: head[208:211] == b"MAP", "convert it to .nrrd or .npy, with mrcfile for example"),
+    "a DICOM file": (lambda head: head[128:132] == b"DICM", "convert its series to .nii or .nrrd, with dcm2niix for example"),
+    "a MATLAB file": (_starts_with(b"MATLAB"), "save the array as .npy or .h5"),
+    "an HDF5 file": (_starts_with(hdf5.MAGIC), "name a volume .h5; explain and optimize find the data of a scan"),
+    "a TIFF file": (
+        lambda head: head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
+        "name the folder of TIFF files of a scan for explain and optimize, or convert a volume to .npy or .nrrd",
+    ),
+    "raw bytes": (lambda head: b"\0" in head, "describe them in a header beside them, .nhdr or .mhd, and name the header"),
+}
+
 #: suffix -> writer(file, values, to_world, metadata).
 WRITERS: dict[str, Callable[[BinaryIO, np.ndarray, np.ndarray, dict[str, Any]], None]] = {
     ".vol": renderer_grids.write_vol,
@@ -116,6 +130,8 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
     path = check_file(path)
     if frame not in FRAMES:
         raise refusal("read_volume", f"frame={frame!r}", f"one of {', '.join(FRAMES)}", "choose one")
+    if not path.name.lower().endswith(tuple(FORMATS)):
+        raise refuse_unread(path)
     suffix = _find_suffix(path, FORMATS)
     kind = FORMATS[suffix]
     with path.open("rb") as file:
@@ -227,6 +243,28 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None) -> st
     write_volume(target, volume.values, place, metadata=space)
     size = " x ".join(str(n) for n in volume.size)
     return f"{target}: {size} voxels" + (f"; {suffix} does not hold {' and '.join(lost)}" if lost else "")
+
+
+def is_unread(path: Path) -> bool:
+    """Whether a file holds binary data, and its suffix is neither in :data:`FORMATS` nor that of a scene or an experiment."""
+    if path.name.lower().endswith((*FORMATS, ".xml", ".toml")) or not path.is_file():
+        return False
+    return _find_unread(path) is not None
+
+
+def refuse_unread(path: Path) -> MivolError:
+    """Return the error that names the contents of a file without a reader, the volumes that are read, and a way out."""
+    found = _find_unread(path)
+    suffix = f"the suffix {path.suffix!r}"
+    if found is None:
+        return refusal(path, suffix, f"one of {', '.join(FORMATS)}", "convert the file or correct its name")
+    return refusal(path, f"{found} with {suffix}", f"a volume of {', '.join(FORMATS)}", UNREAD[found][1])
+
+
+def _find_unread(path: Path) -> str | None:
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    return next((name for name, (recognise, _) in UNREAD.items() if recognise(head)), None)
 
 
 def _find_suffix(path: Path, table: Mapping[str, Any]) -> str:

@@ -76,3 +76,24 @@ def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pyte
     error = capsys.readouterr().err
     assert "the suffix '.tif'" in error and ".vdb" in error
     assert ".vdb" in FORMATS
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "found", "way_out"),
+    [
+        ("a.mrc", bytes(208) + b"MAP " + bytes(812), "an MRC file", "mrcfile"),
+        ("a.dcm", bytes(128) + b"DICM", "a DICOM file", ".nii or .nrrd"),
+        ("a.mat", b"MATLAB 5.0 MAT-file", "a MATLAB file", ".npy or .h5"),
+        ("a.tif", b"II*\0" + bytes(8), "a TIFF file", "the folder of TIFF files"),
+        ("a.raw", bytes(64), "raw bytes", ".nhdr or .mhd"),
+    ],
+)
+@pytest.mark.parametrize("words", [("explain",), ("render",), ("optimize",), ("convert", "b.vol")])
+def test_a_file_without_a_reader_is_named_by_its_contents(
+    tmp_path: Path, capsys: pytest.CaptureFixture, words: tuple, name: str, head: bytes, found: str, way_out: str
+) -> None:
+    (tmp_path / name).write_bytes(head)
+    assert run(words[0], tmp_path / name, *(tmp_path / word for word in words[1:])) == 1
+    error = capsys.readouterr().err
+    assert f"found {found} with the suffix" in error and "expected a volume of .vol, .npy" in error
+    assert way_out in error and error.count("\n") == 1
