@@ -18,7 +18,7 @@ import numpy as np
 
 from mivol.display import format_point
 from mivol.errors import MivolError
-from mivol.files import hdf5, metaimage, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
+from mivol.files import hdf5, metaimage, mrc, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
 from mivol.files.volume import VolumeData, check_frame, to_values
@@ -53,6 +53,7 @@ def _is_metaimage(head: bytes) -> bool:
 _METAIMAGE = VolumeFormat("MetaImage", _is_metaimage, metaimage.read_metaimage)
 _NRRD = VolumeFormat("NRRD", _starts_with(nrrd.MAGIC), nrrd.read_nrrd)
 _HDF5 = VolumeFormat("HDF5", _starts_with(hdf5.MAGIC), hdf5.read_hdf5)
+_MRC = VolumeFormat("MRC", mrc.is_mrc, mrc.read_mrc)
 _LES = VolumeFormat("LES cloud text", renderer_grids.is_les, renderer_grids.read_les)
 
 #: suffix -> format; a longer suffix is tried first.
@@ -74,11 +75,14 @@ FORMATS: dict[str, VolumeFormat] = {
     ".txt": _LES,
     ".h5": _HDF5,
     ".hdf5": _HDF5,
+    ".mrc": _MRC,
+    ".map": _MRC,
+    ".rec": _MRC,
 }
 
 #: name of a kind of file without a reader here -> (test of the first ``HEAD`` bytes, way out).
 UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
-    "an MRC file": (lambda head: head[208:211] == b"MAP", "convert it to .nrrd or .npy, with mrcfile for example"),
+    "an MRC file": (mrc.is_mrc, "name it .mrc"),
     "a DICOM file": (lambda head: head[128:132] == b"DICM", "convert its series to .nii or .nrrd, with dcm2niix for example"),
     "a MATLAB file": (_starts_with(b"MATLAB"), "save the array as .npy or .h5"),
     "an HDF5 file": (_starts_with(hdf5.MAGIC), "name a volume .h5; explain and optimize find the data of a scan"),

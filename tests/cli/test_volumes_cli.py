@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import h5py
@@ -81,7 +82,7 @@ def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pyte
 @pytest.mark.parametrize(
     ("name", "head", "found", "way_out"),
     [
-        ("a.mrc", bytes(208) + b"MAP " + bytes(812), "an MRC file", "mrcfile"),
+        ("a.st", bytes(208) + b"MAP " + bytes(812), "an MRC file", "name it .mrc"),
         ("a.dcm", bytes(128) + b"DICM", "a DICOM file", ".nii or .nrrd"),
         ("a.mat", b"MATLAB 5.0 MAT-file", "a MATLAB file", ".npy or .h5"),
         ("a.tif", b"II*\0" + bytes(8), "a TIFF file", "the folder of TIFF files"),
@@ -97,3 +98,30 @@ def test_a_file_without_a_reader_is_named_by_its_contents(
     error = capsys.readouterr().err
     assert f"found {found} with the suffix" in error and "expected a volume of .vol, .npy" in error
     assert way_out in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("axes", [(1, 2, 3), (3, 1, 2)])
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.uint16, np.float16, np.float32])
+def test_mrc_is_read_as_by_mrcfile(tmp_path: Path, axes: tuple[int, ...], dtype: type) -> None:
+    mrcfile = pytest.importorskip("mrcfile")
+    stored = np.arange(24).reshape(2, 3, 4).astype(dtype)
+    with mrcfile.new(tmp_path / "a.mrc") as file:
+        file.set_data(stored)
+        file.set_volume()
+        file.header.mapc, file.header.mapr, file.header.maps = axes
+        file.voxel_size = (1, 2, 4)
+        file.header.nxstart, file.header.nystart, file.header.nzstart = 5, 6, 7
+    volume = read_volume(tmp_path / "a.mrc")
+    expected = stored if axes == (1, 2, 3) else np.moveaxis(stored, 2, 0)  # (s, r, c) is (y, x, z) for axes 3, 1, 2
+    np.testing.assert_array_equal(volume.values[..., 0], expected)
+    np.testing.assert_array_equal(volume.spacing, [1, 2, 4])
+    starts = [5, 6, 7] if axes == (1, 2, 3) else [6, 7, 5]
+    np.testing.assert_array_equal(volume.to_world[:3, 3], np.array([1, 2, 4]) * (np.array(starts) - 0.5))
+
+
+def test_mrc_refusals_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.mrc").write_bytes(bytes(208) + b"MAP " + bytes(812))
+    monkeypatch.setitem(sys.modules, "mrcfile", None)
+    assert run("explain", tmp_path / "a.mrc") == 1
+    error = capsys.readouterr().err
+    assert 'pip install "mivol[lab]"' in error and error.count("\n") == 1

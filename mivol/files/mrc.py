@@ -1,0 +1,65 @@
+"""Volumes of electron microscopes (MRC2014), read by the package mrcfile.
+
+Conventions. Lengths are in angstrom. The position of the centre of the first voxel is the header's ``origin``; if that is 0, it
+is ``nxstart, nystart, nzstart`` times the voxel size. Without a voxel size in the header, voxels become unit cubes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mivol.files.source import check_file, refusal, refuse_dataset
+from mivol.files.volume import VolumeData, frame_from_steps, to_values
+
+#: Place of the word ``MAP`` in the header [byte].
+MAGIC_OFFSET = 208
+
+
+def is_mrc(head: bytes) -> bool:
+    """Whether the first bytes are the header of an MRC file."""
+    return head[MAGIC_OFFSET : MAGIC_OFFSET + 3] == b"MAP"
+
+
+def read_mrc(path: Path, dataset: str | None = None) -> VolumeData:
+    """Read a volume or a stack of images; the axes of the header (``mapc, mapr, maps``) become (Z, Y, X).
+
+    Raises:
+        MivolError: no mrcfile, a damaged file, several volumes, axes that are no permutation, or numbers that are not real.
+    """
+    refuse_dataset(path, dataset)
+    check_file(path)
+    try:
+        import mrcfile
+    except ImportError as error:
+        raise refusal(
+            path, "an MRC file but no mrcfile", "an installed mrcfile", 'install it: pip install "mivol[lab]"'
+        ) from error
+    try:
+        with mrcfile.open(path, mode="r") as file:
+            header, stored, voxel = file.header.copy(), file.data.copy(), file.voxel_size.copy()
+    except ValueError as error:
+        raise refusal(path, f"a damaged MRC file ({error})", "a whole MRC file", "copy or write it again") from error
+    if stored.ndim == 4:
+        raise refusal(path, f"{len(stored)} volumes", "one volume", "write one of them to a file of its own")
+    axes = [int(header[name]) for name in ("mapc", "mapr", "maps")]
+    if sorted(axes) != [1, 2, 3]:
+        raise refusal(path, f"the axes {axes}", "1, 2 and 3 in any order", "correct mapc, mapr and maps in the header")
+    grid = stored.transpose([2 - axes.index(axis) for axis in (3, 2, 1)]) if stored.ndim == 3 else stored
+    values = to_values(grid, path)
+    spacing = np.array([voxel[name] for name in "xyz"], np.float64)
+    has_spacing = bool(np.any(spacing))
+    spacing = spacing if has_spacing else np.ones(3)
+    origin = np.array([header.origin[name] for name in "xyz"], np.float64)
+    if not origin.any():
+        starts = [int(header[name]) for name in ("nxstart", "nystart", "nzstart")]
+        origin = spacing * [starts[axes.index(axis)] for axis in (1, 2, 3)]
+    meta = {
+        "path": str(path),
+        "format": "mrc",
+        "dtype": str(stored.dtype),
+        "space": None,
+        "unit": "A" if has_spacing else "voxel",
+    }
+    return VolumeData(values, frame_from_steps(values.shape[2::-1], np.diag(spacing), origin), meta)
