@@ -19,15 +19,21 @@ from mivol.transport.path.film import find_batch_views
 FOLLOWED = ("data", "value")
 """Names of the parameters of volumes and textures whose values a recording follows."""
 
-FOLLOWED_SENSORS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
-"""Sensors that can be recorded, with all their parameters."""
+FOLLOWED_SENSOR, RECORDED_FILM = "PerspectiveCamera", "HDRFilm"
+"""The sensor and the film that can be recorded. Mitsuba 3.9.1 shows Dr.Jit the arrays of no other camera but ``batch``."""
 
 RECORDED_BACK_ENDS = ("llvm",)
 """Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that other
 textures leave uninitialised, and aborts the process; nobody has tried recordings there."""
 
-UNRECORDED_PHASES = {"BlendPhaseFunction": "mivol_mixture", "TabulatedPhaseFunction": "mivol_tabulated"}
-"""Phase functions of Mitsuba whose arrays Dr.Jit 1.5 does not find, each with one that can be recorded."""
+HIDING = {
+    "BlendPhaseFunction": "; mivol_mixture can be recorded",
+    "TabulatedPhaseFunction": "; mivol_tabulated can be recorded",
+    "SGGXPhaseFunction": "",
+    "RawConstantTexture": "; the texture uniform can be recorded",
+}
+"""Plugins whose arrays Mitsuba 3.9.1 hides from Dr.Jit (their sources lack ``MI_TRAVERSE_CB``). A recording of them fails, or
+aborts the process while it fails."""
 
 
 @dataclass
@@ -90,18 +96,20 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     """
     if mi.variant().partition("_")[0] not in RECORDED_BACK_ENDS:
         return f"recordings have not been tried with {mi.variant()}"
+    if sensor.film().class_name() != RECORDED_FILM:
+        return f"the film is a {sensor.film().class_name()}"
     views = [sensor] if find_batch_views(sensor) is None else find_children(sensor).values()
-    strange = sorted({v.class_name() for v in views if isinstance(v, mi.Sensor)} - set(FOLLOWED_SENSORS))
+    strange = sorted({v.class_name() for v in views if isinstance(v, mi.Sensor)} - {FOLLOWED_SENSOR})
     if strange:
         return f"the sensor is a {strange[0]}"
     params = traverse(scene)
-    kinds = {type(node) for node in params.hierarchy if not _is_of_mivol(node)}
-    foreign = sorted(kind.__name__ for kind in kinds if kind.__module__.partition(".")[0] != "mitsuba")
+    nodes = [node for node in params.hierarchy if not _is_of_mivol(node)]
+    foreign = sorted({type(node).__name__ for node in nodes if type(node).__module__.partition(".")[0] != "mitsuba"})
     if foreign:
         return f"{foreign[0]} is a Python plugin, whose arrays may be hidden"
-    phases = {node.class_name() for node in params.hierarchy if isinstance(node, mi.PhaseFunction)}
-    if lost := sorted(phases & set(UNRECORDED_PHASES)):
-        return f"Dr.Jit cannot record a {lost[0]}; {UNRECORDED_PHASES[lost[0]]} can be recorded"
+    hiding = sorted({node.class_name() for node in nodes} & set(HIDING))
+    if hiding:
+        return f"Dr.Jit cannot record a {hiding[0]}{HIDING[hiding[0]]}"
     owners = ((key, params.properties[key][2], value) for key, value in list_values(params))
     lost = [key for key, owner, value in owners if _find_gradient(value) is not None and not _is_followed(owner, key)]
     return f"a recording does not follow the derivative by {lost[0]}" if lost else None
@@ -125,7 +133,7 @@ def _is_followed(owner: mi.Object, key: str) -> bool:
         return True
     if isinstance(owner, mi.Volume | mi.Texture):
         return key.rpartition(".")[2] in FOLLOWED
-    return isinstance(owner, mi.Sensor) and owner.class_name() in FOLLOWED_SENSORS
+    return isinstance(owner, mi.Sensor) and owner.class_name() == FOLLOWED_SENSOR
 
 
 def _is_of_mivol(node: mi.Object) -> bool:

@@ -253,12 +253,19 @@ def test_a_replay_launches_few_kernels() -> None:
 def test_what_cannot_be_recorded_is_named() -> None:
     scene = smoke_under("heterogeneous", phase={"type": "hg", "g": 0.4})
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    lens = mi.load_dict({"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0, "film": film})
+    assert find_hidden_arrays(scene, lens) == "the sensor is a ThinLensCamera"
     pencils = mi.load_dict(batch_of(pencil((0, -4, 0), (0, 1, 0))))
     assert find_hidden_arrays(scene, pencils) == "the sensor is a RadianceMeter"
+    microflakes = {"type": "sggx", "S": grid_volume("gridvolume", np.ones((1, 1, 1, 6), np.float32), PLACE)}
     lobes = {"type": "blendphase", "weight": 0.3, "a": {"type": "isotropic"}, "b": {"type": "hg"}}
-    blend = smoke_under(phase=lobes)
-    expected = "Dr.Jit cannot record a BlendPhaseFunction; mivol_mixture can be recorded"
-    assert find_hidden_arrays(blend, blend.sensors()[0]) == expected
+    for phase, sentence in (
+        (microflakes, "Dr.Jit cannot record a SGGXPhaseFunction"),
+        (lobes, "Dr.Jit cannot record a BlendPhaseFunction; mivol_mixture can be recorded"),
+    ):
+        hidden = smoke_under(phase=phase)
+        assert find_hidden_arrays(hidden, hidden.sensors()[0]) == sentence
     params = mi.traverse(scene)
     dr.enable_grad(params[INSIDE + "sigma_t.data"])
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None

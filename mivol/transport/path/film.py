@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
+from mivol.kernel_recording import is_recording
 from mivol.scene_graph import find_children
 from mivol.transport.traversal.random_numbers import SpreadSampler
 
@@ -148,8 +149,11 @@ def _camera_rays(samples: RenderSamples, base: mi.Sampler, index: int, per_pass:
 
 
 def find_batch_views(sensor: mi.Sensor) -> mi.SensorPtr | None:
-    """The sensors of a ``batch`` in their order, side by side on the film; None for another sensor."""
-    if sensor.class_name() != "BatchSensor":
+    """The sensors of a ``batch`` in their order, side by side on the film; None for another sensor.
+
+    None while ``dr.freeze`` records: arrays made then from numbers of the host are unknown to the recording.
+    """
+    if sensor.class_name() != "BatchSensor" or is_recording():
         return None
     views = [child for child in find_children(sensor).values() if isinstance(child, mi.Sensor)]
     # Mitsuba gives each view a film of its part. Views with the same name could not be told apart.
