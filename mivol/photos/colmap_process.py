@@ -13,8 +13,6 @@ import json
 import sys
 from pathlib import Path
 
-import pycolmap
-
 
 def say(**facts: object) -> None:
     """Print facts as a line of JSON."""
@@ -23,6 +21,8 @@ def say(**facts: object) -> None:
 
 def run(job: dict) -> None:
     """Find features, match them, and build the models."""
+    import pycolmap  # the extra ``poses``, in this process alone
+
     pycolmap.logging.minloglevel = 3
     database, images, device = Path(job["database"]), Path(job["images"]), pycolmap.Device.cpu
     reader, features = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
