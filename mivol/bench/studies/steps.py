@@ -1,7 +1,7 @@
 """How long does a step of an optimisation take beside its kernels, in a loop that a user writes?
 
-    mivol bench steps                                        # 3 minutes on 2 idle cores
-    mivol bench steps --quick                                # half a minute, two scenes, few steps
+    mivol bench steps                                        # half a minute on 2 idle cores
+    mivol bench steps --quick                                # ten seconds, two scenes, few steps
     mivol bench steps --scenes god_rays --sides 4 16 --spp 4
 
 A step sets a parameter, calls ``params.update()``, and renders an image; with a gradient it also calls ``dr.backward`` on a
