@@ -290,7 +290,7 @@ def choose_branches(needs: Needs, settings: Settings, segment: str) -> tuple[boo
         return False, []
     if needs.film_samples < MIN_BRANCHING[needs.variant.split("_")[0]]:
         why = "with few samples, tracing branches takes longer than they save"
-        return False, [Choice("derivatives", "whole paths, recorded", why)]
+        return False, [Choice("derivatives", "whole paths", why)]
     why = "colliding paths cause most noise of derivatives, and few camera rays may collide"
     return True, [Choice("derivatives", "paths branch where they first collide", why)]
 

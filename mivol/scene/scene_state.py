@@ -111,17 +111,17 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     if hiding:
         return f"Dr.Jit cannot record a {hiding[0]}{HIDING[hiding[0]]}"
     owners = ((key, params.properties[key][2], value) for key, value in list_values(params))
-    lost = [key for key, owner, value in owners if _find_gradient(value) is not None and not _is_followed(owner, key)]
+    lost = [key for key, owner, value in owners if find_gradient_array(value) is not None and not _is_followed(owner, key)]
     return f"a recording does not follow the derivative by {lost[0]}" if lost else None
 
 
 def find_differentiated(scene: mi.Scene) -> list[Any]:
     """The arrays, and the matrices of transforms, with gradients enabled among the parameters of a scene."""
-    found = (_find_gradient(value) for _, value in list_values(traverse(scene)))
+    found = (find_gradient_array(value) for _, value in list_values(traverse(scene)))
     return [array for array in found if array is not None]
 
 
-def _find_gradient(value: Any) -> Any | None:
+def find_gradient_array(value: Any) -> Any | None:
     """The array of a parameter, or the matrix of a transform, if its gradients are enabled."""
     array = value if dr.is_array_v(value) else getattr(value, "matrix", None)
     return array if array is not None and dr.is_diff_v(array) and dr.grad_enabled(array) else None

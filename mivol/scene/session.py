@@ -35,7 +35,7 @@ from mivol.scene.render_tasks import (
     render_tangent,
     zero_radiance,
 )
-from mivol.scene.scene_state import SceneState, find_differentiated
+from mivol.scene.scene_state import SceneState, find_differentiated, find_gradient_array
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.scene_graph import list_values, traverse
@@ -282,8 +282,8 @@ def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
     parameters = []
     for owner in {o.ptr: o for o in owners if o is not None}.values():
         params = traverse(owner)
-        followed = [(k, v) for k, v in list_values(params) if _is_differentiated(v) and not _is_computed(params, k)]
-        parameters += [_DifferentiatedParameter(params, k, type(v)(v)) for k, v in followed]
+        followed = [(k, v) for k, v in list_values(params) if find_gradient_array(v) is not None]
+        parameters += [_DifferentiatedParameter(params, k, type(v)(v)) for k, v in followed if not _is_computed(params, k)]
     return parameters
 
 
@@ -294,12 +294,6 @@ def _find_derived_owners(medium: mi.Medium) -> list[mi.Object]:
     stands = [n for n, v in volumes.items() if n.startswith("sigma_") or hasattr(v, "mivol_extinction")]
     read = [n for n in stands if f"{n}.table" not in known]
     return [medium.phase_function(), *(v for n, v in volumes.items() if n not in read)]
-
-
-def _is_differentiated(value: Any) -> bool:
-    """Whether an array or a transform has gradients enabled."""
-    array = value if dr.is_array_v(value) else getattr(value, "matrix", None)
-    return array is not None and dr.is_diff_v(array) and dr.grad_enabled(array)
 
 
 def _is_computed(params: mi.SceneParameters, key: str) -> bool:
