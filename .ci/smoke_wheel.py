@@ -254,6 +254,12 @@ def smoke_convert(folder: Path) -> None:
     check("4 Gaussians" in mivol("explain", "gaussians.ply"), "four points are not four Gaussians")
 
 
+def smoke_poses(folder: Path) -> None:
+    """The wheel alone has no pycolmap: the extra that brings it is named."""
+    refused = mivol("poses", "photographs", code=1)
+    check('pip install "mivol[poses]"' in refused, f"the extra that poses need is not named:\n{refused}")
+
+
 def smoke_report(folder: Path) -> None:
     """The same page again."""
     page = folder / "photos" / "report.html"
@@ -264,8 +270,8 @@ def smoke_report(folder: Path) -> None:
 
 
 SMOKES: tuple[Callable[[Path], None], ...] = (
-    smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_export, smoke_convert, smoke_report,
-    smoke_demo, smoke_fetch, smoke_validate, smoke_bench,
+    smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_export, smoke_convert, smoke_poses,
+    smoke_report, smoke_demo, smoke_fetch, smoke_validate, smoke_bench,
 )  # fmt: skip
 """In the order in which each finds what it needs."""
 
