@@ -257,10 +257,10 @@ def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges
     return _read_once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values))
 
 
-def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
+def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, finds_occupied: bool) -> CoarseGrid:
     """Coarsen a grid, once for each state of the array and each placement."""
-    kind = ("coarse", shift, lists, lattice.empty_distances is None, lattice.to_world.tobytes())
-    return _read_once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
+    kind = ("coarse", shift, finds_occupied, lattice.empty_distances is None, lattice.to_world.tobytes())
+    return _read_once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, finds_occupied))
 
 
 def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:

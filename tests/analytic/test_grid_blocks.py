@@ -127,10 +127,10 @@ def test_coarse_grids_skip_what_is_empty_where_the_fine_one_does(skip):
 
 
 @pytest.mark.parametrize("shift", [0, 1, 2, 3])
-def test_blocks_that_hold_anything_are_listed(shift):
-    """The list holds every block with a non-zero node, and no block further than a block from such a node."""
+def test_blocks_that_hold_anything_are_found(shift):
+    """Every block with a non-zero node, and no block further than a block from such a node."""
     values, edge = sparse(1)[..., 0], 1 << shift
-    held = np.array(coarsen_grid(make_lattice(mi.TensorXf(values[..., None]), TWO), shift, True).occupied_blocks)
+    found = np.array(coarsen_grid(make_lattice(mi.TensorXf(values[..., None]), TWO), shift, True).is_occupied)
     blocks = [(n >> shift) + 1 for n in SIZE]
     nodes = [np.clip(np.arange(b * edge + 1)[None] - 1, 0, n - 1)[0] for b, n in zip(blocks, SIZE, strict=True)]
     padded = values[np.ix_(*nodes)] > 0
@@ -138,8 +138,7 @@ def test_blocks_that_hold_anything_are_listed(shift):
     for at in np.ndindex(*blocks):
         own[at] = padded[tuple(slice(b * edge, (b + 1) * edge + 1) for b in at)].any()
         wide[at] = padded[tuple(slice(max(b * edge - edge, 0), (b + 2) * edge + 1) for b in at)].any()
-    listed = np.zeros(blocks, bool)
-    listed.ravel()[held] = True
-    assert np.all(listed[own])
-    assert not np.any(listed[~wide])
+    found = found.reshape(blocks)
+    assert np.all(found[own])
+    assert not np.any(found[~wide])
     assert 0 < own.sum() < own.size

@@ -163,6 +163,25 @@ def batch_of(*views: dict) -> dict:
     return {"type": "batch", "film": film, "sampler": {"type": "independent"}, **{f"eye{k}": v for k, v in enumerate(views)}}
 
 
+def test_a_cache_of_shadows_is_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dr.Jit records no list of unknown length: with two threads it would trace every call again."""
+    values = np.zeros((8, 8, 8, 1), np.float32)
+    values[:4] = 3.0
+    smoke = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8)
+    pair = Pair(close_up({"smoke": box_of(smoke, PLACE), "sun": sun([0.3, 0.2, -1.0])[0]}, res=24), 2)
+    set_thread_count(2)
+    made, build = [], plan.build_visibility_cache
+    monkeypatch.setattr(plan, "build_visibility_cache", lambda *given: made.append(build(*given)) or made[-1])
+    for call in range(4):
+        pair.scale(INSIDE + "sigma_t.data", 0.9)
+        found, truth = pair.images(call)
+        # Sums of two samples for a pixel, by kernels that may round in another order.
+        np.testing.assert_allclose(found, truth, rtol=8 * 2.0**-24, atol=0)
+    assert made[-1] is not None
+    # Four calls of the traced integrator, and the first two of the other.
+    assert len(made) == 4 + 2
+
+
 def test_views_of_a_batch_are_seen_side_by_side() -> None:
     """With the rays that Mitsuba's ``batch`` makes, to the last bit."""
     eyes = [camera((4 * np.sin(a), -4 * np.cos(a), 1.0), (0.0, 0.0, 0.0), res=6, fov=35.0) for a in (0.0, 1.0, 2.0)]

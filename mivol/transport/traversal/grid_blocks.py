@@ -247,20 +247,20 @@ class CoarseGrid:
     Attributes:
         lattice: voxel i holds the mean of the voxels 2^shift i to 2^shift (i + 1) - 1 along each axis; the last voxel repeats
             the border of the grid.
-        occupied_blocks: flat indices (z, y, x) of the non-empty blocks, for a visibility cache; None without a list.
+        is_occupied: whether each block (z, y, x) is non-empty, for a visibility cache; None if it was not asked for.
     """
 
     lattice: Lattice
-    occupied_blocks: mi.UInt32 | None
+    is_occupied: mi.Bool | None
 
 
-def coarsen_grid(lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
+def coarsen_grid(lattice: Lattice, shift: int, finds_occupied: bool) -> CoarseGrid:
     """Average a grid over blocks of 2^shift voxels along each axis.
 
     Args:
         lattice: the grid.
         shift: log2 of the edge of a block [voxels].
-        lists: whether to list the non-empty blocks.
+        finds_occupied: whether to find the non-empty blocks.
 
     Cost: 8/7 look-ups a voxel, 8 a block.
     """
@@ -272,8 +272,8 @@ def coarsen_grid(lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
         shape[axis] = -(-shape[axis] // edge)
     values = mi.TensorXf(flat, (*shape, c))
     empty_distances = find_empty_distances(values) if lattice.empty_distances is not None else None
-    occupied_blocks = _list_occupied(values, lattice.res, shift) if lists else None
-    return CoarseGrid(place_blocks(lattice, values, shift, empty_distances), occupied_blocks)
+    is_occupied = _find_occupied(values, lattice.res, shift) if finds_occupied else None
+    return CoarseGrid(place_blocks(lattice, values, shift, empty_distances), is_occupied)
 
 
 def place_blocks(lattice: Lattice, means: mi.TensorXf, shift: int, empty_distances: mi.UInt8 | None = None) -> Lattice:
@@ -295,8 +295,8 @@ def _mean_along(flat: mi.Float, n: int, inner: int, edge: int) -> mi.Float:
     return total
 
 
-def _list_occupied(means: mi.TensorXf, res: tuple[int, int, int], shift: int) -> mi.UInt32:
-    """List the blocks of cells with a node above 0.
+def _find_occupied(means: mi.TensorXf, res: tuple[int, int, int], shift: int) -> mi.Bool:
+    """Find the blocks of cells with a node above 0.
 
     A block of cells lies across two mean voxels along each axis (a single voxel at the border), so a block with 8 zero means is
     empty.
@@ -311,4 +311,4 @@ def _list_occupied(means: mi.TensorXf, res: tuple[int, int, int], shift: int) ->
         node = mi.UInt32((z * means.shape[1] + y) * means.shape[2] + x) * c
         for channel in range(c):
             is_occupied |= dr.gather(mi.Float, means.array, node + channel) > 0
-    return dr.compress(is_occupied)
+    return is_occupied

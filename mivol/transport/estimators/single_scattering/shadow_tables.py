@@ -40,16 +40,16 @@ __all__ = [
 ]
 
 
-def optical_depth_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitter) -> list[mi.Float]:
+def optical_depth_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitter, active: mi.Bool) -> list[mi.Float]:
     """Optical depth from points in a medium to an emitter with a single position or direction, for each channel [1].
 
-    It is at most ``NEGLIGIBLE_TAU``, its value behind an opaque surface.
+    It is at most ``NEGLIGIBLE_TAU``, its value behind an opaque surface. Inactive lanes have no meaning.
     """
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p = p
     medium = dr.select(dr.full(mi.Bool, True, dr.width(p)), mi.MediumPtr(body.view.medium), None)
-    direct, _ = emitter.sample_direction(it, mi.Point2f(0.5), mi.Bool(True))
-    _, clear, tau, _ = trace_shadow_ray(media, p, medium, direct, mi.Bool(True))
+    direct, _ = emitter.sample_direction(it, mi.Point2f(0.5), active)
+    _, clear, tau, _ = trace_shadow_ray(media, p, medium, direct, active)
     return [dr.select(clear, dr.minimum(t, NEGLIGIBLE_TAU), NEGLIGIBLE_TAU) for t in tau]
 
 
@@ -122,23 +122,22 @@ def build_visibility_cache(
         return None
     (lattice,), (body,) = grids, media.bodies
     # A medium with a constant beside its grid has no empty blocks.
-    lists = occupied is not None and len(body.view.parts) == 1
-    rays_of_block = (occupied if lists else 1) * len(delta)
+    skips_empty = occupied is not None and len(body.view.parts) == 1
+    rays_of_block = (occupied if skips_empty else 1) * len(delta)
     fits = [shift for shift in range(MAX_SHIFT + 1) if _count_blocks(lattice, shift) * rays_of_block <= RAY_FRACTION * rays]
     if not fits:
         return None
     shift = fits[0]
     blocks = tuple((n >> shift) + 1 for n in lattice.res)
     n, k = blocks[0] * blocks[1] * blocks[2], len(emitters.sampled)
-    coarse = take(lattice, shift, lists)
-    index = coarse.occupied_blocks if lists else dr.arange(mi.UInt32, n)
+    coarse = take(lattice, shift, skips_empty)
+    block, active = dr.arange(mi.UInt32, n), coarse.is_occupied if skips_empty else dr.full(mi.Bool, True, n)
     weights = dr.full(mi.Float, 1, n * k)
-    if dr.width(index):
-        far = _replace_grid(media, coarse.lattice)
-        p = _block_centres(lattice, blocks, shift, index)
-        for number in delta:
-            tau = optical_depth_towards(far, far.bodies[0], p, emitters.sampled[number])
-            dr.scatter(weights, dr.exp(-sum(tau) / len(tau)) + MIN_WEIGHT, index * k + number)
+    far = _replace_grid(media, coarse.lattice)
+    p = _block_centres(lattice, blocks, shift, block)
+    for number in delta:
+        tau = optical_depth_towards(far, far.bodies[0], p, emitters.sampled[number], active)
+        dr.scatter(weights, dr.exp(-sum(tau) / len(tau)) + MIN_WEIGHT, block * k + number, active)
     dr.eval(weights)
     return VisibilityCache(weights, blocks, shift, k)
 
@@ -236,7 +235,7 @@ def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: 
     count, k = len(emitters.sampled), media.channels
     tau = dr.zeros(mi.Float, z * y * x * count * k)
     for number, emitter in enumerate(emitters.sampled):
-        for c, row in enumerate(optical_depth_towards(media, body, p, emitter)):
+        for c, row in enumerate(optical_depth_towards(media, body, p, emitter, mi.Bool(True))):
             dr.scatter(tau, row, (index * count + number) * k + c)
     dr.eval(tau)
     return TransmittanceGrid(tau, nodes, lattice, count, k)
@@ -258,7 +257,7 @@ def measure_transmittance_bias(
     weight = body.extinction_at(ray, mi.Float(0), 1, mi.Bool(True))[0]
     total, first, second = dr.sum(weight), mi.Float(0), mi.Float(0)
     for number, emitter in enumerate(emitters.sampled):
-        exact = optical_depth_towards(media, body, p, emitter)
+        exact = optical_depth_towards(media, body, p, emitter, mi.Bool(True))
         off = grid.transmittance(p, number, mi.Bool(True))[0] - dr.exp(-exact[0])
         first += dr.sum(weight * off)
         second += dr.sum(weight * off * off)
