@@ -19,7 +19,7 @@ from mivol.scene.depth_two import depth_two_error, mean_albedo, scattering_depth
 from mivol.scene.needs import MediumFacts, Needs, find_needs, mean_cosine
 from mivol.scene.nesting import shape_bounds
 from mivol.scene.plan import Plan, build_media, make_plan
-from mivol.scene.previews import find_sufficient_depth, measure_media_light, measure_near_light
+from mivol.scene.previews import find_sufficient_depth, measure_lamp_noise, measure_media_light, measure_near_light
 from mivol.scene.render_tasks import find_unrecorded
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
@@ -86,6 +86,7 @@ def explain_scene(
         make_plan(needs, settings)
         needs = measure_media_light(scene, eye, needs, survey, settings)
         needs = measure_near_light(scene, eye, needs, survey, settings)
+        needs = measure_lamp_noise(scene, eye, needs, survey, settings)
         return Explanation((*facts, *_describe_plan(scene, eye, needs, settings, noise)))
     except MivolError as error:
         return Explanation(facts, str(error))

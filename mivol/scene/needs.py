@@ -76,6 +76,8 @@ def find_needs(
         parameters=differentiated,
         places=tuple(k for k in differentiated if _is_placement(k, params.properties[k][2])),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
+        spp=spp or sensor.sampler().sample_count(),
+        is_colour_film=not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
         emitter_distances=_find_emitter_distances(
             scene, [b for b, m in zip(boundaries, media, strict=True) if m.is_scattering]
@@ -283,11 +285,15 @@ class Needs(ShapeFacts):
         parameters: keys of the parameters with gradients enabled.
         places: keys among ``parameters`` that place shapes and sensors.
         film_samples: pixels times samples per pixel of the sensor.
+        spp: samples per pixel.
+        is_colour_film: whether the film stores colours, and not quantities of its own.
         are_samples_independent: whether the sensor has Mitsuba's independent sampler, whose numbers others may replace.
         emitter_distances: distance of each emitter to the nearest medium that scatters, over the longest edge of the box around
             the medium [1]; 0 for an emitter inside, or for a medium without a known end; infinite for an emitter at infinity.
         near_gain: measured gain of drawing the light of near emitters along segments [1] (:mod:`mivol.scene.previews`); None
             before a measurement.
+        lamp_noise: measured variances, for one sample of a pixel, of the light of lamps seen directly and of all other light;
+            None before a measurement.
         media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
     """
 
@@ -300,15 +306,23 @@ class Needs(ShapeFacts):
     parameters: tuple[str, ...]
     places: tuple[str, ...]
     film_samples: int
+    spp: int
+    is_colour_film: bool = True
     are_samples_independent: bool = True
     emitter_distances: tuple[float, ...] = ()
     near_gain: float | None = None
+    lamp_noise: tuple[float, float] | None = None
     media_light: MediaLight | None = None
 
     @property
     def nearness(self) -> float:
         """The smallest of ``emitter_distances`` [1]; infinite without emitters."""
         return min(self.emitter_distances, default=math.inf)
+
+    @property
+    def has_lamps(self) -> bool:
+        """Whether a shape emits light."""
+        return "AreaLight" in self.emitters
 
     def with_views(self, survey: SceneSurvey) -> Needs:
         """The same facts with the media viewed anew: a recording reads their arrays from the scene."""

@@ -21,6 +21,7 @@ from mivol.scene.choices import (
     choose_channels,
     choose_emission,
     choose_flights,
+    choose_lamp_rays,
     choose_lighting,
     choose_media_light,
     choose_near_light,
@@ -111,6 +112,7 @@ class Plan:
         near_emitters: numbers of the emitters inside of media.
         are_thick: whether collisions alone find the derivatives of each medium's extinction.
         have_low_albedo: whether some albedo of each medium may be too low for derivatives to be found at collisions.
+        lamp_rays: own camera rays a sample for the light of lamps seen directly, in images; 0 for none.
         occupied: share of occupied blocks of the first medium's grid, in steps of ``OCCUPIED_STEP`` [1]; None if unknown.
     """
 
@@ -131,6 +133,7 @@ class Plan:
     are_thick: tuple[bool, ...] = ()
     have_low_albedo: tuple[bool, ...] = ()
     occupied: float | None = None
+    lamp_rays: int = 0
 
     @property
     def decisions(self) -> tuple:
@@ -188,6 +191,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     near, near_in_derivatives, why = choose_near_light(needs, settings, segment)
     choices += why
+    lamp_rays, why = choose_lamp_rays(needs, settings)
+    choices += why
     return Plan(
         tuple(choices),
         skips,
@@ -206,6 +211,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         tuple(m.tau_min >= THICK for m in needs.media),
         tuple(m.albedo_min < MIN_ALBEDO for m in needs.media),
         _round_occupied(needs),
+        lamp_rays,
     )
 
 

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.kernel_recording import is_recording, without_garbage_collection
-from mivol.scene.choices import is_near_light_open
+from mivol.scene.choices import is_lamp_noise_open, is_near_light_open
 from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import Needs, find_needs
 from mivol.scene.plan import Plan, build_estimators, choose_segment, make_plan
@@ -291,6 +291,48 @@ def measure_near_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey:
     return replace(needs, near_gain=survey.near_gain)
 
 
+LAMP_SIDE, LAMP_SAMPLES = 32, 16
+"""Pixels along an edge of the preview of lamps, and samples per pixel."""
+
+
+def measure_lamp_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
+    """Measure the variances in a pixel of the light of lamps that the camera sees directly, and of all other light.
+
+    Arguments as for :func:`measure_media_light`; ``survey`` keeps the variances of each sensor.
+
+    Returns:
+        The needs with the variances for one sample, mean over pixels and colours.
+
+    Cost: 16384 camera rays once; if edges of lamps are seen, 16384 paths and another kernel.
+    """
+    if not is_lamp_noise_open(needs, settings) or is_recording():
+        return needs
+    if sensor.ptr not in survey.lamp_noise:
+        with without_garbage_collection(), dr.suspend_grad():
+            estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
+            edge = _measure_pixel_variance(sensor, estimators.of_lamps())
+            rest = _measure_pixel_variance(sensor, estimators.without_lamps()) if edge > 0 else 0.0
+        survey.lamp_noise[sensor.ptr] = (edge, rest)
+    return replace(needs, lamp_noise=survey.lamp_noise[sensor.ptr])
+
+
+def _measure_pixel_variance(sensor: mi.Sensor, estimators: Estimators) -> float:
+    """Variance of one sample in a pixel, mean over pixels spread over the film."""
+    width, height = (int(n) for n in sensor.film().crop_size())
+    columns, rows = min(width, LAMP_SIDE), min(height, LAMP_SIDE)
+    n = columns * rows * LAMP_SAMPLES
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(CELL_SEED, n)
+    chosen = dr.arange(mi.UInt32, n) // LAMP_SAMPLES
+    # The middle pixel of each cell.
+    pixel = mi.Vector2u(
+        (2 * (chosen % columns) + 1) * width // (2 * columns), (2 * (chosen // columns) + 1) * height // (2 * rows)
+    )
+    place = (mi.Point2f(pixel) + sampler.next_2d()) / mi.ScalarVector2f(width, height)
+    L = _walk_from(sensor, estimators, sampler, place)
+    return float(L.reshape(columns * rows, LAMP_SAMPLES).var(axis=1, ddof=1).mean())
+
+
 def sampling_gain(met: NDArray, drawn: NDArray) -> float:
     """Gain in time to an error of sampling over chance [1], from samples (cells, n) of both; 0 for black cells."""
     n = met.shape[1]
@@ -315,6 +357,11 @@ def _walk_cells(sensor: mi.Sensor, estimators: Estimators, side: int, samples: i
     sampler.seed(CELL_SEED, n)
     cell = dr.arange(mi.UInt32, n) // samples
     place = (mi.Point2f(cell % side, cell // side) + 0.5) / side
+    return _walk_from(sensor, estimators, sampler, place).reshape(cells, samples)
+
+
+def _walk_from(sensor: mi.Sensor, estimators: Estimators, sampler: mi.Sampler, place: mi.Point2f) -> NDArray:
+    """Mean radiance over all colours of a path from each place on the film."""
     ray, weight = sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))
-    score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
-    return np.array(score.L * weight, np.float64).reshape(-1, n).mean(axis=0).reshape(cells, samples)
+    score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, dr.width(ray))))
+    return np.array(score.L * weight, np.float64).reshape(-1, dr.width(ray)).mean(axis=0)

@@ -22,7 +22,7 @@ from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.path.derivatives import prepare_derivatives, replay_branches
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, count_passes, render_on_film
+from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
 from mivol.transport.path.successive import paths_per_lane, walk_successively
 from mivol.transport.path.walk import has_one_segment, walk_path
 
@@ -119,9 +119,15 @@ class ImageTask(RenderTask):
         super().__init__(*given, for_images=True)
 
     def __call__(self, scene: mi.Scene, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> mi.TensorXf:
-        estimators = self.build_estimators(scene, arrays)
+        estimators, own = self.build_estimators(scene, arrays), None
+        if self.plan.lamp_rays:
+            lamps, estimators = estimators.of_lamps(), estimators.without_lamps()
+            own = LightOfOwnRays(self.plan.lamp_rays, lambda rays: _walk_paths(lamps, rays)[0])
         return render_on_film(
-            self.samples(sensor, arrays, seed), self.aovs, lambda rays: _render_primal(estimators, rays, self.plan, self.aovs)
+            self.samples(sensor, arrays, seed),
+            self.aovs,
+            lambda rays: _render_primal(estimators, rays, self.plan, self.aovs),
+            own,
         )
 
 
@@ -156,10 +162,14 @@ def _render_primal(estimators: Estimators, rays: CameraRays, plan: Plan, aovs: l
     if count > 1:
         L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
     else:
-        score = Primal(zero_radiance(rays.ray))
-        score, alpha = walk_path(estimators, rays.sampler, rays.ray, score)
-        L = score.L
+        L, alpha = _walk_paths(estimators, rays)
     return L, alpha, integrate_aovs(estimators.media, rays.ray, aovs)
+
+
+def _walk_paths(estimators: Estimators, rays: CameraRays) -> tuple[mi.Spectrum, mi.Float]:
+    """Radiance and alpha of one path for each ray."""
+    score, alpha = walk_path(estimators, rays.sampler, rays.ray, Primal(zero_radiance(rays.ray)))
+    return score.L, alpha
 
 
 def render_tangent(estimators: Estimators, rays: CameraRays, aovs: list[str]) -> tuple:

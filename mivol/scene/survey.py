@@ -67,6 +67,7 @@ class SceneSurvey:
         gain_of_draws: measured gain of sampling the light of media [1] (:mod:`mivol.scene.previews`); None before a
             measurement.
         near_gain: measured gain of drawing the light of near emitters along segments [1]; None before a measurement.
+        lamp_noise: measured variances of the light of lamps seen directly, and of all other light, by sensor.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -84,6 +85,7 @@ class SceneSurvey:
     media_light: tuple | None = None
     gain_of_draws: float | None = None
     near_gain: float | None = None
+    lamp_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def is_current(self) -> bool:

@@ -237,6 +237,7 @@ class Estimators:
         long_paths_count: long paths carry as much light as short ones (an even environment) or more (emitting media); roulette
             then spares them.
         near: estimator of the light of near emitters along segments of paths in media; None if vertices draw this light.
+        shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
         media: media of the scene.
         draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
     """
@@ -250,6 +251,7 @@ class Estimators:
     emission: EmissionSampling | None = None
     long_paths_count: bool = False
     near: NearLighting | None = None
+    shows: str = "all"
     media: SceneMedia = field(init=False)
     draws_shadows: bool = field(init=False)
 
@@ -261,6 +263,21 @@ class Estimators:
     def lights_media_at_vertices(self) -> bool:
         """Whether emitter samples light the collisions in media: not if segments draw the light of all sampled emitters."""
         return self.lights_media and (self.near is None or self.near.lights_vertices)
+
+    def is_shown(self, si: mi.SurfaceInteraction3f) -> mi.Bool | bool:
+        """Whether the camera sees the emitter at the end of its ray."""
+        if self.settings.hide_emitters or self.shows == "all":
+            return not self.settings.hide_emitters
+        return si.is_valid() if self.shows == "lamps" else ~si.is_valid()
+
+    def of_lamps(self) -> Estimators:
+        """The estimators of the light of lamps that reaches the camera without scattering."""
+        settings = replace(self.settings, max_depth=1)
+        return Estimators(self.direct, Absorption(self.media), settings, lights_surfaces=False, shows="lamps")
+
+    def without_lamps(self) -> Estimators:
+        """The estimators of all other light."""
+        return replace(self, shows="rest")
 
     def replayed(self) -> Estimators:
         """The estimators of the radiance that a replay subtracts from, without light sampled anew for its derivatives."""

@@ -13,7 +13,7 @@ draw their own numbers, stratified over all passes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +23,7 @@ from mivol.kernel_recording import is_recording
 from mivol.scene_graph import find_children
 from mivol.transport.traversal.random_numbers import SpreadSampler
 
-__all__ = ["CameraRays", "RenderSamples", "adjoint_rays", "film_passes", "render_on_film"]
+__all__ = ["CameraRays", "LightOfOwnRays", "RenderSamples", "adjoint_rays", "film_passes", "render_on_film"]
 
 
 @dataclass
@@ -68,6 +68,22 @@ class CameraRays:
 
 RadianceFunction = Callable[[CameraRays], tuple]
 """``sample(rays) -> (radiance, alpha, AOVs)``, with the alpha for the film in [0, 1], without derivatives."""
+
+OWN_SEED = 0x6C616D70
+"""Makes the random numbers of rays of their own independent of the other rays."""
+
+
+@dataclass
+class LightOfOwnRays:
+    """Light that has more camera rays than the rest of an image.
+
+    Attributes:
+        per_sample: rays for each sample of the image.
+        sample: radiance along camera rays.
+    """
+
+    per_sample: int
+    sample: Callable[[CameraRays], mi.Spectrum]
 
 
 def film_passes(samples: RenderSamples) -> Iterator[CameraRays]:
@@ -181,27 +197,67 @@ def _sample_rays(samples: RenderSamples, time: mi.Float, on_film: mi.Point2f, ap
     return sensor.sample_ray_differential(time, wavelength, on_film, aperture)
 
 
-def render_on_film(samples: RenderSamples, names: list[str], sample: RadianceFunction) -> mi.TensorXf:
+def render_on_film(
+    samples: RenderSamples, names: list[str], sample: RadianceFunction, own: LightOfOwnRays | None = None
+) -> mi.TensorXf:
     """Render an image: sample the rays pass by pass, and average them on the sensor's film.
 
     Args:
         samples: samples of the render.
         names: names of the AOVs, in the order returned by ``sample``.
         sample: :data:`RadianceFunction`.
+        own: light to be added, with rays of its own; None for none. Not for films that store other channels than colours.
 
     Returns:
         Image (height, width, colours + AOVs).
     """
     film = samples.sensor.film()
+    light = None if own is None else _average_light(samples, own)
     film.prepare(names)
     for rays in film_passes(samples):
         L, alpha, aovs = sample(rays)
         block = _new_block(film, rays)
         _add_samples(block, film, rays, _FilmSample(L * rays.weight, mi.Float(1), alpha, aovs))
+        if light is not None:
+            block = _add_light(block, film, light)
         film.put_block(block)
         dr.eval(block.tensor())
         del L, alpha, aovs, rays, block
     return film.develop()
+
+
+def _average_light(samples: RenderSamples, own: LightOfOwnRays) -> mi.Float:
+    """The light of rays of their own in each pixel of a block (3 channels): the mean over their filter weights."""
+    spp = (samples.spp or samples.sensor.sampler().sample_count()) * own.per_sample
+    film, total = samples.sensor.film(), None
+    channels = film.prepare([])
+    for rays in film_passes(replace(samples, spp=spp, seed=samples.seed ^ OWN_SEED)):
+        block = _new_block(film, rays)
+        light = own.sample(rays) * rays.weight
+        _add_samples(block, film, rays, _FilmSample(light, mi.Float(1), mi.Float(1), []))
+        total = block.tensor().array if total is None else total + block.tensor().array
+        dr.eval(total)
+    colour = dr.arange(mi.UInt32, dr.width(total) // channels * 3)
+    pixel = colour // 3
+    weight = dr.gather(mi.Float, total, pixel * channels + _weight_channel(film))
+    return dr.select(weight != 0, dr.gather(mi.Float, total, pixel * channels + colour % 3) / weight, 0)
+
+
+def _add_light(block: mi.ImageBlock, film: mi.Film, light: mi.Float) -> mi.ImageBlock:
+    """A block with light added to its colours, times the filter weights of the block."""
+    tensor, channels = block.tensor(), block.channel_count()
+    i = dr.arange(mi.UInt32, dr.width(tensor.array))
+    pixel, channel = i // channels, i % channels
+    weight = dr.gather(mi.Float, tensor.array, pixel * channels + _weight_channel(film))
+    is_colour = channel < 3
+    added = dr.gather(mi.Float, light, pixel * 3 + channel, is_colour)
+    summed = mi.TensorXf(tensor.array + dr.select(is_colour, weight * added, 0), tensor.shape)
+    return mi.ImageBlock(summed, block.offset(), block.rfilter(), block.has_border())
+
+
+def _weight_channel(film: mi.Film) -> int:
+    """Number of the channel with the filter weights in a block of :func:`_add_samples`."""
+    return 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
 
 
 def adjoint_rays(

@@ -328,7 +328,7 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
 def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     """Add the emission of the surface or environment hit by the path, weighted against emitter samples."""
     scene, si = estimators.media.scene, event.si
-    visible = path.active & ~event.in_medium & ~((path.depth == 0) & estimators.settings.hide_emitters)
+    visible = path.active & ~event.in_medium & ((path.depth > 0) | estimators.is_shown(si))
     emitter = si.emitter(scene, visible)
     w_mis = mi.Float(1)
     if estimators.lights_surfaces or estimators.lights_media:

@@ -1,0 +1,145 @@
+"""Lamps that the camera sees directly have camera rays of their own where their edges are noisy."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import PLACE, assert_same_images, mivol, volpath
+
+from mivol.experiments.script import explain
+from mivol.scene import choices, plan
+from scenes import box_of, camera, medium, render, sky
+
+RADIANCE = 8.0
+
+
+def lamp(width: float, z: float = 1.5) -> dict:
+    """A square above the fog that shines down, and to the camera above its lower edge."""
+    place = mi.ScalarTransform4f().translate([0.2, 1.5, z]).rotate([1, 0, 0], 80).scale([width, width, 1])
+    light = {"type": "area", "radiance": {"type": "uniform", "value": RADIANCE}}
+    return {"type": "rectangle", "to_world": place, "emitter": light, "bsdf": {"type": "diffuse", "reflectance": 0.0}}
+
+
+def room(width: float = 0.5, res: int = 12, spp: int = 16, **film: object) -> mi.Scene:
+    """Fog before a grey wall, and a lamp that is seen over and through the fog."""
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(4)}
+    sensor = camera([0, -5, 0.5], [0, 0, 0.3], res, fov=45)
+    sensor["film"] |= film
+    sensor["sampler"]["sample_count"] = spp
+    fog = box_of(medium("homogeneous", 0.5, 0.8), PLACE)
+    return mi.load_dict({"type": "scene", "fog": fog, "lamp": lamp(width), "wall": wall, "sensor": sensor})
+
+
+@pytest.fixture
+def own_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four rays for each path, whatever a preview says."""
+    monkeypatch.setattr(plan, "choose_lamp_rays", lambda *_: (4, []))
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    "film",
+    [
+        {},
+        pytest.param({"rfilter": {"type": "gaussian"}, "pixel_format": "rgba"}, marks=pytest.mark.slow),
+        {"rfilter": {"type": "tent"}, "sample_border": True, "crop_offset_x": 2, "crop_width": 9, "crop_height": 10},
+    ],
+    ids=["box", "gaussian", "crop"],
+)
+def test_means_are_those_of_volpath(own_rays: None, variant_rgb: str, film: dict) -> None:
+    scene = room(**film)
+    assert_same_images(scene, (32, 256), tile=3, ours=mivol(max_depth=4), stock=volpath(max_depth=4), precision=0.03)
+
+
+def test_an_even_lamp_has_its_radiance_with_any_filter(own_rays: None, variant_rgb: str) -> None:
+    """Rays of their own divide by their own filter weights: with those of the paths the image would be noisy."""
+    scene = room(width=40.0, rfilter={"type": "gaussian"})
+    scene_without_fog = mi.load_dict({"type": "scene", "lamp": lamp(40.0), "sensor": scene.sensors()[0]})
+    image = render(scene_without_fog, mivol(max_depth=3), spp=8)
+    # Sums of some 8 x 25 weights, in float32.
+    np.testing.assert_allclose(image, RADIANCE, rtol=200 * 2.0**-24)
+
+
+@pytest.mark.parametrize("spp", [6, 7])
+def test_passes_and_paths_add_up(own_rays: None, variant_rgb: str, monkeypatch: pytest.MonkeyPatch, spp: int) -> None:
+    """Several passes: of the paths, and of the rays of their own, which are four times as many."""
+    scene = room(spp=spp)
+    whole = render(scene, mivol(max_depth=3), spp)
+    monkeypatch.setattr(plan, "PASS_RAYS", dict.fromkeys(plan.PASS_RAYS, 3 * 12 * 12))
+    # The same numbers are summed in another order.
+    np.testing.assert_allclose(render(scene, mivol(max_depth=3), spp), whole, rtol=64 * 2.0**-24, atol=1e-6)
+
+
+def test_the_film_holds_what_is_returned(own_rays: None, variant_rgb: str) -> None:
+    """Scripts write the film after a render."""
+    scene = room()
+    image = render(scene, mivol(max_depth=3, aovs="depth"), spp=4)
+    assert image.shape[2] == 4
+    held = np.array(scene.sensors()[0].film().bitmap(raw=False))
+    np.testing.assert_array_equal(held[..., :3], image[..., :3])
+    assert held[..., :3].max() > 0.5 * RADIANCE
+
+
+# -- The choice -------------------------------------------------------------------------------------------------------------
+
+
+def lamp_lines(scene: mi.Scene, depth: int = 4) -> str:
+    return explain(scene, depth).partition("lamps in view")[2].partition("\n  images")[0]
+
+
+def test_a_bright_lamp_in_view_gets_rays_of_its_own(variant_rgb: str) -> None:
+    assert "camera rays of their own" in lamp_lines(room(res=48))
+
+
+def test_nothing_is_measured_without_a_reason(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One path is all there is at depth 1; small images are rendered sooner than a preview; a sampler of the user stays."""
+    assert not lamp_lines(room(res=48), depth=1)
+    assert not lamp_lines(room(res=8))
+    scene = room(res=48)
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": 16})
+    sensor = camera([0, -5, 0.5], [0, 0, 0.3], 48, fov=45) | {"sampler": sampler}
+    assert not lamp_lines(mi.load_dict({"type": "scene", "fog": scene.shapes()[0], "lamp": lamp(0.5), "sensor": sensor}))
+    assert not lamp_lines(mi.load_dict({"type": "scene", "fog": scene.shapes()[0], "sky": sky(), "sensor": sensor}))
+
+
+class Facts:
+    """Facts of a scene whose lamp was measured."""
+
+    has_lamps, media, are_samples_independent, is_colour_film, film_samples = True, (), True, True, 1 << 20
+
+    def __init__(self, edge: float, rest: float, spp: int) -> None:
+        self.lamp_noise, self.spp = (edge, rest), spp
+
+
+class Deep:
+    scatterings, hide_emitters = 3, False
+
+
+def test_the_number_of_rays_follows_noise_and_cost() -> None:
+    """With 64 samples an edge of variance 8 e has e beside the rest's 1: (e k^-3/2 + 1) (1 + k / 20) is least at the k below.
+
+    For e of 0.5, 1, 3 and 30 it is 1.28, 1.35, 1.59 and 2.64 at k of 4, 4, 8 and 16: gains of 1.18, 1.48, 2.5 and 12.
+    """
+    for edge, expected in ((0.0, 0), (0.5, 0), (1.0, 4), (3.0, 8), (30.0, 16)):
+        edge *= 8
+        assert choices.choose_lamp_rays(Facts(edge, 1.0, 64), Deep())[0] == expected
+
+
+def test_a_black_picture_has_no_rays_of_its_own() -> None:
+    assert choices.choose_lamp_rays(Facts(0.0, 0.0, 64), Deep())[0] == 0
+
+
+def test_derivatives_do_not_change(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gradient walks its own paths, with the lamp in them."""
+    key, found = "fog.interior_medium.sigma_t.value.value", []
+    for rays in (0, 4):
+        monkeypatch.setattr(plan, "choose_lamp_rays", lambda *_, rays=rays: (rays, []))
+        scene = room(res=6)
+        params = mi.traverse(scene)
+        dr.enable_grad(params[key])
+        image = mi.render(scene, params, integrator=mi.load_dict(mivol(max_depth=3)), spp=8, seed=1, seed_grad=2)
+        dr.backward(dr.mean(image, axis=None))
+        found.append(dr.grad(params[key])[0])
+    assert found[0] == found[1] != 0
