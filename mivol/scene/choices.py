@@ -53,7 +53,7 @@ over 4, point lights: smoke 1.1, CT 1.1 and 1.3."""
 
 LAMP_RAYS, LAMP_COST, MIN_LAMP_GAIN, MIN_LAMP_SAMPLES = (4, 8, 16), 0.05, 1.2, 1 << 15
 """Own camera rays a sample for lamps in view, the time of one over the time of a path (measured: 0.03 in a room of depth 10,
-0.07 to 0.14 beside glass), the smallest predicted gain, and the number of samples of an image below which nothing is measured."""
+0.07 to 0.14 beside glass), the smallest predicted gain, and the samples of an image below which nothing is measured."""
 
 MIN_SIDE_FLIGHT_COSINE = 0.5
 """Mean cosine of a phase function above which side flights pay. Below, samples of the phase function find the light. Measured
