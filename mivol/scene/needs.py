@@ -343,6 +343,7 @@ class Needs(ShapeFacts):
             start=self.start,
             locates_camera=self.camera_inside and self.start is None,
             size=size,
+            stops_rays=self.stops_rays,
         )
 
 

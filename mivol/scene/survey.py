@@ -35,6 +35,7 @@ class ShapeFacts:
         refractive: names of the boundaries that refract or blur transmitted light.
         is_sealed: whether every medium lies behind refracting boundaries without undeviated light, with all emitters outside
             and hittable by paths. Emitter sampling then finds no light from inside a medium.
+        stops_rays: whether every traced boundary of a medium stops or turns all rays, so that a segment stays in one medium.
     """
 
     surfaces: tuple[str, ...] = ()
@@ -44,6 +45,7 @@ class ShapeFacts:
     are_emitters_far: bool = False
     refractive: tuple[str, ...] = ()
     is_sealed: bool = False
+    stops_rays: bool = False
 
 
 @dataclass
@@ -138,6 +140,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
         are_emitters_far=_are_emitters_far(scene.emitters()),
         refractive=tuple(refractive),
         is_sealed=_are_sealed(boundaries, shapes, scene.emitters()),
+        stops_rays=not has_null and not any(_is_bare(edge) for edge in edges),
     )
     return SceneSurvey(tuple(boundaries), facts, marks, scene_diagonal(scene))
 

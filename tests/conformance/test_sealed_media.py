@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean, over_pixels
-from scattering_scenes import moments
+from scattering_scenes import PLACE, moments, rough_grid
 
 import scenes
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.walk import LONG_PATH
 
@@ -71,6 +73,43 @@ def test_media_around_shapes_are_not_sealed() -> None:
     milk = mi.load_dict({"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.9})
     bubble = ball(0.0, bsdf=GLASS, exterior=milk, interior={"type": "homogeneous", "sigma_t": 1.0})
     assert not survey_scene(mi.load_dict({"type": "scene", "bubble": bubble, "sky": scenes.sky()})).facts.is_sealed
+
+
+STOPPED = {**dict.fromkeys(SEALED, True), "thin glass": False, "glass with holes": False}
+"""Whether a segment stays in one medium. Boxes and balls are clipped: no other boundary counts."""
+
+
+@pytest.mark.parametrize("name", SEALED)
+def test_a_segment_stays_in_one_medium_behind_what_refracts(name: str) -> None:
+    assert survey_scene(mi.load_dict({"type": "scene", **SEALED[name][0]})).facts.stops_rays == STOPPED[name]
+
+
+def test_a_traced_boundary_without_glass_is_passed() -> None:
+    can = {"type": "cylinder", "bsdf": NONE, "interior": {"type": "homogeneous"}}
+    assert not survey_scene(mi.load_dict({"type": "scene", "can": can, "sky": scenes.sky()})).facts.stops_rays
+
+
+def test_what_is_not_traced_again_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lamp in a tank with a grid, images and derivatives: to the rounding of the length of a segment."""
+    smoke = scenes.grid_volume("mivol_voxels", rough_grid(1, 3.0), PLACE)
+    water = {"type": "mivol_medium", "sigma_t": smoke, "albedo": 0.8}
+    bulb = {"type": "point", "position": [0.3, 0.2, 0.1], "intensity": 3.0}
+    parts = {"tank": tank(GLASS) | {"interior": water}, "bulb": bulb, "spoon": ball(-0.5)}
+    eye = scenes.camera((2.0, 1.5, 6.0), (0.0, 0.0, 0.0), res=6)
+    key, found = "tank.interior_medium.sigma_t.data", []
+    for again in (False, True):
+        if again:
+            monkeypatch.setattr(SceneMedia, "stops_rays", property(lambda self: False, lambda self, value: None), raising=False)
+        scene = mi.load_dict({"type": "scene", **parts, "sensor": eye})
+        params = mi.traverse(scene)
+        dr.enable_grad(params[key])
+        image = mi.render(scene, params, integrator=mi.load_dict({"type": "mivol", "max_depth": 5}), spp=4, seed=1)
+        dr.backward(dr.mean(image, axis=None))
+        found.append((np.array(image), np.array(dr.grad(params[key]))))
+    for short, traced in zip(*found, strict=True):
+        assert np.abs(traced).max() > 0
+        # A path of 5 segments, whose ends agree to a rounding; sums over 144 paths.
+        np.testing.assert_allclose(short, traced, rtol=0, atol=1e3 * 2.0**-24 * np.abs(traced).max())
 
 
 # -- Roulette of long paths ------------------------------------------------------------------------------------------------

@@ -182,7 +182,7 @@ def revisit_media(
     active: mi.Bool,
     anywhere: bool = False,
 ) -> Any:
-    """Visit the media of a segment of known length; only boundaries that are no boxes are traced again.
+    """Visit the media of a segment of known length; only boundaries that are no boxes and let rays pass are traced again.
 
     Args:
         media, visit, state, active: as in :func:`visit_media`.
@@ -193,6 +193,10 @@ def revisit_media(
     if anywhere and segment.passages is not None:
         for body, length in zip(media.traced, segment.passages, strict=True):
             state = visit(state, MediumInterval(segment.ray, mi.Float(0), length, active & (length > 0), body))
+    elif media.stops_rays:
+        for body in media.traced:
+            on = active & (segment.medium == mi.MediumPtr(body.view.medium))
+            state = visit(state, MediumInterval(segment.ray, mi.Float(0), segment.length, on, body))
     elif media.traced:
         return visit_media(media, segment.ray, segment.medium, visit, state, active, segment.passes_null)[1]
     for interval in find_boxed_intervals(media, segment.ray, segment.length, active):

@@ -27,6 +27,7 @@ class SceneMedia:
         start: the medium named by the sensor, or None.
         locates_camera: whether the camera may be inside a traced boundary while the sensor names no medium.
         size: size of the scene [length], which scales the offset of spawned rays.
+        stops_rays: whether every traced boundary stops or turns all rays, so that a segment stays in one medium.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class SceneMedia:
         start: mi.Medium | None = None,
         locates_camera: bool = False,
         size: float = 1.0,
+        stops_rays: bool = False,
     ) -> None:
         self.scene = scene
         self.boxed = [b for b in bodies if b.box is not None]
@@ -48,6 +50,7 @@ class SceneMedia:
         self.channels = 1 if mi.is_monochromatic else max([b.view.channels for b in bodies], default=1)
         self.start, self.locates_camera = start, locates_camera
         self.size = dr.opaque(mi.Float, size)
+        self.stops_rays = stops_rays
 
     @property
     def has_microflakes(self) -> bool:
