@@ -4,7 +4,8 @@ Reason. Dr.Jit 1.5 keeps one copy of a small scatter target for each pool thread
 Python threads as the same pool thread. Two Python threads then add to one copy without atomics. Up to a third of a gradient was
 missing in a test, without an error. A forked child has no pool threads at all. Therefore every function that renders or
 differentiates calls :func:`check_one_thread` first, and child processes are started by :func:`run_child` and
-:func:`follow_program`. No other module of mivol starts threads or processes.
+:func:`follow_program`. No other module of mivol starts threads or processes; ``mivol.cluster`` lets Dask start workers,
+each a fresh process with one thread for Dr.Jit.
 """
 
 from __future__ import annotations

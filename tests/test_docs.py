@@ -21,6 +21,7 @@ from hatch_build import absolute
 from mivol import config
 from mivol.bench.harness.catalogue import study_names
 from mivol.cli import parser
+from mivol.cluster import address
 from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 
@@ -203,9 +204,11 @@ def test_commands_of_the_pages_are_taken() -> None:
 
 
 def test_experiments_of_the_pages_are_taken() -> None:
-    """Every setting is known and has a value of its domain."""
-    texts = [(path, text) for path in PAGES for text in blocks(path, "toml")]
-    kinds = {type(config.from_dict(tomllib.loads(text), name_of(path))) for path, text in texts}
+    """Every setting is known and has a value of its domain; a table of a cluster names its scheduler."""
+    trees = [(path, tomllib.loads(text)) for path in PAGES for text in blocks(path, "toml")]
+    clusters = [address.from_dict(tree, name_of(path)) for path, tree in trees if "scheduler" in tree]
+    assert [found.scheduler for found in clusters] == ["slurm", "address"]
+    kinds = {type(config.from_dict(tree, name_of(path))) for path, tree in trees if "scheduler" not in tree}
     assert kinds == {config.SceneExperiment, config.ScanExperiment, config.FieldExperiment, config.GaussianExperiment}
 
 

@@ -126,6 +126,9 @@ def flag(*names: str, **options: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
 MODE = flag("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
 SENSOR = flag("-s", "--sensor", type=int, default=0, help="index of the sensor (default: %(default)s)")
 SEED = flag("--seed", type=int, default=0, help="seed of the random numbers (default: %(default)s)")
+CLUSTER = flag(
+    "--cluster", metavar="WHERE", help="run on workers of Dask: local:N, tcp://host:port, tls://host:port, or a TOML file"
+)
 DATASET = flag("--dataset", help="array of a volume file with several arrays (default: the only one)")
 MAX_DEPTH = flag("--max-depth", type=int, help="longest path (default: the max_depth of the scene's integrator)")
 
@@ -220,6 +223,7 @@ def reference_flags() -> list:
         flag("--spp", type=int, default=1 << 16, help="largest number of samples per pixel (default: %(default)s)"),
         SEED,
         flag("--integrator", default="volpath", help="volpath or volpathmis (default: %(default)s)"),
+        CLUSTER,
     ]  # fmt: skip
 
 
@@ -516,18 +520,25 @@ def reference(arguments: argparse.Namespace) -> None:
 
     With --sensor all, the images of every sensor and a file of cameras are written: photographs for a fit.
     """
-    from mivol.validate.reference import render_photographs, render_reference
+    from mivol.cli.cluster import complete_references
+    from mivol.validate.reference import prepare_reference, render_photographs, render_reference
 
     options = {
         "max_depth": arguments.max_depth, "target_se": arguments.target, "max_spp": arguments.spp,
         "seed": arguments.seed, "integrator": arguments.integrator,
     }  # fmt: skip
-    if arguments.sensor == "all":
-        results = render_photographs(load_named_scene(arguments), arguments.output, **options)
-    else:
-        if not arguments.output.suffix:
-            arguments.output.mkdir(parents=True, exist_ok=True)
-        results = [render_reference(load_named_scene(arguments), arguments.output, sensor=arguments.sensor, **options)]
+    loaded = load_named_scene(arguments)
+    with complete_references(arguments, loaded) as complete:
+        if arguments.sensor == "all":
+            results = render_photographs(loaded, arguments.output, complete=complete, **options)
+        else:
+            if not arguments.output.suffix:
+                arguments.output.mkdir(parents=True, exist_ok=True)
+            options["sensor"] = arguments.sensor
+            if complete is None:
+                results = [render_reference(loaded, arguments.output, **options)]
+            else:
+                results = list(complete(iter([prepare_reference(loaded, arguments.output, **options)])))
     print("\n".join(result.text for result in results))
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -112,6 +112,41 @@ def render_reference(
             another scene or method, a film that is not rgb or luminance or does not fit into memory, a target out of reach of
             32 batches, or a sample that is not finite.
     """
+    prepared = prepare_reference(
+        scene, out, max_depth=max_depth, target_se=target_se, relative=relative, max_spp=max_spp, integrator=integrator,
+        rr_depth=rr_depth, hide_emitters=hide_emitters, sensor=sensor, seed=seed, pass_spp=pass_spp, overrides=overrides,
+        accept_doubts=accept_doubts,
+    )  # fmt: skip
+    with prepared.show_progress() if progress else nullcontext(lambda run: None) as show:
+        return prepared.complete(show)
+
+
+def prepare_reference(
+    scene: SceneSource | mi.Scene | LoadedScene,
+    out: str | Path,
+    *,
+    max_depth: int,
+    target_se: float | None = None,
+    relative: bool = False,
+    max_spp: int = 1 << 16,
+    integrator: str = "volpath",
+    rr_depth: int = 5,
+    hide_emitters: bool = False,
+    sensor: int | Mapping[str, object] | mi.Sensor = 0,
+    seed: int = 0,
+    pass_spp: int | None = None,
+    overrides: Mapping[str, object] | None = None,
+    accept_doubts: bool = False,
+) -> PreparedReference:
+    """Check a reference, and read what is on disk, up to its first batch.
+
+    Args:
+        scene, out, max_depth, target_se, relative, max_spp, integrator, rr_depth, hide_emitters, sensor, seed, pass_spp,
+            overrides, accept_doubts: as for :func:`render_reference`.
+
+    Raises:
+        MivolError: as :func:`render_reference`, samples that are not finite excepted.
+    """
     if integrator not in INTEGRATORS:
         raise MivolError(
             f'"{integrator}" cannot make a reference: only Mitsuba\'s own {" and ".join(INTEGRATORS)} judge, never the '
@@ -119,7 +154,7 @@ def render_reference(
         )
     loaded = scene if isinstance(scene, LoadedScene) else load_scene(scene, overrides)
     method = {"integrator": integrator, "max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
-    setup = _RenderSetup.from_scene(loaded, sensor, method, seed)
+    setup = RenderSetup.from_scene(loaded, sensor, method, seed)
     check_film(setup.sensor, BATCH_BYTES)
     path = reference_path(Path(out), loaded.name, setup.identity)
     doubts = _check_trust(loaded.scene, setup.sensor, accept_doubts)
@@ -127,20 +162,20 @@ def render_reference(
 
     if path != Path(out):
         _drop_damaged(path)
-    result = _read_finished(path, setup.identity, goal)
-    if result is None:
-        setup = setup.with_passes(pass_spp or _stored_pass_spp(path), max_spp)
-        progress_bar = _progress(path.stem, goal) if progress else nullcontext(lambda run: None)
-        with progress_bar as show:
-            result = _render_until(goal, setup, _load_state(path, setup), path, doubts, show)
-    return replace(result, reached=target_se is None or goal.accurate(result.mean, result.variance))
+    finished = _read_finished(path, setup.identity, goal)
+    if finished is not None:
+        return PreparedReference(setup, goal, path, doubts, sensor, method, finished)
+    setup = setup.with_passes(pass_spp or _stored_pass_spp(path), max_spp)
+    prepared = PreparedReference(setup, goal, path, doubts, sensor, method)
+    prepared.run = _load_state(path, setup)
+    return prepared
 
 
 # -- What is rendered -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _RenderSetup:
+class RenderSetup:
     """The inputs of a batch, and the identity that makes batches comparable."""
 
     scene: mi.Scene
@@ -154,7 +189,7 @@ class _RenderSetup:
     @staticmethod
     def from_scene(
         loaded: LoadedScene, sensor: int | Mapping[str, object] | mi.Sensor, method: dict[str, Any], seed: int
-    ) -> _RenderSetup:
+    ) -> RenderSetup:
         """Make the setup without the samples of a pass."""
         look = _find_given_sensor(loaded.scene, sensor)
         columns, rows = (int(n) for n in look.film().crop_size())
@@ -172,9 +207,9 @@ class _RenderSetup:
             "mitsuba": mi.__version__,
             "drjit": dr.__version__,
         }
-        return _RenderSetup(loaded.scene, look, made, identity, extinction, (rows, columns, channels))
+        return RenderSetup(loaded.scene, look, made, identity, extinction, (rows, columns, channels))
 
-    def with_passes(self, wanted: int | None, max_spp: int) -> _RenderSetup:
+    def with_passes(self, wanted: int | None, max_spp: int) -> RenderSetup:
         """Set the samples of a pass: ``wanted``, or a suitable number.
 
         Raises:
@@ -261,8 +296,19 @@ class _Goal:
         return batches >= MIN_BATCHES and (spp >= self.max_spp or self.accurate(mean, variance))
 
     def accurate(self, mean: np.ndarray, variance: np.ndarray) -> bool:
+        return self.target_se is not None and self.error(mean, variance) <= self.target_se
+
+    def error(self, mean: np.ndarray, variance: np.ndarray) -> float:
         error = float(np.sqrt(variance.mean()))
-        return self.target_se is not None and (relative_error(error, mean) if self.relative else error) <= self.target_se
+        return relative_error(error, mean) if self.relative else error
+
+    def count_batches(self, run: _BatchRun) -> int:
+        """The error falls as 1/sqrt(n), which predicts the total number of batches."""
+        m, most = run.moments, self.max_spp / run.pass_spp
+        needed = most if not self.target_se else MIN_BATCHES
+        if self.target_se and m.n > 1:
+            needed = m.n * (self.error(m.mean, m.variance_of_mean) / self.target_se) ** 2
+        return int(np.ceil(max(MIN_BATCHES, min(most, needed))))
 
 
 @dataclass
@@ -279,32 +325,92 @@ class _BatchRun:
         return m.n > 1 and goal.reached(m.n, m.n * self.pass_spp, m.mean, m.variance_of_mean)
 
 
-def _render_until(
-    goal: _Goal, setup: _RenderSetup, run: _BatchRun, path: Path, doubts: tuple[Doubt, ...], show: Callable[[_BatchRun], None]
-) -> ReferenceResult:
-    rendered = False
-    try:
-        with InterruptGuard() as stop:
-            while not run.reached(goal):
-                stop.check()
-                start = time.monotonic()
-                batch = setup.batch(run.moments.n)
-                run.moments, rendered = run.moments.add(batch), True
-                run.seconds += time.monotonic() - start
-                show(run)
-                if time.monotonic() - run.saved > SECONDS_BETWEEN_CHECKPOINTS:
-                    _save_state(path, setup, run)
-    finally:
-        if rendered:
-            _save_state(path, setup, run)
-    result = _result(setup, run, path, doubts)
-    write_reference(result)
-    return result
+@dataclass
+class PreparedReference:
+    """A reference before its first batch, between two batches, or as found on disk.
 
+    Attributes:
+        setup: inputs of its batches.
+        goal: when to stop.
+        path: the file.
+        doubts: reasons not to trust the reference.
+        sensor: the sensor as given.
+        method: integrator and its settings.
+        finished: a sufficient reference from disk; None if batches are missing.
+        run: the batches so far; empty if ``finished``.
+    """
 
-def _result(setup: _RenderSetup, run: _BatchRun, path: Path, doubts: tuple[Doubt, ...]) -> ReferenceResult:
-    m = run.moments
-    return ReferenceResult(m.mean, m.variance_of_mean, m.n, m.n * run.pass_spp, setup.identity, path, doubts, run.seconds)
+    setup: RenderSetup
+    goal: _Goal
+    path: Path
+    doubts: tuple[Doubt, ...]
+    sensor: int | Mapping[str, object] | mi.Sensor
+    method: dict[str, Any]
+    finished: ReferenceResult | None = None
+    run: _BatchRun = field(default_factory=lambda: _BatchRun(Moments.empty(), 0, 0.0))
+    _is_changed: bool = False
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether no more batches are needed."""
+        return self.finished is not None or self.run.reached(self.goal)
+
+    def count_batches(self) -> int:
+        """Number of batches that will be needed, by the present estimate of the error."""
+        return self.goal.count_batches(self.run)
+
+    def add(self, batch: np.ndarray, seconds: float) -> None:
+        """Add the next batch, and write a checkpoint from time to time.
+
+        Args:
+            batch: (H, W, C) of batch number ``run.moments.n``.
+            seconds: time of its render [s].
+        """
+        self.run.moments, self._is_changed = self.run.moments.add(batch), True
+        self.run.seconds += seconds
+        if time.monotonic() - self.run.saved > SECONDS_BETWEEN_CHECKPOINTS:
+            self.save()
+
+    def save(self) -> None:
+        """Write the batches, if any are new."""
+        if self._is_changed:
+            write_checkpoint(self.path, self.setup.identity, self.run.moments, self.run.seconds)
+            self.run.saved, self._is_changed = time.monotonic(), False
+
+    def finish(self) -> ReferenceResult:
+        """Write the image, and return it."""
+        result = self.finished
+        if result is None:
+            self.save()
+            m, run = self.run.moments, self.run
+            spp = m.n * run.pass_spp
+            result = ReferenceResult(
+                m.mean, m.variance_of_mean, m.n, spp, self.setup.identity, self.path, self.doubts, run.seconds
+            )
+            write_reference(result)
+        return replace(result, reached=self.goal.target_se is None or self.goal.accurate(result.mean, result.variance))
+
+    def complete(self, show: Callable[[_BatchRun], None] = lambda run: None) -> ReferenceResult:
+        """Render the missing batches in this process; an interrupt keeps the finished ones.
+
+        Args:
+            show: called after each batch.
+        """
+        try:
+            with InterruptGuard() as stop:
+                while not self.is_reached:
+                    stop.check()
+                    start = time.monotonic()
+                    batch = self.setup.batch(self.run.moments.n)
+                    self.add(batch, time.monotonic() - start)
+                    show(self.run)
+        finally:
+            self.save()
+        return self.finish()
+
+    def show_progress(self) -> AbstractContextManager[Callable[[_BatchRun], None]]:
+        """A progress bar of the batches; none for a finished reference."""
+        return nullcontext(lambda run: None) if self.finished is not None else _progress(self.path.stem, self.goal)
 
 
 @contextmanager
@@ -324,13 +430,8 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_BatchRun], None]]:
         def show(run: _BatchRun) -> None:
             if run.moments.n < 2:
                 return
-            error = float(np.sqrt(run.moments.variance_of_mean.mean()))
-            reached = relative_error(error, run.moments.mean) if goal.relative else error
-            # The error falls as 1/sqrt(n), which predicts the total number of batches.
-            most = goal.max_spp / run.pass_spp
-            needed = run.moments.n * (reached / goal.target_se) ** 2 if goal.target_se else most
-            total = int(np.ceil(max(MIN_BATCHES, min(most, needed))))
-            bar.update(task, completed=run.moments.n, total=total, error=f"error {reached:.2g}")
+            reached = goal.error(run.moments.mean, run.moments.variance_of_mean)
+            bar.update(task, completed=run.moments.n, total=goal.count_batches(run), error=f"error {reached:.2g}")
 
         yield show
         if not console.is_terminal:
@@ -348,7 +449,7 @@ def _drop_damaged(path: Path) -> None:
             if file.exists():
                 read(file)
         except MivolError as error:
-            warnings.warn(f"{file.name} is damaged and made anew: {error}", RuntimeWarning, stacklevel=3)
+            warnings.warn(f"{file.name} is damaged and made anew: {error}", RuntimeWarning, stacklevel=4)
             file.unlink()
 
 
@@ -369,18 +470,13 @@ def _stored_pass_spp(path: Path) -> int | None:
     return int(read_reference(path).identity["pass_spp"]) if path.exists() else None
 
 
-def _load_state(path: Path, setup: _RenderSetup) -> _BatchRun:
+def _load_state(path: Path, setup: RenderSetup) -> _BatchRun:
     state = checkpoint_path(path)
     if not state.exists():
         return _BatchRun(Moments.empty(setup.shape), setup.pass_spp, 0.0)
     made, moments = read_checkpoint(state)
     check_identity(state, made["identity"], setup.identity)
     return _BatchRun(moments, setup.pass_spp, made["seconds"])
-
-
-def _save_state(path: Path, setup: _RenderSetup, run: _BatchRun) -> None:
-    write_checkpoint(path, setup.identity, run.moments, run.seconds)
-    run.saved = time.monotonic()
 
 
 # -- Doubts ---------------------------------------------------------------------------------------
@@ -392,7 +488,7 @@ def _check_trust(scene: mi.Scene, sensor: mi.Sensor, accept: bool) -> tuple[Doub
     if fatal and not accept:
         raise MivolError(f"Mitsuba {mi.__version__} cannot be the reference for this scene: {fatal[0].sentence}")
     for doubt in doubts:
-        warnings.warn(doubt.sentence, RuntimeWarning, stacklevel=3)
+        warnings.warn(doubt.sentence, RuntimeWarning, stacklevel=4)
     return tuple(doubts)
 
 
@@ -449,12 +545,17 @@ def use_channel(media: list[RgbExtinction], channel: int) -> Iterator[None]:
 # -- Photographs -----------------------------------------------------------------------------------------------------------
 
 
+Complete = Callable[[Iterator[PreparedReference]], Iterator[ReferenceResult]]
+"""Renders the missing batches of prepared references, and yields the results in the same order."""
+
+
 def render_photographs(
     scene: SceneSource | mi.Scene | LoadedScene,
     folder: str | Path,
     *,
     sensors: Sequence[int | dict | mi.Sensor] | None = None,
     test: Sequence[int] = (),
+    complete: Complete | None = None,
     **reference: Any,
 ) -> list[ReferenceResult]:
     """Render each view of a scene as a reference, and write the cameras.
@@ -466,6 +567,7 @@ def render_photographs(
         folder: created if missing; views are named ``view_000.exr`` and so on.
         sensors: numbers, dicts or sensors, all perspective; None: all sensors of the scene.
         test: numbers of the views of the test split.
+        complete: renders the missing batches of prepared views, in their order; None: one view after another in this process.
         reference: settings of :func:`render_reference`, ``max_depth`` among them.
 
     Raises:
@@ -481,6 +583,12 @@ def render_photographs(
     if folder.suffix == ".exr":
         raise MivolError(f"{folder} names one image for {len(looks)} views; name a folder.")
     folder.mkdir(parents=True, exist_ok=True)
-    made = [render_reference(loaded, folder / name, sensor=look, **reference) for name, look in zip(names, looks, strict=True)]
+    if complete is None:
+        made = [
+            render_reference(loaded, folder / name, sensor=look, **reference) for name, look in zip(names, looks, strict=True)
+        ]
+    else:
+        views = zip(names, looks, strict=True)
+        made = list(complete(prepare_reference(loaded, folder / name, sensor=look, **reference) for name, look in views))
     write_transforms(folder / "transforms.json", cameras, [names[number] for number in test])
     return made

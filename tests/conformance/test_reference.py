@@ -204,7 +204,7 @@ def test_seeds_are_independent(variant_rgb, tmp_path):
 
 def _counted(monkeypatch, stop_at: int | None = None, how=None) -> list[int]:
     """The numbers of the batches that are rendered from now on; ``how()`` is called during batch ``stop_at``."""
-    rendered, original = [], reference._RenderSetup.batch
+    rendered, original = [], reference.RenderSetup.batch
 
     def batch(self, index):
         rendered.append(index)
@@ -212,7 +212,7 @@ def _counted(monkeypatch, stop_at: int | None = None, how=None) -> list[int]:
             how()
         return original(self, index)
 
-    monkeypatch.setattr(reference._RenderSetup, "batch", batch)
+    monkeypatch.setattr(reference.RenderSetup, "batch", batch)
     return rendered
 
 

@@ -1,0 +1,89 @@
+"""The verbs over a cluster: flags, progress of all workers in one line, and calls of :mod:`mivol.cluster`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.text import Text
+
+from mivol.optim.interrupt import InterruptGuard
+
+if TYPE_CHECKING:
+    from mivol.cluster.pool import Pool
+    from mivol.scene.load import LoadedScene
+    from mivol.validate.reference import Complete
+
+
+def say(line: str) -> None:
+    """Print a line on the error output."""
+    print(line, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def open_workers(where: str, variant: str, threads: int = 0) -> Iterator[Pool]:
+    """The workers of ``--cluster``; Ctrl-C while they start ends the command, and lost workers are told at the end.
+
+    Raises:
+        MivolError: as :func:`mivol.cluster.connection.open_pool`.
+    """
+    from mivol.cluster.connection import open_pool
+
+    with InterruptGuard() as stop:
+        opened = open_pool(where, variant, threads, say, stop.check)
+        pool = opened.__enter__()
+    try:
+        yield pool
+    finally:
+        for line in pool.describe_losses():
+            say(f"cluster: {line}")
+        opened.__exit__(None, None, None)
+
+
+@contextmanager
+def status_line() -> Iterator[Callable[[str], None]]:
+    """A line on the terminal that each call replaces, at most five times a second; nothing without a terminal."""
+    console, drawn = Console(stderr=True), 0.0
+
+    def show(line: str) -> None:
+        nonlocal drawn
+        if console.is_terminal and time.monotonic() - drawn > 0.2:
+            drawn = time.monotonic()
+            text = Text(line)
+            text.truncate(max(10, console.width - 1), overflow="ellipsis")
+            console.file.write(f"\r\x1b[K{text.plain}")
+            console.file.flush()
+
+    try:
+        yield show
+    finally:
+        if drawn:
+            console.file.write("\r\x1b[K")
+            console.file.flush()
+
+
+@contextmanager
+def complete_references(arguments: argparse.Namespace, loaded: LoadedScene) -> Iterator[Complete | None]:
+    """The function that renders references on the workers of ``--cluster``; None without the flag."""
+    if arguments.cluster is None:
+        yield None
+        return
+    from mivol.cluster.packages import SceneSource, share_scene
+    from mivol.cluster.reference import complete_on
+
+    with open_workers(arguments.cluster, arguments.mode, arguments.threads) as pool, status_line() as show:
+        yield complete_on(pool, share_scene(pool, scene_source(arguments, SceneSource), loaded), show)
+
+
+def scene_source(arguments: argparse.Namespace, make: Callable[..., Any]) -> Any:
+    """The scene file of the flags as workers load it."""
+    from mivol.cli import parse_defines
+
+    folders = tuple(Path(folder) for folder in filter(None, arguments.a.split(";")))
+    return make(arguments.scene, parse_defines(arguments.define), folders)

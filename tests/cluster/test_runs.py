@@ -1,0 +1,228 @@
+"""Runs on real workers: the same result with one, two and three of them, and with one killed in the middle."""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_experiment import run, write_experiment
+
+from mivol.cluster.address import ClusterSettings
+from mivol.cluster.connection import _connect, import_distributed
+from mivol.cluster.packages import SceneSource, share_scene
+from mivol.cluster.pool import Pool, Unit
+from mivol.cluster.reference import complete_on
+from mivol.cluster.workplace import Workplace
+from mivol.errors import MivolError
+from mivol.scene.camera_rigs import Ring
+from mivol.scene.load import load_scene
+from mivol.validate.reference import render_photographs
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[object]:
+    """Three local workers for all tests of the module."""
+    distributed = import_distributed()
+    with _connect(distributed, ClusterSettings(scheduler="local", workers=3, threads=1)) as (client, _):
+        yield client
+
+
+@contextmanager
+def some_workers(client: object, count: int, said: list[str] | None = None) -> Iterator[Pool]:
+    """A pool of the first workers only."""
+    settings = ClusterSettings(scheduler="address", address="tcp://127.0.0.1:1", threads=1, wait=60.0)
+    pool = Pool(client, settings, say=(said if said is not None else []).append)
+    present = sorted(client.scheduler_info(n_workers=-1)["workers"])
+    pool._refused |= set(present[count:])
+    while len(pool.workers) < count:
+        pool.begin()
+    yield pool
+
+
+def kill_once(pool: Pool) -> Callable[[str], None]:
+    """A display that kills a worker when it is first called."""
+    killed: list[int] = []
+
+    def show(line: str) -> None:
+        if not killed:
+            killed.append(next(iter(pool.workers.values())).facts.pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    return show
+
+
+# -- The pool ----------------------------------------------------------------------------------------------------------------
+
+
+def answer(place: Workplace, number: int, fault: str) -> int:
+    """Work for the tests of the pool: a number, a refusal, or a bug."""
+    if fault == "refusal":
+        raise MivolError("this scene is refused.")
+    time.sleep(0.05)
+    return number // (fault != "bug")
+
+
+# -- References --------------------------------------------------------------------------------------------------------------
+
+
+def write_scattering_scene(folder: Path) -> Path:
+    """The cube of the tiny experiment, with scattered light, so that its references have noise."""
+    path = write_experiment(folder) / "scene.xml"
+    path.write_text(path.read_text().replace('name="albedo" value="0"', 'name="albedo" value="0.8"'))
+    return path
+
+
+def test_references_do_not_depend_on_workers(client: object, tmp_path: Path, variant_rgb: str) -> None:
+    """Rationale: seeds belong to batches, and the owner adds batches in their order.
+
+    Expected: mean and variance of each view equal to the bit alone, with 1, 2 and 3 workers, and with one killed; the first
+    view stops at its error, not at the largest number of samples.
+    """
+    path = write_scattering_scene(tmp_path)
+    loaded = load_scene(path)
+    sensors = Ring(count=3, width=24, height=24).sensors(loaded.scene)
+    options = {"sensors": sensors, "max_depth": 4, "target_se": 6e-3, "max_spp": 1 << 12, "pass_spp": 4}
+    alone = render_photographs(loaded, tmp_path / "alone", progress=False, **options)
+    assert all(32 < view.batches < 1024 for view in alone)
+
+    def compare(name: str, pool: Pool, show: Callable[[str], None] = lambda line: None) -> None:
+        scene = share_scene(pool, SceneSource(path), loaded)
+        found = render_photographs(loaded, tmp_path / name, complete=complete_on(pool, scene, show), **options)
+        for one, other in zip(alone, found, strict=True):
+            assert (one.batches, one.identity) == (other.batches, other.identity)
+            assert np.array_equal(one.mean, other.mean)
+            assert np.array_equal(one.variance, other.variance)
+
+    for count in (1, 2, 3):
+        with some_workers(client, count) as pool:
+            compare(f"{count}", pool)
+    said: list[str] = []
+    with some_workers(client, 2, said) as pool:
+        compare("killed", pool, kill_once(pool))
+        assert pool.lost == 1
+        assert pool.repeated >= 1
+        assert "1 worker(s) of the cluster were lost" in pool.describe_losses()[0]
+    assert any("lost a worker" in line for line in said)
+
+
+def test_errors_of_workers_are_sentences(client: object) -> None:
+    """A refusal comes as it is, a bug with its type, and the pool goes on after each."""
+    with some_workers(client, 1) as pool:
+        with pytest.raises(MivolError, match="this scene is refused"):
+            list(pool.run([Unit(0, answer, (0, "refusal"))]))
+        with pytest.raises(ZeroDivisionError):
+            list(pool.run([Unit(0, answer, (0, "bug"))]))
+        assert sorted(pool.run(Unit(i, answer, (i, "")) for i in range(5))) == [(i, i) for i in range(5)]
+
+
+# -- Schedulers --------------------------------------------------------------------------------------------------------------
+
+SBATCH = """#!/bin/bash
+script=$(mktemp -p "$(dirname "$0")")
+cp "$1" "$script"
+setsid bash "$script" > "$script.log" 2>&1 < /dev/null &
+echo "Submitted batch job $!"
+"""
+"""A batch system of one machine: runs the script in the background, and prints the number of the job."""
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_jobs_of_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
+    """The example of the docs with a faked sbatch: a reference comes out, encrypted, and the jobs end."""
+    page = (ROOT / "docs" / "tutorials" / "cluster.md").read_text()
+    (tmp_path / "slurm.toml").write_text(page.split("```toml", 1)[1].split("```", 1)[0])
+    for name, text in (("sbatch", SBATCH), ("scancel", '#!/bin/bash\nkill -- -"$1"\n')):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(stat.S_IRWXU)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    path = write_scattering_scene(tmp_path)
+    assert (
+        run("reference", path, "--max-depth", 4, "--spp", 64, "-o", tmp_path / "r.exr", "--cluster", tmp_path / "slurm.toml")
+        == 0
+    )
+    assert (tmp_path / "r.exr").is_file()
+    (script, *_) = [file for file in tmp_path.glob("tmp.*") if file.suffix != ".log"]
+    text = script.read_text()
+    assert "#SBATCH -p normal" in text
+    assert "tls://" in text
+    assert text.rindex("--nthreads 1") > text.index("--nthreads")
+    assert stat.S_IMODE((tmp_path / ".mivol").stat().st_mode) == stat.S_IRWXU
+
+
+def test_a_scheduler_that_dies_is_a_sentence(tmp_path: Path, variant_rgb: str) -> None:
+    """What was finished stays, and the same command goes on without a cluster."""
+    distributed = import_distributed()
+    path, out = write_scattering_scene(tmp_path), tmp_path / "r.exr"
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, memory_limit=0
+    )
+    command = [sys.executable, "-m", "mivol", "reference", str(path), "--max-depth", "4", "--spp", f"{1 << 24}", "-o", str(out)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    child = subprocess.Popen(
+        [*command, "--cluster", cluster.scheduler_address], stderr=subprocess.PIPE, text=True, env=environment
+    )
+    assert "1 worker on 1 host" in child.stderr.readline()
+    time.sleep(3)
+    cluster.close()
+    rest = child.stderr.read()
+    child.stderr.close()
+    assert child.wait(60) == 1
+    assert rest.count("mivol: ") == 1
+    assert "its scheduler does not answer any more; finished work is kept" in rest
+    assert (tmp_path / "r.state.npz").is_file()
+
+
+def test_ctrl_c_ends_workers_and_keeps_batches(tmp_path: Path) -> None:
+    """As in a terminal, where all processes of the group get the signal."""
+    path, out = write_scattering_scene(tmp_path), tmp_path / "r.exr"
+    command = [sys.executable, "-m", "mivol", "reference", str(path), "--max-depth", "4", "--spp", f"{1 << 24}", "-o", str(out)]
+    child = subprocess.Popen(
+        [*command, "--cluster", "local:1"], stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert "1 worker on 1 host" in child.stderr.readline()
+    workers = find_children(child.pid)
+    time.sleep(3)
+    os.killpg(child.pid, signal.SIGINT)
+    rest = child.stderr.read()
+    child.stderr.close()
+    assert child.wait(60) == 130
+    assert rest.endswith("mivol: stopped; finished work is kept.\n")
+    assert "Traceback" not in rest
+    assert (tmp_path / "r.state.npz").is_file()
+    assert workers
+    ends = time.monotonic() + 20
+    while any(map(is_alive, workers)) and time.monotonic() < ends:
+        time.sleep(0.1)
+    assert not any(map(is_alive, workers))
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that waits for its parent to read its exit code does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def find_children(parent: int) -> list[int]:
+    """Processes started by a process."""
+    found = []
+    for stat_file in Path("/proc").glob("[0-9]*/stat"):
+        fields = stat_file.read_text().rpartition(")")[2].split()
+        if int(fields[1]) == parent:
+            found.append(int(stat_file.parent.name))
+    return found

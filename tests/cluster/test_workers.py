@@ -1,0 +1,232 @@
+"""Where workers are, which are refused, what is sent to them, and how work is cut: without a worker."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from tiny_experiment import write_experiment
+
+from mivol import config
+from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
+from mivol.cluster.packages import (
+    decode_sensor,
+    encode_sensor,
+    find_experiment_files,
+    pack_files,
+    place_below,
+    unpack_files,
+)
+from mivol.cluster.pool import Pool, Unit, _Worker, check_equal_workers, check_worker
+from mivol.cluster.reference import LONGEST_UNIT, _View
+from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
+from mivol.errors import MivolError
+from mivol.scene.load import load_scene
+
+TLS = 'scheduler = "address"\naddress = "tls://node1:8786"\n[security]\nca = "a.pem"\ncert = "b.pem"\nkey = "c.pem"\n'
+
+
+# -- Where workers are -------------------------------------------------------------------------------------------------------
+
+
+def test_forms_of_cluster(tmp_path: Path) -> None:
+    """The three forms; names of files in TOML start beside the TOML."""
+    local = parse_cluster("local:3", threads=2)
+    assert (local.scheduler, local.workers, local.threads) == ("local", 3, 2)
+    assert parse_cluster("tcp://127.0.0.1:8786").address == "tcp://127.0.0.1:8786"
+    for name in ("a.pem", "b.pem", "c.pem"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "tls.toml").write_text(TLS)
+    assert parse_cluster(str(tmp_path / "tls.toml")).security.ca == str(tmp_path / "a.pem")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("local:0", "has no worker"),
+        ("local", "names no cluster"),
+        ("tcp://node1:8786", "not encrypted: start scheduler and workers with --tls-ca-file"),
+        ("tcp://0.0.0.0:8786", "not encrypted"),
+        ("tls://node1:8786", "needs certificates"),
+        ("tcp://node1", "not of the form"),
+        ("missing.toml", "there is no such file"),
+    ],
+)
+def test_wrong_clusters_are_refused(text: str, reason: str) -> None:
+    with pytest.raises(MivolError, match=reason):
+        parse_cluster(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('scheduler = "slum"', 'did you mean "slurm"'),
+        ('scheduler = "slurm"\nworker = 2', 'did you mean "workers"'),
+        ('scheduler = "local"\naddress = "tcp://127.0.0.1:1"', "goes with an address"),
+        ('scheduler = "local"\n[job]\nqueue = "a"', "is for a batch system"),
+        ('scheduler = "address"\naddress = "tcp://node1:1"', "not encrypted"),
+        (TLS, "found no file"),
+        (TLS.replace("tls:", "tcp:"), "found no file"),
+        ("scheduler = ", "cannot be read"),
+    ],
+)
+def test_wrong_files_are_refused(text: str, reason: str, tmp_path: Path) -> None:
+    (tmp_path / "cluster.toml").write_text(text)
+    with pytest.raises(MivolError, match=reason):
+        parse_cluster(str(tmp_path / "cluster.toml"))
+
+
+def test_loopback() -> None:
+    assert all(map(is_loopback, ("localhost", "127.0.0.1", "127.8.0.1", "::1")))
+    assert not any(map(is_loopback, ("", "0.0.0.0", "10.0.0.1", "node1", "localhost.example.org")))
+
+
+# -- Which workers are refused -----------------------------------------------------------------------------------------------
+
+
+def test_equal_workers_are_admitted() -> None:
+    own = find_facts()
+    check_worker("tls://a:1", own)
+    check_equal_workers({"a": own, "b": own._replace(host="node2", cores=64)})
+
+
+@pytest.mark.parametrize("name", ["mivol", "mivol code", "Mitsuba", "Dr.Jit", "LLVM"])
+def test_other_software_is_refused(name: str) -> None:
+    own = find_facts()
+    odd = own._replace(host="node7", software=own.software | {name: "0.0"})
+    with pytest.raises(MivolError, match=f"worker tls://a:1 on node7 has {name} 0.0, and this process"):
+        check_worker("tls://a:1", odd)
+
+
+def test_workers_that_cannot_render_are_named() -> None:
+    own = find_facts()
+    with pytest.raises(MivolError, match="on node7 cannot render: no LLVM; run mivol doctor there"):
+        check_worker("tls://a:1", own._replace(host="node7", fault="no LLVM."))
+    with pytest.raises(MivolError, match="2 threads of Dask.*--nthreads 1"):
+        check_worker("tls://a:1", own._replace(dask_threads=2))
+
+
+def test_the_smaller_group_of_cpus_is_refused() -> None:
+    new = find_facts()._replace(cpu="x86_64 avx2 avx512f", host="new")
+    old = new._replace(cpu="x86_64 avx2", host="old")
+    with pytest.raises(MivolError, match=r"worker b on old has other CPU features than 2 other worker\(s\), namely in avx512f"):
+        check_equal_workers({"a": new, "b": old, "c": new})
+
+
+def make_pool(*memories: int) -> Pool:
+    """A pool of workers on one host, without a network."""
+    pool = Pool(SimpleNamespace(status="running"), ClusterSettings(scheduler="local"), say=lambda line: None)
+    facts = Facts("node1", 1, {}, "x86_64", 1, 0)
+    pool.workers = {f"w{i}": _Worker(f"w{i}", None, facts._replace(memory=size)) for i, size in enumerate(memories)}
+    return pool
+
+
+def test_inputs_are_counted_before_they_are_sent() -> None:
+    """Two workers of a host share its free memory of 400 bytes: half of the share of each is 100 bytes."""
+    pool = make_pool(400, 400)
+    pool.share("a", None, 60)
+    pool.share("a", None, 60)  # the same content again
+    with pytest.raises(MivolError, match="half of the memory of a worker on node1"):
+        pool.share("b", None, 41)
+
+
+def test_work_that_kills_its_workers_ends() -> None:
+    """A unit of a lost worker is given back twice; the third loss is a refusal that names the unit."""
+    pool = make_pool(0, 0, 0)
+    unit = Unit("view 3", len)
+    for worker in pool.workers.values():
+        worker.units[7] = unit
+    pool._lose("w0")
+    pool._lose("w1")
+    assert (pool.lost, pool.repeated) == (2, 2)
+    with pytest.raises(MivolError, match=r"work view 3 \(len\) ended 3 workers"):
+        pool._lose("w2")
+
+
+def test_errors_of_work_are_values() -> None:
+    place = Workplace()
+    assert place.work(lambda place, x: x + 1, 2) == 3
+    assert isinstance(place.work(lambda place: 1 / 0), Failure)
+
+
+# -- What is sent ------------------------------------------------------------------------------------------------------------
+
+
+def test_files_arrive_below_the_folder_of_the_worker(tmp_path: Path) -> None:
+    """Relative names stay valid, and no name leads out of the worker's folder."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    (here / "meshes").mkdir(parents=True)
+    (here / "a.xml").write_text("a")
+    (here / "meshes" / "b.ply").write_bytes(b"b" * 1000)
+    bundle = pack_files([here / "a.xml", here / "meshes" / ".." / "meshes"])
+    assert len(bundle.files) == 2
+    assert bundle.size < 100
+    unpack_files(bundle.files, there)
+    assert place_below(there, str(here / "a.xml")).read_text() == "a"
+    assert place_below(there, str(here / "meshes" / "b.ply")).read_bytes() == b"b" * 1000
+    unpack_files({"/x/../../../up": zlib.compress(b"")}, there)
+    assert (there / "up").is_file()
+    assert pack_files([here]).digest == bundle.digest
+    (here / "a.xml").write_text("A")
+    assert pack_files([here]).digest != bundle.digest
+
+
+def test_sensors_cross_processes(variant_rgb: str) -> None:
+    """A dict of a rig comes back with its transform, and an existing sensor as its number."""
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    sent = encode_sensor(None, {"type": "perspective", "to_world": to_world, "film": {"type": "hdrfilm", "width": 4}})
+    assert "ScalarTransform" not in repr(sent)
+    back = decode_sensor(sent)
+    assert np.array_equal(np.array(back["to_world"].matrix), np.array(to_world.matrix))
+    assert back["film"] == {"type": "hdrfilm", "width": 4}
+    scene = mi.load_dict({"type": "scene", "a": {"type": "perspective"}, "b": {"type": "orthographic"}})
+    assert [encode_sensor(scene, sensor) for sensor in scene.sensors()] == [0, 1]
+    with pytest.raises(MivolError, match="which workers do not have"):
+        encode_sensor(scene, mi.load_dict({"type": "perspective"}))
+
+
+def test_files_of_an_experiment_are_found(variant_rgb: str, tmp_path: Path) -> None:
+    """The scene with its volume, and the references; the run folder is no input."""
+    folder = write_experiment(tmp_path)
+    settings = config.load(folder / "fit.toml", ['reference={source="files", paths=["a.exr", "b.exr", "c.exr"]}'])
+    changed, files = find_experiment_files(settings, folder)
+    assert {path.name for path in files} == {"scene.xml", "start.vol", "a.exr", "b.exr", "c.exr"}
+    assert changed.scene.file == str(folder / "scene.xml")
+    assert changed.output == settings.output
+    assert load_scene(changed.scene.file).content_hash == load_scene(folder / "scene.xml").content_hash
+
+
+# -- How work is cut ---------------------------------------------------------------------------------------------------------
+
+
+def make_view(done: int, wanted: int, pixels: int, pass_spp: int) -> _View:
+    reference = SimpleNamespace(
+        run=SimpleNamespace(moments=SimpleNamespace(n=done)),
+        setup=SimpleNamespace(shape=(1, pixels, 3), pass_spp=pass_spp),
+        count_batches=lambda: wanted,
+        is_reached=done >= wanted,
+    )
+    return _View(0, reference, 0, sent=done)
+
+
+def test_batches_are_cut_by_paths() -> None:
+    """A unit has about 2^18 paths, at most 8 batches, and none beyond the wanted number."""
+    assert make_view(0, 40, 1 << 18, 1).next_numbers(4) == range(0, 1)
+    assert make_view(0, 40, 1 << 16, 1).next_numbers(4) == range(0, 4)
+    assert make_view(0, 40, 16, 1).next_numbers(4) == range(0, LONGEST_UNIT)
+    assert make_view(38, 40, 16, 1).next_numbers(4) == range(38, 40)
+    assert not make_view(40, 40, 16, 1).next_numbers(4)
+
+
+def test_units_wait_for_earlier_ones() -> None:
+    """At most ``most`` units of a view are ahead of its first missing batch: their images fill the memory."""
+    view = make_view(0, 400, 1 << 18, 1)
+    for expected in range(4):
+        numbers = view.next_numbers(4)
+        assert numbers == range(expected, expected + 1)
+        view.sent = numbers.stop
+    assert not view.next_numbers(4)
