@@ -105,6 +105,13 @@ CITATIONS: dict[str, Citation] = {
         "CVPR",
         "https://doi.org/10.1109/CVPR52688.2022.00542",
     ),
+    "mueller_2022": Citation(
+        "T. Müller, A. Evans, C. Schied, A. Keller",
+        2022,
+        "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding",
+        "ACM Transactions on Graphics",
+        "https://doi.org/10.1145/3528223.3530127",
+    ),
     "kerbl_2023": Citation(
         "B. Kerbl, G. Kopanas, T. Leimkuehler, G. Drettakis",
         2023,

@@ -463,6 +463,7 @@ MOST_LEVELS = 12
 class FieldSettings(Section):
     """The radiance field and its fit."""
 
+    kind: Annotated[Literal["grid"], setting("1", "a sparse grid of density and harmonics")] = "grid"
     preset: Annotated[str, setting("1", "nodes, steps, rates, priors: tiny, cpu, fine, capture or gpu", min_length=1)] = "cpu"
     longest: Annotated[int, setting("voxel", "voxels along the longest edge; absent: preset", ge=8)] | None = None
     degree: Annotated[int, setting("1", "of the spherical harmonics; absent: preset", ge=0, le=4)] | None = None
@@ -551,6 +552,40 @@ class FieldExperiment(Section):
     output: Output = "runs/field"
 
 
+class HashSettings(Section):
+    """The hash grid and its fit."""
+
+    kind: Annotated[Literal["hash"], setting("1", "a multi-resolution hash grid with two small networks")]
+    preset: Annotated[str, setting("1", "sizes, steps, rates: tiny, minute, minutes or gpu", min_length=1)] = "minute"
+    effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
+    levels: Annotated[int, setting("1", "levels of the hash grid; absent: preset", ge=1, le=32)] | None = None
+    features: Annotated[int, setting("1", "numbers a row: 1, 2, 4 or 8; absent: preset", ge=1, le=8)] | None = None
+    log2_table: Annotated[int, setting("1", "logarithm of the most rows a level; absent: preset", ge=8, le=24)] | None = None
+    coarsest: Annotated[int, setting("cell", "cells along the longest edge, first level; absent: preset", ge=1)] | None = None
+    finest: Annotated[int, setting("cell", "cells along the longest edge, last level; absent: preset", ge=1)] | None = None
+    width: Annotated[int, setting("neuron", "neurons of a hidden layer; absent: preset", ge=1, le=256)] | None = None
+    samples: Annotated[int, setting("sample", "samples of a step; absent: preset", ge=256, le=1 << 22)] | None = None
+    cells: Annotated[int, setting("cell", "cells of the map of occupied space; absent: preset", ge=4, le=256)] | None = None
+
+    def __post_init__(self) -> None:
+        if self.features not in (None, 1, 2, 4, 8):
+            raise ValueError(f"features is {self.features}: 1, 2, 4 or 8 is expected")
+
+
+class HashExperiment(Section):
+    """A fit of a hash grid to photographs: a file with a table ``[photos]``, and ``kind = "hash"`` in its table ``[field]``."""
+
+    title: Title
+    photos: Annotated[Photographs, setting("1", "the photographs")]
+    field: Annotated[HashSettings, setting("1", "the hash grid and its fit")]
+    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
+    checkpoint_every: CheckpointSteps = 500
+    variant: Variant = "llvm_ad_rgb"
+    seed: Seed = 0
+    threads: Threads = 0
+    output: Output = "runs/field"
+
+
 class GaussianSettings(Section):
     """The Gaussians and their fit."""
 
@@ -589,8 +624,8 @@ class GaussianExperiment(Section):
     output: Output = "runs/gaussians"
 
 
-PhotoExperiment = FieldExperiment | GaussianExperiment
-"""A fit of photographs, with either model."""
+PhotoExperiment = FieldExperiment | HashExperiment | GaussianExperiment
+"""A fit of photographs, with one of the models."""
 
 Experiment = SceneExperiment | ScanExperiment | PhotoExperiment
 """An experiment of any kind."""
@@ -602,6 +637,12 @@ KINDS: dict[str, type[Section]] = {
     "photos": FieldExperiment,
 }
 """Kinds of experiments by a table of the file; the first present table decides."""
+
+FIELD_KINDS: dict[str, type[Section]] = {"grid": FieldExperiment, "hash": HashExperiment}
+"""Kinds of fits with a table ``[photos]``, by the setting ``field.kind``."""
+
+EXPERIMENTS = (SceneExperiment, ScanExperiment, FieldExperiment, HashExperiment, GaussianExperiment)
+"""Settings of all kinds of experiments."""
 
 CAPTURE = {"photos": {"largest": 240, "box": "middle"}, "show": {"views": 64}}
 """Defaults of a file with ``field.preset = "capture"``: photograph size resolved by the grids, nested boxes, views."""
@@ -647,7 +688,7 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
     Raises:
         MivolError: as :func:`load`.
     """
-    kind = next((KINDS[table] for table in KINDS if table in raw), SceneExperiment)
+    kind = _find_kind(raw, name)
     raw = _with_capture(raw)
     check_keys(raw, kind, "", name)
     try:
@@ -657,8 +698,28 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
         raise MivolError(f"{name}: {reason}") from None
 
 
-MODELS = {"gaussians": "gaussians", "grid": "field"}
-"""Table of a model's settings, by the word of ``mivol optimize --as``; the first word is the default."""
+def _find_kind(raw: dict[str, Any], name: str) -> type[Section]:
+    """The kind of an experiment by its tables, and by the kind of its field.
+
+    Raises:
+        MivolError: an unknown kind of field.
+    """
+    kind = next((KINDS[table] for table in KINDS if table in raw), SceneExperiment)
+    field = raw.get("field")
+    if kind is not FieldExperiment or not isinstance(field, dict) or "kind" not in field:
+        return kind
+    word = str(field["kind"])
+    if word not in FIELD_KINDS:
+        raise MivolError(f'{name}: field.kind = "{word}" is unknown: {suggest_name(word, list(FIELD_KINDS))}')
+    return FIELD_KINDS[word]
+
+
+MODELS: dict[str, dict[str, dict[str, str]]] = {
+    "gaussians": {"gaussians": {}},
+    "grid": {"field": {}},
+    "hash": {"field": {"kind": "hash"}},
+}
+"""Table of a model with its first settings, by the word of ``mivol optimize --as``; the first word is the default."""
 
 
 def of_photographs(
@@ -669,14 +730,15 @@ def of_photographs(
     Args:
         path: folder of photographs, or file of cameras.
         model: key of ``MODELS``.
-        preset: preset of that model; by default ``gaussians.preset`` or ``field.preset`` of an empty file.
+        preset: preset of that model; by default the preset of an empty file.
         changes: as in :func:`load`.
 
     Raises:
         MivolError: as :func:`load`.
     """
-    table = {} if preset is None else {"preset": preset}
-    raw = {"title": path.resolve().name, "photos": {"path": str(path)}, MODELS[model]: table}
+    chosen = {} if preset is None else {"preset": preset}
+    tables = {table: settings | chosen for table, settings in MODELS[model].items()}
+    raw = {"title": path.resolve().name, "photos": {"path": str(path)}, **tables}
     for change in changes:
         apply_change(raw, change)
     return from_dict(raw, str(path))

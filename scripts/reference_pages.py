@@ -1,7 +1,7 @@
 """The reference pages of the docs, made from what the code says of itself: plugins, verbs, settings of experiments, Python.
 
-    scripts/reference_pages.py            are docs/reference/*.md what the code says?
-    scripts/reference_pages.py --write    write them anew
+scripts/reference_pages.py            are docs/reference/*.md what the code says?
+scripts/reference_pages.py --write    write them anew
 """
 
 from __future__ import annotations
@@ -169,6 +169,7 @@ def toml_page() -> str:
         "Images of a scene (a table `[scene]`)": config.SceneExperiment,
         "Projections (a table `[scan]`)": config.ScanExperiment,
         "Photographs (a table `[photos]`)": config.FieldExperiment,
+        'Photographs, hash grid (tables `[photos]` and `[field]` with `kind = "hash"`)': config.HashExperiment,
         "Gaussians (tables `[photos]` and `[gaussians]`)": config.GaussianExperiment,
     }
     lines = ["# Settings of an experiment", "", *SETTINGS_HEAD.splitlines(), ""]

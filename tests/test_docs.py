@@ -209,7 +209,7 @@ def test_experiments_of_the_pages_are_taken() -> None:
     clusters = [address.from_dict(tree, name_of(path)) for path, tree in trees if "scheduler" in tree]
     assert [found.scheduler for found in clusters] == ["slurm", "address"]
     kinds = {type(config.from_dict(tree, name_of(path))) for path, tree in trees if "scheduler" not in tree}
-    assert kinds == {config.SceneExperiment, config.ScanExperiment, config.FieldExperiment, config.GaussianExperiment}
+    assert kinds == set(config.EXPERIMENTS)
 
 
 def test_reference_is_what_the_code_says(variant_rgb: str) -> None:

@@ -159,7 +159,7 @@ def model_flags(text: str) -> list[tuple[tuple[str, ...], dict[str, Any]]]:
         flag(
             "--preset",
             help="preset of that model; of Gaussians: minute (default), minutes, fine, ...; of a grid: cpu (default) for an "
-            "object, capture for a place around the cameras, ...",
+            "object, capture for a place around the cameras, ...; of a hash grid: minute (default), minutes, gpu",
         ),
     ]
 
@@ -248,7 +248,7 @@ def describe_settings() -> str:
     from mivol.schema import describe
 
     lines = ["Settings of the TOML file, by kind of experiment."]
-    for kind in config.KINDS.values():
+    for kind in config.EXPERIMENTS:
         lines += ["", f"{kind.__doc__}".replace("``", "").rstrip(".") + ":", *describe(kind)]
     return "\n  ".join(lines)
 
@@ -430,7 +430,7 @@ def explain_photos(path: Path, picture: Path | None) -> int:
     print(survey.describe())
     if note := note_on_alpha(survey):
         print(note)
-    print("--as gaussians or --as grid explains a fit; --as grid --preset capture is for a place around the cameras")
+    print("--as gaussians, grid or hash explains a fit; --as grid --preset capture is for a place around the cameras")
     if picture is not None:
         plot_cameras(survey, picture)
         print(picture)
@@ -605,8 +605,9 @@ def _check_preset(model: str, preset: str | None) -> None:
     """Refuse a preset that only the other model has; a preset of no model is refused with the settings."""
     from mivol.optim.gaussians.gaussian_plan import PRESETS as GAUSSIANS
     from mivol.optim.photographs.radiance_plan import PRESETS as GRIDS
+    from mivol.optim.photographs.sampled_problem import PRESETS as HASH_GRIDS
 
-    presets = {"gaussians": GAUSSIANS, "grid": GRIDS}
+    presets = {"gaussians": GAUSSIANS, "grid": GRIDS, "hash": HASH_GRIDS}
     other = next((name for name, known in presets.items() if preset in known), model)
     if preset not in presets[model] and other != model:
         known = ", ".join(presets[model])

@@ -36,6 +36,7 @@ from mivol.optim.photographs.radiance_plan import (
 )
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
+from mivol.optim.photographs.sampled_problem import SampledProblem
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.photos.camera_path import HomeView
@@ -111,7 +112,7 @@ class FieldFit(PhotoFit):
 
 
 def write_result(
-    folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0, view: HomeView | None = None
+    folder: Path, problem: RadianceProblem | SampledProblem, which: str = "", white: float = 1.0, view: HomeView | None = None
 ) -> None:
     """Write the field of a problem, and the fitted sky if present.
 
@@ -126,14 +127,14 @@ def write_result(
 
 
 def judge_view(
-    problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]
+    problem: RadianceProblem | SampledProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]
 ) -> tuple[FieldView, ImageScore]:
     """Render a photograph's view of the field; return the view and the errors."""
     view = render_view(problem.field, photo.camera, find_background(problem, photo))
     return view, score_image(view.image, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 
 
-def find_background(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:
+def find_background(problem: RadianceProblem | SampledProblem, photo: Photo) -> NDArray | Sky:
     """Return the background of a photograph: the fitted sky, or the photograph's own."""
     return photo.background if problem.sky is None else problem.sky
 

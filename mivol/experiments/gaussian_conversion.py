@@ -12,7 +12,7 @@ import numpy as np
 
 from mivol.back_end import set_variant
 from mivol.fields.field_archives import read_field_view
-from mivol.fields.field_files import read_field, write_field
+from mivol.fields.field_files import read_grid, write_field
 from mivol.fields.gaussian_field import MAX_OPACITY
 from mivol.fields.gaussian_grid import gaussian_box, gaussian_masses, gaussians_to_grid, grid_to_gaussians
 from mivol.fields.spherical_grid import SphericalGrid
@@ -71,7 +71,7 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     low, high = corners_of_box(cloud, box)
     view = read_gaussian_view(source)
     write_field(target, gaussians_to_grid(cloud, low, high, resolution), view=view)
-    field = read_field(target)  # as it will be read: half floats
+    field = read_grid(target)  # as it will be read: half floats
     mass = float(field.values()[0].sum(dtype=np.float64) * np.linalg.det(field.to_world[:3, :3]) / math.prod(field.res))
     lines = [
         f"{target}: {' x '.join(map(str, field.res[::-1]))} nodes, {field.rows - 1} of them stored, degree {field.degree}",
@@ -98,12 +98,12 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
         A summary of file and error, in lines.
 
     Raises:
-        MivolError: as :func:`mivol.fields.field_files.read_field`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians` and the
+        MivolError: as :func:`mivol.fields.field_files.read_grid`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians` and the
             disk.
     """
     select_by_suffix(target, GAUSSIAN_WRITERS)
     set_variant(variant)
-    field = read_field(source)
+    field = read_grid(source)
     made = grid_to_gaussians(field, resolution)
     write_gaussians(target, made, read_field_view(source))
     lines = [f"{target}: {made.count} Gaussians of degree {made.degree}"]

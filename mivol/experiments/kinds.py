@@ -13,6 +13,7 @@ from mivol.errors import MivolError
 from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.fit_kind import FitKind, RunContext
 from mivol.experiments.gaussian_fit import GaussianFit
+from mivol.experiments.hash_fit import HashFit
 from mivol.experiments.photo_fit import PhotoFit
 from mivol.experiments.run_folder import CHECKPOINT, BestIterate, RunFolder
 from mivol.experiments.scan_fit import ScanFit
@@ -28,6 +29,7 @@ KINDS: dict[type, type[FitKind]] = {
     config.SceneExperiment: SceneFit,
     config.ScanExperiment: ScanFit,
     config.FieldExperiment: FieldFit,
+    config.HashExperiment: HashFit,
     config.GaussianExperiment: GaussianFit,
 }
 """Kind of an experiment by the type of the settings."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mivol.config import GaussianExperiment, PhotoExperiment
+from mivol.config import FieldExperiment, GaussianExperiment, PhotoExperiment
 from mivol.errors import MivolError
 from mivol.optim.photographs.photo_colours import EPSILON
 from mivol.optim.strategy import suggest_name
@@ -71,15 +71,15 @@ def check_background(settings: PhotoExperiment, has_alpha: bool) -> None:
         MivolError: with the known words.
     """
     word = settings.photos.background
-    learned = [] if isinstance(settings, GaussianExperiment) else list(LEARNED)
+    learned = list(LEARNED) if isinstance(settings, FieldExperiment) else []
     known = list(BACKGROUNDS) if has_alpha else ["white", "black", *learned]
     if not isinstance(word, str) or word in ("", *known):
         return
     if word not in (*BACKGROUNDS, *LEARNED):
         raise MivolError(f'photos.background = "{word}" is unknown: {suggest_name(word, known)}')
     kind = "photographs with alpha" if has_alpha else "photographs without alpha"
-    if word in LEARNED and isinstance(settings, GaussianExperiment):
-        kind = "Gaussians"
+    if word in LEARNED and not learned:
+        kind = "Gaussians" if isinstance(settings, GaussianExperiment) else "a hash grid"
     raise MivolError(f'photos.background = "{word}" is not for {kind}: {", ".join(known)} or an rgb triple is expected.')
 
 

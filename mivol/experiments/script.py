@@ -20,6 +20,7 @@ from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, Progress, RunContext
 from mivol.experiments.kinds import run_experiment
 from mivol.fields.field_files import read_field
+from mivol.fields.hash_grid import HashField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, stack_layers
 from mivol.optim.first_order import Adam
@@ -211,13 +212,14 @@ def fit_photographs(
     output: str | os.PathLike = "runs/field",
     settings: Mapping[str, object] | None = None,
     progress: Progress | None = None,
-) -> SphericalGrid:
+) -> SphericalGrid | HashField:
     """Fit a radiance field to posed photographs; the run folder has ``field.npz`` and the report page.
 
     Args:
         photographs: a folder, or its file of cameras (Blender, nerfstudio, instant-ngp, COLMAP).
         output: run folder.
-        settings: settings of the TOML file by dotted key, as ``{"field.preset": "tiny", "photos.background": "white"}``.
+        settings: settings of the TOML file by dotted key, as ``{"field.preset": "tiny", "photos.background": "white"}``; with
+            ``"field.kind": "hash"`` the field is a hash grid.
         progress: display of the run's progress; may be None.
 
     Raises:

@@ -10,12 +10,15 @@ Source: Fridovich-Keil, Yu et al. 2022; the names of the arrays are read from sv
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.hash_grid import HashField, HashSizes
+from mivol.fields.sampled_field import Region
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole
 from mivol.files.npy import check_memory, read_archive
@@ -72,6 +75,79 @@ def write_archive(path: Path, field: SphericalGrid, half: bool = True, view: Hom
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
 
+HASH_FORMAT = "mivol hash grid 1"
+
+HASH_KINDS = {
+    "kind": ("U", ()), "sizes": ("iu", (10,)), "to_world": ("f", (4, 4)), "table": ("f", None), "density_weights": ("f", None),
+    "colour_weights": ("f", None), "space": ("U", ()), "white": ("f", ()), "res": ("iu", (3,)), "occupied": ("u", None),
+    "region_to_world": ("f", (4, 4)), "step": ("f", ()),
+}  # fmt: skip
+"""Arrays of a hash grid -> allowed kinds of NumPy types, and the shape where it is fixed."""
+
+
+def write_hash_archive(path: Path, field: HashField, half: bool = True, view: HomeView | None = None) -> None:
+    """Write a fitted hash grid in mivol's own format.
+
+    Args:
+        path: destination.
+        field: hash grid with a region.
+        half: store the table in half floats (11 bits), under the conditions of :func:`write_archive`.
+        view: first view of the field, optional.
+
+    Raises:
+        MivolError: a field without a region, or a disk that refuses the file.
+    """
+    region = field.region
+    if region is None:
+        raise MivolError(f"{path.name}: found a hash grid without occupied cells, expected one of a fit: give it a region.")
+    arrays = {name: np.array(value) for name, value in field.parameters().items()}
+    arrays["table"] = _to_half(arrays["table"], half)
+    arrays |= {"kind": np.array("hash"), "format": np.array(HASH_FORMAT), "sizes": np.array(astuple(field.sizes))}
+    arrays |= {"to_world": field.to_world, "space": np.array(field.space), "white": np.array(field.white)}
+    arrays |= {"res": np.array(region.res), "region_to_world": region.to_world, "step": np.array(region.step)}
+    arrays["occupied"] = np.packbits(np.array(region.occupied) > 0)
+    if view is not None:
+        arrays[VIEW] = np.array(view.numbers)
+    write_whole(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def is_hash_archive(arrays: dict[str, np.ndarray]) -> bool:
+    """Whether the arrays of an archive are a hash grid."""
+    return "kind" in arrays or str(arrays.get("format", "")) == HASH_FORMAT
+
+
+def parse_hash_archive(name: str, arrays: dict[str, np.ndarray]) -> HashField:
+    """Make a hash grid from the arrays of mivol's own format.
+
+    Args:
+        name: file name, for error messages.
+        arrays: contents of the archive.
+
+    Raises:
+        MivolError: another kind, a missing array, another type or shape, or values that are not finite.
+    """
+    kind = str(arrays.get("kind", "nothing"))
+    if kind != "hash":
+        raise MivolError(f'{name} holds a field of the kind "{kind}"; the kind "hash" is expected.')
+    missing = HASH_KINDS.keys() - arrays.keys()
+    if missing:
+        raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
+    _check_arrays(name, arrays, HASH_KINDS)
+    res = tuple(int(n) for n in arrays["res"])
+    cells = math.prod(n + 1 for n in res)
+    if min(res) < 1 or arrays["occupied"].shape != (-(-cells // 8),) or not arrays["step"] > 0:
+        found = f"{arrays['occupied'].shape} bytes of occupied cells at steps of {float(arrays['step']):g}"
+        raise MivolError(f"{name} holds {found} for {cells} cells; write it again.")
+    occupied = np.unpackbits(arrays["occupied"].astype(np.uint8))[:cells]
+    region = Region(res, arrays["region_to_world"].astype(np.float64), mi.UInt8(occupied), float(arrays["step"]))
+    numbers = [mi.Float(arrays[key].astype(np.float32).ravel()) for key in ("table", "density_weights", "colour_weights")]
+    try:
+        sizes, place = HashSizes(*map(int, arrays["sizes"])), arrays["to_world"].astype(np.float64)
+        return HashField(sizes, place, *numbers, str(arrays["space"]), region, float(arrays["white"]))
+    except MivolError as error:
+        raise MivolError(f"{name}: {error}") from None
+
+
 VIEW = "view"
 """Array with the numbers of the first view."""
 
@@ -110,7 +186,8 @@ def parse_archive(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     missing = {"density", "sh", "res", "to_world", "activation", "offset", "clamp", "levels", "space"} - arrays.keys()
     if missing:
         raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
-    _check_arrays(name, arrays)
+    _check_arrays(name, arrays, ARRAY_KINDS)
+    _check_node_count(name, arrays)
     res, levels = tuple(int(n) for n in arrays["res"]), int(arrays["levels"])
     nodes = arrays.get("nodes")
     n, shape = levels * math.prod(res) if nodes is None else len(nodes), arrays["sh"].shape
@@ -133,8 +210,8 @@ def parse_archive(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     )
 
 
-def _check_arrays(name: str, arrays: dict[str, np.ndarray]) -> None:
-    for key, (kinds, shape) in ARRAY_KINDS.items():
+def _check_arrays(name: str, arrays: dict[str, np.ndarray], expected: dict[str, tuple[str, tuple | None]]) -> None:
+    for key, (kinds, shape) in expected.items():
         array = arrays.get(key)
         if array is None:
             continue
@@ -142,6 +219,9 @@ def _check_arrays(name: str, arrays: dict[str, np.ndarray]) -> None:
             raise MivolError(f"{name} holds {key} of type {array.dtype} and shape {array.shape}; write it again.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise MivolError(f"{name} holds {key} with values that are not finite; write it again.")
+
+
+def _check_node_count(name: str, arrays: dict[str, np.ndarray]) -> None:
     sizes = [int(arrays["levels"]), *(int(n) for n in arrays["res"])]
     if min(sizes) < 1 or math.prod(sizes) > MAX_NODES:
         found = " x ".join(map(str, sizes[sizes[0] == 1 :]))

@@ -24,7 +24,18 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.field_archives import is_own_archive, is_svox2, parse_archive, parse_svox2, write_archive, write_svox2
+from mivol.fields.field_archives import (
+    is_hash_archive,
+    is_own_archive,
+    is_svox2,
+    parse_archive,
+    parse_hash_archive,
+    parse_svox2,
+    write_archive,
+    write_hash_archive,
+    write_svox2,
+)
+from mivol.fields.hash_grid import HashField
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import extract_surface
@@ -77,8 +88,8 @@ class FieldFormat:
     parse: Callable[[str, dict[str, np.ndarray]], SphericalGrid] | None = None
 
 
-def read_field(path: str | os.PathLike) -> SphericalGrid:
-    """Read a radiance field: an ``.npz`` of mivol, or a checkpoint of svox2.
+def read_field(path: str | os.PathLike) -> SphericalGrid | HashField:
+    """Read a radiance field: an ``.npz`` of mivol (a grid or a hash grid), or a checkpoint of svox2.
 
     Raises:
         MivolError: a missing file, another format, or contents that contradict each other.
@@ -91,13 +102,27 @@ def read_field(path: str | os.PathLike) -> SphericalGrid:
     for kind in readable:
         if kind.recognizes(arrays):
             return kind.parse(path.name, arrays)
+    if is_hash_archive(arrays):
+        return parse_hash_archive(path.name, arrays)
     known = " or a ".join(kind.name for kind in readable)
     raise MivolError(f"{path.name} holds {', '.join(arrays) or 'nothing'}; a {known} is expected.")
 
 
+def read_grid(path: str | os.PathLike) -> SphericalGrid:
+    """Read a radiance field that is a grid.
+
+    Raises:
+        MivolError: as :func:`read_field`, or a hash grid.
+    """
+    field = read_field(path)
+    if isinstance(field, HashField):
+        raise refusal(Path(path), "a hash grid", "a grid of harmonics", "convert it by mivol convert FILE grid.npz --to grid")
+    return field
+
+
 def write_field(
     path: str | os.PathLike,
-    field: SphericalGrid,
+    field: SphericalGrid | HashField,
     level: float | None = None,
     sky: Sky | None = None,
     half: bool = True,
@@ -127,6 +152,11 @@ def write_field(
         known = ", ".join(f"{s} ({kind.name})" for s, kind in FIELD_FORMATS.items())
         found = FOREIGN.get(path.suffix.lower(), f"the suffix {path.suffix!r}")
         raise refusal(path, found, f"one of {known}", "choose one of those")
+    if isinstance(field, HashField):
+        if suffix != ".npz":
+            raise refusal(path, "a hash grid", "an .npz", "convert it to a grid first (mivol convert FILE grid.npz --to grid)")
+        write_hash_archive(path, field, half, view)
+        return [path]
     kind = FIELD_FORMATS[suffix]
     if level is not None and kind.write is not _write_mesh:
         raise refusal(path, f"a level for a {kind.name}", "none", "levels are for meshes: write .ply or .obj")
@@ -298,7 +328,7 @@ def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, 
         settings = {"space": "linear"} | {n: props[n] for n in PLUGIN_SETTINGS if n in props}
         field = SphericalGrid.from_dense(np.array(dr.detach(density)), np.array(dr.detach(sh)), to_world, **settings)
         return field, density, sh
-    field = read_field(str(mi.file_resolver().resolve(props["filename"])))
+    field = read_grid(str(mi.file_resolver().resolve(props["filename"])))
     field = field.with_rows(*field.values(), field.nodes, **{n: props.get(n, getattr(field, n)) for n in PLUGIN_SETTINGS})
     if "to_world" in props:
         field = replace(field, to_world=to_world @ field.to_world)

@@ -78,6 +78,8 @@ QUANTITIES: dict[str, Quantity] = {
     "flip": Quantity("FLIP of the held-out views", log=False),
     "nodes": Quantity("Stored nodes", log=False),
     "gaussians": Quantity("Gaussians", log=False),
+    "numbers": Quantity("Fitted numbers", log=False),
+    "samples": Quantity("Samples of a ray", log=False),
     "bytes": Quantity("Memory of the field", "MiB", log=False),
     "seconds": Quantity("Time", "s"),
     "fit_seconds": Quantity("Fit time", "s"),

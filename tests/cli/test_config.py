@@ -138,7 +138,7 @@ def test_wrong_files(tmp_path: Path) -> None:
 
 def test_the_schema_is_strict() -> None:
     """Every struct that a file can fill refuses unknown fields by itself, too."""
-    seen = [config.SceneExperiment, config.ScanExperiment, config.FieldExperiment, config.GaussianExperiment]
+    seen = list(config.EXPERIMENTS)
     for struct in seen:
         assert struct.__struct_config__.forbid_unknown_fields, struct
         for field in msgspec.structs.fields(struct):
@@ -160,6 +160,22 @@ def test_a_word_that_is_none_of_a_setting_says_which_there_are(tmp_path: Path, c
         config.load(path, (change,))
     assert all(each in str(refused.value) for each in words)
     assert config.load(path, ("show.way=views",)).show.way == "views"
+
+
+def test_the_kind_of_a_field_decides_its_settings() -> None:
+    raw = {"title": "A", "photos": {"path": "photographs"}}
+    assert isinstance(config.from_dict(raw | {"field": {"kind": "grid"}}), config.FieldExperiment)
+    chosen = config.from_dict(raw | {"field": {"kind": "hash", "levels": 4}})
+    assert isinstance(chosen, config.HashExperiment) and chosen.field.levels == 4
+    for field, said in (
+        ({"kind": "hsah"}, 'field.kind = "hsah" is unknown: did you mean "hash"'),
+        ({"kind": "hash", "degree": 2}, 'unknown key "field.degree"'),
+        ({"kind": "hash", "features": 3}, "features is 3: 1, 2, 4 or 8 is expected"),
+        ({"levels": 2, "log2_table": 10}, 'unknown key "field.log2_table"'),
+    ):
+        with pytest.raises(MivolError) as refused:
+            config.from_dict(raw | {"field": field})
+        assert said in str(refused.value)
 
 
 def test_settings_say_what_they_are_chosen_from() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields.field_files import read_field, write_field
+from mivol.fields.field_files import read_field, read_grid, write_field
 from mivol.fields.harmonics import harmonic_degree
+from mivol.fields.hash_grid import HashField, HashSizes
+from mivol.fields.sampled_field import Region
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import npy
 
@@ -48,6 +51,56 @@ def test_a_nested_field_is_read_as_it_was_saved(variant_rgb: str, tmp_path: Path
     assert all(np.array_equal(a, b) for a, b in zip(back.values(), field.values(), strict=True))
     with pytest.raises(MivolError, match="2 nested levels"):
         write_field(tmp_path / "f.svox2.npz", field)
+
+
+def hash_grid() -> HashField:
+    """A hash grid with a region, and values of order 1."""
+    field = HashField.random(HashSizes(levels=3, log2_table=6, coarsest=2, finest=9, width=4), CUBE, 1, "linear")
+    rng = np.random.default_rng(0)
+    values = {name: mi.TensorXf(rng.normal(size=shape).astype(np.float32)) for name, shape in field.shapes().items()}
+    occupied = mi.UInt8((rng.random(4 * 5 * 6) > 0.5).astype(np.uint8))
+    return replace(field.with_parameters(values), region=Region((3, 4, 5), CUBE, occupied, 0.25), white=2.0)
+
+
+def test_a_hash_grid_is_read_as_it_was_saved(variant_rgb: str, tmp_path: Path) -> None:
+    field = hash_grid()
+    write_field(tmp_path / "f.npz", field)
+    back = read_field(tmp_path / "f.npz")
+    assert isinstance(back, HashField) and (back.sizes, back.space, back.white) == (field.sizes, "linear", 2.0)
+    assert (back.region.res, back.region.step) == ((3, 4, 5), 0.25)
+    assert np.array_equal(np.array(back.region.occupied), np.array(field.region.occupied))
+    for name, values in back.parameters().items():
+        rounding = 2.0**-11 if name == "table" else 0  # half floats
+        np.testing.assert_allclose(np.array(values), np.array(field.parameters()[name]), rtol=rounding, atol=1e-7)
+    with pytest.raises(MivolError, match="found a hash grid, expected an .npz"):
+        write_field(tmp_path / "f.ply", field)
+    with pytest.raises(MivolError, match="found a hash grid, expected a grid of harmonics"):
+        read_grid(tmp_path / "f.npz")
+
+
+HOSTILE_HASH_GRIDS = {
+    "another kind": ({"kind": np.array("hsah")}, 'a field of the kind "hsah"; the kind "hash" is expected'),
+    "weights of nothing": (
+        {"colour_weights": np.full(84, np.nan, np.float32)},
+        "colour_weights with values that are not finite",
+    ),
+    "another table": ({"table": np.zeros((5, 2), np.float32)}, "table has 10 numbers, expected 155 x 2"),
+    "other layers": ({"density_weights": np.zeros(9, np.float32)}, "density_weights has 9 numbers, expected 88"),
+    "levels without end": ({"sizes": np.array([2**31, 2, 6, 2, 9, 4, 1, 1, 16, 2])}, "levels = 2147483648, expected 1 to 32"),
+    "other cells": ({"res": np.array([3, 4, 6])}, "15,.* bytes of occupied cells at steps of 0.25 for 140 cells"),
+    "no step": ({"step": np.array(0.0)}, "at steps of 0 for 120 cells"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_HASH_GRIDS)
+def test_hostile_hash_grids_are_refused(variant_rgb: str, tmp_path: Path, case: str) -> None:
+    change, said = HOSTILE_HASH_GRIDS[case]
+    write_field(tmp_path / "f.npz", hash_grid())
+    with np.load(tmp_path / "f.npz") as stored:
+        held = dict(stored)
+    np.savez(tmp_path / "f.npz", **held | change)
+    with pytest.raises(MivolError, match=said):
+        read_field(tmp_path / "f.npz")
 
 
 def test_values_that_half_floats_cannot_hold_stay(variant_rgb: str, tmp_path: Path) -> None:

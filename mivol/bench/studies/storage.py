@@ -26,7 +26,7 @@ import numpy as np
 
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.errors import MivolError
-from mivol.fields.field_files import read_field, write_field
+from mivol.fields.field_files import read_grid, write_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells
 
@@ -112,7 +112,7 @@ def read_run(folder: Path) -> dict:
     if missing:
         raise MivolError(f"{folder} has no {' and no '.join(missing)}; give folders of fits to photographs.")
     record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    field = read_field(folder / "field.npz")
+    field = read_grid(folder / "field.npz")
     return {
         "title": record["title"],
         "longest": max(field.res),

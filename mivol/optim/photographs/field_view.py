@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.fields.hash_grid import HashField
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, pixel_centres, rays
-from mivol.transport.line_integrals.radiance_field import RayBundle, find_occupied_cells, make_model, render_rays
+from mivol.transport.line_integrals.radiance_field import (
+    RayBundle,
+    RenderedRays,
+    find_occupied_cells,
+    make_model,
+    render_rays,
+)
 from mivol.transport.line_integrals.radiance_source import bake
+from mivol.transport.line_integrals.sampled_rays import SampledModel, SampledRays, render_samples
 
 
 @dataclass(frozen=True)
@@ -30,8 +39,11 @@ class FieldView:
 PASS = 1 << 20
 """Maximum number of rays in one pass."""
 
+SAMPLED_PASS = 1 << 15
+"""Maximum number of rays in one pass through a field that is sampled: a ray takes about 700 bytes a sample."""
 
-def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0) -> FieldView:
+
+def render_view(field: SphericalGrid | HashField, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0) -> FieldView:
     """Render the view of a camera.
 
     Args:
@@ -40,28 +52,41 @@ def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | S
         background: background of the field: a colour (3,), or a sky.
         stop: transmittance at which a ray ends.
 
-    Bias: O(h^4) in a cell, and the bias of :func:`mivol.transport.line_integrals.radiance_source.bake`.
+    Bias: of a grid, O(h^4) in a cell, and the bias of :func:`mivol.transport.line_integrals.radiance_source.bake`; of a hash
+        grid, the bias of :mod:`mivol.transport.line_integrals.sampled_rays`.
     """
-    cells, model = find_occupied_cells(field), make_model(field, stop)
-    source = bake(field, cells, camera.origin[None], mi.UInt32(0))
+    render = _prepare(field, camera, stop)
     width, height = camera.size
     order = _by_tiles(width, height)
     pixels = pixel_centres(camera.size).reshape(-1, 2)[order]
     values = np.empty((width * height, 5), np.float32)
-    for start in range(0, len(order), PASS):
-        o, d = rays(camera, pixels[start : start + PASS])
+    at_once = SAMPLED_PASS if isinstance(field, HashField) else PASS
+    for start in range(0, len(order), at_once):
+        o, d = rays(camera, pixels[start : start + at_once])
         o = np.broadcast_to(o, d.shape)
         bundle = RayBundle(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
-        rendered = render_rays(cells, source, model, bundle)
+        rendered = render(bundle)
         behind = background.eval(bundle.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
         colour = rendered.colour + rendered.T * behind
         dr.eval(colour, rendered.T, rendered.distance)
-        values[order[start : start + PASS]] = np.stack([*map(np.array, (*colour, rendered.T, rendered.distance))], axis=1)
+        values[order[start : start + at_once]] = np.stack([*map(np.array, (*colour, rendered.T, rendered.distance))], axis=1)
     values = values.reshape(height, width, 5)
     opacity = 1 - values[..., 3]
     with np.errstate(invalid="ignore", divide="ignore"):
         depth = np.where(opacity > 0, values[..., 4] / opacity, np.nan)
     return FieldView(values[..., :3], opacity, depth)
+
+
+def _prepare(
+    field: SphericalGrid | HashField, camera: Camera, stop: float
+) -> Callable[[RayBundle], RenderedRays | SampledRays]:
+    """The function that renders rays of a camera."""
+    if isinstance(field, HashField):
+        sampled = SampledModel.from_field(field, stop)
+        return lambda bundle: render_samples(sampled, bundle)
+    cells, model = find_occupied_cells(field), make_model(field, stop)
+    source = bake(field, cells, camera.origin[None], mi.UInt32(0))
+    return lambda bundle: render_rays(cells, source, model, bundle)
 
 
 def _by_tiles(width: int, height: int) -> np.ndarray:

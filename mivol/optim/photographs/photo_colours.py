@@ -28,6 +28,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.optim.photographs.ray_batches import RayBatch
+
 EPSILON = 0.1
 """Radiance, relative to white, below which all errors have about the same weight. Mildenhall et al. use 0.001."""
 
@@ -98,6 +100,52 @@ class LinearScale:
 
 SCALES: dict[str, SrgbScale | LinearScale] = {"srgb": SrgbScale(), "linear": LinearScale()}
 """Scales by the kind of photograph values (:data:`mivol.photos.photo_file.CONVERSIONS`)."""
+
+
+@dataclass
+class RayErrors:
+    """Errors of rendered rays against photographs.
+
+    Attributes:
+        colour: rendered colour over the backdrop, with the gain.
+        loss: squared error of each ray, weighted, mean over rgb.
+        by_colour, by_radiance, by_T: derivatives of the mean loss over rays by the colour with the gain, by the radiance
+            without, and by the transmittance.
+    """
+
+    colour: mi.Color3f
+    loss: mi.Float
+    by_colour: mi.Color3f
+    by_radiance: mi.Color3f
+    by_T: mi.Float
+
+
+def compare_rays(
+    batch: RayBatch,
+    radiance: mi.Color3f,
+    T: mi.Float,
+    backdrop: mi.Color3f,
+    scale: SrgbScale | LinearScale,
+    gain: mi.Color3f | None = None,
+) -> RayErrors:
+    """Compare rendered rays with the photographs.
+
+    Args:
+        batch: rays and colours of the photographs.
+        radiance, T: rendered rays, without a background.
+        backdrop: put behind the rays.
+        scale: of the photographs' values.
+        gain: of each ray's photograph; None: 1.
+    """
+    gain = mi.Color3f(1) if gain is None else gain
+    colour = gain * (radiance + T * backdrop)
+    # A transparent pixel of a photograph shows its own background: the error replaces it by the backdrop.
+    error = colour - batch.target - (1 - batch.alpha) * (backdrop - batch.background)
+    weight = scale.weight(colour)
+    error *= batch.counted * weight
+    by_colour = error * weight * (2 / (3 * dr.width(batch.slot)))
+    by_radiance = by_colour * gain
+    return RayErrors(colour, dr.squared_norm(error) * (1 / 3), by_colour, by_radiance, dr.dot(by_radiance, backdrop))
 
 
 CHANNELS = 3

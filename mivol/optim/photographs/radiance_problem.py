@@ -31,7 +31,7 @@ from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure
+from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure, compare_rays
 from mivol.optim.photographs.radiance_plan import RadiancePlan, place_grid
 from mivol.optim.photographs.ray_batches import DepthRays, RayBatch, RayBatches, depth_loss_gradient, sample_depth_rays
 from mivol.optim.priors import Neighbours, Rows
@@ -177,23 +177,17 @@ class RadianceProblem(SparseProblem):
         source = bake(self.field, self._cells, batch.origins, batch.slot, slope=True)
         model, count = make_model(self.field, self.plan.stop), dr.width(batch.slot)
         rendered = render_rays(self._cells, source, model, batch.rays)
-        own = batch.background
-        backdrop = own if background is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
+        backdrop = batch.background
+        if background is not None:
+            backdrop = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
         backdrop = backdrop if self.sky is None else self.sky.eval(batch.rays.d)
-        gain = self.exposure.gains(batch.view) if self.has_gains else mi.Color3f(1)
-        colour = gain * (rendered.colour + rendered.T * backdrop)
-        # A transparent pixel of a photograph shows its own background: the error replaces it by the backdrop.
-        error = colour - batch.target - (1 - batch.alpha) * (backdrop - own)
-        weight = self.scale.weight(colour)
-        error *= batch.counted * weight
-        by_colour = error * weight * (2 / (3 * count))
-        by_radiance = by_colour * gain
-        by_T = dr.dot(by_radiance, backdrop)
+        gain = self.exposure.gains(batch.view) if self.has_gains else None
+        errors = compare_rays(batch, rendered.colour, rendered.T, backdrop, self.scale, gain)
+        by_radiance, by_T, loss = errors.by_radiance, errors.by_T, errors.loss
         if self.plan.beta > 0:
             # Bounded: at 0 and 1 the prior is satisfied, and its derivative is infinite.
             T = dr.clip(rendered.T, 0.01, 0.99)
             by_T += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
-        loss = dr.squared_norm(error) * (1 / 3)
         dr.eval(rendered, by_radiance, by_T, loss)
         vjp_rays(self._cells, source, model, rendered, RayGradient(by_radiance, by_T), near=self.near)
         if depth_rays is not None:
@@ -204,7 +198,7 @@ class RadianceProblem(SparseProblem):
         if self.sky is not None:
             gradient["sky"] = self.sky.texel_gradient(batch.rays.d, by_radiance * rendered.T)
         if self.exposure is not None:
-            by_log_gain = by_colour * colour if self.has_gains else mi.Color3f(0)
+            by_log_gain = errors.by_colour * errors.colour if self.has_gains else mi.Color3f(0)
             gradient["exposure"] = self.exposure.gradient(batch.view, by_log_gain)
         return loss, gradient
 

@@ -1,0 +1,248 @@
+r"""Fit of a radiance field that is known only at points to photographs: a hash grid with small networks.
+
+Conventions. A step has about as many samples as the plan asks for: the number of rays follows from the samples of a ray in the
+last steps. The loss is the mean squared error over rays and rgb, weighted as for grids (:mod:`.photo_colours`). Every few steps
+densities at random points refresh the map of occupied cells (:mod:`mivol.transport.traversal.occupancy`). Photographs with
+alpha get another background colour in each step. A step depends on the reals, the map, the samples of a ray, the seed and its
+number.
+
+References: Müller et al. 2022 (learning rate, decay of the weights, samples a step); Li et al. 2023 (times of the decay).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol import machine
+from mivol.fields.hash_grid import HashField, HashSizes
+from mivol.optim.events import Event
+from mivol.optim.first_order import Adam
+from mivol.optim.loop import Course
+from mivol.optim.photographs.photo_colours import SCALES, compare_rays
+from mivol.optim.photographs.radiance_plan import allocated_bytes, place_grid
+from mivol.optim.photographs.ray_batches import TILE, RayBatches
+from mivol.optim.problem import DifferentiableProblem, Reals
+from mivol.transport.line_integrals.radiance_field import RayGradient
+from mivol.transport.line_integrals.sampled_rays import SampledModel, render_samples, vjp_samples
+from mivol.transport.traversal.occupancy import Occupancy, list_cells
+
+__all__ = ["PRESETS", "SampledPlan", "SampledProblem", "check_memory"]
+
+
+@dataclass(frozen=True)
+class SampledPlan:
+    """Plan of a fit of a hash grid.
+
+    Attributes:
+        sizes: of the hash grid and its networks.
+        steps: number of steps.
+        samples: samples of a step whose colour is evaluated, on average.
+        views: most photographs of a step.
+        cells: cells of the occupancy map along the longest edge of the box.
+        samples_a_cell: samples along the edge of such a cell.
+        rate: initial learning rate of all parameters.
+        warm_up: steps in which the rate rises, linearly from a hundredth.
+        decay: factor on the rate at 50, 75 and 90 % of the steps.
+        weight_decay: L2 decay of the weights of the networks [1].
+        stop: transmittance at which a ray ends.
+        refresh_every: steps between two refreshes of the occupancy map.
+        refresh_all: first steps, in which a refresh evaluates all cells; later ones evaluate a fourth at random and a fourth
+            among the occupied.
+        random_background: whether photographs with alpha get another background colour in each step.
+    """
+
+    sizes: HashSizes = dataclasses.field(default_factory=HashSizes)
+    steps: int = 1000
+    samples: int = 1 << 16
+    views: int = 64
+    cells: int = 64
+    samples_a_cell: float = 2.0
+    rate: float = 1e-2
+    warm_up: int = 100
+    decay: float = 0.33
+    weight_decay: float = 1e-6
+    stop: float = 1e-4
+    refresh_every: int = 16
+    refresh_all: int = 256
+    random_background: bool = True
+
+    @property
+    def optimizer(self) -> Adam:
+        """The optimizer of the plan."""
+        return Adam(beta_1=0.9, beta_2=0.99, epsilon=1e-15)
+
+    def course(self, *more: Event) -> Course:
+        """All steps, with further events."""
+        return Course(self.steps, events=more)
+
+    def learning_rate(self, step: int) -> float:
+        """Learning rate in a step."""
+        passed = sum(step >= share * self.steps for share in (0.5, 0.75, 0.9))
+        rise = min(1.0, 0.01 + 0.99 * step / self.warm_up) if self.warm_up else 1.0
+        return self.rate * rise * self.decay**passed
+
+
+PRESETS: dict[str, SampledPlan] = {
+    "tiny": SampledPlan(HashSizes(levels=6, log2_table=13, finest=64, width=16), steps=200, samples=1 << 13, cells=24),
+    "minute": SampledPlan(),
+    "minutes": SampledPlan(steps=6000),
+    "gpu": SampledPlan(steps=20000, samples=1 << 18, cells=128),
+}
+
+
+@dataclasses.dataclass
+class SampledProblem(DifferentiableProblem):
+    """A hash grid in a box, with photographs.
+
+    Attributes:
+        batches: the photographs, at full size (shrink 1).
+        box: (2, 3) [length], box of the field.
+        plan: plan of the fit.
+        seed: root of the first values, rays and samples.
+        safe_point: not called; a step is short.
+        field: present field.
+        occupancy: map of the cells that rays sample.
+        sky: None; what photographs show behind the box is known.
+    """
+
+    batches: RayBatches
+    box: np.ndarray
+    plan: SampledPlan
+    seed: int = 0
+    safe_point: Callable[[], None] = lambda: None
+    field: HashField = dataclasses.field(init=False)
+    occupancy: Occupancy = dataclasses.field(init=False)
+    sky: ClassVar[None] = None
+
+    def __post_init__(self) -> None:
+        to_world = np.diag([*(self.box[1] - self.box[0]), 1.0])
+        to_world[:3, 3] = self.box[0]
+        self.field = HashField.random(self.plan.sizes, to_world, self.seed, self.batches.space)
+        self.scale = SCALES[self.batches.space]
+        res, place = place_grid(self.box, self.plan.cells)
+        self.step = float(place[0, 0] / res[2]) / self.plan.samples_a_cell
+        self.occupancy = Occupancy.full(res, place)
+        self.samples_a_ray = self.plan.cells * self.plan.samples_a_cell
+        self._list_cells()
+
+    @property
+    def model(self) -> SampledModel:
+        """The present field with its occupied cells."""
+        return SampledModel(self.field, self._cells, self.step, self.plan.stop)
+
+    # -- Values -------------------------------------------------------------------------------------------------------
+
+    def initial_reals(self) -> Reals:
+        return self.values()
+
+    def values(self) -> Reals:
+        return self.field.parameters()
+
+    def set_reals(self, reals: Reals) -> None:
+        self.field = self.field.with_parameters(reals)
+
+    # -- Loss and gradient --------------------------------------------------------------------------------------------
+
+    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
+        """Mean (weighted) squared error of an iteration's rays, and its gradient; 0 views takes the plan's number.
+
+        Noise: from the choice of pixels and of samples.
+        """
+        self.set_reals(reals)
+        rng = np.random.default_rng((self.seed, iteration))
+        if iteration % self.plan.refresh_every == 0:
+            self.refresh_occupancy(iteration, rng)
+        chosen = self.batches.choose_views(views or self.plan.views, rng)
+        tiles = max(1, round(self.plan.samples / self.samples_a_ray / (TILE**2 * len(chosen))))
+        batch = self.batches.draw_tiles(1, chosen, tiles, rng)
+        dr.eval(batch.rays)
+        rendered = render_samples(self.model, batch.rays, float(rng.random()))
+        random = self.plan.random_background and self.batches.channels == 4
+        backdrop = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in rng.random(3))) if random else batch.background
+        errors = compare_rays(batch, rendered.colour, rendered.T, backdrop, self.scale)
+        dr.eval(errors)
+        slopes = vjp_samples(rendered, RayGradient(errors.by_radiance, errors.by_T))
+        kept = 0 if rendered.samples is None else rendered.samples.size
+        self._follow_samples(kept / dr.width(batch.slot))
+        decay = self.plan.weight_decay
+        gradient = {}
+        for name, value in reals.items():
+            slope = slopes.get(name, dr.zeros(mi.Float, dr.width(value.array)))
+            if name != "table":
+                slope = dr.fma(decay, value.array, slope)
+            gradient[name] = mi.TensorXf(slope, value.shape)
+        return dr.mean(errors.loss), gradient
+
+    def _follow_samples(self, samples_a_ray: float) -> None:
+        """Follow the mean number of samples of a ray; a step changes it by at most a factor of 2."""
+        known = self.samples_a_ray
+        self.samples_a_ray = min(max(samples_a_ray, known / 2, 0.25), known * 2) * 0.2 + known * 0.8
+
+    def refresh_occupancy(self, iteration: int, rng: np.random.Generator) -> None:
+        """Update the map with densities at random points, and list the occupied cells."""
+        share = 1.0 if iteration < self.plan.refresh_all else 0.5
+        self.occupancy = self.occupancy.refreshed(self.field.density, float(rng.random()), share)
+        self._list_cells()
+
+    def _list_cells(self) -> None:
+        self.field = replace(self.field, region=self.occupancy.region(self.step))
+        self._cells = list_cells(self.field.region)
+
+    # -- Steps --------------------------------------------------------------------------------------------------------
+
+    def learning_rates(self, iteration: int) -> dict[str, float]:
+        """The rate of the plan for each parameter."""
+        return dict.fromkeys(self.field.parameters(), self.plan.learning_rate(iteration))
+
+    def after_step(self, reals: Reals, iteration: int) -> Reals:
+        return reals
+
+    # -- On disk ------------------------------------------------------------------------------------------------------
+
+    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
+        """The occupancy map and the mean number of samples of a ray."""
+        return {"occupancy": np.array(self.occupancy.values), "samples_a_ray": np.array(self.samples_a_ray)}
+
+    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
+        self.occupancy = replace(self.occupancy, values=mi.Float(arrays["occupancy"]))
+        self.samples_a_ray = float(arrays["samples_a_ray"])
+        self.set_reals(reals)
+        self._list_cells()
+
+
+SAMPLE = 4 * 160
+"""Bytes of a sample: places, values, derivatives, features and harmonics, with their copies by rows."""
+
+
+def estimate_bytes(plan: SampledPlan, box: np.ndarray) -> int:
+    """Dr.Jit's memory in a step [bytes]: parameters with two moments, derivatives and one copy per thread; map; samples."""
+    sizes = plan.sizes
+    rows = sum(level.rows for level in sizes.place_levels(box[1] - box[0]))
+    threads = dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0
+    table = allocated_bytes(4 * rows * sizes.features)
+    cells = math.prod(n + 1 for n in place_grid(box, plan.cells)[0])
+    return (8 + threads) * table + 40 * cells + SAMPLE * 4 * plan.samples
+
+
+def check_memory(plan: SampledPlan, box: np.ndarray, batches: RayBatches, limit: int | None = None) -> str:
+    """Check that a fit has enough memory; returns one sentence about its memory.
+
+    Args:
+        plan, box, batches: plan, box and photographs of the fit.
+        limit: [bytes]; None takes the machine's available memory (unchecked on a GPU).
+
+    Raises:
+        MivolError: the fit needs more memory.
+    """
+    own = estimate_bytes(plan, box)
+    if limit is not None or dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
+        machine.check_memory(batches.bytes + own, "a fit of a hash grid", "give field.log2_table or field.samples less", limit)
+    return f"about {(batches.bytes + own) / 2**20:.0f} MiB: photographs {batches.bytes / 2**20:.0f}, the fit {own / 2**20:.0f}"

@@ -1,0 +1,100 @@
+"""Fit of a hash grid to photographs: gradients, resumed fits, memory, and a small fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from ball_photos import BOX, error_of
+
+from mivol.errors import MivolError
+from mivol.fields.hash_grid import HashSizes
+from mivol.optim.checkpoint import CheckpointFile
+from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.photographs.sampled_problem import SampledPlan, SampledProblem, check_memory
+from mivol.photos import Photo
+
+SIZES = HashSizes(levels=4, log2_table=10, coarsest=4, finest=24, width=16, degree=1)
+PLAN = SampledPlan(SIZES, steps=8, samples=2000, cells=12, warm_up=2, refresh_every=2, refresh_all=3, random_background=False)
+
+
+def taken(fit: Fit, steps: int) -> Fit:
+    while fit.next_iteration < steps:
+        fit.advance()
+    fit.problem.set_reals(fit.run.reals)
+    return fit
+
+
+def begin(photos: list[Photo], plan: SampledPlan = PLAN, store: CheckpointFile | None = None) -> Fit:
+    problem = SampledProblem(RayBatches.from_photos(photos), BOX, plan, seed=1)
+    return begin_fit(problem, plan.optimizer, plan.course(), checkpoint=store)
+
+
+def test_the_gradient_is_the_slope_of_the_loss(variant_rgb: str, photos: list[Photo]) -> None:
+    """Along a random direction of each parameter, with the rays and samples of one step."""
+    plan = replace(PLAN, weight_decay=0.0, refresh_every=1000, stop=0.0)
+    problem = SampledProblem(RayBatches.from_photos(photos[:4]), BOX, plan, seed=1)
+    rng = np.random.default_rng(0)
+    reals = {
+        name: mi.TensorXf(np.array(value) + 0.3 * rng.normal(size=value.shape).astype(np.float32))
+        for name, value in problem.values().items()
+    }
+    known = problem.samples_a_ray
+
+    def loss_at(changed: dict) -> tuple[float, dict]:
+        problem.samples_a_ray = known
+        loss, gradient = problem.loss_and_gradient(changed, 1)
+        return float(loss[0]), gradient
+
+    _, gradient = loss_at(reals)
+    for name, value in reals.items():
+        along = np.array(gradient[name])
+        along /= np.linalg.norm(along)
+        h = 2e-2
+        ends = [loss_at(reals | {name: mi.TensorXf(np.array(value) + np.float32(s * h * along))})[0] for s in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * h)
+        # Rounding: 2^-23 of the loss over h. Central differences err by h^2 / 6 of a third derivative, and at kinks of ReLU.
+        assert float((along * np.array(gradient[name])).sum()) == pytest.approx(slope, rel=0.02, abs=2.0**-22 / h)
+
+
+def test_a_resumed_fit_equals_an_uninterrupted_fit(one_thread, photos: list[Photo], tmp_path: Path) -> None:
+    """Values, moments and losses, to the last bit with one thread; the map of occupied cells is among what is kept."""
+    path = tmp_path / "checkpoint.npz"
+    whole = taken(begin(photos, store=CheckpointFile(path, {})), 5)
+    whole.save()
+    whole = taken(whole, 8)
+    resumed = begin(photos, store=CheckpointFile(path, {}, resume=True))
+    assert resumed.next_iteration == 5
+    resumed = taken(resumed, 8)
+    kept, found = whole.run.pack(), resumed.run.pack()
+    assert kept.keys() == found.keys() and all(np.array_equal(kept[name], found[name]) for name in kept)
+    assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
+    assert resumed.problem.samples_a_ray == whole.problem.samples_a_ray
+
+
+def test_rates_rise_and_fall_as_published() -> None:
+    plan = SampledPlan(steps=1000)
+    rates = [plan.learning_rate(step) for step in (0, 50, 100, 499, 500, 750, 900)]
+    np.testing.assert_allclose(rates, [1e-4, 0.505e-2, 1e-2, 1e-2, 0.33e-2, 0.33**2 * 1e-2, 0.33**3 * 1e-2], rtol=1e-12)
+
+
+def test_memory_is_refused_before_the_fit(variant_rgb: str, photos: list[Photo]) -> None:
+    batches = RayBatches.from_photos(photos[:2])
+    assert "MiB: photographs 0, the fit" in check_memory(PLAN, BOX, batches, 2**40)
+    large = replace(PLAN, sizes=HashSizes(log2_table=24, finest=2048, levels=16, features=8))
+    with pytest.raises(MivolError, match=r"give field.log2_table or field.samples less"):
+        check_memory(large, BOX, batches, 2**30)
+
+
+@pytest.mark.slow
+def test_a_fit_predicts_a_view_between_those_it_saw(variant_rgb: str, photos: list[Photo]) -> None:
+    """25 dB, as for a grid; the mean colour of the views gives 11 dB. Samples concentrate: most cells end up empty."""
+    plan = SampledPlan(SIZES, steps=300, samples=1 << 13, cells=24, warm_up=50, refresh_every=4, refresh_all=128)
+    fit = taken(begin(photos, plan), plan.steps)
+    assert error_of(fit) < 0.0032
+    assert np.array(fit.problem.field.region.occupied).mean() < 0.5
+    assert fit.problem.samples_a_ray < 24
