@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -172,32 +174,47 @@ def test_lanes_in_media_and_at_surfaces_scatter_together():
 # -- Directions around a near emitter ------------------------------------------------------------------------------------
 
 
-def aimed_at(axis: list[float], share: float, u: np.ndarray) -> AimedDirections:
-    """Directions around an axis, drawn in the lanes in which ``u`` is below the share."""
+AXES = [0.3, -0.5, 0.8], [1.0, 0.2, 0.1], [-0.4, 0.6, 0.0]
+
+
+def aimed_at(axes: Sequence[list[float]], shares: Sequence[float], u: np.ndarray) -> AimedDirections:
+    """Directions around some axes, each drawn in the lanes in which ``u`` is in its share."""
     n = len(u)
-    return AimedDirections(
-        dr.normalize(mi.Vector3f(*axis)) + dr.zeros(mi.Float, n), dr.full(mi.Float, share, n), mi.Float(u) < share
-    )
+    towards = [dr.normalize(mi.Vector3f(*axis)) + dr.zeros(mi.Float, n) for axis in axes]
+    return AimedDirections(towards, [dr.full(mi.Float, share, n) for share in shares], mi.Float(u))
 
 
 def test_aimed_directions_have_their_density():
     """The angle theta has the distribution 1 - (1 - theta / pi)^2; sin(theta) q(theta) 2 pi is its derivative."""
     u = np.linspace(0.05, 0.95, 91)
-    aimed = aimed_at([0.3, -0.5, 0.8], 0.4, u)
+    aimed = aimed_at(AXES[:1], [0.4], u)
     d = aimed.draw(mi.Point2f(mi.Float(u), mi.Float(np.roll(u, 7))))
-    theta = np.arccos(np.clip(np.array(dr.dot(d, aimed.axis), np.float64), -1, 1))
+    theta, density = np.arccos(np.clip(np.array(dr.dot(d, aimed.axes[0]), np.float64), -1, 1)), aimed.pdf(aimed.axes[0], d)
     # Four roundings of a cosine of at most 1 move an angle of at least 0.079 by 4 x 2^-24 / 0.079 = 3e-6.
     np.testing.assert_allclose(theta, np.pi * (1 - np.sqrt(1 - u)), atol=1e-5)
-    np.testing.assert_allclose(2 * np.pi * np.sin(theta) * np.array(aimed.pdf(d)), 2 * (np.pi - theta) / np.pi**2, rtol=1e-3)
+    np.testing.assert_allclose(2 * np.pi * np.sin(theta) * np.array(density), 2 * (np.pi - theta) / np.pi**2, rtol=1e-3)
     mixed = np.array(aimed.mix(mi.Float(2.0), d))
-    np.testing.assert_allclose(mixed, 0.6 * 2.0 + 0.4 * np.array(aimed.pdf(d)), rtol=ROUNDING)
+    np.testing.assert_allclose(mixed, 0.6 * 2.0 + 0.4 * np.array(density), rtol=ROUNDING)
+
+
+def test_each_emitter_has_its_share_of_the_directions():
+    """Shares of 0.2, 0.1 and 0.15: a number picks an axis, and the density of a direction counts all of them."""
+    u = np.linspace(0, 0.999, 200)
+    aimed = aimed_at(AXES, [0.2, 0.1, 0.15], u)
+    d = aimed.draw(mi.Point2f(dr.full(mi.Float, 1e-4, 200), 0.3))
+    # Directions at an angle of 1.6e-4 from their axis; the axes are more than 0.5 apart.
+    nearest = np.argmax([np.array(dr.dot(d, axis)) for axis in aimed.axes], axis=0)
+    np.testing.assert_array_equal(nearest[u < 0.45], np.searchsorted([0.2, 0.3], u[u < 0.45], side="right"))
+    np.testing.assert_array_equal(np.array(aimed.is_drawn), u < 0.45)
+    own = sum(share * np.array(aimed.pdf(axis, d)) for axis, share in zip(aimed.axes, (0.2, 0.1, 0.15), strict=True))
+    np.testing.assert_allclose(np.array(aimed.mix(mi.Float(2.0), d)), 0.55 * 2.0 + own, rtol=2 * ROUNDING)
 
 
 def test_no_sample_of_an_aimed_direction_finds_much_light():
     """The light along a ray is in proportion to (pi - theta) / sin(theta), and its weight is at most f / (share q)."""
     theta = np.concatenate([np.geomspace(2e-6, 1, 100), np.linspace(1, np.pi - 1e-3, 100)])
     d = mi.Vector3f(mi.Float(np.sin(theta)), 0, mi.Float(np.cos(theta)))
-    mixed = np.array(aimed_at([0, 0, 1], 0.4, theta).mix(mi.Float(1 / (4 * np.pi)), d), np.float64)
+    mixed = np.array(aimed_at([[0, 0, 1]], [0.4], theta).mix(mi.Float(1 / (4 * np.pi)), d), np.float64)
     assert ((np.pi - theta) / np.sin(theta) / mixed).max() < np.pi**3 / 0.4 * 1.001
 
 
@@ -215,9 +232,9 @@ def test_aimed_directions_keep_the_reflected_light(name):
     """The mean of weight x (1 + d_x + d_z) is an integral over all directions of the BSDF or phase function."""
     bench, rng = FallingRays(SURFACES.get(name, DIFFUSE)), np.random.default_rng(fresh(3))
     found = []
-    for share in (0.0, 0.4):
+    for shares in ([0.0, 0.0, 0.0], [0.2, 0.1, 0.1]):
         u = rng.random((4, 1 << 16))
-        turn = bench.turn_many(u[:3], aimed_at([0.5, 0.2, 1.0], share, u[3]), name == "medium")
+        turn = bench.turn_many(u[:3], aimed_at(AXES, shares, u[3]), name == "medium")
         light = np.array(turn.weight, np.float64)[1] * (1 + np.array(turn.ray.d.x) + np.array(turn.ray.d.z))
         found.append(Moments.from_values(light[:, None]))
     assert_same_mean(*found, rounding=1e-5)
@@ -230,6 +247,6 @@ def test_aimed_directions_keep_the_reflected_light(name):
 def test_surfaces_that_transmit_or_mirror_draw_their_own_directions(bsdf):
     """Where a path transmits, it has another index of refraction; a mirror has one direction only."""
     bench, u = FallingRays(bsdf), np.random.default_rng(1).random((4, 64))
-    alone, beside = (bench.turn_many(u[:3], aimed, False) for aimed in (None, aimed_at([0, 0, 1], 0.4, u[3])))
+    alone, beside = (bench.turn_many(u[:3], aimed, False) for aimed in (None, aimed_at([[0, 0, 1]], [0.4], u[3])))
     for a, b in ((alone.ray.d, beside.ray.d), (alone.weight, beside.weight), (alone.pdf, beside.pdf), (alone.eta, beside.eta)):
         np.testing.assert_array_equal(np.array(a), np.array(b))

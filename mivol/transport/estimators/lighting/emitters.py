@@ -111,6 +111,11 @@ class SceneEmitters:
         """
         return self._grid.at_point(p).sample(u)
 
+    def probabilities_at_point(self, p: mi.Point3f, numbers: list[int]) -> list[mi.Float]:
+        """Probabilities of emitters in :meth:`choose_at_point` [1], by their numbers."""
+        distribution = self._grid.at_point(p)
+        return [distribution.probability(mi.UInt32(number)) for number in numbers]
+
     def ball(self, number: mi.UInt32) -> tuple[mi.Point3f, mi.Float]:
         """Centre and radius of a ``sampled`` emitter [length]; 0 for an emitter at infinity."""
         if len(self.sampled) == 1:

@@ -58,6 +58,9 @@ MAX_AIMED_SHARE = 0.4
 """Largest share of directions drawn around an emitter [1]. Light of other emitters then has at most 1 / (1 - 0.4) = 1.7 times
 the variance. (Variance with a lamp in smoke, depth 8, and shares of 0, 1/4, 0.4 and 1/2: 1.9e-2, 4.3e-3, 3.7e-3, 3.1e-3.)"""
 
+MAX_MIXED = 8
+"""Largest number of emitters inside media whose directions are mixed: each costs its density at every vertex."""
+
 MIN_AIMED_DISTANCE = 3.0
 """Distance of an emitter over its radius [1] up to which no direction is aimed: light is even over so wide an angle."""
 
@@ -67,32 +70,50 @@ MIN_SINE = 1e-6
 
 @dataclass
 class AimedDirections:
-    """Directions around the direction towards an emitter, drawn in place of a share of the directions at a vertex.
+    """Directions around the directions towards emitters, drawn in place of a share of the directions at a vertex.
 
     Attributes:
-        axis: direction towards the emitter.
-        share: probability of drawing such a direction [1].
-        is_drawn: lanes that draw such a direction.
+        axes: direction towards each emitter.
+        shares: probability of a direction around each emitter [1].
+        u: uniform random number in [0, 1) that chooses one of them, or none.
     """
 
-    axis: mi.Vector3f
-    share: mi.Float
-    is_drawn: mi.Bool
+    axes: list[mi.Vector3f]
+    shares: list[mi.Float]
+    u: mi.Float
+
+    @property
+    def share(self) -> mi.Float:
+        """Probability of a direction around some emitter [1]."""
+        return sum(self.shares[1:], self.shares[0])
+
+    @property
+    def is_drawn(self) -> mi.Bool:
+        """Lanes that draw such a direction."""
+        return self.u < self.share
 
     def draw(self, u: mi.Point2f) -> mi.Vector3f:
-        """Draw a direction by two uniform random numbers in [0, 1)."""
+        """Draw a direction around the chosen emitter by two uniform random numbers in [0, 1)."""
+        axis, below = self.axes[0], self.shares[0]
+        for other, share in zip(self.axes[1:], self.shares[1:], strict=True):
+            axis = dr.select(self.u >= below, other, axis)
+            below = below + share  # a copy: += would change the share
         sin_theta, cos_theta = dr.sincos(dr.pi * (1 - dr.sqrt(1 - u.x)))
         sin_phi, cos_phi = dr.sincos(dr.two_pi * u.y)
-        return mi.Frame3f(self.axis).to_world(mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta))
+        return mi.Frame3f(axis).to_world(mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta))
 
-    def pdf(self, d: mi.Vector3f) -> mi.Float:
-        """Density of a direction of :meth:`draw` [1/sr]."""
-        sine = dr.norm(dr.cross(d, self.axis))
-        return (dr.pi - dr.atan2(sine, dr.dot(d, self.axis))) / (dr.pi**3 * dr.maximum(sine, MIN_SINE))
+    @staticmethod
+    def pdf(axis: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
+        """Density of a direction drawn around an axis [1/sr]."""
+        sine = dr.norm(dr.cross(d, axis))
+        return (dr.pi - dr.atan2(sine, dr.dot(d, axis))) / (dr.pi**3 * dr.maximum(sine, MIN_SINE))
 
     def mix(self, pdf: mi.Float, d: mi.Vector3f) -> mi.Float:
         """Density of a direction in the mixture with another density, ``pdf`` [1/sr]."""
-        return dr.lerp(pdf, self.pdf(d), self.share)
+        mixed = (1 - self.share) * pdf
+        for axis, share in zip(self.axes, self.shares, strict=True):
+            mixed = dr.fma(share, self.pdf(axis, d), mixed)
+        return mixed
 
     def weigh(self, f: mi.Spectrum, pdf: mi.Float, d: mi.Vector3f) -> mi.Spectrum:
         """A value over the density of its direction in the mixture with ``pdf``; 0 for a density of 0."""
@@ -156,7 +177,10 @@ class NearLighting:
         self.lights_vertices = bool(direct.far_emitters.sampled)
         aimed = [any(e is other for other in inside) for e in direct.emitters.sampled]
         self.aims = any(aimed)
-        self._aimed_share = None if all(aimed) else join_arrays([dr.opaque(mi.Float, MAX_AIMED_SHARE * a) for a in aimed])
+        self._mixed = [number for number, is_inside in enumerate(aimed) if is_inside]
+        self._aimed_share = None
+        if len(self._mixed) > MAX_MIXED and not all(aimed):
+            self._aimed_share = join_arrays([dr.opaque(mi.Float, MAX_AIMED_SHARE * a) for a in aimed])
 
     def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> NearLightSamples:
         """Draw the random numbers of a segment."""
@@ -165,25 +189,37 @@ class NearLighting:
         )
 
     def aim(self, p: mi.Point3f, u: mi.Float, active: mi.Bool) -> AimedDirections:
-        """Choose an emitter by its light at a vertex, and the share of directions around this emitter.
+        """Give emitters inside media their shares of the directions at a vertex, in proportion to their light there.
+
+        With more than ``MAX_MIXED`` of them, one emitter is chosen. A direction of the BSDF or phase function that passes
+        close by another one then has an unbounded weight.
 
         Args:
             p: the vertex.
             u: uniform random number in [0, 1) for the emitter, and for drawing such a direction.
             active: lanes that may aim; the share of other lanes is 0.
         """
-        number, u = self.direct.emitters.choose_at_point(p, u)
-        centre, radius = self.direct.emitters.ball(number)
+        emitters = self.direct.emitters
+        if len(self._mixed) <= MAX_MIXED:
+            shares = [MAX_AIMED_SHARE * probability for probability in emitters.probabilities_at_point(p, self._mixed)]
+            towards = [self._aim_at(p, mi.UInt32(n), s, active) for n, s in zip(self._mixed, shares, strict=True)]
+            return AimedDirections([axis for axis, _ in towards], [share for _, share in towards], u)
+        number, u = emitters.choose_at_point(p, u)
         share = mi.Float(MAX_AIMED_SHARE)
         if self._aimed_share is not None:
             share = dr.gather(mi.Float, self._aimed_share, number, active)
+        axis, share = self._aim_at(p, number, share, active)
+        return AimedDirections([axis], [share], u)
+
+    def _aim_at(self, p: mi.Point3f, number: mi.UInt32, share: mi.Float, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
+        """The direction from a vertex to an emitter, and the part of ``share`` that is worth spending on it [1]."""
+        centre, radius = self.direct.emitters.ball(number)
         axis = mi.Vector3f(centre - p)
         distance = dr.norm(axis)
         is_far = active & (distance > MIN_AIMED_DISTANCE * radius)
         inverse = dr.rcp(dr.select(is_far, distance, 1))
         share = dr.select(is_far, share * (1 - MIN_AIMED_DISTANCE * radius * inverse), 0)
-        axis = dr.select(is_far, axis * inverse, mi.Vector3f(0, 0, 1))
-        return AimedDirections(axis, share, u < share)
+        return dr.select(is_far, axis * inverse, mi.Vector3f(0, 0, 1)), share
 
     def estimate(
         self, segment: PathSegment, length: mi.Float, samples: NearLightSamples, attached: bool, active: mi.Bool
