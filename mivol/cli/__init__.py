@@ -168,7 +168,7 @@ def explain_flags() -> list:
     """Flags of ``mivol explain``."""
     return [
         *scene_flags(
-            "scene (.xml), experiment (.toml), points or Gaussians (.ply, .spz, ...), volume (.vdb, .nrrd, ...), "
+            "scene (.xml), experiment (.toml), points or Gaussians (.ply, .spz, ...), field (.npz), volume (.vdb, .nrrd, ...), "
             "scan (HDF5, .xtekct, folder), or photographs (folder, file)"
         ),
         flag("-o", "--output", type=Path, help="image (.png, .svg) of the cameras of photographs, and of the boxes"),
@@ -295,10 +295,12 @@ def convert_flags() -> list:
         flag("output", type=Path,
              help=f"file to write: {', '.join(writable)}, .npz (field), .obj (mesh); volumes: {', '.join(WRITERS)}"),
         DATASET,
-        flag("--to", choices=(*KINDS, "field", "mesh"), help="kind of the output (default: as the source, if possible)"),
+        flag("--to", choices=(*KINDS, "field", "mesh", "octree", "grid"),
+             help="kind of the output (default: as the source, if possible)"),
         flag("--resolution", type=int,
              help="for a field or a mesh: voxels along the longest edge (default: 128); for Gaussians from a field: Gaussians "
-             "along that edge (default: one per two voxels)"),
+             "along that edge (default: one per two voxels); for an octree: leaves along the edge of its cube, a power of two "
+             "(default: two per voxel)"),
         flag("--box", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
              help="box of a field or a mesh (default: three standard deviations around all Gaussians), or box that crops "
              "Gaussians or points [length]"),
@@ -327,8 +329,8 @@ def explain(arguments: argparse.Namespace) -> int:
     """Say what mivol would do with a scene or an experiment, and why, before it renders more than a small preview.
 
     For photographs, explain lists present and missing data, and draws the cameras with --output. For points and
-    Gaussians, it prints their number, extent, sizes and opacities; for a volume, its size, values and place. A refusal comes
-    after the facts, with exit code 1.
+    Gaussians, it prints their number, extent, sizes and opacities; for a volume or a field, its size, values and place. A
+    refusal comes after the facts, with exit code 1.
     """
     from mivol.photos import find_format
     from mivol.points.summary import is_points_file, summarize_file
@@ -344,6 +346,10 @@ def explain(arguments: argparse.Namespace) -> int:
         answer = summarize_file(arguments.scene)
     elif arguments.scene.is_dir() or find_format(arguments.scene):
         return explain_photos(arguments.scene, arguments.output)
+    elif arguments.scene.suffix.lower() == ".npz":
+        from mivol.experiments.octree_conversion import describe_field
+
+        answer = describe_field(arguments.scene, arguments.mode)
     else:
         from mivol.scene.explain import explain_scene
 
@@ -645,9 +651,9 @@ def export(arguments: argparse.Namespace) -> None:
 def convert(arguments: argparse.Namespace) -> None:
     """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats; volumes too.
 
-    A field (.npz) is the mivol_sh of a scene. Conversions between a field and Gaussians (.ply) print their error in dB, from
-    views of the field and of splatted Gaussians. A mesh (.obj, or .ply with --to mesh) is fused from depths of splatted views;
-    convert prints the distance between mesh and splats.
+    A field (.npz) is the mivol_sh of a scene, or an octree (--to octree). Conversions between a field and an octree or
+    Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply with --to mesh) is fused from depths of
+    splatted views; convert prints the distance between mesh and splats.
     """
     from mivol.files.formats import is_volume_file
 
@@ -675,6 +681,12 @@ def _convert_cloud(arguments: argparse.Namespace) -> str:
     if not is_points_file(source) and source.suffix.lower() != ".npz":
         _check_contents(source)
     kind = _check_conversion(arguments)
+    if source.suffix.lower() == ".npz" and target.suffix.lower() == ".npz":
+        from mivol.experiments import octree_conversion
+
+        if kind == "grid":
+            return octree_conversion.convert_to_grid(source, target, arguments.mode)
+        return octree_conversion.convert_to_octree(source, target, resolution, arguments.mode)
     if source.suffix.lower() == ".npz":
         return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
     if kind not in ("field", "mesh"):
@@ -688,9 +700,15 @@ def _check_conversion(arguments: argparse.Namespace) -> str | None:
     source, target = arguments.source, arguments.output
     from_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
     kind = arguments.to or WRITTEN_AS.get(target.suffix.lower())
-    if is_field != (kind == "field"):
+    if from_field and is_field and arguments.to not in ("grid", "octree"):
+        raise MivolError(f"{target}: a radiance field becomes an octree with --to octree, and an octree a grid with --to grid.")
+    if kind in ("octree", "grid") and not (from_field and is_field):
+        raise MivolError(f"{target}: --to {kind} makes an .npz from a radiance field (.npz); make a field first: --to field.")
+    if kind == "grid" and arguments.resolution is not None:
+        raise MivolError(f"{target}: the grid of an octree has a node in each of its smallest cells: leave out --resolution.")
+    if is_field != (kind in ("field", "octree", "grid")):
         raise MivolError(f"{target}: a radiance field is written as .npz, and nothing else is; leave out --to {arguments.to}.")
-    if from_field and kind not in (None, "gaussians"):
+    if from_field and not is_field and kind not in (None, "gaussians"):
         raise MivolError(
             f"{source}: a radiance field becomes Gaussians (.ply) here; mivol export writes it as a mesh and more."
         )

@@ -2,6 +2,9 @@
 
 A new format is one writer (and a parser, if mivol reads the format) and one line in the table.
 
+Octrees. Formats that hold no octree get it as a grid with a node in the middle of each smallest cell
+(:meth:`mivol.fields.octree.Octree.to_grid`), which changes views a little.
+
 Conventions of volumes (``.vol``, ``.nrrd``). A file holds the extinction [1/length] at the nodes; a second file
 (``NAME-colour``) holds the colour of degree 0 with its offset, the mean over all directions. Colours keep the space of the
 field's photographs. The activation is applied at the nodes; a field applies it after interpolation, so surfaces of a ``relu``
@@ -18,6 +21,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -36,6 +40,8 @@ from mivol.fields.field_archives import (
     write_svox2,
 )
 from mivol.fields.hash_grid import HashField
+from mivol.fields.octree import Octree
+from mivol.fields.octree_files import is_octree, is_svox, parse_octree, parse_svox, write_octree, write_svox
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import extract_surface
@@ -83,13 +89,13 @@ class FieldFormat:
     """
 
     name: str
-    write: Callable[[Path, SphericalGrid, WriteOptions], list[Path]]
+    write: Callable[[Path, Any, WriteOptions], list[Path]]
     recognizes: Callable[[dict[str, np.ndarray]], bool] | None = None
-    parse: Callable[[str, dict[str, np.ndarray]], SphericalGrid] | None = None
+    parse: Callable[[str, dict[str, np.ndarray]], SphericalGrid | Octree] | None = None
 
 
-def read_field(path: str | os.PathLike) -> SphericalGrid | HashField:
-    """Read a radiance field: an ``.npz`` of mivol (a grid or a hash grid), or a checkpoint of svox2.
+def read_field(path: str | os.PathLike) -> SphericalGrid | HashField | Octree:
+    """Read a radiance field: an ``.npz`` of mivol (a grid, a hash grid, an octree), of svox2, or of svox (PlenOctrees).
 
     Raises:
         MivolError: a missing file, another format, or contents that contradict each other.
@@ -112,9 +118,11 @@ def read_grid(path: str | os.PathLike) -> SphericalGrid:
     """Read a radiance field that is a grid.
 
     Raises:
-        MivolError: as :func:`read_field`, or a hash grid.
+        MivolError: as :func:`read_field`, or a hash grid or an octree.
     """
     field = read_field(path)
+    if isinstance(field, Octree):
+        raise refusal(Path(path), "an octree", "a grid of harmonics", "convert it by mivol convert FILE grid.npz --to grid")
     if isinstance(field, HashField):
         raise refusal(Path(path), "a hash grid", "a grid of harmonics", "convert it by mivol convert FILE grid.npz --to grid")
     return field
@@ -122,7 +130,7 @@ def read_grid(path: str | os.PathLike) -> SphericalGrid:
 
 def write_field(
     path: str | os.PathLike,
-    field: SphericalGrid | HashField,
+    field: SphericalGrid | HashField | Octree,
     level: float | None = None,
     sky: Sky | None = None,
     half: bool = True,
@@ -132,11 +140,11 @@ def write_field(
 
     Args:
         path: destination.
-        field: radiance field, nested or not.
+        field: radiance field, nested or not, a hash grid or an octree.
         level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surfaces.default_level`.
         sky: background of the field, in the space of its colours. Only a scene (``.xml``) holds it.
-        half: store half floats in ``.npz`` (11 bits). Arrays with a value above 65504, or with all values below 2^-12, stay
-            float32.
+        half: store half floats in ``.npz`` (11 bits), or an octree's rounded values (:mod:`mivol.fields.octree_files`). Arrays
+            with a value above 65504, or with all values below 2^-12, stay float32.
         view: first view of the field (:func:`mivol.photos.camera_path.find_home_view`), kept by ``.npz`` and used by ``.xml``.
 
     Returns:
@@ -160,12 +168,25 @@ def write_field(
     kind = FIELD_FORMATS[suffix]
     if level is not None and kind.write is not _write_mesh:
         raise refusal(path, f"a level for a {kind.name}", "none", "levels are for meshes: write .ply or .obj")
+    if isinstance(field, Octree) and kind.write not in (_write_npz, _write_svox):
+        field = field.to_grid()
     return kind.write(path, field, WriteOptions(level, sky, half, view))
 
 
-def _write_npz(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
-    write_archive(path, field, options.half, options.view)
+def _write_npz(path: Path, field: SphericalGrid | Octree, options: WriteOptions) -> list[Path]:
+    (write_octree if isinstance(field, Octree) else write_archive)(path, field, options.half, options.view)
     return [path]
+
+
+def _write_svox(path: Path, field: SphericalGrid | Octree, options: WriteOptions) -> list[Path]:
+    if not isinstance(field, Octree):
+        raise refusal(path, "a field on a grid", "an octree", "convert it first: mivol convert field.npz tree.npz --to octree")
+    write_svox(path, field)
+    return [path]
+
+
+def _parse_own(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid | Octree:
+    return (parse_octree if is_octree(arrays) else parse_archive)(name, arrays)
 
 
 def _write_svox2(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
@@ -200,8 +221,9 @@ def _write_scene(path: Path, field: SphericalGrid, options: WriteOptions) -> lis
 
 
 FIELD_FORMATS: dict[str, FieldFormat] = {
-    ".npz": FieldFormat("field of mivol", _write_npz, is_own_archive, parse_archive),
+    ".npz": FieldFormat("field of mivol", _write_npz, lambda arrays: is_own_archive(arrays) or is_octree(arrays), _parse_own),
     ".svox2.npz": FieldFormat("checkpoint of svox2", _write_svox2, is_svox2, parse_svox2),
+    ".svox.npz": FieldFormat("octree of svox", _write_svox, is_svox, parse_svox),
     ".vol": FieldFormat("pair of Mitsuba grids", _write_volumes),
     ".nrrd": FieldFormat("pair of NRRD volumes", _write_volumes),
     ".ply": FieldFormat("mesh with colours", _write_mesh),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,10 +11,13 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.hash_grid import HashField
+from mivol.fields.octree import Octree
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, pixel_centres, rays
+from mivol.transport.line_integrals.leaf_radiance import LeafPlaces, LeafRays, make_leaf_colours, render_leaves
 from mivol.transport.line_integrals.radiance_field import (
+    MAX_DEPTH,
     RayBundle,
     RenderedRays,
     find_occupied_cells,
@@ -22,6 +26,7 @@ from mivol.transport.line_integrals.radiance_field import (
 )
 from mivol.transport.line_integrals.radiance_source import bake
 from mivol.transport.line_integrals.sampled_rays import SampledModel, SampledRays, render_samples
+from mivol.transport.traversal.octree_walk import LeafIndex
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,9 @@ SAMPLED_PASS = 1 << 15
 """Maximum number of rays in one pass through a field that is sampled: a ray takes about 700 bytes a sample."""
 
 
-def render_view(field: SphericalGrid | HashField, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0) -> FieldView:
+def render_view(
+    field: SphericalGrid | HashField | Octree, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0
+) -> FieldView:
     """Render the view of a camera.
 
     Args:
@@ -53,7 +60,8 @@ def render_view(field: SphericalGrid | HashField, camera: Camera, background: np
         stop: transmittance at which a ray ends.
 
     Bias: of a grid, O(h^4) in a cell, and the bias of :func:`mivol.transport.line_integrals.radiance_source.bake`; of a hash
-        grid, the bias of :mod:`mivol.transport.line_integrals.sampled_rays`.
+        grid, the bias of :mod:`mivol.transport.line_integrals.sampled_rays`; of an octree, the bias of
+        :func:`mivol.transport.line_integrals.leaf_radiance.make_leaf_colours`.
     """
     render = _prepare(field, camera, stop)
     width, height = camera.size
@@ -78,9 +86,13 @@ def render_view(field: SphericalGrid | HashField, camera: Camera, background: np
 
 
 def _prepare(
-    field: SphericalGrid | HashField, camera: Camera, stop: float
-) -> Callable[[RayBundle], RenderedRays | SampledRays]:
+    field: SphericalGrid | HashField | Octree, camera: Camera, stop: float
+) -> Callable[[RayBundle], RenderedRays | SampledRays | LeafRays]:
     """The function that renders rays of a camera."""
+    if isinstance(field, Octree):
+        index, depth = LeafIndex.find(field), MAX_DEPTH if stop == 0 else -math.log(stop)
+        leaves = make_leaf_colours(field, LeafPlaces.find(field), camera.origin[None], mi.UInt32(0))
+        return lambda bundle: render_leaves(index, leaves, bundle, depth, distances=True)
     if isinstance(field, HashField):
         sampled = SampledModel.from_field(field, stop)
         return lambda bundle: render_samples(sampled, bundle)

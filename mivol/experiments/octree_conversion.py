@@ -1,0 +1,151 @@
+"""Conversions between radiance fields on grids and octrees, with their loss, and the description of a field's file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mivol.back_end import set_variant
+from mivol.errors import MivolError
+from mivol.experiments.gaussian_conversion import EDGE, VIEWED, cameras_around
+from mivol.fields.field_archives import read_field_view
+from mivol.fields.field_files import read_field, write_field
+from mivol.fields.hash_grid import HashField
+from mivol.fields.octree import Octree, check_depth
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.files.source import check_file
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree
+from mivol.photos import pixel_centres, rays
+from mivol.scene.explain import Explanation
+from mivol.transport.line_integrals.radiance_field import RayBundle
+from mivol.validate.metrics import psnr
+
+LOOKS = 48
+"""Number of views that decide which leaves are seen."""
+
+LOOK_EDGE = 512
+"""Largest edge of such a view [pixel]."""
+
+
+def convert_to_octree(source: Path, target: Path, resolution: int | None, variant: str) -> str:
+    """Write a radiance field as an octree.
+
+    Args:
+        source: field (.npz) with a single level, or an octree of svox, which is read as it is.
+        target: file ending in .npz, or .svox.npz.
+        resolution: leaves along the edge of the octree's cube, rounded up to a power of two; None means two leaves a voxel.
+        variant: Mitsuba variant of the views.
+
+    Returns:
+        A summary of file and error, in lines.
+
+    Raises:
+        MivolError: as :func:`mivol.fields.field_files.read_field`,
+            :func:`mivol.optim.photographs.octree_building.build_octree` and the disk.
+    """
+    set_variant(variant)
+    field = read_field(source)
+    if isinstance(field, HashField):
+        raise MivolError(f"{source} is a hash grid, and an octree is made from a grid: mivol convert FILE grid.npz --to grid.")
+    if resolution is not None:
+        if isinstance(field, Octree):
+            raise MivolError(f"{source} is an octree, whose leaves stay as they are: leave out --resolution.")
+        check_depth((resolution - 1).bit_length())
+    depth = 0 if resolution is None else max((resolution - 1).bit_length(), 1)
+    tree = field if isinstance(field, Octree) else build_octree(field, LookAround(field), OctreeRecipe(depth))
+    write_field(target, tree, view=read_field_view(source))
+    written = read_field(target)  # as it will be read: rounded values
+    return "\n".join([f"{target}: {describe_leaves(tree)}", *_describe_loss(source, field, target, written)])
+
+
+def convert_to_grid(source: Path, target: Path, variant: str) -> str:
+    """Write an octree as a radiance field on a grid; arguments and result as :func:`convert_to_octree`.
+
+    Raises:
+        MivolError: a source that is a grid, too many nodes, or as the readers and the disk.
+    """
+    set_variant(variant)
+    tree = read_field(source)
+    if not isinstance(tree, Octree):
+        raise MivolError(f"{source} is not an octree: mivol convert --to grid makes a grid from an octree.")
+    grid = tree.to_grid()
+    write_field(target, grid, view=read_field_view(source))
+    head = f"{target}: {' x '.join(map(str, grid.res[::-1]))} nodes, {grid.rows - 1} of them stored, degree {grid.degree}"
+    return "\n".join([head, *_describe_loss(source, tree, target, read_field(target))])
+
+
+def _describe_loss(source: Path, field: SphericalGrid | Octree, target: Path, written: SphericalGrid | Octree) -> list[str]:
+    """Difference between views of two fields, and the sizes of their files, in lines."""
+    sizes = [path.stat().st_size for path in (source, target)]
+    return [
+        f"{views_psnr(written, field):.1f} dB between views of {target.name} and {source.name}: {VIEWED}, over black, peak 1",
+        f"{sizes[1]} bytes, {sizes[1] / sizes[0]:.2f} of {source.name}",
+    ]
+
+
+def views_psnr(field: SphericalGrid | Octree, other: SphericalGrid | Octree) -> float:
+    """PSNR between views of two fields [dB], of the box of ``other``, over black, peak 1."""
+    cameras = cameras_around(other.to_world, EDGE)
+    images, truth = ([render_view(one, camera, np.zeros(3)).image for camera in cameras] for one in (field, other))
+    return psnr(np.stack(images), np.stack(truth), 1.0)
+
+
+class LookAround:
+    """Rays from all sides of the box of a grid, view by view: a pixel a half voxel, at most ``LOOK_EDGE`` along an edge."""
+
+    def __init__(self, grid: SphericalGrid) -> None:
+        edge = min(LOOK_EDGE, 4 * max(grid.res))
+        self.cameras = cameras_around(grid.to_world, edge, LOOKS)
+
+    def __call__(self) -> Iterator[RayBundle]:
+        for camera in self.cameras:
+            o, d = rays(camera, pixel_centres(camera.size).reshape(-1, 2))
+            origin = np.broadcast_to(o, d.shape)
+            points, directions = (np.ascontiguousarray(np.float32(a.T)) for a in (origin, d))
+            yield RayBundle(mi.Point3f(points), mi.Vector3f(directions))
+
+
+def describe_leaves(tree: Octree) -> str:
+    """Number, sizes and degree of the leaves of an octree."""
+    sizes = np.bincount(tree.sizes)
+    kinds = ", ".join(f"{n} of {2**k}" for k, n in enumerate(sizes) if n)
+    return f"{tree.leaves} leaves in 2^{tree.depth} cells along an axis ({kinds} cells an edge), degree {tree.degree}"
+
+
+def describe_field(path: Path, variant: str) -> Explanation:
+    """Facts about the file of a radiance field: kind, size, place, values and memory.
+
+    Raises:
+        MivolError: as :func:`mivol.fields.field_files.read_field`.
+    """
+    set_variant(variant)
+    field = read_field(check_file(path))
+    if isinstance(field, HashField):
+        return Explanation((f"hash grid   {field!r}", f"memory      {path.stat().st_size / 2**20:.2f} MiB in the file"))
+    density, _ = field.values()
+    if isinstance(field, Octree):
+        place, kind = field.to_world, f"octree      {describe_leaves(field)}"
+        look = f"colours     {field.colours}, offset {field.offset:g}, {field.space}"
+    else:
+        counts, stored = " x ".join(map(str, field.res[::-1])), len(field.stored_nodes())
+        levels = f"{field.levels} nested levels of " if field.levels > 1 else ""
+        place = field.level_to_world(field.levels - 1)
+        kind = f"grid        {levels}{counts} nodes, {stored} of them stored, degree {field.degree}"
+        density = np.array(field.activation_function.value_and_slope(mi.Float(density))[0])
+        look = f"colours     {'clamp' if field.clamp else 'no clamp'}, offset {field.offset:g}, {field.space}"
+    corners = place[:3] @ np.array([[0, 0, 0, 1], [1, 1, 1, 1]], np.float64).T
+    low, high = (", ".join(f"{v:.4g}" for v in corner) for corner in np.sort(corners.T, axis=0))
+    return Explanation(
+        (
+            kind,
+            f"box         ({low}) to ({high}) [length]",
+            f"extinction  {density.min():.4g} to {density.max():.4g} [1/length], median {np.median(density):.4g}",
+            look,
+            f"memory      {field.bytes / 2**20:.1f} MiB, {path.stat().st_size / 2**20:.2f} MiB in the file",
+            "mivol render draws it; mivol convert and mivol export write it in other formats",
+        )
+    )
