@@ -260,6 +260,15 @@ def smoke_poses(folder: Path) -> None:
     check('pip install "mivol[poses]"' in refused, f"the extra that poses need is not named:\n{refused}")
 
 
+def smoke_sweep(folder: Path) -> None:
+    """Two fits in turn, and a table of both; the wheel alone has no Dask, and the extra that brings it is named."""
+    mivol("sweep", "smoke.toml", "--over", "seed=0,1", "-o", "sweep")
+    check("2 of 2 runs" in (folder / "sweep" / "sweep.html").read_text(), "the page of the sweep does not have both runs")
+    check_run(folder / "sweep" / "seed=1", "nrmse")
+    refused = mivol("sweep", "smoke.toml", "--over", "seed=2,3", "-o", "sweep", "--cluster", "local:1", code=1)
+    check('pip install "mivol[cluster]"' in refused, f"the extra that clusters need is not named:\n{refused}")
+
+
 def smoke_report(folder: Path) -> None:
     """The same page again."""
     page = folder / "photos" / "report.html"
@@ -270,8 +279,8 @@ def smoke_report(folder: Path) -> None:
 
 
 SMOKES: tuple[Callable[[Path], None], ...] = (
-    smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_export, smoke_convert, smoke_poses,
-    smoke_report, smoke_demo, smoke_fetch, smoke_validate, smoke_bench,
+    smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_sweep, smoke_export, smoke_convert,
+    smoke_poses, smoke_report, smoke_demo, smoke_fetch, smoke_validate, smoke_bench,
 )  # fmt: skip
 """In the order in which each finds what it needs."""
 

@@ -242,6 +242,17 @@ def optimize_flags() -> list:
     ]
 
 
+def sweep_flags() -> list:
+    """Flags of ``mivol sweep``."""
+    return [
+        flag("experiment", type=Path, help="experiment (.toml)"),
+        list_flag("--over", "key=values", "values of a setting: fit.spp=4,16,64 or seed=0..9; again for more settings"),
+        list_flag("--set", "key=value", "override a setting of all runs"),
+        flag("-o", "--output", type=Path, help="folder of the sweep (default: the experiment's output with _sweep)"),
+        CLUSTER,
+    ]
+
+
 def describe_settings() -> str:
     """All settings of a TOML file, by kind of experiment."""
     from mivol import config
@@ -620,6 +631,16 @@ def _check_preset(model: str, preset: str | None) -> None:
         raise MivolError(f"--preset {preset} is a preset of --as {other}, and --as {model} has {known}: add --as {other}.")
 
 
+def sweep(arguments: argparse.Namespace) -> int:
+    """Fit an experiment with several values of some settings: a run folder each, one table and one page of all.
+
+    All combinations are checked first. The same command again runs what is missing and continues interrupted runs.
+    """
+    from mivol.cli.cluster import sweep
+
+    return sweep(arguments)
+
+
 def validate(arguments: argparse.Namespace) -> int:
     """Compare mivol with Mitsuba's path tracer on a scene: bias, z-image, relMSE, gradients and a verdict.
 
@@ -776,6 +797,7 @@ VERBS: dict[str, Verb] = {
     "reference": Verb(reference, reference_flags),
     "poses": Verb(poses, lambda: [flag("folder", type=Path, help="folder of photographs, in images/ or in itself")]),
     "optimize": Verb(optimize, optimize_flags, describe_settings),
+    "sweep": Verb(sweep, sweep_flags),
     "validate": Verb(validate, validate_flags),
     "export": Verb(export, export_flags),
     "convert": Verb(convert, convert_flags),

@@ -87,3 +87,26 @@ def scene_source(arguments: argparse.Namespace, make: Callable[..., Any]) -> Any
 
     folders = tuple(Path(folder) for folder in filter(None, arguments.a.split(";")))
     return make(arguments.scene, parse_defines(arguments.define), folders)
+
+
+def sweep(arguments: argparse.Namespace) -> int:
+    """Run ``mivol sweep``, in turn or on the workers of ``--cluster``; return the exit code."""
+    from mivol.back_end import choose_back_end
+    from mivol.cli.progress import TerminalProgress
+    from mivol.experiments.sweep import plan_sweep, run_in_turn, run_sweep
+
+    found = plan_sweep(arguments.experiment, arguments.over, arguments.set, arguments.output, arguments.command)
+    progress = TerminalProgress()
+    if arguments.cluster is None:
+        page, refused = run_sweep(found, run_in_turn(progress), progress.say)
+    else:
+        from mivol.cluster.sweep import run_on
+
+        first = found.runs[0].settings
+        choose_back_end(first.variant)
+        with open_workers(arguments.cluster, first.variant, first.threads) as pool, status_line() as show:
+            page, refused = run_sweep(found, run_on(pool, show), progress.say)
+    print(page)
+    if refused:
+        say(f"mivol: {refused} of {len(found.runs)} runs were refused; the page says why.")
+    return int(refused > 0)

@@ -21,7 +21,7 @@ from mivol.cluster.pool import Pool
 from mivol.cluster.workplace import Workplace
 from mivol.errors import MivolError
 from mivol.experiments.references import set_parameter
-from mivol.files.fetch import resolve_path
+from mivol.files.fetch import PREFIX
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene_graph import traverse
 
@@ -241,43 +241,35 @@ def map_paths(settings: msgspec.Struct, change: Callable[[str, str], str], prefi
     return msgspec.structs.replace(settings, **changed)
 
 
-def find_experiment_files(settings: msgspec.Struct, base: Path) -> tuple[msgspec.Struct, list[Path]]:
-    """The settings of an experiment with absolute paths, and all files that the experiment reads.
+def find_experiment_files(settings: msgspec.Struct, base: Path) -> list[Path]:
+    """Find all files that an experiment reads, public data (``data:NAME``) excepted.
 
     Args:
         settings: settings of an experiment.
         base: folder from which relative paths start.
 
     Raises:
-        MivolError: as :func:`mivol.scene.load.load_scene` for scenes, or missing public data.
+        MivolError: as :func:`mivol.scene.load.load_scene` for scenes.
     """
     files: list[Path] = []
 
-    def resolve(key: str, name: str) -> str:
-        path = Path(resolve_path(base, name)).absolute()
+    def note(key: str, name: str) -> str:
+        path = (base / name).absolute()
+        if name.startswith(PREFIX):
+            return name
         if path.suffix.lower() == ".xml" and path.is_file():
-            defines = settings.scene.define if key == "scene.file" else {}
-            given = {name: _resolve_define(base, value) for name, value in defines.items()}
-            files.extend(load_scene(path, given).files)
+            files.extend(load_scene(path, settings.scene.define if key == "scene.file" else {}).files)
         elif path.suffix.lower() in WITH_NEIGHBOURS and path.is_file():
             files.append(path.parent)
         elif any(letter in path.name for letter in "*?["):
             files.extend(path.parent.glob(path.name))
         else:
             files.append(path)
-        return str(path)
+        return name
 
-    changed = map_paths(settings, resolve)
-    if hasattr(changed, "scene") and getattr(changed.scene, "define", None):
-        define = {name: _resolve_define(base, value) for name, value in changed.scene.define.items()}
-        changed = msgspec.structs.replace(changed, scene=msgspec.structs.replace(changed.scene, define=define))
-    return changed, files
+    map_paths(settings, note)
+    return files
 
 
 WITH_NEIGHBOURS = (".json", ".xtekct")
 """Files that name others beside them: cameras of photographs, and the settings of a scanner."""
-
-
-def _resolve_define(base: Path, value: Any) -> Any:
-    """A define with the path of public data in place of its name."""
-    return str(resolve_path(base, value)) if isinstance(value, str) and value.startswith("data:") else value

@@ -14,15 +14,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_experiment import run, write_experiment
+from tiny_experiment import PHOTOS, run, write_experiment
 
 from mivol.cluster.address import ClusterSettings
 from mivol.cluster.connection import _connect, import_distributed
 from mivol.cluster.packages import SceneSource, share_scene
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.reference import complete_on
+from mivol.cluster.sweep import run_on
 from mivol.cluster.workplace import Workplace
 from mivol.errors import MivolError
+from mivol.experiments.fit_kind import NullProgress
+from mivol.experiments.sweep import plan_sweep, run_in_turn, run_sweep
+from mivol.report.record import read_record
 from mivol.scene.camera_rigs import Ring
 from mivol.scene.load import load_scene
 from mivol.validate.reference import render_photographs
@@ -125,6 +129,35 @@ def test_errors_of_workers_are_sentences(client: object) -> None:
         with pytest.raises(ZeroDivisionError):
             list(pool.run([Unit(0, answer, (0, "bug"))]))
         assert sorted(pool.run(Unit(i, answer, (i, "")) for i in range(5))) == [(i, i) for i in range(5)]
+
+
+# -- Sweeps ------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_sweep_does_not_depend_on_workers(client: object, tmp_path: Path) -> None:
+    """Rationale: a fit is a function of its settings.
+
+    Expected: fits on two workers, one of them killed, have the numbers of the same fits in one process, to the bit.
+    """
+    path = write_experiment(tmp_path) / "fit.toml"
+    over, changes = ["fit.spp=1,2,4"], PHOTOS[1::2]
+    run_sweep(plan_sweep(path, over, changes, tmp_path / "alone"), run_in_turn(NullProgress()))
+    sweep = plan_sweep(path, over, changes, tmp_path / "two")
+    with some_workers(client, 2) as pool:
+        kill, ended = kill_once(pool), []
+
+        def say(lines: list[str]) -> None:
+            if lines[0].endswith("finished"):
+                ended.append(lines[0])
+                kill("")
+
+        page, refused = run_sweep(sweep, run_on(pool), say)
+        assert (pool.lost, refused) == (1, 0)
+    for one in sweep.runs:
+        alone, two = (read_record(tmp_path / name / one.name) for name in ("alone", "two"))
+        assert {**alone.results, "fit_seconds": 0} == {**two.results, "fit_seconds": 0}
+        assert one.name in page.read_text()
+    assert len(ended) == 3
 
 
 # -- Schedulers --------------------------------------------------------------------------------------------------------------

@@ -17,15 +17,16 @@ from mivol.cluster.packages import (
     decode_sensor,
     encode_sensor,
     find_experiment_files,
+    map_paths,
     pack_files,
     place_below,
     unpack_files,
 )
 from mivol.cluster.pool import Pool, Unit, _Worker, check_equal_workers, check_worker
 from mivol.cluster.reference import LONGEST_UNIT, _View
+from mivol.cluster.sweep import WorkerProgress, has_absolute_paths, read_files, write_run
 from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
 from mivol.errors import MivolError
-from mivol.scene.load import load_scene
 
 TLS = 'scheduler = "address"\naddress = "tls://node1:8786"\n[security]\nca = "a.pem"\ncert = "b.pem"\nkey = "c.pem"\n'
 
@@ -193,11 +194,12 @@ def test_files_of_an_experiment_are_found(variant_rgb: str, tmp_path: Path) -> N
     """The scene with its volume, and the references; the run folder is no input."""
     folder = write_experiment(tmp_path)
     settings = config.load(folder / "fit.toml", ['reference={source="files", paths=["a.exr", "b.exr", "c.exr"]}'])
-    changed, files = find_experiment_files(settings, folder)
+    files = find_experiment_files(settings, folder)
     assert {path.name for path in files} == {"scene.xml", "start.vol", "a.exr", "b.exr", "c.exr"}
-    assert changed.scene.file == str(folder / "scene.xml")
+    changed = map_paths(settings, lambda key, name: f"{key} {name}")
+    assert changed.scene.file == "scene.file scene.xml"
+    assert changed.reference.paths[1] == "reference.paths b.exr"
     assert changed.output == settings.output
-    assert load_scene(changed.scene.file).content_hash == load_scene(folder / "scene.xml").content_hash
 
 
 # -- How work is cut ---------------------------------------------------------------------------------------------------------
@@ -230,3 +232,40 @@ def test_units_wait_for_earlier_ones() -> None:
         assert numbers == range(expected, expected + 1)
         view.sent = numbers.stop
     assert not view.next_numbers(4)
+
+
+# -- Runs of a sweep ---------------------------------------------------------------------------------------------------------
+
+
+def test_returned_files_replace_a_run_folder(tmp_path: Path) -> None:
+    """A new run puts the earlier one away, a continued one does not; nothing of the old files stays beside the new."""
+    target = tmp_path / "spp=4"
+    first = {"run.json": zlib.compress(b"1"), "views/a.png": zlib.compress(b"a")}
+    write_run(target, first, False)
+    assert read_files(target).keys() == first.keys()
+    write_run(target, {"run.json": zlib.compress(b"2")}, False)
+    assert {path.relative_to(target).as_posix() for path in target.rglob("*") if path.is_file()} == {
+        "run.json",
+        "earlier/run.json",
+    }
+    assert (target / "earlier" / "run.json").read_bytes() == b"1"
+    write_run(target, {"run.json": zlib.compress(b"3")}, True)
+    assert sorted(path.name for path in target.iterdir()) == ["run.json"]
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_absolute_paths_are_found(tmp_path: Path) -> None:
+    """A checkpoint holds them, and they differ between workers."""
+    path = write_experiment(tmp_path) / "fit.toml"
+    assert not has_absolute_paths(config.load(path))
+    assert has_absolute_paths(config.load(path, [f'scene.file="{tmp_path}/scene.xml"']))
+
+
+def test_a_worker_stops_at_the_owner_s_request() -> None:
+    place = Workplace()
+    progress = WorkerProgress(place)
+    assert list(progress.track("ab", "views")) == ["a", "b"]
+    assert place.says == "views 1 of 2"
+    place.is_stopped = True
+    with pytest.raises(KeyboardInterrupt):
+        next(progress.track("ab", "views"))
