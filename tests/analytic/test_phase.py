@@ -207,6 +207,9 @@ def test_droplets_of_jendersie_and_deon():
     share = fit["weight_draine"]
     g = (1 - share) * fit["g_hg"] + share * mean_cosine(fit["g_draine"], fit["alpha"])
     assert 0.85 < g < 0.89
+    # Their equations 4 to 7 at 10 micrometre, by hand: exp(-0.0118937), exp(-0.587579), exp(3.090839) and exp(-0.729904).
+    numbers = {"g_hg": 0.988177, "g_draine": 0.555671, "alpha": 21.9955, "weight_draine": 0.481955}
+    assert droplets(10.0) == pytest.approx(numbers, rel=1e-5)
     with pytest.raises(MivolError, match="5 to 50"):
         droplets(1.0)
 
