@@ -658,23 +658,33 @@ def validate(arguments: argparse.Namespace) -> int:
 
 
 def export(arguments: argparse.Namespace) -> None:
-    """Write a radiance field as a mesh, volumes, a scene with its sky, or a file of another program."""
+    """Write a radiance field as a mesh, volumes, a scene with its sky, or a file of another program.
+
+    A hash grid becomes a grid of 128 nodes along its longest edge first, and export prints the loss in dB; mivol convert --to
+    grid makes grids of other resolutions.
+    """
     from mivol.back_end import set_variant
+    from mivol.experiments.octree_conversion import GRID_NODES, sample_hash_grid
     from mivol.experiments.render import sky_beside
     from mivol.fields.field_archives import read_field_view
     from mivol.fields.field_files import read_field, write_field
+    from mivol.fields.hash_grid import HashField
 
     set_variant(arguments.mode)
     field, sky, view = read_field(arguments.field), sky_beside(arguments.field), read_field_view(arguments.field)
+    is_copy = arguments.output.suffix == ".npz" and not arguments.output.name.endswith((".svox2.npz", ".svox.npz"))
+    if isinstance(field, HashField) and not is_copy:
+        field, lines = sample_hash_grid(field, GRID_NODES)
+        print(lines)
     print("\n".join(str(path) for path in write_field(arguments.output, field, arguments.level, sky, view=view)))
 
 
 def convert(arguments: argparse.Namespace) -> None:
     """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats; volumes too.
 
-    A field (.npz) is the mivol_sh of a scene, or an octree (--to octree). Conversions between a field and an octree or
-    Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply with --to mesh) is fused from depths of
-    splatted views; convert prints the distance between mesh and splats.
+    A field (.npz) is the mivol_sh of a scene, an octree (--to octree) or a hash grid (which becomes a grid with --to grid).
+    Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
+    with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     """
     from mivol.files.formats import is_volume_file
 
@@ -706,7 +716,7 @@ def _convert_cloud(arguments: argparse.Namespace) -> str:
         from mivol.experiments import octree_conversion
 
         if kind == "grid":
-            return octree_conversion.convert_to_grid(source, target, arguments.mode)
+            return octree_conversion.convert_to_grid(source, target, resolution, arguments.mode)
         return octree_conversion.convert_to_octree(source, target, resolution, arguments.mode)
     if source.suffix.lower() == ".npz":
         return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
@@ -722,11 +732,9 @@ def _check_conversion(arguments: argparse.Namespace) -> str | None:
     from_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
     kind = arguments.to or WRITTEN_AS.get(target.suffix.lower())
     if from_field and is_field and arguments.to not in ("grid", "octree"):
-        raise MivolError(f"{target}: a radiance field becomes an octree with --to octree, and an octree a grid with --to grid.")
+        raise MivolError(f"{target}: a grid becomes an octree with --to octree, and another field a grid with --to grid.")
     if kind in ("octree", "grid") and not (from_field and is_field):
         raise MivolError(f"{target}: --to {kind} makes an .npz from a radiance field (.npz); make a field first: --to field.")
-    if kind == "grid" and arguments.resolution is not None:
-        raise MivolError(f"{target}: the grid of an octree has a node in each of its smallest cells: leave out --resolution.")
     if is_field != (kind in ("field", "octree", "grid")):
         raise MivolError(f"{target}: a radiance field is written as .npz, and nothing else is; leave out --to {arguments.to}.")
     if from_field and not is_field and kind not in (None, "gaussians"):

@@ -67,7 +67,7 @@ def tabulate_hash_grid(field: HashField, bytes_: int) -> Table:
     """Table of the levels and the size of a hash grid, whose file has ``bytes_``."""
     rows = [
         (str(k), " x ".join(map(str, level.cells)), str(level.rows), "each node" if level.is_dense else "hashed")
-        for k, level in enumerate(field.levels)
+        for k, level in enumerate(field.encoding.levels)
     ]
     occupied = np.array(field.region.occupied).mean()
     title = f"Hash grid: {count_numbers(field)} numbers, file {bytes_ / 2**20:.2f} MiB, {occupied:.1%} of the cells occupied"

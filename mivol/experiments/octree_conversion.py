@@ -1,4 +1,4 @@
-"""Conversions between radiance fields on grids and octrees, with their loss, and the description of a field's file."""
+"""Conversions of radiance fields: grids, octrees and hash grids, with their loss, and the description of a field's file."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ from mivol.fields.field_archives import read_field_view
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.hash_grid import HashField
 from mivol.fields.octree import Octree, check_depth
+from mivol.fields.resampling import sample_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.source import check_file
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree
+from mivol.optim.photographs.radiance_plan import place_grid
 from mivol.photos import pixel_centres, rays
 from mivol.scene.explain import Explanation
 from mivol.transport.line_integrals.radiance_field import RayBundle
 from mivol.validate.metrics import psnr
+
+GRID_NODES = 128
+"""Default number of nodes along the longest edge of the grid of a hash grid."""
 
 LOOKS = 48
 """Number of views that decide which leaves are seen."""
@@ -62,20 +67,47 @@ def convert_to_octree(source: Path, target: Path, resolution: int | None, varian
     return "\n".join([f"{target}: {describe_leaves(tree)}", *_describe_loss(source, field, target, written)])
 
 
-def convert_to_grid(source: Path, target: Path, variant: str) -> str:
-    """Write an octree as a radiance field on a grid; arguments and result as :func:`convert_to_octree`.
+def convert_to_grid(source: Path, target: Path, resolution: int | None, variant: str) -> str:
+    """Write an octree or a hash grid as a radiance field on a grid; result as :func:`convert_to_octree`.
+
+    Args:
+        source: octree or hash grid (.npz).
+        target: file ending in .npz.
+        resolution: nodes along the longest edge, for a hash grid; None means ``GRID_NODES``.
+        variant: Mitsuba variant of the views.
 
     Raises:
-        MivolError: a source that is a grid, too many nodes, or as the readers and the disk.
+        MivolError: a source that is a grid, a resolution for an octree, too many nodes, or as the readers and the disk.
     """
     set_variant(variant)
     tree = read_field(source)
+    if isinstance(tree, HashField):
+        grid, lines = sample_hash_grid(tree, GRID_NODES if resolution is None else resolution)
+        write_field(target, grid, view=read_field_view(source))
+        return f"{target}: {lines}"
     if not isinstance(tree, Octree):
-        raise MivolError(f"{source} is not an octree: mivol convert --to grid makes a grid from an octree.")
+        raise MivolError(f"{source} is a grid: mivol convert --to grid makes a grid from an octree or a hash grid.")
+    if resolution is not None:
+        raise MivolError(f"{target}: the grid of an octree has a node in each of its smallest cells: leave out --resolution.")
     grid = tree.to_grid()
     write_field(target, grid, view=read_field_view(source))
     head = f"{target}: {' x '.join(map(str, grid.res[::-1]))} nodes, {grid.rows - 1} of them stored, degree {grid.degree}"
     return "\n".join([head, *_describe_loss(source, tree, target, read_field(target))])
+
+
+def sample_hash_grid(field: HashField, resolution: int) -> tuple[SphericalGrid, str]:
+    """The grid of a hash grid with ``resolution`` nodes along the longest edge, and lines with its size and its loss.
+
+    Raises:
+        MivolError: no matter in the box, or fewer than 2 nodes.
+    """
+    if resolution < 2:
+        raise MivolError(f"found a grid of {resolution} nodes along its longest edge, expected at least 2: raise --resolution.")
+    box = np.array([field.to_world[:3, 3], field.to_world[:3, 3] + field.encoding.edges])
+    grid = sample_field(field, *place_grid(box, resolution))
+    size = f"{' x '.join(map(str, grid.res[::-1]))} nodes, {grid.rows - 1} of them stored, degree {grid.degree}"
+    loss = f"{views_psnr(grid, field):.1f} dB between views of the grid and of the hash grid: {VIEWED}, over black, peak 1"
+    return grid, f"{size}\n{loss}"
 
 
 def _describe_loss(source: Path, field: SphericalGrid | Octree, target: Path, written: SphericalGrid | Octree) -> list[str]:
@@ -87,7 +119,7 @@ def _describe_loss(source: Path, field: SphericalGrid | Octree, target: Path, wr
     ]
 
 
-def views_psnr(field: SphericalGrid | Octree, other: SphericalGrid | Octree) -> float:
+def views_psnr(field: SphericalGrid | Octree, other: SphericalGrid | Octree | HashField) -> float:
     """PSNR between views of two fields [dB], of the box of ``other``, over black, peak 1."""
     cameras = cameras_around(other.to_world, EDGE)
     images, truth = ([render_view(one, camera, np.zeros(3)).image for camera in cameras] for one in (field, other))

@@ -127,6 +127,67 @@ class HashSizes:
 
 
 @dataclass(frozen=True)
+class HashEncoding:
+    """The levels of a hash grid in a box, and the features of points.
+
+    Attributes:
+        sizes: of the hash grid.
+        to_world: (4, 4) float64, unit cube to world.
+    """
+
+    sizes: HashSizes
+    to_world: np.ndarray
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Edges of the box (x, y, z) [length]."""
+        return np.linalg.norm(self.to_world[:3, :3], axis=0)
+
+    @cached_property
+    def levels(self) -> list[Level]:
+        """The levels in the box."""
+        return self.sizes.place_levels(self.edges)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of the table, (rows, features)."""
+        return sum(level.rows for level in self.levels), self.sizes.features
+
+    def first_table(self, rng: np.random.Generator) -> np.ndarray:
+        """Small random features."""
+        return rng.uniform(-FIRST, FIRST, self.shape).astype(np.float32)
+
+    def to_unit(self, p: mi.Point3f) -> mi.Point3f:
+        """Points of the world in the unit cube."""
+        rows = np.linalg.inv(self.to_world)[:3]
+        opaque = [[dr.opaque(mi.Float, float(v)) for v in row] for row in rows]
+        return mi.Point3f(*(dr.fma(r[0], p.x, dr.fma(r[1], p.y, dr.fma(r[2], p.z, r[3]))) for r in opaque))
+
+    def encode(self, table: mi.Float, unit: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
+        """Features of points of the unit cube; attached to the table."""
+        width, features = self.sizes.features, []
+        for level in self.levels:
+            sums = [mi.Float(0)] * width
+            for row, weight in _corners(level, unit):
+                if width == 1:
+                    values = [dr.gather(mi.Float, table, row, active, mode=_reduce_mode())]
+                else:
+                    values = dr.gather(mi.ArrayXf, table, row, active, mode=_reduce_mode(), shape=(width, 1))
+                sums = [dr.fma(values[k], weight, total) for k, total in enumerate(sums)]
+            features += sums
+        return features
+
+    def add_features(self, unit: mi.Point3f, slopes: list[mi.Float], target: mi.Float, active: mi.Bool = True) -> None:
+        """Add derivatives by the features of points to the derivatives by the table: the transpose of :meth:`encode`."""
+        width = self.sizes.features
+        for number, level in enumerate(self.levels):
+            own = slopes[number * width : (number + 1) * width]
+            for row, weight in _corners(level, unit):
+                values = own[0] * weight if width == 1 else mi.ArrayXf([slope * weight for slope in own])
+                dr.scatter_add(target, values, row, active, mode=_reduce_mode())
+
+
+@dataclass(frozen=True)
 class HashField:
     """A hash grid with its networks, as a :class:`mivol.fields.sampled_field.SampledField`.
 
@@ -163,16 +224,14 @@ class HashField:
     def random(cls, sizes: HashSizes, to_world: np.ndarray, seed: int = 0, space: str = "srgb") -> HashField:
         """An untrained field: small random features, random weights."""
         rng = np.random.default_rng(seed)
-        edges = np.linalg.norm(to_world[:3, :3], axis=0)
-        rows = sum(level.rows for level in sizes.place_levels(edges))
-        table = rng.uniform(-FIRST, FIRST, rows * sizes.features).astype(np.float32)
+        table = HashEncoding(sizes, to_world).first_table(rng).ravel()
         weights = [network.first_weights(rng) for network in (sizes.density_network, sizes.colour_network)]
         return cls(sizes, np.asarray(to_world, np.float64), mi.Float(table), *map(mi.Float, weights), space)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each parameter, by name."""
         return {
-            "table": (sum(level.rows for level in self.levels), self.sizes.features),
+            "table": self.encoding.shape,
             "density_weights": (self.sizes.density_network.size,),
             "colour_weights": (self.sizes.colour_network.size,),
         }
@@ -183,57 +242,19 @@ class HashField:
     def with_parameters(self, values: dict[str, mi.TensorXf]) -> HashField:
         return replace(self, **{name: values[name].array for name in self.shapes()})
 
-    @property
-    def scale(self) -> float:
-        """Density of an untrained field [1/length]."""
-        return 2 / float(self.edges.max())
-
-    @cached_property
-    def edges(self) -> np.ndarray:
-        """Edges of the box (x, y, z) [length]."""
-        return np.linalg.norm(self.to_world[:3, :3], axis=0)
-
-    @cached_property
-    def levels(self) -> list[Level]:
-        """The levels in the box."""
-        return self.sizes.place_levels(self.edges)
-
     def scale_colours(self, white: float) -> HashField:
         """The field with its radiance multiplied by a number; sRGB code values are only multiplied by 1."""
         return replace(self, white=self.white * white)
 
-    # -- Encoding -----------------------------------------------------------------------------------------------------
+    @property
+    def scale(self) -> float:
+        """Density of an untrained field [1/length]."""
+        return 2 / float(self.encoding.edges.max())
 
-    def to_unit(self, p: mi.Point3f) -> mi.Point3f:
-        """Points of the world in the unit cube."""
-        rows = np.linalg.inv(self.to_world)[:3]
-        opaque = [[dr.opaque(mi.Float, float(v)) for v in row] for row in rows]
-        return mi.Point3f(*(dr.fma(r[0], p.x, dr.fma(r[1], p.y, dr.fma(r[2], p.z, r[3]))) for r in opaque))
-
-    def encode(self, unit: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
-        """Features of points of the unit cube; attached to the table."""
-        width, features = self.sizes.features, []
-        for level in self.levels:
-            sums = [mi.Float(0)] * width
-            for row, weight in _corners(level, unit):
-                if width == 1:
-                    values = [dr.gather(mi.Float, self.table, row, active)]
-                else:
-                    values = dr.gather(mi.ArrayXf, self.table, row, active, shape=(width, 1))
-                sums = [dr.fma(values[k], weight, total) for k, total in enumerate(sums)]
-            features += sums
-        return features
-
-    def add_features(self, unit: mi.Point3f, slopes: list[mi.Float], target: mi.Float, active: mi.Bool = True) -> None:
-        """Add derivatives by the features of points to the derivatives by the table: the transpose of :meth:`encode`."""
-        width = self.sizes.features
-        # On the CPU each thread adds to its own copy, without atomics.
-        mode = dr.ReduceMode.Expand if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else dr.ReduceMode.Auto
-        for number, level in enumerate(self.levels):
-            own = slopes[number * width : (number + 1) * width]
-            for row, weight in _corners(level, unit):
-                values = own[0] * weight if width == 1 else mi.ArrayXf([slope * weight for slope in own])
-                dr.scatter_add(target, values, row, active, mode=mode)
+    @cached_property
+    def encoding(self) -> HashEncoding:
+        """The levels in the box."""
+        return HashEncoding(self.sizes, self.to_world)
 
     # -- Values in the lanes of a kernel ------------------------------------------------------------------------------
 
@@ -252,7 +273,7 @@ class HashField:
 
     def _lane_geometry(self, p: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         layers = self.sizes.density_network.pack(self.density_weights)
-        return Network.eval_lanes(layers, self.encode(self.to_unit(p), active))
+        return Network.eval_lanes(layers, self.encoding.encode(self.table, self.encoding.to_unit(p), active))
 
     def _lane_density(self, geometry: list[mi.Float]) -> mi.Float:
         return self.scale * dr.exp(dr.minimum(geometry[0], MAX_EXPONENT))
@@ -262,7 +283,7 @@ class HashField:
     def density(self, p: mi.Point3f) -> mi.Float:
         if not _has_blas():
             return dr.detach(self.eval_density(p))
-        x = self._feature_rows(self.to_unit(p))
+        x = self._feature_rows(self.encoding.to_unit(p))
         layers = self.sizes.density_network.layers(self.density_weights.numpy())
         sigma = dr.empty(mi.Float, len(x))
         out = sigma.numpy()
@@ -288,7 +309,7 @@ class HashField:
 
     def _evaluate_rows(self, p: mi.Point3f, d: mi.Vector3f) -> PointValues:
         """Values by products of matrices; the adjoint computes the hidden layers again, block by block."""
-        unit = self.to_unit(p)
+        unit = self.encoding.to_unit(p)
         dr.eval(unit)
         x, basis = self._feature_rows(unit), _rows(list(dr.sh_eval(d, self.sizes.degree)))
         sigma, colour = dr.empty(mi.Float, len(x)), dr.empty(mi.Float, 3 * len(x))
@@ -327,7 +348,7 @@ class HashField:
         target, lane, width = dr.zeros(mi.Float, dr.width(self.table)), dr.arange(mi.UInt32, len(x)), x.shape[1]
         dr.eval(target)
         row = dr.gather(mi.ArrayXf, slopes, lane, shape=(width, 1))
-        self.add_features(unit, [row[k] for k in range(width)], target)
+        self.encoding.add_features(unit, [row[k] for k in range(width)], target)
         dr.eval(target)
         return {"table": target} | {name: mi.Float(values) for name, values in gradient.items()}
 
@@ -346,7 +367,7 @@ class HashField:
         return 1 / (1 + np.exp(-np.clip(raw, -80, 80)))
 
     def _feature_rows(self, unit: mi.Point3f) -> np.ndarray:
-        return _rows(self.encode(unit))
+        return _rows(self.encoding.encode(self.table, unit))
 
 
 def _corners(level: Level, unit: mi.Point3f) -> Iterator[tuple[mi.UInt32, mi.Float]]:
@@ -366,6 +387,11 @@ def _corners(level: Level, unit: mi.Point3f) -> Iterator[tuple[mi.UInt32, mi.Flo
         x, y, z = (upper[a] if bit else lower[a] for a, bit in enumerate(bits))
         row = x + y + z if level.is_dense else (x ^ y ^ z) & mi.UInt32(level.rows - 1)
         yield row + level.first, weights[0][bits[0]] * weights[1][bits[1]] * weights[2][bits[2]]
+
+
+def _reduce_mode() -> dr.ReduceMode:
+    """How derivatives are added: on a CPU each thread adds to a copy of its own, without atomics."""
+    return dr.ReduceMode.Expand if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else dr.ReduceMode.Auto
 
 
 def _has_blas() -> bool:

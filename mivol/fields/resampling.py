@@ -1,4 +1,4 @@
-"""Resampling of a radiance field: on finer nodes, or in another box along the same axes.
+"""Resampling of a radiance field: on finer nodes, in another box along the same axes, or from points to a grid.
 
 Conventions. Raw densities and harmonics are linear between the old nodes and constant in the outer half voxel. Densities keep
 their sign, so a surface at a zero crossing keeps its position.
@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 
 
@@ -92,3 +93,87 @@ def _interpolate(old: SphericalGrid, axes: list[_AxisWeights], place: tuple) -> 
         values = dr.gather(mi.ArrayXf, old.harmonics, row, shape=(old.width, 1))
         harmonics = [dr.fma(weight, v, h) for v, h in zip(values, harmonics, strict=True)]
     return density, harmonics
+
+
+# -- From points to a grid -------------------------------------------------------------------------------------------------
+
+
+OPAQUE = 4.0
+"""Largest optical depth of a voxel in a grid of a sampled field. Denser nodes gain nothing, and interpolation from them would
+fill the empty voxels beside a surface."""
+
+EMPTY = 1e-3
+"""Optical depth of a voxel below which a node is not stored."""
+
+PARTS = 2
+"""Points along each edge of a voxel, whose mean is the density of the node."""
+
+DIRECTIONS = 48
+"""Directions of the colours that are projected onto harmonics: a Fibonacci lattice."""
+
+NODES = 1 << 13
+"""Nodes sampled at a time."""
+
+
+def sample_field(field: SampledField, res: tuple[int, int, int], to_world: np.ndarray, degree: int = 2) -> SphericalGrid:
+    """A sparse grid of a field that is known at points.
+
+    The density of a node is the mean over its voxel. Its colour is taken at the centre of mass of the voxel, in
+    ``DIRECTIONS`` directions, and projected onto the harmonics by least squares.
+
+    Args:
+        field: with a region.
+        res, to_world: nodes (Z, Y, X) and box of the grid.
+        degree: of the harmonics.
+
+    Raises:
+        MivolError: no matter in the box.
+    """
+    z, y, x = res
+    edge = float(np.abs(np.linalg.det(to_world[:3, :3])) / (x * y * z)) ** (1 / 3)
+    numbers, densities, centres = [], [], []
+    for start in range(0, x * y * z, NODES):
+        node = np.arange(start, min(start + NODES, x * y * z))
+        sigma, places = _sample_voxels(field, node, res, to_world)
+        mean = sigma.mean(axis=1)
+        kept = mean * edge > EMPTY
+        weight = sigma[kept] / sigma[kept].sum(axis=1, keepdims=True)
+        numbers.append(node[kept])
+        densities.append(np.minimum(mean[kept], OPAQUE / edge))
+        centres.append((weight[..., None] * places[kept]).sum(axis=1))
+    nodes, density, places = map(np.concatenate, (numbers, densities, centres))
+    if not len(nodes):
+        raise MivolError("found no matter in the box of the grid, expected some: give another box.")
+    sh = np.concatenate([_project_colours(field, places[k : k + NODES], degree) for k in range(0, len(nodes), NODES)])
+    stored = mi.UInt32(nodes.astype(np.uint32))
+    return SphericalGrid.from_rows(res, to_world, density.astype(np.float32), sh, stored, space=field.space)
+
+
+def _sample_voxels(
+    field: SampledField, node: np.ndarray, res: tuple[int, int, int], to_world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Densities (N, points) at the points of voxels, and their places (N, points, 3)."""
+    z, y, x = res
+    index = np.stack([node % x, node // x % y, node // (x * y)], axis=-1)
+    offsets = (np.stack(np.meshgrid(*[np.arange(PARTS)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) / PARTS
+    unit = (index[:, None, :] + offsets) / [x, y, z]
+    places = unit @ to_world[:3, :3].T + to_world[:3, 3]
+    p = mi.Point3f(np.ascontiguousarray(places.reshape(-1, 3).T, np.float32))
+    dr.eval(p)
+    sigma = dr.select(field.region.holds(p), field.density(p), 0)
+    return np.array(sigma, np.float64).reshape(len(node), -1), places
+
+
+def _project_colours(field: SampledField, places: np.ndarray, degree: int) -> np.ndarray:
+    """Harmonics (N, basis, 3) of the colours at places (N, 3), without the offset 1/2 of a grid."""
+    k = np.arange(DIRECTIONS)
+    height, turn = 1 - (2 * k + 1) / DIRECTIONS, np.pi * (3 - np.sqrt(5)) * k
+    flat = np.sqrt(1 - height**2)
+    towards = np.stack([flat * np.cos(turn), flat * np.sin(turn), height]).astype(np.float32)
+    values = [np.array(value, np.float64) for value in dr.sh_eval(mi.Vector3f(towards), degree)]
+    basis = np.stack(np.broadcast_arrays(*values), axis=1)  # the first harmonic is one number
+    p = mi.Point3f(np.ascontiguousarray(np.repeat(places, DIRECTIONS, axis=0).T, np.float32))
+    d = mi.Vector3f(np.tile(towards, len(places)))
+    dr.eval(p, d)
+    colour = np.array(field.evaluate(p, d).colour, np.float64).T.reshape(len(places), DIRECTIONS, 3)
+    return np.einsum("bk,nkc->nbc", np.linalg.pinv(basis), colour - 0.5).astype(np.float32)

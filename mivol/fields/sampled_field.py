@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -40,6 +41,17 @@ class Region:
     to_world: np.ndarray
     occupied: mi.UInt8
     step: float
+
+    def holds(self, p: mi.Point3f) -> mi.Bool:
+        """Whether points of the world lie in occupied cells."""
+        rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in np.linalg.inv(self.to_world)[:3]]
+        unit = [dr.fma(r[0], p.x, dr.fma(r[1], p.y, dr.fma(r[2], p.z, r[3]))) for r in rows]
+        place, inside, stride = mi.UInt32(0), mi.Bool(True), 1
+        for u, nodes in zip(unit, self.res[::-1], strict=True):
+            inside &= (u >= 0) & (u <= 1)
+            place += mi.UInt32(dr.clip(dr.fma(u, nodes, 0.5), 0, nodes)) * stride
+            stride *= nodes + 1
+        return dr.gather(mi.UInt8, self.occupied, place, inside) > 0
 
 
 @dataclass

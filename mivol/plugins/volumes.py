@@ -1,5 +1,5 @@
 """Volumes: "mivol_voxels", a dense grid; "mivol_transfer", a grid seen through a table; "mivol_sh", a radiance field;
-"mivol_gaussians", Gaussians for ray tracing.
+"mivol_gaussians", Gaussians for ray tracing; "mivol_hash", an extinction of a hash grid.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.field_files import field_from_props
 from mivol.fields.gaussian_field import GaussianField
+from mivol.fields.hash_density import HashDensity
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.transfer import Transfer
 from mivol.fields.voxels import Voxels
@@ -241,6 +242,47 @@ class GaussianVolume(mi.Volume):
         return f"mivol_gaussians[{self.mivol_extinction.count}]"
 
 
+class HashVolume(mi.Volume):
+    """``<volume type="mivol_hash">``: a hash grid with a small network, as a medium's ``sigma_t``.
+
+    Parameters:
+        majorant: largest extinction that the field may take [1/length].
+        levels, features, log2_table, coarsest, finest: sizes of the hash grid: levels of ``coarsest`` to ``finest`` cells along
+            the longest edge, of at most 2^``log2_table`` rows of 1, 2, 4 or 8 numbers. Default 8, 2, 17, 4 and 32.
+        width, layers: neurons of a hidden layer, and hidden layers. Default 16 and 1.
+        seed: of the first values. Default 0.
+        table, weights_0, weights_1, ...: tensors (rows, features) and (outputs, inputs), in place of the first values.
+        to_world: places the unit cube.
+
+    The extinction is ``majorant`` times a logistic function, so it stays below for any values. The tensors are its parameters.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.mivol_extinction = HashDensity.from_props(props)
+        props["to_world"] = mi.ScalarTransform4f(self.mivol_extinction.to_world)
+        super().__init__(props)
+
+    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
+        return mi.Spectrum(self.eval_1(it, active))
+
+    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
+        return self.mivol_extinction.eval(it.p, _towards(it), mi.Bool(active))[0]
+
+    def max(self) -> float:
+        return max(self.mivol_extinction.bound())
+
+    def channel_count(self) -> int:
+        return 1
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        for name, value in self.mivol_extinction.parameters().items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
+
+    def to_string(self) -> str:
+        field = self.mivol_extinction
+        return f"mivol_hash[{field.sizes.levels} levels, {sum(dr.width(value) for value in field.tensors.values())} numbers]"
+
+
 def _towards(it: mi.Interaction3f) -> mi.Vector3f:
     """Direction to the eye; up for an interaction without a direction."""
     wi = getattr(it, "wi", mi.Vector3f(0, 0, 1))
@@ -251,4 +293,5 @@ def _towards(it: mi.Interaction3f) -> mi.Vector3f:
 mi.register_texture("mivol_voxels", VoxelVolume)
 mi.register_texture("mivol_sh", SphericalVolume)
 mi.register_texture("mivol_transfer", TransferVolume)
+mi.register_texture("mivol_hash", HashVolume)
 mi.register_texture("mivol_gaussians", GaussianVolume)

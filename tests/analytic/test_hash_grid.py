@@ -37,7 +37,7 @@ def twin(field: HashField, values: dict[str, np.ndarray], p: np.ndarray, d: np.n
     sizes, table = field.sizes, values["table"].reshape(-1, field.sizes.features)
     unit = (p - PLACE[:3, 3]) / np.diag(PLACE)[:3]
     features = []
-    for level in field.levels:
+    for level in field.encoding.levels:
         total = np.zeros((len(p), sizes.features))
         place = unit * level.cells
         node = np.minimum(place.astype(int), np.array(level.cells) - 1)
@@ -116,12 +116,12 @@ def test_rows_of_any_width_are_read_and_added_to(variant_rgb: str, features: int
     """The transpose: sum of slopes times features equals the sum of gradient times table, since features are linear in it."""
     field = make(HashSizes(levels=3, features=features, log2_table=7, coarsest=2, finest=9))
     p, _ = points(50)
-    unit = field.to_unit(p)
-    found = field.encode(unit)
+    unit = field.encoding.to_unit(p)
+    found = field.encoding.encode(field.table, unit)
     rng = np.random.default_rng(0)
     slopes = [mi.Float(rng.normal(size=50)) for _ in found]
     target = dr.zeros(mi.Float, dr.width(field.table))
-    field.add_features(unit, slopes, target)
+    field.encoding.add_features(unit, slopes, target)
     left = sum(float(np.dot(np.array(a, np.float64), np.array(b, np.float64))) for a, b in zip(found, slopes, strict=True))
     right = float(np.dot(np.array(target, np.float64), np.array(field.table, np.float64)))
     # 1200 products of order 1, each rounded by at most 8 half spacings.

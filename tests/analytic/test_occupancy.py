@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from sampled_fields import CUBE, Slab
 
-from mivol.transport.traversal.occupancy import DECAY, Occupancy, list_cells
+from mivol.transport.traversal.occupancy import DECAY, Occupancy, list_cells, pick_index
 
 RES = (6, 5, 4)
 
@@ -49,6 +49,11 @@ def test_a_partial_refresh_evaluates_a_share(variant_rgb: str) -> None:
     assert ((among >= -0.75) & (among <= 0.25)).all()
     assert 0 < np.sum(grid(later) == 5) <= len(points)
     assert np.sum(grid(later) == np.float32(2 * DECAY)) > 0
+
+
+def test_a_number_rounded_to_1_picks_the_last_cell(variant_rgb: str) -> None:
+    """Once in ten million draws: an index beyond the array ended a fit after some hundred steps."""
+    assert np.array(pick_index(mi.Float(0, 0.5, 1 - 2.0**-24, 1), 143520)).tolist() == [0, 71760, 143519, 143519]
 
 
 def test_the_threshold_is_the_mean_if_it_is_low(variant_rgb: str) -> None:

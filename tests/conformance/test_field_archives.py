@@ -9,7 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mivol.cli import main
 from mivol.errors import MivolError
+from mivol.experiments import octree_conversion
 from mivol.fields.field_files import read_field, read_grid, write_field
 from mivol.fields.harmonics import harmonic_degree
 from mivol.fields.hash_grid import HashField, HashSizes
@@ -76,6 +78,23 @@ def test_a_hash_grid_is_read_as_it_was_saved(variant_rgb: str, tmp_path: Path) -
         write_field(tmp_path / "f.ply", field)
     with pytest.raises(MivolError, match="found a hash grid, expected a grid of harmonics"):
         read_grid(tmp_path / "f.npz")
+
+
+def test_a_hash_grid_becomes_a_grid(
+    variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By both verbs, which print the loss; the grid keeps the space of the colours."""
+    monkeypatch.setattr(octree_conversion, "GRID_NODES", 6)
+    monkeypatch.setattr(octree_conversion, "EDGE", 16)
+    write_field(tmp_path / "f.npz", hash_grid())
+    assert main(["convert", str(tmp_path / "f.npz"), str(tmp_path / "grid.npz"), "--to", "grid", "--resolution", "8"]) == 0
+    assert main(["export", str(tmp_path / "f.npz"), str(tmp_path / "f.vol")]) == 0
+    said = capsys.readouterr().out
+    assert "8 x 8 x 8 nodes" in said and "6 x 6 x 6 nodes" in said
+    assert said.count("dB between views of the grid and of the hash grid") == 2
+    assert read_grid(tmp_path / "grid.npz").space == "linear" and (tmp_path / "f-colour.vol").is_file()
+    assert main(["convert", str(tmp_path / "grid.npz"), str(tmp_path / "again.npz"), "--to", "grid"]) == 1
+    assert "is a grid: mivol convert --to grid makes a grid from an octree or a hash grid" in capsys.readouterr().err
 
 
 HOSTILE_HASH_GRIDS = {

@@ -10,6 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mivol.fields.hash_density import HashDensity
+from mivol.fields.hash_grid import HashSizes
 from mivol.fields.protocol import BOUNDED, EXACT_LINE, Field
 from mivol.fields.voxels import Voxels
 
@@ -24,10 +26,20 @@ def voxels(channels: int) -> Voxels:
     return Voxels(values, place, "voxels")
 
 
+def hash_density() -> HashDensity:
+    """A hash grid with values of order 1, so that densities spread between 0 and the bound."""
+    sizes = HashSizes(levels=3, log2_table=7, coarsest=2, finest=9, width=8, geometry=1)
+    place, rng = voxels(1).to_world, np.random.default_rng(3)
+    shapes = HashDensity.untrained(sizes, place, 2.0).shapes()
+    tensors = {name: mi.TensorXf(2 * rng.normal(size=shape).astype(np.float32)) for name, shape in shapes.items()}
+    return HashDensity(sizes, place, 2.0, tensors)
+
+
 FIELDS: dict[str, tuple[Callable[[], Field], str]] = {
     "grey voxels": (lambda: voxels(1), EXACT_LINE),
     "rgb voxels": (lambda: voxels(3), EXACT_LINE),
     "a ball": (lambda: bounded_ball.Ball(dr.opaque(mi.Float, 1.5), 0.8, (0.1, 0.2, -0.3)), BOUNDED),
+    "a hash grid": (hash_density, BOUNDED),
     "an rgb ball": (lambda: bounded_ball.Ball(mi.Color3f(0.2, 1, 3), 0.8, (0.1, 0.2, -0.3), 2.0), BOUNDED),
 }
 
@@ -70,19 +82,21 @@ def test_accumulate_is_the_transpose_of_eval(name: str) -> None:
     """<J v, d> = <v, accumulate d>, lanes that are not active left out: there the weight may be NaN."""
     field, rng = FIELDS[name][0](), np.random.default_rng(6)
     _, p, w = points(field, 0.1)
-    (parameter,) = field.parameters().values()
-    v = rng.normal(size=dr.shape(parameter)).astype(np.float32)
+    parameters = list(field.parameters().values())
+    v = [rng.normal(size=dr.shape(parameter)).astype(np.float32) for parameter in parameters]
     on, weights = rng.uniform(size=POINTS) < 0.7, rng.normal(size=(field.channels, POINTS)).astype(np.float32)
     active, d = mi.Bool(on), [mi.Float(np.where(on, row, np.nan)) for row in weights]
-    dr.enable_grad(parameter)
+    dr.enable_grad(parameters)
     renew(field)
     with dr.suspend_grad():
         field.accumulate(p, w, d, active)
-    vjp = np.array(dr.grad(parameter), np.float64)
+    vjp = [np.array(dr.grad(parameter), np.float64) for parameter in parameters]
     renew(field)
-    dr.set_grad(parameter, type(parameter)(v))
+    for parameter, tangent in zip(parameters, v, strict=True):
+        dr.set_grad(parameter, type(parameter)(tangent))
     jvp = dr.forward_to(field.eval(p, w, mi.Bool(True)), flags=dr.ADFlag.ClearEdges)
     terms = np.array([np.array(x, np.float64) * row * on for x, row in zip(jvp, weights, strict=True)])
     # Sums of 5000 float32 numbers: 1e-5 of the sum of their sizes.
     assert np.abs(terms).sum() > 100
-    assert abs(terms.sum() - (v * vjp).sum()) < 1e-5 * np.abs(terms).sum()
+    by_parameters = sum((a * b).sum() for a, b in zip(v, vjp, strict=True))
+    assert abs(terms.sum() - by_parameters) < 1e-5 * np.abs(terms).sum()

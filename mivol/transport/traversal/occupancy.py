@@ -78,9 +78,9 @@ class Occupancy:
             count = max(1, int(share * self.count / 2))
             _, (any_u, own_u) = draw_pcg32(seed_pcg32(dr.opaque(mi.Float, u), count, 1), 2)
             own = dr.compress(self.values > self.threshold())
-            chosen = [mi.UInt32(any_u * self.count)]
+            chosen = [pick_index(any_u, self.count)]
             if dr.width(own):
-                chosen.append(dr.gather(mi.UInt32, own, mi.UInt32(own_u * dr.width(own))))
+                chosen.append(dr.gather(mi.UInt32, own, pick_index(own_u, dr.width(own))))
             chosen = dr.concat(chosen)
         dr.eval(chosen)
         values = DECAY * dr.select(dr.isfinite(self.values), self.values, 0)
@@ -119,6 +119,12 @@ class Occupancy:
         unit = [dr.clip((mi.Float(i) - 0.5 + u) / n, 0, 1) for i, u, n in zip(indices, places, counts, strict=True)]
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in self.to_world[:3]]
         return mi.Point3f(*(dr.fma(r[0], unit[0], dr.fma(r[1], unit[1], dr.fma(r[2], unit[2], r[3]))) for r in rows))
+
+
+def pick_index(u: mi.Float, count: int) -> mi.UInt32:
+    """The index from 0 to ``count`` - 1 of a uniform number."""
+    # A number just below 1 is rounded to 1 in float32, once in some ten million draws: an index out of the array.
+    return dr.minimum(mi.UInt32(u * count), count - 1)
 
 
 def list_cells(region: Region) -> OccupiedCells:

@@ -1,0 +1,113 @@
+r"""An extinction of a hash grid and a small network, with a majorant that holds for any weights.
+
+.. math:: f(x) = m\, S(h(x) - 3), \qquad S(y) = \frac{1}{1 + e^{-y}}, \qquad 0 < f < m
+
+h is the output of the network for the features of x (:mod:`mivol.fields.hash_grid`), and m the bound. The logistic function is
+bounded, so m is a majorant of every table and every network: a fit never has to search for one. Untrained, h is about 0 and f
+about 0.05 m.
+
+Conventions. The parameters are tensors: ``table`` (rows, features), and ``weights_k`` (outputs, inputs) of layer k. The field
+is grey, and 0 outside its box.
+
+References: Müller et al. 2022 (encoding). Their activation, an exponential, has no bound.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import drjit as dr
+import drjit.nn as nn
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.fields.hash_grid import HashEncoding, HashSizes
+from mivol.fields.networks import Network
+from mivol.fields.protocol import BOUNDED, accumulate_tracked
+
+__all__ = ["HashDensity"]
+
+SHIFT = 3.0
+"""An untrained field has S(-3) = 0.047 of the bound: most of a box is thin."""
+
+SETTINGS = {name: name for name in ("levels", "features", "log2_table", "coarsest", "finest", "width")} | {
+    "layers": "density_layers"
+}
+"""Sizes by the name of a plugin's parameter."""
+
+
+class HashDensity:
+    """A bounded extinction (:class:`mivol.fields.protocol.Field`).
+
+    Attributes:
+        sizes: of grid and network.
+        to_world: (4, 4) float64, unit cube to world.
+        largest: the bound m [1/length].
+        tensors: parameters by name.
+    """
+
+    line: ClassVar[str] = BOUNDED
+    channels: ClassVar[int] = 1
+
+    def __init__(self, sizes: HashSizes, to_world: np.ndarray, largest: float, tensors: dict[str, mi.TensorXf]) -> None:
+        if not 0 < largest < np.inf:
+            raise MivolError(f"found the bound {largest:g} of a mivol_hash, expected a finite number above 0: give majorant.")
+        self.sizes, self.to_world, self.largest = sizes, np.asarray(to_world, np.float64), largest
+        self.encoding = HashEncoding(sizes, self.to_world)
+        for name, shape in self.shapes().items():
+            if tuple(tensors[name].shape) != shape:
+                found = f"{name} of the shape {tuple(tensors[name].shape)}"
+                raise MivolError(f"mivol_hash was given {found}; {shape} is expected by its sizes.")
+            if not np.isfinite(np.array(dr.detach(tensors[name].array))).all():
+                raise MivolError(f"mivol_hash was given {name} with values that are not finite: start from others.")
+        self.tensors = tensors
+
+    @classmethod
+    def from_props(cls, props: mi.Properties) -> HashDensity:
+        """Make a field from plugin parameters: ``majorant``, ``to_world``, sizes, ``seed``, or tensors.
+
+        Raises:
+            MivolError: sizes or tensors that contradict each other, some tensors only, or no majorant.
+        """
+        if "majorant" not in props:
+            raise MivolError("mivol_hash was given no majorant: give the largest extinction that it may take [1/length].")
+        given = {name: int(props[key]) for key, name in SETTINGS.items() if key in props}
+        sizes = HashSizes(**{"coarsest": 4, "finest": 32, "geometry": 1, "width": 16} | given)
+        place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
+        untrained = cls.untrained(sizes, place, float(props["majorant"]), int(props.get("seed", 0)))
+        names = list(untrained.tensors)
+        given = {name: props[name] for name in names if name in props}
+        if given and len(given) < len(names):
+            raise MivolError(f"mivol_hash was given {' and '.join(given)}; all of {', '.join(names)} or none are expected.")
+        return cls(sizes, place, untrained.largest, given) if given else untrained
+
+    @classmethod
+    def untrained(cls, sizes: HashSizes, to_world: np.ndarray, largest: float, seed: int = 0) -> HashDensity:
+        """A field of small random features and random weights."""
+        rng, network = np.random.default_rng(seed), sizes.density_network
+        layers = network.layers(network.first_weights(rng))
+        first = {"table": HashEncoding(sizes, to_world).first_table(rng)}
+        first |= {f"weights_{k}": np.ascontiguousarray(layer) for k, layer in enumerate(layers)}
+        return cls(sizes, to_world, largest, {name: mi.TensorXf(values) for name, values in first.items()})
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each parameter, by name."""
+        layers = self.sizes.density_network.shapes
+        return {"table": self.encoding.shape} | {f"weights_{k}": shape for k, shape in enumerate(layers)}
+
+    def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
+        unit = self.encoding.to_unit(p)
+        inside = mi.Bool(active) & dr.all((unit >= 0) & (unit <= 1))
+        layers = [nn.view(self.tensors[f"weights_{k}"]) for k in range(len(self.sizes.density_network.shapes))]
+        raw = Network.eval_lanes(layers, self.encoding.encode(self.tensors["table"].array, unit, inside))[0]
+        return [dr.select(inside, self.largest * dr.rcp(1 + dr.exp(SHIFT - raw)), 0)]
+
+    def accumulate(self, p: mi.Point3f, w: mi.Vector3f, d: list[mi.Float], active: mi.Bool) -> None:
+        accumulate_tracked(self, p, w, d, active)
+
+    def bound(self) -> list[float]:
+        return [self.largest]
+
+    def parameters(self) -> dict[str, Any]:
+        return self.tensors

@@ -1,0 +1,160 @@
+"""``mivol_hash`` as the extinction of a medium: images and gradients against quadrature, and refused parameters."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from false_alarms import assert_same_mean
+
+from mivol.validate.moments import Moments
+
+SIZES = {"levels": 3, "log2_table": 7, "coarsest": 2, "finest": 8, "width": 8}
+RUNS = 12
+KEY = "box.interior_medium.sigma_t."
+
+
+def scene(max_depth: int = 2, albedo: float = 0.0) -> mi.Scene:
+    """The unit cube in white light: a pixel is the transmittance of the cube, if nothing scatters."""
+    place = mi.ScalarTransform4f()
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "mivol", "max_depth": max_depth},
+            "sensor": {
+                "type": "perspective",
+                "to_world": place.look_at([0.5, -2, 0.6], [0.5, 0.5, 0.5], [0, 0, 1]),
+                "fov": 16,
+                "film": {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb", "filter": {"type": "box"}},
+                "sampler": {"type": "independent"},
+            },
+            "light": {"type": "constant"},
+            "box": {
+                "type": "cube",
+                "to_world": place.translate([0.5, 0.5, 0.5]).scale(0.5),
+                "bsdf": {"type": "null"},
+                "interior": {
+                    "type": "mivol_medium",
+                    "albedo": albedo,
+                    "sigma_t": {"type": "mivol_hash", "majorant": 8.0, "seed": 4, **SIZES},
+                },
+            },
+        }
+    )
+
+
+def with_values(scene: mi.Scene) -> mi.SceneParameters:
+    """The parameters, with features of order 1."""
+    params = mi.traverse(scene)
+    rng = np.random.default_rng(0)
+    params[KEY + "table"] = mi.TensorXf(8 * rng.normal(size=params[KEY + "table"].shape).astype(np.float32))
+    params.update()
+    return params
+
+
+def quadrature(scene: mi.Scene, samples: int = 100, pixels: int = 32) -> float:
+    """Mean transmittance of rays through the film, by midpoints, for the present values."""
+    sensor, field = scene.sensors()[0], scene.shapes()[0].interior_medium().volumes["sigma_t"].mivol_extinction
+    number = dr.arange(mi.UInt32, pixels * pixels)
+    at = mi.Point2f((number % pixels + 0.5) / pixels, (number // pixels + 0.5) / pixels)
+    ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+    hit = scene.ray_intersect(ray)
+    length = scene.ray_intersect(hit.spawn_ray(ray.d)).t
+    tau = dr.zeros(mi.Float, pixels * pixels)
+    for k in range(samples):
+        tau += length / samples * field.eval(hit.p + ray.d * length * ((k + 0.5) / samples), ray.d, mi.Bool(True))[0]
+        dr.eval(tau)
+    return float(np.mean(np.exp(-np.array(tau, np.float64))))
+
+
+def moments(values: list[float]) -> Moments:
+    found = np.array(values)
+    return Moments(len(found), found.mean(), ((found - found.mean()) ** 2).sum())
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_images_equal_quadrature(variant_rgb: str) -> None:
+    """A cube that absorbs, in white light."""
+    box = scene()
+    with_values(box)
+    truth = quadrature(box)
+    assert 0.1 < truth < 0.7
+    means = [float(dr.mean(mi.render(box, spp=32, seed=seed), axis=None).array[0]) for seed in range(RUNS)]
+    # Midpoints of 100 steps and of 32 x 32 pixels: 4e-4.
+    assert_same_mean(moments(means), truth, rounding=4e-4, what="transmittances")
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", ["table", "weights_0", "weights_1"])
+def test_gradients_equal_quadrature(variant_rgb: str, name: str) -> None:
+    """The slope of the mean pixel along a random direction of a parameter."""
+    box = scene()
+    params, key = with_values(box), KEY + name
+    value = np.array(params[key])
+    along = np.random.default_rng(1).normal(size=value.shape).astype(np.float32)
+    h, ends = 1e-2, []
+    for step in (h, -h):
+        params[key] = mi.TensorXf(value + np.float32(step) * along)
+        params.update()
+        ends.append(quadrature(box))
+    slopes = []
+    for seed in range(RUNS):
+        params[key] = mi.TensorXf(value)
+        dr.enable_grad(params[key])
+        params.update()
+        dr.backward(dr.mean(mi.render(box, params, spp=128, seed=seed), axis=None))
+        slopes.append(float((np.array(dr.grad(params[key]), np.float64) * along).sum()))
+    slope = (ends[0] - ends[1]) / (2 * h)
+    # Central differences: h^2 / 6 of a third derivative of order 1; rays that cross kinks of the ReLU, a share h of them.
+    assert abs(slope) > 0.01
+    assert_same_mean(moments(slopes), slope, rounding=2e-3, what=f"slopes by {name}")
+
+
+@pytest.mark.slow
+def test_a_step_along_the_gradient_of_scattered_light_lowers_the_loss(variant_rgb: str) -> None:
+    """Through multiple scattering: ten steps towards the image of another hash grid at least halve the squared error."""
+    target, box = (scene(6, 0.8) for _ in range(2))
+    with_values(target)
+    reference = mi.render(target, spp=4096, seed=99)
+    params = mi.traverse(box)
+    names = [KEY + name for name in ("table", "weights_0", "weights_1")]
+    optimizer = mi.ad.Adam(lr=0.05, params={name: params[name] for name in names})
+    errors = []
+    for step in range(11):
+        params.update(optimizer)
+        errors.append(float(dr.mean(dr.square(mi.render(box, spp=1024, seed=7) - reference), axis=None).array[0]))
+        image = mi.render(box, params, spp=256, seed=step)
+        dr.backward(dr.mean(dr.square(image - reference), axis=None))
+        optimizer.step()
+    assert errors[-1] < 0.5 * errors[0], errors
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"majorant": -1.0}, "the bound -1 of a mivol_hash"),
+        ({"features": 3}, "features = 3, expected 1, 2, 4 or 8"),
+        ({"weights_0": np.zeros((8, 6), np.float32)}, "given weights_0; all of table, weights_0, weights_1 or none"),
+        (
+            {"table": np.zeros((5, 2), np.float32), "weights_0": np.zeros((8, 6)), "weights_1": np.zeros((1, 8))},
+            r"table of the shape \(5, 2\); \(280, 2\) is expected",
+        ),
+        (
+            {"table": np.zeros((280, 2)), "weights_0": np.full((8, 6), np.nan), "weights_1": np.zeros((1, 8))},
+            "weights_0 with values that are not finite",
+        ),
+        ({"depth": 3}, "unreferenced|depth"),
+    ],
+)
+def test_parameters_that_contradict_are_refused(variant_rgb: str, change: dict, said: str) -> None:
+    given = {name: mi.TensorXf(np.float32(v)) if isinstance(v, np.ndarray) else v for name, v in change.items()}
+    with pytest.raises((RuntimeError, ValueError), match=said):
+        mi.load_dict({"type": "mivol_hash", "majorant": 3.0, **SIZES, **given})
+
+
+def test_a_majorant_is_asked_for(variant_rgb: str) -> None:
+    with pytest.raises((RuntimeError, ValueError), match="given no majorant"):
+        mi.load_dict({"type": "mivol_hash"})
