@@ -26,12 +26,14 @@ from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit
 from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan
 from mivol.experiments.gaussian_fit import make_gaussian_plan, start_gaussians
+from mivol.experiments.hash_fit import make_hash_plan, make_hash_problem
 from mivol.experiments.photo_data import add_box, read_photos
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.sampled_problem import SampledProblem
 from mivol.photos import Photo, Photos, rectify
 from mivol.validate.metrics import ImageScore, average_scores, score_image
 
@@ -111,19 +113,19 @@ class PhotoProblem:
     """A fit before its first step.
 
     Attributes:
-        problem: the fitted grid or Gaussians.
+        problem: the fitted grid, hash grid or Gaussians.
         train, judged: photographs to fit and to judge by.
         steps: number of steps.
     """
 
-    problem: RadianceProblem | GaussianProblem
+    problem: RadianceProblem | SampledProblem | GaussianProblem
     train: Photos
     judged: Photos
     steps: int
 
     def show(self, photo: Photo) -> np.ndarray:
         """Render the view of a pinhole photograph (H, W, 3) over its background."""
-        if isinstance(self.problem, RadianceProblem):
+        if isinstance(self.problem, RadianceProblem | SampledProblem):
             return render_view(self.problem.field, photo.camera, photo.background).image
         return gaussian_fit.render_gaussians(self.problem, photo.camera, photo.background, self.problem.plan.low_pass)
 
@@ -156,6 +158,9 @@ def prepare_fit(
         plan = adapt_plan(adapt(make_plan(chosen)), train)
         problem = RadianceProblem(make_batches(plan, train), train.box, plan)
         return PhotoProblem(problem, train, judged, sum(stage.steps for stage in plan.stages))
+    if isinstance(chosen, config.HashExperiment):
+        problem = make_hash_problem(make_hash_plan(chosen), train, seed)
+        return PhotoProblem(problem, train, judged, problem.plan.steps)
     begun = start_gaussians(chosen, train, make_gaussian_plan(chosen))
     return PhotoProblem(begun.problem(seed), train, judged, begun.plan.steps)
 
@@ -183,7 +188,7 @@ class PhotoFit:
         return reference_seconds(self.processor, self.rate)
 
 
-def fit_photographs(problem: RadianceProblem | GaussianProblem, walk_side: int) -> PhotoFit:
+def fit_photographs(problem: RadianceProblem | SampledProblem | GaussianProblem, walk_side: int) -> PhotoFit:
     """Take all steps of a fit, and measure them.
 
     Args:

@@ -42,7 +42,7 @@ class HashFit(FieldFit):
         }
 
     def plan_fit(self) -> list[PlanLine]:
-        self.batches = RayBatches.from_photos([rectify(view) for view in self.photos.views], space=self.photos.space)
+        self.batches = make_hash_batches(self.photos)
         return explain_hash_plan(self.plan, self.photos, self.batches)
 
     def make_problem(self) -> SampledProblem:
@@ -56,6 +56,16 @@ class HashFit(FieldFit):
 
     def gains(self) -> None:
         return None
+
+
+def make_hash_batches(photos: Photos) -> RayBatches:
+    """The photographs in full size, undistorted if their lens has an image plane."""
+    return RayBatches.from_photos([rectify(view) for view in photos.views], space=photos.space)
+
+
+def make_hash_problem(plan: SampledPlan, photos: Photos, seed: int = 0) -> SampledProblem:
+    """The fit of photographs with a box, before its first step."""
+    return SampledProblem(make_hash_batches(photos), photos.box, plan, seed)
 
 
 def count_numbers(field: HashField) -> int:

@@ -187,7 +187,7 @@ class HashEncoding:
                 dr.scatter_add(target, values, row, active, mode=_reduce_mode())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class HashField:
     """A hash grid with its networks, as a :class:`mivol.fields.sampled_field.SampledField`.
 
@@ -219,6 +219,10 @@ class HashField:
             if dr.width(values) != math.prod(shape):
                 size = " x ".join(str(n) for n in shape)
                 raise MivolError(f"{name} has {dr.width(values)} numbers, expected {size} by the sizes of this hash grid.")
+
+    def __repr__(self) -> str:
+        sizes, numbers = self.sizes, sum(math.prod(shape) for shape in self.shapes().values())
+        return f"HashField({sizes.levels} levels of {sizes.coarsest} to {sizes.finest} cells, {numbers} numbers, {self.space})"
 
     @classmethod
     def random(cls, sizes: HashSizes, to_world: np.ndarray, seed: int = 0, space: str = "srgb") -> HashField:

@@ -98,9 +98,9 @@ def _interpolate(old: SphericalGrid, axes: list[_AxisWeights], place: tuple) -> 
 # -- From points to a grid -------------------------------------------------------------------------------------------------
 
 
-OPAQUE = 4.0
-"""Largest optical depth of a voxel in a grid of a sampled field. Denser nodes gain nothing, and interpolation from them would
-fill the empty voxels beside a surface."""
+OPAQUE = 1.5
+"""Largest optical depth of a voxel in a grid of a sampled field. Interpolation from denser nodes would fill the empty voxels
+beside a surface (views of the chair at 128 nodes, against its hash grid: 30.4 dB with 1.5, 29.8 dB with 8)."""
 
 EMPTY = 1e-3
 """Optical depth of a voxel below which a node is not stored."""

@@ -93,8 +93,8 @@ class SampledPlan:
 PRESETS: dict[str, SampledPlan] = {
     "tiny": SampledPlan(HashSizes(levels=6, log2_table=13, finest=64, width=16), steps=200, samples=1 << 13, cells=24),
     "minute": SampledPlan(),
-    "minutes": SampledPlan(steps=6000),
-    "gpu": SampledPlan(steps=20000, samples=1 << 18, cells=128),
+    "minutes": SampledPlan(HashSizes(log2_table=18, finest=512), steps=5000, cells=96),
+    "gpu": SampledPlan(HashSizes(log2_table=19, finest=2048, features=4, width=64), steps=20000, samples=1 << 18, cells=128),
 }
 
 
