@@ -4,8 +4,8 @@ Reason. Dr.Jit 1.5 keeps one copy of a small scatter target for each pool thread
 Python threads as the same pool thread. Two Python threads then add to one copy without atomics. Up to a third of a gradient was
 missing in a test, without an error. A forked child has no pool threads at all. Therefore every function that renders or
 differentiates calls :func:`check_one_thread` first, and child processes are started by :func:`run_child` and
-:func:`follow_program`. No other module of mivol starts threads or processes; ``mivol.cluster`` lets Dask start workers,
-each a fresh process with one thread for Dr.Jit.
+:func:`follow_program`. :func:`map_arrays` starts threads that compute with NumPy alone. No other module of mivol starts threads
+or processes; ``mivol.cluster`` lets Dask start workers, each a fresh process with one thread for Dr.Jit.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from .errors import MivolError
 
@@ -73,6 +75,24 @@ def set_thread_count(count: int) -> None:
 
     dr.sync_thread()
     dr.set_thread_count(count)
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def map_arrays(work: Callable[[Item], Result], items: Sequence[Item], count: int) -> list[Result]:
+    """Apply a function to items in several threads, and return the results in the order of the items.
+
+    Args:
+        work: computes with NumPy alone, which lets other threads run meanwhile; it must not touch Dr.Jit.
+        items: pieces of the work.
+        count: largest number of threads; 1 works in the calling thread.
+    """
+    if min(count, len(items)) < 2:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(min(count, len(items))) as pool:
+        return list(pool.map(work, items))
 
 
 def run_child(

@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.hash_grid import HashField, HashSizes
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
 from mivol.fields.sampled_field import Region
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole

@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.hash_grid import HashEncoding, HashSizes
+from mivol.fields.hash_encoding import HashEncoding, HashSizes
 from mivol.fields.networks import Network
 from mivol.fields.protocol import BOUNDED, accumulate_tracked
 

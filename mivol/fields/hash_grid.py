@@ -7,11 +7,7 @@ spherical harmonics of the direction of travel, S the logistic function for sRGB
 The exponents are cut at 15: beyond, the value stays and the derivative is that at the cut. ``s`` is 1 over half the longest
 edge of the box, so an untrained field has an optical depth of about 1 across the box in any unit of length.
 
-Levels. Level l has about ``coarsest`` (finest / coarsest)^(l / (levels - 1)) cubic cells along the longest edge of the box. The
-nodes of a level that has at most 2^``log2_table`` of them are stored one by one. A finer level stores 2^``log2_table`` rows,
-and the hash of a node selects a row, which several nodes share.
-
-Conventions. ``table`` is (rows, features), level by level, x fastest; ``density_weights`` and ``colour_weights`` are arrays of
+Conventions. ``table`` is that of :mod:`mivol.fields.hash_encoding`; ``density_weights`` and ``colour_weights`` are arrays of
 :class:`mivol.fields.networks.Network`. On a CPU the networks multiply matrices of many points by BLAS, and the encoding has
 derivatives by hand; on a GPU Dr.Jit differentiates a kernel.
 
@@ -22,7 +18,6 @@ exponential).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,160 +26,19 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.harmonics import SPACES, basis_size
+from mivol.fields.harmonics import SPACES
+from mivol.fields.hash_encoding import HashEncoding, HashSizes
 from mivol.fields.networks import Network
 from mivol.fields.sampled_field import PointValues, Region
+from mivol.threads import map_arrays
 
-__all__ = ["HashField", "HashSizes", "Level"]
-
-PRIMES = 1, 2654435761, 805459861
-"""Factors of the hash (Müller et al. 2022, eq. 4)."""
+__all__ = ["HashField"]
 
 MAX_EXPONENT = 15.0
 """Cut of the exponents: exp(15) = 3e6."""
 
 BLOCK = 8192
 """Points that are multiplied together: their rows of all layers stay in the cache of a core."""
-
-FIRST = 1e-4
-"""Bound of the first values of the table."""
-
-
-LIMITS = {
-    "levels": (1, 32), "features": (1, 8), "log2_table": (4, 24), "coarsest": (1, 1 << 20), "finest": (1, 1 << 20),
-    "width": (1, 1024), "density_layers": (0, 16), "colour_layers": (0, 16), "geometry": (1, 256), "degree": (0, 4),
-}  # fmt: skip
-"""Smallest and largest values of :class:`HashSizes`."""
-
-
-@dataclass(frozen=True)
-class Level:
-    """A level of a hash grid: cells (x, y, z), first row, stored rows, and whether each node has its own row."""
-
-    cells: tuple[int, int, int]
-    first: int
-    rows: int
-    is_dense: bool
-
-
-@dataclass(frozen=True)
-class HashSizes:
-    """Sizes of a hash grid and its networks.
-
-    Attributes:
-        levels: number of levels.
-        features: numbers a row, 1, 2, 4 or 8.
-        log2_table: logarithm of the most rows of a level.
-        coarsest, finest: cells along the longest edge of the box, of the first and of the last level.
-        width: neurons of a hidden layer.
-        density_layers, colour_layers: hidden layers of the networks.
-        geometry: outputs of the density's network; the first is the logarithm of the density, and all enter the colour's.
-        degree: of the harmonics of the direction.
-    """
-
-    levels: int = 8
-    features: int = 2
-    log2_table: int = 17
-    coarsest: int = 16
-    finest: int = 256
-    width: int = 32
-    density_layers: int = 1
-    colour_layers: int = 1
-    geometry: int = 16
-    degree: int = 2
-
-    def __post_init__(self) -> None:
-        for name, (low, high) in LIMITS.items():
-            if not low <= getattr(self, name) <= high:
-                raise MivolError(f"found a hash grid with {name} = {getattr(self, name)}, expected {low} to {high}.")
-        if self.features not in (1, 2, 4, 8):
-            raise MivolError(f"found a hash grid with features = {self.features}, expected 1, 2, 4 or 8.")
-        if self.coarsest > self.finest:
-            raise MivolError(f"found levels from {self.coarsest} to {self.finest} cells, expected the coarsest first.")
-
-    @property
-    def density_network(self) -> Network:
-        """The network from features to density and geometry."""
-        return Network((self.levels * self.features, *[self.width] * self.density_layers, self.geometry))
-
-    @property
-    def colour_network(self) -> Network:
-        """The network from geometry and harmonics to colour."""
-        return Network((self.geometry + basis_size(self.degree), *[self.width] * self.colour_layers, 3))
-
-    def place_levels(self, edges: np.ndarray) -> list[Level]:
-        """The levels in a box with the edges (x, y, z)."""
-        growth = (self.finest / self.coarsest) ** (1 / max(self.levels - 1, 1))
-        placed, first = [], 0
-        for number in range(self.levels):
-            longest = self.coarsest * growth**number
-            cells = tuple(max(1, round(float(longest * edge / edges.max()))) for edge in edges)
-            nodes = math.prod(n + 1 for n in cells)
-            is_dense = nodes <= 1 << self.log2_table
-            placed.append(Level(cells, first, nodes if is_dense else 1 << self.log2_table, is_dense))
-            first += placed[-1].rows
-        return placed
-
-
-@dataclass(frozen=True)
-class HashEncoding:
-    """The levels of a hash grid in a box, and the features of points.
-
-    Attributes:
-        sizes: of the hash grid.
-        to_world: (4, 4) float64, unit cube to world.
-    """
-
-    sizes: HashSizes
-    to_world: np.ndarray
-
-    @cached_property
-    def edges(self) -> np.ndarray:
-        """Edges of the box (x, y, z) [length]."""
-        return np.linalg.norm(self.to_world[:3, :3], axis=0)
-
-    @cached_property
-    def levels(self) -> list[Level]:
-        """The levels in the box."""
-        return self.sizes.place_levels(self.edges)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Shape of the table, (rows, features)."""
-        return sum(level.rows for level in self.levels), self.sizes.features
-
-    def first_table(self, rng: np.random.Generator) -> np.ndarray:
-        """Small random features."""
-        return rng.uniform(-FIRST, FIRST, self.shape).astype(np.float32)
-
-    def to_unit(self, p: mi.Point3f) -> mi.Point3f:
-        """Points of the world in the unit cube."""
-        rows = np.linalg.inv(self.to_world)[:3]
-        opaque = [[dr.opaque(mi.Float, float(v)) for v in row] for row in rows]
-        return mi.Point3f(*(dr.fma(r[0], p.x, dr.fma(r[1], p.y, dr.fma(r[2], p.z, r[3]))) for r in opaque))
-
-    def encode(self, table: mi.Float, unit: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
-        """Features of points of the unit cube; attached to the table."""
-        width, features = self.sizes.features, []
-        for level in self.levels:
-            sums = [mi.Float(0)] * width
-            for row, weight in _corners(level, unit):
-                if width == 1:
-                    values = [dr.gather(mi.Float, table, row, active, mode=_reduce_mode())]
-                else:
-                    values = dr.gather(mi.ArrayXf, table, row, active, mode=_reduce_mode(), shape=(width, 1))
-                sums = [dr.fma(values[k], weight, total) for k, total in enumerate(sums)]
-            features += sums
-        return features
-
-    def add_features(self, unit: mi.Point3f, slopes: list[mi.Float], target: mi.Float, active: mi.Bool = True) -> None:
-        """Add derivatives by the features of points to the derivatives by the table: the transpose of :meth:`encode`."""
-        width = self.sizes.features
-        for number, level in enumerate(self.levels):
-            own = slopes[number * width : (number + 1) * width]
-            for row, weight in _corners(level, unit):
-                values = own[0] * weight if width == 1 else mi.ArrayXf([slope * weight for slope in own])
-                dr.scatter_add(target, values, row, active, mode=_reduce_mode())
 
 
 @dataclass(frozen=True, repr=False)
@@ -272,7 +126,7 @@ class HashField:
         inputs = [*geometry, *dr.sh_eval(d, self.sizes.degree)]
         raw = Network.eval_lanes(self.sizes.colour_network.pack(self.colour_weights), inputs)
         if self.space == "linear":
-            return self._lane_density(geometry), mi.Color3f(*(self.white * dr.exp(dr.minimum(v, MAX_EXPONENT)) for v in raw))
+            return self._lane_density(geometry), mi.Color3f(*(self.white * dr.exp(_cut(v)) for v in raw))
         return self._lane_density(geometry), mi.Color3f(*(dr.rcp(1 + dr.exp(-v)) for v in raw))
 
     def _lane_geometry(self, p: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
@@ -280,7 +134,7 @@ class HashField:
         return Network.eval_lanes(layers, self.encoding.encode(self.table, self.encoding.to_unit(p), active))
 
     def _lane_density(self, geometry: list[mi.Float]) -> mi.Float:
-        return self.scale * dr.exp(dr.minimum(geometry[0], MAX_EXPONENT))
+        return self.scale * dr.exp(_cut(geometry[0]))
 
     # -- Values of points in memory -----------------------------------------------------------------------------------
 
@@ -291,8 +145,11 @@ class HashField:
         layers = self.sizes.density_network.layers(self.density_weights.numpy())
         sigma = dr.empty(mi.Float, len(x))
         out = sigma.numpy()
-        for block in _blocks(len(x)):
+
+        def evaluate(block: slice) -> None:
             out[block] = self._density_of(Network.forward(layers, x[block])[-1][:, 0])
+
+        map_arrays(evaluate, _blocks(len(x)), dr.thread_count())
         return sigma
 
     def evaluate(self, p: mi.Point3f, d: mi.Vector3f) -> PointValues:
@@ -319,10 +176,13 @@ class HashField:
         sigma, colour = dr.empty(mi.Float, len(x)), dr.empty(mi.Float, 3 * len(x))
         sigma_rows, colour_rows = sigma.numpy(), colour.numpy().reshape(-1, 3)
         density, colours = self._layers()
-        for block in _blocks(len(x)):
+
+        def evaluate(block: slice) -> None:
             geometry = Network.forward(density, x[block])[-1]
             raw = Network.forward(colours, np.concatenate([geometry, basis[block]], axis=1))[-1]
             sigma_rows[block], colour_rows[block] = self._density_of(geometry[:, 0]), self._colour_of(raw)
+
+        map_arrays(evaluate, _blocks(len(x)), dr.thread_count())
 
         def vjp(dsigma: mi.Float, dcolour: mi.Color3f) -> dict[str, mi.Float]:
             return self._vjp_rows(unit, x, basis, dsigma, dcolour)
@@ -334,27 +194,34 @@ class HashField:
     ) -> dict[str, mi.Float]:
         by_sigma, by_colour = _rows([dsigma])[:, 0], _rows(list(dcolour))
         density, colours = self._layers()
-        gradient = {name: np.zeros(self.shapes()[name], np.float32) for name in ("density_weights", "colour_weights")}
-        density_gradient = self.sizes.density_network.layers(gradient["density_weights"])
-        colour_gradient = self.sizes.colour_network.layers(gradient["colour_weights"])
+        networks = self.sizes.density_network, self.sizes.colour_network
         slopes = dr.empty(mi.Float, x.size)
         slope_rows = slopes.numpy().reshape(x.shape)
-        for block in _blocks(len(x)):
+
+        def differentiate(block: slice) -> list[np.ndarray]:
+            """Derivatives by the weights of both networks; those by the features are written."""
             rows = Network.forward(density, x[block])
             inputs = np.concatenate([rows[-1], basis[block]], axis=1)
             colour_rows = Network.forward(colours, inputs)
             values = self._colour_of(colour_rows[-1])
             slope = values if self.space == "linear" else values * (1 - values)
-            by_inputs = Network.backward(colours, colour_rows, by_colour[block] * slope, colour_gradient)
+            gradients = [np.zeros(network.size, np.float32) for network in networks]
+            own, own_colours = (network.layers(g) for network, g in zip(networks, gradients, strict=True))
+            by_inputs = Network.backward(colours, colour_rows, by_colour[block] * slope, own_colours)
             by_geometry = by_inputs[:, : self.sizes.geometry]
             by_geometry[:, 0] += by_sigma[block] * self._density_of(rows[-1][:, 0])
-            slope_rows[block] = Network.backward(density, rows, by_geometry, density_gradient)
+            slope_rows[block] = Network.backward(density, rows, by_geometry, own)
+            return gradients
+
+        # Sums over blocks of one size in one order: the same for any number of threads.
+        blocks = map_arrays(differentiate, _blocks(len(x)), dr.thread_count())
+        by_density, by_colours = (np.sum(each, axis=0) for each in zip(*blocks, strict=True))
         target, lane, width = dr.zeros(mi.Float, dr.width(self.table)), dr.arange(mi.UInt32, len(x)), x.shape[1]
         dr.eval(target)
         row = dr.gather(mi.ArrayXf, slopes, lane, shape=(width, 1))
         self.encoding.add_features(unit, [row[k] for k in range(width)], target)
         dr.eval(target)
-        return {"table": target} | {name: mi.Float(values) for name, values in gradient.items()}
+        return {"table": target, "density_weights": mi.Float(by_density), "colour_weights": mi.Float(by_colours)}
 
     def _layers(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         return (
@@ -374,28 +241,9 @@ class HashField:
         return _rows(self.encoding.encode(self.table, unit))
 
 
-def _corners(level: Level, unit: mi.Point3f) -> Iterator[tuple[mi.UInt32, mi.Float]]:
-    """Rows of the 8 nodes around points of the unit cube, and their trilinear weights."""
-    lower, upper, weights, stride = [], [], [], 1
-    for axis, cells in enumerate(level.cells):
-        place = dr.clip(unit[axis], 0, 1) * cells
-        node = dr.minimum(mi.UInt32(place), cells - 1)
-        share = place - mi.Float(node)
-        factor = stride if level.is_dense else PRIMES[axis]
-        lower.append(node * mi.UInt32(factor))
-        upper.append(lower[-1] + mi.UInt32(factor))
-        weights.append((1 - share, share))
-        stride *= cells + 1
-    for corner in range(8):
-        bits = [corner >> axis & 1 for axis in range(3)]
-        x, y, z = (upper[a] if bit else lower[a] for a, bit in enumerate(bits))
-        row = x + y + z if level.is_dense else (x ^ y ^ z) & mi.UInt32(level.rows - 1)
-        yield row + level.first, weights[0][bits[0]] * weights[1][bits[1]] * weights[2][bits[2]]
-
-
-def _reduce_mode() -> dr.ReduceMode:
-    """How derivatives are added: on a CPU each thread adds to a copy of its own, without atomics."""
-    return dr.ReduceMode.Expand if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else dr.ReduceMode.Auto
+def _cut(exponent: mi.Float) -> mi.Float:
+    """An exponent of at most ``MAX_EXPONENT``, with a derivative of 1 everywhere: a density beyond can still fall."""
+    return exponent - dr.detach(dr.maximum(exponent - MAX_EXPONENT, 0))
 
 
 def _has_blas() -> bool:

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields.hash_grid import HashField, HashSizes
+from mivol.fields import hash_grid
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
 from mivol.fields.networks import Network
+from mivol.threads import map_arrays
 
 PLACE = np.array([[2.0, 0, 0, -1], [0, 1.5, 0, -0.5], [0, 0, 3.0, 0], [0, 0, 0, 1]])
 SIZES = HashSizes(levels=4, features=2, log2_table=8, coarsest=3, finest=20, width=8, geometry=5, degree=1)
@@ -109,6 +112,44 @@ def test_values_and_derivatives_equal_a_twin_in_float64(variant_rgb: str, which:
             expected = (loss(values | {name: values[name] + step}) - loss(values | {name: values[name] - step})) / (2 * h)
             # Float32 sums over 40 points, relative to the largest derivative; differences round by 2^-52 x 100 / h.
             np.testing.assert_allclose(slopes[k], expected, rtol=1e-4, atol=2e-5 * np.abs(slopes).max())
+
+
+@pytest.mark.parametrize("space", ["srgb", "linear"])
+def test_both_evaluations_agree_beyond_the_cut_of_exponents(variant_rgb: str, space: str) -> None:
+    """The value stays at exp(15), and the derivative is that at the cut."""
+    field, (p, d) = make(space=space), points(40)
+    values = field.parameters()
+    large = {name: mi.TensorXf(30 * np.array(values[name])) for name in ("density_weights", "colour_weights")}
+    field = field.with_parameters(values | large)
+    dr.eval(p, d)
+    rows, lanes = field._evaluate_rows(p, d), field._evaluate_lanes(p, d)
+    assert np.array(rows.sigma).max() == pytest.approx(field.scale * np.exp(15), rel=1e-5)
+    np.testing.assert_allclose(np.array(rows.sigma), np.array(lanes.sigma), rtol=1e-4, atol=1e-30)
+    ones = dr.ones(mi.Float, 40), dr.ones(mi.Color3f, 40)
+    by_rows, by_lanes = rows.vjp(*ones), lanes.vjp(*ones)
+    for name, slopes in by_rows.items():
+        expected = np.array(by_lanes[name], np.float64)
+        # Exponents of up to 15 in float32 sums of terms up to 1000: 1e-4 of the largest value. Logistic functions saturate.
+        np.testing.assert_allclose(np.array(slopes, np.float64), expected, atol=1e-3 * np.abs(expected).max() + 1e-20)
+
+
+def test_blocks_in_threads_give_the_same_bits(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results keep the order of the blocks; a fault in a thread reaches the caller."""
+    field, (p, d) = make(), points(100)
+    dr.eval(p, d)
+    monkeypatch.setattr(hash_grid, "BLOCK", 16)
+
+    def derive(count: int) -> dict[str, np.ndarray]:
+        monkeypatch.setattr(hash_grid.dr, "thread_count", lambda: count)
+        values = field._evaluate_rows(p, d)
+        slopes = values.vjp(dr.ones(mi.Float, 100), dr.ones(mi.Color3f, 100))
+        return {"sigma": np.array(values.sigma)} | {name: np.array(slopes[name]) for name in slopes if name != "table"}
+
+    one, three = derive(1), derive(3)
+    assert all(np.array_equal(one[name], three[name]) for name in one)
+    assert map_arrays(lambda k: k * k, range(7), 3) == [k * k for k in range(7)]
+    with pytest.raises(ZeroDivisionError):
+        map_arrays(lambda k: 1 // k, [1, 0, 2], 3)
 
 
 @pytest.mark.parametrize("features", [1, 4, 8])

@@ -14,7 +14,8 @@ from mivol.errors import MivolError
 from mivol.experiments import octree_conversion
 from mivol.fields.field_files import read_field, read_grid, write_field
 from mivol.fields.harmonics import harmonic_degree
-from mivol.fields.hash_grid import HashField, HashSizes
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
 from mivol.fields.sampled_field import Region
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import npy

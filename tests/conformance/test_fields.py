@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mivol.fields.hash_density import HashDensity
-from mivol.fields.hash_grid import HashSizes
+from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.protocol import BOUNDED, EXACT_LINE, Field
 from mivol.fields.voxels import Voxels
 

@@ -11,7 +11,7 @@ import pytest
 from ball_photos import BOX, error_of
 
 from mivol.errors import MivolError
-from mivol.fields.hash_grid import HashSizes
+from mivol.fields.hash_encoding import HashSizes
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.ray_batches import RayBatches

@@ -30,7 +30,8 @@ from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs,
 from mivol.bench.reference_walk import REFERENCE_RATE
 from mivol.experiments import field_fit
 from mivol.experiments.hash_fit import count_numbers
-from mivol.fields.hash_grid import HashField, HashSizes
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
 from mivol.fields.networks import Network
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.sampled_problem import SampledProblem

@@ -22,7 +22,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol import machine
-from mivol.fields.hash_grid import HashField, HashSizes
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
 from mivol.optim.events import Event
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course
