@@ -239,6 +239,7 @@ def optimize_flags() -> list:
         list_flag("--set", "key=value", "override a setting of the experiment"),
         flag("-o", "--output", type=Path, help="run folder (default: the experiment's output)"),
         flag("--resume", action="store_true", help="continue from the checkpoint in the run folder"),
+        CLUSTER,
     ]
 
 
@@ -579,6 +580,7 @@ def optimize(arguments: argparse.Namespace) -> None:
     files. optimize says what was found, assumed and chosen. All results are written into the run folder.
     """
     from mivol import config
+    from mivol.cli.cluster import distribute_fit
     from mivol.cli.progress import TerminalProgress
     from mivol.experiments.fit_kind import RunContext
     from mivol.experiments.kinds import run_experiment
@@ -590,7 +592,9 @@ def optimize(arguments: argparse.Namespace) -> None:
     else:
         settings, base = load_experiment(arguments.experiment, arguments)
     folder = arguments.output or Path(settings.output)
-    print(run_experiment(RunContext(settings, base, folder, arguments.resume, progress, arguments.command, notes)))
+    with distribute_fit(arguments, settings) as distribution:
+        given = arguments.resume, progress, arguments.command, notes, distribution
+        print(run_experiment(RunContext(settings, base, folder, *given)))
 
 
 def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path]:

@@ -17,6 +17,8 @@ from mivol.optim.interrupt import InterruptGuard
 
 if TYPE_CHECKING:
     from mivol.cluster.pool import Pool
+    from mivol.config import Experiment
+    from mivol.experiments.fit_kind import Distribution
     from mivol.scene.load import LoadedScene
     from mivol.validate.reference import Complete
 
@@ -87,6 +89,21 @@ def scene_source(arguments: argparse.Namespace, make: Callable[..., Any]) -> Any
 
     folders = tuple(Path(folder) for folder in filter(None, arguments.a.split(";")))
     return make(arguments.scene, parse_defines(arguments.define), folders)
+
+
+@contextmanager
+def distribute_fit(arguments: argparse.Namespace, settings: Experiment) -> Iterator[Distribution | None]:
+    """What computes the gradients of a fit on the workers of ``--cluster``; None without the flag."""
+    if arguments.cluster is None:
+        yield None
+        return
+    from mivol.back_end import choose_back_end
+    from mivol.cluster.scene_steps import ClusterDistribution, check_settings
+
+    check_settings(settings)
+    choose_back_end(settings.variant, settings.threads)
+    with open_workers(arguments.cluster, settings.variant, settings.threads) as pool, status_line() as show:
+        yield ClusterDistribution(pool, show)
 
 
 def sweep(arguments: argparse.Namespace) -> int:

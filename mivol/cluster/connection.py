@@ -105,6 +105,12 @@ def _connect_address(distributed: Any, settings: ClusterSettings) -> Client:
         ) from None
 
 
+PATIENCE = {
+    "distributed.comm.timeouts.connect": "120s", "distributed.comm.timeouts.tcp": "300s",
+    "distributed.scheduler.worker-ttl": None,
+}  # fmt: skip
+"""Timeouts of Dask for clusters that mivol starts: a busy machine, or a long compilation in a worker, is no lost worker."""
+
 OWN_GROUP = "import os; os.setpgid(0, 0)"
 """Code at the start of a local worker. Ctrl-C in a terminal reaches the owner's group of processes. In a worker, Mitsuba would
 answer it with an unfinished image, and call it finished."""
@@ -113,8 +119,11 @@ answer it with an unfinished image, and call it finished."""
 @contextlib.contextmanager
 def _start_local(distributed: Any, settings: ClusterSettings) -> Iterator[Client]:
     """Processes of this machine; their memory is not limited by Dask, since Dr.Jit's cache of memory looks like a leak."""
+    import dask
+
     security = distributed.Security.temporary()
     with (
+        dask.config.set(PATIENCE),
         distributed.LocalCluster(
             n_workers=settings.workers, threads_per_worker=1, processes=True, memory_limit=0, host="127.0.0.1",
             dashboard_address="127.0.0.1:0", security=security, silence_logs=logging.CRITICAL + 1, preload=[OWN_GROUP],
@@ -128,6 +137,7 @@ def _start_local(distributed: Any, settings: ClusterSettings) -> Iterator[Client
 def _start_jobs(distributed: Any, settings: ClusterSettings) -> Iterator[tuple[Client, list[str]]]:
     """Jobs of a batch system, with one Dask thread and temporary certificates."""
     try:
+        import dask
         import dask_jobqueue
     except ImportError:
         raise MivolError(
@@ -145,6 +155,7 @@ def _start_jobs(distributed: Any, settings: ClusterSettings) -> Iterator[tuple[C
             "node, or give --cluster local:N."
         )
     with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set(PATIENCE))
         failures = stack.enter_context(_collect_failures())
         try:
             cluster = getattr(dask_jobqueue, name)(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MOST_LOSSES = 3
 """Workers that a unit may lose. Work that kills its worker would go on for ever otherwise."""
 
-SECONDS_BETWEEN_LOOKS = 0.5
+SECONDS_BETWEEN_LOOKS = 1.0
 """Interval between two looks at the list of workers."""
 
 SECONDS_WITHOUT_WORKERS = 60.0
@@ -293,7 +293,7 @@ class Pool:
                 return
             check()
             self._look()
-            for kind, number, content in self._take_news(0.1):
+            for kind, number, content in self._take_news(0.25):
                 if kind == "again" and number in waiting:
                     again.append((number, content))
                 elif kind == "done" and number in waiting:

@@ -16,6 +16,7 @@ from mivol.optim.optimizer import Optimizer
 from mivol.optim.problem import Problem
 from mivol.report.record import RunRecord
 from mivol.scene.explain import Explanation
+from mivol.validate.reference import Complete
 
 T = TypeVar("T")
 
@@ -51,6 +52,23 @@ class NullProgress:
         return nullcontext(lambda fit: None)
 
 
+class Distribution(Protocol):
+    """Computes parts of a run on the workers of a cluster."""
+
+    def make_problem(self, kind: FitKind) -> Problem:
+        """Return the problem of a fit whose loss and gradient are computed by workers.
+
+        Raises:
+            MivolError: a kind of fit whose steps run in one process only.
+        """
+
+    def complete_references(self, kind: FitKind) -> Complete:
+        """Return the function that renders the references of a fit."""
+
+    def notes(self) -> list[str]:
+        """Return sentences about the workers, for the record, at the end of the fit."""
+
+
 @dataclass(frozen=True)
 class RunContext:
     """An experiment to run, with folders and display.
@@ -63,6 +81,7 @@ class RunContext:
         progress: display of the run's progress.
         command: command line, for the record; empty for a run from Python.
         notes: how the settings came about, for the report.
+        distribution: computes parts of the run on workers; None: everything in this process.
     """
 
     settings: config.Experiment
@@ -72,6 +91,7 @@ class RunContext:
     progress: Progress = field(default_factory=NullProgress)
     command: str = ""
     notes: tuple[str, ...] = ()
+    distribution: Distribution | None = None
 
 
 class Stages(NamedTuple):

@@ -60,11 +60,12 @@ def run_experiment(context: RunContext) -> Path:
             context.progress.say(kind.announcement())
         kind.render_data(run)
         with run.stage(kind.stages.fit):
-            kind.problem = kind.make_problem()
+            workers = context.distribution
+            kind.problem = kind.make_problem() if workers is None else workers.make_problem(kind)
             best = BestIterate(run, kind.best_files())
             kind.prepare(run)
             fit = complete_fit(kind, run, best)
-            run.record.notes += best.says()
+            run.record.notes += best.says() + ([] if workers is None else workers.notes())
         with run.stage(kind.stages.write):
             kind.write_outputs(fit, run, best)
     page = write_page(context.folder)

@@ -25,7 +25,7 @@ from mivol.optim.scenes.views import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.sensors import check_film
 from mivol.scene_graph import traverse
-from mivol.validate.reference import render_reference
+from mivol.validate.reference import Complete, prepare_reference
 from mivol.validate.reference_file import ReferenceResult, read_reference
 
 SEEN = 2 * 3 * 4
@@ -71,6 +71,7 @@ def find_references(
     truth: np.ndarray | None,
     sensors: Sequence[Any],
     held_out: frozenset[int],
+    complete: Complete | None = None,
 ) -> References:
     """Render or read the reference of each view; renders show the truth if known.
 
@@ -79,6 +80,7 @@ def find_references(
         settings: all settings, with a number for ``fit.max_depth``.
         loaded, truth: scene, and true volume (Z, Y, X, C) or None.
         sensors, held_out: from :func:`find_sensors`.
+        complete: renders references on workers; None: in this process.
 
     Raises:
         MivolError: unreadable files, or files of other sizes than the views.
@@ -87,10 +89,10 @@ def find_references(
         return read_references(settings, context.base, loaded, sensors, held_out)
     references = References(held_out)
     if truth is None:
-        render_views(references, context, settings, loaded, sensors)
+        render_views(references, context, settings, loaded, sensors, complete)
     else:
         with hold_values(loaded.scene, settings.truth.key, truth):
-            render_views(references, context, settings, load_scene(loaded.scene), sensors)
+            render_views(references, context, settings, load_scene(loaded.scene), sensors, complete)
     return references
 
 
@@ -141,7 +143,12 @@ def check_held_out(held_out: Sequence[int], count: int) -> None:
 
 
 def render_views(
-    references: References, context: RunContext, settings: SceneExperiment, loaded: LoadedScene, sensors: Sequence[Any]
+    references: References,
+    context: RunContext,
+    settings: SceneExperiment,
+    loaded: LoadedScene,
+    sensors: Sequence[Any],
+    complete: Complete | None = None,
 ) -> None:
     """Render references by Mitsuba's path tracer, cached in ``references/`` for other fits of the same views."""
     cache, reference_settings = context.folder / "references", settings.reference
@@ -149,10 +156,12 @@ def render_views(
     depth = settings.fit.max_depth if reference_settings.max_depth is None else reference_settings.max_depth
     options = {
         "max_depth": depth, "target_se": reference_settings.standard_error or None, "max_spp": reference_settings.spp,
-        "seed": reference_settings.seed, "progress": False,
+        "seed": reference_settings.seed,
     }  # fmt: skip
+    prepared = (prepare_reference(loaded, cache, sensor=sensor, **options) for sensor in sensors)
+    renders = (reference.complete() for reference in prepared) if complete is None else complete(prepared)
     for sensor in context.progress.track(sensors, "references"):
-        render = render_reference(loaded, cache, sensor=sensor, **options)
+        render = next(renders)
         references.add(sensor, render.mean, standard_error(render))
 
 

@@ -121,7 +121,11 @@ class SceneFit(FitKind):
 
     def render_data(self, run: RunFolder) -> None:
         with run.stage("references"):
-            self.references = find_references(self.context, self.settings, self.loaded, self.truth, self.sensors, self.held_out)
+            workers = self.context.distribution
+            complete = None if workers is None else workers.complete_references(self)
+            self.references = find_references(
+                self.context, self.settings, self.loaded, self.truth, self.sensors, self.held_out, complete
+            )
 
     def make_problem(self) -> SceneProblem:
         return make_problem(self.settings, self.loaded.scene, self.integrator, self.starts, self.references)

@@ -16,16 +16,20 @@ import numpy as np
 import pytest
 from tiny_experiment import PHOTOS, run, write_experiment
 
+from mivol import config
 from mivol.cluster.address import ClusterSettings
 from mivol.cluster.connection import _connect, import_distributed
 from mivol.cluster.packages import SceneSource, share_scene
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.reference import complete_on
+from mivol.cluster.scene_steps import ClusterDistribution, SharedSceneProblem
 from mivol.cluster.sweep import run_on
 from mivol.cluster.workplace import Workplace
 from mivol.errors import MivolError
-from mivol.experiments.fit_kind import NullProgress
+from mivol.experiments.fit_kind import NullProgress, RunContext
+from mivol.experiments.kinds import run_experiment
 from mivol.experiments.sweep import plan_sweep, run_in_turn, run_sweep
+from mivol.files import read_volume
 from mivol.report.record import read_record
 from mivol.scene.camera_rigs import Ring
 from mivol.scene.load import load_scene
@@ -158,6 +162,49 @@ def test_a_sweep_does_not_depend_on_workers(client: object, tmp_path: Path) -> N
         assert {**alone.results, "fit_seconds": 0} == {**two.results, "fit_seconds": 0}
         assert one.name in page.read_text()
     assert len(ended) == 3
+
+
+# -- Fits --------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
+def test_a_fit_does_not_depend_on_workers(client: object, tmp_path: Path, optimizer: str) -> None:
+    """Rationale: blocks depend on the views only, and sums of float32 numbers in float64 do not depend on their order.
+
+    Expected: the volumes of 1 and 3 workers, and of 2 with one killed among the references and one in a step, are equal to 1e-6
+    of their largest value.
+    """
+    folder = write_experiment(tmp_path)
+    changes = ["views.count=5", f'optimizer={{name="{optimizer}"}}', "event=[]", "fit.iterations=3", "fit.spp=3"]
+    settings = config.load(folder / "fit.toml", changes)
+
+    def fit(name: str, count: int, killed: bool = False) -> np.ndarray:
+        said: list[str] = []
+        with some_workers(client, count, said) as pool:
+            distribution = ClusterDistribution(pool)
+            if killed:
+                distribution.show = kill_once(pool)  # among the references
+                ask = SharedSceneProblem.ask
+                patch = pytest.MonkeyPatch()
+                strikes = iter([False, True] + 99 * [False])
+
+                def strike(problem: SharedSceneProblem, *args: object, **more: object) -> object:
+                    if next(strikes):
+                        os.kill(next(iter(pool.workers.values())).facts.pid, signal.SIGKILL)
+                    return ask(problem, *args, **more)
+
+                patch.setattr(SharedSceneProblem, "ask", strike)
+            context = RunContext(settings, folder, tmp_path / name, distribution=distribution)
+            run_experiment(context)
+            if killed:
+                patch.undo()
+                assert pool.lost == 2
+                assert "2 worker(s) of the cluster were lost" in " ".join(read_record(tmp_path / name).notes)
+        return read_volume(next((tmp_path / name / "volumes").glob("*.npz"))).values
+
+    one, other = fit("one", 1), fit("two", 2, killed=True) if optimizer == "adam" else fit("three", 3)
+    assert one.std() > 0
+    np.testing.assert_allclose(other, one, rtol=0, atol=1e-6 * one.max())
 
 
 # -- Schedulers --------------------------------------------------------------------------------------------------------------

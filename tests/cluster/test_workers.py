@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from tiny_experiment import write_experiment
+from tiny_experiment import refused, write_experiment
 
 from mivol import config
 from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
@@ -24,9 +24,11 @@ from mivol.cluster.packages import (
 )
 from mivol.cluster.pool import Pool, Unit, _Worker, check_equal_workers, check_worker
 from mivol.cluster.reference import LONGEST_UNIT, _View
+from mivol.cluster.scene_steps import make_blocks
 from mivol.cluster.sweep import WorkerProgress, has_absolute_paths, read_files, write_run
 from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
 from mivol.errors import MivolError
+from mivol.optim.scenes.views import View
 
 TLS = 'scheduler = "address"\naddress = "tls://node1:8786"\n[security]\nca = "a.pem"\ncert = "b.pem"\nkey = "c.pem"\n'
 
@@ -269,3 +271,31 @@ def test_a_worker_stops_at_the_owner_s_request() -> None:
     place.is_stopped = True
     with pytest.raises(KeyboardInterrupt):
         next(progress.track("ab", "views"))
+
+
+# -- Steps of a fit ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "spp", "blocks"),
+    [(5, 8, 1, [3, 2]), (16, 64, 8, [8, 8]), (16, 64, 64, [1] * 16), (5, 64, 20, [3, 2]), (3, 512, 2, [1] * 3), (1, 8, 1, [1])],
+)
+def test_blocks_depend_on_the_views_only(variant_rgb: str, count: int, size: int, spp: int, blocks: list[int]) -> None:
+    """At least two blocks, of at most 2^18 samples or a view each."""
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+    views = [View(f"{i}", sensor, mi.TensorXf(np.zeros((size, size, 3), np.float32))) for i in range(count)]
+    assert [block.n_views for block in make_blocks(views, spp)] == blocks
+
+
+def test_sums_in_float64_do_not_depend_on_their_order() -> None:
+    """The claim behind equal gradients: 64 numbers of float32 over 20 octaves add up without a rounding."""
+    rng = np.random.default_rng(1)
+    numbers = (rng.normal(size=(64, 100)) * 2.0 ** rng.integers(-10, 10, size=(64, 100))).astype(np.float32)
+    sums = [numbers[order].astype(np.float64).sum(axis=0) for order in (rng.permutation(64) for _ in range(5))]
+    assert all(np.array_equal(sums[0], other) for other in sums)
+
+
+def test_other_fits_are_refused_before_workers_start(capsys: pytest.CaptureFixture) -> None:
+    scan = Path(__file__).parents[2] / "scenes" / "shepp_logan" / "fit.toml"
+    assert "is no fit to images of a scene" in refused(capsys, "optimize", scan, "--cluster", "local:1")

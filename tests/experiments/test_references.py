@@ -95,15 +95,15 @@ def test_a_reference_is_rendered_as_the_file_says(
 ) -> None:
     """Each view with its own depth or that of the fit, up to the samples or the error; an error of 0 is no aim."""
     asked, kept = [], []
-    monkeypatch.setattr(references, "render_reference", lambda *how, **settings: asked.append((how, settings)) or made)
+    monkeypatch.setattr(references, "prepare_reference", lambda *how, **settings: asked.append((how, settings)) or made)
     monkeypatch.setattr(references, "standard_error", lambda found: "its error")
-    made = SimpleNamespace(mean="its mean")
+    made = SimpleNamespace(complete=lambda: SimpleNamespace(mean="its mean"))
     chosen = SimpleNamespace(
         fit=SimpleNamespace(max_depth=7), reference=SimpleNamespace(standard_error=wanted, spp=33, seed=5, max_depth=own)
     )
     context = RunContext(chosen, Path(), tmp_path)
     references.render_views(SimpleNamespace(add=lambda *view: kept.append(view)), context, chosen, "scene", ["a", "b"])
-    settings = {"max_depth": depth, "target_se": target, "max_spp": 33, "seed": 5, "progress": False}
+    settings = {"max_depth": depth, "target_se": target, "max_spp": 33, "seed": 5}
     assert asked == [(("scene", tmp_path / "references"), {"sensor": view, **settings}) for view in "ab"]
     assert kept == [(view, "its mean", "its error") for view in "ab"]
     assert (tmp_path / "references").is_dir()

@@ -319,30 +319,39 @@ class Linearization:
         self.problem, self.reals = problem, reals
         self.seeds = [problem.seed_for(0, index, PRIMAL) for index in range(len(problem.batches))]
         self.slopes = {p.name: p.map_derivative(reals[p.name]) for p in problem.parameters}
-        problem.set_reals(reals)
-        compared = []
+        self.loss, gradients = self.differentiate_images()
+        energy, self.gradient = problem.through_priors_and_maps(reals, gradients)
+        self.loss += energy
+
+    def differentiate_images(self) -> tuple[float, Reals]:
+        """Loss of the images, and its derivative by the values."""
+        problem, compared = self.problem, []
+        problem.set_reals(self.reals)
         for index, (batch, seed) in enumerate(zip(problem.batches, self.seeds, strict=True)):
             compared.append(problem.compare(batch, seed, len(problem.views)))
             # The noise of an image and of a derivative from the same samples is correlated, which would bias J^T W r.
             own = problem.seed_for(0, index, ADJOINT) if problem.noisy else seed
             problem.vjp(batch.sensor, compared[-1].adjoint, own)
-        energy, self.gradient = problem.through_priors_and_maps(reals, problem.gradients())
-        self.loss = problem.remember(compared) + energy
+        return problem.remember(compared), problem.gradients()
 
     def curvature(self, direction: Reals) -> Reals:
         """(J^T W J + R'') direction."""
         direction = {k: t * self.slopes[k] for k, t in direction.items()}
-        images = self._jvp(direction)
-        self.problem.set_reals(self.reals)
-        for batch, weight, seed, image in zip(self.problem.batches, self.problem.weights, self.seeds, images, strict=True):
-            share = batch.n_views / len(self.problem.views) / len(image.array)
-            self.problem.vjp(batch.sensor, weight * image * share, seed)
-        product = self.problem.gradients()
+        product = self.curve_images(direction)
         for p in self.problem.parameters:
             value = dr.detach(p.from_reals(self.reals[p.name]))
             for prior in p.priors:
                 product[p.name] += prior.curvature(value, direction[p.name], p.spacing(value.shape))
         return {k: t * self.slopes[k] for k, t in product.items()}
+
+    def curve_images(self, direction: Reals) -> Reals:
+        """J^T W J direction, for a direction of the values."""
+        images = self._jvp(direction)
+        self.problem.set_reals(self.reals)
+        for batch, weight, seed, image in zip(self.problem.batches, self.problem.weights, self.seeds, images, strict=True):
+            share = batch.n_views / len(self.problem.views) / len(image.array)
+            self.problem.vjp(batch.sensor, weight * image * share, seed)
+        return self.problem.gradients()
 
     def _jvp(self, direction: Reals) -> list[mi.TensorXf]:
         self.problem.set_reals(self.reals)
