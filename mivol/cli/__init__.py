@@ -539,24 +539,20 @@ def reference(arguments: argparse.Namespace) -> None:
     With --sensor all, the images of every sensor and a file of cameras are written: photographs for a fit.
     """
     from mivol.cli.cluster import complete_references
-    from mivol.validate.reference import prepare_reference, render_photographs, render_reference
+    from mivol.validate.reference import prepare_reference, render_photographs
 
     options = {
         "max_depth": arguments.max_depth, "target_se": arguments.target, "max_spp": arguments.spp,
         "seed": arguments.seed, "integrator": arguments.integrator,
     }  # fmt: skip
-    loaded = load_named_scene(arguments)
+    loaded, out = load_named_scene(arguments), arguments.output
     with complete_references(arguments, loaded) as complete:
         if arguments.sensor == "all":
-            results = render_photographs(loaded, arguments.output, complete=complete, **options)
+            results = render_photographs(loaded, out, complete=complete, **options)
         else:
-            if not arguments.output.suffix:
-                arguments.output.mkdir(parents=True, exist_ok=True)
-            options["sensor"] = arguments.sensor
-            if complete is None:
-                results = [render_reference(loaded, arguments.output, **options)]
-            else:
-                results = list(complete(iter([prepare_reference(loaded, arguments.output, **options)])))
+            if not out.suffix:
+                out.mkdir(parents=True, exist_ok=True)
+            results = list(complete(iter([prepare_reference(loaded, out, sensor=arguments.sensor, **options)])))
     print("\n".join(result.text for result in results))
 
 

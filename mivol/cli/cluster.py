@@ -71,10 +71,12 @@ def status_line() -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def complete_references(arguments: argparse.Namespace, loaded: LoadedScene) -> Iterator[Complete | None]:
-    """The function that renders references on the workers of ``--cluster``; None without the flag."""
+def complete_references(arguments: argparse.Namespace, loaded: LoadedScene) -> Iterator[Complete]:
+    """The function that renders references on the workers of ``--cluster``, or in this process."""
     if arguments.cluster is None:
-        yield None
+        from mivol.validate.reference import complete_in_turn
+
+        yield complete_in_turn
         return
     from mivol.cluster.packages import SceneSource, share_scene
     from mivol.cluster.reference import complete_on

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -542,6 +543,13 @@ def use_channel(media: list[RgbExtinction], channel: int) -> Iterator[None]:
             medium.assign(medium.values)
 
 
+def complete_in_turn(prepared: Iterator[PreparedReference]) -> Iterator[ReferenceResult]:
+    """Render the missing batches of one reference after another in this process, with a progress bar each."""
+    for reference in prepared:
+        with reference.show_progress() as show:
+            yield reference.complete(show)
+
+
 # -- Photographs -----------------------------------------------------------------------------------------------------------
 
 
@@ -583,12 +591,10 @@ def render_photographs(
     if folder.suffix == ".exr":
         raise MivolError(f"{folder} names one image for {len(looks)} views; name a folder.")
     folder.mkdir(parents=True, exist_ok=True)
+    is_shown, views = reference.pop("progress", True), zip(names, looks, strict=True)
+    prepared = (prepare_reference(loaded, folder / name, sensor=look, **reference) for name, look in views)
     if complete is None:
-        made = [
-            render_reference(loaded, folder / name, sensor=look, **reference) for name, look in zip(names, looks, strict=True)
-        ]
-    else:
-        views = zip(names, looks, strict=True)
-        made = list(complete(prepare_reference(loaded, folder / name, sensor=look, **reference) for name, look in views))
+        complete = complete_in_turn if is_shown else partial(map, PreparedReference.complete)
+    made = list(complete(prepared))
     write_transforms(folder / "transforms.json", cameras, [names[number] for number in test])
     return made
