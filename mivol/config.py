@@ -492,7 +492,7 @@ class FieldSettings(Section):
             int,
             setting(
                 "1",
-                "nested boxes; absent: preset (1, capture 5), or fewer if they hold all reconstructed points",
+                "nested boxes; absent: preset (1, capture 5), or fewer if they hold points and cameras",
                 ge=1,
                 le=MOST_LEVELS,
             ),

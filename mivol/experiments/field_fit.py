@@ -18,7 +18,7 @@ from mivol.config import FieldExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Say
 from mivol.experiments.photo_data import LEARNED
-from mivol.experiments.photo_fit import PhotoFit
+from mivol.experiments.photo_fit import PhotoFit, describe_free_space
 from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.fields.field_files import write_field
 from mivol.fields.sky import Sky
@@ -41,7 +41,7 @@ from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.photos.camera_path import HomeView
 from mivol.photos.photo_file import CONVERSIONS
-from mivol.photos.region import FEWEST_POINTS, count_levels, nested_boxes, points_in_box
+from mivol.photos.region import FEWEST_POINTS, count_levels, median_distance, nested_boxes, points_in_box
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
 from mivol.report.record import Image, PlanLine, Table, Volume
 from mivol.validate.metrics import ImageScore, score_image
@@ -247,8 +247,8 @@ def adapt_plan(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
 
     A plan for cubes keeps the number of nodes in a box of other proportions; the voxels stay at least as large as the plan's
     voxels and as a pixel. Photographs shrink to the plan's number of pixels per voxel at the middle of the box. Stages take no
-    more steps than their pixels justify. Few photographs get a lower degree. The nested boxes end at the first box with the
-    reconstructed points.
+    more steps than their pixels justify. Few photographs get a lower degree. The nested boxes end at the first
+    box with the reconstructed points and the cameras.
     """
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
@@ -283,11 +283,17 @@ def adapt_to_few(plan: RadiancePlan) -> RadiancePlan:
 
 
 def reduce_levels(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
-    """Return the plan with only the nested boxes around the reconstructed points; few points change nothing."""
-    points = photos.survey.points
-    if not plan.fewer_levels or points is None or len(points) < FEWEST_POINTS:
+    """Return the plan with only the nested boxes around points and cameras; few points change nothing."""
+    if not can_reduce_levels(plan, photos):
         return plan
-    return replace(plan, levels=count_levels(photos.box, points, plan.levels))
+    cameras = [view.camera for view in photos.views]
+    return replace(plan, levels=count_levels(photos.box, photos.survey.points, cameras, plan.levels))
+
+
+def can_reduce_levels(plan: RadiancePlan, photos: Photos) -> bool:
+    """Return whether the plan lets enough reconstructed points set the number of levels."""
+    points = photos.survey.points
+    return plan.fewer_levels and points is not None and len(points) >= FEWEST_POINTS
 
 
 def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
@@ -298,10 +304,11 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
     size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
     largest = nested_boxes(box, plan.levels)[-1]
     outer = " x ".join(f"{edge:.4g}" for edge in largest[1] - largest[0])
+    holds = "no more than points and cameras need; " if can_reduce_levels(plan, photos) else ""
     outer_boxes = [
         PlanLine(
             choice=f"{plan.levels} nested boxes, the largest of {outer} [length]",
-            reason=f"each box has twice the extent of the box before, for the surroundings; "
+            reason=f"each box has twice the extent of the box before, for the surroundings; {holds}"
             f"{len(points_in_box(origins, box))} of {len(origins)} cameras stand in the innermost",
         )
     ]
@@ -311,6 +318,7 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
         *explain_points_outside(plan, photos),
         *explain_depths(plan, batches),
         *explain_near_cameras(plan, origins, box),
+        *explain_free_space(plan, photos),
         *explain_wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find empty space"),
         explain_steps(plan),
@@ -345,6 +353,12 @@ def explain_near_cameras(plan: RadiancePlan, origins: np.ndarray, box: np.ndarra
     reach = plan.near_distance(origins, box)
     choice = f"derivatives nearer to a camera than {reach:.4g} [length] fall with the square of the distance"
     return [PlanLine(choice=choice, reason="otherwise matter grows in front of the lenses")] if reach else []
+
+
+def explain_free_space(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
+    """Return a line if nodes in free space stay empty."""
+    reach = median_distance([view.camera for view in photos.views], photos.box.mean(axis=0))
+    return [describe_free_space(reach)][: plan.free_space]
 
 
 def explain_steps(plan: RadiancePlan) -> PlanLine:

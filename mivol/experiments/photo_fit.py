@@ -28,6 +28,7 @@ from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, Photo
 from mivol.photos.camera_path import HomeView, find_home_view
 from mivol.photos.photo_file import CONVERSIONS
+from mivol.photos.region import CLEAR, FEWEST_VIEWS, WITHIN
 from mivol.report.cameras import draw_photo_cameras, plot_cameras, survey_all_cameras
 from mivol.report.record import CODES, Image, PlanLine, Table
 from mivol.scene.explain import Explanation
@@ -168,6 +169,16 @@ def tabulate_views(camera: Camera, scores: Sequence[ImageScore], fitted: Sequenc
     rows.sort(key=lambda row: float(row[1]))
     width, height = camera.size
     return Table(title=f"Judged views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
+
+
+def describe_free_space(reach: float) -> PlanLine:
+    """Line on free space, for cameras at the median distance ``reach`` [length]."""
+    clear, within = CLEAR * reach, WITHIN * reach
+    return PlanLine(
+        choice=f"no matter nearer to a camera than {clear:.4g} [length], nor nearer than {within:.4g} where fewer than "
+        f"{FEWEST_VIEWS} photographs look",
+        reason="fog there explains one photograph and covers the others",
+    )
 
 
 def rename_metrics(values: dict[str, float]) -> dict[str, float]:

@@ -375,6 +375,14 @@ class SphericalGrid:
         """Numbers of the stored nodes, int64."""
         return np.arange(self.node_count) if self.nodes is None else np.array(self.nodes).astype(np.int64)
 
+    def node_positions(self) -> np.ndarray:
+        """(N, 3) positions of the stored nodes in the world, in the order of their rows."""
+        z, y, x = self.res
+        level, node = np.divmod(self.stored_nodes(), x * y * z)
+        cell = np.stack([node % x, node // x % y, node // (x * y)], axis=1)
+        places = (cell + 0.5) / (x, y, z) @ self.to_world[:3, :3].T + self.to_world[:3, 3]
+        return self.middle + 2.0 ** level[:, None] * (places - self.middle)
+
     def look_up_rows(self, node: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
         """Rows of nodes of all levels; nodes that are not stored have the row of the vacuum.
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
 
 from mivol.files.source import refusal
 from mivol.photos.camera import FLIP, Camera, is_seen, project, rays
@@ -33,8 +34,8 @@ SILHOUETTE_SHARE = 0.5
 SILHOUETTE_CELLS = 40
 """Cells along each axis in a search for silhouettes."""
 
-POINT_SHARE = 0.99
-"""Share of the points of a reconstruction inside nested boxes: a few points are far outliers."""
+BOX_SHARE = 0.99
+"""Share of the points of a reconstruction, and of the cameras, inside nested boxes: a few of each are far outliers."""
 
 FEWEST_POINTS = 100
 """Smallest reconstruction [points] from which a box is taken."""
@@ -43,10 +44,14 @@ PARALLEL = 1e-4
 """Smallest mean squared sine of the angle between the optical axes and their common direction: about 0.6 degrees."""
 
 MIDDLE = 0.45
-"""Half the edge of the innermost box of a capture [median distance of the cameras from their focus].
+"""Largest half edge of the innermost box of a capture [median distance of the cameras from their focus].
 
-0.4 to 0.5 were best on photographs of one room; the larger boxes hold the rest.
+0.4 to 0.5 were best for wide lenses; a tele lens takes less (:func:`middle_box`). The larger boxes hold the rest.
 """
+
+CLEAR, WITHIN, FEWEST_VIEWS = 0.25, 1.0, 4
+"""Free space of a capture (:func:`is_free_space`): distances from the nearest camera [median distance of the cameras from their
+focus], and a number of cameras."""
 
 
 # -- Boxes from cameras -------------------------------------------------------------------------------------------
@@ -77,7 +82,14 @@ def shared_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarra
         MivolError: parallel cameras, or views without a shared region.
     """
     focus = find_focus(cameras, name)
-    reach = float(np.median([np.linalg.norm(c.origin - focus) for c in cameras]))
+    box = _shared_region(cameras, focus, median_distance(cameras, focus))
+    if box is None:
+        raise refusal(name, "views without a shared region", "cameras around one subject", "give the box with box=")
+    return box
+
+
+def _shared_region(cameras: Sequence[Camera], focus: np.ndarray, reach: float) -> np.ndarray | None:
+    """Box of the region of :func:`shared_box` at most ``reach`` from the focus; None without such a region."""
     box = np.array([focus - reach, focus + reach])
     for _ in range(SEARCHES):
         step = (box[1] - box[0]) / VIEW_CELLS
@@ -85,7 +97,7 @@ def shared_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarra
         points = points[np.linalg.norm(points - focus, axis=1) <= reach]
         shared = points[count_views(cameras, points) >= VIEW_SHARE * len(cameras)]
         if len(shared) == 0:
-            raise refusal(name, "views without a shared region", "cameras around one subject", "give the box with box=")
+            return None
         box = np.array([shared.min(axis=0) - step, shared.max(axis=0) + step])
     return box + np.array([step / 2, -step / 2])
 
@@ -93,14 +105,25 @@ def shared_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarra
 def middle_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarray:
     """Return the innermost of nested boxes: a cube around the focus of the cameras, which may stand inside it.
 
+    Half its edge is ``MIDDLE`` times the median distance of the cameras, or half the longest edge of the region that most
+    frames share (:func:`shared_box`) if this is smaller. Tele lenses share a small region; cameras without a shared region
+    look around.
+
     Raises:
         MivolError: parallel cameras, or cameras that all stand at their focus.
     """
     focus = find_focus(cameras, name)
-    half = MIDDLE * float(np.median([np.linalg.norm(c.origin - focus) for c in cameras]))
-    if not half > 0:
+    reach = median_distance(cameras, focus)
+    if not reach > 0:
         raise refusal(name, "cameras that all stand in one place", "views from several places", "give the box with box=")
+    shared = _shared_region(cameras, focus, reach)
+    half = MIDDLE * reach if shared is None else min(MIDDLE * reach, float((shared[1] - shared[0]).max()) / 2)
     return np.array([focus - half, focus + half])
+
+
+def median_distance(cameras: Sequence[Camera], point: np.ndarray) -> float:
+    """Return the median distance of the cameras from a point (3,) [length]."""
+    return float(np.median([np.linalg.norm(camera.origin - point) for camera in cameras]))
 
 
 def near_and_far(cameras: Sequence[Camera], box: np.ndarray) -> tuple[float, float]:
@@ -123,6 +146,24 @@ def count_views(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
         inside = (x >= 0) & (x <= camera.size[0] * depth) & (y >= 0) & (y <= camera.size[1] * depth)
         count += inside & (depth > 0)
     return count
+
+
+def is_free_space(cameras: Sequence[Camera], points: np.ndarray, reach: float) -> np.ndarray:
+    """Return whether each of the points (N, 3) holds no matter, judged by the places of the cameras alone (N,).
+
+    Free are all points nearer to a camera than ``CLEAR``, and points nearer to a camera than ``WITHIN`` that fewer than
+    ``FEWEST_VIEWS`` cameras see: fog there explains one photograph and covers the others.
+
+    Args:
+        cameras: of all photographs.
+        points: positions [length].
+        reach: median distance of the cameras from what they look at [length], the unit of ``CLEAR`` and ``WITHIN``.
+    """
+    distance = cKDTree(np.array([camera.origin for camera in cameras])).query(points)[0]
+    free = distance < CLEAR * reach
+    near = np.flatnonzero(~free & (distance < WITHIN * reach))
+    free[near] = count_views(cameras, points[near]) < FEWEST_VIEWS
+    return free
 
 
 def check_views(cameras: Sequence[Camera], box: np.ndarray) -> None:
@@ -189,10 +230,19 @@ def nested_boxes(box: np.ndarray, levels: int) -> list[np.ndarray]:
     return [middle + 2**level * (box - middle) for level in range(levels)]
 
 
-def count_levels(box: np.ndarray, points: np.ndarray, most: int) -> int:
-    """Return the smallest number of nested boxes holding ``POINT_SHARE`` of the points (N, 3), at most ``most``."""
-    radius = 2 * np.abs((points - box.mean(axis=0)) / (box[1] - box[0])).max(axis=1)
-    return min(most, 1 + math.ceil(math.log2(max(1.0, np.percentile(radius, 100 * POINT_SHARE)))))
+def count_levels(box: np.ndarray, points: np.ndarray, cameras: Sequence[Camera], most: int) -> int:
+    """Return the smallest number of nested boxes that hold ``BOX_SHARE`` of the points (N, 3), and twice the cameras' reach.
+
+    Tables and floors may have no points. They lie before the subject, as far as the cameras, and as far behind it. The number
+    is at most ``most``.
+    """
+
+    def reach(places: np.ndarray) -> float:
+        radius = 2 * np.abs((places - box.mean(axis=0)) / (box[1] - box[0])).max(axis=1)
+        return float(np.percentile(radius, 100 * BOX_SHARE))
+
+    widest = max(reach(points), 2 * reach(np.array([camera.origin for camera in cameras])))
+    return min(most, 1 + math.ceil(math.log2(max(1.0, widest))))
 
 
 def points_in_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:

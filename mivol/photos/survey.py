@@ -311,7 +311,9 @@ def _box(box: np.ndarray | str | None, listing: Listing, cameras: Sequence[Camer
         if box != "middle":
             raise refusal("box", f'"{box}"', '"middle", or two corners', "choose one")
         cube = region.middle_box(cameras, path)
-        return cube, f"{region.MIDDLE:g} of the median distance of the cameras from their focus, on each side"
+        half = float(cube[1, 0] - cube[0, 0]) / 2 / region.median_distance(cameras, cube.mean(axis=0))
+        seen = "" if half > 0.999 * region.MIDDLE else ", as wide as what the frames share"
+        return cube, f"{half:.2g} of the median distance of the cameras from their focus, on each side{seen}"
     if box is not None:
         return region.check_box(box), "as given"
     if listing.box is not None:

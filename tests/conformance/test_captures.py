@@ -11,8 +11,19 @@ from capture_photos import DISTANCE, SIZE, cameras, capture, write_capture
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.photos import Camera, intrinsics, load_photos, survey_photos
-from mivol.photos.region import MIDDLE, count_levels, middle_box, nested_boxes, points_in_box
+from mivol.photos import Camera, intrinsics, load_photos, project, survey_photos
+from mivol.photos.region import (
+    CLEAR,
+    FEWEST_VIEWS,
+    MIDDLE,
+    WITHIN,
+    count_levels,
+    is_free_space,
+    middle_box,
+    nested_boxes,
+    points_in_box,
+    shared_box,
+)
 from mivol.validate.metrics import fit_colours, score_image
 
 
@@ -25,17 +36,59 @@ def test_the_middle_box_is_a_cube_around_the_focus() -> None:
     np.testing.assert_allclose(middle_box(far), box, atol=1e-9)
 
 
-def test_nested_boxes_hold_nearly_all_points() -> None:
+def test_the_middle_box_of_a_tele_lens_is_what_its_frames_share() -> None:
+    """At five times the focal length frames share less than 0.45 of the distance; cameras that look around share nothing."""
+    tele = [Camera(intrinsics(96, 96, 16, 12), SIZE, c.to_world, name=c.name) for c in cameras(9)]
+    box, shared = middle_box(tele), shared_box(tele)
+    half = (box[1] - box[0]) / 2
+    np.testing.assert_allclose(half, (shared[1] - shared[0]).max() / 2, rtol=1e-12)
+    # The frame is at most 1/6 of the distance from its middle to its edge, and three cells of the search wider.
+    assert 1 / 8 * DISTANCE < half[0] < 1.25 / 6 * DISTANCE * 2**0.5 < MIDDLE * DISTANCE
+    around = [Camera(c.K, c.size, _moved(c, -0.3)) for c in cameras(9)]
+    reach = np.median([np.linalg.norm(c.origin) for c in around])
+    np.testing.assert_allclose(middle_box(around), MIDDLE * reach * np.array([[-1.0] * 3, [1.0] * 3]), atol=1e-9)
+
+
+def test_free_space_is_near_a_camera_and_seen_by_few() -> None:
+    """Against the definition, point by point; with every camera at one place, all that lies before them is seen by all."""
+    all_cameras = cameras(7)
+    points = np.random.default_rng(3).uniform(-1.3 * DISTANCE, 1.3 * DISTANCE, (400, 3))
+
+    def sees(camera: Camera, point: np.ndarray) -> bool:
+        (x, y), depth = project(camera, point)
+        return bool(depth > 0 and 0 <= x <= SIZE[0] and 0 <= y <= SIZE[1])
+
+    nearest = np.array([min(np.linalg.norm(c.origin - p) for c in all_cameras) for p in points]) / DISTANCE
+    count = np.array([sum(sees(c, p) for c in all_cameras) for p in points])
+    free = (nearest < CLEAR) | ((nearest < WITHIN) & (count < FEWEST_VIEWS))
+    np.testing.assert_array_equal(is_free_space(all_cameras, points, DISTANCE), free)
+    assert 0.2 < free.mean() < 0.8 and (free & (nearest > CLEAR)).any()
+    ahead = all_cameras[0].origin + np.array([0.3, 0.9]).reshape(2, 1) * DISTANCE * all_cameras[0].forward
+    assert is_free_space(all_cameras[:1] * (FEWEST_VIEWS - 1), ahead, DISTANCE).all()
+    assert not is_free_space(all_cameras[:1] * FEWEST_VIEWS, ahead, DISTANCE).any()
+
+
+def test_nested_boxes_hold_nearly_all_points_and_the_cameras() -> None:
     """One of 100 points may be an outlier: here 2 of 200. The other points fill a box of half the length along one axis."""
     box = np.array([[-1.0, -1, -0.5], [1, 1, 0.5]]) + 3
     assert [b.tolist() for b in nested_boxes(box, 3)] == [box.tolist(), (2 * box - 3).tolist(), (4 * box - 9).tolist()]
     wild = np.array([[500.0, 0, 0], [0, 0, 999]])
+    inside = [_at([3, 3, 3])]
     for reach, levels in ((0.4, 1), (0.99, 1), (1.01, 2), (1.99, 2), (2.01, 3), (7.9, 4), (8.1, 5), (40, 5)):
         points = np.concatenate([np.tile([3.0, 3, 3 + 0.5 * reach], (99, 1)), np.tile([3 - reach / 2, 3, 3], (199, 1)), wild])
-        assert count_levels(box, points, 5) == levels, reach
-    assert count_levels(box, np.array([[3.0, 3, 3]]), 5) == 1
+        assert count_levels(box, points, inside, 5) == levels, reach
+        # A camera at half the distance asks for as many boxes as a point.
+        assert count_levels(box, np.array([[3.0, 3, 3]]), [_at([3, 3, 3 + 0.25 * reach])], 5) == levels, reach
+    assert count_levels(box, np.array([[3.0, 3, 3]]), inside, 5) == 1
+    assert count_levels(box, np.array([[3.0, 3, 3]]), [*inside * 199, _at([3, 3, 30])], 5) == 1
     points = np.concatenate([box, box + np.array([0, 0, 0.01]), box - np.array([0, 0, 0.01])])
     np.testing.assert_array_equal(points_in_box(points, box), [*box, points[2], points[5]])
+
+
+def _at(place: list[float]) -> Camera:
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return Camera(intrinsics(9, 9, 4, 4), (8, 8), pose)
 
 
 def _moved(camera: Camera, distance: float) -> np.ndarray:

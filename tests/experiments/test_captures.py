@@ -6,9 +6,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from capture_photos import capture, write_capture
+from capture_photos import DISTANCE, capture, write_capture
 
 from mivol.cli import main
 from mivol.fields.field_files import read_field
@@ -17,7 +18,7 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
-from mivol.photos.region import middle_box
+from mivol.photos.region import is_free_space, middle_box
 from mivol.validate.metrics import score_image
 
 PLAN = replace(
@@ -44,6 +45,47 @@ def test_nested_boxes_hold_the_walls_that_one_box_and_a_sky_do_not(variant_rgb: 
 
 MARGIN = 1.0
 """[dB] They were 2.3 apart; which pixels are drawn moves either by some tenths."""
+
+
+def test_nodes_in_free_space_hold_no_matter(variant_rgb: str) -> None:
+    """At the start, after steps, and on the nodes of the next stage; other nodes have matter."""
+    photos = capture(5)
+    box, all_cameras = middle_box([photo.camera for photo in photos]), [photo.camera for photo in photos]
+    plan = replace(PLAN, stages=(RadianceStage(6, 2, 1, 3, 4), RadianceStage(8, 1, 1, 3, 4)), levels=3, free_space=True)
+    fit = begin_fit(RadianceProblem(RayBatches.from_photos(photos), box, plan), plan.optimizer, plan.course())
+    for stage in (0, 0, 0, 1):
+        field, density = fit.problem.field, np.array(fit.run.reals["density"])
+        free = is_free_space(all_cameras, field.node_positions(), DISTANCE)
+        assert fit.problem.stage == stage and 0.1 < free.mean() < 0.9
+        assert not density[: len(free)][free].any() and (density[: len(free)][~free] > 0).any()
+        if not fit.is_done:
+            fit.advance()
+
+
+def test_free_space_that_no_node_is_in_changes_nothing(variant_rgb: str) -> None:
+    """All photographs look at the inner box, and none stands in it."""
+    photos = capture(8)
+    batches, box = RayBatches.from_photos(photos), middle_box([photo.camera for photo in photos])
+    plan = replace(PLAN, stages=(RadianceStage(6, 3, 1, 3, 4),), levels=1)
+    without, ruled = (RadianceProblem(batches, box, replace(plan, free_space=rule)) for rule in (False, True))
+    start = without.initial_reals()
+    changed = {name: mi.TensorXf(np.array(value) - 0.3) for name, value in start.items()}
+    for problem in (without, ruled):
+        problem.loss_and_gradient(problem.initial_reals(), 0)
+    moved, kept = (problem.after_step(dict(changed), 0) for problem in (without, ruled))
+    for name, value in ruled.initial_reals().items():
+        np.testing.assert_array_equal(np.array(value), np.array(start[name]), err_msg=name)
+        np.testing.assert_array_equal(np.array(kept[name]), np.array(moved[name]), err_msg=name)
+
+
+def test_positions_of_stored_nodes(variant_rgb: str) -> None:
+    """Centres of the cells of each level; nodes that an inner level covers are not stored."""
+    plan = replace(PLAN, stages=(RadianceStage(16, 1, 1, 3, 4),), levels=2)
+    field = RadianceProblem(RayBatches.from_photos(capture(3)), np.array([[-1.0, -1, -0.5], [1, 1, 0.5]]) + 5, plan).field
+    assert field.res == (8, 16, 16) and 2048 < len(field.stored_nodes()) < 4096
+    level, z, y, x = np.unravel_index(field.stored_nodes(), (2, 8, 16, 16))
+    expected = 5 + 2.0 ** level[:, None] * np.stack([x - 7.5, y - 7.5, z - 3.5], axis=1) / 8
+    np.testing.assert_allclose(field.node_positions(), expected, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS, PRESETS, RadiancePlan, RadianceStage, scale_longest
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photos, intrinsics
+from mivol.photos.region import CLEAR, FEWEST_VIEWS, WITHIN
 from mivol.photos.transforms import write_transforms
 from mivol.validate.metrics import score_image
 
@@ -377,13 +378,16 @@ def test_colours_of_few_photographs_do_not_decay(photos: Photos) -> None:
     assert found(preset="cpu") == [(12, 2), (12, 2)]
 
 
-def test_nested_boxes_are_those_that_points_need(photos: Photos, photographs: Path, tmp_path: Path) -> None:
-    """Points up to 3 half edges from the middle need 3 boxes of 5; the plan says what is left out, and where cameras stand."""
+def test_nested_boxes_are_those_that_points_and_cameras_need(photos: Photos, photographs: Path, tmp_path: Path) -> None:
+    """Points up to 6 half edges from the middle need 4 boxes of 5, and so do cameras at half that distance; the plan says what
+    is left out, and where cameras stand."""
     chosen = config.load(toml(tmp_path, photographs))
     half = (photos.box[1] - photos.box[0]) / 2
-    points = photos.box.mean(axis=0) + half * np.concatenate([np.tile([0, 3, 0], (997, 1)), np.tile([0, 0, 4.5], (3, 1))])
+    points = photos.box.mean(axis=0) + half * np.concatenate([np.tile([0, 6, 0], (997, 1)), np.tile([0, 0, 9], (3, 1))])
     plan = replace(field_fit.make_plan(chosen), levels=5, near=1.0)
     assert field_fit.adapt_plan(plan, photos).levels == 5
+    stands = max(np.abs((view.camera.origin - photos.box.mean(axis=0)) / half).max() for view in photos.views)
+    assert 2 < stands < 4
 
     def said(points: np.ndarray, plan: RadiancePlan) -> str:
         known = replace(photos, survey=replace(photos.survey, points=points))
@@ -392,11 +396,22 @@ def test_nested_boxes_are_those_that_points_need(photos: Photos, photographs: Pa
         return "\n".join(f"{line.choice}: {line.reason}" for line in lines)
 
     text = said(points, plan)
-    assert "3 nested boxes" in text and f"0 of {len(photos.views)} cameras stand in the innermost" in text
+    assert (
+        "4 nested boxes" in text
+        and "no more than points and cameras need" in text
+        and f"0 of {len(photos.views)} cameras stand in the innermost" in text
+    )
     assert "3 of 1000 points of the reconstruction left out: they lie outside the largest box, where the model is empty" in text
     distances = [np.linalg.norm(view.camera.origin - photos.box.mean(axis=0)) for view in photos.views]
     assert f"nearer to a camera than {np.median(distances):.4g} [length]" in text
-    assert "5 nested boxes" in said(points[:99], plan) and "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
+    assert "4 nested boxes" in said(points * 0.1, plan) and "5 nested boxes" in said(points[:99], plan)
+    assert "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
+    assert "no matter nearer" not in text
+    reach = np.median(distances)
+    assert (
+        f"no matter nearer to a camera than {CLEAR * reach:.4g} [length], nor nearer than {WITHIN * reach:.4g} where "
+        f"fewer than {FEWEST_VIEWS} photographs look" in said(points, replace(plan, free_space=True))
+    )
     seen = replace(photos, views=tuple(replace(view, points=points[:7]) for view in photos.views))
     batches = field_fit.make_batches(plan, seen)
     lines = [line.choice for line in field_fit.explain_plan(replace(plan, depth=0.5), seen, batches)]

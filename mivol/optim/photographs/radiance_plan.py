@@ -89,9 +89,11 @@ class RadiancePlan:
         sky_smooth: share by which a texel moves to its neighbours per step; no texel then stays at its start.
         exposure: whether photographs have a gain per channel (:mod:`mivol.optim.photographs.photo_colours`), if they disagree.
         levels: number of nested boxes, each of twice the extent (:mod:`mivol.fields.spherical_grid`).
-        fewer_levels: whether fewer levels suffice if the points of a reconstruction need no more.
+        fewer_levels: whether fewer levels suffice if they hold the points of a reconstruction and the cameras.
         near: distance in medians of the camera distances from the box's centre, below which derivatives fall with the square of
             the distance (Philip & Deschaintre 2023); 0 keeps all derivatives.
+        free_space: whether nodes before the cameras that few photographs see stay empty
+            (:func:`mivol.photos.region.is_free_space`).
         voxel: pixels along a voxel, seen from the median camera. Photographs are shrunk to this size within a factor of
             sqrt(2), and no box of a ``cubic`` plan is finer.
         cubic: whether a box that is no cube gets as many nodes as a cube with ``longest`` nodes along its edge, since memory
@@ -132,6 +134,7 @@ class RadiancePlan:
     levels: int = 1
     fewer_levels: bool = True
     near: float = 0.0
+    free_space: bool = False
     voxel: float = 2.0
     cubic: bool = True
     epochs: float = math.inf
@@ -244,6 +247,7 @@ PRESETS: dict[str, RadiancePlan] = {
         sky_smooth=0.05,
         levels=5,
         near=1.0,
+        free_space=True,
         exposure=True,
     ),
     "gpu": RadiancePlan(

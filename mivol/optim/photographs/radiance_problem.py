@@ -36,6 +36,7 @@ from mivol.optim.photographs.radiance_plan import RadiancePlan, place_grid
 from mivol.optim.photographs.ray_batches import DepthRays, RayBatch, RayBatches, depth_loss_gradient, sample_depth_rays
 from mivol.optim.priors import Neighbours, Rows
 from mivol.optim.problem import Reals, Refinement, SparseProblem
+from mivol.photos.region import is_free_space, median_distance
 from mivol.transport.line_integrals.radiance_field import (
     Model,
     RayGradient,
@@ -244,6 +245,7 @@ class RadianceProblem(SparseProblem):
         for name, prior in self.plan.priors:
             if prior.is_spatial:
                 arrays[name] = prior.apply(arrays[name], rows[name])
+        arrays["density"] = self._without_free_space(arrays["density"])
         return {name: mi.TensorXf(array, shapes[name]) for name, array in arrays.items()}
 
     def _rows(self, iteration: int) -> dict[str, Rows]:
@@ -305,7 +307,21 @@ class RadianceProblem(SparseProblem):
         self._cells = None  # frees memory for the new list of the same size
         self._cells = find_occupied_cells(self.field)
 
+    def _without_free_space(self, density: mi.Float) -> mi.Float:
+        """The densities of the rows, 0 at nodes in free space."""
+        return density if self._free is None else dr.select(self._free, 0, density)
+
+    def _find_free_space(self) -> mi.Bool | None:
+        """Whether each row is a node in free space; None if the plan has no free space."""
+        if not self.plan.free_space:
+            return None
+        cameras = self.batches.cameras
+        free = is_free_space(cameras, self.field.node_positions(), median_distance(cameras, self.box.mean(axis=0)))
+        return mi.Bool(np.append(free, np.zeros(self.field.rows - len(free), bool)))
+
     def _update_neighbours(self) -> None:
+        self._free = self._find_free_space()
+        self.field = self.field.with_values(self._without_free_space(self.field.density), self.field.harmonics)
         self._neighbours = Neighbours.from_field(self.field)
         self.update_occupancy()
 

@@ -140,6 +140,7 @@ class RayBatches:
         channels: 3, or 4 with alpha.
         space: kind of the values, "srgb" (codes) or "linear" (radiance).
         points: (K, 3) visible points of a reconstruction for each photograph [length]; empty without a reconstruction.
+        cameras: of the photographs, in their full size.
     """
 
     origins: np.ndarray
@@ -148,6 +149,7 @@ class RayBatches:
     channels: int
     space: str = "srgb"
     points: tuple[np.ndarray, ...] = ()
+    cameras: tuple[Camera, ...] = ()
 
     @classmethod
     def from_photos(
@@ -176,7 +178,8 @@ class RayBatches:
         origins = np.array([photo.camera.origin for photo in photos])
         points = tuple(np.zeros((0, 3)) if photo.points is None else photo.points for photo in photos)
         known = points if any(map(len, points)) else ()
-        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3, space, known)
+        cameras = tuple(photo.camera for photo in photos)
+        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3, space, known, cameras)
 
     @property
     def bytes(self) -> int:
