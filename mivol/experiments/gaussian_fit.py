@@ -22,15 +22,15 @@ from scipy.special import logit
 from mivol.config import GaussianExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Stages
-from mivol.experiments.photo_fit import PhotoFit
+from mivol.experiments.photo_fit import PhotoFit, describe_free_space
 from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.optim.gaussians.density_control import CloudArrays
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.strategy import suggest_name
-from mivol.photos import Camera, Photo, Photos, project, rectify
-from mivol.photos.region import FEWEST_POINTS, count_views
+from mivol.photos import Camera, Photo, Photos, project, rays, rectify
+from mivol.photos.region import FEWEST_POINTS, count_views, is_free_space, median_distance, points_in_box
 from mivol.points import Gaussians, write_gaussians
 from mivol.points.gaussians import to_base_harmonics
 from mivol.report.record import PlanLine, Table
@@ -185,7 +185,10 @@ def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: Gaussian
     views = tuple(rectify(view) for view in photos.views)
     longest = max(max(view.camera.size) for view in views)
     plan = plan.for_edge(longest)
-    places, whence = find_start_points(photos, plan.start, settings.seed)
+    is_capture = settings.photos.background == "" and any(view.alpha is None for view in views)
+    if is_capture:
+        plan = replace(plan, reach=median_distance([view.camera for view in views], photos.box.mean(axis=0)))
+    places, whence = find_start_points(photos, plan.start, settings.seed, is_capture)
     largest = max(view.camera.size[0] * view.camera.size[1] for view in views)
     if settings.gaussians.minutes is not None:
         plan = plan.in_minutes(settings.gaussians.minutes, largest)
@@ -207,6 +210,9 @@ def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, me
     """Return the choices of the plan with their reasons."""
     stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
     behind = "alpha marks the object" if photos.views[0].alpha is not None else "photos.background"
+    background = PlanLine(choice="no Gaussians for the background", reason=behind)
+    if plan.reach:
+        background = describe_free_space(plan.reach)
     control = {
         "clone_split": "split or cloned at large gradients, removed if transparent (Kerbl et al. 2023)",
         "relocation": "transparent Gaussians move to opaque Gaussians (Kheradmand et al. 2024)",
@@ -217,7 +223,7 @@ def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, me
         PlanLine(choice=f"up to {max(plan.most, count)} Gaussians", reason=control),
         PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason="small photographs first, one photograph a step"),
         PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="the rest is the absolute error"),
-        PlanLine(choice="no Gaussians for the background", reason=behind),
+        background,
         *[GAINS][: plan.exposure],
         PlanLine(choice=f"about {minutes:.2g} minutes", reason="for two idle cores; the number of steps is fixed"),
         PlanLine(choice=memory, reason="estimated before the allocation"),
@@ -235,22 +241,33 @@ SHARE = 0.5
 """Share of the views whose images must contain a point."""
 
 
-def find_start_points(photos: Photos, count: int, seed: int) -> tuple[np.ndarray, str]:
+def find_start_points(photos: Photos, count: int, seed: int, has_surroundings: bool = False) -> tuple[np.ndarray, str]:
     """Initial positions (N, 3) [length], and a description of their source.
 
     The points of a reconstruction unchanged, if it has enough; otherwise ``count`` random points in the box. With alpha, the
-    random points avoid places that are transparent in some view.
+    random points avoid places that are transparent in some view. With surroundings, ``count`` more points stand along random
+    rays of the photographs, for what has no reconstructed points and for the background.
 
     Raises:
         MivolError: alpha leaves no part of the box.
     """
+    rng = np.random.default_rng((seed, 1))
     points = photos.survey.points
     if points is not None and len(points) >= FEWEST_POINTS:
-        inside = ((points >= photos.box[0]) & (points <= photos.box[1])).all(axis=1)
-        return points[inside], f"{int(inside.sum())} points of the reconstruction in the box"
-    rng = np.random.default_rng((seed, 1))
-    if any(view.alpha is None for view in photos.views):
-        return rng.uniform(*photos.box, (count, 3)), f"{count} random points in the box"
+        places = points_in_box(points, photos.box)
+        whence = f"{len(places)} points of the reconstruction in the box"
+    elif any(view.alpha is None for view in photos.views):
+        places, whence = rng.uniform(*photos.box, (count, 3)), f"{count} random points in the box"
+    else:
+        return _draw_matter(photos, count, rng)
+    if not has_surroundings:
+        return places, whence
+    around = draw_surroundings(photos, count, rng)
+    return np.concatenate([places, around]), f"{whence}, {len(around)} along random rays of the photographs"
+
+
+def _draw_matter(photos: Photos, count: int, rng: np.random.Generator) -> tuple[np.ndarray, str]:
+    """Random points in the box that no view shows as transparent."""
     accepted = [np.zeros((0, 3))]
     for _ in range(ROUNDS):
         drawn = rng.uniform(*photos.box, (count, 3))
@@ -261,6 +278,24 @@ def find_start_points(photos: Photos, count: int, seed: int) -> tuple[np.ndarray
     if len(points) < 4:
         raise MivolError("alpha leaves no part of the box that all views show as matter: check the box and the cameras.")
     return points, f"{len(points)} random points that no view shows as transparent"
+
+
+SURROUNDINGS = 0.5, 8.0
+"""Distances of random points from the photographs, with evenly distributed logarithms [median distance of the cameras]."""
+
+
+def draw_surroundings(photos: Photos, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Random points (N, 3) along rays of the photographs [length]; at most ``count``, outside free space."""
+    cameras = [view.camera for view in photos.views]
+    reach = median_distance(cameras, photos.box.mean(axis=0))
+    chosen = rng.integers(0, len(cameras), count)
+    places, distances = rng.uniform(0, 1, (count, 2)), np.exp(rng.uniform(*np.log(SURROUNDINGS), count))
+    drawn = []
+    for number, camera in enumerate(cameras):
+        o, d = rays(camera, places[chosen == number] * camera.size)
+        drawn.append(o + reach * distances[chosen == number, None] * d)
+    points = np.concatenate(drawn)
+    return points[~is_free_space(cameras, points, reach)]
 
 
 def make_start_cloud(places: np.ndarray, views: Sequence[Photo], degree: int) -> CloudArrays:

@@ -25,6 +25,7 @@ from mivol.files.image_files import decode_srgb
 from mivol.optim.gaussians.gaussian_plan import PRESETS
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.photos import Camera, Photo, intrinsics, load_photos, project
+from mivol.photos.region import is_free_space, median_distance
 from mivol.photos.transforms import write_transforms
 from mivol.points import read_gaussians
 from mivol.splatting import Splatter
@@ -247,6 +248,27 @@ def test_reconstruction_points_are_used_unchanged() -> None:
         np.testing.assert_array_equal(found, np.random.default_rng((3, 1)).uniform(*BOX, (7, 3)))
         assert says == "7 random points in the box"
     assert len(find_start_points(photos([], points[:100]), 7, 3)[0]) < 100
+
+
+def test_surroundings_stand_along_rays_of_the_photographs() -> None:
+    """After the points in the box, which stay: in the frame of a photograph, neither too near nor too far, and not in free
+    space, where no point of two photographs may stand."""
+    views = [photo(k, k, alpha=False) for k in range(5)]
+    points = np.random.default_rng(1).uniform(*BOX, (120, 3))
+    found, says = find_start_points(photos(views, points), 300, 3, has_surroundings=True)
+    around = found[120:]
+    assert np.array_equal(found[:120], points) and 100 < len(around) < 300
+    assert says == f"120 points of the reconstruction in the box, {len(around)} along random rays of the photographs"
+    all_cameras = [view.camera for view in views]
+    reach = median_distance(all_cameras, BOX.mean(axis=0))
+    for point in around:
+        distances = [np.linalg.norm(point - view.camera.origin) / reach for view in views if seen_pixel(view, point)]
+        assert distances and max(distances) >= 0.5 and min(distances) <= 8
+    assert np.linalg.norm(around - all_cameras[0].origin, axis=1).max() > 4 * reach
+    assert not is_free_space(all_cameras, around, reach).any()
+    few, _ = find_start_points(photos(views[:2], points), 300, 3, has_surroundings=True)
+    reach = median_distance(all_cameras[:2], BOX.mean(axis=0))
+    assert all(min(np.linalg.norm(p - c.origin) for c in all_cameras[:2]) >= reach for p in few[120:])
 
 
 def test_random_points_avoid_transparent_pixels() -> None:

@@ -20,6 +20,7 @@ from mivol.optim.gaussians.gaussian_problem import GaussianProblem, _move_random
 from mivol.optim.loop import Fit, begin_fit, reconstruct
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
+from mivol.photos.region import median_distance
 from mivol.splatting import Splatter
 
 SIDE, WHITE = 40, np.ones(3, np.float32)
@@ -189,6 +190,24 @@ def test_relocation_keeps_the_image_and_moves_unused_gaussians(variant_rgb: str,
     assert len(opacity) == 157  # 5 % more of 150, which is less than the plan has room for
     assert "157 Gaussians, 150 before" in refinement.message
     fit.advance()
+
+
+def test_captures_have_no_gaussians_in_free_space_and_larger_ones_far_away(variant_rgb: str, views: list[Photo]) -> None:
+    """Without a reach the same cloud keeps what stands before a lens, and loses a large Gaussian however far it is."""
+    all_cameras = [view.camera for view in views]
+    reach = median_distance(all_cameras, np.zeros(3))
+    left = []
+    for plan in (PLAN, replace(PLAN, reach=reach)):
+        problem = problem_of(views, replace(plan, split_threshold=1e9, least_opacity=0.0))
+        cloud = problem.cloud
+        cloud["means"][0] = all_cameras[0].origin + 0.1 * reach * all_cameras[0].forward
+        cloud["means"][1:3] = [5 * reach, 0, 0]
+        cloud["log_scales"][1:3] = np.log(plan.largest * problem.extent * np.array([[1.5], [9.0]]))
+        marks = cloud["harmonics"][:3, 0].copy()
+        problem.control_density(8)
+        left.append([(problem.cloud["harmonics"][:, 0] == mark).all(axis=1).any() for mark in marks])
+        assert len(problem.cloud["means"]) == 150 - 3 + sum(left[-1])
+    assert left == [[True, False, False], [False, True, False]]
 
 
 @pytest.mark.slow

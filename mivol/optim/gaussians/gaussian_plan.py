@@ -73,6 +73,8 @@ class GaussianPlan:
         final_rate: last over first rate, except for positions.
         position_noise: for relocation: random moves of transparent Gaussians, in position rates.
         sparsity: for relocation: weight of the mean opacity and of the mean scale [extent].
+        reach: for a capture, the median distance of the cameras from the middle of the box [length]: free space
+            (:func:`mivol.photos.region.is_free_space`) holds no Gaussians, and far Gaussians may be larger. 0: no capture.
     """
 
     stages: tuple[GaussianStage, ...]
@@ -100,6 +102,7 @@ class GaussianPlan:
     sheen: float = 1 / 5
     final_rate: float = 0.3
     position_noise: float = 5e5
+    reach: float = 0.0
     sparsity: float = 0.01
 
     @property

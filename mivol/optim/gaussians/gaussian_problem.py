@@ -36,6 +36,7 @@ from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.problem import Reals, Refinement, StagedProblem
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera
+from mivol.photos.region import is_free_space
 from mivol.splatting import Splatter
 from mivol.splatting.splatter import ScreenStatistics
 
@@ -306,8 +307,17 @@ class GaussianProblem(StagedProblem):
         change = clone_and_split(self.cloud, rows, self.plan.largest_clone * self.extent, rng)
         cloud = change.cloud
         keep = expit(cloud["opacity_logits"]) >= self.plan.least_opacity
-        keep &= np.exp(cloud["log_scales"].max(axis=1)) <= self.plan.largest * self.extent
+        keep &= np.exp(cloud["log_scales"].max(axis=1)) <= self.plan.largest * self._scale_at(cloud["means"])
+        if self.plan.reach:
+            keep &= ~is_free_space(self.cameras, cloud["means"], self.plan.reach)
         return change.then(prune(cloud, keep))
+
+    def _scale_at(self, places: np.ndarray) -> np.ndarray | float:
+        """Unit of the largest scale at places (N, 3) [length]: the extent or, for a capture, a larger distance."""
+        if not self.plan.reach:
+            return self.extent
+        middle = np.mean([camera.origin for camera in self.cameras], axis=0)
+        return np.maximum(self.extent, np.linalg.norm(places - middle, axis=1))
 
     def _relocate(self, room: int, rng: np.random.Generator) -> CloudChange:
         """Move transparent Gaussians to opaque Gaussians, then grow by at most 5 %."""
