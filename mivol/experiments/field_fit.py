@@ -357,8 +357,8 @@ def explain_near_cameras(plan: RadiancePlan, origins: np.ndarray, box: np.ndarra
 
 def explain_free_space(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
     """Return a line if nodes in free space stay empty."""
-    reach = median_distance([view.camera for view in photos.views], photos.box.mean(axis=0))
-    return [describe_free_space(reach)][: plan.free_space]
+    cameras = [view.camera for view in photos.views]
+    return [describe_free_space(cameras, median_distance(cameras, photos.box.mean(axis=0)))][: plan.free_space]
 
 
 def explain_steps(plan: RadiancePlan) -> PlanLine:

@@ -212,7 +212,7 @@ def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, me
     behind = "alpha marks the object" if photos.views[0].alpha is not None else "photos.background"
     background = PlanLine(choice="no Gaussians for the background", reason=behind)
     if plan.reach:
-        background = describe_free_space(plan.reach)
+        background = describe_free_space([view.camera for view in photos.views], plan.reach)
     control = {
         "clone_split": "split or cloned at large gradients, removed if transparent (Kerbl et al. 2023)",
         "relocation": "transparent Gaussians move to opaque Gaussians (Kheradmand et al. 2024)",

@@ -28,7 +28,7 @@ from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, Photo
 from mivol.photos.camera_path import HomeView, find_home_view
 from mivol.photos.photo_file import CONVERSIONS
-from mivol.photos.region import CLEAR, FEWEST_VIEWS, WITHIN
+from mivol.photos.region import FEWEST_VIEWS, find_free_distances
 from mivol.report.cameras import draw_photo_cameras, plot_cameras, survey_all_cameras
 from mivol.report.record import CODES, Image, PlanLine, Table
 from mivol.scene.explain import Explanation
@@ -171,13 +171,13 @@ def tabulate_views(camera: Camera, scores: Sequence[ImageScore], fitted: Sequenc
     return Table(title=f"Judged views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
 
 
-def describe_free_space(reach: float) -> PlanLine:
-    """Line on free space, for cameras at the median distance ``reach`` [length]."""
-    clear, within = CLEAR * reach, WITHIN * reach
+def describe_free_space(cameras: Sequence[Camera], reach: float) -> PlanLine:
+    """Line on the free space of cameras at the median distance ``reach`` [length]."""
+    clear, within = find_free_distances(cameras, reach)
     return PlanLine(
         choice=f"no matter nearer to a camera than {clear:.4g} [length], nor nearer than {within:.4g} where fewer than "
         f"{FEWEST_VIEWS} photographs look",
-        reason="fog there explains one photograph and covers the others",
+        reason="fog there explains one photograph and covers the others; less for wide lenses",
     )
 
 

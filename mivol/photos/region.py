@@ -49,9 +49,9 @@ MIDDLE = 0.45
 0.4 to 0.5 were best for wide lenses; a tele lens takes less (:func:`middle_box`). The larger boxes hold the rest.
 """
 
-CLEAR, WITHIN, FEWEST_VIEWS = 0.25, 1.0, 4
-"""Free space of a capture (:func:`is_free_space`): distances from the nearest camera [median distance of the cameras from their
-focus], and a number of cameras."""
+CLEAR, TELE, FEWEST_VIEWS = 0.25, 0.35, 4
+"""Free space of a capture (:func:`find_free_distances`): a distance from the nearest camera [median distance of the cameras
+from their focus], half a frame over the focal length up to which a lens counts as tele, and a number of cameras."""
 
 
 # -- Boxes from cameras -------------------------------------------------------------------------------------------
@@ -148,20 +148,36 @@ def count_views(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
     return count
 
 
-def is_free_space(cameras: Sequence[Camera], points: np.ndarray, reach: float) -> np.ndarray:
-    """Return whether each of the points (N, 3) holds no matter, judged by the places of the cameras alone (N,).
+def find_free_distances(cameras: Sequence[Camera], reach: float) -> tuple[float, float]:
+    """Return two distances from the nearest camera: no matter is nearer than the first, nor than the second if few see it.
 
-    Free are all points nearer to a camera than ``CLEAR``, and points nearer to a camera than ``WITHIN`` that fewer than
-    ``FEWEST_VIEWS`` cameras see: fog there explains one photograph and covers the others.
+    The first is ``CLEAR`` times ``reach``. The second is ``reach`` for tele lenses, whose frames hold little before the
+    subject. Beyond ``TELE`` it falls with the width of the median frame: wide frames show near floors, each in few photographs.
+
+    Args:
+        cameras: of all photographs.
+        reach: median distance of the cameras from what they look at [length].
+    """
+    wide = [math.inf if c.distortion.is_wide else max(np.array(c.size) / np.diag(c.K)[:2]) / 2 for c in cameras]
+    clear = CLEAR * reach
+    return clear, max(clear, reach * min(1.0, TELE / float(np.median(wide))))
+
+
+def is_free_space(cameras: Sequence[Camera], points: np.ndarray, reach: float) -> np.ndarray:
+    """Return whether each of the points (N, 3) holds no matter, judged by the cameras alone (N,).
+
+    Free are all points nearer to a camera than the first of :func:`find_free_distances`, and points nearer than the second that
+    fewer than ``FEWEST_VIEWS`` cameras see: fog there explains one photograph and covers the others.
 
     Args:
         cameras: of all photographs.
         points: positions [length].
-        reach: median distance of the cameras from what they look at [length], the unit of ``CLEAR`` and ``WITHIN``.
+        reach: median distance of the cameras from what they look at [length].
     """
+    clear, within = find_free_distances(cameras, reach)
     distance = cKDTree(np.array([camera.origin for camera in cameras])).query(points)[0]
-    free = distance < CLEAR * reach
-    near = np.flatnonzero(~free & (distance < WITHIN * reach))
+    free = distance < clear
+    near = np.flatnonzero(~free & (distance < within))
     free[near] = count_views(cameras, points[near]) < FEWEST_VIEWS
     return free
 

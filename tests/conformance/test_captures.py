@@ -12,12 +12,12 @@ from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos import Camera, intrinsics, load_photos, project, survey_photos
+from mivol.photos.lens import Panorama
 from mivol.photos.region import (
-    CLEAR,
     FEWEST_VIEWS,
     MIDDLE,
-    WITHIN,
     count_levels,
+    find_free_distances,
     is_free_space,
     middle_box,
     nested_boxes,
@@ -49,9 +49,10 @@ def test_the_middle_box_of_a_tele_lens_is_what_its_frames_share() -> None:
     np.testing.assert_allclose(middle_box(around), MIDDLE * reach * np.array([[-1.0] * 3, [1.0] * 3]), atol=1e-9)
 
 
-def test_free_space_is_near_a_camera_and_seen_by_few() -> None:
-    """Against the definition, point by point; with every camera at one place, all that lies before them is seen by all."""
-    all_cameras = cameras(7)
+@pytest.mark.parametrize(("focal", "within"), [(96.0, 1.0), (48.0, 1.0), (19.2, 0.35 * 19.2 / 16), (6.4, 0.25)])
+def test_free_space_is_near_a_camera_and_seen_by_few(focal: float, within: float) -> None:
+    """Against the definition, point by point. Half the longer edge is 16 pixels. Cameras at one place see the same points."""
+    all_cameras = [Camera(intrinsics(focal, focal, 16, 12), SIZE, c.to_world, name=c.name) for c in cameras(7)]
     points = np.random.default_rng(3).uniform(-1.3 * DISTANCE, 1.3 * DISTANCE, (400, 3))
 
     def sees(camera: Camera, point: np.ndarray) -> bool:
@@ -60,12 +61,17 @@ def test_free_space_is_near_a_camera_and_seen_by_few() -> None:
 
     nearest = np.array([min(np.linalg.norm(c.origin - p) for c in all_cameras) for p in points]) / DISTANCE
     count = np.array([sum(sees(c, p) for c in all_cameras) for p in points])
-    free = (nearest < CLEAR) | ((nearest < WITHIN) & (count < FEWEST_VIEWS))
+    free = (nearest < 0.25) | ((nearest < within) & (count < FEWEST_VIEWS))
     np.testing.assert_array_equal(is_free_space(all_cameras, points, DISTANCE), free)
-    assert 0.2 < free.mean() < 0.8 and (free & (nearest > CLEAR)).any()
-    ahead = all_cameras[0].origin + np.array([0.3, 0.9]).reshape(2, 1) * DISTANCE * all_cameras[0].forward
-    assert is_free_space(all_cameras[:1] * (FEWEST_VIEWS - 1), ahead, DISTANCE).all()
+    assert 0 < free.mean() < 0.9 and (free & (nearest > 0.25)).any() == (within > 0.25)
+    ahead = all_cameras[0].origin + 0.3 * DISTANCE * all_cameras[0].forward[None]
+    assert is_free_space(all_cameras[:1] * (FEWEST_VIEWS - 1), ahead, DISTANCE).all() == (within > 0.3)
     assert not is_free_space(all_cameras[:1] * FEWEST_VIEWS, ahead, DISTANCE).any()
+
+
+def test_free_space_of_wide_lenses_is_close_to_the_lens() -> None:
+    wide = [Camera(c.K, c.size, c.to_world, Panorama()) for c in cameras(3)]
+    assert find_free_distances(wide, DISTANCE) == (0.25 * DISTANCE, 0.25 * DISTANCE)
 
 
 def test_nested_boxes_hold_nearly_all_points_and_the_cameras() -> None:

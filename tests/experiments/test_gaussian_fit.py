@@ -25,7 +25,7 @@ from mivol.files.image_files import decode_srgb
 from mivol.optim.gaussians.gaussian_plan import PRESETS
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.photos import Camera, Photo, intrinsics, load_photos, project
-from mivol.photos.region import is_free_space, median_distance
+from mivol.photos.region import find_free_distances, is_free_space, median_distance
 from mivol.photos.transforms import write_transforms
 from mivol.points import read_gaussians
 from mivol.splatting import Splatter
@@ -267,8 +267,8 @@ def test_surroundings_stand_along_rays_of_the_photographs() -> None:
     assert np.linalg.norm(around - all_cameras[0].origin, axis=1).max() > 4 * reach
     assert not is_free_space(all_cameras, around, reach).any()
     few, _ = find_start_points(photos(views[:2], points), 300, 3, has_surroundings=True)
-    reach = median_distance(all_cameras[:2], BOX.mean(axis=0))
-    assert all(min(np.linalg.norm(p - c.origin) for c in all_cameras[:2]) >= reach for p in few[120:])
+    within = find_free_distances(all_cameras[:2], median_distance(all_cameras[:2], BOX.mean(axis=0)))[1]
+    assert all(min(np.linalg.norm(p - c.origin) for c in all_cameras[:2]) >= within for p in few[120:])
 
 
 def test_random_points_avoid_transparent_pixels() -> None:

@@ -30,7 +30,7 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS, PRESETS, RadiancePlan, RadianceStage, scale_longest
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photos, intrinsics
-from mivol.photos.region import CLEAR, FEWEST_VIEWS, WITHIN
+from mivol.photos.region import FEWEST_VIEWS, find_free_distances
 from mivol.photos.transforms import write_transforms
 from mivol.validate.metrics import score_image
 
@@ -407,11 +407,11 @@ def test_nested_boxes_are_those_that_points_and_cameras_need(photos: Photos, pho
     assert "4 nested boxes" in said(points * 0.1, plan) and "5 nested boxes" in said(points[:99], plan)
     assert "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
     assert "no matter nearer" not in text
-    reach = np.median(distances)
-    assert (
-        f"no matter nearer to a camera than {CLEAR * reach:.4g} [length], nor nearer than {WITHIN * reach:.4g} where "
-        f"fewer than {FEWEST_VIEWS} photographs look" in said(points, replace(plan, free_space=True))
+    clear, within = find_free_distances([view.camera for view in photos.views], float(np.median(distances)))
+    free = (
+        f"no matter nearer to a camera than {clear:.4g} [length], nor nearer than {within:.4g} where fewer than {FEWEST_VIEWS}"
     )
+    assert free in said(points, replace(plan, free_space=True))
     seen = replace(photos, views=tuple(replace(view, points=points[:7]) for view in photos.views))
     batches = field_fit.make_batches(plan, seen)
     lines = [line.choice for line in field_fit.explain_plan(replace(plan, depth=0.5), seen, batches)]
