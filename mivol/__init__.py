@@ -51,6 +51,8 @@ PUBLIC = {
     "read_gaussians": "points",
     "read_points": "points",
     "read_volume": "files",
+    "read_sparse_volume": "files",
+    "SparseVolumeData": "files",
     "render_reference": "validate.reference",
     "write_field": "fields.field_files",
     "write_gaussians": "points",
@@ -68,6 +70,8 @@ if TYPE_CHECKING:  # for type checkers; at run time __getattr__ imports each nam
     from .fields.field_files import read_field as read_field
     from .fields.field_files import write_field as write_field
     from .fields.procedural import make_procedural as make_procedural
+    from .files import SparseVolumeData as SparseVolumeData
+    from .files import read_sparse_volume as read_sparse_volume
     from .files import read_volume as read_volume
     from .files import write_volume as write_volume
     from .optim.first_order import Adam as Adam

@@ -91,9 +91,7 @@ ENTRIES = {
         "Smoke that scatters, under a white sky",
         f"{PAIRS} From eight views; the example itself has sixteen.",
         "mivol demo white_smoke",
-        (
-            "-m mivol demo white_smoke -o {out} --set views.count=9 --set reference.held_out=[2] --set reference.spp=256",
-        ),
+        ("-m mivol demo white_smoke -o {out} --set views.count=9 --set reference.held_out=[2] --set reference.spp=256",),
     ),
     "shepp_logan": Entry(
         "A phantom by cone beam",
@@ -147,6 +145,13 @@ ENTRIES = {
         "python scenes/fire/render.py",
         ("scenes/fire/render.py --size 240 --spp 64 -o {out}",),
         drawn("fire.png"),
+    ),
+    "big_cloud": Entry(
+        "A cloud of 1024 x 1024 x 1024 voxels",
+        "Sparse in memory, under a sun and a sky; all scattering up to 23 times.",
+        "python scenes/big_cloud/render.py",
+        ("scenes/big_cloud/render.py --size 240 --spp 48 -o {out}",),
+        drawn("cloud.png"),
     ),
 }
 

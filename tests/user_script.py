@@ -29,6 +29,8 @@ found: np.ndarray = np.array(fit.values()[density.name])
 mivol.write_volume("a.vol", mivol.make_procedural("tangle", (8, 8, 8), seed=1, peak=2.0), metadata={"space": "RAS"})
 volume = mivol.read_volume(Path("a.vol"))
 print(volume.values.shape, volume.meta.get("space"))
+mivol.write_volume("a.vdb", mivol.SparseVolumeData.from_dense(volume.values, volume.to_world))
+print(mivol.read_sparse_volume("a.vdb").bricks.shape)
 
 photos = mivol.load_photos("photographs", background="white", held_out=8)
 print(photos.views[0].camera.size)

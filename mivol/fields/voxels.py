@@ -12,7 +12,10 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.protocol import EXACT_LINE, accumulate_tracked
-from mivol.files import check_volume, read_volume
+from mivol.fields.sparse_voxels import SparseVoxels
+from mivol.files import SparseVolumeData, check_volume, is_sparse_file, read_sparse_volume, read_volume
+from mivol.files.source import refusal
+from mivol.files.sparse_volume import EDGE, count_bricks, measure_stored_share
 from mivol.kernel_recording import is_recording
 from mivol.space import check_affine
 
@@ -33,6 +36,7 @@ class Voxels:
     """
 
     line = EXACT_LINE
+    bricks = None
 
     def __init__(
         self,
@@ -50,45 +54,6 @@ class Voxels:
         self.texture = mi.Texture3f(tensor, use_accel=False, migrate=False)
         to_local = np.linalg.inv(self.to_world) if to_local is None else to_local
         self.to_local = mi.ScalarAffineTransform4f(mi.ScalarMatrix4f(to_local), mi.ScalarMatrix4f(self.to_world.T))
-
-    @classmethod
-    def from_props(cls, props: mi.Properties) -> Voxels:
-        """Make a grid from plugin parameters: ``filename`` (with the name of its ``grid``), ``grid`` or ``data``; box and sign
-        options.
-        """
-        names_grid = "filename" in props and "grid" in props and isinstance(props["grid"], str)
-        sources = ["filename"] if names_grid else [k for k in ("filename", "grid", "data") if k in props]
-        name = f"mivol_voxels {props.id()}".strip()
-        if len(sources) != 1:
-            found = " and ".join(sources) or "none of them"
-            raise MivolError(f"{name} was given {found}; give exactly one of filename, grid or data.")
-        transform = props.get("to_world", mi.ScalarTransform4f())
-        to_world = np.array(transform.matrix, dtype=np.float64)
-        to_local = np.array(transform.inverse_transpose, dtype=np.float64).T
-        own_box = props.get("use_grid_bbox", False)
-        values, place = cls._values(props, sources[0], own_box)
-        if "filename" in props:
-            name = f"{name} ({props['filename']})"
-        _check_inverse(check_affine(to_world, f"to_world of {name}"), to_local, f"to_world of {name}")
-        return cls(values, to_world @ place, name, np.linalg.inv(place) @ to_local, props.get("signed", False))
-
-    @staticmethod
-    def _values(props: mi.Properties, source: str, own_box: bool) -> tuple[np.ndarray | mi.TensorXf, np.ndarray]:
-        if source == "filename":
-            path = mi.file_resolver().resolve(props["filename"])
-            volume = read_volume(str(path), props.get("grid"), frame="file" if own_box else "unit")
-            return volume.values, volume.to_world
-        if own_box and source == "data":
-            raise MivolError("mivol_voxels was given data and use_grid_bbox; a bare tensor has no box: give to_world.")
-        grid = props[source]
-        if source == "data":
-            return grid, np.eye(4)
-        values = np.array(grid)
-        place = np.eye(4)
-        if own_box:
-            low, high = np.array(grid.bbox().min), np.array(grid.bbox().max)
-            place[:3, :3], place[:3, 3] = np.diag(high - low), low
-        return values.reshape((*values.shape[:3], -1)), place
 
     @property
     def freezable_texture(self) -> mi.Texture3f | None:
@@ -168,6 +133,113 @@ class Voxels:
     def __repr__(self) -> str:
         z, y, x = self.res
         return f"mivol_voxels[{x}x{y}x{z}, {self.channels} channels]"
+
+
+STORAGES = ("auto", "dense", "sparse")
+"""Values of the property ``storage``."""
+
+LEAST_SPARSE_BYTES = 128 << 20
+"""Size of a dense grid [bytes] from which ``auto`` stores a sparse one: below, memory is cheap, and a walk along coherent rays
+takes 1.2 to 1.35 times as long in a sparse grid."""
+
+MAX_STORED_SHARE = 0.25
+"""Share of stored bricks up to which ``auto`` stores a sparse grid."""
+
+
+def read_voxels(props: mi.Properties) -> Voxels | SparseVoxels:
+    """Make a grid from plugin parameters: ``filename`` (with the name of its ``grid``), ``grid`` or ``data`` (with ``bricks``
+    and ``resolution`` if it is sparse); storage, box and sign options.
+
+    Raises:
+        MivolError: none or several sources, an unknown storage, or what the source or the grid refuses.
+    """
+    names_grid = "filename" in props and "grid" in props and isinstance(props["grid"], str)
+    sources = ["filename"] if names_grid else [k for k in ("filename", "grid", "data") if k in props]
+    name = f"mivol_voxels {props.id()}".strip()
+    if len(sources) != 1:
+        found = " and ".join(sources) or "none of them"
+        raise MivolError(f"{name} was given {found}; give exactly one of filename, grid or data.")
+    storage = props.get("storage", "auto")
+    if storage not in STORAGES:
+        raise refusal(name, f"storage {storage!r}", f"one of {', '.join(STORAGES)}", "choose one")
+    transform = props.get("to_world", mi.ScalarTransform4f())
+    to_world = np.array(transform.matrix, dtype=np.float64)
+    to_local = np.array(transform.inverse_transpose, dtype=np.float64).T
+    own_box = props.get("use_grid_bbox", False)
+    values, place = _read_source(props, sources[0], own_box, storage, name)
+    if "filename" in props:
+        name = f"{name} ({props['filename']})"
+    _check_inverse(check_affine(to_world, f"to_world of {name}"), to_local, f"to_world of {name}")
+    kind = SparseVoxels if isinstance(values, SparseVolumeData) else Voxels
+    return kind(values, to_world @ place, name, np.linalg.inv(place) @ to_local, props.get("signed", False))
+
+
+def _read_source(
+    props: mi.Properties, source: str, own_box: bool, storage: str, name: str
+) -> tuple[np.ndarray | mi.TensorXf | SparseVolumeData, np.ndarray]:
+    """The values, dense or sparse as ``storage`` says, and their own place."""
+    if source == "filename":
+        path, frame = str(mi.file_resolver().resolve(props["filename"])), "file" if own_box else "unit"
+        if storage != "dense" and is_sparse_file(path):
+            sparse = read_sparse_volume(path, props.get("grid"), frame=frame)
+            return _store(sparse, storage), sparse.to_world
+        volume = read_volume(path, props.get("grid"), frame=frame)
+        return _store(volume.values, storage), volume.to_world
+    if own_box and source == "data":
+        raise MivolError("mivol_voxels was given data and use_grid_bbox; a bare tensor has no box: give to_world.")
+    grid = props[source]
+    if source == "data":
+        if "bricks" in props or "resolution" in props:
+            return _given_bricks(props, grid, name), np.eye(4)
+        # A program that gives an array expects the same array among the parameters.
+        return (SparseVolumeData.from_dense(_as_grid(grid, name)) if storage == "sparse" else grid), np.eye(4)
+    values = np.array(grid)
+    place = np.eye(4)
+    if own_box:
+        low, high = np.array(grid.bbox().min), np.array(grid.bbox().max)
+        place[:3, :3], place[:3, 3] = np.diag(high - low), low
+    return _store(values.reshape((*values.shape[:3], -1)), storage), place
+
+
+def _as_grid(values: mi.TensorXf, name: str) -> np.ndarray:
+    if dr.grad_enabled(values):
+        found, way_out = "data with gradients and storage sparse", "enable the gradients of its parameter data"
+        raise refusal(name, found, "data without gradients", way_out)
+    host = np.array(values)
+    check_volume(host, name=name, minimum=None)
+    return host
+
+
+def _store(values: np.ndarray | SparseVolumeData, storage: str) -> np.ndarray | SparseVolumeData:
+    """The values as they are stored in memory."""
+    is_sparse = isinstance(values, SparseVolumeData)
+    if storage == "auto":
+        size = values.dense_bytes if is_sparse else values.nbytes
+        share = None if size < LEAST_SPARSE_BYTES else measure_stored_share(values)
+        storage = "sparse" if share is not None and share <= MAX_STORED_SHARE else "dense"
+    if storage == "sparse":
+        return values if is_sparse else SparseVolumeData.from_dense(values)
+    return values.dense() if is_sparse else values
+
+
+def _given_bricks(props: mi.Properties, data: mi.TensorXf, name: str) -> SparseVolumeData:
+    missing = [k for k in ("bricks", "resolution") if k not in props]
+    if missing:
+        raise refusal(name, f"sparse data without {missing[0]}", "bricks and resolution", "give both")
+    shape = tuple(int(n) for n in np.array(props["resolution"])[::-1])
+    offset = tuple(int(n) for n in np.array(props.get("offset", mi.ScalarVector3f(0)))[::-1])
+    if min(shape) < 1 or not all(0 <= o < EDGE for o in offset):
+        found = f"resolution {shape[::-1]} and offset {offset[::-1]}"
+        raise refusal(name, found, "voxels of at least 1 and offsets of 0 to 7", "correct them")
+    if dr.grad_enabled(data):
+        found, way_out = "data with gradients", "enable the gradients of its parameter data"
+        raise refusal(name, found, "data without gradients", way_out)
+    numbers, counts = np.array(dr.ravel(props["bricks"]), dtype=np.int64), count_bricks(shape, offset)
+    if len(numbers) and not 0 <= numbers.min() <= numbers.max() < np.prod(counts):
+        found = f"bricks {numbers.min()} to {numbers.max()}"
+        raise refusal(name, found, f"numbers below {np.prod(counts)} in a box of {counts} bricks", "correct them")
+    places = np.stack(np.unravel_index(numbers, counts), axis=1).astype(np.int32)
+    return SparseVolumeData(np.array(data, copy=False), places, shape, np.eye(4), offset)
 
 
 def _check_inverse(to_world: np.ndarray, to_local: np.ndarray, name: str) -> None:

@@ -21,6 +21,7 @@ from mivol.errors import MivolError
 from mivol.files import hdf5, metaimage, mrc, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
+from mivol.files.sparse_volume import SparseVolumeData
 from mivol.files.volume import VolumeData, check_frame, to_values
 
 #: Number of first bytes that identify a format.
@@ -132,18 +133,22 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
         (161, 94, 103, 1)
     """
     path = check_file(path)
-    if frame not in FRAMES:
-        raise refusal("read_volume", f"frame={frame!r}", f"one of {', '.join(FRAMES)}", "choose one")
     if not path.name.lower().endswith(tuple(FORMATS)):
         raise refuse_unread(path)
+    return _read_checked(path, FORMATS[_find_suffix(path, FORMATS)].read, dataset, frame)
+
+
+def _read_checked(path: Path, read: Callable, dataset: str | None, frame: str) -> Any:
+    """Read a volume by ``read``, once its first bytes agree with its suffix, and place it."""
+    if frame not in FRAMES:
+        raise refusal("read_volume", f"frame={frame!r}", f"one of {', '.join(FRAMES)}", "choose one")
     suffix = _find_suffix(path, FORMATS)
-    kind = FORMATS[suffix]
     with path.open("rb") as file:
         head = file.read(HEAD)
-    if not kind.recognise(head):
+    if not FORMATS[suffix].recognise(head):
         raise _wrong_format(path, suffix, head)
     try:
-        volume = kind.read(path, dataset)
+        volume = read(path, dataset)
     except MemoryError as error:
         way_out = "crop or coarsen the volume, or correct its header"
         raise refusal(path, "more voxels than memory holds", "a smaller volume", way_out) from error
@@ -152,9 +157,40 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
     return dataclasses.replace(volume, to_world=to_world, meta={**volume.meta, "frame": frame})
 
 
+SPARSE_READERS: dict[str, Callable[[Path, str | None], SparseVolumeData]] = {".vdb": vdb.read_sparse_vdb}
+"""suffix -> reader of a format that is sparse itself."""
+
+
+def is_sparse_file(path: str | os.PathLike) -> bool:
+    """Whether the suffix of a file is that of a format that is sparse itself."""
+    return str(path).lower().endswith(tuple(SPARSE_READERS))
+
+
+def read_sparse_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: str = "file") -> SparseVolumeData:
+    """Read a volume in bricks of 8^3 voxels. A format that is sparse itself never makes a dense array.
+
+    Args:
+        path, dataset, frame: as of :func:`read_volume`.
+
+    Returns:
+        The bricks with a value other than 0, their placement and facts. Voxels elsewhere are 0.
+
+    Raises:
+        MivolError: as :func:`read_volume`.
+
+    Example:
+        >>> read_sparse_volume("smoke.vdb").values.shape
+        (2844, 8, 8, 8, 1)
+    """
+    if not is_sparse_file(path):
+        volume = read_volume(path, dataset, frame=frame)
+        return dataclasses.replace(SparseVolumeData.from_dense(volume.values, volume.to_world), meta=volume.meta)
+    return _read_checked(check_file(path), SPARSE_READERS[_find_suffix(Path(path), SPARSE_READERS)], dataset, frame)
+
+
 def write_volume(
     path: str | os.PathLike,
-    values: np.ndarray,
+    values: np.ndarray | SparseVolumeData,
     to_world: np.ndarray | None = None,
     *,
     metadata: Mapping[str, object] | None = None,
@@ -164,8 +200,9 @@ def write_volume(
 
     Args:
         path: destination.
-        values: real numbers (Z, Y, X) or (Z, Y, X, C), stored as float32.
-        to_world: unit cube to world (4, 4), by default the identity. A ``.vol`` holds an axis-aligned box, a ``.npy`` no box.
+        values: real numbers (Z, Y, X) or (Z, Y, X, C), stored as float32; or a sparse volume, which stays sparse in a ``.vdb``.
+        to_world: unit cube to world (4, 4), by default the identity, or the place of the sparse volume. A ``.vol``
+            holds an axis-aligned box, a ``.npy`` no box.
         metadata: facts in the types of JSON, for ``.npz`` and ``.nrrd``; "space" names the frame ("RAS", "LPS").
         compress: whether a ``.npz`` is compressed; writing without compression is about ten times faster.
 
@@ -174,7 +211,11 @@ def write_volume(
     """
     path = Path(path)
     writer = (WRITERS if compress else STORED_WRITERS)[_find_suffix(path, WRITERS)]
-    values = to_values(values, path)
+    if isinstance(values, SparseVolumeData):
+        to_world = values.to_world if to_world is None else to_world
+        values = values if _find_suffix(path, WRITERS) in SPARSE_READERS else values.dense()
+    else:
+        values = to_values(values, path)
     to_world = np.eye(4) if to_world is None else np.array(to_world, np.float64)
     check_frame(to_world, path)
     write_whole(path, lambda file: writer(file, values, to_world, dict(metadata or {})))

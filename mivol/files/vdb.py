@@ -14,19 +14,21 @@ OpenVDB 3 to 12 writes it.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import uuid
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from mivol.files.npy import check_memory
-from mivol.files.source import decompress, read_bytes, refusal, select_dataset
+from mivol.files.source import check_file, decompress, refusal, select_dataset
+from mivol.files.sparse_volume import SparseVolumeData, allocate_bricks
 from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 MAGIC = b" BDV\0\0\0\0"
@@ -59,6 +61,12 @@ LEVELS = (5, 4, 3)
 LEAF = 1 << LEVELS[-1]
 """Voxels along the edge of a leaf."""
 
+BUFFER = 1 << 16
+"""Bytes that are read from a file at once."""
+
+LEAVES_AT_ONCE = 2048
+"""Leaves whose values are placed together: few calls of NumPy, and little memory beside the result."""
+
 Coord = tuple[int, int, int]
 
 
@@ -85,7 +93,42 @@ def read_vdb(path: Path, dataset: str | None = None) -> VolumeData:
         MivolError: a damaged or truncated file, another version, points or other types of values, a grid without active voxels,
             a projective transform, a box beyond memory, or Blosc data without the package ``blosc``.
     """
-    stream = _Stream(read_bytes(path), path)
+    with _open_file(path) as file:
+        grid, name = _find_grid(_Stream(file, path.stat().st_size, path), dataset)
+        values, low, active = grid.tree.read(name)
+    values = to_values(grid.to_fog(values, path, name).transpose(2, 1, 0, 3), path)
+    return VolumeData(values, grid.place(values.shape[2::-1], low), grid.describe(path, name, low, active))
+
+
+def read_sparse_vdb(path: Path, dataset: str | None = None) -> SparseVolumeData:
+    """Read a grid in its leaves, without the dense box.
+
+    Args, raises: as of :func:`read_vdb`; a value outside of the tree that is not 0 makes every brick of the box a stored one.
+
+    Returns:
+        Values and placement as of :func:`read_vdb`; ``meta`` too.
+    """
+    with _open_file(path) as file:
+        grid, name = _find_grid(_Stream(file, path.stat().st_size, path), dataset)
+        if grid.to_fog(grid.tree.read_background(), path, name).any():
+            volume = read_vdb(path, dataset)
+            return replace(SparseVolumeData.from_dense(volume.values, volume.to_world), meta=volume.meta)
+        values, places, low, high, active = grid.tree.read_bricks(name, lambda block: grid.to_fog(block, path, name))
+    size = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
+    offset = tuple(a % LEAF for a in low[::-1])
+    return SparseVolumeData(values, places, size[::-1], grid.place(size, low), offset, grid.describe(path, name, low, active))
+
+
+def _open_file(path: Path) -> BinaryIO:
+    try:
+        return check_file(path).open("rb", buffering=BUFFER)
+    except PermissionError as error:
+        raise refusal(path, "no permission to read it", "a readable file", "change its permissions") from error
+
+
+def _name_all_grids(stream: _Stream) -> dict[str, _Descriptor]:
+    """Read the head of a file; return its grids by name."""
+    path = stream.path
     stream.skip(len(MAGIC))
     version = stream.unpack("I")[0]
     if not VERSIONS[0] <= version <= VERSIONS[1]:
@@ -97,28 +140,31 @@ def read_vdb(path: Path, dataset: str | None = None) -> VolumeData:
     stream.skip(36)
     _read_metadata(stream)
     count = stream.unpack("I")[0]
-    grids = _name_grids([_Descriptor.read(stream) for _ in range(stream.check_count(count))])
-    name = select_dataset(path, dataset, list(grids))
-    return _read_grid(stream, grids, name)
+    return _name_grids([_Descriptor.read(stream) for _ in range(stream.check_count(count))])
 
 
 @dataclass
 class _Stream:
-    """A position in the bytes of a file, which must not be left."""
+    """A position in an open file, which must not be left. The file is not read as a whole: it may be as large as its volume."""
 
-    data: bytes
+    file: BinaryIO
+    size: int
     path: Path
     at: int = 0
 
     def take(self, count: int) -> bytes:
-        if count < 0 or self.at + count > len(self.data):
-            found = f"{len(self.data)} bytes, where {count} more are announced at byte {self.at}"
-            raise refusal(self.path, found, "a whole file", "the file is truncated or damaged: copy it again")
-        self.at += count
-        return self.data[self.at - count : self.at]
+        self._advance(count)
+        return self.file.read(count)
 
     def skip(self, count: int) -> None:
-        self.take(count)
+        self._advance(count)
+        self.file.seek(self.at)
+
+    def _advance(self, count: int) -> None:
+        if count < 0 or self.at + count > self.size:
+            found = f"{self.size} bytes, where {count} more are announced at byte {self.at}"
+            raise refusal(self.path, found, "a whole file", "the file is truncated or damaged: copy it again")
+        self.at += count
 
     def unpack(self, codes: str) -> tuple:
         return struct.unpack("<" + codes, self.take(struct.calcsize("<" + codes)))
@@ -132,7 +178,7 @@ class _Stream:
 
     def check_count(self, count: int) -> int:
         """Refuse more items than bytes are left."""
-        if count > len(self.data) - self.at:
+        if count > self.size - self.at:
             raise refusal(self.path, f"{count} items announced at byte {self.at}", "a sound header", "copy the file again")
         return count
 
@@ -178,7 +224,58 @@ def _read_metadata(stream: _Stream) -> dict[str, Any]:
     return facts
 
 
-def _read_grid(stream: _Stream, grids: dict[str, _Descriptor], name: str) -> VolumeData:
+@dataclass
+class _Grid:
+    """A grid at the position of its tree.
+
+    Attributes:
+        tree: reader of its tree.
+        facts: its metadata.
+        index_to_world: matrix (4, 4) from indices to the world.
+    """
+
+    tree: _TreeReader
+    facts: dict[str, Any]
+    index_to_world: np.ndarray
+
+    @property
+    def is_level_set(self) -> bool:
+        """Whether values are distances to a surface."""
+        return self.facts.get("class") == "level set"
+
+    def to_fog(self, values: np.ndarray, path: Path, name: str) -> np.ndarray:
+        """The fog of a level set; other values as they are."""
+        if not self.is_level_set:
+            return values
+        band = abs(float(self.tree.background[0]))
+        if not band > 0:
+            raise refusal(path, f"the level set {name!r} with a band of {band}", "a band above 0", "write the grid again")
+        return np.clip(-values / band, 0, 1)
+
+    def place(self, size: Any, low: Coord) -> np.ndarray:
+        """The matrix (4, 4) from the unit cube of the box to the world."""
+        steps = self.index_to_world[:3, :3]
+        return frame_from_steps(size, steps, steps @ low + self.index_to_world[:3, 3])
+
+    def describe(self, path: Path, name: str, low: Coord, active: int) -> dict[str, object]:
+        """The facts of the grid, for ``meta``."""
+        meta = {
+            "path": str(path),
+            "format": "vdb",
+            "dtype": "float16" if self.tree.is_half else np.dtype(TYPES[self.tree.kind][0]).name,
+            "space": None,
+            "grid": name,
+            "class": self.facts.get("class", "unknown"),
+            "index_min": low,
+            "active_voxels": active,
+        }
+        return meta | ({"band": abs(float(self.tree.background[0]))} if self.is_level_set else {})
+
+
+def _find_grid(stream: _Stream, dataset: str | None) -> tuple[_Grid, str]:
+    """Go to the tree of the chosen grid; return the grid and its name."""
+    grids = _name_all_grids(stream)
+    name = select_dataset(stream.path, dataset, list(grids))
     path, descriptor = stream.path, grids[name]
     kind = _parse_type(path, name, descriptor)
     compression, facts, index_to_world = _read_grid_head(stream, descriptor)
@@ -190,29 +287,8 @@ def _read_grid(stream: _Stream, grids: dict[str, _Descriptor], name: str) -> Vol
             raise refusal(path, f"an instance of {descriptor.parent!r}", "the grid of that name", "write the file again")
         kind = _parse_type(path, name, owner)
         compression = _read_grid_head(stream, owner)[0]
-    is_half = owner.type.endswith("_HalfFloat")
-    tree = _TreeReader(stream, kind, compression, is_half)
-    values, low, active = tree.read(name)
-    is_level_set = facts.get("class") == "level set"
-    steps = index_to_world[:3, :3]
-    meta = {
-        "path": str(path),
-        "format": "vdb",
-        "dtype": "float16" if is_half else np.dtype(TYPES[kind][0]).name,
-        "space": None,
-        "grid": name,
-        "class": facts.get("class", "unknown"),
-        "index_min": low,
-        "active_voxels": active,
-    }
-    if is_level_set:
-        band = abs(float(tree.background[0]))
-        if not band > 0:
-            raise refusal(path, f"the level set {name!r} with a band of {band}", "a band above 0", "write the grid again")
-        values, meta["band"] = np.clip(-values / band, 0, 1), band
-    values = to_values(values.transpose(2, 1, 0, 3), path)
-    origin = steps @ low + index_to_world[:3, 3]
-    return VolumeData(values, frame_from_steps(values.shape[2::-1], steps, origin), meta)
+    tree = _TreeReader(stream, kind, compression, owner.type.endswith("_HalfFloat"))
+    return _Grid(tree, facts, index_to_world), name
 
 
 def _parse_type(path: Path, name: str, descriptor: _Descriptor) -> str:
@@ -256,7 +332,7 @@ class _Node:
         origin: index of its first voxel.
         edge: voxels along its edge.
         values: value of a tile (C,); None for a leaf, whose values follow later in the file.
-        mask: active voxels (8, 8, 8) of a leaf; for a tile whether it is active.
+        mask: active voxels of a leaf, a bit each; for a tile whether it is active.
     """
 
     origin: Coord
@@ -285,6 +361,70 @@ class _TreeReader:
 
     def read(self, name: str) -> tuple[np.ndarray, Coord, int]:
         """Read the tree; return values (X, Y, Z, C), the index of the first voxel, and the number of active voxels."""
+        nodes, low, high, active = self._read_topology(name)
+        shape = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
+        dtype, components = TYPES[self.kind]
+        check_memory(self.stream.path, math.prod([*map(int, shape), components]) * max(np.dtype(dtype).itemsize, 4))
+        values = np.empty((*shape, components), dtype)
+        values[:] = self.background
+        for node in nodes:
+            _paste(values, low, node, self._read_leaf(node) if node.values is None else node.values)
+        return values, low, active
+
+    def read_background(self) -> np.ndarray:
+        """Read the value (C,) outside of the tree, and stay at the tree."""
+        at = self.stream.at
+        self.stream.skip(4)
+        self.background = self._read_value()
+        self.stream.seek(at)
+        return self.background
+
+    def read_bricks(
+        self, name: str, convert: Callable[[np.ndarray], np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, Coord, Coord, int]:
+        """Read the tree in bricks, of which those of zeros are left out.
+
+        Args:
+            name: name of the grid.
+            convert: function of the values of a leaf or a tile.
+
+        Returns:
+            values (bricks, z, y, x, C), the place (z, y, x) of each brick in ascending order, the indices of the first and the
+            last active voxel, and the number of active voxels.
+        """
+        nodes, low, high, active = self._read_topology(name)
+        first, last = (np.array(edge) // LEAF for edge in (low, high))
+        leaves = [node for node in nodes if node.values is None]
+        places = [np.array([node.origin for node in leaves], np.int64).reshape(-1, 3) // LEAF]
+        tiles = [(node, _cut_tile(node, first, last)) for node in nodes if node.values is not None]
+        tiles = [(node, cut) for node, cut in tiles if len(cut) and convert(node.values).any()]
+        places = np.concatenate(places + [cut for _, cut in tiles]) - first
+        components, spans = TYPES[self.kind][1], last - first + 1
+        check_memory(self.stream.path, 4 * LEAF**3 * components * len(places))
+        inside = ((places >= 0) & (places < spans)).all(axis=1)
+        numbers = np.ravel_multi_index(np.clip(places, 0, spans - 1)[:, ::-1].T, spans[::-1])
+        order = np.argsort(np.where(inside, numbers, spans.prod()), kind="stable")
+        rank = np.empty(len(order), np.int64)
+        rank[order] = np.arange(len(order))
+        values = allocate_bricks(len(order), components)
+        held = np.zeros(len(order), bool)
+        for begin in range(0, len(leaves), LEAVES_AT_ONCE):
+            block = convert(self._read_leaves(leaves[begin : begin + LEAVES_AT_ONCE]))
+            rows = rank[begin : begin + len(block)]
+            values[rows] = block.reshape(-1, LEAF, LEAF, LEAF, components).transpose(0, 3, 2, 1, 4)
+            held[rows] = block.any(axis=(1, 2))
+        begin = len(leaves)
+        for node, cut in tiles:
+            rows = rank[begin : begin + len(cut)]
+            values[rows], held[rows], begin = convert(node.values), True, begin + len(cut)
+        held &= inside[order]
+        # A grid of zeros keeps a brick: no array of a medium is empty.
+        held[0] |= not held.any()
+        places = places[order][:, ::-1].astype(np.int32)
+        return (values, places, low, high, active) if held.all() else (values[held], places[held], low, high, active)
+
+    def _read_topology(self, name: str) -> tuple[list[_Node], Coord, Coord, int]:
+        """Read the nodes, and the first and the last index and the number of the active voxels."""
         stream = self.stream
         if (buffers := stream.unpack("I")[0]) != 1:
             raise refusal(stream.path, f"{buffers} buffers a tree", "1", "write it again with OpenVDB 3 to 12")
@@ -296,14 +436,28 @@ class _TreeReader:
         low, high, active = _active_box(nodes)
         if not active:
             raise refusal(stream.path, f"no active voxel in the grid {name!r}", "at least one", "choose another grid")
-        shape = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
-        dtype, components = TYPES[self.kind]
-        check_memory(stream.path, int(np.prod([*map(int, shape), components])) * max(np.dtype(dtype).itemsize, 4))
-        values = np.empty((*shape, components), dtype)
+        return nodes, low, high, active
+
+    def _read_leaves(self, leaves: list[_Node]) -> np.ndarray:
+        """Read leaves (n, 512, C), x slowest; the values of those stored in the usual way are joined before they are placed."""
+        stream, (dtype, components) = self.stream, TYPES[self.kind]
+        values = np.empty((len(leaves), LEAF**3, components), dtype)
         values[:] = self.background
-        for node in nodes:
-            _paste(values, low, node, self._read_leaf(node) if node.values is None else node.values)
-        return values, low, active
+        plain, blocks = np.zeros(len(leaves), bool), []
+        masks = _unpack_masks(leaves).reshape(len(leaves), -1)
+        counts = masks.sum(axis=1).tolist()
+        joins = self.kind != "bool" and self.compression & ACTIVE_VALUES
+        for k, (node, count) in enumerate(zip(leaves, counts, strict=True)):
+            begin = stream.at
+            if joins and stream.take(LEAF**3 // 8 + 1)[-1] == 0:
+                plain[k] = True
+                blocks.append(self._read_stored(count))
+            else:
+                stream.seek(begin)
+                values[k] = self._read_leaf(node).reshape(LEAF**3, components)
+        stored = np.frombuffer(b"".join(blocks), "<f2" if self.is_half else dtype).reshape(-1, components)
+        values[masks & plain[:, None]] = stored
+        return values
 
     def _read_value(self) -> np.ndarray:
         dtype, components = TYPES[self.kind]
@@ -328,7 +482,7 @@ class _TreeReader:
             elif level + 1 < len(LEVELS) - 1:
                 yield from self._read_inner(place, level + 1)
             else:
-                yield _Node(place, LEAF, None, self._read_mask(LEAF**3).reshape(LEAF, LEAF, LEAF))
+                yield _Node(place, LEAF, None, self.stream.take(LEAF**3 // 8))
 
     def _read_mask(self, count: int) -> np.ndarray:
         return np.unpackbits(np.frombuffer(self.stream.take(count // 8), np.uint8), bitorder="little").astype(bool)
@@ -367,6 +521,12 @@ class _TreeReader:
     def _read_block(self, count: int) -> np.ndarray:
         """Read ``count`` stored values (count, C)."""
         dtype, components = TYPES[self.kind]
+        data = self._read_stored(count)
+        return np.frombuffer(data, "<f2" if self.is_half else dtype).astype(dtype).reshape(count, components)
+
+    def _read_stored(self, count: int) -> bytes:
+        """Read the bytes of ``count`` stored values."""
+        dtype, components = TYPES[self.kind]
         stored = "<f2" if self.is_half else dtype
         size, stream = np.dtype(stored).itemsize * components * count, self.stream
         if self.is_half and count == 0:
@@ -379,7 +539,7 @@ class _TreeReader:
             data = stream.take(size)
         if len(data) != size:
             raise refusal(stream.path, f"a block of {len(data)} bytes", f"{size}", "the file is damaged: copy it again")
-        return np.frombuffer(data, stored).astype(dtype).reshape(count, components)
+        return data
 
     def _decompress(self, data: bytes, size: int) -> bytes:
         if self.compression & BLOSC:
@@ -411,21 +571,38 @@ def _child_origin(origin: Coord, index: int, log2: int, below: int) -> Coord:
 
 def _active_box(nodes: list[_Node]) -> tuple[Coord, Coord, int]:
     """First and last index of the active voxels, and their number."""
-    lows, highs, active = [], [], 0
-    for node in nodes:
-        if node.values is not None:
-            if node.mask:
-                lows.append(node.origin)
-                highs.append(tuple(start + node.edge - 1 for start in node.origin))
-                active += node.edge**3
-        elif node.mask.any():
-            spans = [np.flatnonzero(node.mask.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
-            lows.append(tuple(start + int(span[0]) for start, span in zip(node.origin, spans, strict=True)))
-            highs.append(tuple(start + int(span[-1]) for start, span in zip(node.origin, spans, strict=True)))
-            active += int(np.count_nonzero(node.mask))
+    tiles = [node for node in nodes if node.values is not None and node.mask]
+    leaves = [node for node in nodes if node.values is None]
+    lows = [np.array([node.origin for node in tiles], np.int64).reshape(-1, 3)]
+    highs = [lows[0] + [[node.edge - 1] for node in tiles] if tiles else lows[0]]
+    active = sum(node.edge**3 for node in tiles)
+    for begin in range(0, len(leaves), LEAVES_AT_ONCE):
+        some = leaves[begin : begin + LEAVES_AT_ONCE]
+        masks, origins = _unpack_masks(some), np.array([node.origin for node in some], np.int64)
+        spans = np.stack([masks.any(axis=axes) for axes in ((2, 3), (1, 3), (1, 2))], axis=1)
+        filled = spans[:, 0].any(axis=1)
+        lows.append((origins + spans.argmax(axis=2))[filled])
+        highs.append((origins + LEAF - 1 - spans[:, :, ::-1].argmax(axis=2))[filled])
+        active += int(np.count_nonzero(masks))
     if not active:
         return (0, 0, 0), (0, 0, 0), 0
-    return tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True))), active
+    low, high = np.concatenate(lows).min(axis=0), np.concatenate(highs).max(axis=0)
+    return tuple(map(int, low)), tuple(map(int, high)), active
+
+
+def _unpack_masks(leaves: list[_Node]) -> np.ndarray:
+    """The active voxels of leaves, bool (n, 8, 8, 8)."""
+    bits = np.frombuffer(b"".join(node.mask for node in leaves), np.uint8)
+    return np.unpackbits(bits, bitorder="little").astype(bool).reshape(-1, LEAF, LEAF, LEAF)
+
+
+def _cut_tile(node: _Node, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """The places (n, 3) of the bricks of a tile between two bricks (x, y, z)."""
+    begin = np.maximum(np.array(node.origin) // LEAF, first)
+    end = np.minimum((np.array(node.origin) + node.edge) // LEAF, last + 1)
+    return np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(begin, end, strict=True)), indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )
 
 
 def _paste(values: np.ndarray, low: Coord, node: _Node, content: np.ndarray) -> None:
@@ -443,14 +620,14 @@ def _paste(values: np.ndarray, low: Coord, node: _Node, content: np.ndarray) -> 
 # -- Writing -------------------------------------------------------------------------------------------------------------
 
 
-def write_vdb(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
+def write_vdb(file: BinaryIO, values: np.ndarray | SparseVolumeData, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
     """Write a fog volume in float32, compressed by zip: the grid ``density`` of numbers, or ``color`` of three channels.
 
     Voxels of the value 0 are off, and blocks of 8^3 such voxels take no space.
 
     Args:
         file: destination.
-        values: float32 (Z, Y, X, 1) or (Z, Y, X, 3).
+        values: float32 (Z, Y, X, 1) or (Z, Y, X, 3), or a sparse volume, whose bricks become leaves.
         to_world: unit cube to world (4, 4).
         metadata: ``grid``: another name of the grid. Nothing else can be held.
 
@@ -458,20 +635,21 @@ def write_vdb(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
         MivolError: another number of channels, other metadata, or nothing but zeros, which no reader can place.
     """
     names = {1: ("float", "density"), 3: ("vec3s", "color")}
-    channels = values.shape[3]
+    volume = values if isinstance(values, SparseVolumeData) else SparseVolumeData.from_dense(values)
+    channels = volume.channels
     if channels not in names:
         way_out = "write one file for each channel, or a .npz"
         raise refusal("write_volume", f"{channels} channels for a .vdb file", "1 or 3", way_out)
     if rest := set(metadata) - {"grid"}:
         found = f"metadata {', '.join(sorted(rest))} for a .vdb file"
         raise refusal("write_volume", found, "at most the key grid", "write .npz, or remove the metadata")
-    if not values.any():
+    if not volume.values.any():
         raise refusal("write_volume", "nothing but zeros for a .vdb file", "a voxel with another value", "write .npz")
     kind, name = names[channels]
     name = str(metadata.get("grid", name))
-    leaves = _cut_leaves(np.ascontiguousarray(values.transpose(2, 1, 0, 3), "<f4"))
+    leaves = _cut_leaves(volume)
     topology, blocks = _pack_tree(leaves, channels)
-    low, high, count = _active_box([_Node(origin, LEAF, None, mask) for origin, (mask, _) in leaves.items()])
+    low, high, count = _active_box([_Node(origin, LEAF, None, _pack_mask(mask)) for origin, (mask, _) in leaves.items()])
     facts = [
         ("name", "string", name.encode()),
         ("class", "string", b"fog volume"),
@@ -479,7 +657,7 @@ def write_vdb(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
         ("file_bbox_max", "vec3i", struct.pack("<3i", *high)),
         ("file_voxel_count", "int64", struct.pack("<q", count)),
     ]
-    grid = struct.pack("<I", ZIP | ACTIVE_VALUES) + _pack_metadata(facts) + _pack_transform(values.shape[2::-1], to_world)
+    grid = struct.pack("<I", ZIP | ACTIVE_VALUES) + _pack_metadata(facts) + _pack_transform(volume, to_world)
     head = MAGIC + struct.pack("<3I?", 224, 10, 0, True) + str(uuid.uuid4()).encode()
     head += _pack_metadata([("creator", "string", b"mivol")]) + struct.pack("<I", 1)
     head += _pack_text(name) + _pack_text(f"Tree_{kind}_5_4_3") + _pack_text("")
@@ -488,18 +666,15 @@ def write_vdb(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
     file.write(head + struct.pack("<3q", begin, after_topology, after_topology + len(blocks)) + grid + topology + blocks)
 
 
-def _cut_leaves(values: np.ndarray) -> dict[Coord, tuple[np.ndarray, np.ndarray]]:
-    """The leaves (X, Y, Z, C) with a value other than 0: origin -> (mask, values), both of 8^3 voxels."""
-    size = values.shape[:3]
-    padded = np.zeros((*(-(-n // LEAF) * LEAF for n in size), values.shape[3]), values.dtype)
-    padded[tuple(slice(n) for n in size)] = values
-    counts = [n // LEAF for n in padded.shape[:3]]
-    cut = padded.reshape(counts[0], LEAF, counts[1], LEAF, counts[2], LEAF, -1).transpose(0, 2, 4, 1, 3, 5, 6)
-    masks = (cut != 0).any(axis=-1)
-    return {
-        tuple(LEAF * int(k) for k in index): (masks[tuple(index)], cut[tuple(index)])
-        for index in np.argwhere(masks.any(axis=(3, 4, 5)))
-    }
+def _cut_leaves(volume: SparseVolumeData) -> dict[Coord, tuple[np.ndarray, np.ndarray]]:
+    """The leaves with a value other than 0: origin (x, y, z) -> (mask, values), both of 8^3 voxels, x slowest."""
+    leaves = {}
+    for place, block in zip(volume.bricks, volume.values, strict=True):
+        values = np.ascontiguousarray(block.transpose(2, 1, 0, 3), "<f4")
+        mask = (values != 0).any(axis=3)
+        if mask.any():
+            leaves[tuple(LEAF * int(k) for k in place[::-1])] = (mask, values)
+    return leaves
 
 
 def _pack_tree(leaves: dict[Coord, tuple[np.ndarray, np.ndarray]], channels: int) -> tuple[bytes, bytes]:
@@ -508,7 +683,7 @@ def _pack_tree(leaves: dict[Coord, tuple[np.ndarray, np.ndarray]], channels: int
 
     def add_leaf(origin: Coord) -> None:
         mask, values = leaves[origin]
-        packed = np.packbits(mask.ravel(), bitorder="little").tobytes()
+        packed = _pack_mask(mask)
         topology.append(packed)
         blocks.append(packed + b"\0" + _pack_block(values[mask].tobytes()))
 
@@ -541,6 +716,10 @@ def _pack_tree(leaves: dict[Coord, tuple[np.ndarray, np.ndarray]], channels: int
     return b"".join(topology), b"".join(blocks)
 
 
+def _pack_mask(mask: np.ndarray) -> bytes:
+    return np.packbits(mask.ravel(), bitorder="little").tobytes()
+
+
 def _pack_block(data: bytes) -> bytes:
     short = zlib.compress(data) if data else data
     if len(short) < len(data):
@@ -558,9 +737,9 @@ def _pack_metadata(facts: list[tuple[str, str, bytes]]) -> bytes:
     return struct.pack("<I", len(entries)) + b"".join(entries)
 
 
-def _pack_transform(size: Any, to_world: np.ndarray) -> bytes:
-    """The matrix from indices to the world, as OpenVDB multiplies it: rows from the left."""
-    steps = to_world[:3, :3] / np.asarray(size)
+def _pack_transform(volume: SparseVolumeData, to_world: np.ndarray) -> bytes:
+    """The matrix from indices to the world, as OpenVDB multiplies it: rows from the left. Index 0 is the first of a brick."""
+    steps = to_world[:3, :3] / np.asarray(volume.shape[::-1])
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = steps, to_world[:3, 3] + steps.sum(axis=1) / 2
+    matrix[:3, :3], matrix[:3, 3] = steps, to_world[:3, 3] + steps @ (0.5 - np.array(volume.offset[::-1]))
     return _pack_text("AffineMap") + struct.pack("<16d", *matrix.T.ravel())

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mivol.display import summarize, with_short_repr
+from mivol.errors import MivolError
 from mivol.files.notebook import slices_html
 from mivol.files.source import refusal
 
@@ -210,22 +211,28 @@ def check_volume(values: np.ndarray, *, name: str, channels: Sequence[int] = (1,
         )
     if values.dtype.kind not in "biuf":
         raise refusal(name, f"numbers of type {values.dtype}", "real numbers", "convert them to float32")
+    if (bad := find_bad_voxel(values, minimum)) is not None:
+        index, count = bad
+        raise refuse_voxel(name, float(values[index]), index, count, minimum)
+
+
+def find_bad_voxel(values: np.ndarray, minimum: float | None) -> tuple[tuple[int, ...], int] | None:
+    """The index of the first number that is NaN, infinite or below ``minimum``, and how many there are; None without one."""
     low, high = values.min(), values.max()
     if np.isfinite(low) and np.isfinite(high) and (minimum is None or low >= minimum):
-        return
+        return None
     bad = ~np.isfinite(values)
     if minimum is not None:
         bad |= values < minimum
-    index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), values.shape))
+    return tuple(int(i) for i in np.unravel_index(np.argmax(bad), values.shape)), int(bad.sum())
+
+
+def refuse_voxel(name: str, value: float, index: Sequence[int], count: int, minimum: float | None) -> MivolError:
+    """Return the error that names the first of ``count`` bad values, at the index (z, y, x, channel)."""
     expected = "finite numbers" if minimum is None else f"finite numbers of at least {minimum:g}"
-    count = int(bad.sum())
     more = f" and {count - 1} more bad values" if count > 1 else ""
-    raise refusal(
-        name,
-        f"{values[index]:g} at voxel {_voxel(index)}{more}",
-        expected,
-        "repair them (for instance with numpy.clip or numpy.nan_to_num) or choose another array",
-    )
+    way_out = "repair them (for instance with numpy.clip or numpy.nan_to_num) or choose another array"
+    return refusal(name, f"{value:g} at voxel {_voxel(index)}{more}", expected, way_out)
 
 
 def _voxel(index: Sequence[int]) -> str:

@@ -147,6 +147,22 @@ def _change_stage(fit: RunningFit, stage: int) -> str:
     return message
 
 
+class AdaptBricks(Event, tag="adapt_bricks"):
+    """Let bricks of sparse grids vanish where they are empty, and appear beside others where the gradient asks for them."""
+
+    every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 20
+    end: Annotated[int, setting("iteration", "iteration after the last application", ge=1)] = 1000
+    threshold: Annotated[float, setting("1/length", "largest value of a brick that vanishes", ge=0)] = 0.0
+
+    def due(self, iteration: int) -> bool:
+        return 0 < iteration < self.end and iteration % self.every == 0
+
+    def apply(self, fit: RunningFit) -> str:
+        refinement = fit.problem.adapt_bricks(fit.run.reals, fit.next_iteration, self.threshold)
+        fit.run.refine(refinement)
+        return refinement.message
+
+
 class UpdateOccupancy(Event, tag="update_occupancy"):
     """Let a problem update the list of cells that steps can skip without changing their result."""
 
@@ -204,7 +220,7 @@ class Evaluate(Event, tag="evaluate"):
         return ""
 
 
-EVENTS = make_table(Upsample, Checkpoint, Evaluate)
+EVENTS = make_table(Upsample, AdaptBricks, Checkpoint, Evaluate)
 """Events available in files; plans of photographs use the others."""
 
 

@@ -9,12 +9,14 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.bricks import Bricks
 from mivol.fields.field_files import field_from_props
 from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.hash_density import HashDensity
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.transfer import Transfer
-from mivol.fields.voxels import Voxels
+from mivol.fields.voxels import read_voxels
+from mivol.transport.traversal.grid_blocks import find_stored_distances
 
 
 class VoxelVolume(mi.Volume):
@@ -26,13 +28,36 @@ class VoxelVolume(mi.Volume):
         to_world: places the unit cube.
         use_grid_bbox: place the grid by its file's own box first. Default false.
         signed: permit negative values, as for a ``g``. Default false.
+        storage: dense, sparse (bricks of 8^3 voxels; elsewhere 0) or auto: sparse for a file or grid of at least 128 MiB of
+            which at most a quarter would be stored. Default auto.
+        bricks, resolution, offset: for sparse ``data`` (bricks, 8, 8, 8, C): ascending numbers (z, y, x) of the bricks among
+            those of the box, voxels of the box ``x, y, z``, and voxels of the first brick before the box (default 0, 0, 0).
+
+    The parameter ``data`` holds the values: (Z, Y, X, C), or of the stored bricks (bricks, 8, 8, 8, C), with their numbers as
+    ``bricks``.
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        self.field = Voxels.from_props(props)
+        self.field = read_voxels(props)
         self.texture = self.field.freezable_texture
+        self.hold_bricks()
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
         super().__init__(props)
+
+    def hold_bricks(self) -> None:
+        """Hold the arrays of a sparse grid: ``dr.freeze`` finds arrays only among a plugin's own attributes."""
+        bricks = self.field.bricks
+        if bricks is None:
+            return
+        if bricks.distances is None:
+            bricks.distances = find_stored_distances(bricks)
+        self.data, self.bricks = self.field.tensor, self.field.stored
+        self.table, self.distances, self.stored = bricks.table, bricks.distances, bricks.stored
+
+    @property
+    def mivol_bricks(self) -> Bricks | None:
+        """Where the values of a sparse grid are stored; None for a dense grid."""
+        return self.field.bricks
 
     @property
     def mivol_to_world(self) -> np.ndarray:
@@ -65,9 +90,12 @@ class VoxelVolume(mi.Volume):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         for name, value in self.field.parameters().items():
             callback.put(name, value, mi.ParamFlags.Differentiable)
+        if self.field.bricks is not None:
+            callback.put("bricks", self.bricks, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.field.refresh()
+        self.hold_bricks()
 
     def to_string(self) -> str:
         return repr(self.field)

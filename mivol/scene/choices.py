@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from mivol.files.sparse_volume import VOXELS
 from mivol.scene.needs import MediumFacts, Needs
 from mivol.transport.media.body import flight_parts
 from mivol.transport.path.estimators import Settings
@@ -26,6 +27,7 @@ __all__ = [
     "choose_shadows",
     "choose_side_flights",
     "choose_skipping",
+    "choose_storage",
     "choose_successive_paths",
     "choose_tracing",
     "choose_transport",
@@ -220,6 +222,14 @@ def choose_skipping(medium: MediumFacts, skip: bool) -> Choice:
     """Choose whether a walk skips empty blocks of a medium."""
     share = f"{medium.occupied:.0%} of its blocks are occupied"
     return Choice(f"empty space in {medium.name}", "skipped" if skip else "walked", share)
+
+
+def choose_storage(medium: MediumFacts) -> Choice:
+    """Say what a sparse grid stores."""
+    stored = sum(VOXELS * n for n in medium.bricks)
+    whole = sum(z * y * x for (z, y, x), n in zip(medium.resolutions, medium.bricks, strict=True) if n)
+    size = f"{stored / whole:.1%} of its voxels are stored, {4 * stored / 2**20:.3g} MiB a channel"
+    return Choice(f"storage of {medium.name}", "sparse", f"{size} instead of {4 * whole / 2**20:.3g}")
 
 
 def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:

@@ -21,6 +21,8 @@ Source: ``mivol bench depth`` prints the tables (Mitsuba's ``volpath``, a cube);
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -199,7 +201,7 @@ def _traced_depths(scene: mi.Scene, view: MediumView, ray: mi.Ray3f) -> np.ndarr
 def mean_albedo(view: MediumView) -> float:
     """Albedo [1] of the highest channel, averaged over space; from ``sigma_s`` as mean scattering over mean extinction."""
     means = [np.asarray(dr.detach(a), np.float64) for a in view.albedo_arrays]
-    scattering = max(float(m.reshape(-1, m.shape[-1]).mean(axis=0).max()) if m.ndim == 4 else float(m.max()) for m in means)
+    scattering = max(float(m.reshape(-1, m.shape[-1]).mean(axis=0).max()) if m.ndim >= 4 else float(m.max()) for m in means)
     if view.albedo is not None:
         return scattering
     total = sum(_mean_value(part) for part in view.parts)
@@ -210,4 +212,6 @@ def _mean_value(part: ExactExtinction) -> float:
     """Mean of a part over space, of the highest channel."""
     values = part.constant if part.is_constant else part.lattice.values
     host = np.asarray(dr.detach(values), np.float64)
-    return float(host.reshape(-1, part.channels).mean(axis=0).max()) if not part.is_constant else float(host.max())
+    if part.is_constant:
+        return float(host.max())
+    return float(host.reshape(-1, part.channels).sum(axis=0).max()) / math.prod(part.lattice.res)

@@ -158,6 +158,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
         "boundary": _describe_boundary(boundary),
         "extinction": "rgb" if view.channels == 3 else "grey",
         "resolutions": tuple(g.res for g in grids),
+        "bricks": tuple(0 if g.bricks is None else g.bricks.count for g in grids),
         "phase": _phase_name(phase),
         "emits": view.emits,
         "gaussians": sum(p.field.count for p in view.parts if isinstance(p, GaussianExtinction)),
@@ -240,6 +241,7 @@ class MediumFacts:
         mean_cosine: mean cosine of the phase function at the first reading [1]; None for a medium that does not scatter, or
             with a near emitter.
         misplaced: names of the grids that lie wholly outside of the shape.
+        bricks: number of stored bricks of each grid, 0 for a dense grid; empty if all are dense.
     """
 
     name: str
@@ -259,6 +261,7 @@ class MediumFacts:
     gaussians: int = 0
     mean_cosine: float | None = None
     misplaced: tuple[str, ...] = ()
+    bricks: tuple[int, ...] = ()
 
     @property
     def misplacement(self) -> str:

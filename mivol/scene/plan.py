@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
+from mivol.files.sparse_volume import VOXELS
 from mivol.machine import available_memory
 from mivol.scene.choices import (
     MAX_SKIPPED_SHARE,
@@ -29,6 +30,7 @@ from mivol.scene.choices import (
     choose_shadows,
     choose_side_flights,
     choose_skipping,
+    choose_storage,
     choose_successive_paths,
     choose_tracing,
     choose_transport,
@@ -166,7 +168,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         choose_tracing(needs),
         choose_channels(needs),
     ]
-    skips = tuple(bool(m.resolutions) and m.occupied < MAX_SKIPPED_SHARE for m in needs.media)
+    skips = tuple(bool(m.resolutions) and (m.occupied < MAX_SKIPPED_SHARE or any(m.bricks)) for m in needs.media)
+    choices += [choose_storage(m) for m in needs.media if any(m.bricks)]
     choices += [choose_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
     choices += [choice for m in needs.media if (choice := choose_flights(m, segment)) is not None]
     shadows = [choose_shadows(m, needs, settings) for m in needs.media]
@@ -249,7 +252,11 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
     memory, ways = 0, set()
     for medium in needs.media:
         channels = 3 if medium.extinction == "rgb" else 1
-        for z, y, x in medium.resolutions:
+        for (z, y, x), bricks in zip(medium.resolutions, medium.bricks or (0,) * len(medium.resolutions), strict=True):
+            if bricks:
+                memory += 8 * VOXELS * bricks * channels
+                ways.add("added to the stored nodes")
+                continue
             packed = gradient_bytes((z, y, x), channels)
             fits = needs.variant.startswith("llvm") and packed <= PACKED_LIMIT
             memory += (packed if fits else 0) + 8 * z * y * x * channels

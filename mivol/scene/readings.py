@@ -32,9 +32,10 @@ from mivol.transport.traversal.grid_blocks import (
     coarsen_grid,
     find_block_ranges,
     find_distances_of_bounds,
+    find_occupied_blocks,
     place_blocks,
 )
-from mivol.transport.traversal.grid_walk import corner_nodes
+from mivol.transport.traversal.grid_walk import NodeArray, corner_nodes, read_nodes
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice, locate_cell
 
@@ -44,13 +45,13 @@ class GridReading:
     """The result of reading a grid.
 
     Attributes:
-        bounds: largest value of each block.
+        bounds: largest value of each block; of a sparse grid, whether the block is occupied.
         occupied: share of blocks with a positive value [1].
         maximum: largest value of the grid.
         floored: values with 0 in place of negative values; None without negative values.
     """
 
-    bounds: mi.Float | None
+    bounds: mi.Float | mi.Bool | None
     occupied: float
     maximum: float
     floored: mi.Float | None = None
@@ -93,9 +94,14 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
         elif not dr.all((array >= 0) & dr.isfinite(array)):
             floored = _clip_negative(part, survey, name)
             values = mi.TensorXf(floored, values.shape)
+        _check_look_up(part, survey, name)
+        bricks = part.lattice.bricks
+        if bricks is not None:
+            blocks = find_occupied_blocks(values, bricks)
+            share = float(dr.count(blocks)[0]) / dr.width(blocks)
+            return GridReading(blocks, share, float(dr.max(values.array)[0]), floored)
         blocks = bound_blocks(values)
         host = np.array(blocks)
-        _check_look_up(part, survey, name)
         return GridReading(blocks, float((host > 0).mean()), float(host.max(initial=0.0)), floored)
 
     reading = _read_once(survey, ("part",), array, make)
@@ -168,8 +174,8 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
     it = dr.zeros(mi.Interaction3f, LOOK_UP_POINTS)
     it.p = lattice.to_world_points(mi.Vector3f(u.T.astype(np.float32)))
     cell, frac, _ = locate_cell(lattice, it.p, mi.Vector3f(0, 0, 1), mi.Float(0))
-    nodes, c = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res), lattice.channels
-    corners = [[dr.gather(mi.Float, dr.detach(lattice.values.array), k * c + i) for k in nodes] for i in range(c)]
+    values = [NodeArray(dr.detach(lattice.values.array), lattice.channels)]
+    corners, c = read_nodes(values, corner_nodes(cell, lattice, mi.Bool(True)), mi.Bool(True))[0], lattice.channels
     expected = np.array([np.array(interpolate(row, frac)) for row in corners])
     actual = np.array(volume.eval_1(it))[None] if c == 1 else np.array(volume.eval(it))
     spread = np.ptp(np.array([[np.array(v) for v in row] for row in corners]), axis=1)
@@ -253,8 +259,8 @@ def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) 
 
 def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges:
     """Read the range of values of each block of a grid, once for each state of the array."""
-    values = part.lattice.values
-    return _read_once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values))
+    values, bricks = part.lattice.values, part.lattice.bricks
+    return _read_once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values, None, bricks))
 
 
 def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, finds_occupied: bool) -> CoarseGrid:

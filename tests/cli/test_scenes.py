@@ -22,7 +22,7 @@ from mivol.cli import main
 from mivol.fields.field_files import write_field
 from mivol.fields.procedural import make_procedural
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.files import read_exr, read_volume, write_volume
+from mivol.files import read_exr, read_sparse_volume, read_volume, write_volume
 from mivol.points import write_gaussians
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -64,6 +64,7 @@ NOWHERE = {"MIVOL_DATA": "", "MIVOL_CACHE": "nowhere"}
 """No public data is there: what stands in for it is small."""
 
 SCRIPTS = {
+    "big_cloud": "render.py",
     "bonsai": "scan.py",
     "cloud": "models.py",
     "fire": "render.py",
@@ -293,6 +294,16 @@ def test_fire(tmp_path, data_dir, script):
     median, most = map(float, re.search(r"luminance ([\d.]+) cd/m2 in the median, ([\d.]+) cd/m2 at most", said).groups())
     assert 10 < median < 80 and 200 < most < 835
     assert (tmp_path / "fire.png").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_big_cloud(tmp_path: Path, script: Script) -> None:
+    """The script says what it stores, and the cloud is brighter than the sky around it."""
+    said = script("big_cloud", "--voxels", 96, "--size", 24, "--spp", 4, "--gradient", "--vdb", "-o", tmp_path)
+    bricks = int(re.search(r"^(\d+) bricks, [\d.]+% of 96\^3 voxels above 0", said, re.MULTILINE).group(1))
+    assert 50 < bricks < 12**3 and f"derivatives by {512 * bricks} voxels" in said
+    assert read_sparse_volume(tmp_path / "cloud.vdb").values.shape[0] == bricks
+    assert (tmp_path / "cloud.png").stat().st_size > 500
 
 
 def test_an_exposure_is_chosen_by_the_brightest_hundredth() -> None:

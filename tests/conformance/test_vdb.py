@@ -22,7 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mivol
-from mivol.files import read_volume, vdb, write_volume
+from mivol.files import SparseVolumeData, check_bricks, read_sparse_volume, read_volume, vdb, write_volume
 
 PLACED = np.array([[0.5, 0, 0, 1], [0, 0, -0.5, 2], [0, 0.25, 0, 3], [0, 0, 0, 1]])
 """Index to world of the first grid: x of the index runs along x, y along z, z against y."""
@@ -82,6 +82,45 @@ def test_a_level_set_becomes_a_fog(openvdb_file: Path) -> None:
     depth = 1 - np.sqrt(x**2 + y**2 + z**2)
     np.testing.assert_allclose(volume.values[..., 0], np.clip(depth, 0, 1), atol=2 * np.finfo(np.float32).eps)
     assert volume.meta["band"] == 1
+
+
+@pytest.mark.parametrize("name", [*GRIDS, "ball"])
+def test_bricks_hold_what_the_dense_box_holds(openvdb_file: Path, name: str) -> None:
+    """Tiles, values of inactive voxels, the fog of a level set, and boxes that begin inside of a leaf."""
+    dense, sparse = read_volume(openvdb_file, name), read_sparse_volume(openvdb_file, name)
+    assert np.array_equal(sparse.dense(), dense.values)
+    assert np.array_equal(sparse.to_world, dense.to_world) and sparse.meta == dense.meta
+    check_bricks(sparse, name=name, minimum=None)
+    assert sparse.values.any(axis=(1, 2, 3, 4)).all()
+
+
+def test_bricks_never_need_the_dense_box(tmp_path: Path) -> None:
+    """Two voxels 4 million voxels apart: the dense box would have 2^66 voxels."""
+    path, values = tmp_path / "far.vdb", np.zeros((2, 8, 8, 8, 1), np.float32)
+    values[0, 0, 0, 0], values[1, 7, 7, 7] = 1, 2
+    far = SparseVolumeData(values, np.array([[0, 0, 0], [2**19 - 1] * 3], np.int32), (2**22,) * 3, np.eye(4))
+    write_volume(path, far)
+    with refused("expected at most the free memory"):
+        read_volume(path)
+    found = read_sparse_volume(path)
+    assert found.shape == far.shape and np.array_equal(found.values, values) and np.array_equal(found.bricks, far.bricks)
+    assert np.allclose(found.to_world, np.eye(4), rtol=0, atol=1e-9)
+
+
+def test_a_sparse_volume_is_written_as_its_dense_twin(tmp_path: Path) -> None:
+    values = np.zeros((9, 20, 17, 1), np.float32)
+    values[8, 19, 16] = values[0, 3, 5] = 1
+    place = np.array([[2.0, 0, 0.5, 1], [0, 3, 0, -2], [0, 0, 4, 0.5], [0, 0, 0, 1]])
+    write_volume(tmp_path / "dense.vdb", values, place)
+    whole = SparseVolumeData.from_dense(np.pad(values, ((3, 0), (1, 0), (6, 0), (0, 0))), place)
+    cut = SparseVolumeData(whole.values, whole.bricks, (9, 20, 17), place, (3, 1, 6))
+    write_volume(tmp_path / "sparse.vdb", cut)
+    truth = read_volume(tmp_path / "dense.vdb")
+    for found in (read_volume(tmp_path / "sparse.vdb"), read_sparse_volume(tmp_path / "sparse.vdb")):
+        assert np.array_equal(found.dense() if isinstance(found, SparseVolumeData) else found.values, truth.values)
+        assert np.allclose(found.to_world, truth.to_world, rtol=0, atol=1e-12)
+    write_volume(tmp_path / "sparse.npz", cut)
+    assert np.array_equal(read_volume(tmp_path / "sparse.npz").values, values)
 
 
 def test_a_grid_is_chosen_by_name(openvdb_file: Path) -> None:

@@ -25,7 +25,8 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.optim.losses import L2, FunctionLoss, Loss, to_loss
 from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
-from mivol.optim.problem import LinearizableProblem, Reals
+from mivol.optim.problem import LinearizableProblem, Reals, Refinement
+from mivol.optim.scenes.brick_stages import adapt_bricks, bricks_key, check_sparse_parameter
 from mivol.optim.scenes.render_noise import Comparison, compare_with_reference, describe_noise, make_noise_check, split_samples
 from mivol.optim.scenes.views import (
     ADJOINT,
@@ -56,6 +57,7 @@ class SceneProblem(LinearizableProblem):
         seed: root of all random numbers.
         safe_point: called between kernels.
         noisy: whether images hold noise of sampled light, at the scene's present values.
+        sparse: names of the parameters that are sparse grids.
         newest_loss: loss of the views (no priors) and its noise, from the latest gradient.
     """
 
@@ -78,7 +80,14 @@ class SceneProblem(LinearizableProblem):
         for parameter in self.parameters:
             find(parameter.name, self.params)
         check_names([parameter.name for parameter in self.parameters])
-        self.params.keep([parameter.name for parameter in self.parameters])
+        names = [parameter.name for parameter in self.parameters]
+        self.sparse = [name for name in names if bricks_key(name) in self.params.keys()]  # noqa: SIM118
+        for parameter in self.parameters:
+            if parameter.name in self.sparse:
+                check_sparse_parameter(parameter)
+        owners = {name: self.params.properties[name][2] for name in self.sparse}
+        self._counts = {name: owner.mivol_bricks.counts for name, owner in owners.items()}
+        self.params.keep([*names, *map(bricks_key, self.sparse)])
         self.loss = to_loss(self.loss)
         alone = isinstance(self.loss, FunctionLoss)
         self.batches = make_single_batches(self.views) if alone else make_batches(self.views, self.samples_per_pass)
@@ -133,6 +142,32 @@ class SceneProblem(LinearizableProblem):
         for name, value in values.items():
             self.params[name] = value
         self.noisy = self._has_noise()
+
+    # -- Sparse grids ---------------------------------------------------------------------------------------------
+
+    def brick_counts(self) -> dict[str, tuple[int, int, int]]:
+        """Bricks (Z, Y, X) of the box of each sparse grid among the parameters, by name."""
+        return self._counts
+
+    def brick_numbers(self, name: str) -> np.ndarray:
+        """Ascending numbers of the stored bricks of a sparse grid."""
+        return np.array(self.params[bricks_key(name)], dtype=np.int64)
+
+    def set_brick_numbers(self, name: str, numbers: np.ndarray) -> None:
+        """Store other bricks with the values of the next :meth:`set_reals`."""
+        self.params[bricks_key(name)] = mi.UInt32(numbers.astype(np.uint32))
+
+    def adapt_bricks(self, reals: Reals, iteration: int, threshold: float) -> Refinement:
+        """As :func:`mivol.optim.scenes.brick_stages.adapt_bricks`."""
+        return adapt_bricks(self, reals, iteration, threshold)
+
+    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
+        """The bricks of sparse grids."""
+        return {f"bricks/{name}": self.brick_numbers(name) for name in self.sparse}
+
+    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
+        for name in self.sparse:
+            self.set_brick_numbers(name, arrays[f"bricks/{name}"])
 
     # -- Images ---------------------------------------------------------------------------------------------------
 

@@ -92,7 +92,7 @@ class BodySweep:
             integral = add_constant(integral, layout.leave, layout.t1)
         if layout.lattice is not None:
             alone = skip and len(self.extinction.reads) == 1 and not self._has_constants
-            lattice = layout.lattice if alone else replace(layout.lattice, empty_distances=None)
+            lattice = layout.lattice if alone else self._walked_lattice
             integral = walk_cells(lattice, layout.segment, visit, integral, self._reads, self.active)
         if self._has_constants:
             integral = add_constant(integral, layout.t0, layout.enter)
@@ -138,8 +138,7 @@ class BodySweep:
         if self._has_constants and layout.lattice is not None:
             sweep = add_constant(sweep, layout.leave, layout.t1)
         if layout.lattice is not None:
-            lattice = replace(layout.lattice, empty_distances=None)
-            sweep = walk_cells(lattice, layout.segment, visit, sweep, self.extinction.reads, self.active)
+            sweep = walk_cells(self._walked_lattice, layout.segment, visit, sweep, self.extinction.reads, self.active)
         if self._has_constants:
             sweep = add_constant(sweep, layout.t0, layout.enter)
             body.add_to_constants(self.media.sum_channels(sweep.constant), self.active)
@@ -153,6 +152,12 @@ class BodySweep:
     def _has_constants(self) -> bool:
         """Whether the medium has matter outside its grid too, which forbids skipping blocks."""
         return self.body.view.emission_density is not None or any(p.is_constant for p in self.body.view.parts)
+
+    @property
+    def _walked_lattice(self) -> Lattice:
+        """The lattice to walk where empty blocks count: matter outside of the grid, or derivatives."""
+        lattice = self.layout.lattice
+        return replace(lattice, empty_distances=None) if self._has_constants else lattice.where_derivatives()
 
     @property
     def _reads(self) -> list:

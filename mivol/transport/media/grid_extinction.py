@@ -10,7 +10,7 @@ Conventions. Values are detached arrays; channels are 1 (grey) or 3 (rgb), and a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import drjit as dr
@@ -20,7 +20,7 @@ import numpy as np
 from mivol.fields.activation import Activation
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_segment
-from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, walk_cells
+from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, read_nodes, walk_cells
 from mivol.transport.traversal.interpolation import (
     fraction_from_lower,
     gauss_points,
@@ -113,13 +113,16 @@ class GridExtinction(NodeValues):
         return integrate_segment(self.lattice, dr.detach(self.values), segment, interval.active, enough)
 
     def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
-        lattice = replace(self.lattice, empty_distances=None)
+        lattice = self.lattice.where_derivatives()
         return integrate_segment(lattice, tangent, clip_interval(lattice, interval), interval.active)
 
     def vjp(self, gradient: NodeGradient, weight: list[mi.Float], interval: RayInterval) -> None:
         backproject_segment(self.lattice, gradient, weight, clip_interval(self.lattice, interval), interval.active)
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        if self.lattice.bricks is not None:
+            # No second array of scaled values: it would take the memory of the grid.
+            return [dr.detach(scale) * v for v in interpolate_at(self.lattice, dr.detach(self.values), ray, t, active)]
         return interpolate_at(self.lattice, dr.detach(self.scaled(scale)), ray, t, active)
 
     def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
@@ -137,9 +140,9 @@ def clip_interval(lattice: Lattice, interval: RayInterval) -> Segment:
 def interpolate_at(lattice: Lattice, values: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
     """Each channel of flat node values at a point of a ray; 0 outside the box of the grid."""
     cell, frac, inside = locate_cell(lattice, ray.o, ray.d, t)
-    upward = dr.full(dr.mask_t(mi.Vector3f), True)
-    nodes, on, n = corner_nodes(cell, upward, lattice.res), inside & active, lattice.channels
-    return [interpolate([dr.gather(mi.Float, values, k * n + c, on) for k in nodes], frac) for c in range(n)]
+    on = inside & active
+    (rows,) = read_nodes([NodeArray(values, lattice.channels)], corner_nodes(cell, lattice, on), on)
+    return [interpolate(row, frac) for row in rows]
 
 
 def add_to_cell(gradient: NodeGradient, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
@@ -178,7 +181,7 @@ class ActivatedGridExtinction(NodeValues):
         return self._integrate(self.lattice, interval, enough)
 
     def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
-        return self._integrate(replace(self.lattice, empty_distances=None), interval, tangent=tangent)
+        return self._integrate(self.lattice.where_derivatives(), interval, tangent=tangent)
 
     def vjp(self, gradient: NodeGradient, weight: list[mi.Float], interval: RayInterval) -> None:
         def visit(state: None, cell: Cell, on: mi.Bool) -> None:
@@ -189,7 +192,7 @@ class ActivatedGridExtinction(NodeValues):
             gradient.add(0, cell.lower, [0.5 * cell.dt * weight[0] * r for r in row], on)
             return state
 
-        lattice, reads = replace(self.lattice, empty_distances=None), [NodeArray(dr.detach(self.values))]
+        lattice, reads = self.lattice.where_derivatives(), [NodeArray(dr.detach(self.values))]
         walk_cells(lattice, clip_interval(lattice, interval), visit, None, reads, interval.active)
 
     def _integrate(
@@ -270,8 +273,9 @@ class SummedExtinction:
 
 
 def have_same_cells(a: Lattice, b: Lattice) -> bool:
-    """Whether two grids have the same resolution and place."""
-    return a.res == b.res and np.array_equal(a.to_world, b.to_world)
+    """Whether two grids have the same resolution and place, and number their nodes alike."""
+    alike = a.bricks is b.bricks or (a.bricks is not None and b.bricks is not None and a.bricks.has_same_slots(b.bricks))
+    return a.res == b.res and np.array_equal(a.to_world, b.to_world) and alike
 
 
 def activate(activation: Activation | None, value: mi.Float) -> mi.Float:

@@ -14,7 +14,7 @@ adjoints).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -113,13 +113,13 @@ class NodeGradient:
 
     Attributes:
         buffer: flat sums; corners of cells if ``packed``, else nodes.
-        res: resolution of the grid (Z, Y, X).
+        lattice: the grid.
         channels: channels of the grid.
         packed: whether the buffer holds cells.
     """
 
     buffer: mi.Float
-    res: tuple[int, int, int]
+    lattice: Lattice
     channels: int
     packed: bool
 
@@ -129,27 +129,27 @@ class NodeGradient:
         z, y, x = lattice.res
         cells = (z + 1) * (y + 1) * (x + 1) * lattice.channels
         on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-        packed = on_cpu and gradient_bytes(lattice.res, lattice.channels) <= PACKED_LIMIT
-        buffer = dr.zeros(mi.Float, 8 * cells if packed else z * y * x * lattice.channels)
-        return cls(buffer, lattice.res, lattice.channels, packed)
+        packed = on_cpu and lattice.bricks is None and gradient_bytes(lattice.res, lattice.channels) <= PACKED_LIMIT
+        buffer = dr.zeros(mi.Float, 8 * cells if packed else dr.width(lattice.values.array))
+        return cls(buffer, lattice, lattice.channels, packed)
 
     def add(self, channel: int, lower: mi.Vector3i, corners: list[mi.Float], active: mi.Bool) -> None:
         """Add 8 values, in the order of the axes of the grid, to the corners of the cell with the lower node ``lower``."""
-        _, y, x = self.res
         if self.packed:
+            _, y, x = self.lattice.res
             index = ((lower.z + 1) * (y + 1) + lower.y + 1) * (x + 1) + lower.x + 1
             index = mi.UInt32(index) * self.channels + channel
             dr.scatter_add(self.buffer, mi.ArrayXf(corners), index, active, mode=dr.ReduceMode.Expand)
             return
-        upward = dr.full(dr.mask_t(mi.Vector3f), True)
-        for node, value in zip(corner_nodes(lower, upward, self.res), corners, strict=True):
-            dr.scatter_add(self.buffer, value, node * self.channels + channel, active)
+        nodes = corner_nodes(lower, self.lattice, active)
+        for node, value, on in zip(nodes.index, corners, nodes.select(active), strict=True):
+            dr.scatter_add(self.buffer, value, node * self.channels + channel, on)
 
     def fold(self) -> mi.Float:
         """The derivative at each node (flat, channels fastest)."""
         if not self.packed:
             return self.buffer
-        z, y, x = self.res
+        z, y, x = self.lattice.res
         entry = dr.arange(mi.UInt32, z * y * x * self.channels)
         node, channel = entry // self.channels, entry % self.channels
         i, j, k = node % x, (node // x) % y, node // (x * y)
@@ -175,7 +175,7 @@ def backproject_segment(
     """Add ``weight`` times the row of ``A`` of each lane to a gradient: the transpose ``A^T``.
 
     Args:
-        lattice: place of the grid. Empty blocks are walked too, since an empty voxel has a derivative.
+        lattice: place of the grid. Empty blocks are walked too, since an empty voxel has a derivative if it is stored.
         target: the gradient.
         weight: d loss / d tau of each lane, an entry a channel.
         segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
@@ -191,7 +191,7 @@ def backproject_segment(
             target.add(channel, cell.lower, [w * r for r in row], on)
         return state
 
-    walk_cells(replace(lattice, empty_distances=None), segment, visit, None, (), active)
+    walk_cells(lattice.where_derivatives(), segment, visit, None, (), active)
 
 
 class _OpticalDepth(dr.CustomOp):
@@ -203,8 +203,8 @@ class _OpticalDepth(dr.CustomOp):
 
     def forward(self) -> None:
         # The tangent may be nonzero where the values are 0, so no block may be skipped.
-        dense = replace(self.lattice, empty_distances=None)
-        self.set_grad_out(integrate_segment(dense, self.grad_in("values"), self.segment, self.active))
+        whole = self.lattice.where_derivatives()
+        self.set_grad_out(integrate_segment(whole, self.grad_in("values"), self.segment, self.active))
 
     def backward(self) -> None:
         target = NodeGradient.zeros(self.lattice)

@@ -293,7 +293,10 @@ def _part(
     """The part of an extinction under ``name`` among the parameters of a medium."""
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
-        lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places))
+        bricks = getattr(volume, "mivol_bricks", None)
+        lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places), bricks=bricks)
+        if bricks is not None:
+            lattice = lattice.where_derivatives()
         return GridExtinction(name, lattice, volume if volume.class_name() == "GridVolume" else None)
     if constant not in params.properties:
         keys = sorted(k for k in params.properties if k.startswith(name + "."))
@@ -312,8 +315,8 @@ def _part(
 
 
 def _tensor(values: mi.TensorXf) -> mi.TensorXf:
-    """Grid values as (Z, Y, X, C)."""
-    return values if len(values.shape) == 4 else mi.TensorXf(values.array, (*values.shape, 1))
+    """Grid values as (Z, Y, X, C), or (bricks, 8, 8, 8, C)."""
+    return values if len(values.shape) >= 4 else mi.TensorXf(values.array, (*values.shape, 1))
 
 
 def find_grid_place(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:

@@ -17,7 +17,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.fields.bricks import BITS, Bricks
 from mivol.numerics import maximum
+from mivol.transport.traversal.brick_blocks import mean_of_bricks, occupied_blocks, range_of_bricks
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = [
@@ -30,7 +32,9 @@ __all__ = [
     "count_blocks",
     "find_distances",
     "find_distances_of_bounds",
+    "find_occupied_blocks",
     "find_empty_distances",
+    "find_stored_distances",
     "reduce_blocks",
     "BlockRanges",
     "find_block_ranges",
@@ -61,6 +65,16 @@ def bound_blocks(values: mi.TensorXf) -> mi.Float:
     """
     flat = _channel_max(dr.abs(dr.detach(values.array)), values.shape[3])
     return reduce_blocks(flat, values.shape[:3], SHIFT, Reduction(dr.maximum, 0))
+
+
+def find_occupied_blocks(values: mi.TensorXf, bricks: Bricks) -> mi.Bool:
+    """Find the blocks of a sparse grid (bricks, 8, 8, 8, C) with a value other than 0, flat over the blocks (z, y, x)."""
+    counts = tuple(count_blocks(n) for n in bricks.res)
+    flat, c = dr.detach(values.array), values.shape[-1]
+    node, occupied = dr.arange(mi.UInt32, dr.width(flat) // c) * c, mi.Bool(False)
+    for channel in range(c):
+        occupied |= dr.gather(mi.Float, flat, node + channel) != 0
+    return occupied_blocks(dr.select(occupied, mi.UInt8(1), mi.UInt8(0)), bricks, SHIFT, counts)
 
 
 def count_blocks(n: int, shift: int = SHIFT) -> int:
@@ -124,11 +138,11 @@ def find_empty_distances(values: mi.TensorXf) -> mi.UInt8:
     return find_distances_of_bounds(bound_blocks(values), values.shape[:3])
 
 
-def find_distances_of_bounds(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UInt8:
+def find_distances_of_bounds(bounds: mi.Float | mi.Bool, res: tuple[int, int, int]) -> mi.UInt8:
     """Find the distance of each block to the nearest non-empty block.
 
     Args:
-        bounds: from :func:`bound_blocks`.
+        bounds: from :func:`bound_blocks`, or whether each block is occupied.
         res: resolution of the grid (Z, Y, X).
 
     Returns:
@@ -136,7 +150,14 @@ def find_distances_of_bounds(bounds: mi.Float, res: tuple[int, int, int]) -> mi.
 
     Cost: at most 6 ``REACH`` look-ups a block.
     """
-    return find_distances(bounds > 0, tuple(count_blocks(n) for n in res))
+    occupied = bounds if dr.is_mask_v(bounds) else bounds > 0
+    return find_distances(occupied, tuple(count_blocks(n) for n in res))
+
+
+def find_stored_distances(bricks: Bricks) -> mi.UInt8:
+    """Find the distance of each block to the nearest block with a stored node of a sparse grid."""
+    counts = tuple(count_blocks(n) for n in bricks.res)
+    return find_distances(occupied_blocks(None, bricks, SHIFT, counts), counts)
 
 
 def find_distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
@@ -211,24 +232,28 @@ def block_shift(res: tuple[int, int, int]) -> int:
     return 2 if max(res) <= SMALL else 3
 
 
-def find_block_ranges(values: mi.TensorXf, shift: int | None = None) -> BlockRanges:
+def find_block_ranges(values: mi.TensorXf, shift: int | None = None, bricks: Bricks | None = None) -> BlockRanges:
     """Find the minorant and the range of each block of a grid.
 
     Args:
-        values: (Z, Y, X, C), finite.
+        values: (Z, Y, X, C), finite; (bricks, 8, 8, 8, C) of a sparse grid.
         shift: log2 of the edge of a block [cells]; by default :func:`block_shift`.
+        bricks: where the values of a sparse grid are stored.
 
     Cost: 9/8 reads a voxel along each axis, since neighbouring blocks share a layer of nodes.
     """
-    z, y, x, c = values.shape
-    flat = dr.detach(values.array)
-    shift = block_shift((z, y, x)) if shift is None else shift
-    res = tuple(count_blocks(n, shift) for n in (z, y, x))
+    c, flat = values.shape[-1], dr.detach(values.array)
+    nodes = values.shape[:3] if bricks is None else bricks.res
+    shift = block_shift(nodes) if shift is None else shift
+    res = tuple(count_blocks(n, shift) for n in nodes)
     rows, ranges = [], []
     for channel in range(c):
-        own = dr.gather(mi.Float, flat, dr.arange(mi.UInt32, z * y * x) * c + channel) if c > 1 else flat
-        low = reduce_blocks(own, (z, y, x), shift, Reduction(dr.minimum, dr.inf))
-        high = reduce_blocks(own, (z, y, x), shift, Reduction(dr.maximum, -dr.inf))
+        own = dr.gather(mi.Float, flat, dr.arange(mi.UInt32, dr.width(flat) // c) * c + channel) if c > 1 else flat
+        if bricks is None:
+            low = reduce_blocks(own, nodes, shift, Reduction(dr.minimum, dr.inf))
+            high = reduce_blocks(own, nodes, shift, Reduction(dr.maximum, -dr.inf))
+        else:
+            low, high = range_of_bricks(own, bricks, shift, res)
         rows.append(low)
         # A tracker divides (value - low) by this range. The range is rounded up, so that rounding never makes that exceed 1.
         ranges.append((high - low) * (1 + 1e-6))
@@ -264,9 +289,14 @@ def coarsen_grid(lattice: Lattice, shift: int, finds_occupied: bool) -> CoarseGr
 
     Cost: 8/7 look-ups a voxel, 8 a block.
     """
-    c, edge, shape = lattice.channels, 1 << shift, list(lattice.res)
+    c, shape, below = lattice.channels, list(lattice.res), 0
     flat = dr.detach(lattice.values.array)
-    for axis in (2, 1, 0):
+    if lattice.bricks is not None:
+        # A block of more voxels than a brick is the mean of smaller blocks, of which the last repeats the border.
+        below = min(shift, BITS)
+        flat, shape = _mean_stored(lattice, below), [-(-n >> below) for n in shape]
+    edge = 1 << shift - below
+    for axis in (2, 1, 0) if edge > 1 or lattice.bricks is None else ():
         inner = int(np.prod(shape[axis + 1 :])) * c
         flat = _mean_along(flat, shape[axis], inner, edge)
         shape[axis] = -(-shape[axis] // edge)
@@ -280,6 +310,14 @@ def place_blocks(lattice: Lattice, means: mi.TensorXf, shift: int, empty_distanc
     """Place the means of blocks of 2^shift voxels of a lattice as a grid of their own."""
     ratios = [(m << shift) / n for m, n in zip(means.shape[2::-1], lattice.res[::-1], strict=True)]
     return Lattice(means, lattice.to_world @ np.diag([*ratios, 1.0]), empty_distances)
+
+
+def _mean_stored(lattice: Lattice, shift: int) -> mi.Float:
+    """Means of blocks of a sparse grid (Z, Y, X, C), flat."""
+    c, flat = lattice.channels, dr.detach(lattice.values.array)
+    node = dr.arange(mi.UInt32, dr.width(flat) // c)
+    means = [mean_of_bricks(dr.gather(mi.Float, flat, node * c + k), lattice.bricks, shift) for k in range(c)]
+    return dr.ravel(mi.ArrayXf(means)) if c > 1 else means[0]
 
 
 def _mean_along(flat: mi.Float, n: int, inner: int, edge: int) -> mi.Float:

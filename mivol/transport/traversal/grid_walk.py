@@ -19,6 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.fields.bricks import Nodes, find_corners
 from mivol.numerics import fast_max, fast_min
 from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks
@@ -30,7 +31,7 @@ __all__ = ["Cell", "NodeArray", "corner_nodes", "read_nodes", "walk_box_cells", 
 
 @dataclass
 class NodeArray:
-    """An array over the nodes of a lattice for a walk to read: flat, channels fastest, then x."""
+    """An array over the (stored) nodes of a lattice for a walk to read: flat, channels fastest, then x."""
 
     array: mi.Float
     channels: int = 1
@@ -88,12 +89,14 @@ def walk_cells(
             ``cell.dt``, and is called again from there.
 
     Cost: a step for each cell or empty region, at most X + Y + Z + 6 steps; 4 reads a step and channel (8 a visited cell if
-        empty blocks are skipped).
+        empty blocks are skipped, or if the grid is sparse).
     """
-    # Dr.Jit makes every object that a loop's body names part of the loop's state: so the body names these two arrays only,
-    # and neither the lattice nor the segment.
+    # Dr.Jit makes every object that a loop's body names part of the loop's state: so the body names these arrays only, and
+    # neither the lattice nor the segment.
     empty_distances, length = lattice.empty_distances, segment.length
-    skip = empty_distances is not None
+    skip, is_sparse = empty_distances is not None, lattice.bricks is not None
+    table, offset = (lattice.bricks.table, lattice.bricks.offset) if is_sparse else (None, None)
+    carries = not (skip or is_sparse)
     res = lattice.res
     blocks_y, blocks_x = count_blocks(res[1]), count_blocks(res[2])
 
@@ -114,7 +117,10 @@ def walk_cells(
     s, s_rest = mi.Float(0), mi.Float(0)  #                                     world length walked, and its lost digits
     stride, top = _strides(lattice.res)
     near, far = _planes(cell, ahead, lattice.res)  #                            flat offsets of the corners, an axis each
-    corners = read_nodes(reads, _box(near, far), active)
+    if is_sparse:
+        corners = [[[mi.Float(0) for _ in range(8)] for _ in range(r.channels)] for r in reads]
+    else:
+        corners = read_nodes(reads, Nodes(_box(near, far)), active)
 
     while dr.hint(active, label="lattice walk"):
         # -- Cells to cross at once: one, or what is left of an empty block and the empty ones around it -----------------
@@ -127,8 +133,11 @@ def walk_cells(
             full = distance == 0
             inner = (cell + 1) & (BLOCK - 1)
             span = dr.select(full, 0, dr.select(ahead, BLOCK - 1 - inner, inner) + (distance - 1) * BLOCK)
+        if is_sparse:
+            corners = read_nodes(reads, find_corners(table, res, offset, cell, ahead, full), full)
+        elif skip:
             near, far = _planes(cell, ahead, res)
-            corners = read_nodes(reads, _box(near, far), full)
+            corners = read_nodes(reads, Nodes(_box(near, far)), full)
 
         # -- Distance to the planes ahead, and visit ----------------------------------------------------------------------
         reach = (mi.Vector3f(span) + (1 - frac)) * pace
@@ -163,9 +172,10 @@ def walk_cells(
         else:
             passed = dr.select(through, passed + 1, passed)
             cell = dr.clip(dr.select(through, cell + sign, cell), -1, top)
+        if carries:
             near = dr.select(through, far, near)
             far = dr.select(through, dr.clip(far + sign * stride, 0, top * stride), far)
-            corners = _shift(corners, through, read_nodes(reads, _far_face(near, far, through), active))
+            corners = _shift(corners, through, read_nodes(reads, Nodes(_far_face(near, far, through)), active))
         # The fraction is found from the entry point, not from the last cell: the rounding of 3e-8 in a step has the same sign
         # in every step, and would carry a ray 1e-5 of a cell off its course in 256. speed * s and the number of planes passed
         # are nearly equal; the fused multiply-add subtracts them before it rounds, so that only the remainder is rounded.
@@ -196,9 +206,12 @@ def _planes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> tuple
     return dr.select(ahead, low, high), dr.select(ahead, high, low)
 
 
-def corner_nodes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> list[mi.UInt32]:
-    """Flat node indices of the 8 corners of a cell, near and far along ``ahead`` (all true: lower and upper)."""
-    return _box(*_planes(cell, ahead, res))
+def corner_nodes(cell: mi.Vector3i, lattice: Lattice, active: mi.Bool) -> Nodes:
+    """The 8 corners of a cell, in the order of the axes of the grid."""
+    upward = dr.full(dr.mask_t(mi.Vector3f), True)
+    if lattice.bricks is not None:
+        return lattice.bricks.find_corners(cell, upward, active)
+    return Nodes(_box(*_planes(cell, upward, lattice.res)))
 
 
 def _box(near: mi.Vector3i, far: mi.Vector3i) -> list[mi.UInt32]:
@@ -236,10 +249,11 @@ def _along(through: Mask3, x: mi.Float, y: mi.Float, z: mi.Float) -> mi.Float:
     return dr.select(through.x, x, dr.select(through.y, y, z))
 
 
-def read_nodes(reads: Sequence[NodeArray], nodes: list[mi.UInt32], active: mi.Bool) -> list:
-    """Read [array][channel][node] values."""
+def read_nodes(reads: Sequence[NodeArray], nodes: Nodes, active: mi.Bool) -> list:
+    """Read [array][channel][node] values; 0 at nodes that are not stored."""
+    pairs = list(zip(nodes.index, nodes.select(active), strict=True))
     return [
-        [[dr.gather(mi.Float, r.array, n * r.channels + c, active) for n in nodes] for c in range(r.channels)] for r in reads
+        [[dr.gather(mi.Float, r.array, n * r.channels + c, on) for n, on in pairs] for c in range(r.channels)] for r in reads
     ]
 
 

@@ -9,7 +9,7 @@ cell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.bricks import Bricks
 from mivol.space import check_affine, lattice_from_world
 from mivol.transport.traversal.box import clip_to_box, map_point
 from mivol.transport.traversal.rays import Ray
@@ -33,12 +34,13 @@ class Lattice:
     """A grid placed in the world.
 
     Attributes:
-        values: TensorXf (Z, Y, X, C), at voxel centres.
+        values: TensorXf (Z, Y, X, C), at voxel centres; (bricks, 8, 8, 8, C) of a sparse grid.
         to_world: (4, 4) float64, unit cube to world.
         empty_distances: distance of each block of cells to the nearest non-empty block
             (:mod:`mivol.transport.traversal.grid_blocks`); None to walk all blocks.
         block_ranges: :class:`mivol.transport.traversal.grid_blocks.BlockRanges` for tracking; None to walk every cell.
         from_world: (3, 4) map from the world to lattice coordinates; made from ``to_world`` by default.
+        bricks: where the values of a sparse grid are stored; None for a dense grid.
     """
 
     values: mi.TensorXf
@@ -46,11 +48,12 @@ class Lattice:
     empty_distances: mi.UInt8 | None = None
     block_ranges: Any = None
     from_world: list[list[mi.Float64]] | None = None
+    bricks: Bricks | None = None
 
     def __post_init__(self) -> None:
         if self.from_world is not None:
             return
-        shape = tuple(self.values.shape)
+        shape = tuple(self.values.shape) if self.bricks is None else (*self.bricks.res, self.channels)
         if len(shape) != 4 or 0 in shape:
             raise MivolError(f"a grid of shape {shape} was given; (Z, Y, X, channels) is expected: reshape it.")
         if np.prod([n + 1 for n in shape[:3]]) * self.channels >= 2**31:
@@ -63,12 +66,16 @@ class Lattice:
     @property
     def res(self) -> tuple[int, int, int]:
         """Resolution (Z, Y, X)."""
-        return tuple(self.values.shape[:3])
+        return tuple(self.values.shape[:3]) if self.bricks is None else self.bricks.res
 
     @property
     def channels(self) -> int:
         """Number of values at each voxel."""
-        return self.values.shape[3]
+        return self.values.shape[-1]
+
+    def where_derivatives(self) -> Lattice:
+        """The lattice whose walk passes every cell with a derivative: all cells, or those with a stored node."""
+        return replace(self, empty_distances=None if self.bricks is None else self.bricks.distances)
 
     def to_world_points(self, u: mi.Vector3f) -> mi.Point3f:
         """Map points of the unit cube to the world, in float32."""

@@ -145,8 +145,7 @@ def _collide_in_grid(
     # -- The position of the collision inside its cell ---------------------------------------------------------------------
     begin = segment.start + mi.Float64(s)
     cell, points, inside = points_of_piece(lattice, ray, begin, dt, collides)
-    nodes = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
-    rows = read_nodes(reads, nodes, inside)[0]
+    rows = read_nodes(reads, corner_nodes(cell, lattice, inside), inside)[0]
     corners = [_select_channel([row[q] for row in rows], channel) for q in range(8)]
     curve = fit_cubic(*(scale * activate(part.activation, interpolate(corners, p)) for p in points))
     x = invert_cubic_integral(curve, dt, remaining, integrate_cubic(curve, dt, mi.Float(1)))

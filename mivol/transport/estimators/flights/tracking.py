@@ -58,6 +58,7 @@ class BlockLattice:
 
     res: tuple[int, int, int]
     empty_distances: None = None
+    bricks: None = None
 
 
 @dataclass
@@ -114,10 +115,11 @@ def residual_ratio_tracking(
         tau = [t + dr.select(on, scale * m * dt, 0) for t, m in zip(state.tau, least, strict=True)]
         # -- The factor, from one corner of the cell -------------------------------------------------------------------
         rng, u = draw_pcg32(state.rng, 5)
-        index = draw_corner(cell, dt, u) * channels
+        node, stored = draw_corner(cell, dt, u, meets)
+        index = node * channels
         weight = []
         for c, (w, m) in enumerate(zip(state.weight, least, strict=True)):
-            value = dr.gather(mi.Float, values, index + c, meets)
+            value = dr.gather(mi.Float, values, index + c, stored)
             factor = 1 - (value - m) / (LOOKUP_RATE * above)
             weight.append(dr.select(meets, w * factor, w))
         fresh = -dr.log(u[3])
@@ -144,20 +146,26 @@ def residual_ratio_tracking(
     return [w * dr.exp(-t) for t, w in zip(end.tau, end.weight, strict=True)], end.rng
 
 
-def _make_corner_sampler(lattice: Lattice, segment: Segment) -> Callable[[Cell, mi.Float, list[mi.Float]], mi.UInt32]:
-    """Make ``draw_corner(cell, dt, u)``, drawing a corner of the cell at the distance ``dt`` behind the entry into a block.
+def _make_corner_sampler(
+    lattice: Lattice, segment: Segment
+) -> Callable[[Cell, mi.Float, list[mi.Float], mi.Bool], tuple[mi.UInt32, mi.Bool]]:
+    """Make ``draw_corner(cell, dt, u, active)``, drawing a corner of the cell at the distance ``dt`` behind the entry into a
+    block.
 
-    Each corner has its trilinear weight as probability, by three uniform random numbers; the result is the index of its node.
+    Each corner has its trilinear weight as probability, by three uniform random numbers; the result is the index of its node,
+    and the lanes in which it is stored.
     """
-    res, shift = lattice.res, lattice.block_ranges.shift
+    res, shift, bricks = lattice.res, lattice.block_ranges.shift, lattice.bricks
     is_ascending, speed = segment.d > 0, dr.abs(segment.d) * 2.0**-shift
 
-    def draw_corner(cell: Cell, dt: mi.Float, u: list[mi.Float]) -> mi.UInt32:
+    def draw_corner(cell: Cell, dt: mi.Float, u: list[mi.Float], active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         near = dr.fma(speed, dt, cell.frac)
         inside = dr.select(is_ascending, near, 1 - near) * (1 << shift)
         node = (cell.lower + 1) * (1 << shift) - 1 + mi.Vector3i(dr.floor(inside + mi.Vector3f(*u[:3])))
         node = dr.clip(node, 0, mi.Vector3i(res[2] - 1, res[1] - 1, res[0] - 1))
-        return mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x)
+        if bricks is not None:
+            return bricks.find_slot(node, active)
+        return mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x), active
 
     return draw_corner
 
@@ -249,7 +257,7 @@ def delta_tracking_in_blocks(
         dt = dr.select(meets, dr.minimum(ahead / rate, cell.dt), cell.dt)
         # -- Real or not, from one corner of the cell ------------------------------------------------------------------
         rng, u = draw_pcg32(rng, 5)
-        value = dr.gather(mi.Float, values, draw_corner(cell, dt, u), meets)
+        value = dr.gather(mi.Float, values, *draw_corner(cell, dt, u, meets))
         real = meets & (u[3] * majorant <= value)
         ahead = dr.select(meets, -dr.log(u[4]), dr.maximum(ahead - dr.select(on, rate * dt, 0), 0))
         return (ahead, dr.select(real, cell.s + dt, s), collides | real, rng), dt

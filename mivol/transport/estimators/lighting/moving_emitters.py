@@ -14,8 +14,6 @@ along the ray.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 
@@ -136,7 +134,7 @@ def _part_gradient(
         entering = _boundary_direction(body, ray, t0) if body.box is not None else mi.Vector3f(0)
         shift = dr.select(on & (t0 > 0), entering * mi.Float(t0), 0) - dr.select(on & (t1 < end), leaving * mi.Float(t1), 0)
         return [v * shift for v in each]
-    lattice = replace(part.lattice, empty_distances=None)
+    lattice = part.lattice.where_derivatives()
     segment = clip_to_grid(lattice, ray.o, ray.d, t0, t1)
     a, b = mi.Float64(segment.t0), mi.Float64(segment.t0) + mi.Float64(segment.length)
     inside = on & (segment.length > 0)

@@ -18,6 +18,7 @@ References: Rousselle et al. 2016 (control variates in rendering).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -107,17 +108,21 @@ class GridControl:
     """A control variate for one grid.
 
     Attributes:
-        values: S of each cell of the grid: flat (Z + 1, Y + 1, X + 1, channels) [radiance].
+        values: S of each cell of the grid: flat (Z + 1, Y + 1, X + 1, channels) [radiance]; empty for a sparse grid.
         res: resolution of the grid (Z, Y, X).
         channels: 1 or 3.
+        compute: S of a cell (z, y, x) counted from 0, for a sparse grid, which has less memory than its cells.
     """
 
     values: mi.Float
     res: tuple[int, int, int]
     channels: int
+    compute: Callable[[list[mi.UInt32]], list[mi.Float]] | None = None
 
     def at(self, lower: mi.Vector3i, active: mi.Bool) -> list[mi.Float]:
         """S of the cell with the lower node ``lower``, one number for each channel."""
+        if self.compute is not None:
+            return self.compute([mi.UInt32(dr.select(active, i + 1, 0)) for i in (lower.z, lower.y, lower.x)])
         _, y, x = self.res
         index = mi.UInt32(((lower.z + 1) * (y + 1) + lower.y + 1) * (x + 1) + lower.x + 1) * self.channels
         return [dr.gather(mi.Float, self.values, index + c, active) for c in range(self.channels)]
@@ -149,21 +154,26 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     lattice = body.view.parts[0].lattice
     nodes = [count_nodes(n) for n in lattice.res]
     coarse = _estimate_node_light(direct, body, origins, lattice, nodes)
+
+    def compute(cell: list[mi.UInt32]) -> list[mi.Float]:
+        # The centre of each cell, in steps of the coarse lattice.
+        q = [mi.Float(c) / m * (k - 1) for c, m, k in zip(cell, lattice.res, nodes, strict=True)]
+        low = [dr.minimum(mi.UInt32(v), k - 2) for v, k in zip(q, nodes, strict=True)]
+        frac = mi.Vector3f(*(v - mi.Float(a) for v, a in zip(q[::-1], low[::-1], strict=True)))
+        corner = [((low[0] + (b >> 2)) * nodes[1] + low[1] + (b >> 1 & 1)) * nodes[2] + low[2] + (b & 1) for b in range(8)]
+        rows = [interpolate([dr.gather(mi.Float, c, k) for k in corner], frac) for c in coarse]
+        if isinstance(body.view.albedo, mi.Volume):
+            u = mi.Vector3f(*(mi.Float(c) / m for c, m in zip(cell[::-1], lattice.res[::-1], strict=True)))
+            albedo = eval_albedo(body, _interaction_at(lattice.to_world_points(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
+        else:
+            albedo = eval_albedo(body, dr.zeros(mi.MediumInteraction3f), mi.Bool(True))
+        return [row * dr.detach(albedo[c]) for c, row in enumerate(rows)]
+
+    if lattice.bricks is not None:
+        return GridControl(mi.Float(), lattice.res, len(coarse), compute)
     z, y, x = (r + 1 for r in lattice.res)
     index = dr.arange(mi.UInt32, z * y * x)
-    cell = [index // (y * x), (index // x) % y, index % x]
-    # The centre of each cell, in steps of the coarse lattice.
-    q = [mi.Float(c) / m * (k - 1) for c, m, k in zip(cell, lattice.res, nodes, strict=True)]
-    low = [dr.minimum(mi.UInt32(v), k - 2) for v, k in zip(q, nodes, strict=True)]
-    frac = mi.Vector3f(*(v - mi.Float(a) for v, a in zip(q[::-1], low[::-1], strict=True)))
-    corner = [((low[0] + (b >> 2)) * nodes[1] + low[1] + (b >> 1 & 1)) * nodes[2] + low[2] + (b & 1) for b in range(8)]
-    rows = [interpolate([dr.gather(mi.Float, c, k) for k in corner], frac) for c in coarse]
-    if isinstance(body.view.albedo, mi.Volume):
-        u = mi.Vector3f(*(mi.Float(c) / m for c, m in zip(cell[::-1], lattice.res[::-1], strict=True)))
-        albedo = eval_albedo(body, _interaction_at(lattice.to_world_points(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
-    else:
-        albedo = eval_albedo(body, dr.zeros(mi.MediumInteraction3f), mi.Bool(True))
-    rows = _merge_equal([row * dr.detach(albedo[c]) for c, row in enumerate(rows)])
+    rows = _merge_equal(compute([index // (y * x), (index // x) % y, index % x]))
     n = len(rows)
     values = dr.zeros(mi.Float, z * y * x * n)
     for c, row in enumerate(rows):
@@ -405,10 +415,8 @@ class ControlSweep:
         start = dr.clip(frac - speed * length, 0, 1)
         points = [dr.fma(frac - start, g, start) for g in (GAUSS_POINT, 1 - GAUSS_POINT)]
         if tracks.tangent:
-            upward = dr.full(dr.mask_t(mi.Vector3f), True)
-            (corners,) = read_nodes(
-                [NodeArray(body.tangents[0], part.channels)], corner_nodes(cell, upward, part.lattice.res), on
-            )
+            reads = [NodeArray(body.tangents[0], part.channels)]
+            (corners,) = read_nodes(reads, corner_nodes(cell, part.lattice, on), on)
             at = media.to_channels([interpolate(v, frac) for v in corners])
             front = media.to_channels([0.5 * length * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in corners])
             pairs = zip(probe.source, probe.attenuation, strict=True)

@@ -249,8 +249,10 @@ class _Filling:
             reservoir = add_constant(reservoir, t0, t1)
             return _set_probe_sigma(reservoir, probe_sigma)
         # Empty blocks scatter no light, but their derivative is not 0.
-        walks_all = self.proposal.probe_depth > 0 or extinction.has_constants or len(extinction.reads) > 1
-        lattice = replace(grid, empty_distances=None) if walks_all else grid
+        walks_all = self.proposal.probe_depth > 0 or len(extinction.reads) > 1
+        lattice = grid.where_derivatives() if walks_all else grid
+        if extinction.has_constants:
+            lattice = replace(grid, empty_distances=None)
         hit = segment.length > 0
 
         def visit(reservoir: Reservoir, cell: Cell, full: mi.Bool) -> Reservoir:
@@ -467,8 +469,7 @@ def _extinction_along(proposal: DistanceProposal, body: Body, candidate: Candida
         return _to_scene_channels(media, constant)
     start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)
     cell, points, inside = points_of_piece(lattice, ray, start, candidate.dt, on)
-    nodes = corner_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
-    grid = extinction.along(read_nodes(extinction.reads, nodes, inside), points)
+    grid = extinction.along(read_nodes(extinction.reads, corner_nodes(cell, lattice, inside), inside), points)
     values = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
     return _to_scene_channels(media, values)
 

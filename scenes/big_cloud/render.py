@@ -1,0 +1,149 @@
+"""A cumulus of 1024^3 voxels that is sparse in memory, under a sun and a sky.
+
+    python scenes/big_cloud/render.py [--voxels 1024] [--gradient] [-o runs/big_cloud]
+
+The cloud is a heap of balls whose surface octaves of noise erode. It is made in bricks of 8^3 voxels: no array of the whole box
+exists at any time. Printed: bricks, their size beside that of a dense grid, seconds, and the peak memory of the process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from pathlib import Path
+
+import mivol
+from mivol.files import write_png
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+EDGE = 8
+"""Voxels along the edge of a brick."""
+CHUNK = 4096
+"""Bricks that are made at once."""
+EXTINCTION = 90.0
+"""Extinction [1/length] in the cloud, whose box has the edge 1."""
+OCTAVES = [(8 * 2**k, 0.62**k) for k in range(5)]
+"""Period of each octave of noise [1/length], and its amplitude."""
+
+
+class Cumulus:
+    """Signed depth below the surface of a cloud, at points of the unit cube; positive inside."""
+
+    def __init__(self, balls: int = 26, seed: int = 11) -> None:
+        rng = np.random.default_rng(seed)
+        angle, away = rng.uniform(0, 2 * np.pi, balls), 0.3 * np.sqrt(rng.uniform(0, 1, balls))
+        radius = rng.uniform(0.05, 0.12, balls) * (1.2 - 1.6 * away)
+        height = 0.2 + rng.uniform(0, 0.38, balls) * (1 - away / 0.32) + radius / 2
+        self.balls = np.column_stack([0.5 + away * np.cos(angle), 0.5 + away * np.sin(angle), height, radius])
+        grids = [rng.uniform(-1, 1, (n, n, n, 1)).astype(np.float32) for n, _ in OCTAVES]
+        self.noise = [mi.Texture3f(mi.TensorXf(grid), wrap_mode=dr.WrapMode.Repeat) for grid in grids]
+
+    def depth(self, p: mi.Point3f, erosion: float = 0.045) -> mi.Float:
+        """Depth [length]; the base of the cloud is flat."""
+        inside = mi.Float(-1)
+        for x, y, z, radius in self.balls.tolist():
+            inside = dr.maximum(inside, radius - dr.norm(p - mi.Point3f(x, y, z)))
+        eroded = sum(amplitude * noise.eval(p)[0] for (_, amplitude), noise in zip(OCTAVES, self.noise, strict=True))
+        return dr.minimum(inside + erosion * eroded, (p.z - 0.2) + 0.3 * erosion * eroded)
+
+
+def make_cloud(voxels: int, cumulus: Cumulus) -> mivol.SparseVolumeData:
+    """The extinction of the cloud in bricks; rises from 0 at its surface within four voxels."""
+    counts = -(-voxels // EDGE)
+    # Bricks whose middle lies far outside have no voxel inside: the noise moves the surface by at most twice the erosion.
+    index = dr.arange(mi.UInt32, counts**3)
+    places = (index // counts**2, index // counts % counts, index % counts)
+    middle = mi.Point3f(*((mi.Float(k) + 0.5) * (EDGE / voxels) for k in places[::-1]))
+    near = dr.compress(cumulus.depth(middle) > -EDGE / voxels * 3)
+    values, numbers = [], []
+    for begin in range(0, dr.width(near), CHUNK):
+        bricks = near.numpy()[begin : begin + CHUNK]
+        node = dr.arange(mi.UInt32, len(bricks) * EDGE**3)
+        brick, inner = dr.gather(mi.UInt32, mi.UInt32(bricks), node // EDGE**3), node % EDGE**3
+        z = brick // counts**2 * EDGE + inner // EDGE**2
+        y = brick // counts % counts * EDGE + inner // EDGE % EDGE
+        x = brick % counts * EDGE + inner % EDGE
+        depth = cumulus.depth(mi.Point3f(*((mi.Float(k) + 0.5) / voxels for k in (x, y, z))))
+        block = np.array(EXTINCTION * dr.clip(depth * voxels / 4, 0, 1)).reshape(-1, EDGE, EDGE, EDGE, 1)
+        held = block.any(axis=(1, 2, 3, 4))
+        values.append(block[held])
+        numbers.append(bricks[held])
+    rows = np.stack(np.unravel_index(np.concatenate(numbers), (counts,) * 3), axis=1).astype(np.int32)
+    return mivol.SparseVolumeData(np.concatenate(values), rows, (voxels,) * 3, np.eye(4))
+
+
+def make_scene(cloud: mivol.SparseVolumeData, size: int, spp: int) -> mi.Scene:
+    """The cloud under a sun and a blue sky, seen from the ground."""
+    to_world = mi.ScalarTransform4f
+    grid = {
+        "type": "mivol_voxels",
+        "data": mi.TensorXf(cloud.values),
+        "bricks": mi.UInt32(cloud.numbers),
+        "resolution": list(cloud.shape[::-1]),
+    }
+    droplets = {"type": "mivol_medium", "sigma_t": grid, "albedo": 0.999, "phase": {"type": "mivol_hg", "g": 0.8}}
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    view = to_world().look_at([0.5, -1.05, 0.12], [0.5, 0.5, 0.36], [0, 0, 1])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "mivol", "max_depth": 24},
+            "sensor": {"type": "perspective", "fov": 42, "to_world": view, "film": film,
+                       "sampler": {"type": "independent", "sample_count": spp}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.16, 0.32, 0.68]}},
+            "sun": {"type": "directional", "direction": [0.75, 0.55, -0.6],
+                    "irradiance": {"type": "rgb", "value": [5.2, 4.7, 4.0]}},
+            "cloud": {"type": "cube", "to_world": to_world().scale(0.5).translate(1), "bsdf": {"type": "null"},
+                      "interior": droplets},
+        }
+    )  # fmt: skip
+
+
+def peak_memory() -> float:
+    """Largest memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--voxels", type=int, default=1024, help="voxels along each edge of the box")
+    parser.add_argument("--size", type=int, default=384, help="pixels a side")
+    parser.add_argument("--spp", type=int, default=64, help="samples a pixel")
+    parser.add_argument("--gradient", action="store_true", help="also compute the derivative by every stored voxel")
+    parser.add_argument("--vdb", action="store_true", help="also write cloud.vdb")
+    parser.add_argument("-o", "--output", type=Path, default=Path("runs/big_cloud"))
+    given = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    given.output.mkdir(parents=True, exist_ok=True)
+
+    before, start = peak_memory(), time.perf_counter()
+    cloud = make_cloud(given.voxels, Cumulus())
+    share = np.count_nonzero(cloud.values) / given.voxels**3
+    print(
+        f"{len(cloud.values)} bricks, {share:.1%} of {given.voxels}^3 voxels above 0: {cloud.values.nbytes / 1e6:.0f} MB, a "
+        f"dense grid takes {cloud.dense_bytes / 1e6:.0f} MB; made in {time.perf_counter() - start:.1f} s"
+    )
+    if given.vdb:
+        mivol.write_volume(given.output / "cloud.vdb", cloud)
+    start = time.perf_counter()
+    scene = make_scene(cloud, given.size, given.spp)
+    del cloud
+    image = mi.render(scene)
+    write_png(given.output / "cloud.png", np.array(image))
+    seconds, more = time.perf_counter() - start, peak_memory() - before
+    print(f"rendered in {seconds:.1f} s, {more:.0f} MB more than before: {given.output}/cloud.png")
+    if given.gradient:
+        params = mi.traverse(scene)
+        key = "cloud.interior_medium.sigma_t.data"
+        dr.enable_grad(params[key])
+        dr.backward(dr.mean(mi.render(scene, params, spp=1), axis=None))
+        derivative = dr.grad(params[key])
+        print(f"derivatives by {derivative.shape[0] * EDGE**3} voxels, {peak_memory() - before:.0f} MB more than before")
+
+
+if __name__ == "__main__":
+    main()
