@@ -150,7 +150,7 @@ ENTRIES = {
         "A cloud of 1024 x 1024 x 1024 voxels",
         "Sparse in memory, under a sun and a sky; all scattering up to 23 times.",
         "python scenes/big_cloud/render.py",
-        ("scenes/big_cloud/render.py --size 240 --spp 48 -o {out}",),
+        ("scenes/big_cloud/render.py --voxels 512 --size 240 --spp 64 -o {out}",),
         drawn("cloud.png"),
     ),
 }

@@ -8,6 +8,7 @@ The suffix selects the format, and the first bytes must agree. A new format is a
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import re
 from collections.abc import Callable, Mapping
@@ -236,30 +237,44 @@ def is_volume_file(path: Path) -> bool:
     return path.name.lower().endswith(VOLUME_SUFFIXES)
 
 
+LARGEST_DENSE = 1 << 28
+"""Size of a sparse volume as a dense array [bytes] up to which its voxels are described one by one."""
+
+
 def describe_volume(path: Path, dataset: str | None = None) -> str:
     """Describe a volume in a few lines: size, values, place, and numbers that no medium takes.
 
     Raises:
         MivolError: as :func:`read_volume`.
     """
-    volume = read_volume(path, dataset)
-    values, finite = volume.values, np.isfinite(volume.values)
+    is_sparse = is_sparse_file(path)
+    volume = read_sparse_volume(path, dataset) if is_sparse else read_volume(path, dataset)
+    # Statistics of a large sparse volume count the voxels of its bricks, and 0 outside.
+    is_whole = not is_sparse or volume.dense_bytes <= LARGEST_DENSE
+    values = volume.dense() if is_sparse and is_whole else volume.values
+    finite = np.isfinite(values)
     size = " x ".join(str(n) for n in volume.size)
+    channels, voxels = values.shape[-1], math.prod(map(int, volume.size))
+    memory = f"{voxels * channels * 4 / 2**20:.3g} MiB in memory"
+    if is_sparse:
+        memory += f", {volume.values.nbytes / 2**20:.3g} MiB in {len(volume.values)} bricks"
     corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ volume.to_world[:3].T
     is_turned = np.count_nonzero(volume.to_world[:3, :3]) > 3
     array = volume.meta.get("grid") or volume.meta.get("dataset")
     lines = [
         f"{path}: {FORMATS[_find_suffix(path, FORMATS)].name}" + (f", array {array!r}" if array else ""),
-        f"voxels (x, y, z): {size}, {values.shape[3]} channel{'s' if values.shape[3] > 1 else ''} of {volume.meta['dtype']}, "
-        f"{values.nbytes / 2**20:.3g} MiB in memory",
+        f"voxels (x, y, z): {size}, {channels} channel{'s' if channels > 1 else ''} of {volume.meta['dtype']}, {memory}",
         f"box: {format_point(corners.min(axis=0))} to {format_point(corners.max(axis=0))}"
         + (" around the turned axes" if is_turned else "")
         + f"; voxel {format_point(volume.spacing)}",
     ]
     if finite.any():
         inside = values[finite]
-        shares = f"mean {inside.mean(dtype=np.float64):.4g}, {100 * np.mean(inside == 0):.3g} % are 0"
-        lines.append(f"values: {inside.min():.4g} to {inside.max():.4g}, {shares}")
+        # Voxels outside of all bricks are 0.
+        total = voxels * channels - np.count_nonzero(~finite)
+        shares = f"mean {inside.sum(dtype=np.float64) / total:.4g}, {100 * (1 - np.count_nonzero(inside) / total):.3g} % are 0"
+        low, high = (min(inside.min(), 0), max(inside.max(), 0)) if not is_whole else (inside.min(), inside.max())
+        lines.append(f"values: {low:.4g} to {high:.4g}, {shares}")
         if negative := np.count_nonzero(inside < 0):
             lines.append(f"{negative} values are below 0: no extinction, albedo or emission takes them")
     if not finite.all():

@@ -82,6 +82,16 @@ class SparseVolumeData:
         return self.values.shape[4]
 
     @property
+    def size(self) -> np.ndarray:
+        """Voxels along x, y, z, int (3,)."""
+        return np.array(self.shape[::-1])
+
+    @property
+    def spacing(self) -> np.ndarray:
+        """Distances between neighbouring voxel centres along x, y, z, float64 (3,) [length]."""
+        return np.linalg.norm(self.to_world[:3, :3] / self.size, axis=0)
+
+    @property
     def numbers(self) -> np.ndarray:
         """Number of each brick among all bricks of the box (z, y, x), uint32, ascending."""
         return np.ravel_multi_index(self.bricks.T, count_bricks(self.shape, self.offset)).astype(np.uint32)

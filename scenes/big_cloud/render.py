@@ -24,7 +24,7 @@ EDGE = 8
 """Voxels along the edge of a brick."""
 CHUNK = 4096
 """Bricks that are made at once."""
-EXTINCTION = 90.0
+EXTINCTION = 150.0
 """Extinction [1/length] in the cloud, whose box has the edge 1."""
 OCTAVES = [(8 * 2**k, 0.62**k) for k in range(5)]
 """Period of each octave of noise [1/length], and its amplitude."""
@@ -87,16 +87,16 @@ def make_scene(cloud: mivol.SparseVolumeData, size: int, spp: int) -> mi.Scene:
     }
     droplets = {"type": "mivol_medium", "sigma_t": grid, "albedo": 0.999, "phase": {"type": "mivol_hg", "g": 0.8}}
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
-    view = to_world().look_at([0.5, -1.05, 0.12], [0.5, 0.5, 0.36], [0, 0, 1])
+    view = to_world().look_at([0.5, -1.05, 0.12], [0.5, 0.5, 0.4], [0, 0, 1])
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "mivol", "max_depth": 24},
-            "sensor": {"type": "perspective", "fov": 42, "to_world": view, "film": film,
+            "sensor": {"type": "perspective", "fov": 29, "to_world": view, "film": film,
                        "sampler": {"type": "independent", "sample_count": spp}},
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.16, 0.32, 0.68]}},
-            "sun": {"type": "directional", "direction": [0.75, 0.55, -0.6],
-                    "irradiance": {"type": "rgb", "value": [5.2, 4.7, 4.0]}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.07, 0.17, 0.42]}},
+            "sun": {"type": "directional", "direction": [0.8, 0.25, -0.55],
+                    "irradiance": {"type": "rgb", "value": [4.4, 3.9, 3.2]}},
             "cloud": {"type": "cube", "to_world": to_world().scale(0.5).translate(1), "bsdf": {"type": "null"},
                       "interior": droplets},
         }
