@@ -13,6 +13,7 @@ from pathlib import Path
 import h5py
 import laspy
 import numpy as np
+from dicom_series import write_frames, write_series
 from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
 from photo_sets import write_blender, write_colmap, write_transforms
 from PIL import Image
@@ -59,6 +60,14 @@ def _projections(path: Path) -> None:
         for name, shape in (("data", (4, 3, 5)), ("data_white", (2, 3, 5)), ("data_dark", (2, 3, 5))):
             file[f"exchange/{name}"] = rng.integers(1, 999, shape).astype(np.uint16)
         file["exchange/theta"] = np.linspace(0, 180, 4, endpoint=False)
+
+
+def _dicom(path: Path) -> None:
+    write_frames(path, numbered()[..., 0].astype("i2"), "axial", [1, 0], [1.0, 2.0])
+
+
+def _series(folder: Path) -> None:
+    write_series(folder, numbered()[..., 0].astype("i2"), names=["a.dcm", "b.dcm"])
 
 
 def _hdf5(path: Path) -> None:
@@ -220,6 +229,7 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "pbrt": (".pbrt", _bytes(pbrt(numbered())), mivol.read_volume),
     "vdb": (".vdb", _volume, mivol.read_volume),
     "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
+    "dicom": (".dcm", _dicom, mivol.read_volume),
     "hdf5": (".h5", _hdf5, mivol.read_volume),
     "projections": (".h5", _projections, read_projections),
     "stack": (".tif", lambda path: Image.fromarray(np.eye(8, 9, dtype=np.float32)).save(path), read_stack),
@@ -254,6 +264,7 @@ FILES: dict[str, tuple[str, Write, Read]] = {
 SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
     "nrrd detached": (_detached_nrrd, ("a.nhdr", "a.raw"), lambda folder: mivol.read_volume(folder / "a.nhdr")),
     "metaimage detached": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.mhd")),
+    "dicom series": (_series, ("a.dcm", "b.dcm"), mivol.read_volume),
     "nikon": (_nikon, ("bead.xtekct", "_ctdata.txt", "bead_0002.tif"), _read_nikon),
     "run": (_run, ("run.json", "metrics.jsonl", "a.png", "a.vol"), write_page),
     "blender": (

@@ -129,7 +129,7 @@ SEED = flag("--seed", type=int, default=0, help="seed of the random numbers (def
 CLUSTER = flag(
     "--cluster", metavar="WHERE", help="run on workers of Dask: local:N, tcp://host:port, tls://host:port, or a TOML file"
 )
-DATASET = flag("--dataset", help="array of a volume file with several arrays (default: the only one)")
+DATASET = flag("--dataset", help="array of a volume file with several arrays, or series of DICOM (default: the only one)")
 MAX_DEPTH = flag("--max-depth", type=int, help="longest path (default: the max_depth of the scene's integrator)")
 
 
@@ -341,8 +341,8 @@ def explain(arguments: argparse.Namespace) -> int:
     """Say what mivol would do with a scene or an experiment, and why, before it renders more than a small preview.
 
     For photographs, explain lists present and missing data, and draws the cameras with --output. For points and
-    Gaussians, it prints their number, extent, sizes and opacities; for a volume or a field, its size, values and place. A
-    refusal comes after the facts, with exit code 1.
+    Gaussians, it prints their number, extent, sizes and opacities; for a volume (or the folder of a DICOM series) or a field,
+    its size, values and place. A refusal comes after the facts, with exit code 1.
     """
     from mivol.photos import find_format
     from mivol.points.summary import is_points_file, summarize_file
@@ -372,12 +372,12 @@ def explain(arguments: argparse.Namespace) -> int:
 
 def explain_array(arguments: argparse.Namespace) -> int | None:
     """Explain a scan or describe a volume, and return the exit code; None for anything else."""
-    from mivol.files.formats import describe_volume, is_volume_file
+    from mivol.files.formats import describe_volume, is_volume
 
-    is_volume = is_volume_file(_check_dataset(arguments.scene, arguments.dataset))
-    if draft := draft_of(arguments.scene, arguments, is_volume):
+    is_array = is_volume(_check_dataset(arguments.scene, arguments.dataset))
+    if draft := draft_of(arguments.scene, arguments, is_array):
         return explain_scan(draft)
-    if not is_volume:
+    if not is_array:
         return None
     print(describe_volume(arguments.scene, arguments.dataset))
     return 0
@@ -393,7 +393,7 @@ def explain_scan(draft: ScanDraft) -> int:
     return int(bool(answer.refusal))
 
 
-def draft_of(path: Path, arguments: argparse.Namespace, is_volume: bool = False) -> ScanDraft | None:
+def draft_of(path: Path, arguments: argparse.Namespace, is_array: bool = False) -> ScanDraft | None:
     """Return the settings of a scan without a TOML file; None for anything else.
 
     An HDF5 file without the layout of a scan counts as one if its suffix is not that of a volume, or with ``--set``;
@@ -408,7 +408,7 @@ def draft_of(path: Path, arguments: argparse.Namespace, is_volume: bool = False)
     is_photographs = arguments.preset is not None or arguments.model is not None
     if is_photographs or getattr(arguments, "dataset", None) is not None or path.suffix.lower() == ".toml":
         return None
-    is_named = path.is_file() and is_hdf5(path) and (arguments.set or not is_volume)
+    is_named = path.is_file() and is_hdf5(path) and (arguments.set or not is_array)
     return draft_scan(path, arguments.set) if is_named or find_scan(path) else None
 
 
@@ -422,18 +422,20 @@ def _is_experiment(arguments: argparse.Namespace) -> bool:
 
 
 def _check_contents(path: Path) -> None:
-    """Refuse binary data that no reader of a scene, an experiment, a cloud or a volume takes."""
-    from mivol.files.formats import is_unread, refuse_unread
+    """Refuse a volume, and binary data that no reader takes, in place of a scene, an experiment or a cloud."""
+    from mivol.files.formats import is_unread, is_volume, refuse_unread
 
     if is_unread(path):
         raise refuse_unread(path)
+    if is_volume(path):
+        raise MivolError(f"{path}: found a volume, expected a scene, a fit or points; mivol explain and mivol convert take it.")
 
 
 def _check_dataset(path: Path, dataset: str | None) -> Path:
     """Return the file; refuse ``--dataset`` for a file that is no volume."""
-    from mivol.files.formats import is_volume_file
+    from mivol.files.formats import is_volume
 
-    if dataset is not None and not is_volume_file(path):
+    if dataset is not None and not is_volume(path):
         raise MivolError(f"--dataset names an array of a volume, and {path} is no volume: leave it out.")
     return path
 
@@ -605,6 +607,7 @@ def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Pat
     from mivol import config
     from mivol.photos import find_format
 
+    _check_contents(path)
     if path.is_dir() or (path.suffix.lower() == ".json" and find_format(path)):
         model = arguments.model or next(iter(config.MODELS))
         _check_preset(model, arguments.preset)
@@ -614,7 +617,6 @@ def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Pat
         fault = f"--as and --preset are for photographs, and {path} {'is an experiment' if is_experiment else 'holds none'}"
         advice = "its tables [gaussians] or [field] name model and preset" if is_experiment else "leave them out"
         raise MivolError(f"{fault}: {advice}.")
-    _check_contents(path)
     return config.load(path, arguments.set), path.parent
 
 
@@ -686,10 +688,10 @@ def convert(arguments: argparse.Namespace) -> None:
     Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     """
-    from mivol.files.formats import is_volume_file
+    from mivol.files.formats import is_volume
 
-    is_volume = is_volume_file(_check_dataset(arguments.source, arguments.dataset))
-    print((_convert_volume if is_volume else _convert_cloud)(arguments))
+    is_array = is_volume(_check_dataset(arguments.source, arguments.dataset))
+    print((_convert_volume if is_array else _convert_cloud)(arguments))
 
 
 def _convert_volume(arguments: argparse.Namespace) -> str:

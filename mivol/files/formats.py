@@ -1,8 +1,8 @@
 """The table of volume formats, and the functions that read and write every format in it.
 
-The suffix selects the format, and the first bytes must agree. A new format is a reader module and an entry in :data:`FORMATS`
-(and in :data:`WRITERS`); messages and docs read the tables. A stack of headerless slices has no format:
-:func:`mivol.files.read_slices` reads it with facts from the caller.
+The suffix selects the format, and the first bytes must agree; DICOM is known by its contents, in folders and under any suffix.
+A new format is a reader module and an entry in :data:`FORMATS` (and in :data:`WRITERS`); messages and docs read the tables. A
+stack of headerless slices has no format: :func:`mivol.files.read_slices` reads it with facts from the caller.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from mivol.display import format_point
 from mivol.errors import MivolError
-from mivol.files import hdf5, metaimage, mrc, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
+from mivol.files import dicom, hdf5, metaimage, mrc, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
 from mivol.files.sparse_volume import SparseVolumeData
@@ -56,6 +56,7 @@ _METAIMAGE = VolumeFormat("MetaImage", _is_metaimage, metaimage.read_metaimage)
 _NRRD = VolumeFormat("NRRD", _starts_with(nrrd.MAGIC), nrrd.read_nrrd)
 _HDF5 = VolumeFormat("HDF5", _starts_with(hdf5.MAGIC), hdf5.read_hdf5)
 _MRC = VolumeFormat("MRC", mrc.is_mrc, mrc.read_mrc)
+_DICOM = VolumeFormat("DICOM", dicom.is_dicom, dicom.read_dicom)
 _LES = VolumeFormat("LES cloud text", renderer_grids.is_les, renderer_grids.read_les)
 
 #: suffix -> format; a longer suffix is tried first.
@@ -80,12 +81,13 @@ FORMATS: dict[str, VolumeFormat] = {
     ".mrc": _MRC,
     ".map": _MRC,
     ".rec": _MRC,
+    ".dcm": _DICOM,
 }
 
 #: name of a kind of file without a reader here -> (test of the first ``HEAD`` bytes, way out).
 UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
     "an MRC file": (mrc.is_mrc, "name it .mrc"),
-    "a DICOM file": (lambda head: head[128:132] == b"DICM", "convert its series to .nii or .nrrd, with dcm2niix for example"),
+    "a DICOM file": (dicom.is_dicom, "describe or convert it by mivol explain and mivol convert"),
     "a MATLAB file": (_starts_with(b"MATLAB"), "save the array as .npy or .h5"),
     "an HDF5 file": (_starts_with(hdf5.MAGIC), "name a volume .h5; explain and optimize find the data of a scan"),
     "a TIFF file": (
@@ -118,8 +120,9 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
     """Read a volume of any format in :data:`FORMATS`.
 
     Args:
-        path: file; the suffix selects the format, and the first bytes must agree.
-        dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .h5, LES text).
+        path: file; the suffix selects the format, and the first bytes must agree. The folder, or a file, of a DICOM series.
+        dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .h5, LES text); number or
+            ``SeriesInstanceUID`` of a DICOM series.
         frame: key of :data:`FRAMES`: "file" places the volume as in the header and refuses a degenerate box, "unit" puts the
             volume on the unit cube.
 
@@ -133,21 +136,15 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
         >>> read_volume("tooth.nrrd").values.shape
         (161, 94, 103, 1)
     """
-    path = check_file(path)
-    if not path.name.lower().endswith(tuple(FORMATS)):
-        raise refuse_unread(path)
-    return _read_checked(path, FORMATS[_find_suffix(path, FORMATS)].read, dataset, frame)
+    path = Path(path)
+    kind = _find_format(path)
+    return _read_placed(path, kind.read, dataset, frame)
 
 
-def _read_checked(path: Path, read: Callable, dataset: str | None, frame: str) -> Any:
-    """Read a volume by ``read``, once its first bytes agree with its suffix, and place it."""
+def _read_placed(path: Path, read: Callable, dataset: str | None, frame: str) -> Any:
+    """Read a volume by ``read``, and place it."""
     if frame not in FRAMES:
         raise refusal("read_volume", f"frame={frame!r}", f"one of {', '.join(FRAMES)}", "choose one")
-    suffix = _find_suffix(path, FORMATS)
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-    if not FORMATS[suffix].recognise(head):
-        raise _wrong_format(path, suffix, head)
     try:
         volume = read(path, dataset)
     except MemoryError as error:
@@ -186,7 +183,9 @@ def read_sparse_volume(path: str | os.PathLike, dataset: str | None = None, *, f
     if not is_sparse_file(path):
         volume = read_volume(path, dataset, frame=frame)
         return dataclasses.replace(SparseVolumeData.from_dense(volume.values, volume.to_world), meta=volume.meta)
-    return _read_checked(check_file(path), SPARSE_READERS[_find_suffix(Path(path), SPARSE_READERS)], dataset, frame)
+    path = Path(path)
+    _find_format(path)
+    return _read_placed(path, SPARSE_READERS[_find_suffix(path, SPARSE_READERS)], dataset, frame)
 
 
 def write_volume(
@@ -232,9 +231,11 @@ VOLUME_SUFFIXES = tuple(suffix for suffix in FORMATS if suffix not in SHARED_SUF
 """Suffixes of volumes alone."""
 
 
-def is_volume_file(path: Path) -> bool:
-    """Whether a suffix belongs to volumes alone."""
-    return path.name.lower().endswith(VOLUME_SUFFIXES)
+def is_volume(path: Path) -> bool:
+    """Whether a suffix belongs to volumes alone, or a folder or a file without such a suffix holds DICOM."""
+    if path.is_dir():
+        return _is_dicom_folder(path)
+    return path.name.lower().endswith(VOLUME_SUFFIXES) or _is_nameless_dicom(path)
 
 
 LARGEST_DENSE = 1 << 28
@@ -262,7 +263,7 @@ def describe_volume(path: Path, dataset: str | None = None) -> str:
     is_turned = np.count_nonzero(volume.to_world[:3, :3]) > 3
     array = volume.meta.get("grid") or volume.meta.get("dataset")
     lines = [
-        f"{path}: {FORMATS[_find_suffix(path, FORMATS)].name}" + (f", array {array!r}" if array else ""),
+        f"{path}: {_find_format(path).name}" + (f", array {array!r}" if array else ""),
         f"voxels (x, y, z): {size}, {channels} channel{'s' if channels > 1 else ''} of {volume.meta['dtype']}, {memory}",
         f"box: {format_point(corners.min(axis=0))} to {format_point(corners.max(axis=0))}"
         + (" around the turned axes" if is_turned else "")
@@ -279,14 +280,14 @@ def describe_volume(path: Path, dataset: str | None = None) -> str:
             lines.append(f"{negative} values are below 0: no extinction, albedo or emission takes them")
     if not finite.all():
         lines.append(f"{np.count_nonzero(~finite)} values are NaN or Inf: no medium takes them")
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"assumed: {note}" for note in volume.meta.get("notes", ()))])
 
 
 def convert_volume(source: Path, target: Path, dataset: str | None = None) -> str:
     """Write a volume in another format; its values and place are kept.
 
     Returns:
-        A line that describes the written file, and what it does not hold.
+        A line that describes the written file and what it does not hold, and a line for each assumption about the source.
 
     Raises:
         MivolError: as :func:`read_volume` and :func:`write_volume`.
@@ -302,7 +303,8 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None) -> st
         lost.append("the place")
     write_volume(target, volume.values, place, metadata=space)
     size = " x ".join(str(n) for n in volume.size)
-    return f"{target}: {size} voxels" + (f"; {suffix} does not hold {' and '.join(lost)}" if lost else "")
+    line = f"{target}: {size} voxels" + (f"; {suffix} does not hold {' and '.join(lost)}" if lost else "")
+    return "\n".join([line, *(f"assumed: {note}" for note in volume.meta.get("notes", ()))])
 
 
 def is_unread(path: Path) -> bool:
@@ -321,9 +323,38 @@ def refuse_unread(path: Path) -> MivolError:
     return refusal(path, f"{found} with {suffix}", f"a volume of {', '.join(FORMATS)}", UNREAD[found][1])
 
 
-def _find_unread(path: Path) -> str | None:
+def _find_format(path: Path) -> VolumeFormat:
+    """The format of a folder, of DICOM with any other suffix, or of a suffix with which the first bytes agree."""
+    if path.is_dir() and _is_dicom_folder(path):
+        return _DICOM
+    check_file(path)
+    if not path.name.lower().endswith(tuple(FORMATS)):
+        if _is_nameless_dicom(path):
+            return _DICOM
+        raise refuse_unread(path)
+    suffix = _find_suffix(path, FORMATS)
+    head = _read_head(path)
+    if not FORMATS[suffix].recognise(head):
+        raise _wrong_format(path, suffix, head)
+    return FORMATS[suffix]
+
+
+def _is_dicom_folder(path: Path) -> bool:
+    return any(True for _ in dicom.find_dicom(path))
+
+
+def _is_nameless_dicom(path: Path) -> bool:
+    """Whether a file with a suffix of no other format is DICOM: scanners write names such as IM0001."""
+    return not path.name.lower().endswith(tuple(FORMATS)) and path.is_file() and dicom.is_dicom(_read_head(path))
+
+
+def _read_head(path: Path) -> bytes:
     with path.open("rb") as file:
-        head = file.read(HEAD)
+        return file.read(HEAD)
+
+
+def _find_unread(path: Path) -> str | None:
+    head = _read_head(path)
     return next((name for name, (recognise, _) in UNREAD.items() if recognise(head)), None)
 
 

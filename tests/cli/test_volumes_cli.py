@@ -83,7 +83,6 @@ def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pyte
     ("name", "head", "found", "way_out"),
     [
         ("a.st", bytes(208) + b"MAP " + bytes(812), "an MRC file", "name it .mrc"),
-        ("a.dcm", bytes(128) + b"DICM", "a DICOM file", ".nii or .nrrd"),
         ("a.mat", b"MATLAB 5.0 MAT-file", "a MATLAB file", ".npy or .h5"),
         ("a.tif", b"II*\0" + bytes(8), "a TIFF file", "the folder of TIFF files"),
         ("a.raw", bytes(64), "raw bytes", ".nhdr or .mhd"),
