@@ -15,6 +15,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.gaussian_field import GaussianField
 from mivol.scene_graph import traverse
+from mivol.transport.media.medium_view import ASYMMETRY
 from mivol.transport.traversal.box import clip_to_box
 
 COEFFICIENT_PAIRS = (("sigma_t", "albedo"), ("sigma_a", "sigma_s"))
@@ -218,9 +219,13 @@ def check_coefficient(value: float, name: str, owner: str = "") -> None:
         owner: the owner of the coefficient, if an optimizer may have moved the number: `` of the medium in smoke``.
 
     Raises:
-        MivolError: a NaN, infinite or negative number, or an albedo above 1.
+        MivolError: a NaN, infinite or negative number, an albedo above 1, or a mean cosine outside (-1, 1).
     """
     way_out = ": clip it after each step" if owner else ""
+    if name == ASYMMETRY:
+        if not -1 < value < 1:
+            raise MivolError(f"{name}{owner} is {value:.9g}; a mean cosine between -1 and 1 is expected{way_out}.")
+        return
     if not np.isfinite(value) or value < 0:
         raise MivolError(f"{name}{owner} is {value:.9g}; a finite number of at least 0 is expected{way_out}.")
     if name == "albedo" and value > 1:

@@ -327,9 +327,10 @@ class Needs(ShapeFacts):
         """Whether a shape emits light."""
         return "AreaLight" in self.emitters
 
-    def with_views(self, survey: SceneSurvey) -> Needs:
-        """The same facts with the media viewed anew: a recording reads their arrays from the scene."""
-        return replace(self, views=tuple(b.view(survey.places) for b in self.boundaries))
+    def with_views(self, survey: SceneSurvey, asymmetries: list[mi.Float | None]) -> Needs:
+        """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``asymmetries``."""
+        views = (b.view(survey.places) for b in self.boundaries)
+        return replace(self, views=tuple(replace(v, asymmetry=g) for v, g in zip(views, asymmetries, strict=True)))
 
     def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
         """Build the media of the scene among its surfaces.

@@ -6,7 +6,7 @@ recording reads the arrays of that call.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -20,6 +20,7 @@ from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
+from mivol.transport.media.medium_view import read_asymmetry
 from mivol.transport.path.derivatives import prepare_derivatives, replay_branches
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
@@ -35,11 +36,14 @@ class PreparedArrays:
         readings: what transport reads of the values of media.
         light: table of the light of media (density, cumulative); None without a table.
         views: sensors of a ``batch``; None for another sensor.
+        asymmetries: the ``g`` of the stock ``hg`` of each medium, which Mitsuba hides from Dr.Jit; None for another phase
+            function.
     """
 
     readings: Readings
     light: tuple[mi.Float, mi.Float] | None
     views: mi.SensorPtr | None
+    asymmetries: list[mi.Float | None] = field(default_factory=list)
 
 
 @dataclass
@@ -63,6 +67,10 @@ class PlannedScene:
     plan: Plan
     arrays: PreparedArrays
     unrecorded: str | None = None
+
+    def read_arrays(self) -> PreparedArrays:
+        """The arrays of the next call. The derivatives of a ``g`` belong to one step, so they are not kept."""
+        return replace(self.arrays, asymmetries=[read_asymmetry(boundary.medium) for boundary in self.needs.boundaries])
 
     def is_for(self, state: SceneState, spp: int) -> bool:
         """Whether a scene in this state, with so many samples, has the same facts."""
@@ -102,7 +110,7 @@ class RenderTask(RecordedTask):
 
     def build_estimators(self, scene: mi.Scene, arrays: PreparedArrays) -> Estimators:
         """Build the planned estimators over the arrays of the scene."""
-        needs = self.needs.with_views(self.survey)
+        needs = self.needs.with_views(self.survey, arrays.asymmetries)
         if arrays.light is not None:
             needs = replace(needs, media_light=MediaLight(*arrays.light))
         return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, arrays.readings)

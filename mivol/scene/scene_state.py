@@ -1,8 +1,8 @@
 """The state of a scene's parameters: what has changed since a plan was made, and what a recording follows by itself.
 
 Conventions. A plan holds as long as no parameter has changed. A recording (:mod:`mivol.kernel_recording`) holds longer: it
-reads the values of volumes and textures anew in every call. All other parameters are part of its key, since some of them decide
-on the host what is traced: the place of a shape, the ``scale`` of a stock medium, the ``g`` of a stock ``hg``.
+reads the values of volumes, textures and phase functions anew in every call. All other parameters are part of its key, since
+some of them decide on the host what is traced: the place of a shape, the ``scale`` of a stock medium.
 """
 
 from __future__ import annotations
@@ -131,6 +131,9 @@ def _is_followed(owner: mi.Object, key: str) -> bool:
     """Whether a recording follows the values of a parameter."""
     if _is_of_mivol(owner):
         return True
+    if owner.class_name() == "HGPhaseFunction":
+        # Of a medium: its ``g`` is an input. A lobe of a mixture is called through its pointer, where ``g`` is hidden.
+        return key.endswith("phase_function.g")
     if isinstance(owner, mi.Volume | mi.Texture):
         return key.rpartition(".")[2] in FOLLOWED
     return isinstance(owner, mi.Sensor) and owner.class_name() == FOLLOWED_SENSOR

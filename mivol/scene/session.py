@@ -119,7 +119,7 @@ class Session:
             with dr.resume_grad():
                 opened = self._open(scene, sensor, spp, SceneState.of(scene, sensor), for_images=False)
                 task = RenderTask(opened, self.settings, self.aovs, for_images=False)
-                estimators = task.build_estimators(scene, opened.arrays)
+                estimators = task.build_estimators(scene, opened.read_arrays())
                 estimators.media.find_followed()
                 estimators.media.start_tangent()
             samples = task.samples(sensor, opened.arrays, seed)
@@ -144,7 +144,7 @@ class Session:
             sensor = find_sensor(scene, 0)
             opened = self._open(scene, sensor, 1, SceneState.of(scene, sensor), for_images=True)
             task = RenderTask(opened, self.settings, self.aovs, for_images=True)
-            estimators = task.build_estimators(scene, opened.arrays)
+            estimators = task.build_estimators(scene, opened.read_arrays())
             media = estimators.media
             named = [sensor.get_medium() for sensor in scene.sensors()]
             media.start = named[0] if all(medium is named[0] for medium in named) else None
@@ -159,7 +159,7 @@ class Session:
         def make() -> RenderTask:
             return kind(opened, self.settings, self.aovs)
 
-        given = (scene, sensor, opened.arrays, *inputs)
+        given = (scene, sensor, opened.read_arrays(), *inputs)
         if is_recording() or opened.unrecorded is not None:
             return make()(*given)
         gradients = [(value, dr.grad(value)) for value in find_differentiated(scene)] if kind is GradientTask else []

@@ -22,7 +22,7 @@ from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.event import DirectionSamples, NextDirection, PathEvent, sample_next_direction
 from mivol.transport.traversal.rays import point_along
 from mivol.validate.moments import Moments
-from scenes import box_of, camera, media_of, medium
+from scenes import box_of, camera, centred, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -84,9 +84,10 @@ class FallingRays:
     """Rays falling from z = 2 on a rectangle in the plane z = 0, with ends 5 behind the rectangle."""
 
     def __init__(self, bsdf: dict, lights_media: bool = True) -> None:
-        self.fog = mi.load_dict(medium("homogeneous", 0.5, phase={"type": "hg", "g": G}))
-        wall = {"type": "rectangle", "bsdf": bsdf}
-        media = media_of(mi.load_dict({"type": "scene", "wall": wall, "sensor": camera([0, -1, 4], [0, 0, 0])}))
+        far = box_of(medium("homogeneous", 0.5, phase={"type": "hg", "g": G}), centred(np.eye(3), (0, 0, 50)))
+        parts = {"wall": {"type": "rectangle", "bsdf": bsdf}, "far": far, "sensor": camera([0, -1, 4], [0, 0, 0])}
+        media = media_of(mi.load_dict({"type": "scene", **parts}))
+        self.fog = media.bodies[0].view.medium
         self.estimators = Estimators(DirectLighting(media), FreeFlight(media), Settings(), True, lights_media)
         zero = dr.zeros(mi.Float, 4)
         self.ray = mi.Ray3f(mi.Point3f(zero, 0, 2), mi.Vector3f(0, 0, -1), mi.Float(7), zero, mi.Color0f())

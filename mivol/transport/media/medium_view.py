@@ -32,7 +32,7 @@ from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridE
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["MediumView", "nested_field", "traverse_medium", "view_medium"]
+__all__ = ["ASYMMETRY", "MediumView", "nested_field", "read_asymmetry", "traverse_medium", "view_medium"]
 
 
 @dataclass
@@ -52,9 +52,12 @@ class MediumView:
         emission_lattice: the grid of ``emission_density``, ``emission`` or ``albedo``, whose cells are walked if the
             extinction has no grid. Its values are zeros.
         emission_arrays: the arrays of ``emission`` and ``emission_density``.
-        numbers: the constants among ``scale`` and the coefficients of the extinction, as in ``mi.traverse``.
+        numbers: the constants among ``scale``, the coefficients of the extinction and the ``g`` of a stock ``hg``, as in
+            ``mi.traverse``.
         stock_boxes: the boxes of stock grids of emission and albedo, by the pointer of the volume. Mitsuba repeats the border
             of a stock grid outside its box, where mivol has no emission.
+        is_isotropic: whether the phase function is Mitsuba's ``isotropic``.
+        asymmetry: the ``g`` of Mitsuba's ``hg`` [1], with derivatives; None for another phase function.
     """
 
     medium: mi.Medium
@@ -69,6 +72,8 @@ class MediumView:
     emission_arrays: list = field(default_factory=list)
     stock_boxes: dict[int, Box] = field(default_factory=dict)
     numbers: dict[str, float | mi.Float | mi.Color3f] = field(default_factory=dict)
+    is_isotropic: bool = False
+    asymmetry: mi.Float | None = None
 
     def holds(self, volume: mi.Volume, p: mi.Point3f) -> mi.Bool:
         """Whether a point lies in the box of a stock volume of emission; true for volumes of mivol, which are 0 outside."""
@@ -105,6 +110,9 @@ class MediumView:
 
 
 STOCK = ("HomogeneousMedium", "HeterogeneousMedium")
+
+ASYMMETRY = "phase_function.g"
+"""Name of the ``g`` of a medium with Mitsuba's ``hg``, as in ``mi.traverse``."""
 
 
 def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | None = None, level: int = 0) -> MediumView:
@@ -148,6 +156,9 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     emission_lattice = _emission_lattice(emission_density, light, boundary, places)
     stock_boxes = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats_border(v)}
     numbers = {k.partition(".")[0]: v for k, v in values if k in ("scale", *(f"{n}.value.value" for n in names))}
+    is_isotropic, asymmetry = _read_phase(medium)
+    if asymmetry is not None:
+        numbers[ASYMMETRY] = params[ASYMMETRY]
     return MediumView(
         medium,
         parts,
@@ -161,12 +172,33 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
         emission_arrays,
         stock_boxes,
         numbers,
+        is_isotropic,
+        asymmetry,
     )
 
 
 def _read_scale(scale: float | mi.Float) -> mi.Float:
     """A scale as an array. A literal other than 1 would make a new kernel for each number of a stock medium."""
     return dr.opaque(mi.Float, scale) if isinstance(scale, float) and scale != 1 else mi.Float(scale)
+
+
+def _read_phase(medium: mi.Medium) -> tuple[bool, mi.Float | None]:
+    """Whether the phase function of a medium is Mitsuba's ``isotropic``, and the ``g`` of Mitsuba's ``hg``."""
+    phase = medium.phase_function()
+    return phase is not None and phase.class_name() == "IsotropicPhaseFunction", read_asymmetry(medium)
+
+
+def read_asymmetry(medium: mi.Medium) -> mi.Float | None:
+    """The ``g`` of a medium with Mitsuba's ``hg`` [1], with its derivatives; None for another phase function."""
+    phase = medium.phase_function()
+    if phase is None or phase.class_name() != "HGPhaseFunction":
+        return None
+    g = traverse(phase)["g"]
+    if not dr.grad_enabled(g):
+        # A literal would make a new kernel for each number.
+        g = mi.Float(dr.detach(g))
+        dr.make_opaque(g)
+    return g
 
 
 def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:

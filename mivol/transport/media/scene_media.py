@@ -6,11 +6,14 @@ traced.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.body import Body, is_followed
 from mivol.transport.media.channels import to_scene_channels
+from mivol.transport.media.phases import ScenePhases
 from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["SceneMedia"]
@@ -52,11 +55,10 @@ class SceneMedia:
         self.size = dr.opaque(mi.Float, size)
         self.stops_rays = stops_rays
 
-    @property
-    def has_microflakes(self) -> bool:
-        """Whether some phase function is, or contains, a microflake phase function."""
-        phases = [b.view.medium.phase_function() for b in self.bodies]
-        return any(p is not None and int(p.flags()) & int(mi.PhaseFunctionFlags.Microflake) for p in phases)
+    @cached_property
+    def phases(self) -> ScenePhases:
+        """The phase functions of the media."""
+        return ScenePhases(self.bodies)
 
     @property
     def bodies(self) -> list[Body]:

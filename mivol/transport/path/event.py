@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.lighting.vertex import MediumVertex, MixedVertex, SurfaceVertex, Vertex, sample_phase
+from mivol.transport.estimators.lighting.vertex import MediumVertex, MixedVertex, SurfaceVertex, Vertex
 from mivol.transport.estimators.scores import TrackedFactor
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
 from mivol.transport.estimators.single_scattering.near_light import AimedDirections
@@ -203,7 +203,7 @@ def _sample_phase_function(
     """Sample a direction of the phase function. The flight ending here differentiates the albedo."""
     media, mei = estimators.media, collision.mei
     on = collision.on & may_scatter
-    wo, weight, pdf = sample_phase(media, mei, samples.component, samples.direction, on)
+    wo, weight, pdf = media.phases.sample(mei, samples.component, samples.direction, on)
     if (aimed := samples.aimed) is not None:
         wo = dr.select(aimed.is_drawn, aimed.draw(samples.direction), wo)
         f, pdf = MediumVertex(media, mei, collision.p).eval_and_pdf(wo, on)

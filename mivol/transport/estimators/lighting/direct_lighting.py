@@ -32,7 +32,7 @@ from mivol.transport.estimators.lighting.emitters import (
 )
 from mivol.transport.estimators.lighting.moving_emitters import attach_position, moving_transmittance
 from mivol.transport.estimators.lighting.shadow_rays import find_transmittance, trace_shadow_ray
-from mivol.transport.estimators.lighting.vertex import MediumVertex, Vertex, sample_phase
+from mivol.transport.estimators.lighting.vertex import MediumVertex, Vertex
 from mivol.transport.estimators.scores import TrackedTerm
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
@@ -289,7 +289,7 @@ class DirectLighting:
     ) -> DirectSample:
         """Light from a direction sampled from the phase function."""
         emitters, mei = self.emitters, vertex.interaction
-        wo, weight, pdf = sample_phase(self.media, mei, samples.component, samples.direction, active)
+        wo, weight, pdf = self.media.phases.sample(mei, samples.component, samples.direction, active)
         on = active & (pdf > 0)
         ray = FineRay.from_point(vertex.p, wo, mei)
         end, _, passages, light = find_transmittance(self.media, ray, mei.medium, on, rng)

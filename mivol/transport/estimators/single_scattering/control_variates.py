@@ -138,7 +138,7 @@ def supports_grid_control(media: SceneMedia) -> bool:
     """Whether the media can have a grid control: a single medium in a box, with one grid of extinction and an albedo."""
     parts = [p for b in media.bodies for p in b.view.parts]
     alone = len(parts) == 1 and not media.traced and parts[0].lattice is not None
-    return alone and media.bodies[0].view.albedo is not None and not media.has_microflakes
+    return alone and media.bodies[0].view.albedo is not None and not media.phases.has_microflakes
 
 
 def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigins) -> GridControl:

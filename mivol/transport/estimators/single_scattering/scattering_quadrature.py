@@ -221,7 +221,7 @@ class _LitRay:
         emitter = self.quadrature.emitters.sampled[self.number]
         mei = medium_interaction(self.ray, t, body.view.medium)
         direct, weight = emitter.sample_direction(mei, mi.Point2f(0.5), on)
-        f, _ = body.view.medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, direct.d, on)
+        f = media.phases.eval(mei, direct.d, on)
         if grid is None:
             _, clear, _, seen = trace_shadow_ray(media, point_along(self.ray, t), mei.medium, direct, on)
             seen = dr.select(clear, seen, 0)
