@@ -84,7 +84,8 @@ def shared_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarra
     focus = find_focus(cameras, name)
     box = _shared_region(cameras, focus, median_distance(cameras, focus))
     if box is None:
-        raise refusal(name, "views without a shared region", "cameras around one subject", "give the box with box=")
+        way_out = 'choose box = "middle" for cameras that look around'
+        raise refusal(name, "views without a shared region", "cameras around one subject", way_out)
     return box
 
 

@@ -47,6 +47,8 @@ def test_the_middle_box_of_a_tele_lens_is_what_its_frames_share() -> None:
     around = [Camera(c.K, c.size, _moved(c, -0.3)) for c in cameras(9)]
     reach = np.median([np.linalg.norm(c.origin) for c in around])
     np.testing.assert_allclose(middle_box(around), MIDDLE * reach * np.array([[-1.0] * 3, [1.0] * 3]), atol=1e-9)
+    with pytest.raises(MivolError, match='views without a shared region, .*; choose box = "middle"'):
+        shared_box(around)
 
 
 @pytest.mark.parametrize(("focal", "within"), [(96.0, 1.0), (48.0, 1.0), (19.2, 0.35 * 19.2 / 16), (6.4, 0.25)])
