@@ -208,6 +208,7 @@ def render_flags() -> list:
         flag("--integrator", help="integrator in place of the scene's, with the same max_depth: mivol, volpath, ..."),
         flag("--spp", type=int, help="samples per pixel (default: the number of the sensor's sampler)"),
         SEED,
+        CLUSTER,
     ]  # fmt: skip
 
 
@@ -276,6 +277,7 @@ def validate_flags() -> list:
         flag("--reference-spp", type=int, default=1024, help="samples per pixel of Mitsuba's volpath (default: %(default)s)"),
         SEED,
         list_flag("--parameter", "key", "check the gradient of this parameter too"),
+        CLUSTER,
     ]
 
 
@@ -493,19 +495,22 @@ def render(arguments: argparse.Namespace) -> None:
 
     For a scene, the flags are the flags of the command mitsuba.
     """
+    from mivol.cli.cluster import check_alone, render_passes
     from mivol.experiments.render import check_output, choose_integrator, integrator_name, render_image, write_image
 
     path = arguments.output or arguments.scene.with_suffix(".exr")
     check_output(path)
     if view := view_without_scene(arguments):
+        check_alone(arguments)
         write_image(path, view(), ["R", "G", "B"])
         print(path)
         return
-    scene = load_named_scene(arguments).scene
-    integrator = choose_integrator(scene, arguments.integrator)
+    loaded = load_named_scene(arguments)
+    scene, integrator = loaded.scene, choose_integrator(loaded.scene, arguments.integrator)
     if integrator_name(integrator) != "mivol":
         print(f"rendered by {integrator_name(integrator)}; --integrator mivol renders with mivol", file=sys.stderr)
-    write_image(path, *render_image(scene, arguments.sensor, integrator, arguments.spp, arguments.seed))
+    with render_passes(arguments, loaded) as passes:
+        write_image(path, *render_image(scene, arguments.sensor, integrator, arguments.spp, arguments.seed, passes))
     print(path)
 
 
@@ -648,13 +653,16 @@ def validate(arguments: argparse.Namespace) -> int:
 
     The exit code is 0 if both agree, 3 if they differ, and 4 if Mitsuba's image is not reliable.
     """
+    from mivol.cli.cluster import validate_on_workers
     from mivol.experiments.validation import Validation, validate_scene
 
     options = Validation(
         max_depth=arguments.max_depth, spp=arguments.spp, reference_spp=arguments.reference_spp, seed=arguments.seed,
         sensor=arguments.sensor, parameters=tuple(arguments.parameter),
     )  # fmt: skip
-    verdict = validate_scene(load_named_scene(arguments), arguments.output, options)
+    loaded = load_named_scene(arguments)
+    with validate_on_workers(arguments, loaded, arguments.max_depth) as workers:
+        verdict = validate_scene(loaded, arguments.output, options, **workers)
     print(verdict.text)
     return verdict.code
 

@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
+from mivol.errors import MivolError
 from mivol.optim.interrupt import InterruptGuard
 
 if TYPE_CHECKING:
     from mivol.cluster.pool import Pool
     from mivol.config import Experiment
     from mivol.experiments.fit_kind import Distribution
+    from mivol.experiments.render import Passes
     from mivol.scene.load import LoadedScene
     from mivol.validate.reference import Complete
 
@@ -83,6 +85,48 @@ def complete_references(arguments: argparse.Namespace, loaded: LoadedScene) -> I
 
     with open_workers(arguments.cluster, arguments.mode, arguments.threads) as pool, status_line() as show:
         yield complete_on(pool, share_scene(pool, scene_source(arguments, SceneSource), loaded), show)
+
+
+@contextmanager
+def render_passes(arguments: argparse.Namespace, loaded: LoadedScene) -> Iterator[Passes | None]:
+    """The function that renders passes of an image on the workers of ``--cluster``; None without the flag."""
+    if arguments.cluster is None:
+        yield None
+        return
+    from mivol.cluster.packages import SceneSource, share_scene
+    from mivol.cluster.reference import passes_on
+
+    with open_workers(arguments.cluster, arguments.mode, arguments.threads) as pool, status_line() as show:
+        scene = share_scene(pool, scene_source(arguments, SceneSource), loaded)
+        yield passes_on(pool, scene, arguments.sensor, arguments.integrator, show)
+
+
+def check_alone(arguments: argparse.Namespace) -> None:
+    """Refuse ``--cluster`` for an image of a field or of points.
+
+    Raises:
+        MivolError: the flag is given.
+    """
+    if arguments.cluster is not None:
+        raise MivolError(f"{arguments.scene}: --cluster renders scenes (.xml); a field or points take seconds: leave it out.")
+
+
+@contextmanager
+def validate_on_workers(arguments: argparse.Namespace, loaded: LoadedScene, depth: int | None) -> Iterator[dict[str, Any]]:
+    """Keywords of :func:`mivol.experiments.validation.validate_scene` for the workers of ``--cluster``; none without it."""
+    if arguments.cluster is None:
+        yield {}
+        return
+    from mivol.cluster.packages import SceneSource, share_scene
+    from mivol.cluster.reference import complete_on, passes_on
+    from mivol.scene.explain import read_settings
+
+    depth = read_settings(loaded.scene).max_depth if depth is None else depth
+    integrator = {"type": "mivol", "max_depth": depth}
+    with open_workers(arguments.cluster, arguments.mode, arguments.threads) as pool, status_line() as show:
+        scene = share_scene(pool, scene_source(arguments, SceneSource), loaded)
+        passes = passes_on(pool, scene, arguments.sensor, integrator, show)
+        yield {"complete": complete_on(pool, scene, show), "make_passes": lambda *own: passes}
 
 
 def scene_source(arguments: argparse.Namespace, make: Callable[..., Any]) -> Any:

@@ -1,4 +1,4 @@
-"""References over the workers of a cluster: batches of views as work.
+"""References and images over the workers of a cluster: batches of views, and passes of samples, as work.
 
 Conventions. A unit is a few batches of one view. The owner adds batches in the order of their numbers, so a reference is the
 same to the bit as one of a single process. Workers begin the next views while the last batches of a view are on their way.
@@ -8,18 +8,21 @@ Batches beyond the end of a view, which its error decides, are thrown away.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mivol.cluster.packages import decode_sensor, encode_sensor, open_scene
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.workplace import Workplace
+from mivol.experiments.render import Passes, choose_integrator, render_in_turn
 from mivol.optim.interrupt import InterruptGuard
 from mivol.scene.load import LoadedScene
+from mivol.scene.sensors import find_sensor
 from mivol.validate.reference import PATHS_PER_PASS, Complete, PreparedReference, ReferenceResult, RenderSetup
 
 LONGEST_UNIT = 8
@@ -156,3 +159,60 @@ class _Queue:
         """Progress in a line."""
         parts = [f"view {v.number}: {v.reference.run.moments.n} of {v.reference.count_batches()}" for v in self.views if v.sent]
         return f"{len(self.pool.workers)} workers, batches of {', '.join(parts[:4])}{', ...' * (len(parts) > 4)}"
+
+
+# -- Images ------------------------------------------------------------------------------------------------------------------
+
+
+def render_pass(
+    place: Workplace, scene: str, sensor: int, integrator: str | dict[str, Any] | None, seed: int, spp: int
+) -> tuple[np.ndarray, float]:
+    """Render a pass in a worker.
+
+    Args:
+        place: the worker.
+        scene: content hash of the scene.
+        sensor: number of the sensor.
+        integrator: name, or dict of an integrator; None: the scene's.
+        seed, spp: seed, and samples per pixel.
+
+    Returns:
+        Image, float32, and the time of its render [s].
+    """
+    loaded = open_scene(place, scene)
+
+    def make() -> mi.Integrator:
+        return mi.load_dict(integrator) if isinstance(integrator, dict) else choose_integrator(loaded.scene, integrator)
+
+    used = place.made(f"integrator {scene} {integrator}", make)
+    return next(render_in_turn(loaded.scene, find_sensor(loaded.scene, sensor), used)([(seed, spp)]))
+
+
+def passes_on(
+    pool: Pool, scene: str, sensor: int, integrator: str | dict[str, Any] | None, show: Show = lambda line: None
+) -> Passes:
+    """Return the function that renders passes on workers, and yields them in their order.
+
+    Args:
+        pool: workers.
+        scene: content hash of the scene.
+        sensor: number of the sensor.
+        integrator: name, or dict of an integrator; None: the scene's.
+        show: receives the progress in a line.
+    """
+
+    def render(passes: Sequence[tuple[int, int]]) -> Iterator[tuple[np.ndarray, float]]:
+        units = (
+            Unit(number, render_pass, (scene, sensor, integrator, seed, spp), (scene,))
+            for number, (seed, spp) in enumerate(passes)
+        )
+        waiting: dict[int, tuple[np.ndarray, float]] = {}
+        due = 0
+        for number, found in pool.run(units):
+            waiting[number] = found
+            while due in waiting:
+                yield waiting.pop(due)
+                due += 1
+            show(f"{len(pool.workers)} workers, {due} of {len(passes)} passes")
+
+    return render

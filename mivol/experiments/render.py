@@ -8,11 +8,13 @@ without a scene, through a given camera.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import drjit as dr
 import matplotlib as mpl
 import mitsuba as mi
 import numpy as np
@@ -79,8 +81,30 @@ def choose_integrator(scene: mi.Scene, name: str | None = None) -> mi.Integrator
         raise MivolError(f'the integrator "{name}" cannot be loaded ({describe_error(error)}): choose "mivol".') from None
 
 
+Passes = Callable[[Sequence[tuple[int, int]]], Iterator[tuple[np.ndarray, float]]]
+"""Renders passes, each a seed and a number of samples per pixel, in their order: float32 images, and the time of each [s]."""
+
+
+def render_in_turn(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator) -> Passes:
+    """The function that renders passes one after another in this process, without derivatives."""
+
+    def render(passes: Sequence[tuple[int, int]]) -> Iterator[tuple[np.ndarray, float]]:
+        for seed, spp in passes:
+            start = time.monotonic()
+            with dr.suspend_grad():
+                image = np.array(integrator.render(scene, camera, seed=seed, spp=spp))
+            yield image, time.monotonic() - start
+
+    return render
+
+
 def render_image(
-    scene: mi.Scene, sensor: int, integrator: mi.Integrator | None = None, spp: int | None = None, seed: int = 0
+    scene: mi.Scene,
+    sensor: int,
+    integrator: mi.Integrator | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+    passes: Passes | None = None,
 ) -> tuple[np.ndarray, list[str]]:
     """Render a scene: image (height, width, channels) and channel names.
 
@@ -90,6 +114,7 @@ def render_image(
         integrator: integrator; None means the scene's own.
         spp: samples per pixel; None means the number of the sensor's sampler.
         seed: seed of the random numbers.
+        passes: renders passes on workers; None: in this process.
 
     Raises:
         MivolError: an unknown sensor, no integrator, no samples, or a film beyond the memory.
@@ -101,11 +126,10 @@ def render_image(
     check_film(camera, KEPT)
     most = max(SAMPLES_PER_PASS // math.prod(int(n) for n in camera.film().crop_size()), 1)
     n = math.ceil(spp / most)
+    parts = [(derive_seed(seed, number) if n > 1 else seed, spp // n + (number < spp % n)) for number in range(n)]
     total = 0.0
-    for number in range(n):
-        part = spp // n + (number < spp % n)
-        root = derive_seed(seed, number) if n > 1 else seed
-        total = total + part * np.asarray(integrator.render(scene, camera, seed=root, spp=part), dtype=np.float64)
+    for (_, part), (image, _) in zip(parts, (passes or render_in_turn(scene, camera, integrator))(parts), strict=True):
+        total = total + part * image.astype(np.float64)
     image = total / spp
     aovs = list(integrator.aov_names())
     return image, [*COLOURS[image.shape[2] - len(aovs)], *aovs]

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import math
-import time
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.experiments.references import set_parameter
+from mivol.experiments.render import Passes, render_in_turn
 from mivol.files import write_whole_text
 from mivol.optim.parameters import as_tensor, find
 from mivol.optim.scenes.views import derive_seed
@@ -30,7 +31,7 @@ from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.scene_graph import traverse
 from mivol.validate.moments import BATCHES, Moments
-from mivol.validate.reference import render_reference
+from mivol.validate.reference import Complete, complete_quietly, prepare_reference
 from mivol.validate.reference_file import Comparison, ReferenceResult, compare
 from mivol.validate.statistics import Estimate, Significance, effective_dof, z_bound
 from mivol.validate.trust import Doubt, find_doubts
@@ -183,13 +184,21 @@ class Verdict:
         return "\n".join([*lines, *(str(path) for path in self.files)])
 
 
-def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> Verdict:
+def validate_scene(
+    loaded: LoadedScene,
+    folder: Path,
+    settings: Validation,
+    complete: Complete = complete_quietly,
+    make_passes: Callable[..., Passes] = render_in_turn,
+) -> Verdict:
     """Compare mivol with Mitsuba's path tracer; write ``validation.json``, ``validation.png`` and the reference.
 
     Args:
         loaded: the scene.
         folder: folder of the results; created if missing.
         settings: settings.
+        complete: renders the reference, in this process or on workers.
+        make_passes: makes the function that renders mivol's image from scene, sensor and integrator.
 
     Raises:
         MivolError: a scene that mivol or Mitsuba cannot render, or an unknown parameter.
@@ -200,16 +209,15 @@ def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> V
     folder.mkdir(parents=True, exist_ok=True)
     depth = read_settings(scene).max_depth if settings.max_depth is None else settings.max_depth
     integrator = mi.load_dict({"type": "mivol", "max_depth": depth})
-    start = time.monotonic()
-    image = render_batches(scene, camera, integrator, settings)
-    seconds = time.monotonic() - start
+    image, seconds = render_batches(make_passes(scene, camera, integrator), settings)
     doubts = tuple(find_doubts(scene, [camera]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # doubts are part of the verdict
-        reference = render_reference(
+        prepared = prepare_reference(
             loaded, folder, max_depth=depth, max_spp=settings.reference_spp, seed=settings.seed + 1, sensor=camera,
-            accept_doubts=True, progress=False,
+            accept_doubts=True,
         )  # fmt: skip
+        (reference,) = complete(iter([prepared]))
     estimate = Estimate.from_result(image)
     # Our spread of a pixel that saw nothing is 0, and so may be volpath's: one missed event a pixel is allowed for.
     compared = compare(estimate, reference, alpha=ALPHA, samples_seen=float(reference.mean.max()), correlated=27)
@@ -221,12 +229,11 @@ def validate_scene(loaded: LoadedScene, folder: Path, settings: Validation) -> V
     return write_verdict(verdict, estimate, reference, folder, settings)
 
 
-def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, settings: Validation) -> Moments:
-    """Render the colour channels in independent batches."""
+def render_batches(passes: Passes, settings: Validation) -> tuple[Moments, float]:
+    """Render the colour channels in independent batches; returns the time of all renders [s] too."""
     spp = math.ceil(settings.spp / BATCHES)
-    with dr.suspend_grad():
-        seeds = (derive_seed(settings.seed, IMAGE, batch) for batch in range(BATCHES))
-        return Moments.from_batches(integrator.render(scene, camera, seed=seed, spp=spp) for seed in seeds)
+    found = list(passes([(derive_seed(settings.seed, IMAGE, batch), spp) for batch in range(BATCHES)]))
+    return Moments.from_batches(image for image, _ in found), math.fsum(seconds for _, seconds in found)
 
 
 # -- Gradients ----------------------------------------------------------------------------------------------------

@@ -16,7 +16,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -550,6 +549,12 @@ def complete_in_turn(prepared: Iterator[PreparedReference]) -> Iterator[Referenc
             yield reference.complete(show)
 
 
+def complete_quietly(prepared: Iterator[PreparedReference]) -> Iterator[ReferenceResult]:
+    """Render the missing batches of one reference after another in this process, without a display."""
+    for reference in prepared:
+        yield reference.complete()
+
+
 # -- Photographs -----------------------------------------------------------------------------------------------------------
 
 
@@ -594,7 +599,7 @@ def render_photographs(
     is_shown, views = reference.pop("progress", True), zip(names, looks, strict=True)
     prepared = (prepare_reference(loaded, folder / name, sensor=look, **reference) for name, look in views)
     if complete is None:
-        complete = complete_in_turn if is_shown else partial(map, PreparedReference.complete)
+        complete = complete_in_turn if is_shown else complete_quietly
     made = list(complete(prepared))
     write_transforms(folder / "transforms.json", cameras, [names[number] for number in test])
     return made

@@ -21,13 +21,14 @@ from mivol.cluster.address import ClusterSettings
 from mivol.cluster.connection import _connect, import_distributed
 from mivol.cluster.packages import SceneSource, share_scene
 from mivol.cluster.pool import Pool, Unit
-from mivol.cluster.reference import complete_on
+from mivol.cluster.reference import complete_on, passes_on
 from mivol.cluster.scene_steps import ClusterDistribution, SharedSceneProblem
 from mivol.cluster.sweep import run_on
 from mivol.cluster.workplace import Workplace
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, RunContext
 from mivol.experiments.kinds import run_experiment
+from mivol.experiments.render import render_image
 from mivol.experiments.sweep import plan_sweep, run_in_turn, run_sweep
 from mivol.files import read_volume
 from mivol.report.record import read_record
@@ -133,6 +134,25 @@ def test_errors_of_workers_are_sentences(client: object) -> None:
         with pytest.raises(ZeroDivisionError):
             list(pool.run([Unit(0, answer, (0, "bug"))]))
         assert sorted(pool.run(Unit(i, answer, (i, "")) for i in range(5))) == [(i, i) for i in range(5)]
+
+
+# -- Images ------------------------------------------------------------------------------------------------------------------
+
+
+def test_images_do_not_depend_on_workers(
+    client: object, tmp_path: Path, variant_rgb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An image of five passes is equal to the bit alone and by three workers, in the order of its passes."""
+    monkeypatch.setattr("mivol.experiments.render.SAMPLES_PER_PASS", 48 * 4)
+    path = write_scattering_scene(tmp_path)
+    loaded = load_scene(path)
+    alone, names = render_image(loaded.scene, 0, None, 18, 3)
+    with some_workers(client, 3) as pool:
+        passes = passes_on(pool, share_scene(pool, SceneSource(path), loaded), 0, None)
+        found, others = render_image(loaded.scene, 0, None, 18, 3, passes)
+    assert names == others
+    assert alone.std() > 0
+    assert np.array_equal(alone, found)
 
 
 # -- Sweeps ------------------------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from mivol.cluster.packages import (
 )
 from mivol.cluster.pool import Pool, Unit, _Worker, check_equal_workers, check_worker
 from mivol.cluster.reference import LONGEST_UNIT, _View
+from mivol.cluster.scaling import Network, Workload, best_workers, say_limit, step_seconds
 from mivol.cluster.scene_steps import make_blocks
 from mivol.cluster.sweep import WorkerProgress, has_absolute_paths, read_files, write_run
 from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
@@ -299,3 +300,29 @@ def test_sums_in_float64_do_not_depend_on_their_order() -> None:
 def test_other_fits_are_refused_before_workers_start(capsys: pytest.CaptureFixture) -> None:
     scan = Path(__file__).parents[2] / "scenes" / "shepp_logan" / "fit.toml"
     assert "is no fit to images of a scene" in refused(capsys, "optimize", scan, "--cluster", "local:1")
+
+
+def test_images_of_points_are_refused_before_workers_start(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    np.save(tmp_path / "points.npy", np.eye(4, 3))
+    assert "--cluster renders scenes" in refused(capsys, "render", tmp_path / "points.npy", "--cluster", "local:1")
+
+
+# -- The model of larger clusters --------------------------------------------------------------------------------------------
+
+
+def test_time_of_a_step_by_hand() -> None:
+    """12 units of 1 s, 1 MB at 10 MB/s and 0.1 s: a message takes 0.2 s; the fewest seconds are near sqrt(12 / 0.2) = 7.7."""
+    network, step = Network(0.1, 10e6), Workload("a", 12, 1.0, 1e6, owner_seconds=0.5)
+    assert network.message_seconds(1e6) == pytest.approx(0.2)
+    expected = {1: 12.7, 2: 6.9, 5: 4.5, 6: 3.7, 12: 3.9, 1000: 3.9}
+    assert {workers: pytest.approx(step_seconds(step, network, workers)) for workers in expected} == expected
+    assert best_workers(step, network) == 6
+    assert say_limit(step, network) == "6 workers: latency of the messages, one worker after another"
+
+
+def test_time_of_units_that_stream_by_hand() -> None:
+    """Messages overlap with the work: 12 messages of 0.2 s take 2.4 s, as 5 workers do in 3 rounds."""
+    network, views = Network(0.1, 10e6), Workload("a", 12, 1.0, 1e6, streams=True)
+    assert [round(step_seconds(views, network, workers), 6) for workers in (1, 4, 6, 12)] == [12.0, 3.0, 2.4, 2.4]
+    assert say_limit(views, network) == "6 workers: the owner receives images one after another"
+    assert say_limit(Workload("b", 3, 1.0, 0.0, streams=True), network) == "3 workers: no more units"

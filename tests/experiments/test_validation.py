@@ -166,7 +166,9 @@ def test_renders_are_independent(variant_rgb: str) -> None:
         asked.append((scene, camera, seed, spp))
         return np.full((2, 2, 3), float(len(asked)))
 
-    found = validation.render_batches("scene", "camera", SimpleNamespace(render=render), Validation(spp=33, seed=5))
+    passes = validation.render_in_turn("scene", "camera", SimpleNamespace(render=render))
+    found, seconds = validation.render_batches(passes, Validation(spp=33, seed=5))
+    assert seconds >= 0
     assert asked == [("scene", "camera", derive_seed(5, validation.IMAGE, batch), 3) for batch in range(16)]
     assert (found.n, float(found.mean[0, 0, 0])) == (16, 8.5)
     assert float(found.variance[1, 1, 2]) == pytest.approx(np.var(np.arange(1, 17), ddof=1))

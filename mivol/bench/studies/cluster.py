@@ -1,0 +1,189 @@
+"""What does a cluster cost: time of two workers over one process, overhead of a step, and a model for up to 1,000 workers?
+
+    mivol bench cluster
+
+All is measured on this machine with two local workers of one thread, in turns with one process of one thread. The machine may
+be busy, so time is processor time. For streaming units it is the slowest worker, or half of all processor time if that is more
+(two cores). For steps it is the slowest worker and the owner, one after the other. ``mivol.cluster.scaling`` is fitted to these
+figures: larger workloads scale them by views, pixels and voxels.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mivol import config
+from mivol.back_end import choose_back_end
+from mivol.bench.harness.study import Size, Study, amount
+from mivol.cluster.connection import open_pool
+from mivol.cluster.packages import SceneSource, share_scene
+from mivol.cluster.pool import Pool, Unit
+from mivol.cluster.reference import complete_on
+from mivol.cluster.scaling import Network, Workload, say_limit, step_seconds
+from mivol.cluster.scene_steps import ClusterDistribution
+from mivol.cluster.workplace import Workplace
+from mivol.experiments.examples import copy_example
+from mivol.experiments.fit_kind import RunContext
+from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.scene_fit import SceneFit
+from mivol.scene.camera_rigs import Ring
+from mivol.scene.load import load_scene
+from mivol.validate.reference import render_photographs
+
+WORKERS = (1, 2, 4, 8, 16, 32, 100, 1000)
+
+
+@dataclass(frozen=True)
+class ClusterSize(Size):
+    """Amount of work."""
+
+    views: int = amount(16, 2, doc="views")
+    side: int = amount(128, 16, doc="edge of a reference [pixel]")
+    spp: int = amount(64, 32, doc="samples a pixel of a reference")
+    fit_spp: int = amount(64, 2, doc="samples a pixel of a step")
+    rounds: int = amount(3, 1, doc="rounds of one process and two workers in turn")
+
+
+def worker_seconds(pool: Pool) -> np.ndarray:
+    """Processor time of each worker so far [s]."""
+    ticks = []
+    for worker in pool.workers.values():
+        fields = Path(f"/proc/{worker.facts.pid}/stat").read_text().rpartition(")")[2].split()
+        ticks.append(int(fields[11]) + int(fields[12]))
+    return np.array(ticks) / 100.0
+
+
+def measure(pool: Pool, run: Callable[[], object]) -> dict[str, Any]:
+    """Processor time of the workers and of this process, and wall time, during a call [s]."""
+    workers, owner, wall = worker_seconds(pool), time.process_time(), time.perf_counter()
+    run()
+    wall = time.perf_counter() - wall
+    return {"wall": wall, "owner": time.process_time() - owner, "workers": (worker_seconds(pool) - workers).tolist()}
+
+
+@contextlib.contextmanager
+def two_workers() -> Iterator[tuple[Pool, Path]]:
+    """Two workers of one thread, this process with one thread, and a copy of the example demo."""
+    choose_back_end("llvm_ad_rgb", 1)
+    with tempfile.TemporaryDirectory() as folder, open_pool("local:2", threads=1, say=lambda line: None) as pool:
+        copy_example("demo", Path(folder) / "demo")
+        yield pool, Path(folder) / "demo"
+
+
+def measure_reference(size: ClusterSize) -> dict:
+    """Time of the references of all views by two workers over one process."""
+    found = []
+    with two_workers() as (pool, folder):
+        path = folder / "scene.xml"
+        loaded = load_scene(path, {})
+        looks = Ring(count=size.views, width=size.side, height=size.side).sensors(loaded.scene)
+        options = {"sensors": looks, "max_depth": 6, "max_spp": size.spp}
+        complete = complete_on(pool, share_scene(pool, SceneSource(path), loaded))
+        for number in range(size.rounds + 1):  # the first compiles kernels
+            alone = measure(pool, lambda n=number: render_photographs(loaded, folder / f"one{n}", progress=False, **options))
+            both = measure(pool, lambda n=number: render_photographs(loaded, folder / f"two{n}", complete=complete, **options))
+            slowest = max(max(both["workers"]), (sum(both["workers"]) + both["owner"]) / 2)
+            found.append({"one": alone["owner"], "two": slowest, "wall": [alone["wall"], both["wall"]]})
+    return {"rounds": found[1:], "ratio": float(np.median([row["two"] / row["one"] for row in found[1:]]))}
+
+
+def measure_gradient(size: ClusterSize) -> dict:
+    """Time of a gradient over all views at depth 6 by two workers over one process."""
+    found = []
+    with two_workers() as (pool, folder):
+        changes = [
+            f"views.count={size.views}", "reference.spp=32", "reference.held_out=[]", "threads=1", f"fit.spp={size.fit_spp}",
+            'optimizer={name="adam"}', "event=[]",
+        ]  # fmt: skip
+        settings = config.load(folder / "fit.toml", changes)
+        workers = ClusterDistribution(pool)
+        kind = SceneFit(RunContext(settings, folder, folder / "run", distribution=workers))
+        kind.load(lambda line: None)
+        kind.render_data(RunFolder(folder / "run", kind.record))
+        alone, shared = kind.make_problem(), workers.make_problem(kind)
+        reals = alone.initial_reals()
+        for number in range(size.rounds + 3):  # kernels are compiled, then recorded
+            one = measure(pool, lambda n=number: alone.loss_and_gradient(reals, n))
+            two = measure(pool, lambda n=number: shared.loss_and_gradient(reals, n))
+            row = {"one": one["owner"], "two": max(two["workers"]) + two["owner"], "wall": [one["wall"], two["wall"]]}
+            found.append(row | {"owner": two["owner"], "blocks": len(shared.batches)})
+    found = found[3:]
+    answer = {name: float(np.median([row[name] for row in found])) for name in ("one", "two", "owner")}
+    return answer | {"rounds": found, "ratio": answer["two"] / answer["one"], "blocks": found[0]["blocks"]}
+
+
+def echo(place: Workplace, arrays: np.ndarray) -> np.ndarray:
+    """Answer with as many bytes as came."""
+    return np.asarray(arrays)
+
+
+def measure_messages(size: ClusterSize) -> dict:
+    """Overhead of a step: a message to each of two workers and its answer, by size."""
+    found = {}
+    with two_workers() as (pool, _):
+        for count in (1 << 10, 1 << 18, 1 << 20):
+            array, times = np.zeros(count, np.float32), []
+            for _ in range(6 * size.rounds):
+                start = time.perf_counter()
+                list(pool.run([Unit(part, echo, (array,)) for part in range(2)], ahead=1))
+                times.append(time.perf_counter() - start)
+            found[4 * count] = {"median": float(np.median(times)), "fastest": min(times)}
+    small, large = found[4 << 10]["fastest"] / 2, found[4 << 20]["fastest"] / 2
+    bandwidth = 2 * (4 << 20) / (large - small)
+    return {"seconds": found, "latency": small, "bandwidth": bandwidth}
+
+
+def measure_cluster(size: ClusterSize) -> dict:
+    """Time of two workers over one process, overhead of a step, and the model of larger numbers of workers."""
+    messages, gradient, reference = measure_messages(size), measure_gradient(size), measure_reference(size)
+    network = Network(messages["latency"], messages["bandwidth"])
+    rows = [
+        {
+            "name": load.name,
+            "seconds": [step_seconds(load, network, workers) for workers in WORKERS],
+            "limit": say_limit(load, network),
+        }
+        for load in make_workloads(size, gradient, reference)
+    ]
+    return {"messages": messages, "gradient": gradient, "reference": reference, "scaling": rows}
+
+
+def make_workloads(size: ClusterSize, gradient: dict, reference: dict) -> list[Workload]:
+    """The measured workloads, and larger ones by views, pixels and voxels. A step sends float32 and returns float64."""
+    path = float(np.median([row["one"] for row in reference["rounds"]])) / (size.views * size.side**2 * size.spp)
+    block, blocks, owner = gradient["one"] / gradient["blocks"], gradient["blocks"], gradient["owner"]
+    view = 16 * gradient["one"] / size.views
+    batch = size.side**2 * size.spp / 32
+    return [
+        Workload(f"step of {size.views} views of 64^2 pixels, 40^3 voxels", blocks, block, 12 * 40**3, owner),
+        Workload("step of 256 views of 256^2 pixels, 128^3 voxels", 256, view, 12 * 128**3, owner),
+        Workload(f"reference of {size.views} views of {size.side}^2 pixels", 32 * size.views, batch * path, 12 * size.side**2,
+                 streams=True),
+        Workload("reference of 64 views of 1024^2 pixels, 256 samples", 64 * 256, 2**20 * path, 12 * 1024**2, streams=True),
+    ]  # fmt: skip
+
+
+def table(question: str, answer: dict) -> list[str]:
+    """Markdown lines of the answer."""
+    names = "reference", "gradient"
+    lines = [f"{name}: two workers take {answer[name]['ratio']:.3f} of the time of one process" for name in names]
+    for size, taken in answer["messages"]["seconds"].items():
+        median, fastest = 1e3 * taken["median"], 1e3 * taken["fastest"]
+        lines.append(f"{size} bytes to two workers and back: median {median:.2g} ms, fastest {fastest:.2g} ms")
+    latency, bandwidth = answer["messages"]["latency"], answer["messages"]["bandwidth"]
+    lines += [f"latency {1e3 * latency:.2g} ms a worker, bandwidth {bandwidth / 1e6:.3g} MB/s", ""]
+    lines += ["| workload | " + " | ".join(map(str, WORKERS)) + " | fastest |", "|---" * (len(WORKERS) + 2) + "|"]
+    for row in answer["scaling"]:
+        lines.append(f"| {row['name']} | " + " | ".join(f"{s:.3g}" for s in row["seconds"]) + f" | {row['limit']} |")
+    return lines
+
+
+STUDY = Study(__name__, __doc__, ClusterSize, {"cluster": measure_cluster}, table=table)
