@@ -13,6 +13,7 @@ from pathlib import Path
 import h5py
 import laspy
 import numpy as np
+import tifffile
 from dicom_series import write_frames, write_series
 from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
 from photo_sets import write_blender, write_colmap, write_transforms
@@ -68,6 +69,16 @@ def _dicom(path: Path) -> None:
 
 def _series(folder: Path) -> None:
     write_series(folder, numbered()[..., 0].astype("i2"), names=["a.dcm", "b.dcm"])
+
+
+def _tiff(compression: str | None) -> Write:
+    more = {"compression": compression, "imagej": compression is None}
+    return lambda path: tifffile.imwrite(path, numbered(5, 6, 7)[..., 0], photometric="minisblack", **more)
+
+
+def _slices(folder: Path) -> None:
+    for k, values in enumerate(numbered()[..., 0]):
+        tifffile.imwrite(folder / f"s{k}.tif", values)
 
 
 def _hdf5(path: Path) -> None:
@@ -229,6 +240,10 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "pbrt": (".pbrt", _bytes(pbrt(numbered())), mivol.read_volume),
     "vdb": (".vdb", _volume, mivol.read_volume),
     "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
+    "tiff": (".tif", _tiff(None), mivol.read_volume),
+    "tiff zlib": (".tif", _tiff("zlib"), mivol.read_volume),
+    "tiff ours": (".tif", _volume, mivol.read_volume),
+    "mrc": (".mrc", _volume, mivol.read_volume),
     "dicom": (".dcm", _dicom, mivol.read_volume),
     "hdf5": (".h5", _hdf5, mivol.read_volume),
     "projections": (".h5", _projections, read_projections),
@@ -264,6 +279,7 @@ FILES: dict[str, tuple[str, Write, Read]] = {
 SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
     "nrrd detached": (_detached_nrrd, ("a.nhdr", "a.raw"), lambda folder: mivol.read_volume(folder / "a.nhdr")),
     "metaimage detached": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.mhd")),
+    "tiff slices": (_slices, ("s0.tif", "s1.tif"), mivol.read_volume),
     "dicom series": (_series, ("a.dcm", "b.dcm"), mivol.read_volume),
     "nikon": (_nikon, ("bead.xtekct", "_ctdata.txt", "bead_0002.tif"), _read_nikon),
     "run": (_run, ("run.json", "metrics.jsonl", "a.png", "a.vol"), write_page),

@@ -343,8 +343,9 @@ def explain(arguments: argparse.Namespace) -> int:
     """Say what mivol would do with a scene or an experiment, and why, before it renders more than a small preview.
 
     For photographs, explain lists present and missing data, and draws the cameras with --output. For points and
-    Gaussians, it prints their number, extent, sizes and opacities; for a volume (or the folder of a DICOM series) or a field,
-    its size, values and place. A refusal comes after the facts, with exit code 1.
+    Gaussians, it prints their number, extent, sizes and opacities; for a volume or a field, its size, values and place. The
+    folder of a DICOM series is a volume; so is a folder of TIFF files without flats, darks and angles, unless --set makes it
+    a scan. A refusal comes after the facts, with exit code 1.
     """
     from mivol.photos import find_format
     from mivol.points.summary import is_points_file, summarize_file
@@ -374,9 +375,9 @@ def explain(arguments: argparse.Namespace) -> int:
 
 def explain_array(arguments: argparse.Namespace) -> int | None:
     """Explain a scan or describe a volume, and return the exit code; None for anything else."""
-    from mivol.files.formats import describe_volume, is_volume
+    from mivol.files.formats import describe_volume
 
-    is_array = is_volume(_check_dataset(arguments.scene, arguments.dataset))
+    is_array = _is_array(_check_dataset(arguments.scene, arguments.dataset))
     if draft := draft_of(arguments.scene, arguments, is_array):
         return explain_scan(draft)
     if not is_array:
@@ -399,19 +400,22 @@ def draft_of(path: Path, arguments: argparse.Namespace, is_array: bool = False) 
     """Return the settings of a scan without a TOML file; None for anything else.
 
     An HDF5 file without the layout of a scan counts as one if its suffix is not that of a volume, or with ``--set``;
-    ``--dataset`` makes it a volume.
+    ``--dataset`` makes it a volume. So does a folder of TIFF files for ``is_array``: it is a scan with flats, darks or angles.
 
     Raises:
         MivolError: as :func:`mivol.experiments.found_scan.draft_scan`.
     """
-    from mivol.experiments.found_scan import draft_scan, find_scan
+    from mivol.experiments.found_scan import TIFF_FOLDER, draft_scan, find_scan, has_scan_files
     from mivol.files.hdf5 import is_hdf5
 
     is_photographs = arguments.preset is not None or arguments.model is not None
     if is_photographs or getattr(arguments, "dataset", None) is not None or path.suffix.lower() == ".toml":
         return None
     is_named = path.is_file() and is_hdf5(path) and (arguments.set or not is_array)
-    return draft_scan(path, arguments.set) if is_named or find_scan(path) else None
+    kind = find_scan(path)
+    if kind == TIFF_FOLDER and is_array and not arguments.set and not has_scan_files(path):
+        return None
+    return draft_scan(path, arguments.set) if is_named or kind else None
 
 
 def _is_experiment(arguments: argparse.Namespace) -> bool:
@@ -425,19 +429,25 @@ def _is_experiment(arguments: argparse.Namespace) -> bool:
 
 def _check_contents(path: Path) -> None:
     """Refuse a volume, and binary data that no reader takes, in place of a scene, an experiment or a cloud."""
-    from mivol.files.formats import is_unread, is_volume, refuse_unread
+    from mivol.files.formats import is_unread, refuse_unread
 
     if is_unread(path):
         raise refuse_unread(path)
-    if is_volume(path):
+    if _is_array(path):
         raise MivolError(f"{path}: found a volume, expected a scene, a fit or points; mivol explain and mivol convert take it.")
+
+
+def _is_array(path: Path) -> bool:
+    """Whether a file or a folder is a volume; a folder of photographs with cameras is none."""
+    from mivol.files.formats import is_volume
+    from mivol.photos import find_format
+
+    return is_volume(path) and not (path.is_dir() and find_format(path))
 
 
 def _check_dataset(path: Path, dataset: str | None) -> Path:
     """Return the file; refuse ``--dataset`` for a file that is no volume."""
-    from mivol.files.formats import is_volume
-
-    if dataset is not None and not is_volume(path):
+    if dataset is not None and not _is_array(path):
         raise MivolError(f"--dataset names an array of a volume, and {path} is no volume: leave it out.")
     return path
 
@@ -696,9 +706,7 @@ def convert(arguments: argparse.Namespace) -> None:
     Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     """
-    from mivol.files.formats import is_volume
-
-    is_array = is_volume(_check_dataset(arguments.source, arguments.dataset))
+    is_array = _is_array(_check_dataset(arguments.source, arguments.dataset))
     print((_convert_volume if is_array else _convert_cloud)(arguments))
 
 

@@ -9,11 +9,10 @@ pixel, in pixels otherwise.
 
 from __future__ import annotations
 
-import glob
 import json
 import math
-import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,10 +21,11 @@ import numpy as np
 from mivol import config
 from mivol.errors import MivolError
 from mivol.files.hdf5 import is_hdf5
-from mivol.files.image_stack import TIFF, natural_order, read_images
+from mivol.files.image_stack import read_images
 from mivol.files.nikon import SECTION, read_nikon
 from mivol.files.scan_hdf5 import half_turns_in_radians, is_scan, survey_projections
 from mivol.files.source import read_columns, refusal
+from mivol.files.tiff import group_images, natural_order
 from mivol.machine import available_memory
 from mivol.photos import find_format
 
@@ -253,48 +253,16 @@ def _draft_nikon(path: Path, given: dict[str, Any]) -> ScanDraft:
 # -- TIFF ------------------------------------------------------------------------------------------------------------------
 
 
-class ImageGroup(NamedTuple):
-    """Images whose names differ in their numbers: a name with "#" for numbers, and the files."""
-
-    name: str
-    files: list[Path]
-
-    @property
-    def words(self) -> set[str]:
-        """Words of the name, in lower case; "i0" is one."""
-        return set(re.findall(r"i0|[a-z]+", self.name.lower().rpartition(".")[0].replace("#", "0")))
-
-    @property
-    def size(self) -> int:
-        """Size of all files [byte]."""
-        return sum(file.stat().st_size for file in self.files)
-
-    def pattern(self) -> str:
-        """The pattern that finds these files and no others.
-
-        Raises:
-            MivolError: no such pattern.
-        """
-        first = self.files[0]
-        if len(self.files) == 1:
-            return str(first)
-        name, folder = glob.escape(first.name), first.parent
-        for number in ("*", "[0-9]*"):
-            pattern = re.sub(r"\d+", number, name)
-            if sorted(folder.glob(pattern)) == sorted(self.files):
-                return str(folder / pattern)
-        raise refusal(folder, f"other images between {first.name} and its like", "one folder a kind", "move them apart")
-
-
-def group_images(folder: Path) -> list[ImageGroup]:
-    """Group the TIFF files of a folder and of the folders in it by their names without numbers; the largest groups first."""
-    groups: dict[str, list[Path]] = {}
-    inner = [entry for entry in folder.iterdir() if entry.is_dir()]
-    for file in (file for place in (folder, *inner) for file in place.iterdir()):
-        if file.suffix.lower() in TIFF:
-            groups.setdefault(re.sub(r"\d+", "#", str(file.relative_to(folder))), []).append(file)
-    found = [ImageGroup(name, sorted(files, key=natural_order)) for name, files in groups.items()]
-    return sorted(found, key=lambda group: -group.size)
+def has_scan_files(folder: Path) -> bool:
+    """Whether flats, darks or a file of angles lie beside the images of a folder: they tell a scan from slices of a volume."""
+    if any(group.words & (FLAT_WORDS | DARK_WORDS) for group in group_images(folder)):
+        return True
+    for file in folder.iterdir():
+        if file.suffix.lower() in ANGLE_FILES:
+            with suppress(MivolError):
+                read_columns(file, 1)
+                return True
+    return False
 
 
 def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
@@ -407,10 +375,10 @@ def _three_views(files: list[Path], flat: np.ndarray | None, dark: np.ndarray | 
     return (three - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
 
 
-HDF5 = "hdf5"
+HDF5, TIFF_FOLDER = "hdf5", "tiff"
 SCAN_KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, dict[str, Any]], ScanDraft]]] = {
     "nikon": (lambda path: any(map(_is_nikon, path.iterdir() if path.is_dir() else [path])), _draft_nikon),
     HDF5: (lambda path: any(map(is_scan, path.iterdir() if path.is_dir() else [path])), _draft_hdf5),
-    "tiff": (lambda path: path.is_dir() and bool(group_images(path)), _draft_tiff),
+    TIFF_FOLDER: (lambda path: path.is_dir() and bool(group_images(path)), _draft_tiff),
 }
 """Recognition and draft of each kind of scan, in this order."""

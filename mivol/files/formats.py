@@ -19,11 +19,11 @@ import numpy as np
 
 from mivol.display import format_point
 from mivol.errors import MivolError
-from mivol.files import dicom, hdf5, metaimage, mrc, nifti, npy, nrrd, renderer_grids, vdb, vti, vtk_legacy
+from mivol.files import dicom, hdf5, metaimage, mrc, nifti, npy, nrrd, renderer_grids, tiff, vdb, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
 from mivol.files.sparse_volume import SparseVolumeData
-from mivol.files.volume import VolumeData, check_frame, to_values
+from mivol.files.volume import VolumeData, check_frame, frame_from_steps, is_upright, to_values
 
 #: Number of first bytes that identify a format.
 HEAD = 4096
@@ -57,6 +57,7 @@ _NRRD = VolumeFormat("NRRD", _starts_with(nrrd.MAGIC), nrrd.read_nrrd)
 _HDF5 = VolumeFormat("HDF5", _starts_with(hdf5.MAGIC), hdf5.read_hdf5)
 _MRC = VolumeFormat("MRC", mrc.is_mrc, mrc.read_mrc)
 _DICOM = VolumeFormat("DICOM", dicom.is_dicom, dicom.read_dicom)
+_TIFF = VolumeFormat("TIFF", tiff.is_tiff, tiff.read_tiff)
 _LES = VolumeFormat("LES cloud text", renderer_grids.is_les, renderer_grids.read_les)
 
 #: suffix -> format; a longer suffix is tried first.
@@ -82,6 +83,8 @@ FORMATS: dict[str, VolumeFormat] = {
     ".map": _MRC,
     ".rec": _MRC,
     ".dcm": _DICOM,
+    ".tif": _TIFF,
+    ".tiff": _TIFF,
 }
 
 #: name of a kind of file without a reader here -> (test of the first ``HEAD`` bytes, way out).
@@ -90,10 +93,7 @@ UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
     "a DICOM file": (dicom.is_dicom, "describe or convert it by mivol explain and mivol convert"),
     "a MATLAB file": (_starts_with(b"MATLAB"), "save the array as .npy or .h5"),
     "an HDF5 file": (_starts_with(hdf5.MAGIC), "name a volume .h5; explain and optimize find the data of a scan"),
-    "a TIFF file": (
-        lambda head: head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
-        "name the folder of TIFF files of a scan for explain and optimize, or convert a volume to .npy or .nrrd",
-    ),
+    "a TIFF file": (tiff.is_tiff, "name it .tif, or the folder of a scan for explain and optimize"),
     "raw bytes": (lambda head: b"\0" in head, "describe them in a header beside them, .nhdr or .mhd, and name the header"),
 }
 
@@ -104,6 +104,12 @@ WRITERS: dict[str, Callable[[BinaryIO, np.ndarray, np.ndarray, dict[str, Any]], 
     ".npz": npy.write_npz,
     ".nrrd": nrrd.write_nrrd,
     ".vdb": vdb.write_vdb,
+    ".mha": metaimage.write_metaimage,
+    ".nii": nifti.write_nifti,
+    ".vti": vti.write_vti,
+    ".mrc": mrc.write_mrc,
+    ".tif": tiff.write_tiff,
+    ".tiff": tiff.write_tiff,
 }
 
 #: suffix -> writer without compression.
@@ -120,9 +126,10 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
     """Read a volume of any format in :data:`FORMATS`.
 
     Args:
-        path: file; the suffix selects the format, and the first bytes must agree. The folder, or a file, of a DICOM series.
+        path: file; the suffix selects the format, and the first bytes must agree. The folder, or a file, of a DICOM series;
+            a folder of TIFF slices.
         dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .h5, LES text); number or
-            ``SeriesInstanceUID`` of a DICOM series.
+            ``SeriesInstanceUID`` of a DICOM series; name of the slices, with "#" for numbers, in a folder of several kinds.
         frame: key of :data:`FRAMES`: "file" places the volume as in the header and refuses a degenerate box, "unit" puts the
             volume on the unit cube.
 
@@ -202,8 +209,9 @@ def write_volume(
         path: destination.
         values: real numbers (Z, Y, X) or (Z, Y, X, C), stored as float32; or a sparse volume, which stays sparse in a ``.vdb``.
         to_world: unit cube to world (4, 4), by default the identity, or the place of the sparse volume. A ``.vol``
-            holds an axis-aligned box, a ``.npy`` no box.
-        metadata: facts in the types of JSON, for ``.npz`` and ``.nrrd``; "space" names the frame ("RAS", "LPS").
+            holds an axis-aligned box, a ``.mrc`` too, a ``.tif`` voxel sizes alone, a ``.npy`` no box.
+        metadata: facts in the types of JSON, for ``.npz`` and ``.nrrd``; "space" names the frame ("RAS", "LPS") there and in
+            ``.nii`` and ``.mha``, "unit" the unit of ``.nii`` and ``.tif``.
         compress: whether a ``.npz`` is compressed; writing without compression is about ten times faster.
 
     Raises:
@@ -232,9 +240,9 @@ VOLUME_SUFFIXES = tuple(suffix for suffix in FORMATS if suffix not in SHARED_SUF
 
 
 def is_volume(path: Path) -> bool:
-    """Whether a suffix belongs to volumes alone, or a folder or a file without such a suffix holds DICOM."""
+    """Whether a suffix belongs to volumes alone, a file without such a suffix is DICOM, or a folder holds DICOM or TIFF."""
     if path.is_dir():
-        return _is_dicom_folder(path)
+        return _is_dicom_folder(path) or bool(tiff.group_images(path))
     return path.name.lower().endswith(VOLUME_SUFFIXES) or _is_nameless_dicom(path)
 
 
@@ -293,18 +301,32 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None) -> st
         MivolError: as :func:`read_volume` and :func:`write_volume`.
     """
     volume = read_volume(source, dataset)
-    place, lost = volume.to_world, []
     suffix = _find_suffix(target, WRITERS)
-    space = {"space": volume.meta["space"]} if volume.meta.get("space") else {}
-    if space and suffix not in (".npz", ".nrrd"):
-        lost.append(f"the frame {space.pop('space')}")
-    if suffix == ".npy" and not np.array_equal(place, np.eye(4)):
-        place = np.eye(4)
-        lost.append("the place")
-    write_volume(target, volume.values, place, metadata=space)
+    place, lost = _keep_place(suffix, volume)
+    facts = {"space": volume.meta["space"]} if volume.meta.get("space") else {}
+    if facts and suffix not in (".npz", ".nrrd", ".mha", ".nii"):
+        lost.insert(0, f"the frame {facts.pop('space')}")
+    if suffix in (".nii", ".tif", ".tiff") and volume.meta.get("unit"):
+        facts["unit"] = volume.meta["unit"]
+    write_volume(target, volume.values, place, metadata=facts)
     size = " x ".join(str(n) for n in volume.size)
     line = f"{target}: {size} voxels" + (f"; {suffix} does not hold {' and '.join(lost)}" if lost else "")
     return "\n".join([line, *(f"assumed: {note}" for note in volume.meta.get("notes", ()))])
+
+
+def _keep_place(suffix: str, volume: VolumeData) -> tuple[np.ndarray, list[str]]:
+    """The part of a placement that a format holds, and names of the lost parts."""
+    place, lost = volume.to_world, []
+    if suffix not in (".npy", ".mrc", ".tif", ".tiff") or np.array_equal(place, np.eye(4)):
+        return place, lost
+    if suffix == ".npy":
+        return np.eye(4), ["the place"]
+    steps, origin = volume.steps, volume.origin
+    if not is_upright(steps):
+        lost.append("the directions of the axes")
+    if suffix != ".mrc" and not np.allclose(origin, 0, atol=1e-9 * volume.spacing.max()):
+        lost.append("the origin")
+    return frame_from_steps(volume.size, np.diag(volume.spacing), origin if suffix == ".mrc" else np.zeros(3)), lost
 
 
 def is_unread(path: Path) -> bool:
@@ -327,6 +349,8 @@ def _find_format(path: Path) -> VolumeFormat:
     """The format of a folder, of DICOM with any other suffix, or of a suffix with which the first bytes agree."""
     if path.is_dir() and _is_dicom_folder(path):
         return _DICOM
+    if path.is_dir() and tiff.group_images(path):
+        return _TIFF
     check_file(path)
     if not path.name.lower().endswith(tuple(FORMATS)):
         if _is_nameless_dicom(path):

@@ -7,7 +7,6 @@ their names: slice.2 before slice.10.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,9 +15,8 @@ import numpy as np
 from mivol.files import source
 from mivol.files.formats import read_volume
 from mivol.files.source import check_file, refusal
+from mivol.files.tiff import TIFF, natural_order
 from mivol.files.volume import VolumeData, check_frame, frame_from_steps, to_values
-
-TIFF = (".tif", ".tiff")
 
 
 def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarray:
@@ -140,8 +138,3 @@ def read_slices(
         "files": [f.name for f in files],
     }
     return VolumeData(values, to_world, meta)
-
-
-def natural_order(path: Path) -> tuple:
-    """Return a sort key that compares numbers in a name as numbers."""
-    return tuple(int(piece) if piece.isdigit() else piece for piece in re.split(r"(\d+)", path.name))

@@ -11,12 +11,13 @@ Reference: MetaIO documentation, itk.org/Wiki/ITK/MetaIO/Documentation.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from mivol.files import source
 from mivol.files.source import refusal, refuse_dataset
-from mivol.files.volume import VolumeData, frame_from_steps, to_values
+from mivol.files.volume import VolumeData, frame_from_steps, split_frame, to_values, turn_frame
 
 TYPES: dict[str, str] = {
     "MET_CHAR": "i1",
@@ -55,6 +56,33 @@ def read_metaimage(path: Path, dataset: str | None = None) -> VolumeData:
     values = to_values(stored.reshape(*size[::-1], channels), path)
     meta = {"path": str(path), "format": "metaimage", "dtype": str(dtype), "space": "LPS", "header": keys}
     return VolumeData(values, frame_from_steps(size, *_place(keys, path)), meta)
+
+
+def write_metaimage(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
+    """Write an ``.mha`` of float32 in LPS; a placement without ``metadata["space"]`` counts as LPS."""
+    size = values.shape[2::-1]
+    steps, origin = split_frame(size, turn_frame(to_world, metadata.get("space"), "LPS"))
+    spacing = np.linalg.norm(steps, axis=0)
+    keys = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
+        "TransformMatrix": _words((steps / spacing).T.ravel()),
+        "Offset": _words(origin),
+        "ElementSpacing": _words(spacing),
+        "DimSize": " ".join(map(str, size)),
+        "ElementNumberOfChannels": str(values.shape[3]),
+        "ElementType": "MET_FLOAT",
+        "ElementDataFile": "LOCAL",
+    }
+    file.write("".join(f"{key} = {value}\n" for key, value in keys.items()).encode())
+    file.write(np.ascontiguousarray(values, "<f4").data)
+
+
+def _words(numbers: np.ndarray) -> str:
+    return " ".join(repr(float(number)) for number in numbers)
 
 
 def _header(data: bytes, path: Path) -> tuple[dict[str, str], bytes]:

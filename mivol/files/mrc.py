@@ -1,17 +1,20 @@
 """Volumes of electron microscopes (MRC2014), read by the package mrcfile.
 
 Conventions. Lengths are in angstrom. The position of the centre of the first voxel is the header's ``origin``; if that is 0, it
-is ``nxstart, nystart, nzstart`` times the voxel size. Without a voxel size in the header, voxels become unit cubes.
+is ``nxstart, nystart, nzstart`` times the voxel size. Without a voxel size in the header, voxels become unit cubes, and a
+note says so.
 """
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from mivol.files.source import check_file, refusal, refuse_dataset
-from mivol.files.volume import VolumeData, frame_from_steps, to_values
+from mivol.files.volume import VolumeData, frame_from_steps, is_upright, split_frame, to_values
 
 #: Place of the word ``MAP`` in the header [byte].
 MAGIC_OFFSET = 208
@@ -61,5 +64,30 @@ def read_mrc(path: Path, dataset: str | None = None) -> VolumeData:
         "dtype": str(stored.dtype),
         "space": None,
         "unit": "A" if has_spacing else "voxel",
+        "notes": () if has_spacing else ("the header has a voxel size of 0: a voxel counts as 1.",),
     }
     return VolumeData(values, frame_from_steps(values.shape[2::-1], np.diag(spacing), origin), meta)
+
+
+def write_mrc(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
+    """Write MRC2014 of float32 with the numbers of the placement as lengths; no package is needed.
+
+    Raises:
+        MivolError: several channels, or axes that are turned against the world's.
+    """
+    nz, ny, nx, channels = values.shape
+    steps, origin = split_frame((nx, ny, nz), to_world)
+    if channels > 1:
+        raise refusal("write_volume", f"{channels} channels for an MRC file", "one", "write .nrrd, or one channel a file")
+    if not is_upright(steps):
+        raise refusal("write_volume", "turned axes for an MRC file", "axes of the world", "write .nrrd, or remove the place")
+    head = bytearray(1024)
+    struct.pack_into("<10i", head, 0, nx, ny, nz, 2, 0, 0, 0, nx, ny, nz)
+    struct.pack_into("<6f", head, 40, *(np.diag(steps) * (nx, ny, nz)), 90, 90, 90)
+    struct.pack_into("<3i", head, 64, 1, 2, 3)
+    struct.pack_into("<3fi", head, 76, values.min(), values.max(), values.mean(dtype=np.float64), 1)
+    struct.pack_into("<i", head, 108, 20141)
+    struct.pack_into("<3f4s4B", head, 196, *origin, b"MAP ", 0x44, 0x44, 0, 0)
+    struct.pack_into("<f", head, 216, values.std(dtype=np.float64))
+    file.write(head)
+    file.write(np.ascontiguousarray(values, "<f4").data)

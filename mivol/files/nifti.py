@@ -16,13 +16,13 @@ import math
 import struct
 import zlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from mivol.files import source
 from mivol.files.source import refusal, refuse_dataset
-from mivol.files.volume import VolumeData, frame_from_steps, to_values
+from mivol.files.volume import VolumeData, frame_from_steps, split_frame, to_values, turn_frame
 
 TYPES: dict[int, str] = {
     2: "u1",
@@ -135,6 +135,40 @@ def read_nifti(path: Path, dataset: str | None = None) -> VolumeData:
         "unit": UNITS.get(fields["units"][0] & 7, "unknown"),
     }
     return VolumeData(to_values(grid, path), frame_from_steps(size, steps, origin), meta)
+
+
+def write_nifti(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
+    """Write NIfTI-1 of float32 in RAS by an sform; a placement without ``metadata["space"]`` counts as RAS.
+
+    Raises:
+        MivolError: more than 32,767 voxels or channels along an axis.
+    """
+    *shape, channels = values.shape
+    size = shape[::-1]
+    if max(*size, channels) > np.iinfo(np.int16).max:
+        raise refusal("write_volume", f"a size of {size}", "at most 32767 along an axis in NIfTI", "write .nrrd")
+    steps, origin = split_frame(size, turn_frame(to_world, metadata.get("space"), "RAS"))
+    unit = {name: code for code, name in UNITS.items()}.get(str(metadata.get("unit")), 0)
+    layout = LAYOUTS[348]
+    numbers = {
+        "dim": (5 if channels > 1 else 3, *size, 1, channels, 1, 1),
+        "datatype": (16,),
+        "pixdim": (1.0, *np.linalg.norm(steps, axis=0), 1.0, 1.0, 1.0, 1.0),
+        "vox_offset": (352.0,),
+        "scale": (1.0, 0.0),
+        "units": (unit,),
+        "codes": (0, 1),
+        "srow": tuple(np.column_stack([steps, origin]).ravel()),
+    }
+    head = bytearray(352)
+    struct.pack_into("<i", head, 0, layout.size)
+    struct.pack_into("<h", head, 72, 32)  # bits of a number
+    struct.pack_into("4s", head, layout.magic_at, layout.magic)
+    for name, value in numbers.items():
+        code, at = layout.fields[name]
+        struct.pack_into("<" + code, head, at, *value)
+    file.write(head)
+    file.write(np.ascontiguousarray(values.transpose(3, 0, 1, 2), "<f4").data)
 
 
 def _stored(data: bytes, offset: float, header: int, dtype: np.dtype, shape: list[int], path: Path) -> np.ndarray:

@@ -21,8 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.files.image_stack import TIFF, check_finite, natural_order, read_images
+from mivol.files.image_stack import check_finite, read_images
 from mivol.files.source import check_file, refusal
+from mivol.files.tiff import TIFF, natural_order
 
 SECTION = "xtekct"
 

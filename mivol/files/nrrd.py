@@ -23,7 +23,7 @@ import numpy as np
 
 from mivol.files import source
 from mivol.files.source import refusal, refuse_dataset
-from mivol.files.volume import VolumeData, frame_from_steps, to_values
+from mivol.files.volume import VolumeData, frame_from_steps, split_frame, to_values
 
 MAGIC = b"NRRD000"
 
@@ -112,8 +112,7 @@ def read_nrrd(path: Path, dataset: str | None = None) -> VolumeData:
 def write_nrrd(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
     """Write an attached, gzip-compressed float32 NRRD, with ``metadata`` as ``key:=value`` lines."""
     nz, ny, nx, channels = values.shape
-    steps = to_world[:3, :3] / (nx, ny, nz)
-    origin = to_world[:3, 3] + steps.sum(axis=1) / 2
+    steps, origin = split_frame((nx, ny, nz), to_world)
     directions = [_vector(step) for step in steps.T]
     space = metadata.get("space")
     lines = [

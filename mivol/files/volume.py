@@ -86,6 +86,17 @@ def frame_from_steps(size: Sequence[int], steps: np.ndarray, origin: Sequence[fl
     return to_world
 
 
+def split_frame(size: Sequence[int], to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return voxel steps (3, 3) and the centre of the first voxel (3,): the inverse of :func:`frame_from_steps`."""
+    steps = to_world[:3, :3] / np.asarray(size, np.float64)
+    return steps, to_world[:3, 3] + steps.sum(axis=1) / 2
+
+
+def is_upright(steps: np.ndarray) -> bool:
+    """Whether the axes of a grid are those of the world, to 1e-9 of the largest step."""
+    return bool(np.allclose(steps, np.diag(np.abs(np.diag(steps))), rtol=0, atol=1e-9 * np.abs(steps).max()))
+
+
 def frame_from_box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
     """Return the placement (4, 4) of the unit cube on the axis-aligned box from corner ``low`` to corner ``high``."""
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
@@ -146,8 +157,17 @@ def to_space(volume: VolumeData, space: str) -> VolumeData:
         if name not in MEDICAL_FRAMES:
             expected = f"one of {', '.join(MEDICAL_FRAMES)}"
             raise refusal(volume.meta.get("path", "volume"), f"the frame {name!r}", expected, "set to_world by hand")
+    return dataclasses.replace(
+        volume, to_world=turn_frame(volume.to_world, current, space), meta={**volume.meta, "space": space}
+    )
+
+
+def turn_frame(to_world: np.ndarray, current: str | None, space: str) -> np.ndarray:
+    """Return a placement (4, 4) in another key of :data:`MEDICAL_FRAMES`; without a current one, it stays."""
+    if current is None:
+        return to_world
     signs = np.array(MEDICAL_FRAMES[current]) * np.array(MEDICAL_FRAMES[space])
-    return dataclasses.replace(volume, to_world=np.diag([*signs, 1.0]) @ volume.to_world, meta={**volume.meta, "space": space})
+    return np.diag([*signs, 1.0]) @ to_world
 
 
 def to_values(array: np.ndarray, path: object) -> np.ndarray:

@@ -18,12 +18,13 @@ import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from mivol.files import source
 from mivol.files.source import refusal, select_dataset
-from mivol.files.volume import VolumeData, frame_from_steps, to_values
+from mivol.files.volume import VolumeData, frame_from_steps, split_frame, to_values
 
 TYPES: dict[str, str] = {
     "Int8": "i1",
@@ -80,6 +81,28 @@ def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
     }
     values = to_values(stored.reshape(*size[::-1], channels), path)
     return VolumeData(values, frame_from_steps(size, steps, origin), meta)
+
+
+def write_vti(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
+    """Write an array "values" of float32 at points, as appended raw bytes."""
+    nz, ny, nx, channels = values.shape
+    steps, origin = split_frame((nx, ny, nz), to_world)
+    spacing = np.linalg.norm(steps, axis=0)
+    extent = f"0 {nx - 1} 0 {ny - 1} 0 {nz - 1}"
+    placed = f'Origin="{_words(origin)}" Spacing="{_words(spacing)}" Direction="{_words((steps / spacing).ravel())}"'
+    head = (
+        '<?xml version="1.0"?>\n<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
+        f'<ImageData WholeExtent="{extent}" {placed}>\n<Piece Extent="{extent}">\n<PointData Scalars="values">\n'
+        f'<DataArray type="Float32" Name="values" NumberOfComponents="{channels}" format="appended" offset="0"/>\n'
+        '</PointData>\n</Piece>\n</ImageData>\n<AppendedData encoding="raw">_'
+    )
+    file.write(head.encode() + np.array(values.nbytes, "<u8").tobytes())
+    file.write(np.ascontiguousarray(values, "<f4").data)
+    file.write(b"</AppendedData>\n</VTKFile>\n")
+
+
+def _words(numbers: np.ndarray) -> str:
+    return " ".join(repr(float(number)) for number in numbers)
 
 
 def _document(data: bytes, path: Path) -> tuple[ElementTree.Element, bytes, str]:

@@ -73,9 +73,9 @@ def test_flags_of_points_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     write_volume(tmp_path / "a.vdb", VALUES)
-    assert run("convert", tmp_path / "a.vdb", tmp_path / "b.tif") == 1
+    assert run("convert", tmp_path / "a.vdb", tmp_path / "b.png") == 1
     error = capsys.readouterr().err
-    assert "the suffix '.tif'" in error and ".vdb" in error
+    assert "the suffix '.png'" in error and ".vdb" in error
     assert ".vdb" in FORMATS
 
 
@@ -84,7 +84,7 @@ def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pyte
     [
         ("a.st", bytes(208) + b"MAP " + bytes(812), "an MRC file", "name it .mrc"),
         ("a.mat", b"MATLAB 5.0 MAT-file", "a MATLAB file", ".npy or .h5"),
-        ("a.tif", b"II*\0" + bytes(8), "a TIFF file", "the folder of TIFF files"),
+        ("a.lsm", b"II*\0" + bytes(8), "a TIFF file", "name it .tif"),
         ("a.raw", bytes(64), "raw bytes", ".nhdr or .mhd"),
     ],
 )

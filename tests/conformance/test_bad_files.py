@@ -461,7 +461,7 @@ def test_an_exr_of_several_parts_is_refused(tmp_path: Path) -> None:
 WRITES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "no folder": (lambda p: files.write_volume(p / "no" / "a.vol", ONE), ("no folder", "create it first")),
     "a folder": (lambda p: files.write_whole_bytes(p, b""), ("a folder", "file name")),
-    "suffix": (lambda p: files.write_volume(p / "a.nii", ONE), ("'.nii'", ".vol, .npy, .npz, .nrrd")),
+    "suffix": (lambda p: files.write_volume(p / "a.nhdr", ONE), ("'.nhdr'", ".vol, .npy, .npz, .nrrd")),
     "rank": (lambda p: files.write_volume(p / "a.vol", ONE[0, 0]), ("shape (4, 1)",)),
     "rotated box": (
         lambda p: files.write_volume(p / "a.vol", ONE, np.eye(4)[[1, 0, 2, 3]]),
