@@ -11,7 +11,7 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.fields.activation import ACTIVATIONS, select_activation
-from mivol.fields.field_archives import MAX_NODES, _check_arrays, parse_archive
+from mivol.fields.field_archives import MAX_NODES, _check_node_count, parse_archive
 from mivol.fields.procedural import make_procedural
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.events import Upsample
@@ -128,7 +128,7 @@ def test_harmonics_of_a_file_belong_to_its_nodes(sh: tuple[int, ...]) -> None:
     says = refusal_of(parse_archive, "f", arrays(sh=np.zeros(sh, np.float32)))
     assert says == f"f holds (8,) densities and {sh} harmonics for 8 nodes; write it again."
     large = arrays(res=(2048, 2048, 1024))
-    assert refusal_of(_check_arrays, "f", large).startswith("f has a grid of 2048 x 2048 x 1024 nodes;")
+    assert refusal_of(_check_node_count, "f", large).startswith("f has a grid of 2048 x 2048 x 1024 nodes;")
 
 
 # -- Scenes ------------------------------------------------------------------------------------------------------------
