@@ -27,6 +27,7 @@ from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.optim.gaussians.density_control import CloudArrays
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, project, rays, rectify
@@ -187,6 +188,7 @@ def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: Gaussian
     plan = plan.for_edge(longest)
     is_capture = settings.photos.background == "" and any(view.alpha is None for view in views)
     if is_capture:
+        plan = adapt_to_few(plan, len(views)) if settings.gaussians.degree is None else plan
         plan = replace(plan, reach=median_distance([view.camera for view in views], photos.box.mean(axis=0)))
     places, whence = find_start_points(photos, plan.start, settings.seed, is_capture)
     largest = max(view.camera.size[0] * view.camera.size[1] for view in views)
@@ -201,6 +203,12 @@ def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: Gaussian
     cloud = make_start_cloud(places, views, plan.stages[0].degree)
     lines = explain_plan(plan, photos, len(places), whence, memory, plan.minutes(largest))
     return GaussianStart(views, plan, batches, cloud, lines)
+
+
+def adapt_to_few(plan: GaussianPlan, photographs: int) -> GaussianPlan:
+    """Return the plan of a capture: harmonics of degree 1 at most for fewer than ``FEW_PHOTOGRAPHS`` photographs."""
+    most = 1 if photographs < FEW_PHOTOGRAPHS else plan.degree
+    return replace(plan, stages=tuple(replace(stage, degree=min(stage.degree, most)) for stage in plan.stages))
 
 
 GAINS = PlanLine(choice="gains of each photograph", reason="for cameras with automatic exposure; with a prior towards 1")

@@ -18,7 +18,7 @@ from tiny_experiment import assert_explained, resume_stopped_fit
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.gaussian_fit import find_start_points, make_gaussian_plan, make_start_cloud
+from mivol.experiments.gaussian_fit import adapt_to_few, find_start_points, make_gaussian_plan, make_start_cloud
 from mivol.experiments.photo_fit import PhotoFit
 from mivol.files import write_png
 from mivol.files.image_files import decode_srgb
@@ -269,6 +269,12 @@ def test_surroundings_stand_along_rays_of_the_photographs() -> None:
     few, _ = find_start_points(photos(views[:2], points), 300, 3, has_surroundings=True)
     within = find_free_distances(all_cameras[:2], median_distance(all_cameras[:2], BOX.mean(axis=0)))[1]
     assert all(min(np.linalg.norm(p - c.origin) for c in all_cameras[:2]) >= within for p in few[120:])
+
+
+def test_few_photographs_of_a_capture_get_a_lower_degree() -> None:
+    plan = PRESETS["minutes"]
+    assert [stage.degree for stage in adapt_to_few(plan, 49).stages] == [0, 1]
+    assert adapt_to_few(plan, 50) == plan and [stage.degree for stage in plan.stages] == [0, 3]
 
 
 def test_random_points_avoid_transparent_pixels() -> None:
