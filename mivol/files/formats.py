@@ -19,7 +19,7 @@ import numpy as np
 
 from mivol.display import format_point
 from mivol.errors import MivolError
-from mivol.files import dicom, hdf5, metaimage, mrc, nifti, npy, nrrd, renderer_grids, tiff, vdb, vti, vtk_legacy
+from mivol.files import dicom, hdf5, metaimage, mrc, nifti, npy, nrrd, nvdb, renderer_grids, tiff, vdb, vti, vtk_legacy
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal
 from mivol.files.sparse_volume import SparseVolumeData
@@ -74,6 +74,7 @@ FORMATS: dict[str, VolumeFormat] = {
     ".vti": VolumeFormat("VTK XML image", lambda head: b"<VTKFile" in head, vti.read_vti),
     ".vtk": VolumeFormat("legacy VTK", _starts_with(vtk_legacy.MAGIC), vtk_legacy.read_vtk),
     ".vdb": VolumeFormat("OpenVDB", vdb.is_vdb, vdb.read_vdb),
+    ".nvdb": VolumeFormat("NanoVDB", nvdb.is_nvdb, nvdb.read_nvdb),
     ".pbrt": VolumeFormat("pbrt volumegrid", renderer_grids.is_pbrt, renderer_grids.read_pbrt),
     ".csv": _LES,
     ".txt": _LES,
@@ -162,7 +163,10 @@ def _read_placed(path: Path, read: Callable, dataset: str | None, frame: str) ->
     return dataclasses.replace(volume, to_world=to_world, meta={**volume.meta, "frame": frame})
 
 
-SPARSE_READERS: dict[str, Callable[[Path, str | None], SparseVolumeData]] = {".vdb": vdb.read_sparse_vdb}
+SPARSE_READERS: dict[str, Callable[[Path, str | None], SparseVolumeData]] = {
+    ".vdb": vdb.read_sparse_vdb,
+    ".nvdb": nvdb.read_sparse_nvdb,
+}
 """suffix -> reader of a format that is sparse itself."""
 
 

@@ -23,7 +23,7 @@ class VoxelVolume(mi.Volume):
     """``<volume type="mivol_voxels">``: a trilinear grid, 1 or 3 channels.
 
     Parameters:
-        filename, grid or data: a file (.vol, .vdb, .npy, .npz, .nrrd, .mhd, .nii, .vti, ...), a ``mi.VolumeGrid`` or a tensor.
+        filename, grid or data: a file (.vol, .vdb, .nvdb, .npy, .npz, .nrrd, .mhd, .nii, ...), a ``mi.VolumeGrid`` or a tensor.
             For a file of several arrays, ``grid`` is the name of one of them.
         to_world: places the unit cube.
         use_grid_bbox: place the grid by its file's own box first. Default false.

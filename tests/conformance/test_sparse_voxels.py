@@ -124,7 +124,7 @@ def assert_twins(seed: int, shape: tuple, offset: tuple, channels: int, frame: s
 
 
 def smoke_scene(grid: dict, depth: int, albedo: float = 0.8, **more: dict) -> mi.Scene:
-    emission = {k: more.pop(k) for k in ("emission", "emission_density") if k in more}
+    emission = {k: more.pop(k) for k in ("emission", "emission_density", "scale") if k in more}
     smoke = medium("mivol_medium", grid | {"to_world": mi.ScalarTransform4f(PLACE)}, albedo, **emission)
     integrator = {"type": "mivol", "max_depth": depth}
     return close_up({"smoke": box_of(smoke, PLACE), "integrator": integrator, **(more or {"sky": sky(0.7)})}, res=10)
@@ -134,8 +134,8 @@ SUN = {"sun": sun([0.3, 0.2, -1.0])[0]}
 ESTIMATORS: dict[str, dict] = {
     "absorption": {"depth": 1, "albedo": 0.0},
     "one scattering": {"depth": 2},
-    "one scattering, sun": {"depth": 2, **SUN},
-    "flights": {"depth": 5, **SUN},
+    "one scattering, sun": {"depth": 2, "scale": 1.5, **SUN},
+    "flights": {"depth": 5, "scale": 1.5, **SUN},
     "emission": {"depth": 1, "albedo": 0.0, "emission": 2.0},
     "emission density": {"depth": 3, "emission_density": 2.0},
 }

@@ -1,0 +1,281 @@
+"""NanoVDB (``.nvdb``): the bricks of named sparse grids of float or double, uncompressed or compressed by zip.
+
+Conventions. A file is a row of segments: a header, the facts of its grids, and the grids. A grid is one block of memory: its
+head, the head of its tree, a root, two levels of inner nodes with 32^3 and 16^3 children, and leaves of 8^3 voxels, x slowest.
+The nodes of a level lie side by side. The box of the active voxels becomes the volume; a level set becomes a fog as in
+:mod:`mivol.files.vdb`.
+
+Reference: Museth 2021, "NanoVDB: A GPU-friendly and portable VDB data structure for real-time rendering and simulation"; the
+layout of version 32.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mivol.files.npy import check_memory
+from mivol.files.source import decompress, read_bytes, refusal, select_dataset
+from mivol.files.sparse_volume import EDGE, SparseVolumeData, allocate_bricks
+from mivol.files.volume import VolumeData, frame_from_steps
+
+MAGIC = (b"NanoVDB0", b"NanoVDB2")
+
+#: major version of the layout that is read.
+VERSION = 32
+
+#: compression of a grid by number.
+CODECS = ("none", "zip", "blosc")
+
+#: class of a grid by number; others are read as fogs.
+CLASSES = {1: "level set", 2: "fog volume"}
+
+FACTS, GRID_HEAD, TREE_HEAD = 176, 672, 64
+"""Sizes of the facts of a grid in a segment, of the head of a grid, and of the head of a tree [bytes]."""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where the numbers of a type lie.
+
+    Attributes:
+        name: name of the type.
+        dtype: NumPy's type.
+        background, root: place of the background in a root, and size of a root before its tiles [bytes].
+        tile: place of the value in a tile of the root.
+        values, leaf: place of the values in a leaf, and size of a leaf.
+    """
+
+    name: str
+    dtype: str
+    background: int
+    root: int
+    tile: int
+    values: int
+    leaf: int
+
+
+LAYOUTS = {1: _Layout("float", "<f4", 28, 64, 20, 96, 2144), 2: _Layout("double", "<f8", 32, 96, 24, 128, 4224)}
+"""By the number of the type."""
+
+INNER = ((16, 8, 1088, 33856), (32, 128, 8256, 270400))
+"""Children along an edge, voxels along the edge of a child, place of the table and size, of lower and upper nodes."""
+
+
+def is_nvdb(head: bytes) -> bool:
+    """Whether the first bytes are NanoVDB's."""
+    return head.startswith(MAGIC)
+
+
+def read_nvdb(path: Path, dataset: str | None = None) -> VolumeData:
+    """Read a grid as a dense volume; arguments and errors as of :func:`read_sparse_nvdb`."""
+    volume = read_sparse_nvdb(path, dataset)
+    check_memory(path, volume.dense_bytes)
+    return VolumeData(volume.dense(), volume.to_world, volume.meta)
+
+
+def read_sparse_nvdb(path: Path, dataset: str | None = None) -> SparseVolumeData:
+    """Read a grid in its leaves.
+
+    Args:
+        path: file.
+        dataset: name of the grid; ``name[1]`` is the second grid of a name. None for a file of one grid.
+
+    Returns:
+        Values and placement; ``meta`` holds ``grid``, ``class``, the first index ``index_min``, and for a level set the width
+        ``band`` of its narrow band [length].
+
+    Raises:
+        MivolError: a damaged or truncated file, another version, compression or type of values, a grid without active voxels,
+            or a fog whose value outside of its tree is not 0.
+    """
+    data = read_bytes(path)
+    grids = _list_grids(data, path)
+    name = select_dataset(path, dataset, list(grids))
+    codec, at, size = grids[name]
+    if codec == "blosc":
+        way_out = "write it without compression or with zip (nanovdb_convert -z none)"
+        raise refusal(path, f"the grid {name!r} compressed with Blosc", "no compression or zip", way_out)
+    if codec == "zip":
+        (held,) = _unpack("<Q", data, at, path)
+        return _read_grid(decompress(_take(data, at + 8, held, path), "zlib", size, path), path, name)
+    return _read_grid(_take(data, at, size, path), path, name)
+
+
+def _take(data: bytes, at: int, count: int, path: Path) -> bytes:
+    if count < 0 or at < 0 or at + count > len(data):
+        found = f"{len(data)} bytes, where {count} more are announced at byte {at}"
+        raise refusal(path, found, "a whole file", "the file is truncated or damaged: copy it again")
+    return data[at : at + count]
+
+
+def _unpack(codes: str, data: bytes, at: int, path: Path) -> tuple:
+    return struct.unpack(codes, _take(data, at, struct.calcsize(codes), path))
+
+
+def _list_grids(data: bytes, path: Path) -> dict[str, tuple[str, int, int]]:
+    """Codec, position and size in memory of each grid, by name."""
+    grids: dict[str, tuple[str, int, int]] = {}
+    at, seen = 0, []
+    while at < len(data):
+        magic, version, count, _ = _unpack("<8sIHH", data, at, path)
+        if magic not in MAGIC or version >> 21 != VERSION:
+            found = f"version {version >> 21} of NanoVDB's format" if magic in MAGIC else f"the bytes {magic!r} at byte {at}"
+            raise refusal(path, found, f"version {VERSION}", "write it again with NanoVDB of OpenVDB 8 or later")
+        at += 16
+        facts = []
+        for _ in range(count):
+            size, held = _unpack("<2Q", data, at, path)
+            (length,) = _unpack("<I", data, at + 136, path)
+            (codec,) = _unpack("<H", data, at + 168, path)
+            name = _take(data, at + FACTS, length, path).split(b"\0")[0].decode("utf-8", errors="replace")
+            facts.append((name, codec, size, held))
+            at += FACTS + length
+        for name, codec, size, held in facts:
+            if codec >= len(CODECS):
+                raise refusal(path, f"compression {codec}", f"one of {', '.join(CODECS)}", "the file is damaged: copy it again")
+            number = seen.count(name)
+            seen.append(name)
+            grids[f"{name}[{number}]" if number else name] = (CODECS[codec], at, size)
+            at += held
+    return grids
+
+
+def _read_grid(data: bytes, path: Path, name: str) -> SparseVolumeData:
+    grid_class, kind = _unpack("<2I", data, 632, path)
+    if kind not in LAYOUTS:
+        expected = " or ".join(layout.name for layout in LAYOUTS.values())
+        raise refusal(
+            path, f"the grid {name!r} of type {kind} of NanoVDB's", expected, "convert the grid, or choose another one"
+        )
+    layout = LAYOUTS[kind]
+    matrix = np.reshape(_unpack("<9d", data, 384, path), (3, 3))
+    shift = np.array(_unpack("<3d", data, 528, path))
+    offsets, counts = _unpack("<4q", data, GRID_HEAD, path), _unpack("<3I", data, GRID_HEAD + 32, path)
+    root = GRID_HEAD + offsets[3]
+    low, high = np.array(_unpack("<6i", data, root, path), np.int64).reshape(2, 3)
+    (background,) = _unpack(layout.dtype.replace("f4", "f").replace("f8", "d"), data, root + layout.background, path)
+    if (high < low).any():
+        raise refusal(path, f"no active voxel in the grid {name!r}", "at least one", "choose another grid")
+    is_level_set = CLASSES.get(grid_class) == "level set"
+    band = abs(background)
+    if is_level_set and not band > 0:
+        raise refusal(path, f"the level set {name!r} with a band of {band}", "a band above 0", "write the grid again")
+    if not is_level_set and background != 0:
+        raise refusal(path, f"the value {background:g} outside of the grid {name!r}", "0", "convert the grid to a .vdb")
+
+    def convert(values: np.ndarray) -> np.ndarray:
+        return np.clip(-values / band, 0, 1) if is_level_set else values
+
+    first, last = low // EDGE, high // EDGE
+    nodes = _Nodes(data, path, layout, offsets, counts, root)
+    places, values = nodes.read_leaves()
+    tiles = [
+        (value, cut) for value, cut in nodes.cut_tiles(first, last, background) if convert(np.array(value)) != 0 and len(cut)
+    ]
+    everywhere = np.concatenate([places, *(cut for _, cut in tiles)]) - first
+    check_memory(path, 4 * EDGE**3 * len(everywhere))
+    spans = last - first + 1
+    inside = ((everywhere >= 0) & (everywhere < spans)).all(axis=1)
+    numbers = np.where(inside, np.ravel_multi_index(np.clip(everywhere, 0, spans - 1)[:, ::-1].T, spans[::-1]), spans.prod())
+    bricks = allocate_bricks(len(everywhere), 1)
+    bricks[: len(places)] = convert(values.reshape(-1, EDGE, EDGE, EDGE, 1)).transpose(0, 3, 2, 1, 4)
+    begin = len(places)
+    for value, cut in tiles:
+        bricks[begin : begin + len(cut)], begin = convert(np.array(value)), begin + len(cut)
+    held = np.flatnonzero(inside & bricks.any(axis=(1, 2, 3, 4)))
+    if not len(held):
+        raise refusal(path, f"no value other than 0 in the grid {name!r}", "at least one", "choose another grid")
+    order = held[np.argsort(numbers[held], kind="stable")]
+    size = high - low + 1
+    meta = {
+        "path": str(path),
+        "format": "nvdb",
+        "dtype": np.dtype(layout.dtype).name,
+        "space": None,
+        "grid": name,
+        "class": CLASSES.get(grid_class, "unknown"),
+        "index_min": tuple(map(int, low)),
+        **({"band": float(band)} if is_level_set else {}),
+    }
+    return SparseVolumeData(
+        bricks[order],
+        everywhere[order][:, ::-1].astype(np.int32),
+        tuple(map(int, size[::-1])),
+        frame_from_steps(size, matrix, matrix @ low + shift),
+        tuple(int(n) % EDGE for n in low[::-1]),
+        meta,
+    )
+
+
+@dataclass
+class _Nodes:
+    """The nodes of a tree.
+
+    Attributes:
+        data, path: memory of the grid, and the file for refusals.
+        layout: of its type.
+        offsets: of the leaves, the lower and the upper nodes and the root, from the head of the tree.
+        counts: leaves, lower and upper nodes.
+        root: position of the root.
+    """
+
+    data: bytes
+    path: Path
+    layout: _Layout
+    offsets: tuple[int, ...]
+    counts: tuple[int, ...]
+    root: int
+
+    def _records(self, level: int, fields: dict[str, tuple[object, int]], size: int) -> np.ndarray:
+        """The nodes of a level as records."""
+        block = _take(self.data, GRID_HEAD + self.offsets[level], self.counts[level] * size, self.path)
+        names, formats, places = list(fields), [f[0] for f in fields.values()], [f[1] for f in fields.values()]
+        return np.frombuffer(block, np.dtype({"names": names, "formats": formats, "offsets": places, "itemsize": size}))
+
+    def read_leaves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places (n, 3) of the leaves with an active voxel, in bricks (x, y, z), and their values (n, 512)."""
+        fields = {"low": ("<3i4", 0), "mask": ("64u1", 16), "values": ((self.layout.dtype, 512), self.layout.values)}
+        leaves = self._records(0, fields, self.layout.leaf)
+        leaves = leaves[leaves["mask"].any(axis=1)]
+        return leaves["low"].astype(np.int64) // EDGE, leaves["values"]
+
+    def cut_tiles(self, first: np.ndarray, last: np.ndarray, background: float) -> list[tuple[float, np.ndarray]]:
+        """Value and bricks (n, 3) of each tile between two bricks (x, y, z) that differs from the background."""
+        tiles = []
+        for level, (children, edge, table, size) in enumerate(INNER, 1):
+            bits = children**3 // 8
+            fields = {
+                "low": ("<3i4", 0),
+                "on": (f"{bits}u1", 32),
+                "child": (f"{bits}u1", 32 + bits),
+                "table": (("<u8", children**3), table),
+            }
+            for node in self._records(level, fields, size):
+                has_child = np.unpackbits(node["child"], bitorder="little").astype(bool)
+                values = np.ascontiguousarray(node["table"]).view(self.layout.dtype)[
+                    :: 8 // np.dtype(self.layout.dtype).itemsize
+                ]
+                origin = node["low"].astype(np.int64) // (children * edge) * (children * edge)
+                for index in np.flatnonzero(~has_child & (values != background)):
+                    steps = np.array(np.unravel_index(index, (children,) * 3))
+                    tiles.append((float(values[index]), _cut(origin + steps * edge, edge, first, last)))
+        (count,) = _unpack("<I", self.data, self.root + 24, self.path)
+        for number in range(count):
+            at = self.root + self.layout.root + 32 * number
+            key, child, _ = _unpack("<QqI", self.data, at, self.path)
+            (value,) = _unpack("<f" if self.layout.dtype == "<f4" else "<d", self.data, at + self.layout.tile, self.path)
+            if not child and value != background:
+                origin = [(key >> s & (1 << 21) - 1) << 12 for s in (42, 21, 0)]
+                origin = np.array([o - (1 << 32) if o >= 1 << 31 else o for o in origin])
+                tiles.append((value, _cut(origin, 4096, first, last)))
+        return tiles
+
+
+def _cut(origin: np.ndarray, edge: int, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """The bricks (n, 3) of a tile between two bricks (x, y, z)."""
+    begin, end = np.maximum(origin // EDGE, first), np.minimum((origin + edge) // EDGE, last + 1)
+    return np.stack(np.meshgrid(*map(np.arange, begin, end), indexing="ij"), axis=-1).reshape(-1, 3)
