@@ -13,6 +13,7 @@ from pathlib import Path
 import h5py
 import laspy
 import numpy as np
+import scipy.io
 import tifffile
 from dicom_series import write_frames, write_series
 from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
@@ -69,6 +70,15 @@ def _dicom(path: Path) -> None:
 
 def _series(folder: Path) -> None:
     write_series(folder, numbered()[..., 0].astype("i2"), names=["a.dcm", "b.dcm"])
+
+
+def _matlab(path: Path) -> None:
+    scipy.io.savemat(path, {"density": numbered()[..., 0], "name": "a"}, do_compression=True)
+
+
+def _matlab_hdf5(path: Path) -> None:
+    _hdf5(path)
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + path.read_bytes())
 
 
 def _tiff(compression: str | None) -> Write:
@@ -240,6 +250,9 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "pbrt": (".pbrt", _bytes(pbrt(numbered())), mivol.read_volume),
     "vdb": (".vdb", _volume, mivol.read_volume),
     "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
+    "matlab": (".mat", _matlab, mivol.read_volume),
+    "matlab hdf5": (".mat", _matlab_hdf5, mivol.read_volume),
+    "raw": (".raw", lambda path: path.write_bytes(_raw()), lambda path: mivol.read_volume(path, shape=(2, 3, 4), dtype="f4")),
     "tiff": (".tif", _tiff(None), mivol.read_volume),
     "tiff zlib": (".tif", _tiff("zlib"), mivol.read_volume),
     "tiff ours": (".tif", _volume, mivol.read_volume),
@@ -279,6 +292,7 @@ FILES: dict[str, tuple[str, Write, Read]] = {
 SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
     "nrrd detached": (_detached_nrrd, ("a.nhdr", "a.raw"), lambda folder: mivol.read_volume(folder / "a.nhdr")),
     "metaimage detached": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.mhd")),
+    "raw by a header": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.raw")),
     "tiff slices": (_slices, ("s0.tif", "s1.tif"), mivol.read_volume),
     "dicom series": (_series, ("a.dcm", "b.dcm"), mivol.read_volume),
     "nikon": (_nikon, ("bead.xtekct", "_ctdata.txt", "bead_0002.tif"), _read_nikon),

@@ -7,6 +7,7 @@ code; only a bug of the program shows a traceback. Each verb makes its own slow 
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -19,6 +20,8 @@ from mivol.optim.interrupt import Signals
 
 if TYPE_CHECKING:
     from mivol.experiments.found_scan import ScanDraft
+    from mivol.points.summary import FileSummary
+    from mivol.scene.explain import Explanation
     from mivol.scene.load import LoadedScene
 
 USAGE, STOPPED = 2, 130
@@ -130,6 +133,8 @@ CLUSTER = flag(
     "--cluster", metavar="WHERE", help="run on workers of Dask: local:N, tcp://host:port, tls://host:port, or a TOML file"
 )
 DATASET = flag("--dataset", help="array of a volume file with several arrays, or series of DICOM (default: the only one)")
+SHAPE = flag("--shape", metavar="Z,Y,X", help="voxels of raw bytes without a header, with --dtype")
+DTYPE = flag("--dtype", help="type of raw bytes: uint16, float32, >i2 for big-endian, ...")
 MAX_DEPTH = flag("--max-depth", type=int, help="longest path (default: the max_depth of the scene's integrator)")
 
 
@@ -175,6 +180,8 @@ def explain_flags() -> list:
         *model_flags("explain the fit of mivol optimize with this --as"),
         list_flag("--set", "key=value", "override a setting of the experiment"),
         DATASET,
+        SHAPE,
+        DTYPE,
         MAX_DEPTH,
         flag(
             "--noise", type=float, default=0.02,
@@ -309,6 +316,8 @@ def convert_flags() -> list:
         flag("output", type=Path,
              help=f"file to write: {', '.join(writable)}, .npz (field), .obj (mesh); volumes: {', '.join(WRITERS)}"),
         DATASET,
+        SHAPE,
+        DTYPE,
         flag("--to", choices=(*KINDS, "field", "mesh", "octree", "grid"),
              help="kind of the output (default: as the source, if possible)"),
         flag("--resolution", type=int,
@@ -348,41 +357,48 @@ def explain(arguments: argparse.Namespace) -> int:
     a scan. A refusal comes after the facts, with exit code 1.
     """
     from mivol.photos import find_format
-    from mivol.points.summary import is_points_file, summarize_file
+    from mivol.points.summary import is_points_file
 
-    code = explain_array(arguments)
-    if code is not None:
+    if (code := explain_array(arguments)) is not None:
         return code
     if _is_experiment(arguments):
         from mivol.experiments.kinds import explain_experiment
 
         answer = explain_experiment(*load_experiment(arguments.scene, arguments), arguments.output)
-    elif is_points_file(arguments.scene):
-        answer = summarize_file(arguments.scene)
-    elif arguments.scene.is_dir() or find_format(arguments.scene):
+    elif not is_points_file(arguments.scene) and (arguments.scene.is_dir() or find_format(arguments.scene)):
         return explain_photos(arguments.scene, arguments.output)
-    elif arguments.scene.suffix.lower() == ".npz":
-        from mivol.experiments.octree_conversion import describe_field
-
-        answer = describe_field(arguments.scene, arguments.mode)
     else:
-        from mivol.scene.explain import explain_scene
-
-        answer = explain_scene(load_named_scene(arguments).scene, arguments.max_depth, noise=arguments.noise)
+        answer = _explain_file(arguments)
     print(answer.text)
     return int(bool(answer.refusal))
+
+
+def _explain_file(arguments: argparse.Namespace) -> Explanation | FileSummary:
+    """Explain points, Gaussians, a radiance field or a scene."""
+    from mivol.points.summary import is_points_file, summarize_file
+
+    if is_points_file(arguments.scene):
+        return summarize_file(arguments.scene)
+    if arguments.scene.suffix.lower() == ".npz":
+        from mivol.experiments.octree_conversion import describe_field
+
+        return describe_field(arguments.scene, arguments.mode)
+    from mivol.scene.explain import explain_scene
+
+    return explain_scene(load_named_scene(arguments).scene, arguments.max_depth, noise=arguments.noise)
 
 
 def explain_array(arguments: argparse.Namespace) -> int | None:
     """Explain a scan or describe a volume, and return the exit code; None for anything else."""
     from mivol.files.formats import describe_volume
 
-    is_array = _is_array(_check_dataset(arguments.scene, arguments.dataset))
-    if draft := draft_of(arguments.scene, arguments, is_array):
+    layout = _raw_layout(arguments)
+    is_array = bool(layout) or _is_array(_check_dataset(arguments.scene, arguments.dataset))
+    if not layout and (draft := draft_of(arguments.scene, arguments, is_array)):
         return explain_scan(draft)
     if not is_array:
         return None
-    print(describe_volume(arguments.scene, arguments.dataset))
+    print(describe_volume(arguments.scene, arguments.dataset, **layout))
     return 0
 
 
@@ -443,6 +459,16 @@ def _is_array(path: Path) -> bool:
     from mivol.photos import find_format
 
     return is_volume(path) and not (path.is_dir() and find_format(path))
+
+
+def _raw_layout(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Shape and type of raw bytes from the flags; empty without them."""
+    if arguments.shape is None and arguments.dtype is None:
+        return {}
+    words = (arguments.shape or "").split(",")
+    if arguments.shape is not None and not all(re.fullmatch(r"\s*\d{1,9}\s*", word, re.ASCII) for word in words):
+        raise MivolError(f"--shape: found {arguments.shape!r}, expected Z,Y,X; write --shape 64,128,128.")
+    return {"shape": None if arguments.shape is None else tuple(map(int, words)), "dtype": arguments.dtype}
 
 
 def _check_dataset(path: Path, dataset: str | None) -> Path:
@@ -706,7 +732,7 @@ def convert(arguments: argparse.Namespace) -> None:
     Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     """
-    is_array = _is_array(_check_dataset(arguments.source, arguments.dataset))
+    is_array = bool(_raw_layout(arguments)) or _is_array(_check_dataset(arguments.source, arguments.dataset))
     print((_convert_volume if is_array else _convert_cloud)(arguments))
 
 
@@ -718,7 +744,7 @@ def _convert_volume(arguments: argparse.Namespace) -> str:
         raise MivolError(
             f"{arguments.source}: --to, --resolution and --box are for points, Gaussians and fields: leave them out."
         )
-    return convert_volume(arguments.source, arguments.output, arguments.dataset)
+    return convert_volume(arguments.source, arguments.output, arguments.dataset, **_raw_layout(arguments))
 
 
 def _convert_cloud(arguments: argparse.Namespace) -> str:

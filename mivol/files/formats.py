@@ -11,7 +11,7 @@ import dataclasses
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,9 +19,25 @@ import numpy as np
 
 from mivol.display import format_point
 from mivol.errors import MivolError
-from mivol.files import dicom, hdf5, metaimage, mrc, nifti, npy, nrrd, nvdb, renderer_grids, tiff, vdb, vti, vtk_legacy
+from mivol.files import (
+    dicom,
+    hdf5,
+    matlab,
+    metaimage,
+    mrc,
+    nifti,
+    npy,
+    nrrd,
+    nvdb,
+    raw,
+    renderer_grids,
+    tiff,
+    vdb,
+    vti,
+    vtk_legacy,
+)
 from mivol.files.atomic import write_whole
-from mivol.files.source import check_file, refusal
+from mivol.files.source import check_file, refusal, refuse_dataset
 from mivol.files.sparse_volume import SparseVolumeData
 from mivol.files.volume import VolumeData, check_frame, frame_from_steps, is_upright, to_values
 
@@ -84,18 +100,24 @@ FORMATS: dict[str, VolumeFormat] = {
     ".map": _MRC,
     ".rec": _MRC,
     ".dcm": _DICOM,
+    ".mat": VolumeFormat("MATLAB", _starts_with(matlab.MAGIC), matlab.read_matlab),
     ".tif": _TIFF,
     ".tiff": _TIFF,
 }
+
+RAW_BYTES = "raw bytes"
 
 #: name of a kind of file without a reader here -> (test of the first ``HEAD`` bytes, way out).
 UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
     "an MRC file": (mrc.is_mrc, "name it .mrc"),
     "a DICOM file": (dicom.is_dicom, "describe or convert it by mivol explain and mivol convert"),
-    "a MATLAB file": (_starts_with(b"MATLAB"), "save the array as .npy or .h5"),
+    "a MATLAB file": (_starts_with(b"MATLAB"), "name it .mat"),
     "an HDF5 file": (_starts_with(hdf5.MAGIC), "name a volume .h5; explain and optimize find the data of a scan"),
     "a TIFF file": (tiff.is_tiff, "name it .tif, or the folder of a scan for explain and optimize"),
-    "raw bytes": (lambda head: b"\0" in head, "describe them in a header beside them, .nhdr or .mhd, and name the header"),
+    RAW_BYTES: (
+        lambda head: b"\0" in head,
+        "say size and type by --shape and --dtype (shape= and dtype= in Python), or in a header .nhdr or .mhd beside them",
+    ),
 }
 
 #: suffix -> writer(file, values, to_world, metadata).
@@ -123,7 +145,14 @@ FRAMES: dict[str, Callable[[VolumeData], np.ndarray]] = {
 }
 
 
-def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: str = "file") -> VolumeData:
+def read_volume(
+    path: str | os.PathLike,
+    dataset: str | None = None,
+    *,
+    frame: str = "file",
+    shape: Sequence[int] | None = None,
+    dtype: np.dtype | str | None = None,
+) -> VolumeData:
     """Read a volume of any format in :data:`FORMATS`.
 
     Args:
@@ -133,6 +162,8 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
             ``SeriesInstanceUID`` of a DICOM series; name of the slices, with "#" for numbers, in a folder of several kinds.
         frame: key of :data:`FRAMES`: "file" places the volume as in the header and refuses a degenerate box, "unit" puts the
             volume on the unit cube.
+        shape, dtype: voxels (Z, Y, X) and type of raw bytes, which have no header. Raw bytes with a header .nhdr or .mhd beside
+            them need neither.
 
     Returns:
         Values, placement and facts. NaN, Inf and negative numbers are kept; :func:`mivol.files.check_volume` refuses them.
@@ -145,7 +176,7 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
         (161, 94, 103, 1)
     """
     path = Path(path)
-    kind = _find_format(path)
+    kind = _find_format(path, shape, dtype)
     return _read_placed(path, kind.read, dataset, frame)
 
 
@@ -244,24 +275,32 @@ VOLUME_SUFFIXES = tuple(suffix for suffix in FORMATS if suffix not in SHARED_SUF
 
 
 def is_volume(path: Path) -> bool:
-    """Whether a suffix belongs to volumes alone, a file without such a suffix is DICOM, or a folder holds DICOM or TIFF."""
+    """Whether a suffix belongs to volumes alone, a file of another suffix is DICOM or raw with a header, or a folder
+    holds DICOM or TIFF.
+    """
     if path.is_dir():
         return _is_dicom_folder(path) or bool(tiff.group_images(path))
-    return path.name.lower().endswith(VOLUME_SUFFIXES) or _is_nameless_dicom(path)
+    if path.name.lower().endswith(VOLUME_SUFFIXES) or _is_nameless_dicom(path):
+        return True
+    return path.is_file() and not path.name.lower().endswith(tuple(FORMATS)) and raw.find_header(path) is not None
 
 
 LARGEST_DENSE = 1 << 28
 """Size of a sparse volume as a dense array [bytes] up to which its voxels are described one by one."""
 
 
-def describe_volume(path: Path, dataset: str | None = None) -> str:
+def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> str:
     """Describe a volume in a few lines: size, values, place, and numbers that no medium takes.
+
+    Args:
+        path, dataset: as of :func:`read_volume`.
+        layout: ``shape`` and ``dtype`` of raw bytes.
 
     Raises:
         MivolError: as :func:`read_volume`.
     """
     is_sparse = is_sparse_file(path)
-    volume = read_sparse_volume(path, dataset) if is_sparse else read_volume(path, dataset)
+    volume = read_sparse_volume(path, dataset) if is_sparse else read_volume(path, dataset, **layout)
     # Statistics of a large sparse volume count the voxels of its bricks, and 0 outside.
     is_whole = not is_sparse or volume.dense_bytes <= LARGEST_DENSE
     values = volume.dense() if is_sparse and is_whole else volume.values
@@ -275,7 +314,7 @@ def describe_volume(path: Path, dataset: str | None = None) -> str:
     is_turned = np.count_nonzero(volume.to_world[:3, :3]) > 3
     array = volume.meta.get("grid") or volume.meta.get("dataset")
     lines = [
-        f"{path}: {_find_format(path).name}" + (f", array {array!r}" if array else ""),
+        f"{path}: {_find_format(path, **layout).name}" + (f", array {array!r}" if array else ""),
         f"voxels (x, y, z): {size}, {channels} channel{'s' if channels > 1 else ''} of {volume.meta['dtype']}, {memory}",
         f"box: {format_point(corners.min(axis=0))} to {format_point(corners.max(axis=0))}"
         + (" around the turned axes" if is_turned else "")
@@ -295,8 +334,13 @@ def describe_volume(path: Path, dataset: str | None = None) -> str:
     return "\n".join([*lines, *(f"assumed: {note}" for note in volume.meta.get("notes", ()))])
 
 
-def convert_volume(source: Path, target: Path, dataset: str | None = None) -> str:
+def convert_volume(source: Path, target: Path, dataset: str | None = None, **layout: Any) -> str:
     """Write a volume in another format; its values and place are kept.
+
+    Args:
+        source, target: files; a folder may be the source.
+        dataset: as of :func:`read_volume`.
+        layout: ``shape`` and ``dtype`` of raw bytes.
 
     Returns:
         A line that describes the written file and what it does not hold, and a line for each assumption about the source.
@@ -304,7 +348,7 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None) -> st
     Raises:
         MivolError: as :func:`read_volume` and :func:`write_volume`.
     """
-    volume = read_volume(source, dataset)
+    volume = read_volume(source, dataset, **layout)
     suffix = _find_suffix(target, WRITERS)
     place, lost = _keep_place(suffix, volume)
     facts = {"space": volume.meta["space"]} if volume.meta.get("space") else {}
@@ -349,8 +393,10 @@ def refuse_unread(path: Path) -> MivolError:
     return refusal(path, f"{found} with {suffix}", f"a volume of {', '.join(FORMATS)}", UNREAD[found][1])
 
 
-def _find_format(path: Path) -> VolumeFormat:
-    """The format of a folder, of DICOM with any other suffix, or of a suffix with which the first bytes agree."""
+def _find_format(path: Path, shape: Sequence[int] | None = None, dtype: np.dtype | str | None = None) -> VolumeFormat:
+    """The format of a folder, of DICOM or raw bytes with any other suffix, or of a suffix with which the first bytes agree."""
+    if shape is not None or dtype is not None:
+        return _raw_format(check_file(path), shape, dtype)
     if path.is_dir() and _is_dicom_folder(path):
         return _DICOM
     if path.is_dir() and tiff.group_images(path):
@@ -359,12 +405,29 @@ def _find_format(path: Path) -> VolumeFormat:
     if not path.name.lower().endswith(tuple(FORMATS)):
         if _is_nameless_dicom(path):
             return _DICOM
+        if header := raw.find_header(path):
+            named = FORMATS[header.suffix]
+            return VolumeFormat(f"raw bytes by {header.name}", named.recognise, lambda _, dataset: named.read(header, dataset))
         raise refuse_unread(path)
     suffix = _find_suffix(path, FORMATS)
     head = _read_head(path)
     if not FORMATS[suffix].recognise(head):
         raise _wrong_format(path, suffix, head)
     return FORMATS[suffix]
+
+
+def _raw_format(path: Path, shape: Sequence[int] | None, dtype: np.dtype | str | None) -> VolumeFormat:
+    if path.name.lower().endswith(tuple(FORMATS)):
+        name = FORMATS[_find_suffix(path, FORMATS)].name
+        raise refusal(path, f"shape or dtype for {name}", "raw bytes without a header", "leave them out")
+    if shape is None or dtype is None:
+        raise refusal(path, "only one of shape and dtype", "both", 'add the other, as shape "64,64,64" and dtype "uint16"')
+
+    def read(path: Path, dataset: str | None) -> VolumeData:
+        refuse_dataset(path, dataset)
+        return raw.read_raw(path, shape, dtype)
+
+    return VolumeFormat("raw bytes", lambda head: True, read)
 
 
 def _is_dicom_folder(path: Path) -> bool:
@@ -382,6 +445,8 @@ def _read_head(path: Path) -> bytes:
 
 
 def _find_unread(path: Path) -> str | None:
+    if path.suffix.lower() in raw.SUFFIXES:
+        return RAW_BYTES
     head = _read_head(path)
     return next((name for name, (recognise, _) in UNREAD.items() if recognise(head)), None)
 
