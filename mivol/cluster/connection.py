@@ -105,11 +105,14 @@ def _connect_address(distributed: Any, settings: ClusterSettings) -> Client:
         ) from None
 
 
-PATIENCE = {
+DASK = {
     "distributed.comm.timeouts.connect": "120s", "distributed.comm.timeouts.tcp": "300s",
     "distributed.scheduler.worker-ttl": None,
+    "distributed.worker.profile.enabled": False, "distributed.admin.system-monitor.interval": "2s",
+    "distributed.admin.tick.interval": "200ms",
 }  # fmt: skip
-"""Timeouts of Dask for clusters that mivol starts: a busy machine, or a long compilation in a worker, is no lost worker."""
+"""Settings of Dask for clusters that mivol starts. A busy machine, or a long compilation in a worker, is no lost worker; and
+profiles of Python code take time from workers that compute in kernels."""
 
 OWN_GROUP = "import os; os.setpgid(0, 0)"
 """Code at the start of a local worker. Ctrl-C in a terminal reaches the owner's group of processes. In a worker, Mitsuba would
@@ -123,7 +126,7 @@ def _start_local(distributed: Any, settings: ClusterSettings) -> Iterator[Client
 
     security = distributed.Security.temporary()
     with (
-        dask.config.set(PATIENCE),
+        dask.config.set(DASK),
         distributed.LocalCluster(
             n_workers=settings.workers, threads_per_worker=1, processes=True, memory_limit=0, host="127.0.0.1",
             dashboard_address="127.0.0.1:0", security=security, silence_logs=logging.CRITICAL + 1, preload=[OWN_GROUP],
@@ -155,7 +158,7 @@ def _start_jobs(distributed: Any, settings: ClusterSettings) -> Iterator[tuple[C
             "node, or give --cluster local:N."
         )
     with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(PATIENCE))
+        stack.enter_context(dask.config.set(DASK))
         failures = stack.enter_context(_collect_failures())
         try:
             cluster = getattr(dask_jobqueue, name)(
