@@ -98,6 +98,12 @@ CITATIONS: dict[str, Citation] = {
         "CVPR",
         "https://arxiv.org/abs/2111.13679",
     ),
+    "plenoctrees_2021": Citation(
+        "A. Yu, R. Li, M. Tancik, H. Li, R. Ng, A. Kanazawa",
+        2021,
+        "PlenOctrees for Real-time Rendering of Neural Radiance Fields",
+        "ICCV",
+    ),
     "plenoxels_2022": Citation(
         "S. Fridovich-Keil, A. Yu, M. Tancik, Q. Chen, B. Recht, A. Kanazawa",
         2022,

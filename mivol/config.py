@@ -586,6 +586,41 @@ class HashExperiment(Section):
     output: Output = "runs/field"
 
 
+class OctreeSettings(Section):
+    """The octree and its fit: a grid first, or a field of a file."""
+
+    kind: Annotated[Literal["octree"], setting("1", "a grid, its octree, and a fit of the leaves")]
+    start: Annotated[str, setting("path", "field (.npz) to begin at, a grid or an octree; empty: fit a grid first")] = ""
+    preset: Annotated[str, setting("1", "of the grid: tiny, cpu, fine or gpu", min_length=1)] = "cpu"
+    effort: Annotated[float, setting("1", "factor on the steps of grid and octree", gt=0)] = 1.0
+    longest: (
+        Annotated[int, setting("voxel", "voxels of the grid along its longest edge; absent: preset", ge=8, le=2048)] | None
+    ) = None
+    degree: Annotated[int, setting("1", "of the spherical harmonics; absent: preset", ge=0, le=4)] | None = None
+    depth: (
+        Annotated[int, setting("1", "levels of the octree below its root; absent: leaves of half a voxel", ge=1, le=12)] | None
+    ) = None
+    keep_weight: Annotated[
+        float, setting("1", "share of a pixel below which a leaf that weighs less in all views is dropped", ge=0, lt=1)
+    ] = 0.015
+    tolerance: Annotated[float, setting("1", "change of views up to which eight leaves become one", ge=0, lt=1)] = 0.15
+    steps: Annotated[int, setting("step", "steps of the octree, before effort", ge=1)] = 400
+
+
+class OctreeExperiment(Section):
+    """A fit of an octree to photographs: a file with a table ``[photos]``, and ``kind = "octree"`` in its table ``[field]``."""
+
+    title: Title
+    photos: Annotated[Photographs, setting("1", "the photographs")]
+    field: Annotated[OctreeSettings, setting("1", "the octree and its fit")]
+    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
+    checkpoint_every: CheckpointSteps = 500
+    variant: Variant = "llvm_ad_rgb"
+    seed: Seed = 0
+    threads: Threads = 0
+    output: Output = "runs/octree"
+
+
 class GaussianSettings(Section):
     """The Gaussians and their fit."""
 
@@ -624,7 +659,7 @@ class GaussianExperiment(Section):
     output: Output = "runs/gaussians"
 
 
-PhotoExperiment = FieldExperiment | HashExperiment | GaussianExperiment
+PhotoExperiment = FieldExperiment | HashExperiment | OctreeExperiment | GaussianExperiment
 """A fit of photographs, with one of the models."""
 
 Experiment = SceneExperiment | ScanExperiment | PhotoExperiment
@@ -638,10 +673,10 @@ KINDS: dict[str, type[Section]] = {
 }
 """Kinds of experiments by a table of the file; the first present table decides."""
 
-FIELD_KINDS: dict[str, type[Section]] = {"grid": FieldExperiment, "hash": HashExperiment}
+FIELD_KINDS: dict[str, type[Section]] = {"grid": FieldExperiment, "hash": HashExperiment, "octree": OctreeExperiment}
 """Kinds of fits with a table ``[photos]``, by the setting ``field.kind``."""
 
-EXPERIMENTS = (SceneExperiment, ScanExperiment, FieldExperiment, HashExperiment, GaussianExperiment)
+EXPERIMENTS = (SceneExperiment, ScanExperiment, FieldExperiment, HashExperiment, OctreeExperiment, GaussianExperiment)
 """Settings of all kinds of experiments."""
 
 CAPTURE = {"photos": {"largest": 240, "box": "middle"}, "show": {"views": 64}}
@@ -718,6 +753,7 @@ MODELS: dict[str, dict[str, dict[str, str]]] = {
     "gaussians": {"gaussians": {}},
     "grid": {"field": {}},
     "hash": {"field": {"kind": "hash"}},
+    "octree": {"field": {"kind": "octree"}},
 }
 """Table of a model with its first settings, by the word of ``mivol optimize --as``; the first word is the default."""
 

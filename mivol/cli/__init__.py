@@ -164,7 +164,8 @@ def model_flags(text: str) -> list[tuple[tuple[str, ...], dict[str, Any]]]:
         flag(
             "--preset",
             help="preset of that model; of Gaussians: minute (default), minutes, fine, ...; of a grid: cpu (default) for an "
-            "object, capture for a place around the cameras, ...; of a hash grid: minute (default), minutes, gpu",
+            "object, capture for a place around the cameras, ...; of a hash grid: minute (default), minutes, gpu; of an "
+            "octree: the grid's",
         ),
     ]
 
@@ -488,7 +489,7 @@ def explain_photos(path: Path, picture: Path | None) -> int:
     print(survey.describe())
     if note := note_on_alpha(survey):
         print(note)
-    print("--as gaussians, grid or hash explains a fit; --as grid --preset capture is for a place around the cameras")
+    print("--as gaussians, grid, hash or octree explains a fit; --as grid --preset capture is for a place around the cameras")
     if picture is not None:
         plot_cameras(survey, picture)
         print(picture)
@@ -667,7 +668,7 @@ def _check_preset(model: str, preset: str | None) -> None:
     from mivol.optim.photographs.radiance_plan import PRESETS as GRIDS
     from mivol.optim.photographs.sampled_problem import PRESETS as HASH_GRIDS
 
-    presets = {"gaussians": GAUSSIANS, "grid": GRIDS, "hash": HASH_GRIDS}
+    presets = {"gaussians": GAUSSIANS, "grid": GRIDS, "hash": HASH_GRIDS, "octree": GRIDS}
     other = next((name for name, known in presets.items() if preset in known), model)
     if preset not in presets[model] and other != model:
         known = ", ".join(presets[model])

@@ -14,6 +14,7 @@ from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.fit_kind import FitKind, RunContext
 from mivol.experiments.gaussian_fit import GaussianFit
 from mivol.experiments.hash_fit import HashFit
+from mivol.experiments.octree_fit import OctreeFit
 from mivol.experiments.photo_fit import PhotoFit
 from mivol.experiments.run_folder import CHECKPOINT, BestIterate, RunFolder
 from mivol.experiments.scan_fit import ScanFit
@@ -30,6 +31,7 @@ KINDS: dict[type, type[FitKind]] = {
     config.ScanExperiment: ScanFit,
     config.FieldExperiment: FieldFit,
     config.HashExperiment: HashFit,
+    config.OctreeExperiment: OctreeFit,
     config.GaussianExperiment: GaussianFit,
 }
 """Kind of an experiment by the type of the settings."""

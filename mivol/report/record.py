@@ -78,6 +78,7 @@ QUANTITIES: dict[str, Quantity] = {
     "flip": Quantity("FLIP of the held-out views", log=False),
     "nodes": Quantity("Stored nodes", log=False),
     "gaussians": Quantity("Gaussians", log=False),
+    "leaves": Quantity("Leaves", log=False),
     "numbers": Quantity("Fitted numbers", log=False),
     "samples": Quantity("Samples of a ray", log=False),
     "bytes": Quantity("Memory of the field", "MiB", log=False),

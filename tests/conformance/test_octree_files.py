@@ -31,7 +31,7 @@ def test_rounded_values_err_by_what_the_page_says(variant_rgb: str, tmp_path: Pa
     (density, sh), (old, old_sh) = back.values(), tree.values()
     edges = tree.cell * edges_of(tree.sizes)
     assert np.abs(np.exp(-density * edges) - np.exp(-old * edges)).max() <= 0.011
-    assert np.abs(sh[:, 0] - old_sh[:, 0]).max() <= 1 / 64 + 1e-6 and np.abs(sh - old_sh).max() <= 1 / 40 + 1e-6
+    assert np.abs(sh[:, 0] - old_sh[:, 0]).max() <= 1 / 64 + 1e-6 and np.abs(sh - old_sh).max() <= 1 / 32 + 1e-6
 
 
 def test_a_single_leaf_is_a_tree(variant_rgb: str, tmp_path: Path) -> None:

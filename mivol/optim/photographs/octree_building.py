@@ -50,8 +50,8 @@ class OctreeRecipe:
     """
 
     depth: int = 0
-    keep_weight: float = 0.02
-    tolerance: float = 0.002
+    keep_weight: float = 0.015
+    tolerance: float = 0.05
 
 
 def build_octree(grid: SphericalGrid, rays: ViewRays, recipe: OctreeRecipe = OctreeRecipe()) -> Octree:
@@ -79,7 +79,11 @@ def build_octree(grid: SphericalGrid, rays: ViewRays, recipe: OctreeRecipe = Oct
             )
         tree = _sample(grid, base, level, cells, with_colours=False)
         cells = separate(tree.codes, level)
-        seen = max_weights(tree, rays) >= recipe.keep_weight
+        weights = max_weights(tree, rays)
+        if level > base + 1:
+            # Leaves smaller than pixels lie between the rays: what a ray meets in a sibling counts for all eight.
+            weights = _largest_of_siblings(tree.codes, weights)
+        seen = weights >= recipe.keep_weight
         if not seen.any():
             raise MivolError("no view shows matter in the grid: check the box, the cameras and the threshold.")
         cells = cells[seen]
@@ -190,6 +194,12 @@ def _means(grid: SphericalGrid, edge: float, cells: np.ndarray, with_colours: bo
     dr.eval(density, table)
     sh = np.array(table).reshape(len(cells), grid.width)[:, : 3 * grid.basis]
     return np.array(density), sh.reshape(len(cells), grid.basis, 3)
+
+
+def _largest_of_siblings(codes: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The largest weight among the siblings of each leaf; all leaves have one size, in the order of their codes."""
+    _, first, which = np.unique(codes >> np.uint64(3), return_index=True, return_inverse=True)
+    return np.maximum.reduceat(weights, first)[which]
 
 
 def max_weights(tree: Octree, rays: ViewRays) -> np.ndarray:

@@ -1,15 +1,19 @@
 """The walk of a ray through the leaves of an octree, from leaf plane to leaf plane.
 
 Index. A table holds an entry for each of 2^top cells along each axis. An entry is a leaf, vacuum, or the number of a brick of
-4 x 4 x 4 entries, each a quarter of the edge; bricks nest until their entries are cells. So a look-up reads one number at up
-to 128 leaves along an axis, two numbers at 512, and four at most. A leaf larger than an entry fills all its entries. An entry
-of vacuum has a reach r: the ray may cross the r - 1 entries on every side (Chebyshev distance).
+4 x 4 x 4 entries, each a quarter of the edge; bricks nest until their entries are cells. A brick of cells is two records, for
+its lower and its upper half along z: a bit for each cell with matter, a bit for each cell that begins a leaf, and the number
+of leaves before the half. Bits, like leaves, stand in the order of codes, so the row of a leaf is that number plus the count
+of leaves that begin up to its cell. A look-up reads two records at up to 256 cells along an axis, and four at most; a record
+is 16 bytes for 32 cells. Vacuum has a reach r: the ray may cross the r - 1 entries, or octants of a brick, on every side
+(Chebyshev distance).
 
 Planes. Positions are whole numbers of cells, counted from the cell of entry, and the distance of a plane is computed from its
 number and the point of entry, so nothing accumulates along a ray. A ray in a plane, an edge or a corner belongs to one of the
 cells beside it, by the whole number, and never stands still: at least one axis advances by a cell in each step.
 
-References: Amanatides & Woo 1987 (the traversal); Cohen & Sheffer 1994 (distances for a ray to skip).
+References: Amanatides & Woo 1987 (the traversal); Cohen & Sheffer 1994 (distances for a ray to skip);
+    Jacobson 1989 (rank of a bit in constant time).
 """
 
 from __future__ import annotations
@@ -39,8 +43,14 @@ SIZE_SHIFT, ROW_MASK = 27, (1 << 27) - 1
 FIRST_REACH = (1 << 27) - 4096
 """Numbers from here on are reaches of vacuum."""
 
-TOP = 7
-"""Largest logarithm of the edge of the table: 8 MiB."""
+TOP = 6
+"""Largest logarithm of the edge of the table: 1 MiB."""
+
+HALF = 32
+"""Cells of a record of half a brick."""
+
+FINE = 9
+"""Largest depth at which octants have reaches: the distances of 256^3 octants."""
 
 
 @dataclass
@@ -51,7 +61,9 @@ class LeafIndex:
         depth: levels below the root.
         top: logarithm of the edge of the table.
         table: UInt32, an entry for each cell of the table, x fastest.
-        bricks: UInt32, 64 entries a brick, x fastest; a dummy without bricks.
+        bricks: UInt32, 64 entries a brick, x fastest; a dummy without bricks of entries.
+        halves: UInt32, 4 numbers for each half of a brick of cells: cells with matter, cells that begin a leaf, leaves before
+            it, and a byte for the reach of each octant; a dummy without bricks of cells.
         from_world: (3, 4) map from the world to cells: cell (i, j, k) begins at (i, j, k).
         low, high: first cell with a leaf, and the cell after the last one, along x, y and z: rays are clipped to this box.
     """
@@ -60,6 +72,7 @@ class LeafIndex:
     top: int
     table: mi.UInt32
     bricks: mi.UInt32
+    halves: mi.UInt32
     from_world: list[list[mi.Float64]]
     low: list[mi.Float64]
     high: list[mi.Float64]
@@ -67,7 +80,7 @@ class LeafIndex:
     @property
     def bytes(self) -> int:
         """Memory of the index [bytes]."""
-        return 4 * (dr.width(self.table) + dr.width(self.bricks))
+        return 4 * (dr.width(self.table) + dr.width(self.bricks) + dr.width(self.halves))
 
     @classmethod
     def find(cls, tree: Octree) -> LeafIndex:
@@ -75,39 +88,37 @@ class LeafIndex:
         depth = tree.depth
         steps = max(0, -(-(depth - TOP) // 2))
         top = depth - 2 * steps
-        row = np.arange(tree.leaves, dtype=np.uint32)
-        leaf = row | tree.sizes.astype(np.uint32) << np.uint32(SIZE_SHIFT)
+        leaf = np.arange(tree.leaves, dtype=np.uint32) | tree.sizes.astype(np.uint32) << np.uint32(SIZE_SHIFT)
         first, size = tree.codes, tree.sizes.astype(np.int64)
-        table, bricks, before = _fill_table(first, size, leaf, depth, top), [], 0
-        # The codes of the bricks of a level, ascending; a brick of the level above holds their entries.
-        shift = depth - top
+        table, shift = _fill_table(first, size, leaf, depth, top), depth - top
+        # Codes of the bricks of a level, ascending; a brick of the level above holds their numbers.
         inner = np.unique(first[size < shift] >> np.uint64(3 * shift)) if steps else np.zeros(0, np.uint64)
-        _put_bricks(table, _flat(separate(inner, top), 1 << top), 0)
-        level_of_bricks = []
-        for step in range(steps):
-            edge = depth - top - 2 * step - 2  # logarithm of the edge of an entry
+        table[_flat(separate(inner, top), 1 << top)] = BRICK | np.arange(len(inner), dtype=np.uint32)
+        levels, before = [], 0
+        for step in range(steps - 1):
+            edge = shift - 2 * step - 2  # logarithm of the edge of an entry
             own = (size < edge + 2) & (size >= edge)
-            entries = np.full((len(inner), 64), 0, np.uint32)
+            entries = np.zeros((len(inner), 64), np.uint32)
             _fill_bricks(entries, inner, first[own], size[own], leaf[own], edge)
-            level_of_bricks.append((entries, edge))
-            following = np.unique(first[size < edge] >> np.uint64(3 * edge)) if edge else np.zeros(0, np.uint64)
             before += len(inner)
-            if len(following):
-                place = np.searchsorted(inner, following >> np.uint64(6))
-                local = separate(following & np.uint64(63), 2)
-                entries[place, _flat(local, 4)] = BRICK | (before + np.arange(len(following), dtype=np.uint32))
-            inner = following
-        for entries, edge in level_of_bricks:
+            following = np.unique(first[size < edge] >> np.uint64(3 * edge))
+            place = np.searchsorted(inner, following >> np.uint64(6))
+            # Bricks of cells have numbers of their own, since they are stored apart.
+            numbers = np.arange(len(following), dtype=np.uint32) + (0 if step == steps - 2 else before)
+            entries[place, _flat(separate(following & np.uint64(63), 2), 4)] = BRICK | numbers.astype(np.uint32)
             _mark_vacuum(entries, edge)
-            bricks.append(entries.reshape(-1))
-        _mark_far_vacuum(table, depth - top, 1 << top)
-        flat = np.concatenate(bricks) if before else np.zeros(64, np.uint32)
+            levels.append(entries.reshape(-1))
+            inner = following
+        halves = _make_halves(tree, inner) if steps else np.zeros(4, np.uint32)
+        _mark_far_vacuum(table, shift, 1 << top)
+        flat = np.concatenate(levels) if levels else np.zeros(64, np.uint32)
         rows = np.linalg.inv(tree.to_world)[:3] * 2**depth
         from_world = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in rows]
         corners = tree.corners()
         low, high = corners.min(axis=0), (corners + edges_of(tree.sizes)[:, None]).max(axis=0)
         ends = ([dr.opaque(mi.Float64, float(v)) for v in end] for end in (low, high))
-        return cls(depth, top, mi.UInt32(table), mi.UInt32(flat), from_world, *ends)
+        tables = (mi.UInt32(np.ascontiguousarray(a).reshape(-1)) for a in (table, flat, halves))
+        return cls(depth, top, *tables, from_world, *ends)
 
     def look_up(self, cell: mi.Vector3i, ahead: mi.Array3b, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool, mi.Vector3i]:
         """Look up the leaf of cells.
@@ -124,7 +135,7 @@ class LeafIndex:
         place = cell >> shift
         at = mi.UInt32(place.x + ((place.y + (place.z << self.top)) << self.top))
         entry = dr.gather(mi.UInt32, self.table, at, active)
-        while shift:
+        while shift > 2:
             shift -= 2
             inside = (cell >> shift) & 3
             local = mi.UInt32(inside.x | inside.y << 2 | inside.z << 4)
@@ -134,10 +145,62 @@ class LeafIndex:
         size = mi.Int32((entry >> SIZE_SHIFT) & 15)
         row = entry & ROW_MASK
         is_leaf = row < FIRST_REACH
+        reach = dr.select(is_leaf, 1, mi.Int32(row) - FIRST_REACH)
+        if shift:
+            is_brick = entry >= BRICK
+            fine = self._look_up_half(cell, entry & (BRICK - 1), active & is_brick)
+            row, is_leaf, size, reach = (
+                dr.select(is_brick, a, b) for a, b in zip(fine, (row, is_leaf, size, reach), strict=True)
+            )
         edge = mi.Int32(1) << size
         within = cell & (edge - 1)
-        far = dr.select(is_leaf, 0, mi.Int32(row) - (FIRST_REACH + 1)) << size
-        return row, is_leaf, dr.select(ahead, edge - within, within + 1) + far
+        return row, is_leaf, dr.select(ahead, edge - within, within + 1) + ((reach - 1) << size)
+
+    def _look_up_half(
+        self, cell: mi.Vector3i, brick: mi.UInt32, active: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Bool, mi.Int32, mi.Int32]:
+        """Look up cells in a brick of cells: row, whether there is a leaf, logarithm of the edge, and reach."""
+        half = 2 * brick + mi.UInt32((cell.z >> 1) & 1)
+        filled, begins, before, reaches = dr.gather(mi.ArrayXu, self.halves, half, active, shape=(4, 1))
+        inside = cell & 1
+        octant = mi.UInt32((cell.x >> 1) & 1 | ((cell.y >> 1) & 1) << 1)
+        bit = mi.UInt32(inside.x | inside.y << 1 | inside.z << 2) | octant << 3
+        row = before + dr.popcnt(begins & ((mi.UInt32(2) << bit) - 1)) - 1
+        own, own_begins = ((word >> (octant << 3)) & 0xFF for word in (filled, begins))
+        is_empty = own == 0
+        is_large = is_empty | ((own == 0xFF) & (own_begins == 1))
+        reach = dr.select(is_empty, mi.Int32((reaches >> (octant << 3)) & 0xFF), 1)
+        return row, ((filled >> bit) & 1) > 0, dr.select(is_large, mi.Int32(1), 0), reach
+
+
+def _make_halves(tree: Octree, bricks: np.ndarray) -> np.ndarray:
+    """The records (2 bricks, 4) of bricks of cells, from the codes of the bricks, ascending."""
+    fine = np.flatnonzero(tree.sizes < 2)
+    codes = tree.codes[fine]
+    place = 2 * np.searchsorted(bricks, codes >> np.uint64(6)) + (codes >> np.uint64(5) & np.uint64(1)).astype(np.int64)
+    bit = (codes & np.uint64(31)).astype(np.uint32)
+    cells = np.where(tree.sizes[fine] == 1, np.uint32(0xFF), np.uint32(1))
+    records = np.zeros((2 * len(bricks), 4), np.uint32)
+    np.bitwise_or.at(records[:, 0], place, cells << bit)
+    np.bitwise_or.at(records[:, 1], place, np.uint32(1) << bit)
+    starts = (bricks[:, None] << np.uint64(6) | np.arange(2, dtype=np.uint64) << np.uint64(5)).reshape(-1)
+    records[:, 2] = np.searchsorted(tree.codes, starts)
+    records[:, 3] = _octant_reaches(tree, starts)
+    return records
+
+
+def _octant_reaches(tree: Octree, starts: np.ndarray) -> np.ndarray:
+    """A byte for the reach of each of the 4 octants of halves that begin at the codes ``starts``; 1 in octants with a leaf."""
+    if tree.depth > FINE:
+        return np.full(len(starts), 0x01010101, np.uint32)
+    n = 1 << (tree.depth - 1)
+    is_filled = np.zeros(n**3, bool)
+    octants, _ = _spread(tree.codes >> np.uint64(3), np.maximum(tree.sizes.astype(np.int64) - 1, 0))
+    is_filled[_flat(separate(octants, tree.depth - 1), n)] = True
+    distance = np.array(find_distances(mi.Bool(is_filled), (n, n, n)))
+    own = (starts[:, None] >> np.uint64(3)) + np.arange(4, dtype=np.uint64)
+    reach = distance[_flat(separate(own.reshape(-1), tree.depth - 1), n)].reshape(-1, 4).astype(np.uint32)
+    return (np.maximum(reach, 1) << (8 * np.arange(4, dtype=np.uint32))).sum(axis=1, dtype=np.uint32)
 
 
 def _flat(place: np.ndarray, n: int) -> np.ndarray:
@@ -170,10 +233,6 @@ def _fill_bricks(
     place, which = _spread(first >> np.uint64(3 * edge), size - edge)
     brick = np.searchsorted(inner, place >> np.uint64(6))
     entries[brick, _flat(separate(place & np.uint64(63), 2), 4)] = leaf[which] + 1
-
-
-def _put_bricks(table: np.ndarray, at: np.ndarray, before: int) -> None:
-    table[at] = BRICK | (before + np.arange(len(at), dtype=np.uint32))
 
 
 def _vacuum(size: np.ndarray | int, reach: np.ndarray | int) -> np.ndarray:

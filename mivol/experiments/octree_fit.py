@@ -1,0 +1,200 @@
+"""A fit of an octree to photographs: the fit of a grid, its octree, and a fit of the leaves, in one run.
+
+Conventions. As for :mod:`mivol.experiments.field_fit`; ``field.npz`` is the octree. ``stages/`` has the grid and its octree
+before the fit of the leaves, each with its quality, time and size on the page. There is no sky and there are no gains.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mivol.config import OctreeExperiment
+from mivol.errors import MivolError
+from mivol.experiments.field_fit import FieldFit, adapt_plan, explain_plan, make_batches, set_background, write_result
+from mivol.experiments.octree_conversion import describe_leaves
+from mivol.experiments.run_folder import RunFolder
+from mivol.fields.field_files import read_field, write_field
+from mivol.fields.hash_grid import HashField
+from mivol.fields.octree import Octree
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.files import write_whole
+from mivol.optim.loop import Fit
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree
+from mivol.optim.photographs.octree_problem import LeafPlan, OctreePlan, OctreeProblem
+from mivol.optim.photographs.radiance_plan import PRESETS
+from mivol.optim.strategy import suggest_name
+from mivol.report.record import PlanLine, Table
+from mivol.validate.metrics import score_image
+
+STAGES = "grid", "octree", "octree, its leaves fitted"
+"""Names of the stages on the page."""
+
+
+class OctreeFit(FieldFit):
+    """A fit of an octree.
+
+    Attributes:
+        stage_rows: name, PSNR, time and size of each finished stage.
+    """
+
+    settings: OctreeExperiment
+    problem: OctreeProblem
+
+    def make_plan(self, settings: OctreeExperiment) -> OctreePlan:
+        return make_octree_plan(settings)
+
+    def describe_run(self) -> dict[str, Any]:
+        start = self.settings.field.start or f"a grid, preset {self.settings.field.preset}"
+        return {
+            "method": f"an octree of harmonics from {start}, its leaves fitted to photographs",
+            "seeds": {"fit": self.settings.seed},
+            "units": {"loss": "1"},
+            "citations": ["mitsuba3", "drjit", "plenoctrees_2021", "plenoxels_2022", "max_1995"],
+        }
+
+    def plan_fit(self) -> list[PlanLine]:
+        begins = self.plan.grid or PRESETS[self.settings.field.preset]
+        grid = adapt_plan(begins, self.photos)
+        last = grid.stages[-1]
+        leaves = replace(self.plan.leaves, shrink=last.shrink, views=last.views, tiles=last.tiles, matte=grid.matte)
+        self.plan = replace(self.plan, grid=grid if self.plan.grid else None, leaves=leaves)
+        self.batches = make_batches(replace(grid, stages=(*(grid.stages if self.plan.grid else ()), last)), self.photos)
+        steps = PlanLine(
+            choice=f"{leaves.steps} steps of the octree, photographs shrunk by {leaves.shrink}",
+            reason="field.steps times field.effort; the leaves stay in place",
+        )
+        size = "half a voxel" if not self.plan.recipe.depth else f"a cube's edge over 2^{self.plan.recipe.depth}"
+        built = PlanLine(
+            choice=f"leaves of {size} where a view gives a leaf {self.plan.recipe.keep_weight:g} of a pixel",
+            reason=f"field.keep_weight; eight become one if views change by less than {self.plan.recipe.tolerance:g}",
+        )
+        if self.plan.grid is None:
+            first = PlanLine(choice=f"begins at {self.settings.field.start}", reason="field.start")
+            return [first, built, steps]
+        return [*explain_plan(grid, self.photos, self.batches), built, steps]
+
+    def make_problem(self) -> OctreeProblem:
+        self.stage_rows: list[tuple[str, ...]] = []
+        self.clock, self.start = 0.0, None
+        box, plan = self.photos.box, self.plan
+        if plan.grid is not None:
+            return OctreeProblem(self.batches, box, plan, self.settings.seed)
+        self.start = read_start(self.context.base / self.settings.field.start, self.photos.space, self.photos.white)
+        begun = time.perf_counter()
+        tree = self.start if isinstance(self.start, Octree) else build_octree(self.start, self._view_rays, plan.recipe)
+        self.clock = time.perf_counter() - begun
+        return OctreeProblem(self.batches, box, plan, self.settings.seed, tree)
+
+    def _view_rays(self) -> Any:
+        return (self.batches.all_pixels(self.plan.leaves.shrink, v).rays for v in range(len(self.batches.origins)))
+
+    def prepare(self, run: RunFolder) -> None:
+        run.make("stages")
+
+        def report(name: str, field: SphericalGrid | Octree) -> str:
+            return self.add_stage(run, name, field)
+
+        self.problem.report = report
+        kept = run.path / "stages" / "stages.json"
+        if run.is_resumed and kept.is_file():
+            self.stage_rows = [tuple(row) for row in json.loads(kept.read_text())]
+        elif self.start is not None:
+            if isinstance(self.start, SphericalGrid):
+                self.add_stage(run, STAGES[0], self.start)
+            self.add_stage(run, STAGES[1], self.problem.tree)
+
+    def add_stage(self, run: RunFolder, name: str, field: SphericalGrid | Octree, path: Any = None) -> str:
+        """Write the field of a stage, and note its quality, time and size; returns a clause for the log."""
+        if path is None:
+            path = run.path / "stages" / f"{name}.npz"
+            write_field(path, field.scale_colours(self.photos.white), view=self.home_view)
+        written = read_field(path)  # as it is read: rounded values
+        psnr = self.mean_psnr(written.scale_colours(1 / self.photos.white))
+        size = path.stat().st_size
+        count = f"{field.leaves} leaves" if isinstance(field, Octree) else f"{len(field.stored_nodes())} nodes"
+        quality = "-" if psnr is None else f"{psnr:.2f}"
+        self.stage_rows.append((name, count, quality, f"{size / 2**20:.2f}", f"{field.bytes / 2**20:.1f}", f"{self.clock:.0f}"))
+        write_whole(run.path / "stages" / "stages.json", lambda file: file.write(json.dumps(self.stage_rows).encode()))
+        return f"{name}: {quality} dB, {count}, a file of {size / 2**20:.2f} MiB, after {self.clock:.0f} s"
+
+    def mean_psnr(self, field: SphericalGrid | Octree) -> float | None:
+        """Mean PSNR [dB] of the judged views; None without such views."""
+        if self.judged is None:
+            return None
+        scores: list[float] = []
+        for photo in self.judged.views:
+            image = render_view(field, photo.camera, photo.background).image
+            score = score_image(image, photo.image, space=self.judged.space, mask=photo.mask, metrics=("psnr",))
+            scores.append(score.values["psnr"])
+        return float(np.mean(scores))
+
+    def after_step(self, fit: Fit, run: RunFolder, best: Any) -> None:
+        self.clock = fit.seconds
+        super().after_step(fit, run, best)
+
+    def write_model(self, run: RunFolder) -> dict[str, float]:
+        tree = self.problem.tree
+        write_result(run.path, self.problem, white=self.photos.white, view=self.home_view)
+        self.add_stage(run, STAGES[2], tree, run.path / "field.npz")
+        self.record.tables = [tabulate_stages(self.stage_rows, tree)]
+        return {"leaves": float(tree.leaves), "bytes": tree.bytes / 2**20}
+
+    def gains(self) -> None:
+        return None
+
+
+def tabulate_stages(rows: list[tuple[str, ...]], tree: Octree) -> Table:
+    """Table of the finished stages of a run."""
+    head = ("stage", "size", "PSNR of the judged views [dB], from the file", "file [MiB]", "memory [MiB]", "steps [s]")
+    return Table(title=f"Stages: {describe_leaves(tree)}", head=head, rows=tuple(rows))
+
+
+def read_start(path: Any, space: str, white: float) -> SphericalGrid | Octree:
+    """Read the field at which a fit begins.
+
+    Raises:
+        MivolError: as :func:`mivol.fields.field_files.read_field`, a hash grid, nested levels, or colours of another space.
+    """
+    field = read_field(path)
+    if isinstance(field, HashField):
+        raise MivolError(
+            f"{path} is a hash grid, and field.start is a grid or an octree: mivol convert FILE grid.npz --to grid."
+        )
+    if field.space != space:
+        raise MivolError(
+            f"{path} has colours in {field.space} and the photographs are {space}: set photos.space to the field's."
+        )
+    return field.scale_colours(1 / white)
+
+
+def make_octree_plan(settings: OctreeExperiment) -> OctreePlan:
+    """Return the plan of the settings.
+
+    Raises:
+        MivolError: an unknown preset, or one with nested boxes or a fitted background.
+    """
+    options = settings.field
+    if options.preset not in PRESETS:
+        raise MivolError(f'field.preset = "{options.preset}" is unknown: {suggest_name(options.preset, list(PRESETS))}')
+    grid = set_background(PRESETS[options.preset], settings.photos.background)
+    if grid.levels > 1 or grid.sky:
+        raise MivolError(
+            "an octree has one box and a known background, and nested boxes or a fitted sky were asked for: "
+            "choose preset cpu and a colour for photos.background."
+        )
+    stages = tuple(replace(stage, steps=max(1, round(stage.steps * options.effort))) for stage in grid.stages)
+    grid = replace(grid, stages=stages, epochs=grid.epochs * options.effort)
+    if options.degree is not None:
+        grid = replace(grid, degree=options.degree, few_degree=None)
+    if options.longest is not None:
+        grid = replace(grid.with_longest(options.longest), cubic=False)
+    recipe = OctreeRecipe(options.depth or 0, options.keep_weight, options.tolerance)
+    leaves = LeafPlan(steps=max(1, math.ceil(options.steps * options.effort)))
+    return OctreePlan(None if options.start else grid, recipe, leaves, grid.random_background)

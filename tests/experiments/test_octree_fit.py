@@ -1,0 +1,85 @@
+"""``mivol optimize`` of an octree: from a field of a file or a grid of its own, with its stages on the page, and refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ball_photos import WHITE, ball, camera
+
+from mivol import config
+from mivol.cli import main
+from mivol.errors import MivolError
+from mivol.experiments.octree_fit import make_octree_plan, read_start
+from mivol.fields.field_files import read_field, write_field
+from mivol.fields.octree import Octree
+from mivol.files import decode_srgb, write_png
+from mivol.optim.photographs.field_view import render_view
+from mivol.photos.transforms import write_transforms
+
+
+@pytest.fixture
+def photographs(variant_rgb: str, tmp_path: Path) -> Path:
+    """Ten views of the ball over white, two of them to be judged by, and its grid."""
+    cameras = {}
+    for k in range(10):
+        cameras[f"view_{k}.png"] = camera(k)
+        write_png(tmp_path / f"view_{k}.png", decode_srgb(np.clip(render_view(ball(), camera(k), WHITE).image, 0, 1)))
+    write_transforms(tmp_path / "transforms.json", cameras, ["view_3.png", "view_8.png"])
+    write_field(tmp_path / "grid.npz", ball())
+    return tmp_path
+
+
+def toml(folder: Path, field: str, photos: str = 'background = "white"') -> Path:
+    path = folder / "fit.toml"
+    path.write_text(
+        f"""
+        title = "A ball"
+        [photos]
+        path = "."
+        box = [[-1, -1, -1], [1, 1, 1]]
+        held_out = 0
+        judged = "test"
+        {photos}
+        [field]
+        kind = "octree"
+        {field}
+        [show]
+        frames = 0
+        """
+    )
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "field, names",
+    [
+        ('start = "grid.npz"\nsteps = 20', ["grid", "octree", "octree, its leaves fitted"]),
+        (
+            'preset = "tiny"\nlongest = 24\ndegree = 1\neffort = 0.3\nsteps = 100',
+            ["grid", "octree", "octree, its leaves fitted"],
+        ),
+    ],
+)
+def test_stages_stand_on_the_page(photographs: Path, field: str, names: list[str]) -> None:
+    run = photographs / "run"
+    assert main(["optimize", str(toml(photographs, field)), "-o", str(run)]) == 0
+    rows = json.loads((run / "stages" / "stages.json").read_text())
+    assert [row[0] for row in rows] == names
+    assert isinstance(read_field(run / "field.npz"), Octree) and "its leaves fitted" in (run / "report.html").read_text()
+    before, after = (float(row[2]) for row in rows[1:])
+    # Rounded values are read again for both.
+    assert after > before - 0.5
+
+
+def test_an_octree_needs_one_box_and_a_known_background(photographs: Path) -> None:
+    for field, photos in (('preset = "capture"', ""), ("", 'background = "sky"')):
+        with pytest.raises(MivolError, match="one box and a known background"):
+            make_octree_plan(config.load(toml(photographs, field, photos)))
+    with pytest.raises(MivolError, match="cpv"):
+        make_octree_plan(config.load(toml(photographs, 'preset = "cpv"')))
+    with pytest.raises(MivolError, match="srgb and the photographs are linear"):
+        read_start(photographs / "grid.npz", "linear", 1.0)
