@@ -390,13 +390,18 @@ def _explain_file(arguments: argparse.Namespace) -> Explanation | FileSummary:
 
 
 def explain_array(arguments: argparse.Namespace) -> int | None:
-    """Explain a scan or describe a volume, and return the exit code; None for anything else."""
+    """Explain a scan, or describe a volume or a field, and return the exit code; None for anything else."""
     from mivol.files.formats import describe_volume
 
     layout = _raw_layout(arguments)
     is_array = bool(layout) or _is_array(_check_dataset(arguments.scene, arguments.dataset))
     if not layout and (draft := draft_of(arguments.scene, arguments, is_array)):
         return explain_scan(draft)
+    if not is_array and arguments.scene.suffix.lower() == ".npz":
+        from mivol.experiments.octree_conversion import describe_field
+
+        print(describe_field(arguments.scene, arguments.mode).text)
+        return 0
     if not is_array:
         return None
     print(describe_volume(arguments.scene, arguments.dataset, **layout))

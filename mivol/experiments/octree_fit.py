@@ -17,7 +17,7 @@ import numpy as np
 from mivol.config import OctreeExperiment
 from mivol.errors import MivolError
 from mivol.experiments.field_fit import FieldFit, adapt_plan, explain_plan, make_batches, set_background, write_result
-from mivol.experiments.octree_conversion import describe_leaves
+from mivol.experiments.octree_conversion import describe_leaves, describe_speed
 from mivol.experiments.run_folder import RunFolder
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.hash_grid import HashField
@@ -82,14 +82,14 @@ class OctreeFit(FieldFit):
 
     def make_problem(self) -> OctreeProblem:
         self.stage_rows: list[tuple[str, ...]] = []
-        self.clock, self.start = 0.0, None
+        self.clock, self.built, self.start = 0.0, 0.0, None
         box, plan = self.photos.box, self.plan
         if plan.grid is not None:
             return OctreeProblem(self.batches, box, plan, self.settings.seed)
         self.start = read_start(self.context.base / self.settings.field.start, self.photos.space, self.photos.white)
         begun = time.perf_counter()
         tree = self.start if isinstance(self.start, Octree) else build_octree(self.start, self._view_rays, plan.recipe)
-        self.clock = time.perf_counter() - begun
+        self.built = time.perf_counter() - begun
         return OctreeProblem(self.batches, box, plan, self.settings.seed, tree)
 
     def _view_rays(self) -> Any:
@@ -108,6 +108,7 @@ class OctreeFit(FieldFit):
         elif self.start is not None:
             if isinstance(self.start, SphericalGrid):
                 self.add_stage(run, STAGES[0], self.start)
+            self.clock = self.built
             self.add_stage(run, STAGES[1], self.problem.tree)
 
     def add_stage(self, run: RunFolder, name: str, field: SphericalGrid | Octree, path: Any = None) -> str:
@@ -136,7 +137,7 @@ class OctreeFit(FieldFit):
         return float(np.mean(scores))
 
     def after_step(self, fit: Fit, run: RunFolder, best: Any) -> None:
-        self.clock = fit.seconds
+        self.clock = self.built + fit.seconds
         super().after_step(fit, run, best)
 
     def write_model(self, run: RunFolder) -> dict[str, float]:
@@ -144,6 +145,9 @@ class OctreeFit(FieldFit):
         write_result(run.path, self.problem, white=self.photos.white, view=self.home_view)
         self.add_stage(run, STAGES[2], tree, run.path / "field.npz")
         self.record.tables = [tabulate_stages(self.stage_rows, tree)]
+        grid = run.path / "stages" / f"{STAGES[0]}.npz"
+        if grid.is_file():
+            self.record.notes.append(f"Speed: {describe_speed(tree, read_field(grid), 'the grid')}.")
         return {"leaves": float(tree.leaves), "bytes": tree.bytes / 2**20}
 
     def gains(self) -> None:
@@ -152,7 +156,7 @@ class OctreeFit(FieldFit):
 
 def tabulate_stages(rows: list[tuple[str, ...]], tree: Octree) -> Table:
     """Table of the finished stages of a run."""
-    head = ("stage", "size", "PSNR of the judged views [dB], from the file", "file [MiB]", "memory [MiB]", "steps [s]")
+    head = ("stage", "size", "PSNR of the judged views [dB], from the file", "file [MiB]", "memory [MiB]", "time [s]")
     return Table(title=f"Stages: {describe_leaves(tree)}", head=head, rows=tuple(rows))
 
 

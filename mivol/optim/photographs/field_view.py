@@ -63,9 +63,9 @@ def render_view(
         grid, the bias of :mod:`mivol.transport.line_integrals.sampled_rays`; of an octree, the bias of
         :func:`mivol.transport.line_integrals.leaf_radiance.make_leaf_colours`.
     """
-    render = _prepare(field, camera, stop)
+    render = prepare_view(field, camera, stop)
     width, height = camera.size
-    order = _by_tiles(width, height)
+    order = order_by_tiles(width, height)
     pixels = pixel_centres(camera.size).reshape(-1, 2)[order]
     values = np.empty((width * height, 5), np.float32)
     at_once = SAMPLED_PASS if isinstance(field, HashField) else PASS
@@ -85,10 +85,10 @@ def render_view(
     return FieldView(values[..., :3], opacity, depth)
 
 
-def _prepare(
+def prepare_view(
     field: SphericalGrid | HashField | Octree, camera: Camera, stop: float
 ) -> Callable[[RayBundle], RenderedRays | SampledRays | LeafRays]:
-    """The function that renders rays of a camera."""
+    """Prepare a field for the rays of a camera, which end at the transmittance ``stop``; returns the renderer of rays."""
     if isinstance(field, Octree):
         index, depth = LeafIndex.find(field), MAX_DEPTH if stop == 0 else -math.log(stop)
         leaves = make_leaf_colours(field, LeafPlaces.find(field), camera.origin[None], mi.UInt32(0))
@@ -101,7 +101,7 @@ def _prepare(
     return lambda bundle: render_rays(cells, source, model, bundle)
 
 
-def _by_tiles(width: int, height: int) -> np.ndarray:
+def order_by_tiles(width: int, height: int) -> np.ndarray:
     """Flat numbers of pixels, tile by tile of 4 x 4."""
     row, column = np.divmod(np.arange(width * height), width)
     return np.lexsort((column % 4, row % 4, column // 4, row // 4))

@@ -227,7 +227,7 @@ class LeafRays:
         tau: optical depth up to the stop of the ray.
         first: distance at which the first leaf begins, from the entry into the cube [length].
         last: distance at which the last leaf ended.
-        cell: last cell in the last leaf.
+        cell: a cell of the last leaf.
         rays: the rays.
     """
 
@@ -264,7 +264,7 @@ def render_leaves(
         sigma, colour = source.read(leaf.row, on)
         own = dr.select(on, sigma * leaf.dt, 0)
         # Weights and the transmittance sum to 1 up to rounding. The subtraction has an absolute error of 6e-8, as the light.
-        weight = T * one_minus_exp(own)
+        weight = T * _opacity(own)
         values = [*colour, *([segment.t0 + leaf.t + leaf.dt * _mean_place(own)] if distances else [])]
         light = [dr.fma(weight, dr.select(on, c, 0), s) for s, c in zip(light, values, strict=True)]
         return [*light, T - weight, tau + own, dr.select(on & (first < 0), leaf.t, first)]
@@ -274,6 +274,12 @@ def render_leaves(
     *light, _, tau, first = state
     distance = light[3] if distances else mi.Float(0)
     return LeafRays(mi.Color3f(*light[:3]), dr.exp(-tau), distance, tau, fast_max(first, 0), last, cell, rays)
+
+
+def _opacity(tau: mi.Float) -> mi.Float:
+    """1 - exp(-tau) with an absolute error of 6e-8: in half the operations of :func:`mivol.numerics.one_minus_exp`, whose error
+    is relative. Below 0.02 the series is off by tau^4 / 24 = 7e-9."""
+    return dr.select(tau < 0.02, tau * dr.fma(tau, dr.fma(tau, 1 / 6, -0.5), 1), 1 - dr.exp(-tau))
 
 
 def _mean_place(tau: mi.Float) -> mi.Float:
@@ -314,7 +320,7 @@ def vjp_leaves(index: LeafIndex, source: LeafSource, rendered: LeafRays, by: Ray
     """
     rays = rendered.rays
     segment = clip_to_octree(index, rays.o, rays.d, rays.t_max)
-    back = reverse_from(segment, rendered.cell, rendered.last, rendered.first)
+    back = reverse_from(segment, rendered.cell, rendered.last, rendered.first, index)
     by_colour = [mi.Float(c) for c in by.colour]
 
     def visit(state: list, leaf: VisitedLeaf, on: mi.Bool) -> list:

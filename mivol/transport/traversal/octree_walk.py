@@ -5,11 +5,11 @@ Index. A table holds an entry for each of 2^top cells along each axis. An entry 
 its lower and its upper half along z: a bit for each cell with matter, a bit for each cell that begins a leaf, and the number
 of leaves before the half. Bits, like leaves, stand in the order of codes, so the row of a leaf is that number plus the count
 of leaves that begin up to its cell. A look-up reads two records at up to 256 cells along an axis, and four at most; a record
-is 16 bytes for 32 cells. Vacuum has a reach r: the ray may cross the r - 1 entries, or octants of a brick, on every side
-(Chebyshev distance).
+is 16 bytes for 32 cells. Vacuum has a reach r: the ray may cross r - 1 more entries of the table, in the octant of its
+direction, or r - 1 more octants of a brick, on every side (Chebyshev distance).
 
-Planes. Positions are whole numbers of cells, counted from the cell of entry, and the distance of a plane is computed from its
-number and the point of entry, so nothing accumulates along a ray. A ray in a plane, an edge or a corner belongs to one of the
+Planes. The cell of a ray is a whole number along each axis, and the distance of a plane is computed from its number and the
+point of entry, so nothing accumulates along a ray. A ray in a plane, an edge or a corner belongs to one of the
 cells beside it, by the whole number, and never stands still: at least one axis advances by a cell in each step.
 
 References: Amanatides & Woo 1987 (the traversal); Cohen & Sheffer 1994 (distances for a ray to skip);
@@ -41,7 +41,10 @@ SIZE_SHIFT, ROW_MASK = 27, (1 << 27) - 1
 """An entry of a leaf or of vacuum: logarithm of its edge [cells] above bit 27, its row or reach below."""
 
 FIRST_REACH = (1 << 27) - 4096
-"""Numbers from here on are reaches of vacuum."""
+"""The row of vacuum in a brick."""
+
+FAR = 15 << 27
+"""Flag of vacuum in the table: a code of 3 bits for the reach towards each octant of directions follows."""
 
 TOP = 6
 """Largest logarithm of the edge of the table: 1 MiB."""
@@ -110,7 +113,7 @@ class LeafIndex:
             levels.append(entries.reshape(-1))
             inner = following
         halves = _make_halves(tree, inner) if steps else np.zeros(4, np.uint32)
-        _mark_far_vacuum(table, shift, 1 << top)
+        _mark_far_vacuum(table, 1 << top)
         flat = np.concatenate(levels) if levels else np.zeros(64, np.uint32)
         rows = np.linalg.inv(tree.to_world)[:3] * 2**depth
         from_world = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in rows]
@@ -120,16 +123,17 @@ class LeafIndex:
         tables = (mi.UInt32(np.ascontiguousarray(a).reshape(-1)) for a in (table, flat, halves))
         return cls(depth, top, *tables, from_world, *ends)
 
-    def look_up(self, cell: mi.Vector3i, ahead: mi.Array3b, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool, mi.Vector3i]:
+    def look_up(self, cell: mi.Vector3i, towards: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool, mi.Int32, mi.Int32]:
         """Look up the leaf of cells.
 
         Args:
             cell: along x, y and z.
-            ahead: axes along which the ray runs upwards.
+            towards: octant of the ray's direction, from :func:`find_octant`.
             active: lanes to look up.
 
         Returns:
-            Row of the leaf, whether there is a leaf, and the cells to cross along each axis, the own cell included.
+            Row of the leaf, whether there is a leaf, edge of the leaf or vacuum, and the number of cells beyond this edge that
+            are vacuum, on the side to which the ray runs.
         """
         shift = self.depth - self.top
         place = cell >> shift
@@ -145,16 +149,19 @@ class LeafIndex:
         size = mi.Int32((entry >> SIZE_SHIFT) & 15)
         row = entry & ROW_MASK
         is_leaf = row < FIRST_REACH
-        reach = dr.select(is_leaf, 1, mi.Int32(row) - FIRST_REACH)
+        is_far = (entry >= FAR) & (entry < BRICK)
+        code = (entry >> (3 * towards)) & 7
+        # Codes 0 to 7: a reach of 1, 1, 2, 3, 4, 6, 8, 12.
+        far = mi.Int32(((2 + (code & 1)) << (code >> 1)) >> 1)
+        size, is_leaf = dr.select(is_far, self.depth - self.top, size), is_leaf & ~is_far
+        reach = dr.select(is_far, far, 1)
         if shift:
             is_brick = entry >= BRICK
             fine = self._look_up_half(cell, entry & (BRICK - 1), active & is_brick)
             row, is_leaf, size, reach = (
                 dr.select(is_brick, a, b) for a, b in zip(fine, (row, is_leaf, size, reach), strict=True)
             )
-        edge = mi.Int32(1) << size
-        within = cell & (edge - 1)
-        return row, is_leaf, dr.select(ahead, edge - within, within + 1) + ((reach - 1) << size)
+        return row, is_leaf, mi.Int32(1) << size, (reach - 1) << size
 
     def _look_up_half(
         self, cell: mi.Vector3i, brick: mi.UInt32, active: mi.Bool
@@ -235,24 +242,45 @@ def _fill_bricks(
     entries[brick, _flat(separate(place & np.uint64(63), 2), 4)] = leaf[which] + 1
 
 
-def _vacuum(size: np.ndarray | int, reach: np.ndarray | int) -> np.ndarray:
-    """Entries of vacuum of the edge 2^size."""
-    return (np.uint32(size) << np.uint32(SIZE_SHIFT)) | np.uint32(FIRST_REACH + reach)
+def _vacuum(size: int) -> np.uint32:
+    """An entry of vacuum of the edge 2^size in a brick."""
+    return np.uint32(size << SIZE_SHIFT | FIRST_REACH)
 
 
 def _mark_vacuum(entries: np.ndarray, edge: int) -> None:
     """Replace the empty entries (0) of bricks by vacuum, of twice the edge in an empty octant; undo the shift of leaves."""
     octants = entries.reshape(-1, 2, 2, 2, 2, 2, 2)
     empty = (octants == 0).all(axis=(2, 4, 6), keepdims=True)
-    vacuum = np.where(empty, _vacuum(edge + 1, 1), _vacuum(edge, 1))
+    vacuum = np.where(empty, _vacuum(edge + 1), _vacuum(edge))
     octants[...] = np.where(octants == 0, vacuum, np.where(octants < BRICK, octants - 1, octants))
 
 
-def _mark_far_vacuum(table: np.ndarray, size: int, n: int) -> None:
-    """Replace the empty entries (0) of the table by vacuum with its reach; undo the shift of leaves."""
+def _mark_far_vacuum(table: np.ndarray, n: int) -> None:
+    """Replace the empty entries (0) of the table by vacuum with a reach towards each octant; undo the shift of leaves."""
     is_filled = table > 0
-    reach = np.array(find_distances(mi.Bool(is_filled), (n, n, n))).astype(np.uint32)
-    table[...] = np.where(is_filled, np.where(table < BRICK, table - 1, table), _vacuum(size, reach))
+    vacuum = np.full(len(table), FAR, np.uint32)
+    for octant in range(8):
+        # Axes z, y, x; an octant with its bit set runs downwards along the axis.
+        turn = tuple(slice(None, None, -1 if octant >> axis & 1 else 1) for axis in (2, 1, 0))
+        free = ~is_filled.reshape(n, n, n)[turn]
+        code = np.zeros((n, n, n), np.uint32)
+        for reach in range(2, REACHES[-1] + 1):
+            # A cube of the edge r is free if the eight cubes of the edge r - 1 at its corners are; outside all is free.
+            for axis in range(3):
+                free = free & np.concatenate([np.take(free, range(1, n), axis), np.ones_like(np.take(free, [0], axis))], axis)
+            if reach in REACHES:
+                code[free] = CODES[REACHES.index(reach)]
+        vacuum |= code[turn].reshape(-1) << np.uint32(3 * octant)
+    table[...] = np.where(is_filled, np.where(table < BRICK, table - 1, table), vacuum)
+
+
+REACHES, CODES = (2, 3, 4, 6, 8, 12), (2, 3, 4, 5, 6, 7)
+"""Stored reaches above 1 [entries], and their codes of 3 bits."""
+
+
+def find_octant(d: mi.Vector3f) -> mi.UInt32:
+    """Octant of directions: bits 0, 1, 2 are set for directions downwards along x, y, z."""
+    return sum((dr.select(d[a] >= 0, mi.UInt32(0), 1 << a) for a in range(3)), mi.UInt32(0))
 
 
 @dataclass
@@ -307,67 +335,79 @@ def walk_leaves(
         until: ``until(state) -> mask`` of lanes to stop, evaluated after each leaf; None to walk to the end.
 
     Returns:
-        The last state, the last cell of the last visited leaf, and the distance of its exit from the start of the segment
-        [length]; the distance is 0 for a ray without leaves.
+        The last state, the first visited cell of the last visited leaf, and the distance of its exit from the start of the
+        segment [length]; the distance is 0 for a ray without leaves.
 
     Error: positions are off by at most 2^-23 (X + Y + Z) cells, for 2^depth cells along each axis.
     Cost: up to four reads a leaf, or stretch of vacuum.
     """
-    length = segment.length
-    ahead = segment.d >= 0
-    sign = dr.select(ahead, mi.Vector3i(1), mi.Vector3i(-1))
-    first = segment.cell
+    length, d = segment.length, segment.d
+    ahead = d >= 0
     least, end = (mi.Vector3i(*(mi.Int32(v) for v in side)) for side in (index.low, index.high))
-    most = dr.select(ahead, end - 1 - first, first - least)
-    entry = dr.select(ahead, segment.frac, 1 - segment.frac)
-    speed = dr.abs(segment.d)
-    still = speed < 1e-30
-    pace = dr.select(still, 0, dr.rcp(speed))
-    never = dr.select(still, mi.Vector3f(1e30), 0)
+    entry = mi.Vector3f(segment.cell) + segment.frac
+    still = dr.abs(d) < 1e-30
+    pace = dr.select(still, 0, dr.rcp(d))
+    # The distance of plane k along an axis is pace k + offset; an axis to which the ray is parallel has no plane.
+    offset = dr.select(still, mi.Vector3f(1e30), -entry * pace)
+    behind, towards = dr.select(ahead, mi.Vector3i(0), mi.Vector3i(-1)), find_octant(d)
 
-    # -- State: n counts the cells crossed since the first, along each axis ----------------------------------------------
+    def cross(cell: mi.Vector3i, edge: mi.Int32, beyond: mi.Int32) -> tuple[mi.Float, mi.Vector3i]:
+        """Distance of the exit from a leaf or a stretch of vacuum, and the next cell."""
+        low = (cell & -edge) - beyond
+        high = low + (edge + 2 * beyond)
+        plane = dr.select(ahead, high, low)
+        reach = dr.fma(mi.Vector3f(plane), pace, offset)
+        exit = fast_min(fast_min(reach.x, reach.y), reach.z)
+        within = dr.clip(mi.Vector3i(dr.fma(d, exit, entry)), low, high - 1)
+        return exit, dr.select(reach <= exit, plane + behind, within)
+
+    # -- State ---------------------------------------------------------------------------------------------------------
     active = mi.Bool(active) & (length > 0)
-    n = mi.Vector3i(0)
+    cell = mi.Vector3i(segment.cell)
     t = mi.Float(0)
-    last, left = mi.Vector3i(first), mi.Float(0)
+    last, left = mi.Vector3i(cell), mi.Float(0)
 
     # -- The first leaf: most rays of a photograph meet none, and their packets end here ----------------------------------
     found, searching = mi.Bool(False), mi.Bool(active)
     while dr.hint(searching, label="vacuum"):
-        row, is_leaf, free = index.look_up(first + sign * n, ahead, searching)
+        row, is_leaf, edge, beyond = index.look_up(cell, towards, searching)
         found |= searching & is_leaf
         searching &= ~is_leaf
-        ends = n + free
-        reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
-        exit = fast_min(fast_min(reach.x, reach.y), reach.z)
-        arrival = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
-        n = dr.select(searching, dr.select(reach <= exit, ends, arrival), n)
+        exit, following = cross(cell, edge, beyond)
+        cell = dr.select(searching, following, cell)
         t = dr.select(searching, fast_max(exit, t), t)
-        searching &= (exit < length) & dr.all(n <= most)
+        searching &= (exit < length) & dr.all((cell >= least) & (cell < end))
     active = found
 
     # -- Leaf by leaf ----------------------------------------------------------------------------------------------------
     while dr.hint(active, label="leaves"):
-        row, is_leaf, free = index.look_up(first + sign * n, ahead, active)
-        ends = n + free
-        reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
-        exit = fast_min(fast_min(reach.x, reach.y), reach.z)
-        stop = fast_min(exit, length)
+        row, is_leaf, edge, beyond = index.look_up(cell, towards, active)
+        exit, following = cross(cell, edge, beyond)
+        stop = fast_max(fast_min(exit, length), t)
         on = active & is_leaf
-        state = visit(state, VisitedLeaf(row, t, fast_max(stop - t, 0)), on)
-        arrival = dr.clip(mi.Vector3i(dr.fma(speed, stop, entry)), n, ends - 1)
-        last = dr.select(on, first + sign * arrival, last)
-        left = dr.select(on, fast_max(stop, t), left)
-        n = dr.select(reach <= exit, ends, arrival)
-        t = fast_max(exit, t)
-        active &= (exit < length) & dr.all(n <= most)
+        state = visit(state, VisitedLeaf(row, t, stop - t), on)
+        last = dr.select(on, cell, last)
+        left = dr.select(on, stop, left)
+        cell = following
+        t = stop
+        active &= (exit < length) & dr.all((cell >= least) & (cell < end))
         if until is not None:
             active &= ~until(state)
     return state, last, left
 
 
-def reverse_from(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.Float) -> Segment:
-    """The reversed segment from the point in ``cell`` at ``t`` back to ``until`` [lengths from the start of ``segment``]."""
-    planes = mi.Vector3f(cell - segment.cell)
-    frac = dr.clip(dr.fma(segment.d, t, segment.frac - planes), 0, 1)
+def reverse_from(segment: Segment, leaf_cell: mi.Vector3i, t: mi.Float, until: mi.Float, index: LeafIndex) -> Segment:
+    """The reversed segment from the exit of a leaf at ``t`` back to ``until`` [lengths from the start of ``segment``].
+
+    Args:
+        segment: segment of the walk.
+        leaf_cell: a cell of the leaf.
+        t, until: ends.
+        index: index of the leaves, to find the cell of the exit within the leaf.
+    """
+    _, _, edge, _ = index.look_up(leaf_cell, mi.UInt32(0), t > until)
+    low = leaf_cell & -edge
+    place = dr.fma(segment.d, t, mi.Vector3f(segment.cell) + segment.frac)
+    cell = dr.clip(mi.Vector3i(dr.floor(place)), low, low + edge - 1)
+    frac = dr.clip(place - mi.Vector3f(cell), 0, 1)
     return Segment(cell, frac, -segment.d, -segment.d_rest, segment.t0 + t, t - until)
