@@ -391,6 +391,7 @@ def _explain_file(arguments: argparse.Namespace) -> Explanation | FileSummary:
 
 def explain_array(arguments: argparse.Namespace) -> int | None:
     """Explain a scan, or describe a volume or a field, and return the exit code; None for anything else."""
+    from mivol.experiments.found_scan import TIFF_FOLDER, find_scan
     from mivol.files.formats import describe_volume
 
     layout = _raw_layout(arguments)
@@ -405,6 +406,10 @@ def explain_array(arguments: argparse.Namespace) -> int | None:
     if not is_array:
         return None
     print(describe_volume(arguments.scene, arguments.dataset, **layout))
+    if arguments.dataset is None and arguments.scene.is_dir() and find_scan(arguments.scene) == TIFF_FOLDER:
+        print(
+            "a volume, for want of flats, darks and angles: mivol optimize takes it as a scan, mivol explain does so with --set"
+        )
     return 0
 
 

@@ -107,6 +107,9 @@ def test_a_folder_of_slices(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     said = capsys.readouterr().out
     assert "s: TIFF\nvoxels (x, y, z): 4 x 3 x 3" in said
     assert "assumed: 3 files are the slices from z = 0 upwards." in said
+    assert said.endswith("mivol optimize takes it as a scan, mivol explain does so with --set\n")
+    run("explain", folder, "--set", "data.reading=intensity")
+    assert "voxels (x, y, z)" not in capsys.readouterr().out
     tifffile.imwrite(folder / "overview.tif", np.zeros((9, 9), np.uint8))
     assert run("convert", folder, tmp_path / "a.nrrd") == 1
     assert "2 arrays ('slice_#.tif', 'overview.tif')" in capsys.readouterr().err
