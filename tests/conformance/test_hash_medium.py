@@ -113,7 +113,8 @@ def test_gradients_equal_quadrature(variant_rgb: str, name: str) -> None:
         dr.backward(dr.mean(mi.render(box, params, spp=128, seed=seed), axis=None))
         slopes.append(float((np.array(dr.grad(params[key]), np.float64) * along).sum()))
     slope = (ends[0] - ends[1]) / (2 * h)
-    # Quadrature rounds by 2^-24 / h of the mean pixel; central differences err by h^2 / 6 of a third derivative below the slope.
+    # Quadrature rounds by 2^-24 / h of the mean pixel; central differences err by h^2 / 6 of a third derivative, below the
+    # slope itself.
     assert_precise(moments(slopes), 0.1 * abs(slope), what=f"slopes by {name}")
     assert_same_mean(moments(slopes), slope, rounding=1e-5 + 0.01 * abs(slope), what=f"slopes by {name}")
 
