@@ -223,7 +223,7 @@ def _write_scene(path: Path, field: SphericalGrid, options: WriteOptions) -> lis
 FIELD_FORMATS: dict[str, FieldFormat] = {
     ".npz": FieldFormat("field of mivol", _write_npz, lambda arrays: is_own_archive(arrays) or is_octree(arrays), _parse_own),
     ".svox2.npz": FieldFormat("checkpoint of svox2", _write_svox2, is_svox2, parse_svox2),
-    ".svox.npz": FieldFormat("octree of svox", _write_svox, is_svox, parse_svox),
+    ".svox.npz": FieldFormat("PlenOctree of svox", _write_svox, is_svox, parse_svox),
     ".vol": FieldFormat("pair of Mitsuba grids", _write_volumes),
     ".nrrd": FieldFormat("pair of NRRD volumes", _write_volumes),
     ".ply": FieldFormat("mesh with colours", _write_mesh),
