@@ -375,15 +375,11 @@ def explain(arguments: argparse.Namespace) -> int:
 
 
 def _explain_file(arguments: argparse.Namespace) -> Explanation | FileSummary:
-    """Explain points, Gaussians, a radiance field or a scene."""
+    """Explain points, Gaussians or a scene."""
     from mivol.points.summary import is_points_file, summarize_file
 
     if is_points_file(arguments.scene):
         return summarize_file(arguments.scene)
-    if arguments.scene.suffix.lower() == ".npz":
-        from mivol.experiments.octree_conversion import describe_field
-
-        return describe_field(arguments.scene, arguments.mode)
     from mivol.scene.explain import explain_scene
 
     return explain_scene(load_named_scene(arguments).scene, arguments.max_depth, noise=arguments.noise)
