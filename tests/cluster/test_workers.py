@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+from syntax import tree_of
 from tiny_experiment import refused, write_experiment
 
 from mivol import config
@@ -326,3 +328,15 @@ def test_time_of_units_that_stream_by_hand() -> None:
     assert [round(step_seconds(views, network, workers), 6) for workers in (1, 4, 6, 12)] == [12.0, 3.0, 2.4, 2.4]
     assert say_limit(views, network) == "6 workers: the owner receives images one after another"
     assert say_limit(Workload("b", 3, 1.0, 0.0, streams=True), network) == "3 workers: no more units"
+
+
+def test_dask_is_imported_with_the_switch_only() -> None:
+    """Nothing else is slower: each import of Dask stands inside of a function, or is for types."""
+    package = Path(__file__).parents[2] / "mivol"
+    found = {}
+    for path in package.rglob("*.py"):
+        nodes = [node for node in tree_of(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
+        names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+        names |= {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+        found |= {str(path): name for name in names if name.partition(".")[0] in ("dask", "distributed", "dask_jobqueue")}
+    assert found == {}
