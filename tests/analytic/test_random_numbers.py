@@ -34,6 +34,12 @@ def test_numbers_are_uniform():
     assert_same_mean(Moments.from_values(np.array(pairs).T), what="products")
 
 
+def test_numbers_of_a_generator_are_neither_0_nor_1():
+    """The words of these states begin with 24 zeros or 24 ones; they were found among 2^26 states."""
+    _, (u,) = draw_pcg32(mi.UInt32([0, 45809007, 36683381, 39019822, 40351736]), 1)
+    assert np.array_equal(np.array(u), np.float32([2**-25, 2**-25, 1 - 2**-24, 1 - 2**-24, 1 - 2**-24]))
+
+
 def spread(pixels: int, samples: int, seed: int = 3) -> SpreadSampler:
     """Samples of pixels side by side, the samples of a pixel in turn."""
     lane = dr.arange(mi.UInt32, pixels * samples)

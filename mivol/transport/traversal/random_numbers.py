@@ -57,11 +57,13 @@ def draw_pcg32(state: mi.UInt32, count: int) -> tuple[mi.UInt32, list[mi.Float]]
     Returns:
         The next state, and ``count`` numbers in the open interval (0, 1). The numbers are never 0. A reservoir keeps a
         candidate if u times the sum of weights is below the weight of the candidate, so u = 0 would keep every candidate. A
-        tracker would get an infinite distance -log(0) to the next collision.
+        tracker would get an infinite distance -log(0) to the next collision. Nor are they 1: u n would be no index of n.
     """
     numbers = []
     for _ in range(count):
-        numbers.append((mi.Float(_permute_state(state) >> 8) + 0.5) * (1 / (1 << 24)))
+        # Above 2^23 a half is rounded to an even number, the largest to 2^24.
+        u = (mi.Float(_permute_state(state) >> 8) + 0.5) * (1 / (1 << 24))
+        numbers.append(dr.minimum(u, dr.one_minus_epsilon(mi.Float)))
         state = _advance_state(state)
     return state, numbers
 
