@@ -196,11 +196,11 @@ def render_flags() -> list:
     from mivol.experiments.render import DRAWN_AS
 
     return [
-        *scene_flags("scene (.xml), radiance field (.npz), or points or Gaussians (.ply, .npy, .spz, ...)"),
+        *scene_flags("scene (.xml), radiance field (.npz), points or Gaussians (.ply, .npy, .spz, ...) or volume (.vdb, ...)"),
         flag(
             "--look-at", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
-            help="for a field or points: positions of camera and target [length] (default: the view that a fit keeps in its "
-            "file, or a view of all points)",
+            help="for a field, points or a volume: positions of camera and target [length] (default: the view that a fit keeps "
+            "in its file, or a view of everything)",
         ),
         flag("--up", type=float, nargs=3, metavar=("x", "y", "z"),
              help="upward direction of that camera (default: up in the photographs of a fit, else 0 0 1)"),
@@ -457,7 +457,7 @@ def _check_contents(path: Path) -> None:
     if is_unread(path):
         raise refuse_unread(path)
     if _is_array(path):
-        raise MivolError(f"{path}: found a volume, expected a scene, a fit or points; mivol explain and mivol convert take it.")
+        raise MivolError(f"{path}: found a volume, expected a scene, a fit or points; mivol render, explain and convert take it.")
 
 
 def _is_array(path: Path) -> bool:
@@ -534,9 +534,9 @@ def parse_defines(pairs: list[str]) -> dict[str, str]:
 
 
 def render(arguments: argparse.Namespace) -> None:
-    """Render an image of a scene, a radiance field, points or Gaussians.
+    """Render an image of a scene, a radiance field, points, Gaussians or a volume.
 
-    For a scene, the flags are the flags of the command mitsuba.
+    A volume is shown as a smoke under a sky and a sun. For a scene, the flags are the flags of the command mitsuba.
     """
     from mivol.cli.cluster import check_alone, render_passes
     from mivol.experiments.render import check_output, choose_integrator, integrator_name, render_image, write_image
@@ -545,7 +545,7 @@ def render(arguments: argparse.Namespace) -> None:
     check_output(path)
     if view := view_without_scene(arguments):
         check_alone(arguments)
-        write_image(path, view(), ["R", "G", "B"])
+        write_image(path, *view())
         print(path)
         return
     loaded = load_named_scene(arguments)
@@ -558,29 +558,33 @@ def render(arguments: argparse.Namespace) -> None:
 
 
 def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
-    """Return the function to render a radiance field, points or Gaussians; None if the file is a scene.
+    """Return the function to render a radiance field, points, Gaussians or a volume; None if the file is a scene.
 
     Raises:
         MivolError: a camera for a scene.
     """
     from mivol.back_end import set_variant
-    from mivol.experiments.render import Framing, PointLook, render_field, render_points
+    from mivol.experiments.render import Framing, PointLook, render_field, render_points, render_volume
+    from mivol.files.formats import is_volume as is_volume_file
     from mivol.points.summary import SUFFIXES
 
     suffix = arguments.scene.suffix.lower()
     is_field, is_cloud = suffix == ".npz", suffix in SUFFIXES
-    if not (is_cloud or is_field) and arguments.look_at is not None:
-        raise MivolError(f"{arguments.scene}: --look-at is for a radiance field (.npz) or points; a scene has its own cameras.")
+    is_volume = not (is_field or is_cloud) and arguments.scene.exists() and is_volume_file(arguments.scene)
+    if not (is_cloud or is_field or is_volume) and arguments.look_at is not None:
+        raise MivolError(f"{arguments.scene}: --look-at is for a field, points or a volume; a scene has its own cameras.")
     look = PointLook(arguments.points, arguments.radius, arguments.opacity)
     if not is_cloud and look != PointLook():
         raise MivolError(f"{arguments.scene}: --points, --radius and --opacity are for clouds of points: leave them out.")
-    if not (is_field or is_cloud):
+    if not (is_field or is_cloud or is_volume):
         return None
     set_variant(arguments.mode)
     camera = Framing(arguments.look_at, arguments.up, arguments.fov, arguments.size and tuple(arguments.size))
+    if is_volume:
+        return lambda: render_volume(arguments.scene, camera, arguments.spp, arguments.seed)
     if is_cloud:
-        return lambda: render_points(arguments.scene, camera, look)
-    return lambda: render_field(arguments.scene, camera)
+        return lambda: (render_points(arguments.scene, camera, look), ["R", "G", "B"])
+    return lambda: (render_field(arguments.scene, camera), ["R", "G", "B"])
 
 
 def reference(arguments: argparse.Namespace) -> None:

@@ -222,6 +222,57 @@ def make_camera(look_at: Sequence[float], up: Sequence[float], fov: float, size:
     return aim_camera(template, np.array(look_at[:3]), np.array(look_at[3:]), np.array(up), "--look-at")
 
 
+VOLUME_DEPTH, VOLUME_SAMPLES = 100.0, 32
+"""Optical depth [1] along the longest edge of a volume's box if all of it had the largest value, and samples per pixel."""
+
+
+def render_volume(path: Path, framing: Framing, spp: int | None = None, seed: int = 0) -> tuple[np.ndarray, list[str]]:
+    """Render a volume as a smoke of albedo 0.9 in its box, under a sky and a sun, with up to seven scatterings: linear light.
+
+    Values are scaled to ``VOLUME_DEPTH``, since a file does not tell the unit of an extinction.
+
+    Args:
+        path: file of :func:`mivol.files.read_volume` with values of which the largest is above 0.
+        framing: the camera; without a place, it sees the whole box.
+        spp: samples per pixel; None means ``VOLUME_SAMPLES``.
+        seed: seed of the random numbers.
+
+    Raises:
+        MivolError: as :func:`mivol.files.read_volume`, a volume without a positive value, or an invalid camera.
+    """
+    try:
+        grid = mi.load_dict({"type": "mivol_voxels", "filename": str(path), "use_grid_bbox": True, "signed": True})
+    except RuntimeError as error:
+        said = describe_error(error)
+        raise MivolError(said.partition('"mivol_voxels": ')[2] or said) from None
+    low, high = (np.array(corner, np.float64) for corner in (grid.bbox().min, grid.bbox().max))
+    top = float(grid.max())
+    if top <= 0:
+        raise MivolError(f"{path}: found no value above 0, which a smoke needs; mivol explain {path} prints its values.")
+    place, up, fov, size = framing.complete(None)
+    place = place or frame_points(np.array([low, high]), up, fov, size)
+    make_camera(place, up, fov, size)
+    smoke = {"type": "mivol_medium", "sigma_t": grid, "albedo": 0.9, "scale": VOLUME_DEPTH / (top * float((high - low).max()))}
+    box = mi.ScalarTransform4f().translate((low + high) / 2).scale((high - low) / 2)
+    sun = mi.ScalarVector3f(*(np.cross(np.subtract(place[3:], place[:3]), up) - np.array(up) * np.linalg.norm(high - low)))
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "smoke": {"type": "cube", "to_world": box, "bsdf": {"type": "null"}, "interior": smoke},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.03, 0.05, 0.09]}},
+            "sun": {"type": "directional", "direction": sun, "irradiance": {"type": "rgb", "value": [8.0, 7.5, 7.0]}},
+            "sensor": {
+                "type": "perspective",
+                "fov": fov,
+                "to_world": mi.ScalarTransform4f().look_at(origin=place[:3], target=place[3:], up=list(up)),
+                "film": {"type": "hdrfilm", "width": size[0], "height": size[1], "pixel_format": "rgb"},
+                "sampler": {"type": "independent", "sample_count": VOLUME_SAMPLES},
+            },
+        }
+    )
+    return render_image(scene, 0, mi.load_dict({"type": "mivol", "max_depth": 8}), spp, seed)
+
+
 DRAWN_AS = ("discs", "splats")
 """Shapes of points: a disc that faces the camera, or a Gaussian (EWA splatting, Zwicker et al. 2001)."""
 

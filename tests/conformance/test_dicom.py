@@ -129,9 +129,11 @@ def test_explain_and_convert_take_a_folder(tmp_path: Path, capsys: pytest.Captur
     np.testing.assert_array_equal(volume.values[..., 0], values)
     np.testing.assert_allclose(volume.to_world, expected_place("coronal", values.shape), atol=1e-8)
     assert volume.meta["space"] == "LPS"
-    for verb in ("optimize", "render"):
+    for verb in ("optimize", "validate"):
         assert run(verb, next((tmp_path / "s").iterdir())) == 1
         assert "found a volume, expected a scene, a fit or points" in capsys.readouterr().err
+    assert run("render", tmp_path / "s", "-o", tmp_path / "a.png", "--size", 8, 8, "--spp", 1) == 0
+    assert (tmp_path / "a.png").is_file()
 
 
 def test_a_series_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

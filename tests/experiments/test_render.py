@@ -1,4 +1,4 @@
-"""An image in passes."""
+"""An image in passes, and of a volume alone."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from mivol.experiments import render
+from mivol.experiments.render import Framing
+from mivol.files import write_volume
+from scenes import refused
 
 
 def test_render_in_passes_is_the_mean(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -20,3 +23,44 @@ def test_render_in_passes_is_the_mean(variant_rgb, folder: Path, monkeypatch: py
     assert names == ["R", "G", "B", "tau"]
     assert np.isclose(split[3, 4, 0], once[3, 4, 0], rtol=0.02)
     assert not np.array_equal(split, once)
+
+
+# -- A volume alone ----------------------------------------------------------------------------------------------------
+
+
+def write_ball(path: Path, factor: float = 1.0) -> Path:
+    """A ball in a box of 2 x 2 x 4, far from the origin."""
+    z, y, x = np.meshgrid(*(np.linspace(-1, 1, 16),) * 3, indexing="ij")
+    values = factor * (x * x + y * y + z * z < 0.5).astype(np.float32)
+    place = np.diag([2.0, 2.0, 4.0, 1.0])
+    place[:3, 3] = 10, -5, 3
+    write_volume(path, values, place)
+    return path
+
+
+def test_a_volume_is_seen_whole_and_scaled(variant_rgb, tmp_path: Path) -> None:
+    """Before the sky, in the middle of the image; its values in another unit give the same image."""
+    size = Framing(size=(16, 12))
+    image, names = render.render_volume(write_ball(tmp_path / "a.vol"), size, spp=16)
+    other, _ = render.render_volume(write_ball(tmp_path / "b.vol", 256.0), size, spp=16)
+    assert image.shape == (12, 16, 3) and names == ["R", "G", "B"]
+    edge = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+    np.testing.assert_allclose(edge, np.broadcast_to([0.03, 0.05, 0.09], edge.shape), rtol=1e-5)
+    assert image[6, 8, 0] > 0.1
+    # The same products, since 256 is a power of two; threads add the 16 samples of a pixel in any order.
+    np.testing.assert_allclose(image, other, rtol=16 * 2.0**-23)
+    side = Framing([11, -20, 5, 11, 0, 5], (0.0, 0.0, 1.0), 30.0, (16, 12))
+    moved, _ = render.render_volume(tmp_path / "a.vol", side, spp=16)
+    assert moved[6, 8, 0] > 0.04 and not np.array_equal(moved, image)
+
+
+def test_a_volume_without_matter_is_refused(variant_rgb, tmp_path: Path) -> None:
+    write_volume(tmp_path / "empty.vol", np.full((2, 2, 2), -1.0, np.float32))
+    with refused("empty.vol: found no value above 0, which a smoke needs"):
+        render.render_volume(tmp_path / "empty.vol", Framing())
+    write_ball(tmp_path / "a.vol")
+    with refused("^--look-at .* is no camera"):
+        render.render_volume(tmp_path / "a.vol", Framing([0, 0, 0, 1, 1, 1], (0.0, 0.0, 1.0), 200.0))
+    (tmp_path / "broken.vol").write_bytes(b"VOL\3")
+    with refused("^[^ ]*broken.vol"):
+        render.render_volume(tmp_path / "broken.vol", Framing())
