@@ -111,6 +111,13 @@ CITATIONS: dict[str, Citation] = {
         "CVPR",
         "https://doi.org/10.1109/CVPR52688.2022.00542",
     ),
+    "nerf_2020": Citation(
+        "B. Mildenhall, P. P. Srinivasan, M. Tancik, J. T. Barron, R. Ramamoorthi, R. Ng",
+        2020,
+        "NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis",
+        "ECCV",
+        "https://arxiv.org/abs/2003.08934",
+    ),
     "mueller_2022": Citation(
         "T. Müller, A. Evans, C. Schied, A. Keller",
         2022,

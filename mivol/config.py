@@ -586,6 +586,40 @@ class HashExperiment(Section):
     output: Output = "runs/field"
 
 
+class NerfSettings(Section):
+    """The coordinate network and its fit."""
+
+    kind: Annotated[Literal["nerf"], setting("1", "one coordinate network, density and colour of a place and a direction")]
+    preset: Annotated[str, setting("1", "sizes, steps, rates: tiny, minutes or gpu", min_length=1)] = "minutes"
+    effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
+    depth: Annotated[int, setting("layer", "layers of the trunk; absent: preset", ge=1, le=16)] | None = None
+    width: Annotated[int, setting("neuron", "neurons of such a layer; absent: preset", ge=1, le=1024)] | None = None
+    skip: (
+        Annotated[int, setting("layer", "layer after which the place is put in again; 0: none; absent: preset", ge=0, le=15)]
+        | None
+    ) = None
+    place: Annotated[int, setting("1", "frequencies of the place; absent: preset", ge=0, le=16)] | None = None
+    direction: Annotated[int, setting("1", "frequencies of the direction; absent: preset", ge=0, le=16)] | None = None
+    branch: Annotated[int, setting("neuron", "hidden neurons of the colours; absent: preset", ge=1, le=1024)] | None = None
+    relu: Annotated[int, setting("1", "1: density by a ReLU, 0: by softplus; absent: preset", ge=0, le=1)] | None = None
+    samples: Annotated[int, setting("sample", "samples of a step; absent: preset", ge=256, le=1 << 22)] | None = None
+    cells: Annotated[int, setting("cell", "cells of the map of occupied space; absent: preset", ge=4, le=256)] | None = None
+
+
+class NerfExperiment(Section):
+    """A fit of a NeRF to photographs: a file with a table ``[photos]``, and ``kind = "nerf"`` in its table ``[field]``."""
+
+    title: Title
+    photos: Annotated[Photographs, setting("1", "the photographs")]
+    field: Annotated[NerfSettings, setting("1", "the network and its fit")]
+    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
+    checkpoint_every: CheckpointSteps = 500
+    variant: Variant = "llvm_ad_rgb"
+    seed: Seed = 0
+    threads: Threads = 0
+    output: Output = "runs/field"
+
+
 class OctreeSettings(Section):
     """The octree and its fit: a grid first, or a field of a file."""
 
@@ -659,7 +693,7 @@ class GaussianExperiment(Section):
     output: Output = "runs/gaussians"
 
 
-PhotoExperiment = FieldExperiment | HashExperiment | OctreeExperiment | GaussianExperiment
+PhotoExperiment = FieldExperiment | HashExperiment | NerfExperiment | OctreeExperiment | GaussianExperiment
 """A fit of photographs, with one of the models."""
 
 Experiment = SceneExperiment | ScanExperiment | PhotoExperiment
@@ -673,10 +707,23 @@ KINDS: dict[str, type[Section]] = {
 }
 """Kinds of experiments by a table of the file; the first present table decides."""
 
-FIELD_KINDS: dict[str, type[Section]] = {"grid": FieldExperiment, "hash": HashExperiment, "octree": OctreeExperiment}
+FIELD_KINDS: dict[str, type[Section]] = {
+    "grid": FieldExperiment,
+    "hash": HashExperiment,
+    "nerf": NerfExperiment,
+    "octree": OctreeExperiment,
+}
 """Kinds of fits with a table ``[photos]``, by the setting ``field.kind``."""
 
-EXPERIMENTS = (SceneExperiment, ScanExperiment, FieldExperiment, HashExperiment, OctreeExperiment, GaussianExperiment)
+EXPERIMENTS = (
+    SceneExperiment,
+    ScanExperiment,
+    FieldExperiment,
+    HashExperiment,
+    NerfExperiment,
+    OctreeExperiment,
+    GaussianExperiment,
+)
 """Settings of all kinds of experiments."""
 
 CAPTURE = {"photos": {"largest": 240, "box": "middle"}, "show": {"views": 64}}
@@ -753,6 +800,7 @@ MODELS: dict[str, dict[str, dict[str, str]]] = {
     "gaussians": {"gaussians": {}},
     "grid": {"field": {}},
     "hash": {"field": {"kind": "hash"}},
+    "nerf": {"field": {"kind": "nerf"}},
     "octree": {"field": {"kind": "octree"}},
 }
 """Table of a model with its first settings, by the word of ``mivol optimize --as``; the first word is the default."""

@@ -170,6 +170,7 @@ def toml_page() -> str:
         "Projections (a table `[scan]`)": config.ScanExperiment,
         "Photographs (a table `[photos]`)": config.FieldExperiment,
         'Photographs, hash grid (tables `[photos]` and `[field]` with `kind = "hash"`)': config.HashExperiment,
+        'Photographs, NeRF (tables `[photos]` and `[field]` with `kind = "nerf"`)': config.NerfExperiment,
         'Photographs, octree (tables `[photos]` and `[field]` with `kind = "octree"`)': config.OctreeExperiment,
         "Gaussians (tables `[photos]` and `[gaussians]`)": config.GaussianExperiment,
     }

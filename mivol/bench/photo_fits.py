@@ -26,8 +26,8 @@ from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit
 from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan
 from mivol.experiments.gaussian_fit import make_gaussian_plan, start_gaussians
-from mivol.experiments.hash_fit import make_hash_plan, make_hash_problem
 from mivol.experiments.photo_data import add_box, read_photos
+from mivol.experiments.sampled_fit import make_sampled_plan, make_sampled_problem
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
@@ -158,8 +158,8 @@ def prepare_fit(
         plan = adapt_plan(adapt(make_plan(chosen)), train)
         problem = RadianceProblem(make_batches(plan, train), train.box, plan)
         return PhotoProblem(problem, train, judged, sum(stage.steps for stage in plan.stages))
-    if isinstance(chosen, config.HashExperiment):
-        problem = make_hash_problem(make_hash_plan(chosen), train, seed)
+    if isinstance(chosen, config.HashExperiment | config.NerfExperiment):
+        problem = make_sampled_problem(make_sampled_plan(chosen), train, seed)
         return PhotoProblem(problem, train, judged, problem.plan.steps)
     begun = start_gaussians(chosen, train, make_gaussian_plan(chosen))
     return PhotoProblem(begun.problem(seed), train, judged, begun.plan.steps)

@@ -164,7 +164,8 @@ def model_flags(text: str) -> list[tuple[tuple[str, ...], dict[str, Any]]]:
         flag(
             "--preset",
             help="preset of that model; of Gaussians: minute (default), minutes, fine, ...; of a grid: cpu (default) for an "
-            "object, capture for a place around the cameras, ...; of a hash grid: minute (default), minutes, gpu; of an "
+            "object, capture for a place around the cameras, ...; of a hash grid: minute (default), minutes, gpu; of a "
+            "NeRF: tiny, minutes (default), gpu; of an "
             "octree: the grid's",
         ),
     ]
@@ -495,7 +496,7 @@ def explain_photos(path: Path, picture: Path | None) -> int:
     print(survey.describe())
     if note := note_on_alpha(survey):
         print(note)
-    print("--as gaussians, grid, hash or octree explains a fit; --as grid --preset capture is for a place around the cameras")
+    print("--as gaussians, grid, hash, nerf or octree explains a fit; --as grid --preset capture is for a place around cameras")
     if picture is not None:
         plot_cameras(survey, picture)
         print(picture)
@@ -676,9 +677,9 @@ def _check_preset(model: str, preset: str | None) -> None:
     """Refuse a preset that only the other model has; a preset of no model is refused with the settings."""
     from mivol.optim.gaussians.gaussian_plan import PRESETS as GAUSSIANS
     from mivol.optim.photographs.radiance_plan import PRESETS as GRIDS
-    from mivol.optim.photographs.sampled_problem import PRESETS as HASH_GRIDS
+    from mivol.optim.photographs.sampled_problem import PRESETS as SAMPLED
 
-    presets = {"gaussians": GAUSSIANS, "grid": GRIDS, "hash": HASH_GRIDS, "octree": GRIDS}
+    presets = {"gaussians": GAUSSIANS, "grid": GRIDS, **SAMPLED, "octree": GRIDS}
     other = next((name for name, known in presets.items() if preset in known), model)
     if preset not in presets[model] and other != model:
         known = ", ".join(presets[model])
@@ -717,21 +718,21 @@ def validate(arguments: argparse.Namespace) -> int:
 def export(arguments: argparse.Namespace) -> None:
     """Write a radiance field as a mesh, volumes, a scene with its sky, or a file of another program.
 
-    A hash grid becomes a grid of 128 nodes along its longest edge first, and export prints the loss in dB; mivol convert --to
-    grid makes grids of other resolutions.
+    A hash grid or a NeRF becomes a grid of 128 nodes along its longest edge first, and export prints the loss in dB; mivol
+    convert --to grid makes grids of other resolutions.
     """
     from mivol.back_end import set_variant
-    from mivol.experiments.octree_conversion import GRID_NODES, sample_hash_grid
+    from mivol.experiments.octree_conversion import GRID_NODES, sample_to_grid
     from mivol.experiments.render import sky_beside
     from mivol.fields.field_archives import read_field_view
     from mivol.fields.field_files import read_field, write_field
-    from mivol.fields.hash_grid import HashField
+    from mivol.fields.sampled_field import SampledField
 
     set_variant(arguments.mode)
     field, sky, view = read_field(arguments.field), sky_beside(arguments.field), read_field_view(arguments.field)
     is_copy = arguments.output.suffix == ".npz" and not arguments.output.name.endswith((".svox2.npz", ".svox.npz"))
-    if isinstance(field, HashField) and not is_copy:
-        field, lines = sample_hash_grid(field, GRID_NODES)
+    if isinstance(field, SampledField) and not is_copy:
+        field, lines = sample_to_grid(field, GRID_NODES)
         print(lines)
     print("\n".join(str(path) for path in write_field(arguments.output, field, arguments.level, sky, view=view)))
 
@@ -739,7 +740,7 @@ def export(arguments: argparse.Namespace) -> None:
 def convert(arguments: argparse.Namespace) -> None:
     """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats; volumes too.
 
-    A field (.npz) is the mivol_sh of a scene, an octree (--to octree) or a hash grid (which becomes a grid with --to grid).
+    A field (.npz) is the mivol_sh of a scene, an octree (--to octree) or a hash grid or a NeRF (a grid with --to grid).
     Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     """

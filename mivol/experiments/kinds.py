@@ -13,10 +13,10 @@ from mivol.errors import MivolError
 from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.fit_kind import FitKind, RunContext
 from mivol.experiments.gaussian_fit import GaussianFit
-from mivol.experiments.hash_fit import HashFit
 from mivol.experiments.octree_fit import OctreeFit
 from mivol.experiments.photo_fit import PhotoFit
 from mivol.experiments.run_folder import CHECKPOINT, BestIterate, RunFolder
+from mivol.experiments.sampled_fit import SampledFit
 from mivol.experiments.scan_fit import ScanFit
 from mivol.experiments.scene_fit import SceneFit
 from mivol.optim import checkpoint
@@ -30,7 +30,8 @@ KINDS: dict[type, type[FitKind]] = {
     config.SceneExperiment: SceneFit,
     config.ScanExperiment: ScanFit,
     config.FieldExperiment: FieldFit,
-    config.HashExperiment: HashFit,
+    config.HashExperiment: SampledFit,
+    config.NerfExperiment: SampledFit,
     config.OctreeExperiment: OctreeFit,
     config.GaussianExperiment: GaussianFit,
 }

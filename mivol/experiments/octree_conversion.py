@@ -1,4 +1,4 @@
-"""Conversions of radiance fields: grids, octrees and hash grids, with their loss, and the description of a field's file."""
+"""Conversions of radiance fields (grids, octrees, hash grids, NeRFs) with their loss, and the description of a file."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from mivol.errors import MivolError
 from mivol.experiments.gaussian_conversion import EDGE, VIEWED, cameras_around
 from mivol.fields.field_archives import read_field_view
 from mivol.fields.field_files import read_field, write_field
-from mivol.fields.hash_grid import HashField
 from mivol.fields.octree import Octree, check_depth
 from mivol.fields.resampling import sample_field
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.source import check_file
 from mivol.optim.photographs.field_view import order_by_tiles, prepare_view, render_view
@@ -29,7 +29,7 @@ from mivol.transport.line_integrals.radiance_field import RayBundle
 from mivol.validate.metrics import psnr
 
 GRID_NODES = 128
-"""Default number of nodes along the longest edge of the grid of a hash grid."""
+"""Default number of nodes along the longest edge of the grid of a hash grid or a NeRF."""
 
 LOOKS = 48
 """Number of views that decide which leaves are seen."""
@@ -56,8 +56,10 @@ def convert_to_octree(source: Path, target: Path, resolution: int | None, varian
     """
     set_variant(variant)
     field = read_field(source)
-    if isinstance(field, HashField):
-        raise MivolError(f"{source} is a hash grid, and an octree is made from a grid: mivol convert FILE grid.npz --to grid.")
+    if isinstance(field, SampledField):
+        raise MivolError(
+            f"{source} is a {field.noun}, and an octree is made from a grid: mivol convert FILE grid.npz --to grid."
+        )
     if resolution is not None:
         if isinstance(field, Octree):
             raise MivolError(f"{source} is an octree, whose leaves stay as they are: leave out --resolution.")
@@ -70,12 +72,12 @@ def convert_to_octree(source: Path, target: Path, resolution: int | None, varian
 
 
 def convert_to_grid(source: Path, target: Path, resolution: int | None, variant: str) -> str:
-    """Write an octree or a hash grid as a radiance field on a grid; result as :func:`convert_to_octree`.
+    """Write an octree, a hash grid or a NeRF as a radiance field on a grid; result as :func:`convert_to_octree`.
 
     Args:
-        source: octree or hash grid (.npz).
+        source: octree, hash grid or NeRF (.npz).
         target: file ending in .npz.
-        resolution: nodes along the longest edge, for a hash grid; None means ``GRID_NODES``.
+        resolution: nodes along the longest edge, for a hash grid or a NeRF; None means ``GRID_NODES``.
         variant: Mitsuba variant of the views.
 
     Raises:
@@ -83,12 +85,12 @@ def convert_to_grid(source: Path, target: Path, resolution: int | None, variant:
     """
     set_variant(variant)
     tree = read_field(source)
-    if isinstance(tree, HashField):
-        grid, lines = sample_hash_grid(tree, GRID_NODES if resolution is None else resolution)
+    if isinstance(tree, SampledField):
+        grid, lines = sample_to_grid(tree, GRID_NODES if resolution is None else resolution)
         write_field(target, grid, view=read_field_view(source))
         return f"{target}: {lines}"
     if not isinstance(tree, Octree):
-        raise MivolError(f"{source} is a grid: mivol convert --to grid makes a grid from an octree or a hash grid.")
+        raise MivolError(f"{source} is a grid: mivol convert --to grid makes a grid from an octree, a hash grid or a NeRF.")
     if resolution is not None:
         raise MivolError(f"{target}: the grid of an octree has a node in each of its smallest cells: leave out --resolution.")
     grid = tree.to_grid()
@@ -97,25 +99,25 @@ def convert_to_grid(source: Path, target: Path, resolution: int | None, variant:
     return "\n".join([head, *_describe_loss(source, tree, target, read_field(target))])
 
 
-def sample_hash_grid(field: HashField, resolution: int) -> tuple[SphericalGrid, str]:
-    """The grid of a hash grid with ``resolution`` nodes along the longest edge, and lines with its size and its loss.
+def sample_to_grid(field: SampledField, resolution: int) -> tuple[SphericalGrid, str]:
+    """The grid of a hash grid or a NeRF with ``resolution`` nodes along the longest edge, and lines with its size and its loss.
 
     Raises:
         MivolError: no matter in the box, or fewer than 2 nodes.
     """
     if resolution < 2:
         raise MivolError(f"found a grid of {resolution} nodes along its longest edge, expected at least 2: raise --resolution.")
-    box = np.array([field.to_world[:3, 3], field.to_world[:3, 3] + field.encoding.edges])
+    box = np.array([field.to_world[:3, 3], field.to_world[:3, 3] + field.edges])
     grid = sample_field(field, *place_grid(box, resolution))
     size = f"{' x '.join(map(str, grid.res[::-1]))} nodes, {grid.rows - 1} of them stored, degree {grid.degree}"
-    loss = f"{views_psnr(grid, field):.1f} dB between views of the grid and of the hash grid: {VIEWED}, over black, peak 1"
+    loss = f"{views_psnr(grid, field):.1f} dB between views of the grid and of the {field.noun}: {VIEWED}, over black, peak 1"
     return grid, f"{size}\n{loss}"
 
 
 def _describe_loss(source: Path, field: SphericalGrid | Octree, target: Path, written: SphericalGrid | Octree) -> list[str]:
     """Difference between views of two fields, and the sizes of their files, in lines."""
     sizes = [path.stat().st_size for path in (source, target)]
-    speeds = [] if isinstance(field, HashField) else [describe_speed(written, field, source.name)]
+    speeds = [] if isinstance(field, SampledField) else [describe_speed(written, field, source.name)]
     return [
         f"{views_psnr(written, field):.1f} dB between views of {target.name} and {source.name}: {VIEWED}, over black, peak 1",
         f"{sizes[1]} bytes, {sizes[1] / sizes[0]:.2f} of {source.name}",
@@ -146,7 +148,7 @@ def describe_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree,
     return f"{rates[0]:.1f} M pixels a second of processor time, {other_name} {rates[1]:.1f}: {ratio:.2f} times as many"
 
 
-def views_psnr(field: SphericalGrid | Octree, other: SphericalGrid | Octree | HashField) -> float:
+def views_psnr(field: SphericalGrid | Octree, other: SphericalGrid | Octree | SampledField) -> float:
     """PSNR between views of two fields [dB], of the box of ``other``, over black, peak 1."""
     cameras = cameras_around(other.to_world, EDGE)
     images, truth = ([render_view(one, camera, np.zeros(3)).image for camera in cameras] for one in (field, other))
@@ -183,8 +185,8 @@ def describe_field(path: Path, variant: str) -> Explanation:
     """
     set_variant(variant)
     field = read_field(check_file(path))
-    if isinstance(field, HashField):
-        return Explanation((f"hash grid   {field!r}", f"memory      {path.stat().st_size / 2**20:.2f} MiB in the file"))
+    if isinstance(field, SampledField):
+        return Explanation((f"{field.noun:<12}{field!r}", f"memory      {path.stat().st_size / 2**20:.2f} MiB in the file"))
     density, _ = field.values()
     if isinstance(field, Octree):
         place, kind = field.to_world, f"octree      {describe_leaves(field)}"

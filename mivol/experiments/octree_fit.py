@@ -20,8 +20,8 @@ from mivol.experiments.field_fit import FieldFit, adapt_plan, explain_plan, make
 from mivol.experiments.octree_conversion import describe_leaves, describe_speed
 from mivol.experiments.run_folder import RunFolder
 from mivol.fields.field_files import read_field, write_field
-from mivol.fields.hash_grid import HashField
 from mivol.fields.octree import Octree
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole
 from mivol.optim.loop import Fit
@@ -164,12 +164,13 @@ def read_start(path: Any, space: str, white: float) -> SphericalGrid | Octree:
     """Read the field at which a fit begins.
 
     Raises:
-        MivolError: as :func:`mivol.fields.field_files.read_field`, a hash grid, nested levels, or colours of another space.
+        MivolError: as :func:`mivol.fields.field_files.read_field`, a hash grid or a NeRF, nested levels, or colours of
+            another space.
     """
     field = read_field(path)
-    if isinstance(field, HashField):
+    if isinstance(field, SampledField):
         raise MivolError(
-            f"{path} is a hash grid, and field.start is a grid or an octree: mivol convert FILE grid.npz --to grid."
+            f"{path} is a {field.noun}, and field.start is a grid or an octree: mivol convert FILE grid.npz --to grid."
         )
     if field.space != space:
         raise MivolError(

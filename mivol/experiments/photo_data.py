@@ -79,7 +79,7 @@ def check_background(settings: PhotoExperiment, has_alpha: bool) -> None:
         raise MivolError(f'photos.background = "{word}" is unknown: {suggest_name(word, known)}')
     kind = "photographs with alpha" if has_alpha else "photographs without alpha"
     if word in LEARNED and not learned:
-        kind = "Gaussians" if isinstance(settings, GaussianExperiment) else "a hash grid"
+        kind = "Gaussians" if isinstance(settings, GaussianExperiment) else f'field.kind = "{settings.field.kind}"'
     raise MivolError(f'photos.background = "{word}" is not for {kind}: {", ".join(known)} or an rgb triple is expected.')
 
 

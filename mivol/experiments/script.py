@@ -20,7 +20,7 @@ from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, Progress, RunContext
 from mivol.experiments.kinds import run_experiment
 from mivol.fields.field_files import read_field
-from mivol.fields.hash_grid import HashField
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, stack_layers
 from mivol.optim.first_order import Adam
@@ -212,14 +212,14 @@ def fit_photographs(
     output: str | os.PathLike = "runs/field",
     settings: Mapping[str, object] | None = None,
     progress: Progress | None = None,
-) -> SphericalGrid | HashField:
+) -> SphericalGrid | SampledField:
     """Fit a radiance field to posed photographs; the run folder has ``field.npz`` and the report page.
 
     Args:
         photographs: a folder, or its file of cameras (Blender, nerfstudio, instant-ngp, COLMAP).
         output: run folder.
         settings: settings of the TOML file by dotted key, as ``{"field.preset": "tiny", "photos.background": "white"}``; with
-            ``"field.kind": "hash"`` the field is a hash grid.
+            ``"field.kind": "hash"`` the field is a hash grid, with "nerf" a NeRF.
         progress: display of the run's progress; may be None.
 
     Raises:

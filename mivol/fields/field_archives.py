@@ -10,16 +10,15 @@ Source: Fridovich-Keil, Yu et al. 2022; the names of the arrays are read from sv
 from __future__ import annotations
 
 import math
-from dataclasses import astuple
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
-from mivol.fields.sampled_field import Region
+from mivol.fields.nerf import NerfField
+from mivol.fields.sampled_field import Region, SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole
 from mivol.files.npy import check_memory, read_archive
@@ -76,23 +75,23 @@ def write_archive(path: Path, field: SphericalGrid, half: bool = True, view: Hom
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-HASH_FORMAT = "mivol hash grid 1"
+SAMPLED_FIELDS: dict[str, type[SampledField]] = {field.kind: field for field in (HashField, NerfField)}
+"""Fields that are known at points, by the word of their files and of ``field.kind``."""
 
-HASH_KINDS = {
-    "kind": ("U", ()), "sizes": ("iu", (10,)), "to_world": ("f", (4, 4)), "table": ("f", None), "density_weights": ("f", None),
-    "colour_weights": ("f", None), "space": ("U", ()), "white": ("f", ()), "res": ("iu", (3,)), "occupied": ("u", None),
-    "region_to_world": ("f", (4, 4)), "step": ("f", ()),
+SAMPLED_KINDS = {
+    "kind": ("U", ()), "to_world": ("f", (4, 4)), "space": ("U", ()), "white": ("f", ()), "res": ("iu", (3,)),
+    "occupied": ("u", None), "region_to_world": ("f", (4, 4)), "step": ("f", ()),
 }  # fmt: skip
-"""Arrays of a hash grid -> allowed kinds of NumPy types, and the shape where it is fixed."""
+"""Arrays of such a field of any kind -> allowed kinds of NumPy types, and the shape where it is fixed."""
 
 
-def write_hash_archive(path: Path, field: HashField, half: bool = True, view: HomeView | None = None) -> None:
-    """Write a fitted hash grid in mivol's own format.
+def write_sampled_archive(path: Path, field: SampledField, half: bool = True, view: HomeView | None = None) -> None:
+    """Write a fitted field that is known at points in mivol's own format.
 
     Args:
         path: destination.
-        field: hash grid with a region.
-        half: store the table in half floats (11 bits), under the conditions of :func:`write_archive`.
+        field: hash grid or NeRF, with a region.
+        half: store features in half floats (11 bits), under the conditions of :func:`write_archive`; weights stay float32.
         view: first view of the field, optional.
 
     Raises:
@@ -100,10 +99,10 @@ def write_hash_archive(path: Path, field: HashField, half: bool = True, view: Ho
     """
     region = field.region
     if region is None:
-        raise MivolError(f"{path.name}: found a hash grid without occupied cells, expected one of a fit: give it a region.")
+        raise MivolError(f"{path.name}: found a {field.noun} without occupied cells, expected one of a fit: give it a region.")
     arrays = {name: np.array(value) for name, value in field.parameters().items()}
-    arrays["table"] = _to_half(arrays["table"], half)
-    arrays |= {"kind": np.array("hash"), "format": np.array(HASH_FORMAT), "sizes": np.array(astuple(field.sizes))}
+    arrays |= {name: _to_half(arrays[name], half) for name in field.features}
+    arrays |= {"kind": np.array(field.kind), "format": np.array(f"mivol {field.noun} 1")} | field.arrays()
     arrays |= {"to_world": field.to_world, "space": np.array(field.space), "white": np.array(field.white)}
     arrays |= {"res": np.array(region.res), "region_to_world": region.to_world, "step": np.array(region.step)}
     arrays["occupied"] = np.packbits(np.array(region.occupied) > 0)
@@ -112,28 +111,31 @@ def write_hash_archive(path: Path, field: HashField, half: bool = True, view: Ho
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-def is_hash_archive(arrays: dict[str, np.ndarray]) -> bool:
-    """Whether the arrays of an archive are a hash grid."""
-    return "kind" in arrays or str(arrays.get("format", "")) == HASH_FORMAT
+def is_sampled_archive(arrays: dict[str, np.ndarray]) -> bool:
+    """Whether the arrays of an archive are a field that is known at points."""
+    formats = [f"mivol {field.noun} 1" for field in SAMPLED_FIELDS.values()]
+    return "kind" in arrays or str(arrays.get("format", "")) in formats
 
 
-def parse_hash_archive(name: str, arrays: dict[str, np.ndarray]) -> HashField:
-    """Make a hash grid from the arrays of mivol's own format.
+def parse_sampled_archive(name: str, arrays: dict[str, np.ndarray]) -> SampledField:
+    """Make a field that is known at points from the arrays of mivol's own format.
 
     Args:
         name: file name, for error messages.
         arrays: contents of the archive.
 
     Raises:
-        MivolError: another kind, a missing array, another type or shape, or values that are not finite.
+        MivolError: an unknown kind, a missing array, another type or shape, or values that are not finite.
     """
-    kind = str(arrays.get("kind", "nothing"))
-    if kind != "hash":
-        raise MivolError(f'{name} holds a field of the kind "{kind}"; the kind "hash" is expected.')
-    missing = HASH_KINDS.keys() - arrays.keys()
+    kind = SAMPLED_FIELDS.get(word := str(arrays.get("kind", "nothing")))
+    if kind is None:
+        known = " or ".join(f'"{each}"' for each in SAMPLED_FIELDS)
+        raise MivolError(f'{name} holds a field of the kind "{word}"; the kind {known} is expected.')
+    expected = SAMPLED_KINDS | kind.own_arrays | dict.fromkeys(kind.parameter_names(), ("f", None))
+    missing = expected.keys() - arrays.keys()
     if missing:
         raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
-    _check_arrays(name, arrays, HASH_KINDS)
+    _check_arrays(name, arrays, expected)
     res = tuple(int(n) for n in arrays["res"])
     cells = math.prod(n + 1 for n in res)
     if min(res) < 1 or arrays["occupied"].shape != (-(-cells // 8),) or not arrays["step"] > 0:
@@ -141,10 +143,9 @@ def parse_hash_archive(name: str, arrays: dict[str, np.ndarray]) -> HashField:
         raise MivolError(f"{name} holds {found} for {cells} cells; write it again.")
     occupied = np.unpackbits(arrays["occupied"].astype(np.uint8))[:cells]
     region = Region(res, arrays["region_to_world"].astype(np.float64), mi.UInt8(occupied), float(arrays["step"]))
-    numbers = [mi.Float(arrays[key].astype(np.float32).ravel()) for key in ("table", "density_weights", "colour_weights")]
+    numbers = [mi.Float(arrays[key].astype(np.float32).ravel()) for key in kind.parameter_names()]
     try:
-        sizes, place = HashSizes(*map(int, arrays["sizes"])), arrays["to_world"].astype(np.float64)
-        return HashField(sizes, place, *numbers, str(arrays["space"]), region, float(arrays["white"]))
+        return kind.from_arrays(arrays, numbers, region)
     except MivolError as error:
         raise MivolError(f"{name}: {error}") from None
 

@@ -29,19 +29,19 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.field_archives import (
-    is_hash_archive,
     is_own_archive,
+    is_sampled_archive,
     is_svox2,
     parse_archive,
-    parse_hash_archive,
+    parse_sampled_archive,
     parse_svox2,
     write_archive,
-    write_hash_archive,
+    write_sampled_archive,
     write_svox2,
 )
-from mivol.fields.hash_grid import HashField
 from mivol.fields.octree import Octree
 from mivol.fields.octree_files import is_octree, is_svox, parse_octree, parse_svox, write_octree, write_svox
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import extract_surface
@@ -94,8 +94,8 @@ class FieldFormat:
     parse: Callable[[str, dict[str, np.ndarray]], SphericalGrid | Octree] | None = None
 
 
-def read_field(path: str | os.PathLike) -> SphericalGrid | HashField | Octree:
-    """Read a radiance field: an ``.npz`` of mivol (a grid, a hash grid, an octree), of svox2, or of svox (PlenOctrees).
+def read_field(path: str | os.PathLike) -> SphericalGrid | SampledField | Octree:
+    """Read a radiance field: an ``.npz`` of mivol (a grid, a hash grid, a NeRF, an octree), of svox2, or of svox (PlenOctrees).
 
     Raises:
         MivolError: a missing file, another format, or contents that contradict each other.
@@ -108,8 +108,8 @@ def read_field(path: str | os.PathLike) -> SphericalGrid | HashField | Octree:
     for kind in readable:
         if kind.recognizes(arrays):
             return kind.parse(path.name, arrays)
-    if is_hash_archive(arrays):
-        return parse_hash_archive(path.name, arrays)
+    if is_sampled_archive(arrays):
+        return parse_sampled_archive(path.name, arrays)
     known = " or a ".join(kind.name for kind in readable)
     raise MivolError(f"{path.name} holds {', '.join(arrays) or 'nothing'}; a {known} is expected.")
 
@@ -118,19 +118,21 @@ def read_grid(path: str | os.PathLike) -> SphericalGrid:
     """Read a radiance field that is a grid.
 
     Raises:
-        MivolError: as :func:`read_field`, or a hash grid or an octree.
+        MivolError: as :func:`read_field`, or a hash grid, a NeRF or an octree.
     """
     field = read_field(path)
     if isinstance(field, Octree):
         raise refusal(Path(path), "an octree", "a grid of harmonics", "convert it by mivol convert FILE grid.npz --to grid")
-    if isinstance(field, HashField):
-        raise refusal(Path(path), "a hash grid", "a grid of harmonics", "convert it by mivol convert FILE grid.npz --to grid")
+    if isinstance(field, SampledField):
+        raise refusal(
+            Path(path), f"a {field.noun}", "a grid of harmonics", "convert it by mivol convert FILE grid.npz --to grid"
+        )
     return field
 
 
 def write_field(
     path: str | os.PathLike,
-    field: SphericalGrid | HashField | Octree,
+    field: SphericalGrid | SampledField | Octree,
     level: float | None = None,
     sky: Sky | None = None,
     half: bool = True,
@@ -140,7 +142,7 @@ def write_field(
 
     Args:
         path: destination.
-        field: radiance field, nested or not, a hash grid or an octree.
+        field: radiance field, nested or not, a hash grid, a NeRF or an octree.
         level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surfaces.default_level`.
         sky: background of the field, in the space of its colours. Only a scene (``.xml``) holds it.
         half: store half floats in ``.npz`` (11 bits), or an octree's rounded values (:mod:`mivol.fields.octree_files`). Arrays
@@ -160,10 +162,12 @@ def write_field(
         known = ", ".join(f"{s} ({kind.name})" for s, kind in FIELD_FORMATS.items())
         found = FOREIGN.get(path.suffix.lower(), f"the suffix {path.suffix!r}")
         raise refusal(path, found, f"one of {known}", "choose one of those")
-    if isinstance(field, HashField):
+    if isinstance(field, SampledField):
         if suffix != ".npz":
-            raise refusal(path, "a hash grid", "an .npz", "convert it to a grid first (mivol convert FILE grid.npz --to grid)")
-        write_hash_archive(path, field, half, view)
+            raise refusal(
+                path, f"a {field.noun}", "an .npz", "convert it to a grid first (mivol convert FILE grid.npz --to grid)"
+            )
+        write_sampled_archive(path, field, half, view)
         return [path]
     kind = FIELD_FORMATS[suffix]
     if level is not None and kind.write is not _write_mesh:

@@ -95,6 +95,20 @@ class HashSizes:
         """The network from geometry and harmonics to colour."""
         return Network((self.geometry + basis_size(self.degree), *[self.width] * self.colour_layers, 3))
 
+    def count_numbers(self, edges: np.ndarray) -> int:
+        """Number of fitted numbers, in a box with the edges (x, y, z)."""
+        rows = sum(level.rows for level in self.place_levels(edges))
+        return rows * self.features + self.density_network.size + self.colour_network.size
+
+    def describe(self, edges: np.ndarray) -> tuple[str, str]:
+        """Levels in a box with the edges (x, y, z), and their numbers."""
+        weights = self.density_network.size + self.colour_network.size
+        numbers = self.count_numbers(edges) - weights
+        return (
+            f"{self.levels} levels of {self.coarsest} to {self.finest} cells, {self.features} features each",
+            f"{numbers} numbers in at most {1 << self.log2_table} rows a level, and {weights} weights of networks",
+        )
+
     def place_levels(self, edges: np.ndarray) -> list[Level]:
         """The levels in a box with the edges (x, y, z)."""
         growth = (self.finest / self.coarsest) ** (1 / max(self.levels - 1, 1))

@@ -67,9 +67,9 @@ class Network:
         """The rows ``x`` (N, inputs), the rows of each hidden layer, and the outputs (N, outputs)."""
         rows = [x]
         for layer in layers[:-1]:
-            hidden = _multiply(rows[-1], layer.T)
+            hidden = multiply(rows[-1], layer.T)
             rows.append(np.maximum(hidden, 0, out=hidden))
-        return [*rows, _multiply(rows[-1], layers[-1].T)]
+        return [*rows, multiply(rows[-1], layers[-1].T)]
 
     @staticmethod
     def backward(
@@ -87,8 +87,8 @@ class Network:
             gradient: receives the derivatives by the layers, which are added.
         """
         for k in reversed(range(len(layers))):
-            gradient[k] += _multiply_transposed(dy, rows[k])
-            dy = _multiply(dy, layers[k])
+            gradient[k] += multiply_transposed(dy, rows[k])
+            dy = multiply(dy, layers[k])
             if k:
                 np.multiply(dy, rows[k] > 0, out=dy)
         return dy
@@ -126,7 +126,7 @@ def _rows_alone(rows: np.ndarray, columns: int) -> int:
     return count if count >= FEWEST_ROWS else 0
 
 
-def _multiply(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+def multiply(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """``rows @ matrix``, in pieces of few rows."""
     at_once, (count, inputs), outputs = _rows_alone(rows, matrix.shape[1]), rows.shape, matrix.shape[1]
     if not at_once:
@@ -138,7 +138,7 @@ def _multiply(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return product
 
 
-def _multiply_transposed(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def multiply_transposed(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """``left.T @ right``, in pieces of few rows."""
     at_once = _rows_alone(left, right.shape[1])
     if not at_once:
@@ -146,3 +146,51 @@ def _multiply_transposed(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     whole = len(left) // at_once * at_once
     first, second = (a[:whole].reshape(-1, at_once, a.shape[1]) for a in (left, right))
     return np.matmul(first.transpose(0, 2, 1), second).sum(axis=0) + left[whole:].T @ right[whole:]
+
+
+# -- Points and outputs of the networks of fields ----------------------------------------------------------------------
+
+MAX_EXPONENT = 15.0
+"""Cut of the exponents: exp(15) = 3e6."""
+
+BLOCK = 8192
+"""Points that are multiplied together: their rows of all layers stay in the cache of a core."""
+
+
+def cut_exponent(exponent: mi.Float) -> mi.Float:
+    """An exponent of at most ``MAX_EXPONENT``, with a derivative of 1 everywhere: a density beyond can still fall."""
+    return exponent - dr.detach(dr.maximum(exponent - MAX_EXPONENT, 0))
+
+
+def has_blas() -> bool:
+    """Whether the arrays lie in the memory of the CPU, where NumPy reads them without a copy."""
+    return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+
+
+def rows_of(columns: list[mi.Float]) -> np.ndarray:
+    """Numbers of points as rows (N, columns) of one array in memory, without a copy of Dr.Jit's memory."""
+    count = dr.width(columns)
+    rows = dr.empty(mi.Float, count * len(columns))
+    dr.scatter(rows, mi.ArrayXf(columns) if len(columns) > 1 else columns[0], dr.arange(mi.UInt32, count))
+    dr.eval(rows)
+    dr.sync_thread()
+    return rows.numpy().reshape(count, len(columns))
+
+
+def list_blocks(count: int) -> list[slice]:
+    """Blocks of points that are multiplied together."""
+    return [slice(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK)]
+
+
+def colour_rows(raw: np.ndarray, space: str, white: float) -> np.ndarray:
+    """Colours of the outputs of a network: the logistic function for sRGB, the cut exponential for radiance."""
+    if space == "linear":
+        return white * np.exp(np.minimum(raw, MAX_EXPONENT))
+    return 1 / (1 + np.exp(-np.clip(raw, -80, 80)))
+
+
+def colour_lanes(raw: list[mi.Float], space: str, white: float) -> mi.Color3f:
+    """:func:`colour_rows` in the lanes of a kernel."""
+    if space == "linear":
+        return mi.Color3f(*(white * dr.exp(cut_exponent(v)) for v in raw))
+    return mi.Color3f(*(dr.rcp(1 + dr.exp(-v)) for v in raw))

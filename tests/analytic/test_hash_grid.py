@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields import hash_grid
+from mivol.fields import hash_grid, networks
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
 from mivol.fields.networks import Network
@@ -137,7 +137,7 @@ def test_blocks_in_threads_give_the_same_bits(variant_rgb: str, monkeypatch: pyt
     """Results keep the order of the blocks; a fault in a thread reaches the caller."""
     field, (p, d) = make(), points(100)
     dr.eval(p, d)
-    monkeypatch.setattr(hash_grid, "BLOCK", 16)
+    monkeypatch.setattr(networks, "BLOCK", 16)
 
     def derive(count: int) -> dict[str, np.ndarray]:
         monkeypatch.setattr(hash_grid.dr, "thread_count", lambda: count)

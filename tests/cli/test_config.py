@@ -167,7 +167,10 @@ def test_the_kind_of_a_field_decides_its_settings() -> None:
     assert isinstance(config.from_dict(raw | {"field": {"kind": "grid"}}), config.FieldExperiment)
     chosen = config.from_dict(raw | {"field": {"kind": "hash", "levels": 4}})
     assert isinstance(chosen, config.HashExperiment) and chosen.field.levels == 4
+    chosen = config.from_dict(raw | {"field": {"kind": "nerf", "depth": 4}})
+    assert isinstance(chosen, config.NerfExperiment) and chosen.field.depth == 4
     for field, said in (
+        ({"kind": "nerf", "levels": 4}, 'unknown key "field.levels"'),
         ({"kind": "hsah"}, 'field.kind = "hsah" is unknown: did you mean "hash"'),
         ({"kind": "hash", "degree": 2}, 'unknown key "field.degree"'),
         ({"kind": "hash", "features": 3}, "features is 3: 1, 2, 4 or 8 is expected"),

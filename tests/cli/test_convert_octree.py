@@ -60,7 +60,7 @@ def test_leaves_as_large_as_asked_for(field: Path, capsys: pytest.CaptureFixture
         ("tree.npz", [], "--to octree"),
         ("tree.ply", ["--to", "octree"], "--to octree makes an .npz from"),
         ("tree.npz", ["--to", "octree", "--resolution", "8192"], "depth 13"),
-        ("tree.npz", ["--to", "grid"], "makes a grid from an octree or a hash grid"),
+        ("tree.npz", ["--to", "grid"], "makes a grid from an octree, a hash grid or a NeRF"),
         ("tree.npz", ["--to", "octree", "--box", "0", "0", "0", "1", "1", "1"], "--box"),
     ],
 )

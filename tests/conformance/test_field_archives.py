@@ -16,6 +16,7 @@ from mivol.fields.field_files import read_field, read_grid, write_field
 from mivol.fields.harmonics import harmonic_degree
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
+from mivol.fields.nerf import NerfField, NerfSizes
 from mivol.fields.sampled_field import Region
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import npy
@@ -95,11 +96,57 @@ def test_a_hash_grid_becomes_a_grid(
     assert said.count("dB between views of the grid and of the hash grid") == 2
     assert read_grid(tmp_path / "grid.npz").space == "linear" and (tmp_path / "f-colour.vol").is_file()
     assert main(["convert", str(tmp_path / "grid.npz"), str(tmp_path / "again.npz"), "--to", "grid"]) == 1
-    assert "is a grid: mivol convert --to grid makes a grid from an octree or a hash grid" in capsys.readouterr().err
+    assert "is a grid: mivol convert --to grid makes a grid from an octree, a hash grid or a NeRF" in capsys.readouterr().err
+
+
+def nerf() -> NerfField:
+    """A NeRF in another frame than that of its box, with a region of four cells in five."""
+    sizes = NerfSizes(depth=2, width=6, skip=1, place=2, direction=1, branch=5, relu=1)
+    field = replace(NerfField.random(sizes, CUBE, 1, "linear"), white=2.0, frame=(0.5, 0.0, 0.0, 2.0))
+    occupied = mi.UInt8((np.arange(4 * 5 * 6) % 5 > 0).astype(np.uint8))
+    return replace(field, region=Region((3, 4, 5), CUBE, occupied, 0.25))
+
+
+def test_a_nerf_is_read_as_it_was_saved(
+    variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bit; it becomes a grid, and explain names its kind."""
+    monkeypatch.setattr(octree_conversion, "EDGE", 16)
+    field = nerf()
+    write_field(tmp_path / "f.npz", field)
+    back = read_field(tmp_path / "f.npz")
+    assert isinstance(back, NerfField) and (back.sizes, back.space, back.white) == (field.sizes, "linear", 2.0)
+    assert back.frame == (0.5, 0.0, 0.0, 2.0) and np.array_equal(np.array(back.weights), np.array(field.weights))
+    assert np.array_equal(np.array(back.region.occupied), np.array(field.region.occupied))
+    with pytest.raises(MivolError, match="found a NeRF, expected an .npz"):
+        write_field(tmp_path / "f.ply", field)
+    assert main(["convert", str(tmp_path / "f.npz"), str(tmp_path / "grid.npz"), "--to", "grid", "--resolution", "6"]) == 0
+    assert "dB between views of the grid and of the NeRF" in capsys.readouterr().out
+    assert main(["explain", str(tmp_path / "f.npz")]) == 0
+    assert "NerfField(2 layers x 6" in capsys.readouterr().out
+
+
+HOSTILE_NERFS = {
+    "other layers": ({"weights": np.zeros(9, np.float32)}, "weights has 9 numbers, expected 375 by the sizes of this NeRF"),
+    "weights of nothing": ({"weights": np.full(375, np.nan, np.float32)}, "weights with values that are not finite"),
+    "no unit": ({"frame": np.array([0, 0, 0, 0.0])}, "expected finite numbers and a unit above 0"),
+    "a skip behind the trunk": ({"sizes": np.array([2, 6, 2, 2, 1, 5, 1])}, "skip = 2, expected less than its 2 layers"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_NERFS)
+def test_hostile_nerfs_are_refused(variant_rgb: str, tmp_path: Path, case: str) -> None:
+    change, said = HOSTILE_NERFS[case]
+    write_field(tmp_path / "f.npz", nerf())
+    with np.load(tmp_path / "f.npz") as stored:
+        held = dict(stored)
+    np.savez(tmp_path / "f.npz", **held | change)
+    with pytest.raises(MivolError, match=said):
+        read_field(tmp_path / "f.npz")
 
 
 HOSTILE_HASH_GRIDS = {
-    "another kind": ({"kind": np.array("hsah")}, 'a field of the kind "hsah"; the kind "hash" is expected'),
+    "another kind": ({"kind": np.array("hsah")}, 'a field of the kind "hsah"; the kind "hash" or "nerf" is expected'),
     "weights of nothing": (
         {"colour_weights": np.full(84, np.nan, np.float32)},
         "colour_weights with values that are not finite",

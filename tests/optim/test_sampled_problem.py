@@ -1,4 +1,4 @@
-"""Fit of a hash grid to photographs: gradients, resumed fits, memory, and a small fit."""
+"""Fit of a hash grid or a NeRF to photographs: gradients, resumed fits, memory, and a small fit."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from ball_photos import BOX, error_of
 
 from mivol.errors import MivolError
 from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
+from mivol.fields.nerf import NerfField, NerfSizes
+from mivol.fields.sampled_field import SampledField
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.ray_batches import RayBatches
-from mivol.optim.photographs.sampled_problem import SampledPlan, SampledProblem, check_memory
+from mivol.optim.photographs.sampled_problem import PRESETS, SampledPlan, SampledProblem, check_memory
 from mivol.photos import Photo
 
 SIZES = HashSizes(levels=4, log2_table=10, coarsest=4, finest=24, width=16, degree=1)
+NERF = NerfSizes(depth=3, width=16, skip=1, place=3, direction=1, branch=8)
 PLAN = SampledPlan(SIZES, steps=8, samples=2000, cells=12, warm_up=2, refresh_every=2, refresh_all=3, random_background=False)
 
 
@@ -34,9 +38,11 @@ def begin(photos: list[Photo], plan: SampledPlan = PLAN, store: CheckpointFile |
     return begin_fit(problem, plan.optimizer, plan.course(), checkpoint=store)
 
 
-def test_the_gradient_is_the_slope_of_the_loss(variant_rgb: str, photos: list[Photo]) -> None:
+@pytest.mark.parametrize("model", [HashField, NerfField])
+def test_the_gradient_is_the_slope_of_the_loss(variant_rgb: str, photos: list[Photo], model: type[SampledField]) -> None:
     """Along a random direction of each parameter, with the rays and samples of one step."""
-    plan = replace(PLAN, weight_decay=0.0, refresh_every=1000, stop=0.0)
+    sizes = PLAN.sizes if model is HashField else NERF
+    plan = replace(PLAN, sizes=sizes, model=model, weight_decay=0.0, refresh_every=1000, stop=0.0)
     problem = SampledProblem(RayBatches.from_photos(photos[:4]), BOX, plan, seed=1)
     rng = np.random.default_rng(0)
     reals = {
@@ -54,7 +60,7 @@ def test_the_gradient_is_the_slope_of_the_loss(variant_rgb: str, photos: list[Ph
     for name, value in reals.items():
         along = np.array(gradient[name])
         along /= np.linalg.norm(along)
-        h = 2e-2
+        h = 2e-2 if model is HashField else 2e-3
         ends = [loss_at(reals | {name: mi.TensorXf(np.array(value) + np.float32(s * h * along))})[0] for s in (1, -1)]
         slope = (ends[0] - ends[1]) / (2 * h)
         # Rounding: 2^-23 of the loss over h. Central differences err by h^2 / 6 of a third derivative, and at kinks of ReLU.
@@ -82,6 +88,11 @@ def test_rates_rise_and_fall_as_published() -> None:
     np.testing.assert_allclose(rates, [1e-4, 0.505e-2, 1e-2, 1e-2, 0.33e-2, 0.33**2 * 1e-2, 0.33**3 * 1e-2], rtol=1e-12)
 
 
+def test_rates_of_a_nerf_fall_to_a_tenth() -> None:
+    plan = replace(PRESETS["nerf"]["gpu"], steps=1000, warm_up=0)
+    assert [plan.learning_rate(step) for step in (0, 500, 1000)] == pytest.approx([5e-4, 5e-4 / 10**0.5, 5e-5], rel=1e-12)
+
+
 def test_memory_is_refused_before_the_fit(variant_rgb: str, photos: list[Photo]) -> None:
     batches = RayBatches.from_photos(photos[:2])
     assert "MiB: photographs 0, the fit" in check_memory(PLAN, BOX, batches, 2**40)
@@ -98,3 +109,12 @@ def test_a_fit_predicts_a_view_between_those_it_saw(variant_rgb: str, photos: li
     assert error_of(fit) < 0.0032
     assert np.array(fit.problem.field.region.occupied).mean() < 0.5
     assert fit.problem.samples_a_ray < 24
+
+
+@pytest.mark.slow
+def test_a_nerf_predicts_a_view_between_those_it_saw(variant_rgb: str, photos: list[Photo]) -> None:
+    """20 dB, where the mean colour of the views gives 11 dB."""
+    plan = replace(PRESETS["nerf"]["tiny"], warm_up=50, refresh_every=4, refresh_all=128)
+    fit = taken(begin(photos, plan), plan.steps)
+    assert error_of(fit) < 0.01
+    assert np.array(fit.problem.field.region.occupied).mean() < 0.9

@@ -29,7 +29,6 @@ from mivol.bench.harness.timing import Stopwatch, race, ratio_of
 from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs, prepare_fit
 from mivol.bench.reference_walk import REFERENCE_RATE
 from mivol.experiments import field_fit
-from mivol.experiments.hash_fit import count_numbers
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
 from mivol.fields.networks import Network
@@ -110,7 +109,7 @@ def store(problem: object) -> tuple[int, int]:
         if isinstance(problem, RadianceProblem | SampledProblem):
             field_fit.write_result(Path(folder), problem)
             is_grid = isinstance(problem, RadianceProblem)
-            count = problem.field.rows if is_grid else count_numbers(problem.field)
+            count = problem.field.rows if is_grid else problem.field.numbers
         else:
             cloud = Gaussians(**problem.cloud)
             write_gaussians(Path(folder) / "gaussians.ply", cloud)

@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.fields.hash_grid import HashField
 from mivol.fields.octree import Octree
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, pixel_centres, rays
@@ -49,7 +49,7 @@ SAMPLED_PASS = 1 << 15
 
 
 def render_view(
-    field: SphericalGrid | HashField | Octree, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0
+    field: SphericalGrid | SampledField | Octree, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0
 ) -> FieldView:
     """Render the view of a camera.
 
@@ -59,8 +59,8 @@ def render_view(
         background: background of the field: a colour (3,), or a sky.
         stop: transmittance at which a ray ends.
 
-    Bias: of a grid, O(h^4) in a cell, and the bias of :func:`mivol.transport.line_integrals.radiance_source.bake`; of a hash
-        grid, the bias of :mod:`mivol.transport.line_integrals.sampled_rays`; of an octree, the bias of
+    Bias: of a grid, O(h^4) in a cell, and the bias of :func:`mivol.transport.line_integrals.radiance_source.bake`; of a
+        field known at points, the bias of :mod:`mivol.transport.line_integrals.sampled_rays`; of an octree, the bias of
         :func:`mivol.transport.line_integrals.leaf_radiance.make_leaf_colours`.
     """
     render = prepare_view(field, camera, stop)
@@ -68,7 +68,7 @@ def render_view(
     order = order_by_tiles(width, height)
     pixels = pixel_centres(camera.size).reshape(-1, 2)[order]
     values = np.empty((width * height, 5), np.float32)
-    at_once = SAMPLED_PASS if isinstance(field, HashField) else PASS
+    at_once = SAMPLED_PASS if isinstance(field, SampledField) else PASS
     for start in range(0, len(order), at_once):
         o, d = rays(camera, pixels[start : start + at_once])
         o = np.broadcast_to(o, d.shape)
@@ -86,14 +86,14 @@ def render_view(
 
 
 def prepare_view(
-    field: SphericalGrid | HashField | Octree, camera: Camera, stop: float
+    field: SphericalGrid | SampledField | Octree, camera: Camera, stop: float
 ) -> Callable[[RayBundle], RenderedRays | SampledRays | LeafRays]:
     """Prepare a field for the rays of a camera, which end at the transmittance ``stop``; returns the renderer of rays."""
     if isinstance(field, Octree):
         index, depth = LeafIndex.find(field), MAX_DEPTH if stop == 0 else -math.log(stop)
         leaves = make_leaf_colours(field, LeafPlaces.find(field), camera.origin[None], mi.UInt32(0))
         return lambda bundle: render_leaves(index, leaves, bundle, depth, distances=True)
-    if isinstance(field, HashField):
+    if isinstance(field, SampledField):
         sampled = SampledModel.from_field(field, stop)
         return lambda bundle: render_samples(sampled, bundle)
     cells, model = find_occupied_cells(field), make_model(field, stop)

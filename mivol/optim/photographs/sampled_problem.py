@@ -1,4 +1,4 @@
-r"""Fit of a radiance field that is known only at points to photographs: a hash grid with small networks.
+r"""Fit of a radiance field that is known only at points to photographs: a hash grid or a network.
 
 Conventions. A step has about as many samples as the plan asks for: the number of rays follows from the samples of a ray in the
 last steps. The loss is the mean squared error over rays and rgb, weighted as for grids (:mod:`.photo_colours`). Every few steps
@@ -24,6 +24,8 @@ import numpy as np
 from mivol import machine
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
+from mivol.fields.nerf import NerfField, NerfSizes
+from mivol.fields.sampled_field import FieldSizes, SampledField
 from mivol.optim.events import Event
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course
@@ -35,15 +37,16 @@ from mivol.transport.line_integrals.radiance_field import RayGradient
 from mivol.transport.line_integrals.sampled_rays import SampledModel, render_samples, vjp_samples
 from mivol.transport.traversal.occupancy import Occupancy, list_cells
 
-__all__ = ["PRESETS", "SampledPlan", "SampledProblem", "check_memory"]
+__all__ = ["PRESETS", "SampledPlan", "SampledProblem", "check_memory", "find_region"]
 
 
 @dataclass(frozen=True)
 class SampledPlan:
-    """Plan of a fit of a hash grid.
+    """Plan of a fit of a field that is known at points.
 
     Attributes:
-        sizes: of the hash grid and its networks.
+        sizes: of the field.
+        model: class of the field.
         steps: number of steps.
         samples: samples of a step whose colour is evaluated, on average.
         views: most photographs of a step.
@@ -52,6 +55,8 @@ class SampledPlan:
         rate: initial learning rate of all parameters.
         warm_up: steps in which the rate rises, linearly from a hundredth.
         decay: factor on the rate at 50, 75 and 90 % of the steps.
+        fall: factor on the rate over all steps, exponentially.
+        memory: Adam's memory of the squared gradient.
         weight_decay: L2 decay of the weights of the networks [1].
         stop: transmittance at which a ray ends.
         refresh_every: steps between two refreshes of the occupancy map.
@@ -60,7 +65,8 @@ class SampledPlan:
         random_background: whether photographs with alpha get another background colour in each step.
     """
 
-    sizes: HashSizes = dataclasses.field(default_factory=HashSizes)
+    sizes: FieldSizes = dataclasses.field(default_factory=HashSizes)
+    model: type[SampledField] = HashField
     steps: int = 1000
     samples: int = 1 << 16
     views: int = 64
@@ -69,6 +75,8 @@ class SampledPlan:
     rate: float = 1e-2
     warm_up: int = 100
     decay: float = 0.33
+    fall: float = 1.0
+    memory: float = 0.99
     weight_decay: float = 1e-6
     stop: float = 1e-4
     refresh_every: int = 16
@@ -78,7 +86,7 @@ class SampledPlan:
     @property
     def optimizer(self) -> Adam:
         """The optimizer of the plan."""
-        return Adam(beta_1=0.9, beta_2=0.99, epsilon=1e-15)
+        return Adam(beta_1=0.9, beta_2=self.memory, epsilon=1e-15)
 
     def course(self, *more: Event) -> Course:
         """All steps, with further events."""
@@ -88,10 +96,10 @@ class SampledPlan:
         """Learning rate in a step."""
         passed = sum(step >= share * self.steps for share in (0.5, 0.75, 0.9))
         rise = min(1.0, 0.01 + 0.99 * step / self.warm_up) if self.warm_up else 1.0
-        return self.rate * rise * self.decay**passed
+        return self.rate * rise * self.decay**passed * self.fall ** (step / self.steps)
 
 
-PRESETS: dict[str, SampledPlan] = {
+HASH_GRIDS: dict[str, SampledPlan] = {
     "tiny": SampledPlan(HashSizes(levels=6, log2_table=13, finest=64, width=16), steps=200, samples=1 << 13, cells=24),
     "minute": SampledPlan(HashSizes(log2_table=18, finest=512), cells=96),
     "minutes": SampledPlan(HashSizes(log2_table=18, finest=512), steps=5000, cells=96),
@@ -100,10 +108,26 @@ PRESETS: dict[str, SampledPlan] = {
 """``tiny`` takes seconds, ``minute`` a minute on two cores, ``minutes`` five. ``gpu`` has the sizes of Müller et al. (not
 measured)."""
 
+NERF = SampledPlan(NerfSizes(), NerfField, rate=5e-4, decay=1.0, fall=0.1, memory=0.999, weight_decay=0.0)
+"""Published sizes, rate and decay (Mildenhall et al. 2020): a tenth of the rate at the end."""
+
+SMALL = NerfSizes(depth=4, width=64, skip=2, place=8, branch=32)
+
+NERFS: dict[str, SampledPlan] = {
+    "tiny": replace(NERF, sizes=replace(SMALL, depth=3, width=32, place=5), steps=200, samples=1 << 13, cells=24, rate=5e-3),
+    "minutes": replace(NERF, sizes=SMALL, steps=4000, samples=1 << 14, cells=48, rate=5e-3),
+    "gpu": replace(NERF, steps=50000, samples=1 << 18, cells=128),
+}
+"""``tiny`` takes seconds, ``minutes`` about ten minutes of processor time; their small networks take ten times the published
+rate. ``gpu`` has the sizes and the rate of Mildenhall et al. (not measured)."""
+
+PRESETS: dict[str, dict[str, SampledPlan]] = {HashField.kind: HASH_GRIDS, NerfField.kind: NERFS}
+"""Presets by the kind of the field."""
+
 
 @dataclasses.dataclass
 class SampledProblem(DifferentiableProblem):
-    """A hash grid in a box, with photographs.
+    """A field that is known at points in a box, with photographs.
 
     Attributes:
         batches: the photographs, at full size (shrink 1).
@@ -121,14 +145,14 @@ class SampledProblem(DifferentiableProblem):
     plan: SampledPlan
     seed: int = 0
     safe_point: Callable[[], None] = lambda: None
-    field: HashField = dataclasses.field(init=False)
+    field: SampledField = dataclasses.field(init=False)
     occupancy: Occupancy = dataclasses.field(init=False)
     sky: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         to_world = np.diag([*(self.box[1] - self.box[0]), 1.0])
         to_world[:3, 3] = self.box[0]
-        self.field = HashField.random(self.plan.sizes, to_world, self.seed, self.batches.space)
+        self.field = self.plan.model.random(self.plan.sizes, to_world, self.seed, self.batches.space)
         self.scale = SCALES[self.batches.space]
         res, place = place_grid(self.box, self.plan.cells)
         self.step = float(place[0, 0] / res[2]) / self.plan.samples_a_cell
@@ -179,7 +203,7 @@ class SampledProblem(DifferentiableProblem):
         gradient = {}
         for name, value in reals.items():
             slope = slopes.get(name, dr.zeros(mi.Float, dr.width(value.array)))
-            if name != "table":
+            if name not in self.field.features:
                 slope = dr.fma(decay, value.array, slope)
             gradient[name] = mi.TensorXf(slope, value.shape)
         return dr.mean(errors.loss), gradient
@@ -221,16 +245,36 @@ class SampledProblem(DifferentiableProblem):
         self._list_cells()
 
 
+def find_region(
+    field: SampledField, cells: int = 128, samples_a_cell: float = 2.0, rounds: int = 8, seed: int = 0
+) -> SampledField:
+    """A field with its occupied cells, as rays and files need them: of a network that was not fitted here.
+
+    Args:
+        field: hash grid or NeRF in an upright box.
+        cells: along the longest edge of the box.
+        samples_a_cell: samples of a ray along the edge of a cell.
+        rounds: points at which each cell is evaluated.
+        seed: of the points.
+
+    Bias: as of :mod:`mivol.transport.traversal.occupancy`; matter that all points of a cell miss is lost.
+    """
+    low = field.to_world[:3, 3]
+    res, place = place_grid(np.array([low, low + field.edges]), cells)
+    occupancy = Occupancy.full(res, place)
+    for u in np.random.default_rng(seed).random(rounds):
+        occupancy = occupancy.refreshed(field.density, float(u))
+    return replace(field, region=occupancy.region(float(place[0, 0] / res[2]) / samples_a_cell))
+
+
 SAMPLE = 4 * 160
 """Bytes of a sample: places, values, derivatives, features and harmonics, with their copies by rows."""
 
 
 def estimate_bytes(plan: SampledPlan, box: np.ndarray) -> int:
     """Dr.Jit's memory in a step [bytes]: parameters with two moments, derivatives and one copy per thread; map; samples."""
-    sizes = plan.sizes
-    rows = sum(level.rows for level in sizes.place_levels(box[1] - box[0]))
     threads = dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0
-    table = allocated_bytes(4 * rows * sizes.features)
+    table = allocated_bytes(4 * plan.sizes.count_numbers(box[1] - box[0]))
     cells = math.prod(n + 1 for n in place_grid(box, plan.cells)[0])
     return (8 + threads) * table + 40 * cells + SAMPLE * 4 * plan.samples
 
@@ -246,6 +290,7 @@ def check_memory(plan: SampledPlan, box: np.ndarray, batches: RayBatches, limit:
         MivolError: the fit needs more memory.
     """
     own = estimate_bytes(plan, box)
+    advice = "give field.log2_table or field.samples less" if plan.model is HashField else "give field.samples less"
     if limit is not None or dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
-        machine.check_memory(batches.bytes + own, "a fit of a hash grid", "give field.log2_table or field.samples less", limit)
+        machine.check_memory(batches.bytes + own, f"a fit of a {plan.model.noun}", advice, limit)
     return f"about {(batches.bytes + own) / 2**20:.0f} MiB: photographs {batches.bytes / 2**20:.0f}, the fit {own / 2**20:.0f}"
