@@ -235,6 +235,20 @@ CITATIONS: dict[str, Citation] = {
         "Journal of the Optical Society of America A 1(6), 612-619",
         "https://doi.org/10.1364/josaa.1.000612",
     ),
+    "vo_2018": Citation(
+        "N. T. Vo, R. C. Atwood, M. Drakopoulos",
+        2018,
+        "Superior techniques for eliminating ring artifacts in X-ray micro-tomography",
+        "Optics Express 26(22), 28396-28412",
+        "https://doi.org/10.1364/OE.26.028396",
+    ),
+    "eilers_2003": Citation(
+        "P. H. C. Eilers",
+        2003,
+        "A perfect smoother",
+        "Analytical Chemistry 75(14), 3631-3636",
+        "https://doi.org/10.1021/ac034173t",
+    ),
     "parker_1982": Citation(
         "D. L. Parker",
         1982,

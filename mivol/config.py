@@ -274,6 +274,26 @@ class Readings(Section):
         | None
     ) = None
     drift: Annotated[int, setting("iteration", "fits of a drift of the light to each pixel; 0: none", ge=0)] = 0
+    rings: Annotated[
+        Literal["none", "gain", "sort"],
+        setting(
+            "1",
+            "steps between columns to remove, which make rings; gain: a constant factor of each pixel; sort: the sorted values "
+            "of each pixel, for factors that change with the brightness; blurs the projections",
+        ),
+    ] = "none"
+    ring_width: (
+        Annotated[
+            int,
+            setting(
+                "pixel",
+                "gain: period along the detector of which half is removed, and more of a shorter one; sort: columns of the "
+                "median, an odd number; absent: 30 and 7",
+                ge=3,
+            ),
+        ]
+        | None
+    ) = None
     saturation: Annotated[float, setting("reading", "smallest saturated reading, not used", gt=0)] = INFINITY
 
 

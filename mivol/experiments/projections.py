@@ -25,6 +25,7 @@ from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_from_matric
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import Quanta, Transmission, count_quanta, find_air, fit_air, normalise_air, to_line_integrals
 from mivol.tomography.projector import Projector
+from mivol.tomography.rings import RING_WIDTHS, remove_rings
 from mivol.tomography.rotation_axis import find_axis
 
 RAY_BYTES = 3 * 8
@@ -43,6 +44,7 @@ class Projections:
         truth: true volume (Z, Y, X), if known.
         quanta: numbers of quanta, if known: simulated, or from readings with flats and darks.
         notes: notes for the report.
+        removed_rings: (views, cols) removed from the middle row, for the report; None without ring removal.
         is_noise_known: whether 1 / weights are the variances; otherwise 1 / weights are only proportional to the variances.
     """
 
@@ -53,6 +55,7 @@ class Projections:
     quanta: Quanta | None = None
     notes: tuple[str, ...] = ()
     is_noise_known: bool = False
+    removed_rings: np.ndarray | None = None
 
     def digest(self) -> str:
         """SHA-256 of projections and weights."""
@@ -220,7 +223,10 @@ def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
         notes += note_order(angles)
     transmission, light, air_notes = correct_air(readings.transmission, data.air)
     notes += air_notes
-    y, weights = to_line_integrals(transmission)
+    measured, weights = to_line_integrals(transmission)
+    y, ring_notes = correct_rings(measured, weights, data)
+    notes += ring_notes
+    removed = None if y is measured else (measured - y)[:, y.shape[1] // 2]
     offset = None
     if isinstance(settings.scan, Parallel | Cone):
         offset, axis_notes = resolve_axis(settings, base, y, weights, angles)
@@ -239,7 +245,31 @@ def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
         if ALL_SOLVERS[settings.solve.solver].problem is PoissonCounts
         else None
     )
-    return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=is_noise_known)
+    return Projections(
+        geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=is_noise_known, removed_rings=removed
+    )
+
+
+def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> tuple[np.ndarray, list[str]]:
+    """Remove rings if the settings ask for it, and say so.
+
+    Args:
+        y, weights: line integrals and weights (views, rows, cols).
+        data: ``rings`` and ``ring_width`` count.
+
+    Returns:
+        The line integrals, the same array without ring removal; notes.
+
+    Raises:
+        MivolError: as :func:`mivol.tomography.rings.remove_rings`.
+    """
+    if data.rings == "none":
+        return y, []
+    width = RING_WIDTHS[data.rings] if data.ring_width is None else data.ring_width
+    found = remove_rings(y, weights, data.rings, width)
+    size = float(np.sqrt(np.mean((y - found) ** 2)))
+    said = f'ring removal (data.rings = "{data.rings}", {width} columns) changed the line integrals by {size:.2g} (RMS)'
+    return found, [said]
 
 
 def correct_air(transmission: Transmission, columns: int | None) -> tuple[Transmission, np.ndarray | None, list[str]]:
@@ -304,12 +334,12 @@ def count_measured_quanta(settings: config.ScanExperiment, readings: ScanReading
     """Return the numbers of quanta of a measured scan; ``light`` is that of the air over the flats'.
 
     Raises:
-        MivolError: data without flats and darks, or with a drift, which only line integrals have.
+        MivolError: data without flats and darks, or with a drift or ring removal, which only line integrals have.
     """
-    if readings.intensity is None or settings.data.drift:
+    if readings.intensity is None or settings.data.drift or settings.data.rings != "none":
         raise MivolError(
-            "ml-tr needs counts of quanta, found line integrals, transmissions or a drift: give readings with flats and darks, "
-            "and no data.drift, or choose pcg."
+            "ml-tr needs counts of quanta, found line integrals, transmissions, a drift or ring removal: give readings with "
+            "flats and darks, and neither data.drift nor data.rings, or choose pcg."
         )
     quanta = count_quanta(*readings.intensity, settings.data.saturation)
     return quanta if light is None else replace(quanta, blank=quanta.blank * light)

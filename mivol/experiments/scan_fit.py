@@ -47,6 +47,7 @@ from mivol.optim.projections.inversion import LinearSolve, ProjectionProblem, fi
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.cameras import draw_scanner
+from mivol.report.figures import plot_ring_removal, save_figure
 from mivol.report.pixel_scale import is_preview_due, write_preview
 from mivol.report.record import LINES, SINOGRAM, Image, PlanLine, Volume
 from mivol.scene.explain import Explanation
@@ -55,6 +56,9 @@ from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, v
 from mivol.tomography.preprocess import interpolate_gaps
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
+
+RING_CITATIONS = {"gain": ("vo_2018", "eilers_2003"), "sort": ("vo_2018",)}
+"""Citations by ``data.rings``."""
 
 
 class ScanFit(FitKind):
@@ -75,6 +79,7 @@ class ScanFit(FitKind):
         settings = self.settings
         name = settings.solve.solver
         prior = ["rudin_1992", "huber_1964"] if tv_strength(settings.solve) else []
+        rings = RING_CITATIONS.get(getattr(settings.data, "rings", "none"), ())
         return {
             "method": f"{name} on line integrals of a {describe_beam(settings)}",
             "seeds": {"noise": getattr(settings.data, "seed", 0)},
@@ -82,7 +87,7 @@ class ScanFit(FitKind):
             "plan": [
                 PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias")
             ],
-            "citations": ["mitsuba3", "drjit", *ALL_SOLVERS[name].cites, *prior],
+            "citations": ["mitsuba3", "drjit", *ALL_SOLVERS[name].cites, *prior, *rings],
         }
 
     def load(self, say: Say) -> None:
@@ -302,6 +307,10 @@ def write_outputs(
             pair = Pair(*(part[view, ::-1] for part in (data.y, predicted, noise)))
             record.images += write_pair(run.path, f"view {view}", pair, held_out=True)
     record.images += draw_scanner(run.path, data.geometry, grid, held_out)
+    if data.removed_rings is not None:
+        before, after = data.y[:, middle] + data.removed_rings, data.y[:, middle]
+        save_figure(plot_ring_removal(before, after), run.path / "rings.png")
+        record.images.append(Image(path="rings.png", role="picture", caption=f"ring removal in {caption}, each line one view"))
     run.write_curves()
     record.results["views"] = float(projector.n_views - len(held_out))
     if data.truth is not None:

@@ -255,6 +255,24 @@ def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None
     return figure
 
 
+def plot_ring_removal(before: NDArray, after: NDArray) -> Figure:
+    """Plot a sinogram before and after ring removal, and what was removed.
+
+    Args:
+        before, after: line integrals (views, columns).
+    """
+    removed = np.asarray(before, float) - np.asarray(after, float)
+    values = pixel_scale.shared_scale(before, after, kind="grey")
+    panels = (("before", before, values), ("after", after, values), ("removed", removed, pixel_scale.signed_scale(removed)))
+    with mpl.rc_context(STYLE):
+        figure = empty_figure(8.4, 3.6)
+        for axes, (name, image, scale) in zip(figure.subplots(1, 3), panels, strict=True):
+            _show_pixels(axes, pixel_scale.to_pixels(image, scale), 1.0)
+            axes.set(title=name, xlabel="column →", ylabel="← view")
+            _draw_colour_bar(figure, [axes], scale, "line integral", below=True)
+    return figure
+
+
 def _show_pixels(axes: Axes, rgb: NDArray[np.uint8], aspect: float) -> None:
     axes.imshow(rgb, aspect=rgb.shape[1] / rgb.shape[0] / aspect)
     axes.set(xticks=[], yticks=[])

@@ -85,7 +85,7 @@ def test_some_ray_must_meet_the_grid(views: int, asked: list[int], seen: float) 
 
 def scan(**data: object) -> SimpleNamespace:
     """The settings of a measured scan in parallel light of 2 x 3 pixels of 1 x 0.5."""
-    data = {"air": 0, "find_axis": False, "drift": 0, "saturation": 99.0} | data
+    data = {"air": 0, "find_axis": False, "drift": 0, "saturation": 99.0, "rings": "none", "ring_width": None} | data
     beam = Parallel(views=2, detector=(2, 3), pitch=(1.0, 0.5), axis_offset=0.25)
     return SimpleNamespace(data=SimpleNamespace(**data), scan=beam, solve=config.SolveSettings("pcg"))
 
@@ -142,6 +142,28 @@ def test_air_is_looked_for_unless_the_settings_say(monkeypatch: pytest.MonkeyPat
     assert "has 0.5 to 0.6 of" in projections.correct_air(light, None)[2][0]
 
 
+def test_rings_stay_unless_the_settings_say(measured: ScanReadings) -> None:
+    """Off, the line integrals are the same array and nothing is said; on, what is removed from the middle row is kept."""
+    before = projections.read_measured(scan(), Path())
+    assert before.removed_rings is None
+    y, notes = projections.correct_rings(before.y, before.weights, scan().data)
+    assert y is before.y and notes == []
+    measured.transmission.value[:, 1, 1] *= 1.5
+    before = projections.read_measured(scan(), Path()).y
+    found = projections.read_measured(scan(rings="sort", ring_width=3), Path())
+    # Columns of log 2, log 2 - log 1.5, log 2: the median is log 2.
+    np.testing.assert_allclose(found.y[found.weights > 0], np.log(2), rtol=1e-14)
+    np.testing.assert_array_equal(found.removed_rings, (before - found.y)[:, 1])
+    size = np.sqrt(np.mean((before - found.y) ** 2))
+    assert found.notes[1] == f'ring removal (data.rings = "sort", 3 columns) changed the line integrals by {size:.2g} (RMS)'
+    found = projections.read_measured(scan(rings="gain", ring_width=3), Path())
+    assert 'data.rings = "gain", 3 columns' in found.notes[1] and found.removed_rings[0, 1] < 0
+    with pytest.raises(MivolError, match=r"ring width of 30, expected a number from 3 to the 3 columns: set data.ring_width"):
+        projections.read_measured(scan(rings="gain"), Path())
+    with pytest.raises(MivolError, match=r"ring width of 7, expected an odd number from 3 to the 3 columns"):
+        projections.read_measured(scan(rings="sort"), Path())
+
+
 def test_an_axis_that_is_found_takes_the_place_of_the_settings(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
     """Column 1.75 of three lies 0.75 of a column beyond the middle, and columns are 0.5 wide."""
     monkeypatch.setattr(projections, "find_axis", lambda y, w, angles: Axis(1.75, 0.125, "some way"))
@@ -191,13 +213,14 @@ def test_as_many_views_as_the_geometry_has(measured: ScanReadings, monkeypatch: 
 
 
 def test_quanta_are_those_of_the_readings(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where air is named the light is as bright as it is there; a drift, or no readings, leave none."""
+    """Where air is named the light is as bright as it is there; a drift, ring removal, or no readings, leave none."""
     blank = np.full((2, 2, 3), 8.0)
     made = Quanta(np.ones((2, 2, 3)), blank, 0.5, np.ones((2, 2, 3), bool))
     monkeypatch.setattr(projections, "count_quanta", lambda *asked: made if asked == ("r", "f", "d", 99.0) else None)
     assert projections.count_measured_quanta(scan(), measured) is made
     assert (projections.count_measured_quanta(scan(), measured, np.full((2, 1, 1), 0.5)).blank == 4).all()
-    for chosen, found in ((scan(drift=1), measured), (scan(), ScanReadings(measured.transmission))):
+    bare = ScanReadings(measured.transmission)
+    for chosen, found in ((scan(drift=1), measured), (scan(rings="gain"), measured), (scan(), bare)):
         with pytest.raises(MivolError, match="ml-tr needs counts of quanta"):
             projections.count_measured_quanta(chosen, found)
     problems = {"pcg": SimpleNamespace(problem=LeastSquares), "ml-tr": SimpleNamespace(problem=PoissonCounts)}

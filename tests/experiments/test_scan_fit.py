@@ -17,7 +17,7 @@ from tiny_experiment import assert_explained
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import kinds, projections, readings
+from mivol.experiments import kinds, projections, readings, scan_fit
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_fit import make_problem, write_outputs
 from mivol.experiments.solver_choice import Storage, choose_storage
@@ -450,7 +450,7 @@ REFUSED = {
     "counts that are not there": (["solve.name=ml-tr"], "needs counts of quanta"),
     "counts of line integrals": (
         ["solve.name=ml-tr", 'data={source="stack", file="y.npy", reading="line_integral"}'],
-        "found line integrals, transmissions or a drift",
+        "found line integrals, transmissions, a drift or ring removal",
     ),
     "saturation of line integrals": (
         ['data={source="stack", file="y.npy", reading="line_integral", saturation=3}'],
@@ -554,7 +554,12 @@ GRID = VoxelGrid((2, 3, 4), (0.5, 0.25, 0.75))
 
 
 def written(
-    folder: Path, y: np.ndarray, held_out: np.ndarray, truth: np.ndarray | None, is_noise_known: bool = False
+    folder: Path,
+    y: np.ndarray,
+    held_out: np.ndarray,
+    truth: np.ndarray | None,
+    is_noise_known: bool = False,
+    removed_rings: np.ndarray | None = None,
 ) -> SimpleNamespace:
     """The record of a run whose volume is 0, 1, 2, ... and projects to half of what was measured."""
     record = SimpleNamespace(volumes=[], images=[], results={})
@@ -570,7 +575,8 @@ def written(
     weights = np.full(y.shape, 4.0)
     weights[..., 0] = 0 if is_noise_known else 4.0
     beam = ParallelBeam(np.arange(len(y)) / len(y), y.shape[1:])
-    data = SimpleNamespace(y=y, weights=weights, truth=truth, is_noise_known=is_noise_known, geometry=beam)
+    facts = {"is_noise_known": is_noise_known, "removed_rings": removed_rings}
+    data = SimpleNamespace(y=y, weights=weights, truth=truth, geometry=beam, **facts)
     write_outputs(run, Half(), GRID, data, held_out, np.arange(24.0, dtype=np.float32).reshape(GRID.shape))
     return record
 
@@ -604,6 +610,21 @@ def test_outputs_of_a_scan(tmp_path: Path) -> None:
         (role, tuple(float(edge) for edge in GRID.extent)) for role in ("reconstruction", "truth")
     ]
     assert read_volume(tmp_path / "volumes/reconstruction.vol").values.ravel().tolist() == list(range(24))
+
+
+def test_removed_rings_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The middle row with what was removed from it, and without."""
+    drawn = []
+    plot = scan_fit.plot_ring_removal
+    monkeypatch.setattr(scan_fit, "plot_ring_removal", lambda *images: drawn.append(images) or plot(*images))
+    y, removed = np.random.default_rng(1).normal(size=(2, 6, 4, 5))[0], np.full((6, 5), 0.25)
+    record = written(tmp_path, y, np.arange(0), None, removed_rings=removed)
+    ((before, after),) = drawn
+    np.testing.assert_array_equal(before, y[:, 2] + 0.25)
+    np.testing.assert_array_equal(after, y[:, 2])
+    (picture,) = (image for image in record.images if image.path == "rings.png")
+    assert (picture.role, picture.caption) == ("picture", "ring removal in row 3 of 4, each line one view")
+    assert (tmp_path / "rings.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_a_single_row_is_the_sinogram(tmp_path: Path) -> None:
