@@ -458,7 +458,7 @@ def _check_contents(path: Path) -> None:
     if is_unread(path):
         raise refuse_unread(path)
     if _is_array(path):
-        raise MivolError(f"{path}: found a volume, expected a scene, a fit or points; mivol render, explain and convert take it.")
+        raise MivolError(f"{path}: found a volume, expected a scene, a fit or points; render, explain and convert take it.")
 
 
 def _is_array(path: Path) -> bool:

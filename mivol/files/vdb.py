@@ -1,4 +1,4 @@
-"""OpenVDB (``.vdb``): named sparse grids, read into a dense box of voxels and written as fog volumes.
+"""OpenVDB (``.vdb``): named sparse grids, read into a dense box of voxels or into bricks.
 
 Own reader: ``tinyvdb`` 0.9 returns 21,005 of the 1,049,275 voxels of OpenVDB's sample smoke without an error, and OpenVDB
 itself is not on PyPI.
@@ -17,8 +17,6 @@ from __future__ import annotations
 import math
 import re
 import struct
-import uuid
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -325,7 +323,7 @@ def _read_transform(stream: _Stream) -> np.ndarray:
 
 
 @dataclass
-class _Node:
+class Node:
     """A constant region (tile) or a leaf.
 
     Attributes:
@@ -423,7 +421,7 @@ class _TreeReader:
         places = places[order][:, ::-1].astype(np.int32)
         return (values, places, low, high, active) if held.all() else (values[held], places[held], low, high, active)
 
-    def _read_topology(self, name: str) -> tuple[list[_Node], Coord, Coord, int]:
+    def _read_topology(self, name: str) -> tuple[list[Node], Coord, Coord, int]:
         """Read the nodes, and the first and the last index and the number of the active voxels."""
         stream = self.stream
         if (buffers := stream.unpack("I")[0]) != 1:
@@ -433,12 +431,12 @@ class _TreeReader:
         nodes = [self._read_root_tile() for _ in range(stream.check_count(tiles))]
         for _ in range(stream.check_count(children)):
             nodes += self._read_inner(stream.unpack("3i"), 0)
-        low, high, active = _active_box(nodes)
+        low, high, active = find_active_box(nodes)
         if not active:
             raise refusal(stream.path, f"no active voxel in the grid {name!r}", "at least one", "choose another grid")
         return nodes, low, high, active
 
-    def _read_leaves(self, leaves: list[_Node]) -> np.ndarray:
+    def _read_leaves(self, leaves: list[Node]) -> np.ndarray:
         """Read leaves (n, 512, C), x slowest; the values of those stored in the usual way are joined before they are placed."""
         stream, (dtype, components) = self.stream, TYPES[self.kind]
         values = np.empty((len(leaves), LEAF**3, components), dtype)
@@ -463,12 +461,12 @@ class _TreeReader:
         dtype, components = TYPES[self.kind]
         return np.frombuffer(self.stream.take(np.dtype(dtype).itemsize * components), dtype)
 
-    def _read_root_tile(self) -> _Node:
+    def _read_root_tile(self) -> Node:
         origin = self.stream.unpack("3i")
         value = self._read_value()
-        return _Node(origin, 1 << sum(LEVELS), value, self.stream.unpack("?")[0])
+        return Node(origin, 1 << sum(LEVELS), value, self.stream.unpack("?")[0])
 
-    def _read_inner(self, origin: Coord, level: int) -> Iterator[_Node]:
+    def _read_inner(self, origin: Coord, level: int) -> Iterator[Node]:
         """Read the topology below an inner node: its active and its non-background tiles, and its leaves."""
         log2, below = LEVELS[level], sum(LEVELS[level + 1 :])
         count = 1 << 3 * log2
@@ -478,16 +476,16 @@ class _TreeReader:
         for index in np.flatnonzero(has_child | matters):
             place = _child_origin(origin, int(index), log2, below)
             if not has_child[index]:
-                yield _Node(place, 1 << below, values[index], bool(is_on[index]))
+                yield Node(place, 1 << below, values[index], bool(is_on[index]))
             elif level + 1 < len(LEVELS) - 1:
                 yield from self._read_inner(place, level + 1)
             else:
-                yield _Node(place, LEAF, None, self.stream.take(LEAF**3 // 8))
+                yield Node(place, LEAF, None, self.stream.take(LEAF**3 // 8))
 
     def _read_mask(self, count: int) -> np.ndarray:
         return np.unpackbits(np.frombuffer(self.stream.take(count // 8), np.uint8), bitorder="little").astype(bool)
 
-    def _read_leaf(self, node: _Node) -> np.ndarray:
+    def _read_leaf(self, node: Node) -> np.ndarray:
         mask = self._read_mask(LEAF**3)
         if self.kind == "bool":
             # The origin of the leaf, then a bit for each value.
@@ -569,7 +567,7 @@ def _child_origin(origin: Coord, index: int, log2: int, below: int) -> Coord:
     return tuple(start + (step << below) for start, step in zip(origin, steps, strict=True))
 
 
-def _active_box(nodes: list[_Node]) -> tuple[Coord, Coord, int]:
+def find_active_box(nodes: list[Node]) -> tuple[Coord, Coord, int]:
     """First and last index of the active voxels, and their number."""
     tiles = [node for node in nodes if node.values is not None and node.mask]
     leaves = [node for node in nodes if node.values is None]
@@ -590,13 +588,13 @@ def _active_box(nodes: list[_Node]) -> tuple[Coord, Coord, int]:
     return tuple(map(int, low)), tuple(map(int, high)), active
 
 
-def _unpack_masks(leaves: list[_Node]) -> np.ndarray:
+def _unpack_masks(leaves: list[Node]) -> np.ndarray:
     """The active voxels of leaves, bool (n, 8, 8, 8)."""
     bits = np.frombuffer(b"".join(node.mask for node in leaves), np.uint8)
     return np.unpackbits(bits, bitorder="little").astype(bool).reshape(-1, LEAF, LEAF, LEAF)
 
 
-def _cut_tile(node: _Node, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+def _cut_tile(node: Node, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """The places (n, 3) of the bricks of a tile between two bricks (x, y, z)."""
     begin = np.maximum(np.array(node.origin) // LEAF, first)
     end = np.minimum((np.array(node.origin) + node.edge) // LEAF, last + 1)
@@ -605,7 +603,7 @@ def _cut_tile(node: _Node, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     )
 
 
-def _paste(values: np.ndarray, low: Coord, node: _Node, content: np.ndarray) -> None:
+def _paste(values: np.ndarray, low: Coord, node: Node, content: np.ndarray) -> None:
     """Copy the part of a node inside the box."""
     target, source = [], []
     for start, first, extent in zip(node.origin, low, values.shape, strict=False):
@@ -615,131 +613,3 @@ def _paste(values: np.ndarray, low: Coord, node: _Node, content: np.ndarray) -> 
         target.append(slice(begin, end))
         source.append(slice(begin - start + first, end - start + first))
     values[tuple(target)] = content[tuple(source)] if content.ndim > 1 else content
-
-
-# -- Writing -------------------------------------------------------------------------------------------------------------
-
-
-def write_vdb(file: BinaryIO, values: np.ndarray | SparseVolumeData, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
-    """Write a fog volume in float32, compressed by zip: the grid ``density`` of numbers, or ``color`` of three channels.
-
-    Voxels of the value 0 are off, and blocks of 8^3 such voxels take no space.
-
-    Args:
-        file: destination.
-        values: float32 (Z, Y, X, 1) or (Z, Y, X, 3), or a sparse volume, whose bricks become leaves.
-        to_world: unit cube to world (4, 4).
-        metadata: ``grid``: another name of the grid. Nothing else can be held.
-
-    Raises:
-        MivolError: another number of channels, other metadata, or nothing but zeros, which no reader can place.
-    """
-    names = {1: ("float", "density"), 3: ("vec3s", "color")}
-    volume = values if isinstance(values, SparseVolumeData) else SparseVolumeData.from_dense(values)
-    channels = volume.channels
-    if channels not in names:
-        way_out = "write one file for each channel, or a .npz"
-        raise refusal("write_volume", f"{channels} channels for a .vdb file", "1 or 3", way_out)
-    if rest := set(metadata) - {"grid"}:
-        found = f"metadata {', '.join(sorted(rest))} for a .vdb file"
-        raise refusal("write_volume", found, "at most the key grid", "write .npz, or remove the metadata")
-    if not volume.values.any():
-        raise refusal("write_volume", "nothing but zeros for a .vdb file", "a voxel with another value", "write .npz")
-    kind, name = names[channels]
-    name = str(metadata.get("grid", name))
-    leaves = _cut_leaves(volume)
-    topology, blocks = _pack_tree(leaves, channels)
-    low, high, count = _active_box([_Node(origin, LEAF, None, _pack_mask(mask)) for origin, (mask, _) in leaves.items()])
-    facts = [
-        ("name", "string", name.encode()),
-        ("class", "string", b"fog volume"),
-        ("file_bbox_min", "vec3i", struct.pack("<3i", *low)),
-        ("file_bbox_max", "vec3i", struct.pack("<3i", *high)),
-        ("file_voxel_count", "int64", struct.pack("<q", count)),
-    ]
-    grid = struct.pack("<I", ZIP | ACTIVE_VALUES) + _pack_metadata(facts) + _pack_transform(volume, to_world)
-    head = MAGIC + struct.pack("<3I?", 224, 10, 0, True) + str(uuid.uuid4()).encode()
-    head += _pack_metadata([("creator", "string", b"mivol")]) + struct.pack("<I", 1)
-    head += _pack_text(name) + _pack_text(f"Tree_{kind}_5_4_3") + _pack_text("")
-    begin = len(head) + 24
-    after_topology = begin + len(grid) + len(topology)
-    file.write(head + struct.pack("<3q", begin, after_topology, after_topology + len(blocks)) + grid + topology + blocks)
-
-
-def _cut_leaves(volume: SparseVolumeData) -> dict[Coord, tuple[np.ndarray, np.ndarray]]:
-    """The leaves with a value other than 0: origin (x, y, z) -> (mask, values), both of 8^3 voxels, x slowest."""
-    leaves = {}
-    for place, block in zip(volume.bricks, volume.values, strict=True):
-        values = np.ascontiguousarray(block.transpose(2, 1, 0, 3), "<f4")
-        mask = (values != 0).any(axis=3)
-        if mask.any():
-            leaves[tuple(LEAF * int(k) for k in place[::-1])] = (mask, values)
-    return leaves
-
-
-def _pack_tree(leaves: dict[Coord, tuple[np.ndarray, np.ndarray]], channels: int) -> tuple[bytes, bytes]:
-    """The topology of a tree with these leaves, and their values in the same order."""
-    topology, blocks = [struct.pack("<I", 1), bytes(4 * channels)], []
-
-    def add_leaf(origin: Coord) -> None:
-        mask, values = leaves[origin]
-        packed = _pack_mask(mask)
-        topology.append(packed)
-        blocks.append(packed + b"\0" + _pack_block(values[mask].tobytes()))
-
-    def add_children(origins: list[Coord], level: int) -> None:
-        """Add the inner nodes of a level that hold these leaves: masks of children and tiles, then each child."""
-        log2, below = LEVELS[level], sum(LEVELS[level + 1 :])
-        children: dict[int, list[Coord]] = {}
-        for origin in origins:
-            x, y, z = (c >> below & (1 << log2) - 1 for c in origin)
-            children.setdefault(x << 2 * log2 | y << log2 | z, []).append(origin)
-        has_child = np.zeros(1 << 3 * log2, bool)
-        has_child[list(children)] = True
-        # No tile is on, so no value of a tile follows.
-        topology.append(
-            np.packbits(has_child, bitorder="little").tobytes() + bytes(has_child.size // 8) + b"\0" + _pack_block(b"")
-        )
-        for index in sorted(children):
-            if level + 1 < len(LEVELS) - 1:
-                add_children(children[index], level + 1)
-            else:
-                add_leaf(children[index][0])
-
-    roots: dict[Coord, list[Coord]] = {}
-    for origin in leaves:
-        roots.setdefault(tuple(c >> sum(LEVELS) << sum(LEVELS) for c in origin), []).append(origin)
-    topology.append(struct.pack("<2I", 0, len(roots)))
-    for root in sorted(roots):
-        topology.append(struct.pack("<3i", *root))
-        add_children(roots[root], 0)
-    return b"".join(topology), b"".join(blocks)
-
-
-def _pack_mask(mask: np.ndarray) -> bytes:
-    return np.packbits(mask.ravel(), bitorder="little").tobytes()
-
-
-def _pack_block(data: bytes) -> bytes:
-    short = zlib.compress(data) if data else data
-    if len(short) < len(data):
-        return struct.pack("<q", len(short)) + short
-    return struct.pack("<q", -len(data)) + data
-
-
-def _pack_text(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
-
-
-def _pack_metadata(facts: list[tuple[str, str, bytes]]) -> bytes:
-    entries = [_pack_text(name) + _pack_text(kind) + struct.pack("<I", len(data)) + data for name, kind, data in facts]
-    return struct.pack("<I", len(entries)) + b"".join(entries)
-
-
-def _pack_transform(volume: SparseVolumeData, to_world: np.ndarray) -> bytes:
-    """The matrix from indices to the world, as OpenVDB multiplies it: rows from the left. Index 0 is the first of a brick."""
-    steps = to_world[:3, :3] / np.asarray(volume.shape[::-1])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = steps, to_world[:3, 3] + steps @ (0.5 - np.array(volume.offset[::-1]))
-    return _pack_text("AffineMap") + struct.pack("<16d", *matrix.T.ravel())
