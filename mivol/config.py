@@ -288,7 +288,7 @@ class Readings(Section):
             setting(
                 "pixel",
                 "gain: period along the detector of which half is removed, and more of a shorter one; sort: columns of the "
-                "median, an odd number; absent: 30 and 7",
+                "median, an odd number; absent: 14 and 7",
                 ge=3,
             ),
         ]

@@ -158,7 +158,7 @@ def test_rings_stay_unless_the_settings_say(measured: ScanReadings) -> None:
     assert found.notes[1] == f'ring removal (data.rings = "sort", 3 columns) changed the line integrals by {size:.2g} (RMS)'
     found = projections.read_measured(scan(rings="gain", ring_width=3), Path())
     assert 'data.rings = "gain", 3 columns' in found.notes[1] and found.removed_rings[0, 1] < 0
-    with pytest.raises(MivolError, match=r"ring width of 30, expected a number from 3 to the 3 columns: set data.ring_width"):
+    with pytest.raises(MivolError, match=r"ring width of 14, expected a number from 3 to the 3 columns: set data.ring_width"):
         projections.read_measured(scan(rings="gain"), Path())
     with pytest.raises(MivolError, match=r"ring width of 7, expected an odd number from 3 to the 3 columns"):
         projections.read_measured(scan(rings="sort"), Path())
