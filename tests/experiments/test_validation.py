@@ -70,12 +70,12 @@ def test_a_wrong_renderer_is_found(variant_rgb, scene: Path, monkeypatch: pytest
     loaded = load_scene(scene)
     real_image, real_slope = validation.render_batches, validation.MeanRadiance.slope
 
-    def halved(scene: mi.Scene, *rest: object) -> object:
-        params = mi.traverse(scene)
+    def halved(*given: object) -> object:
+        params = mi.traverse(loaded.scene)
         params[KEY] = params[KEY] * 0.5
         params.update()
         try:
-            return real_image(scene, *rest)
+            return real_image(*given)
         finally:
             params[KEY] = params[KEY] * 2.0
             params.update()
