@@ -100,7 +100,7 @@ def test_what_is_no_field_has_its_own_cameras(field: Path, tmp_path: Path, capsy
     assert main(["render", str(field), "-o", str(tmp_path / "a.png")]) == 1
     assert "keeps no camera, as the field of a fit to photographs does: give --look-at" in capsys.readouterr().err
     assert main(["render", "scene.xml", "--look-at", *"123456", "-o", str(tmp_path / "a.png")]) == 1
-    assert "is for a radiance field" in capsys.readouterr().err
+    assert "is for a field, points or a volume" in capsys.readouterr().err
     write_exr(tmp_path / "sky.exr", {"": np.zeros((4, 4, 3), np.float32)})
     with pytest.raises(MivolError, match="is no sky"):
         read_sky(tmp_path / "sky.exr")
