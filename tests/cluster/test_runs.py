@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import stat
@@ -91,6 +92,13 @@ def write_scattering_scene(folder: Path) -> Path:
     path = write_experiment(folder) / "scene.xml"
     path.write_text(path.read_text().replace('name="albedo" value="0"', 'name="albedo" value="0.8"'))
     return path
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_leftovers() -> None:
+    """References are rendered in this process too, where shapes that other tests left behind in cycles would take part."""
+    gc.unfreeze()
+    gc.collect()
 
 
 def test_references_do_not_depend_on_workers(client: object, tmp_path: Path, variant_rgb: str) -> None:
