@@ -13,6 +13,7 @@ from mivol.fields.bricks import Bricks
 from mivol.fields.field_files import field_from_props
 from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.hash_density import HashDensity
+from mivol.fields.protocol import Field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.transfer import Transfer
 from mivol.fields.voxels import read_voxels
@@ -220,7 +221,36 @@ class TransferVolume(VoxelVolume):
         self.mivol_transfer.refresh()
 
 
-class GaussianVolume(mi.Volume):
+class ExtinctionVolume(mi.Volume):
+    """A volume that shows the grey field ``mivol_extinction``, and the parameters of the field.
+
+    Args:
+        field: a field of :mod:`mivol.fields.protocol`.
+    """
+
+    def __init__(self, props: mi.Properties, field: Field) -> None:
+        self.mivol_extinction = field
+        props["to_world"] = mi.ScalarTransform4f(field.to_world)
+        super().__init__(props)
+
+    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
+        return mi.Spectrum(self.eval_1(it, active))
+
+    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
+        return self.mivol_extinction.eval(it.p, _towards(it), mi.Bool(active))[0]
+
+    def max(self) -> float:
+        return max(self.mivol_extinction.bound())
+
+    def channel_count(self) -> int:
+        return 1
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        for name, value in self.mivol_extinction.parameters().items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
+
+
+class GaussianVolume(ExtinctionVolume):
     """``<volume type="mivol_gaussians">``: Gaussians for ray tracing: as a medium's ``emission`` they show their colours, as
     its
     ``sigma_t`` they are lit.
@@ -243,25 +273,7 @@ class GaussianVolume(mi.Volume):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        self.mivol_extinction = GaussianField.from_props(props)
-        props["to_world"] = mi.ScalarTransform4f(self.mivol_extinction.to_world)
-        super().__init__(props)
-
-    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
-        return mi.Spectrum(self.eval_1(it, active))
-
-    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
-        return self.mivol_extinction.eval(it.p, _towards(it), mi.Bool(active))[0]
-
-    def max(self) -> float:
-        return max(self.mivol_extinction.bound())
-
-    def channel_count(self) -> int:
-        return 1
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        for name, value in self.mivol_extinction.parameters().items():
-            callback.put(name, value, mi.ParamFlags.Differentiable)
+        super().__init__(props, GaussianField.from_props(props))
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.mivol_extinction.refresh()
@@ -270,7 +282,7 @@ class GaussianVolume(mi.Volume):
         return f"mivol_gaussians[{self.mivol_extinction.count}]"
 
 
-class HashVolume(mi.Volume):
+class HashVolume(ExtinctionVolume):
     """``<volume type="mivol_hash">``: a hash grid with a small network, as a medium's ``sigma_t``.
 
     Parameters:
@@ -286,25 +298,7 @@ class HashVolume(mi.Volume):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        self.mivol_extinction = HashDensity.from_props(props)
-        props["to_world"] = mi.ScalarTransform4f(self.mivol_extinction.to_world)
-        super().__init__(props)
-
-    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
-        return mi.Spectrum(self.eval_1(it, active))
-
-    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
-        return self.mivol_extinction.eval(it.p, _towards(it), mi.Bool(active))[0]
-
-    def max(self) -> float:
-        return max(self.mivol_extinction.bound())
-
-    def channel_count(self) -> int:
-        return 1
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        for name, value in self.mivol_extinction.parameters().items():
-            callback.put(name, value, mi.ParamFlags.Differentiable)
+        super().__init__(props, HashDensity.from_props(props))
 
     def to_string(self) -> str:
         field = self.mivol_extinction
