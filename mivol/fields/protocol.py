@@ -56,3 +56,22 @@ def accumulate_tracked(field: Field, p: mi.Point3f, w: mi.Vector3f, d: list[mi.F
         values = field.eval(p, w, active)
         if dr.grad_enabled(values):
             dr.backward_from(sum((weight * value for weight, value in zip(d, values, strict=True)), mi.Float(0)))
+
+
+class GridValues:
+    """What a dense and a sparse grid of voxels share: a field with its values in ``tensor``, which Dr.Jit differentiates."""
+
+    tensor: mi.TensorXf
+
+    def eval_colour(self, p: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
+        """Values as :meth:`eval`; in a mono variant an rgb grid has one channel, its luminance, as in ``gridvolume``."""
+        values = self.eval(p, None, active)
+        return [mi.luminance(mi.Color3f(*values))] if mi.is_monochromatic and len(values) == 3 else values
+
+    def accumulate(self, p: mi.Point3f, w: mi.Vector3f | None, d: list[mi.Float], active: mi.Bool = True) -> None:
+        """Add ``d`` (d loss / d value of each channel) at world points to the gradient of the stored voxels."""
+        accumulate_tracked(self, p, w, d, active)
+
+    def parameters(self) -> dict[str, mi.TensorXf]:
+        """The stored values, ``data``."""
+        return {"data": self.tensor}

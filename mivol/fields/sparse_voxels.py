@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.bricks import Bricks, Nodes
-from mivol.fields.protocol import EXACT_LINE, accumulate_tracked
+from mivol.fields.protocol import EXACT_LINE, GridValues
 from mivol.files import SparseVolumeData, check_bricks
 from mivol.files.source import refusal
 from mivol.files.sparse_volume import EDGE, count_bricks
@@ -23,7 +23,7 @@ MOST_SLOTS = 1 << 31
 """Largest number of stored values, and of bricks in the box."""
 
 
-class SparseVoxels:
+class SparseVoxels(GridValues):
     """A trilinear grid in the world, of which bricks of 8^3 voxels are stored.
 
     Args:
@@ -85,19 +85,6 @@ class SparseVoxels:
     def _read(self, nodes: Nodes, channel: int, active: mi.Bool) -> list[mi.Float]:
         rows, on = [k * self.channels + channel for k in nodes.index], nodes.select(active)
         return [dr.gather(mi.Float, self.tensor.array, k, lanes) for k, lanes in zip(rows, on, strict=True)]
-
-    def eval_colour(self, p: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
-        """Values as :meth:`eval`; in a mono variant an rgb grid has one channel, its luminance, as in ``gridvolume``."""
-        values = self.eval(p, None, active)
-        return [mi.luminance(mi.Color3f(*values))] if mi.is_monochromatic and len(values) == 3 else values
-
-    def accumulate(self, p: mi.Point3f, w: mi.Vector3f | None, d: list[mi.Float], active: mi.Bool = True) -> None:
-        """Add ``d`` (d loss / d value of each channel) at world points to the gradient of the stored voxels."""
-        accumulate_tracked(self, p, w, d, active)
-
-    def parameters(self) -> dict[str, mi.TensorXf]:
-        """The stored values, ``data``."""
-        return {"data": self.tensor}
 
     def bound(self) -> list[float]:
         """Largest value of each channel, at least 0."""

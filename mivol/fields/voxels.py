@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.protocol import EXACT_LINE, accumulate_tracked
+from mivol.fields.protocol import EXACT_LINE, GridValues
 from mivol.fields.sparse_voxels import SparseVoxels
 from mivol.files import SparseVolumeData, check_volume, is_sparse_file, read_sparse_volume, read_volume
 from mivol.files.source import refusal
@@ -20,7 +20,7 @@ from mivol.kernel_recording import is_recording
 from mivol.space import check_affine
 
 
-class Voxels:
+class Voxels(GridValues):
     """A trilinear grid in the world.
 
     Args:
@@ -91,19 +91,6 @@ class Voxels:
         q = mi.AffineTransform4f(self.to_local) @ p
         inside = mi.Bool(active) & dr.all((q >= 0) & (q <= 1))
         return [dr.select(inside, v, 0) for v in self.texture.eval(q, inside)]
-
-    def eval_colour(self, p: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
-        """Values as :meth:`eval`; in a mono variant an rgb grid has one channel, its luminance, as in ``gridvolume``."""
-        values = self.eval(p, None, active)
-        return [mi.luminance(mi.Color3f(*values))] if mi.is_monochromatic and len(values) == 3 else values
-
-    def accumulate(self, p: mi.Point3f, w: mi.Vector3f | None, d: list[mi.Float], active: mi.Bool = True) -> None:
-        """Add ``d`` (d loss / d value of each channel) at world points to the gradient of the voxels."""
-        accumulate_tracked(self, p, w, d, active)
-
-    def parameters(self) -> dict[str, mi.TensorXf]:
-        """The tensor of the voxels, ``data``."""
-        return {"data": self.tensor}
 
     def bound(self) -> list[float]:
         """Largest value of each channel."""
