@@ -40,6 +40,7 @@ from mivol.validate.reference_file import ReferenceResult, read_checkpoint, read
 from mivol.validate.trust import Doubt
 
 ROOT = Path(__file__).resolve().parents[1]
+CONFORMANCE = ROOT / "tests" / "conformance"
 
 Read = Callable[[Path], object]
 Write = Callable[[Path], object]
@@ -124,6 +125,17 @@ def _checkpoint(path: Path) -> None:
 
 def _volume(path: Path) -> None:
     mivol.write_volume(path, numbered())
+
+
+def _of_openvdb(path: Path) -> None:
+    """A file of OpenVDB with Blosc, tiles, half floats and a level set."""
+    path.write_bytes(gzip.decompress((CONFORMANCE / "openvdb_10.vdb.gz").read_bytes()))
+
+
+def _packed_nvdb(path: Path) -> None:
+    """The last grid of a file of NanoVDB, compressed by zip."""
+    data = gzip.decompress((CONFORMANCE / "nanovdb_32.nvdb.gz").read_bytes())
+    path.write_bytes(data[data.rindex(b"NanoVDB0") :])
 
 
 def _exr(path: Path) -> None:
@@ -249,6 +261,11 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "vtk text": (".vtk", _bytes(vtk(numbered(), binary=False)), mivol.read_volume),
     "pbrt": (".pbrt", _bytes(pbrt(numbered())), mivol.read_volume),
     "vdb": (".vdb", _volume, mivol.read_volume),
+    "vdb sparse": (".vdb", _volume, mivol.files.read_sparse_volume),
+    "vdb blosc": (".vdb", _of_openvdb, lambda path: mivol.files.read_sparse_volume(path, "density")),
+    "vdb level set": (".vdb", _of_openvdb, lambda path: mivol.read_volume(path, "ball")),
+    "nvdb": (".nvdb", _volume, mivol.read_volume),
+    "nvdb packed": (".nvdb", _packed_nvdb, mivol.read_volume),
     "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
     "matlab": (".mat", _matlab, mivol.read_volume),
     "matlab hdf5": (".mat", _matlab_hdf5, mivol.read_volume),

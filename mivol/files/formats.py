@@ -29,6 +29,7 @@ from mivol.files import (
     npy,
     nrrd,
     nvdb,
+    nvdb_writer,
     raw,
     renderer_grids,
     tiff,
@@ -128,6 +129,8 @@ WRITERS: dict[str, Callable[[BinaryIO, np.ndarray, np.ndarray, dict[str, Any]], 
     ".npz": npy.write_npz,
     ".nrrd": nrrd.write_nrrd,
     ".vdb": vdb_writer.write_vdb,
+    ".nvdb": nvdb_writer.write_nvdb,
+    ".mhd": metaimage.write_metaimage,
     ".mha": metaimage.write_metaimage,
     ".nii": nifti.write_nifti,
     ".vti": vti.write_vti,
@@ -159,7 +162,7 @@ def read_volume(
     Args:
         path: file; the suffix selects the format, and the first bytes must agree. The folder, or a file, of a DICOM series;
             a folder of TIFF slices.
-        dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .h5, LES text); number or
+        dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .nvdb, .h5, LES text); number or
             ``SeriesInstanceUID`` of a DICOM series; name of the slices, with "#" for numbers, in a folder of several kinds.
         frame: key of :data:`FRAMES`: "file" places the volume as in the header and refuses a degenerate box, "unit" puts the
             volume on the unit cube.
@@ -243,7 +246,8 @@ def write_volume(
 
     Args:
         path: destination.
-        values: real numbers (Z, Y, X) or (Z, Y, X, C), stored as float32; or a sparse volume, which stays sparse in a ``.vdb``.
+        values: real numbers (Z, Y, X) or (Z, Y, X, C), stored as float32; or a sparse volume, which stays sparse in a
+            ``.vdb`` and a ``.nvdb``.
         to_world: unit cube to world (4, 4), by default the identity, or the place of the sparse volume. A ``.vol``
             holds an axis-aligned box, a ``.mrc`` too, a ``.tif`` voxel sizes alone, a ``.npy`` no box.
         metadata: facts in the types of JSON, for ``.npz`` and ``.nrrd``; "space" names the frame ("RAS", "LPS") there and in
@@ -349,21 +353,33 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
     Raises:
         MivolError: as :func:`read_volume` and :func:`write_volume`.
     """
-    volume = read_volume(source, dataset, **layout)
     suffix = _find_suffix(target, WRITERS)
+    # Between two formats that are sparse themselves, no dense array is made.
+    is_sparse = not layout and suffix in SPARSE_READERS and is_sparse_file(source)
+    volume = read_sparse_volume(source, dataset) if is_sparse else read_volume(source, dataset, **layout)
     place, lost = _keep_place(suffix, volume)
     facts = {"space": volume.meta["space"]} if volume.meta.get("space") else {}
-    if facts and suffix not in (".npz", ".nrrd", ".mha", ".nii"):
+    if facts and suffix not in (".npz", ".nrrd", ".mhd", ".mha", ".nii"):
         lost.insert(0, f"the frame {facts.pop('space')}")
     if suffix in (".nii", ".tif", ".tiff") and volume.meta.get("unit"):
         facts["unit"] = volume.meta["unit"]
-    write_volume(target, volume.values, place, metadata=facts)
+    if suffix in SPARSE_READERS and "grid" in volume.meta:
+        facts["grid"] = str(volume.meta["grid"]).partition("[")[0]
+    if np.dtype(str(volume.meta["dtype"]).replace("text", "float32")).name in WIDE_TYPES:
+        lost.append(f"{volume.meta['dtype']} (numbers are rounded to float32)")
+    if volume.meta.get("class") == "level set":
+        lost.append("the distances of the level set (its fog is written)")
+    write_volume(target, volume if is_sparse else volume.values, place, metadata=facts)
     size = " x ".join(str(n) for n in volume.size)
     line = f"{target}: {size} voxels" + (f"; {suffix} does not hold {' and '.join(lost)}" if lost else "")
     return "\n".join([line, *(f"assumed: {note}" for note in volume.meta.get("notes", ()))])
 
 
-def _keep_place(suffix: str, volume: VolumeData) -> tuple[np.ndarray, list[str]]:
+WIDE_TYPES = ("float64", "int32", "uint32", "int64", "uint64")
+"""Types of numbers on disk that float32 does not hold exactly."""
+
+
+def _keep_place(suffix: str, volume: VolumeData | SparseVolumeData) -> tuple[np.ndarray, list[str]]:
     """The part of a placement that a format holds, and names of the lost parts."""
     place, lost = volume.to_world, []
     if suffix not in (".npy", ".mrc", ".tif", ".tiff") or np.array_equal(place, np.eye(4)):

@@ -1,4 +1,4 @@
-"""NanoVDB (``.nvdb``): the bricks of named sparse grids of float or double, uncompressed or compressed by zip.
+"""NanoVDB (``.nvdb``): the bricks of named sparse grids, uncompressed or compressed by zip or Blosc.
 
 Conventions. A file is a row of segments: a header, the facts of its grids, and the grids. A grid is one block of memory: its
 head, the head of its tree, a root, two levels of inner nodes with 32^3 and 16^3 children, and leaves of 8^3 voxels, x slowest.
@@ -20,6 +20,7 @@ import numpy as np
 from mivol.files.npy import check_memory
 from mivol.files.source import decompress, read_bytes, refusal, select_dataset
 from mivol.files.sparse_volume import EDGE, SparseVolumeData, allocate_bricks
+from mivol.files.vdb import decompress_blosc
 from mivol.files.volume import VolumeData, frame_from_steps
 
 MAGIC = (b"NanoVDB0", b"NanoVDB2")
@@ -36,33 +37,102 @@ CLASSES = {1: "level set", 2: "fog volume"}
 FACTS, GRID_HEAD, TREE_HEAD = 176, 672, 64
 """Sizes of the facts of a grid in a segment, of the head of a grid, and of the head of a tree [bytes]."""
 
+BLOSC_CHUNK = 1 << 30
+"""Largest part of a grid that is compressed at once by Blosc [bytes]."""
+
+INNER = ((16, 8), (32, 128))
+"""Children along an edge, and voxels along the edge of a child, of lower and upper nodes."""
+
+
+def _align(size: int, to: int = 32) -> int:
+    return -(-size // to) * to
+
 
 @dataclass(frozen=True)
-class _Layout:
-    """Where the numbers of a type lie.
+class Layout:
+    """Where the numbers of a type lie. Places and sizes are bytes; a record is as long as a multiple of 32.
 
     Attributes:
         name: name of the type.
-        dtype: NumPy's type.
-        background, root: place of the background in a root, and size of a root before its tiles [bytes].
-        tile: place of the value in a tile of the root.
-        values, leaf: place of the values in a leaf, and size of a leaf.
+        dtype: NumPy's type of a number.
+        channels: numbers of a value.
+        bits: bits of a quantised value in a leaf; 0: values are stored as they are; -1: each leaf says how many.
     """
 
     name: str
     dtype: str
-    background: int
-    root: int
-    tile: int
-    values: int
-    leaf: int
+    channels: int = 1
+    bits: int = 0
+
+    @property
+    def number(self) -> int:
+        """Size of a number, to which values are aligned. Averages and deviations are float, or double beside 8 bytes."""
+        return np.dtype(self.dtype).itemsize
+
+    @property
+    def value(self) -> int:
+        """Size of a value."""
+        return self.number * self.channels
+
+    @property
+    def background(self) -> int:
+        """Place of the background in a root, before smallest and largest value, average and deviation."""
+        return _align(28, self.number)
+
+    @property
+    def root(self) -> int:
+        """Size of a root before its tiles."""
+        return _align(self.background + 3 * self.value + 2 * self.number)
+
+    @property
+    def tile_value(self) -> int:
+        """Place of the value in a tile of the root."""
+        return _align(20, self.number)
+
+    @property
+    def tile(self) -> int:
+        """Size of a tile of the root."""
+        return _align(self.tile_value + self.value)
+
+    @property
+    def entry(self) -> int:
+        """Size of an entry in the table of an inner node: a value, or the way to a child in 8 bytes."""
+        return _align(self.value, 8)
+
+    def table(self, children: int) -> int:
+        """Place of the table in an inner node, behind box, flags, two masks, range, average and deviation."""
+        return _align(32 + children**3 // 4 + 2 * self.value + 2 * self.number)
+
+    def inner(self, children: int) -> int:
+        """Size of an inner node."""
+        return _align(self.table(children) + self.entry * children**3)
+
+    @property
+    def values(self) -> int:
+        """Place of the values in a leaf, behind box, flags, mask and range; a quantised leaf has a minimum and a step at 80."""
+        return 96 if self.bits else _align(80 + 2 * self.value + 2 * self.number)
+
+    def leaf(self, bits: int = 0) -> int:
+        """Size of a leaf."""
+        return self.values + (EDGE**3 * bits // 8 if self.bits else EDGE**3 * self.value)
 
 
-LAYOUTS = {1: _Layout("float", "<f4", 28, 64, 20, 96, 2144), 2: _Layout("double", "<f8", 32, 96, 24, 128, 4224)}
+LAYOUTS = {
+    1: Layout("float", "<f4"),
+    2: Layout("double", "<f8"),
+    4: Layout("int32", "<i4"),
+    5: Layout("int64", "<i8"),
+    6: Layout("vec3f", "<f4", 3),
+    7: Layout("vec3d", "<f8", 3),
+    13: Layout("fp4", "<f4", bits=4),
+    14: Layout("fp8", "<f4", bits=8),
+    15: Layout("fp16", "<f4", bits=16),
+    16: Layout("fpN", "<f4", bits=-1),
+}
 """By the number of the type."""
 
-INNER = ((16, 8, 1088, 33856), (32, 128, 8256, 270400))
-"""Children along an edge, voxels along the edge of a child, place of the table and size, of lower and upper nodes."""
+OTHER_TYPES = {3: "int16", 8: "mask", 9: "half", 10: "uint32", 11: "bool", 12: "RGBA8", 17: "vec4f", 18: "vec4d", 19: "index"}
+"""Types that are not read; points are of the types uint32 and index."""
 
 
 def is_nvdb(head: bytes) -> bool:
@@ -89,20 +159,25 @@ def read_sparse_nvdb(path: Path, dataset: str | None = None) -> SparseVolumeData
         ``band`` of its narrow band [length].
 
     Raises:
-        MivolError: a damaged or truncated file, another version, compression or type of values, a grid without active voxels,
-            or a fog whose value outside of its tree is not 0.
+        MivolError: a damaged or truncated file, another version or type of values, a grid without active voxels, a fog whose
+            value outside of its tree is not 0, or Blosc data without the package ``blosc``.
     """
     data = read_bytes(path)
     grids = _list_grids(data, path)
     name = select_dataset(path, dataset, list(grids))
     codec, at, size = grids[name]
-    if codec == "blosc":
-        way_out = "write it without compression or with zip (nanovdb_convert -z none)"
-        raise refusal(path, f"the grid {name!r} compressed with Blosc", "no compression or zip", way_out)
+    if codec == "none":
+        return _read_grid(_take(data, at, size, path), path, name)
+    check_memory(path, size)
     if codec == "zip":
         (held,) = _unpack("<Q", data, at, path)
         return _read_grid(decompress(_take(data, at + 8, held, path), "zlib", size, path), path, name)
-    return _read_grid(_take(data, at, size, path), path, name)
+    chunks = []
+    for begin in range(0, size, BLOSC_CHUNK):
+        (held,) = _unpack("<Q", data, at, path)
+        chunks.append(decompress_blosc(_take(data, at + 8, held, path), min(BLOSC_CHUNK, size - begin), path))
+        at += 8 + held
+    return _read_grid(b"".join(chunks), path, name)
 
 
 def _take(data: bytes, at: int, count: int, path: Path) -> bytes:
@@ -147,25 +222,25 @@ def _list_grids(data: bytes, path: Path) -> dict[str, tuple[str, int, int]]:
 def _read_grid(data: bytes, path: Path, name: str) -> SparseVolumeData:
     grid_class, kind = _unpack("<2I", data, 632, path)
     if kind not in LAYOUTS:
-        expected = " or ".join(layout.name for layout in LAYOUTS.values())
-        raise refusal(
-            path, f"the grid {name!r} of type {kind} of NanoVDB's", expected, "convert the grid, or choose another one"
-        )
+        expected = ", ".join(layout.name for layout in LAYOUTS.values())
+        found = f"the grid {name!r} of type {OTHER_TYPES.get(kind, kind)} of NanoVDB's"
+        raise refusal(path, found, f"one of {expected}", "convert the grid, or choose another one")
     layout = LAYOUTS[kind]
     matrix = np.reshape(_unpack("<9d", data, 384, path), (3, 3))
     shift = np.array(_unpack("<3d", data, 528, path))
     offsets, counts = _unpack("<4q", data, GRID_HEAD, path), _unpack("<3I", data, GRID_HEAD + 32, path)
     root = GRID_HEAD + offsets[3]
     low, high = np.array(_unpack("<6i", data, root, path), np.int64).reshape(2, 3)
-    (background,) = _unpack(layout.dtype.replace("f4", "f").replace("f8", "d"), data, root + layout.background, path)
+    background = np.frombuffer(_take(data, root + layout.background, layout.value, path), layout.dtype)
     if (high < low).any():
         raise refusal(path, f"no active voxel in the grid {name!r}", "at least one", "choose another grid")
     is_level_set = CLASSES.get(grid_class) == "level set"
-    band = abs(background)
+    band = abs(float(background[0]))
     if is_level_set and not band > 0:
         raise refusal(path, f"the level set {name!r} with a band of {band}", "a band above 0", "write the grid again")
-    if not is_level_set and background != 0:
-        raise refusal(path, f"the value {background:g} outside of the grid {name!r}", "0", "convert the grid to a .vdb")
+    if not is_level_set and background.any():
+        found = f"the value {background.tolist()} outside of the grid {name!r}"
+        raise refusal(path, found, "0", "convert the grid to a .vdb")
 
     def convert(values: np.ndarray) -> np.ndarray:
         return np.clip(-values / band, 0, 1) if is_level_set else values
@@ -173,19 +248,17 @@ def _read_grid(data: bytes, path: Path, name: str) -> SparseVolumeData:
     first, last = low // EDGE, high // EDGE
     nodes = _Nodes(data, path, layout, offsets, counts, root)
     places, values = nodes.read_leaves()
-    tiles = [
-        (value, cut) for value, cut in nodes.cut_tiles(first, last, background) if convert(np.array(value)) != 0 and len(cut)
-    ]
+    tiles = [(value, cut) for value, cut in nodes.cut_tiles(first, last, background) if convert(value).any() and len(cut)]
     everywhere = np.concatenate([places, *(cut for _, cut in tiles)]) - first
-    check_memory(path, 4 * EDGE**3 * len(everywhere))
+    check_memory(path, 4 * EDGE**3 * layout.channels * len(everywhere))
     spans = last - first + 1
     inside = ((everywhere >= 0) & (everywhere < spans)).all(axis=1)
     numbers = np.where(inside, np.ravel_multi_index(np.clip(everywhere, 0, spans - 1)[:, ::-1].T, spans[::-1]), spans.prod())
-    bricks = allocate_bricks(len(everywhere), 1)
-    bricks[: len(places)] = convert(values.reshape(-1, EDGE, EDGE, EDGE, 1)).transpose(0, 3, 2, 1, 4)
+    bricks = allocate_bricks(len(everywhere), layout.channels)
+    bricks[: len(places)] = convert(values.reshape(-1, EDGE, EDGE, EDGE, layout.channels)).transpose(0, 3, 2, 1, 4)
     begin = len(places)
     for value, cut in tiles:
-        bricks[begin : begin + len(cut)], begin = convert(np.array(value)), begin + len(cut)
+        bricks[begin : begin + len(cut)], begin = convert(value), begin + len(cut)
     held = np.flatnonzero(inside & bricks.any(axis=(1, 2, 3, 4)))
     if not len(held):
         raise refusal(path, f"no value other than 0 in the grid {name!r}", "at least one", "choose another grid")
@@ -217,7 +290,7 @@ class _Nodes:
 
     Attributes:
         data, path: memory of the grid, and the file for refusals.
-        layout: of its type.
+        layout: of the type of its values.
         offsets: of the leaves, the lower and the upper nodes and the root, from the head of the tree.
         counts: leaves, lower and upper nodes.
         root: position of the root.
@@ -225,7 +298,7 @@ class _Nodes:
 
     data: bytes
     path: Path
-    layout: _Layout
+    layout: Layout
     offsets: tuple[int, ...]
     counts: tuple[int, ...]
     root: int
@@ -237,42 +310,76 @@ class _Nodes:
         return np.frombuffer(block, np.dtype({"names": names, "formats": formats, "offsets": places, "itemsize": size}))
 
     def read_leaves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Places (n, 3) of the leaves with an active voxel, in bricks (x, y, z), and their values (n, 512)."""
-        fields = {"low": ("<3i4", 0), "mask": ("64u1", 16), "values": ((self.layout.dtype, 512), self.layout.values)}
-        leaves = self._records(0, fields, self.layout.leaf)
-        leaves = leaves[leaves["mask"].any(axis=1)]
-        return leaves["low"].astype(np.int64) // EDGE, leaves["values"]
+        """Places (n, 3) of the leaves with an active voxel, in bricks (x, y, z), and their values (n, 512, C)."""
+        layout, fields = self.layout, {"low": ("<3i4", 0), "mask": ("64u1", 16)}
+        if not layout.bits:
+            fields["values"] = ((layout.dtype, (EDGE**3, layout.channels)), layout.values)
+            leaves = self._records(0, fields, layout.leaf())
+            leaves = leaves[leaves["mask"].any(axis=1)]
+            return leaves["low"].astype(np.int64) // EDGE, leaves["values"]
+        fields |= {"minimum": ("<f4", 80), "step": ("<f4", 84)}
+        if layout.bits > 0:
+            size = layout.leaf(layout.bits)
+            leaves = self._records(0, fields | {"codes": (f"{size - 96}u1", 96)}, size)
+            leaves = leaves[leaves["mask"].any(axis=1)]
+            codes = _unpack_codes(leaves["codes"], layout.bits)
+            values = leaves["minimum"][:, None] + leaves["step"][:, None] * codes.astype(np.float32)
+            return leaves["low"].astype(np.int64) // EDGE, values[..., None]
+        check_memory(self.path, 4 * EDGE**3 * self.counts[0])
+        places, values = [], []
+        at = GRID_HEAD + self.offsets[0]
+        for _ in range(self.counts[0]):
+            head = _take(self.data, at, layout.values, self.path)
+            bits = 1 << (head[15] >> 5)
+            codes = np.frombuffer(_take(self.data, at + layout.values, EDGE**3 * bits // 8, self.path), np.uint8)
+            minimum, step = np.frombuffer(head[80:88], "<f4")
+            if any(head[16:80]):
+                places.append(np.frombuffer(head[:12], "<i4").astype(np.int64) // EDGE)
+                values.append(minimum + step * _unpack_codes(codes[None], bits)[0].astype(np.float32))
+            at += layout.leaf(bits)
+        return np.array(places, np.int64).reshape(-1, 3), np.array(values, np.float32).reshape(-1, EDGE**3, 1)
 
-    def cut_tiles(self, first: np.ndarray, last: np.ndarray, background: float) -> list[tuple[float, np.ndarray]]:
-        """Value and bricks (n, 3) of each tile between two bricks (x, y, z) that differs from the background."""
-        tiles = []
-        for level, (children, edge, table, size) in enumerate(INNER, 1):
+    def cut_tiles(self, first: np.ndarray, last: np.ndarray, background: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Value (C,) and bricks (n, 3) of each tile between two bricks (x, y, z) that differs from the background."""
+        tiles, layout = [], self.layout
+        for level, (children, edge) in enumerate(INNER, 1):
             bits = children**3 // 8
+            entries = {
+                "names": ["value"],
+                "formats": [(layout.dtype, layout.channels)],
+                "offsets": [0],
+                "itemsize": layout.entry,
+            }
             fields = {
                 "low": ("<3i4", 0),
-                "on": (f"{bits}u1", 32),
                 "child": (f"{bits}u1", 32 + bits),
-                "table": (("<u8", children**3), table),
+                "table": ((np.dtype(entries), children**3), layout.table(children)),
             }
-            for node in self._records(level, fields, size):
+            for node in self._records(level, fields, layout.inner(children)):
                 has_child = np.unpackbits(node["child"], bitorder="little").astype(bool)
-                values = np.ascontiguousarray(node["table"]).view(self.layout.dtype)[
-                    :: 8 // np.dtype(self.layout.dtype).itemsize
-                ]
+                values = node["table"]["value"].reshape(-1, layout.channels)
                 origin = node["low"].astype(np.int64) // (children * edge) * (children * edge)
-                for index in np.flatnonzero(~has_child & (values != background)):
+                for index in np.flatnonzero(~has_child & (values != background).any(axis=1)):
                     steps = np.array(np.unravel_index(index, (children,) * 3))
-                    tiles.append((float(values[index]), _cut(origin + steps * edge, edge, first, last)))
+                    tiles.append((values[index], _cut(origin + steps * edge, edge, first, last)))
         (count,) = _unpack("<I", self.data, self.root + 24, self.path)
         for number in range(count):
-            at = self.root + self.layout.root + 32 * number
+            at = self.root + layout.root + layout.tile * number
             key, child, _ = _unpack("<QqI", self.data, at, self.path)
-            (value,) = _unpack("<f" if self.layout.dtype == "<f4" else "<d", self.data, at + self.layout.tile, self.path)
-            if not child and value != background:
+            value = np.frombuffer(_take(self.data, at + layout.tile_value, layout.value, self.path), layout.dtype)
+            if not child and (value != background).any():
                 origin = [(key >> s & (1 << 21) - 1) << 12 for s in (42, 21, 0)]
                 origin = np.array([o - (1 << 32) if o >= 1 << 31 else o for o in origin])
                 tiles.append((value, _cut(origin, 4096, first, last)))
         return tiles
+
+
+def _unpack_codes(codes: np.ndarray, bits: int) -> np.ndarray:
+    """Codes (n, 512) of quantised leaves from their bytes; the first code of a byte has its lowest bits."""
+    if bits >= 8:
+        return codes.view(f"<u{bits // 8}")
+    steps = np.arange(0, 8, bits, dtype=np.uint8)
+    return (codes[..., None] >> steps & (1 << bits) - 1).reshape(len(codes), -1)
 
 
 def _cut(origin: np.ndarray, edge: int, first: np.ndarray, last: np.ndarray) -> np.ndarray:

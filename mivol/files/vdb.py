@@ -50,6 +50,9 @@ TYPES: dict[str, tuple[str, int]] = {
 #: type of a metadata value -> struct codes; strings are decoded, other types skipped.
 METADATA = {"bool": "?", "int32": "i", "int64": "q", "float": "f", "double": "d", "vec3i": "3i", "vec3s": "3f", "vec3d": "3d"}
 
+#: types of grids of points.
+POINTS = r"Tree_pt(dataidx|idx)32.*"
+
 #: bits of a grid's compression.
 ZIP, ACTIVE_VALUES, BLOSC = 1, 2, 4
 
@@ -290,6 +293,9 @@ def _find_grid(stream: _Stream, dataset: str | None) -> tuple[_Grid, str]:
 
 
 def _parse_type(path: Path, name: str, descriptor: _Descriptor) -> str:
+    if re.fullmatch(POINTS, descriptor.type):
+        way_out = "rasterize them to a fog volume first, or choose another grid"
+        raise refusal(path, f"the points {name!r} ({descriptor.type})", "a grid of voxels", way_out)
     match = re.fullmatch(r"Tree_(\w+?)_5_4_3(_HalfFloat)?", descriptor.type)
     if match is None or match[1] not in TYPES:
         expected = f"a tree 5, 4, 3 of {', '.join(TYPES)}"
@@ -431,7 +437,7 @@ class _TreeReader:
         nodes = [self._read_root_tile() for _ in range(stream.check_count(tiles))]
         for _ in range(stream.check_count(children)):
             nodes += self._read_inner(stream.unpack("3i"), 0)
-        low, high, active = find_active_box(nodes)
+        low, high, active = _find_active_box(nodes)
         if not active:
             raise refusal(stream.path, f"no active voxel in the grid {name!r}", "at least one", "choose another grid")
         return nodes, low, high, active
@@ -541,11 +547,16 @@ class _TreeReader:
 
     def _decompress(self, data: bytes, size: int) -> bytes:
         if self.compression & BLOSC:
-            return _decompress_blosc(data, size, self.stream.path)
+            return decompress_blosc(data, size, self.stream.path)
         return decompress(data, "zlib", size, self.stream.path)
 
 
-def _decompress_blosc(data: bytes, size: int, path: Path) -> bytes:
+def decompress_blosc(data: bytes, size: int, path: Path) -> bytes:
+    """Decompress a frame of Blosc.
+
+    Raises:
+        MivolError: no package ``blosc``, or a damaged frame.
+    """
     try:
         import blosc
     except ImportError:
@@ -567,7 +578,7 @@ def _child_origin(origin: Coord, index: int, log2: int, below: int) -> Coord:
     return tuple(start + (step << below) for start, step in zip(origin, steps, strict=True))
 
 
-def find_active_box(nodes: list[Node]) -> tuple[Coord, Coord, int]:
+def _find_active_box(nodes: list[Node]) -> tuple[Coord, Coord, int]:
     """First and last index of the active voxels, and their number."""
     tiles = [node for node in nodes if node.values is not None and node.mask]
     leaves = [node for node in nodes if node.values is None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import sys
 from pathlib import Path
 
@@ -38,6 +39,66 @@ def test_convert_keeps_values_and_place(tmp_path: Path, target: str) -> None:
     volume = read_volume(tmp_path / target)
     np.testing.assert_array_equal(volume.values, values)
     np.testing.assert_allclose(volume.to_world, PLACE, atol=1e-12)
+
+
+SPATIAL = (".vdb", ".nvdb", ".vol", ".nrrd", ".mhd", ".vti")
+"""Formats of volumes with a place that are written."""
+
+
+@pytest.mark.parametrize("source", SPATIAL)
+def test_formats_convert_into_each_other(tmp_path: Path, capsys: pytest.CaptureFixture, source: str) -> None:
+    """Values to the bit. A ``.vol`` holds its corners in float32; NaN and negative numbers pass as well."""
+    values = np.where(np.isnan(VALUES), VALUES, VALUES + 3)
+    write_volume(tmp_path / f"a{source}", values, PLACE)
+    for target in SPATIAL:
+        assert run("convert", tmp_path / f"a{source}", tmp_path / f"b{target}") == 0
+        lost = capsys.readouterr().out.partition("does not hold ")[2].strip()
+        assert lost == ("the frame LPS" if source == ".mhd" != target and target != ".nrrd" else "")
+        volume = read_volume(tmp_path / f"b{target}")
+        np.testing.assert_array_equal(volume.values, values)
+        np.testing.assert_allclose(volume.to_world, PLACE, rtol=0, atol=1e-12)
+    write_volume(tmp_path / f"a{source}", np.repeat(values, 3, axis=3) * np.float32([1, 2, 3]))
+    for target in SPATIAL:
+        assert run("convert", tmp_path / f"a{source}", tmp_path / f"c{target}") == 0
+        np.testing.assert_array_equal(read_volume(tmp_path / f"c{target}").values[..., 2], 3 * values[..., 0])
+
+
+def test_convert_says_what_is_rounded_and_clipped(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Numbers wider than float32, and the distances of a level set (of OpenVDB's own file)."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["one"] = np.ones((2, 3, 4))
+    assert run("convert", tmp_path / "a.h5", tmp_path / "a.vdb") == 0
+    assert ".vdb does not hold float64 (numbers are rounded to float32)" in capsys.readouterr().out
+    packed = Path(__file__).parents[1] / "conformance" / "openvdb_10.vdb.gz"
+    (tmp_path / "b.vdb").write_bytes(gzip.decompress(packed.read_bytes()))
+    assert run("convert", tmp_path / "b.vdb", tmp_path / "b.nvdb", "--dataset", "ball") == 0
+    assert ".nvdb does not hold the distances of the level set (its fog is written)" in capsys.readouterr().out
+    assert read_volume(tmp_path / "b.nvdb", "ball").values.max() == 1
+
+
+@pytest.mark.slow
+def test_vtk_reads_what_we_write(tmp_path: Path) -> None:
+    """ParaView's library: values, and places by its matrix from indices to the world."""
+    pytest.importorskip("vtk")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+
+    rng = np.random.default_rng(0)
+    values, place = rng.normal(size=(4, 5, 6, 3)).astype(np.float32), np.eye(4)
+    place[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0] * [6, 10, 2]
+    place[:3, 3] = 1, 2, 3
+    write_volume(tmp_path / "a.nvdb", values, place)
+    assert run("convert", tmp_path / "a.nvdb", tmp_path / "a.vti") == 0
+    reader = vtkXMLImageDataReader()
+    reader.SetFileName(str(tmp_path / "a.vti"))
+    reader.Update()
+    image = reader.GetOutput()
+    np.testing.assert_array_equal(vtk_to_numpy(image.GetPointData().GetScalars()).reshape(values.shape), values)
+    matrix = image.GetIndexToPhysicalMatrix()
+    found = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+    volume = read_volume(tmp_path / "a.nvdb")
+    np.testing.assert_allclose(found[:3, :3], volume.steps, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found[:3, 3], volume.origin, rtol=0, atol=1e-12)
 
 
 def test_convert_says_what_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

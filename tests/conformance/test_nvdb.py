@@ -1,17 +1,26 @@
-"""NanoVDB files, written here byte by byte as the layout of version 32 says (Museth 2021), since no package writes them."""
+"""NanoVDB files: made here byte by byte as the layout of version 32 says (Museth 2021), made by NanoVDB, and our own.
+
+``nanovdb_32.nvdb.gz`` holds grids that NanoVDB 32.4.2 wrote: of six types by its ``GridBuilder``, of four quantised types and
+with Blosc and zip by ``nanovdb_convert``. All have five voxels, (3 i - 6, i % 2, 2 - i) for i = 0 to 4.
+"""
 
 from __future__ import annotations
 
+import gzip
+import shutil
 import struct
+import subprocess
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conformance.test_bad_files import refused
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import mivol
-from mivol.files import check_bricks, read_sparse_volume, read_volume
+from mivol.files import SparseVolumeData, check_bricks, read_sparse_volume, read_volume, write_volume
 
 MATRIX = np.array([[0.5, 0, 0], [0, 0, 0.25], [0, -2.0, 0]])
 SHIFT = np.array([1.0, 2.0, 3.0])
@@ -148,10 +157,10 @@ def test_a_level_set_becomes_a_fog(tmp_path: Path) -> None:
     ("data", "words"),
     [
         (lambda: file_of({"density": grid()})[:-100], "truncated"),
-        (lambda: file_of({"density": grid()}, codec=2), "compressed with Blosc"),
+        (lambda: file_of({"density": grid()}, codec=2), "announced at byte"),
         (lambda: file_of({"density": grid()}, version=29), "version 29"),
-        (lambda: file_of({"density": grid(background=1.0)}), "the value 1 outside of the grid"),
-        (lambda: file_of({"density": grid()[:636] + struct.pack("<I", 13) + grid()[640:]}), "type 13"),
+        (lambda: file_of({"density": grid(background=1.0)}), "the value [1.0] outside of the grid"),
+        (lambda: file_of({"density": grid()[:636] + struct.pack("<I", 19) + grid()[640:]}), "type index of NanoVDB's"),
         (lambda: file_of({"density": grid()}) + b"NanoVDB2", "truncated"),
     ],
     ids=["cut", "blosc", "version", "background", "type", "segment"],
@@ -170,3 +179,115 @@ def test_a_plugin_reads_it(tmp_path: Path, variant_rgb: None) -> None:
     path.write_bytes(file_of({"density": grid()}))
     volume = mi.load_dict({"type": "mivol_voxels", "filename": str(path), "use_grid_bbox": True, "storage": "sparse"})
     assert volume.mivol_bricks.count == 3 and "3 bricks" in mivol.files.formats.describe_volume(path)
+
+
+# -- Files of NanoVDB ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def nanovdb_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("nvdb") / "nanovdb_32.nvdb"
+    path.write_bytes(gzip.decompress((Path(__file__).parent / "nanovdb_32.nvdb.gz").read_bytes()))
+    return path
+
+
+COUNTED = np.arange(1, 6, dtype=np.float32)[:, None]
+TENTHS = np.float32(0.1) * COUNTED
+WRITTEN = {
+    **dict.fromkeys(("float", "double", "int32", "int64"), COUNTED),
+    **{name: np.column_stack([COUNTED, 0 * COUNTED + 2, 0 * COUNTED + 3]) for name in ("vec3f", "vec3d")},
+    **dict.fromkeys(("fp4", "fp8", "fp16", "fpN", "blosc", "zip"), TENTHS),
+}
+"""Name of the grid: values (5, C). Each of the two leaves is quantised between its own extremes, 0 and the largest tenth."""
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_grid_of_nanovdb(nanovdb_file: Path, name: str) -> None:
+    volume = read_volume(nanovdb_file, name)
+    x, y, z = np.array([(3 * i - 6, i % 2, 2 - i) for i in range(5)]).T
+    found = volume.values[z + 2, y, x + 6]
+    # fpN keeps half a step of its codes of 1 to 16 bits, the others hit these numbers; a product and a sum round twice.
+    tolerance = {"fpN": 1e-2, **dict.fromkeys(("fp4", "fp8", "fp16"), 2**-24 + 2**-17)}.get(name, 0)
+    np.testing.assert_allclose(found, WRITTEN[name], rtol=0, atol=tolerance)
+    assert np.count_nonzero(volume.values.any(axis=3)) == 5
+    np.testing.assert_allclose(volume.origin, np.array([1, 2, 3]) + 0.5 * np.array([-6, 0, -2]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(volume.steps, 0.5 * np.eye(3), rtol=0, atol=1e-12)
+
+
+# -- Our own files -------------------------------------------------------------------------------------------------------
+
+
+def make_patches(seed: int, channels: int, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Values (Z, Y, X, C) of which half are 0, with a NaN and full corners, and a place."""
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(*shape, channels)).astype(np.float32) * (rng.random((*shape, 1)) < 0.5)
+    values[0, 0, 0] = values[-1, -1, -1] = 1
+    values[tuple(rng.integers(shape))] = np.nan
+    to_world = np.eye(4)
+    to_world[:3] += rng.normal(size=(3, 4)) / 4
+    return values, to_world
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, 3]), st.tuples(*[st.integers(1, 20)] * 3))
+@settings(max_examples=15, deadline=None)
+def test_what_is_written_is_read(tmp_path_factory, seed: int, channels: int, shape: tuple[int, int, int]) -> None:
+    values, to_world = make_patches(seed, channels, shape)
+    path = tmp_path_factory.mktemp("nvdb") / "a.nvdb"
+    write_volume(path, values, to_world)
+    volume = read_volume(path)
+    np.testing.assert_array_equal(volume.values, values)
+    np.testing.assert_allclose(volume.to_world, to_world, rtol=0, atol=1e-12)
+
+
+def test_leaves_far_apart(tmp_path: Path) -> None:
+    """Voxels in several lower and upper nodes, whose order in the file is that of their places."""
+    path, values = tmp_path / "far.nvdb", np.zeros((5, 8, 8, 8, 1), np.float32)
+    values[:, 3, 4, 5, 0] = [1, 2, 3, 4, 5]
+    places = np.array([[0, 0, 0], [0, 0, 16], [0, 520, 1], [7, 0, 1100], [1200, 513, 2]], np.int32)
+    far = SparseVolumeData(values, places, (9608, 4168, 8808), np.eye(4))
+    write_volume(path, far, metadata={"grid": "heat"})
+    found = read_sparse_volume(path, "heat")
+    origin = (places - found.bricks)[0]
+    assert np.array_equal(found.bricks, places - origin) and found.values.max() == 5 and np.count_nonzero(found.values) == 5
+    assert np.array_equal(found.values.max(axis=(1, 2, 3, 4)), [1, 2, 3, 4, 5])
+
+
+def test_the_head_of_a_file_is_nanovdbs(nanovdb_file: Path, tmp_path: Path) -> None:
+    """Facts by which other programs find a grid: the hash of its name, its type, and its boxes in the world and in voxels."""
+    values = np.zeros((5, 2, 13, 1), np.float32)
+    for i in range(5):
+        values[4 - i, i % 2, 3 * i] = i + 1
+    place = np.diag([6.5, 1, 2.5, 1])
+    place[:3, 3] = np.array([1, 2, 3]) - 0.25
+    write_volume(tmp_path / "a.nvdb", values, place, metadata={"grid": "float"})
+    ours, theirs = (path.read_bytes()[16 : 16 + 176] for path in (tmp_path / "a.nvdb", nanovdb_file))
+    assert ours[16:36] == theirs[16:36]  # hash, active voxels, type
+    box = np.frombuffer(theirs[40:88], "<f8").reshape(2, 3) + 0.5 * np.array([6, 0, 2])  # our indices begin at 0
+    np.testing.assert_allclose(np.frombuffer(ours[40:88], "<f8").reshape(2, 3), box, rtol=0, atol=1e-12)
+    assert np.array_equal(np.frombuffer(ours[88:112], "<i4"), [0, 0, 0, 12, 1, 4])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("channels", [1, 3])
+def test_nanovdb_takes_what_we_write(tmp_path: Path, channels: int) -> None:
+    """NanoVDB's own validation, and OpenVDB's file of the same values, converted by NanoVDB."""
+    if shutil.which("nanovdb_validate") is None:
+        pytest.skip("no nanovdb_validate (sudo apt install libnanovdb-tools)")
+    values, to_world = make_patches(0, channels, (20, 30, 140))
+    values = np.nan_to_num(values)
+    for name in ("a.nvdb", "a.vdb"):
+        write_volume(tmp_path / name, values, to_world)
+    for words in ("nanovdb_validate a.nvdb", "nanovdb_convert a.vdb b.nvdb", "nanovdb_convert a.nvdb b.vdb"):
+        done = subprocess.run(words.split(), cwd=tmp_path, check=True, capture_output=True, text=True)
+        assert "fail" not in (done.stdout + done.stderr).lower()
+    np.testing.assert_array_equal(read_volume(tmp_path / "b.vdb").values, values)  # its transform is transposed: not compared
+    both = [read_volume(tmp_path / name) for name in ("a.nvdb", "b.nvdb")]
+    np.testing.assert_array_equal(both[0].values, values)
+    np.testing.assert_array_equal(both[1].values, values)
+    np.testing.assert_allclose(both[0].to_world, both[1].to_world, rtol=0, atol=1e-12)
+
+
+def test_a_long_name_has_the_hash_of_nanovdb(tmp_path: Path) -> None:
+    """The number is that of NanoVDB 32.4.2; a reader finds no grid of another number."""
+    write_volume(tmp_path / "a.nvdb", np.ones((1, 1, 1)), metadata={"grid": "temperature_of_the_flame"})
+    assert struct.unpack_from("<Q", (tmp_path / "a.nvdb").read_bytes(), 32) == (15057899901529382897,)

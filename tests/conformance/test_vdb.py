@@ -2,7 +2,8 @@
 
 ``openvdb_10.vdb.gz`` holds the grids of :data:`GRIDS`, written by Debian's ``python3-openvdb`` with Blosc: single voxels,
 a filled region (which makes active tiles), values truncated to half, a level set by ``createLevelSetSphere``. Values are
-compared exactly, because all of them are float32 or half.
+compared exactly, because all of them are float32 or half. ``openvdb_10_types.vdb.gz`` was written by OpenVDB 10.0.1 in C++:
+five voxels and a filled region in every other type of grid, a frustum, and points.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from hypothesis import strategies as st
 
 import mivol
 from mivol.files import SparseVolumeData, check_bricks, read_sparse_volume, read_volume, vdb, write_volume
+from mivol.files.formats import convert_volume
 
 PLACED = np.array([[0.5, 0, 0, 1], [0, 0, -0.5, 2], [0, 0.25, 0, 3], [0, 0, 0, 1]])
 """Index to world of the first grid: x of the index runs along x, y along z, z against y."""
@@ -73,6 +75,54 @@ def test_a_grid_of_openvdb(openvdb_file: Path, name: str) -> None:
     np.testing.assert_allclose(volume.origin, index_to_world[:3, :3] @ first + index_to_world[:3, 3], atol=1e-13)
     np.testing.assert_allclose(volume.steps, index_to_world[:3, :3], atol=1e-13)
     assert volume.meta["index_min"] == first
+
+
+@pytest.fixture(scope="module")
+def types_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("vdb") / "openvdb_10_types.vdb"
+    path.write_bytes(gzip.decompress((Path(__file__).parent / "openvdb_10_types.vdb.gz").read_bytes()))
+    return path
+
+
+FIVE = np.arange(5.0)[:, None]
+TYPED = {
+    "double": (1 / (FIVE + 3), 2.5),
+    "doubleh": ((1 / (FIVE + 3)).astype(np.float16), 2.5),
+    "int32": (100 * FIVE - 7, 11),
+    "int64": (2 ** (FIVE + 8), 12),
+    "bool": (0 * FIVE + 1, 1),
+    "vec3d": (np.column_stack([FIVE, -FIVE, 0.1 * FIVE + 1]), (1, 2, 3)),
+    "vec3h": (np.column_stack([FIVE, -FIVE, np.float32(0.1) * FIVE + 1]).astype(np.float16), (1, 2, 3)),
+    "vec3i": (np.column_stack([FIVE, -FIVE, FIVE + 1]), (1, 2, 3)),
+}
+"""Name: values of the voxels (3 i - 6, i % 2, 2 - i), value of the region from (8, 8, 8) to (23, 15, 15)."""
+
+
+@pytest.mark.parametrize("name", TYPED)
+def test_a_type_of_values(types_file: Path, name: str) -> None:
+    volume, (values, tile) = read_volume(types_file, name), TYPED[name]
+    expected = np.zeros((18, 16, 30, values.shape[1]), np.float32)
+    expected[10:, 8:, 14:] = tile
+    x, y, z = np.array([(3 * i - 6, i % 2, 2 - i) for i in range(5)]).T
+    expected[z + 2, y, x + 6] = values.astype(np.float32)
+    np.testing.assert_array_equal(volume.values, expected)
+    np.testing.assert_array_equal(read_sparse_volume(types_file, name).dense(), expected)
+    np.testing.assert_allclose(volume.origin, [1 - 3, 2, 3 - 1], rtol=0, atol=1e-13)
+    assert volume.meta["active_voxels"] == 5 + 16 * 8 * 8
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("points", "the points 'points' (Tree_ptdataidx32_5_4_3)"),
+        ("mask", "the grid 'mask' of type Tree_mask_5_4_3"),
+        ("frustum", "the transform NonlinearFrustumMap"),
+    ],
+)
+def test_what_no_volume_can_be_is_named(types_file: Path, name: str, words: str) -> None:
+    for read in (read_volume, read_sparse_volume):
+        with refused(words):
+            read(types_file, name)
 
 
 def test_a_level_set_becomes_a_fog(openvdb_file: Path) -> None:
@@ -184,20 +234,92 @@ def test_empty_space_takes_no_space(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_volume(tmp_path / "a.vdb").values[..., 0], values)
 
 
-@pytest.mark.slow
-def test_openvdb_reads_what_we_write(tmp_path: Path) -> None:
-    """Debian's python3-openvdb as oracle: the values, the box and the transform."""
+# -- OpenVDB as oracle: Debian's python3-openvdb, in a process of the system's Python -------------------------------------
+
+
+def run_openvdb(script: str, *arguments: object) -> None:
     python = shutil.which("python3", path="/usr/bin")
     if python is None or subprocess.run([python, "-c", "import pyopenvdb"], capture_output=True).returncode:
         pytest.skip("no python3-openvdb (sudo apt install python3-openvdb)")
+    subprocess.run([python, "-c", script, *map(str, arguments)], check=True)
+
+
+MAKE_GRIDS = """import sys, numpy, pyopenvdb
+rng, grids, truth = numpy.random.default_rng(int(sys.argv[1])), [], {}
+for k in range(int(sys.argv[2])):
+    background = 0.0 if k % 3 else float(rng.normal())
+    colour = k % 4 == 3
+    grid = pyopenvdb.Vec3SGrid([background] * 3) if colour else pyopenvdb.FloatGrid(background)
+    value = (lambda: tuple(rng.normal(size=3))) if colour else (lambda: float(rng.normal()))
+    access, far = grid.getAccessor(), 3000 if k % 5 == 4 else 40
+    for _ in range(30):
+        access.setValueOn(tuple(map(int, rng.integers(-20, 20, 3))), value())
+        access.setValueOff(tuple(map(int, rng.integers(-20, 20, 3))), value())
+    access.setValueOn(tuple(map(int, rng.integers(0, far, 1))) + (5, -3), (numpy.nan,) * 3 if colour else numpy.nan)
+    low = rng.integers(-30, 10, 3)
+    grid.fill(tuple(map(int, low)), tuple(map(int, low + rng.integers(1, 40, 3))), value(), True)
+    grid.fill(tuple(map(int, low - 20)), tuple(map(int, low + 3)), value(), False)
+    colour or grid.prune()
+    grid.saveFloatAsHalf = k % 7 == 6
+    matrix = numpy.eye(4)
+    kind = k % 6
+    if kind == 0:
+        grid.transform = pyopenvdb.createLinearTransform(0.37)
+    else:
+        matrix[:3, :3] = numpy.diag(rng.uniform(0.1, 3, 3) * rng.choice([-1, 1], 3) if kind < 3 else [1, 1, 1])
+        matrix[:3, :3] += rng.normal(size=(3, 3)) / 5 if kind > 3 else 0
+        matrix[3, :3] = rng.normal(size=3) if kind % 2 else 0
+        grid.transform = pyopenvdb.createLinearTransform(matrix.tolist())
+    grid.name = "twice" if k % 8 == 7 else f"grid{k}"
+    grids.append(grid)
+grids.append(pyopenvdb.createLevelSetSphere(1.3, center=(0.2, 0, 5), voxelSize=0.2, halfWidth=3))
+grids[-1].name = "ball"
+pyopenvdb.write(sys.argv[3], grids=grids)
+# Half numbers, the places of the grids, and the order of equal names are those of the file.
+for k, grid in enumerate(pyopenvdb.readAll(sys.argv[3])[0]):
+    low, high = grid.evalActiveVoxelBoundingBox()
+    shape = [b - a + 1 for a, b in zip(low, high)] + ([3] if "Vec" in type(grid).__name__ else [])
+    values = numpy.zeros(shape, numpy.float32)
+    grid.copyToArray(values, ijk=low)
+    indices = rng.uniform(-50, 50, (20, 3))
+    truth[f"values {k}"], truth[f"low {k}"], truth[f"name {k}"] = values, low, grid.name
+    truth[f"active {k}"], truth[f"background {k}"] = grid.activeVoxelCount(), grid.background
+    truth[f"indices {k}"], truth[f"places {k}"] = indices, [grid.transform.indexToWorld(tuple(i)) for i in indices]
+numpy.savez(sys.argv[4], **truth)"""
+
+
+@pytest.mark.slow
+def test_values_and_places_are_those_of_openvdb(tmp_path: Path) -> None:
+    """Random grids: tiles on and off, values of inactive voxels, backgrounds, NaN, half, colours, equal names, boxes up to 3000
+    voxels wide, and every kind of linear transform. Values to the bit; places to a rounding of float64."""
+    run_openvdb(MAKE_GRIDS, 0, 24, tmp_path / "a.vdb", tmp_path / "a.npz")
+    truth, seen = np.load(tmp_path / "a.npz"), []
+    for k in range(25):
+        plain = str(truth[f"name {k}"])
+        seen.append(plain)
+        name = plain + (f"[{seen.count(plain) - 1}]" if seen.count(plain) > 1 else "")
+        volume = read_volume(tmp_path / "a.vdb", name)
+        values = truth[f"values {k}"]
+        values = values.reshape(*values.shape[:3], -1).transpose(2, 1, 0, 3)
+        if plain == "ball":
+            values = np.clip(-values / truth[f"background {k}"].astype(np.float32), 0, 1)
+        np.testing.assert_array_equal(volume.values, values)
+        np.testing.assert_array_equal(read_sparse_volume(tmp_path / "a.vdb", name).dense(), values)
+        low, indices, places = truth[f"low {k}"], truth[f"indices {k}"], truth[f"places {k}"]
+        assert volume.meta["index_min"] == tuple(low) and volume.meta["active_voxels"] == truth[f"active {k}"]
+        local = (indices - low + 0.5) / volume.size
+        found = local @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
+        # A product and four sums round in each, of terms that are at most box and origin.
+        scale = np.abs(volume.to_world[:3]).sum(axis=1).max() * max(1, np.abs(local).max())
+        np.testing.assert_allclose(found, places, rtol=0, atol=16 * 2.0**-53 * scale)
+    assert seen.count("twice") == 3 and "ball" in seen
+
+
+@pytest.mark.slow
+def test_openvdb_reads_what_we_write(tmp_path: Path) -> None:
+    """The values, the box and the transform, of a file of ours and of one that ``mivol convert`` made of a ``.nvdb``."""
     rng = np.random.default_rng(0)
-    for channels in (1, 3):
-        values = (rng.normal(size=(20, 30, 140, channels)) * (rng.random((20, 30, 140, 1)) < 0.1)).astype(np.float32)
-        values[0, 0, 0] = values[-1, -1, -1] = 1
-        to_world = np.eye(4)
-        to_world[:3] += rng.normal(size=(3, 4)) / 4
-        write_volume(tmp_path / "a.vdb", values, to_world)
-        script = """import sys, numpy, pyopenvdb
+    script = """import sys, numpy, pyopenvdb
 grid = pyopenvdb.readAll(sys.argv[1])[0][0]
 low, high = grid.evalActiveVoxelBoundingBox()
 shape = [b - a + 1 for a, b in zip(low, high)] + ([3] if "Vec" in type(grid).__name__ else [])
@@ -205,7 +327,15 @@ values = numpy.zeros(shape, numpy.float32)
 grid.copyToArray(values, ijk=low)
 corners = [grid.transform.indexToWorld(c) for c in [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]]
 numpy.savez(sys.argv[2], values=values, low=low, corners=corners)"""
-        subprocess.run([python, "-c", script, tmp_path / "a.vdb", tmp_path / "a.npz"], check=True)
+    for channels, source in ((1, "a.vdb"), (3, "a.vdb"), (1, "a.nvdb")):
+        values = (rng.normal(size=(20, 30, 140, channels)) * (rng.random((20, 30, 140, 1)) < 0.1)).astype(np.float32)
+        values[0, 0, 0] = values[-1, -1, -1] = 1
+        to_world = np.eye(4)
+        to_world[:3] += rng.normal(size=(3, 4)) / 4
+        write_volume(tmp_path / source, values, to_world)
+        if source != "a.vdb":
+            convert_volume(tmp_path / source, tmp_path / "a.vdb")
+        run_openvdb(script, tmp_path / "a.vdb", tmp_path / "a.npz")
         found, volume = np.load(tmp_path / "a.npz"), read_volume(tmp_path / "a.vdb")
         read = found["values"].reshape(*found["values"].shape[:3], channels).transpose(2, 1, 0, 3)
         np.testing.assert_array_equal(read, values)
@@ -229,7 +359,6 @@ def test_a_file_cut_anywhere_is_refused(openvdb_file: Path, tmp_path: Path) -> N
     ("old", "new", "words"),
     [
         (struct.pack("<I", 224), struct.pack("<I", 219), "version 219"),
-        (b"Tree_float_5_4_3_HalfFloat", b"Tree_ptdataidx32_5_4_3____", "Tree_ptdataidx32"),
         (b"UniformScaleMap", b"NonlinearFrustu", "the transform NonlinearFrustu"),
     ],
 )
