@@ -50,24 +50,32 @@ def open_workers(where: str, variant: str, threads: int = 0) -> Iterator[Pool]:
         opened.__exit__(None, None, None)
 
 
+SECONDS_BETWEEN_LINES = 30.0
+"""Interval between two lines about the progress, if the error output is no terminal."""
+
+
 @contextmanager
 def status_line() -> Iterator[Callable[[str], None]]:
-    """A line on the terminal that each call replaces, at most five times a second; nothing without a terminal."""
-    console, drawn = Console(stderr=True), 0.0
+    """A line on the terminal that each call replaces, at most five times a second; elsewhere a line now and then."""
+    console, drawn = Console(stderr=True), -SECONDS_BETWEEN_LINES
 
     def show(line: str) -> None:
         nonlocal drawn
-        if console.is_terminal and time.monotonic() - drawn > 0.2:
-            drawn = time.monotonic()
-            text = Text(line)
-            text.truncate(max(10, console.width - 1), overflow="ellipsis")
-            console.file.write(f"\r\x1b[K{text.plain}")
-            console.file.flush()
+        if time.monotonic() - drawn < (0.2 if console.is_terminal else SECONDS_BETWEEN_LINES):
+            return
+        drawn = time.monotonic()
+        if not console.is_terminal:
+            say(f"cluster: {line}")
+            return
+        text = Text(line)
+        text.truncate(max(10, console.width - 1), overflow="ellipsis")
+        console.file.write(f"\r\x1b[K{text.plain}")
+        console.file.flush()
 
     try:
         yield show
     finally:
-        if drawn:
+        if console.is_terminal and drawn > 0:
             console.file.write("\r\x1b[K")
             console.file.flush()
 
@@ -144,9 +152,8 @@ def distribute_fit(arguments: argparse.Namespace, settings: Experiment) -> Itera
         yield None
         return
     from mivol.back_end import choose_back_end
-    from mivol.cluster.scene_steps import ClusterDistribution, check_settings
+    from mivol.cluster.distribution import ClusterDistribution
 
-    check_settings(settings)
     choose_back_end(settings.variant, settings.threads)
     with open_workers(arguments.cluster, settings.variant, settings.threads) as pool, status_line() as show:
         yield ClusterDistribution(pool, show)

@@ -263,6 +263,19 @@ class Pool:
                 )
         return digest
 
+    def forget(self, digest: str) -> None:
+        """Remove an input here and in the workers; no unit under way may need it."""
+        del self._inputs[digest]
+
+        async def drop(worker: _Worker) -> None:
+            with contextlib.suppress(Exception):
+                await worker.actor.forget(digest)
+
+        for worker in self.workers.values():
+            if digest in worker.held:
+                worker.held.discard(digest)
+                self.client.loop.add_callback(drop, worker)
+
     # -- Work --------------------------------------------------------------------------------------------------------
 
     def run(self, units: Iterable[Unit | None], ahead: int = 2, check: Callable[[], None] = lambda: None) -> Iterator[tuple]:
@@ -362,6 +375,12 @@ class Pool:
             self._refuse(name, content)
 
     # -- Telling -----------------------------------------------------------------------------------------------------
+
+    def describe(self) -> str:
+        """Number of workers in words, with losses and repeated work."""
+        count = len(self.workers)
+        lost = f", {self.lost} lost, {self.repeated} repeated" if self.lost else ""
+        return f"{count} worker{'s' * (count != 1)}{lost}"
 
     def collect_progress(self, timeout: float = 2.0) -> dict[Any, str]:
         """Newest progress of the work under way, by the key of the unit; workers that do not answer in time are left out."""

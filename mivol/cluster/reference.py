@@ -158,7 +158,7 @@ class _Queue:
     def describe(self) -> str:
         """Progress in a line."""
         parts = [f"view {v.number}: {v.reference.run.moments.n} of {v.reference.count_batches()}" for v in self.views if v.sent]
-        return f"{len(self.pool.workers)} workers, batches of {', '.join(parts[:4])}{', ...' * (len(parts) > 4)}"
+        return f"{self.pool.describe()}, batches of {', '.join(parts[:4])}{', ...' * (len(parts) > 4)}"
 
 
 # -- Images ------------------------------------------------------------------------------------------------------------------
@@ -213,6 +213,6 @@ def passes_on(
             while due in waiting:
                 yield waiting.pop(due)
                 due += 1
-            show(f"{len(pool.workers)} workers, {due} of {len(passes)} passes")
+            show(f"{pool.describe()}, {due} of {len(passes)} passes")
 
     return render

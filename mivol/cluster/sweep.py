@@ -215,7 +215,7 @@ class _SweepOnPool:
             self.shown = now
             with suppress(OSError):
                 lines = [f"{name}: {line}" for name, line in self.pool.collect_progress(0.2).items() if line]
-                self.show(f"{self.ended} runs ended; " + ", ".join(lines))
+                self.show(f"{self.pool.describe()}, {self.ended} runs ended; " + ", ".join(lines))
 
 
 def has_absolute_paths(settings: config.Experiment) -> bool:

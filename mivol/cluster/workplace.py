@@ -124,6 +124,10 @@ class Workplace:
         """Keep an input."""
         self.kept[digest] = value
 
+    def forget(self, digest: str) -> None:
+        """Drop an input."""
+        self.kept.pop(digest, None)
+
     def made(self, key: str, make: Callable[[], Any]) -> Any:
         """Return what was made for a key, and make it at the first call."""
         if key not in self.kept:

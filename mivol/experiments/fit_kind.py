@@ -56,11 +56,7 @@ class Distribution(Protocol):
     """Computes parts of a run on the workers of a cluster."""
 
     def make_problem(self, kind: FitKind) -> Problem:
-        """Return the problem of a fit whose loss and gradient are computed by workers.
-
-        Raises:
-            MivolError: a kind of fit whose steps run in one process only.
-        """
+        """Return the problem of a fit whose steps are computed by workers."""
 
     def complete_references(self, kind: FitKind) -> Complete:
         """Return the function that renders the references of a fit."""

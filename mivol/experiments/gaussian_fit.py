@@ -174,7 +174,8 @@ def make_gaussian_plan(settings: GaussianExperiment) -> GaussianPlan:
     if options.degree is not None:
         stages = [replace(stage, degree=min(stage.degree, options.degree)) for stage in plan.stages]
         plan = replace(plan, stages=(*stages[:-1], replace(stages[-1], degree=options.degree)))
-    return plan.scaled(options.effort)
+    plan = plan.scaled(options.effort)
+    return plan if options.views == 1 else plan.with_views(options.views)
 
 
 def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: GaussianPlan) -> GaussianStart:
@@ -225,11 +226,12 @@ def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, me
         "clone_split": "split or cloned at large gradients, removed if transparent (Kerbl et al. 2023)",
         "relocation": "transparent Gaussians move to opaque Gaussians (Kheradmand et al. 2024)",
     }[plan.control]
+    views = "one photograph" if plan.views == 1 else f"{plan.views} photographs"
     return [
         PlanLine(choice=f"{len(photos.views)} photographs", reason=photos.survey.box_from),
         PlanLine(choice=f"{count} Gaussians at first", reason=whence),
         PlanLine(choice=f"up to {max(plan.most, count)} Gaussians", reason=control),
-        PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason="small photographs first, one photograph a step"),
+        PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason=f"small photographs first, {views} a step"),
         PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="the rest is the absolute error"),
         background,
         *[GAINS][: plan.exposure],

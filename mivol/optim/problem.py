@@ -12,9 +12,9 @@ problem's seed and i.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import mitsuba as mi
 import numpy as np
@@ -82,6 +82,55 @@ class DifferentiableProblem(Problem, Protocol):
             reals: of the step; the problem may empty this dictionary, since its entries keep the gradient in memory.
             iteration: of the latest :meth:`loss_and_gradient`.
         """
+
+
+Part: TypeAlias = "tuple[Any, ...]"
+"""A part of a step, in plain Python: arguments of :meth:`DividedProblem.compute_part`."""
+
+Divide: TypeAlias = "Callable[[DividedProblem, Reals, Sequence[Part]], dict[str, np.ndarray]]"
+"""Computes parts of a step, perhaps in other processes, and adds their results as :func:`add_parts`."""
+
+
+class DividedProblem(DifferentiableProblem, Protocol):
+    """Additional methods of a problem whose step is a sum over parts, which several processes can compute.
+
+    A part depends on the reals, on :meth:`step_state` and on itself only. Another process makes the problem from the fields of
+    its class, and takes the state before it computes parts.
+
+    Attributes:
+        divide: computes the parts of a step; None computes the whole step at once in this process.
+    """
+
+    divide: Divide | None
+
+    def compute_part(self, reals: Reals, *part: Any) -> Reals:
+        """Contributions of a part to the step by name: the loss, derivatives by parameter, and statistics."""
+
+    def step_state(self) -> dict[str, Any]:
+        """What parts read beside the reals and the fields of the class; an object that changes is another object."""
+
+    def take_step_state(self, state: dict[str, Any]) -> None:
+        """Continue from the state of the same problem in another process."""
+
+
+def add_parts(total: dict[str, np.ndarray], result: Mapping[str, np.ndarray]) -> None:
+    """Add the results of a part to a sum, by name: float64 from the second summand on.
+
+    Sums of float32 numbers in float64 are exact unless they differ by more than 2^29 over their count, so they do not depend on
+    their order.
+    """
+    for name, value in result.items():
+        total[name] = np.add(total[name], value, dtype=np.float64) if name in total else value
+
+
+def to_arrays(tensors: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Tensors as NumPy arrays."""
+    return {name: np.array(value) for name, value in tensors.items()}
+
+
+def to_tensors(arrays: Mapping[str, np.ndarray]) -> Reals:
+    """NumPy arrays as tensors of float32."""
+    return {name: mi.TensorXf(np.ascontiguousarray(array, dtype=np.float32)) for name, array in arrays.items()}
 
 
 class BoundedProblem(DifferentiableProblem, Protocol):

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import singledispatch
 
 import drjit as dr
 import mitsuba as mi
@@ -118,7 +119,8 @@ def is_worth_storing(rows: int, iterations: int, is_by_subsets: bool) -> bool:
     return is_by_subsets or rows * iterations >= MIN_PRODUCTS
 
 
-def store_matrix(projector: Projector) -> StoredProjector:
+@singledispatch
+def store_matrix(projector: Projector) -> Projector:
     """Store the rows of a projector.
 
     Raises:

@@ -9,21 +9,21 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from local_workers import kill_once, kill_worker, some_workers
 from tiny_experiment import PHOTOS, run, write_experiment
 
 from mivol import config
-from mivol.cluster.address import ClusterSettings
-from mivol.cluster.connection import _connect, import_distributed
+from mivol.cluster.connection import import_distributed
+from mivol.cluster.distribution import ClusterDistribution
 from mivol.cluster.packages import SceneSource, share_scene
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.reference import complete_on, passes_on
-from mivol.cluster.scene_steps import ClusterDistribution, SharedSceneProblem
+from mivol.cluster.scene_steps import SharedSceneProblem
 from mivol.cluster.sweep import run_on
 from mivol.cluster.workplace import Workplace
 from mivol.errors import MivolError
@@ -39,38 +39,6 @@ from mivol.validate.reference import render_photographs
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def client() -> Iterator[object]:
-    """Three local workers for all tests of the module."""
-    distributed = import_distributed()
-    with _connect(distributed, ClusterSettings(scheduler="local", workers=3, threads=1)) as (client, _):
-        yield client
-
-
-@contextmanager
-def some_workers(client: object, count: int, said: list[str] | None = None) -> Iterator[Pool]:
-    """A pool of the first workers only."""
-    settings = ClusterSettings(scheduler="address", address="tcp://127.0.0.1:1", threads=1, wait=60.0)
-    pool = Pool(client, settings, say=(said if said is not None else []).append)
-    present = sorted(client.scheduler_info(n_workers=-1)["workers"])
-    pool._refused |= set(present[count:])
-    while len(pool.workers) < count:
-        pool.begin()
-    yield pool
-
-
-def kill_once(pool: Pool) -> Callable[[str], None]:
-    """A display that kills a worker when it is first called."""
-    killed: list[int] = []
-
-    def show(line: str) -> None:
-        if not killed:
-            killed.append(next(iter(pool.workers.values())).facts.pid)
-            os.kill(killed[0], signal.SIGKILL)
-
-    return show
 
 
 # -- The pool ----------------------------------------------------------------------------------------------------------------
@@ -218,7 +186,7 @@ def test_a_fit_does_not_depend_on_workers(client: object, tmp_path: Path, optimi
 
                 def strike(problem: SharedSceneProblem, *args: object, **more: object) -> object:
                     if next(strikes):
-                        os.kill(next(iter(pool.workers.values())).facts.pid, signal.SIGKILL)
+                        kill_worker(pool)
                     return ask(problem, *args, **more)
 
                 patch.setattr(SharedSceneProblem, "ask", strike)
@@ -283,7 +251,7 @@ def test_a_scheduler_that_dies_is_a_sentence(tmp_path: Path, variant_rgb: str) -
         [*command, "--cluster", cluster.scheduler_address], stderr=subprocess.PIPE, text=True, env=environment
     )
     assert "1 worker on 1 host" in child.stderr.readline()
-    time.sleep(3)
+    assert "1 worker, batches of view 0: " in child.stderr.readline()
     cluster.close()
     rest = child.stderr.read()
     child.stderr.close()
@@ -303,7 +271,7 @@ def test_ctrl_c_ends_workers_and_keeps_batches(tmp_path: Path) -> None:
     )  # fmt: skip
     assert "1 worker on 1 host" in child.stderr.readline()
     workers = find_children(child.pid)
-    time.sleep(3)
+    assert "1 worker, batches of view 0: " in child.stderr.readline()
     os.killpg(child.pid, signal.SIGINT)
     rest = child.stderr.read()
     child.stderr.close()

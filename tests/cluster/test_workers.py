@@ -299,11 +299,6 @@ def test_sums_in_float64_do_not_depend_on_their_order() -> None:
     assert all(np.array_equal(sums[0], other) for other in sums)
 
 
-def test_other_fits_are_refused_before_workers_start(capsys: pytest.CaptureFixture) -> None:
-    scan = Path(__file__).parents[2] / "scenes" / "shepp_logan" / "fit.toml"
-    assert "is no fit to images of a scene" in refused(capsys, "optimize", scan, "--cluster", "local:1")
-
-
 def test_images_of_points_are_refused_before_workers_start(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     np.save(tmp_path / "points.npy", np.eye(4, 3))
     assert "--cluster renders scenes" in refused(capsys, "render", tmp_path / "points.npy", "--cluster", "local:1")

@@ -269,9 +269,6 @@ def test_refusals(variant_rgb: str, views: list[Photo]) -> None:
         problem_of(views, replace(PLAN, control="clone"))
     with pytest.raises(MivolError, match="3 initial points, expected at least 4"):
         make_start_cloud(places(3), views, 0)
-    problem = problem_of(views)
-    with pytest.raises(MivolError, match="expected at most 1 view per step of a fit of Gaussians"):
-        problem.loss_and_gradient(problem.initial_reals(), 0, 2)
     with pytest.raises(MivolError, match="the plan needs views shrunk by 2"):
         GaussianProblem(RayBatches.from_photos(views), [view.camera for view in views], truth(), PLAN)
     with pytest.raises(MivolError, match="all cameras are at one position"):

@@ -24,11 +24,11 @@ from mivol import config
 from mivol.back_end import choose_back_end
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.cluster.connection import open_pool
+from mivol.cluster.distribution import ClusterDistribution
 from mivol.cluster.packages import SceneSource, share_scene
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.reference import complete_on
 from mivol.cluster.scaling import Network, Workload, say_limit, step_seconds
-from mivol.cluster.scene_steps import ClusterDistribution
 from mivol.cluster.workplace import Workplace
 from mivol.experiments.examples import copy_example
 from mivol.experiments.fit_kind import RunContext

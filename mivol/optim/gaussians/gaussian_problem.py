@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -33,7 +34,7 @@ from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, scene_ex
 from mivol.optim.losses import ImageShape, image_loss
 from mivol.optim.photographs.photo_colours import Exposure
 from mivol.optim.photographs.ray_batches import RayBatches
-from mivol.optim.problem import Reals, Refinement, StagedProblem
+from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, StagedProblem, add_parts, to_arrays, to_tensors
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera
 from mivol.photos.region import is_free_space
@@ -46,9 +47,12 @@ GAIN_STEP = 0.05
 RESET_TO = 0.01
 """Maximum opacity after a reset of opacities."""
 
+MOVED, SEEN = "statistics/moved", "statistics/seen"
+"""Results of a part: gradient of the screen position of each Gaussian, and the number of views that show it."""
+
 
 @dataclasses.dataclass
-class GaussianProblem(StagedProblem):
+class GaussianProblem(StagedProblem, DividedProblem):
     """Gaussians with photographs.
 
     Attributes:
@@ -58,6 +62,7 @@ class GaussianProblem(StagedProblem):
         plan: plan of the fit.
         seed: root of the order of views, of backgrounds and of density control.
         safe_point: called between kernels.
+        divide: computes the views of a step elsewhere; None: in this process.
         stage: number of the current stage.
         exposure: gains of the photographs, if the plan has gains.
 
@@ -73,6 +78,7 @@ class GaussianProblem(StagedProblem):
     plan: GaussianPlan
     seed: int = 0
     safe_point: Callable[[], None] = lambda: None
+    divide: Divide | None = None
     stage: int = dataclasses.field(init=False, default=0)
     exposure: Exposure | None = dataclasses.field(init=False, default=None)
 
@@ -133,20 +139,58 @@ class GaussianProblem(StagedProblem):
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
-        """Loss and gradient of a single view; the views follow a new random order per epoch.
+        """Mean loss of the views of a step and its gradient; the views follow a new random order per epoch.
 
-        Raises:
-            MivolError: more than one view per step.
+        Args:
+            reals: of the cloud.
+            iteration: selects the views.
+            views: number of views; 0 takes the plan's.
         """
-        if views > 1:
-            raise MivolError(f"found views = {views}, expected at most 1 view per step of a fit of Gaussians: leave views out.")
-        epoch, index = divmod(iteration, len(self.cameras))
-        view = int(np.random.default_rng((self.seed, 2, epoch)).permutation(len(self.cameras))[index])
-        loss, gradient, statistics = self.view_loss_and_gradient(reals, view, self._background(iteration))
-        self._add_statistics(statistics)
+        count = min(views or self.plan.views, len(self.cameras))
+        parts = [(number, count) for number in range(iteration * count, (iteration + 1) * count)]
+        if self.divide is not None:
+            found = to_tensors(self.divide(self, reals, parts))
+        elif count == 1:
+            found = self.compute_part(reals, *parts[0])
+        else:
+            total: dict[str, np.ndarray] = {}
+            for part in parts:
+                add_parts(total, to_arrays(self.compute_part(reals, *part)))
+            found = to_tensors(total)
+        self._slopes += np.array(found.pop(MOVED), np.float64)
+        self._times += np.array(found.pop(SEEN), np.float64)
+        loss = found.pop("loss").array
         if self.plan.control == "relocation":
-            loss, gradient = self._add_priors(reals, loss, gradient)
-        return loss, gradient
+            loss, found = self._add_priors(reals, loss, found)
+        return loss, found
+
+    def compute_part(self, reals: Reals, number: int, count: int) -> Reals:
+        """Loss, derivatives and statistics of a view, as shares of a step of ``count`` views.
+
+        Args:
+            reals: of the cloud.
+            number: number of the view in the order of all epochs.
+            count: views of the step.
+        """
+        epoch, index = divmod(number, len(self.cameras))
+        view = int(np.random.default_rng((self.seed, 2, epoch)).permutation(len(self.cameras))[index])
+        loss, gradient, statistics = self.view_loss_and_gradient(reals, view, self._background(number))
+        found = {name: mi.TensorXf(value.array / count, value.shape) for name, value in gradient.items()}
+        visible = np.asarray(statistics.visible)
+        moved = np.where(visible, statistics.d_mean2d, 0).astype(np.float32)
+        return found | {
+            "loss": mi.TensorXf(loss / count, (1,)),
+            MOVED: mi.TensorXf(moved),
+            SEEN: mi.TensorXf(visible.astype(np.float32)),
+        }
+
+    def step_state(self) -> dict[str, Any]:
+        """The stage."""
+        return {"stage": self.stage}
+
+    def take_step_state(self, state: dict[str, Any]) -> None:
+        """Enter the stage of the same problem in another process."""
+        self.stage = state["stage"]
 
     def view_loss_and_gradient(
         self, reals: Reals, view: int, background: np.ndarray | None = None
@@ -324,10 +368,6 @@ class GaussianProblem(StagedProblem):
         moved = relocate(self.cloud, self.plan.least_opacity, rng)
         more = min(max(room, 0), max(1, len(self.cloud["means"]) // 20))
         return moved.then(grow(moved.cloud, more, self.plan.least_opacity, rng)) if more else moved
-
-    def _add_statistics(self, statistics: ScreenStatistics) -> None:
-        self._slopes += np.where(statistics.visible, statistics.d_mean2d, 0)
-        self._times += statistics.visible
 
     def _reset_statistics(self) -> None:
         """Restart the sums of screen gradients and the counts of views of each Gaussian."""

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.fields.harmonics import basis_size, row_width
 from mivol.fields.octree import COLOUR_MAPS, Octree
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.events import CoarseToFine, DropUnseen, Event, UpdateOccupancy
@@ -33,7 +35,7 @@ from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatch, RayBatches
 from mivol.optim.priors import decay_view_dependence
-from mivol.optim.problem import Reals, Refinement, SparseProblem
+from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, SparseProblem, to_tensors
 from mivol.transport.line_integrals.leaf_radiance import (
     LeafPlaces,
     make_leaf_colours,
@@ -124,7 +126,7 @@ Report = Callable[[str, "SphericalGrid | Octree"], str]
 
 
 @dataclasses.dataclass
-class OctreeProblem(SparseProblem):
+class OctreeProblem(SparseProblem, DividedProblem):
     """A grid that becomes an octree, with photographs.
 
     Attributes:
@@ -133,6 +135,7 @@ class OctreeProblem(SparseProblem):
         plan: plan of the fit.
         seed: root of the random rays.
         tree: present octree; None while the grid is fitted, given for a plan without a grid.
+        divide: computes the views of a step elsewhere; None: in this process.
         grid: problem of the grid; None once there is an octree.
         report: called with the grid and its octree when one becomes the other.
         safe_point: called between views while visible matter is found.
@@ -143,6 +146,7 @@ class OctreeProblem(SparseProblem):
     plan: OctreePlan
     seed: int = 0
     tree: Octree | None = None
+    divide: Divide | None = None
     grid: RadianceProblem | None = dataclasses.field(init=False, default=None)
     report: Report = lambda name, field: ""
     safe_point: Callable[[], None] = lambda: None
@@ -161,6 +165,8 @@ class OctreeProblem(SparseProblem):
     def _begin_tree(self, tree: Octree) -> None:
         self.tree, self.grid = tree, None
         self.index, self.places = LeafIndex.find(tree), LeafPlaces.find(tree)
+        names = "depth", "to_world", "degree", "codes", "sizes", "colours", "offset", "space"
+        self._leaves = {name: getattr(tree, name) for name in names}
 
     @property
     def field(self) -> SphericalGrid | Octree:
@@ -203,23 +209,68 @@ class OctreeProblem(SparseProblem):
         Noise: from the choice of pixels. Bias: as :func:`mivol.transport.line_integrals.leaf_radiance.make_leaf_colours`.
         """
         if self.grid is not None:
+            self.grid.divide = self.divide and (lambda grid, reals, parts: self.divide(self, reals, parts))
             return self.grid.loss_and_gradient(reals, iteration, views)
+        if self.divide is None:
+            found = self.compute_part(reals, iteration, views)
+        else:
+            self.set_reals(reals)
+            count = min(views or self.plan.leaves.views, len(self.batches.origins))
+            found = to_tensors(self.divide(self, reals, [(iteration, views, (number,)) for number in range(count)]))
+        return found.pop("loss").array, found
+
+    def compute_part(self, reals: Reals, iteration: int, views: int, only: Sequence[int] | None = None) -> Reals:
+        """Loss and derivatives of the rays of some views of a step, as shares of the step's mean.
+
+        Args:
+            reals: of the step.
+            iteration, views: as :meth:`loss_and_gradient`.
+            only: indices of the views among the views of the step; None: all.
+        """
+        if self.grid is not None:
+            return self.grid.compute_part(reals, iteration, views, only)
         self.set_reals(reals)
         plan, rng = self.plan.leaves, np.random.default_rng((self.seed, iteration))
-        batch = self.batches.draw_tiles(plan.shrink, self.batches.choose_views(views or plan.views, rng), plan.tiles, rng)
+        chosen = self.batches.choose_views(views or plan.views, rng)
+        corner = self.batches.draw_corners(plan.shrink, chosen, plan.tiles, rng)
         background = rng.random(3) if self.plan.random_background and self.batches.channels == 4 else None
-        loss, (density, harmonics) = self.batch_loss_and_gradient(batch, background)
+        numbers = list(range(len(chosen)) if only is None else only)
+        share = len(numbers) / len(chosen)
+        batch = self.batches.make_tiles(plan.shrink, chosen[numbers], corner[numbers])
+        loss, (density, harmonics) = self.batch_loss_and_gradient(batch, background, share)
         slopes = {"density": density, "harmonics": self.scale.gradient_by_reals(harmonics, reals["harmonics"].array)}
-        return dr.mean(loss), {name: mi.TensorXf(slopes[name], value.shape) for name, value in reals.items()}
+        found = {name: mi.TensorXf(slopes[name], value.shape) for name, value in reals.items()}
+        return found | {"loss": mi.TensorXf(dr.mean(loss) * share, (1,))}
+
+    def step_state(self) -> dict[str, Any]:
+        """The state of the grid, or the octree."""
+        if self.grid is not None:
+            return self.grid.step_state()
+        return self._leaves
+
+    def take_step_state(self, state: dict[str, Any]) -> None:
+        """Nodes or leaves of the same problem in another process."""
+        if "codes" in state:
+            count = len(state["codes"])
+            self._begin_tree(
+                Octree(
+                    **state,
+                    density=dr.zeros(mi.Float, count),
+                    harmonics=dr.zeros(mi.Float, count * row_width(basis_size(state["degree"]))),
+                )
+            )
+        else:
+            self.grid.take_step_state(state)
 
     def batch_loss_and_gradient(
-        self, batch: RayBatch, background: np.ndarray | None = None
+        self, batch: RayBatch, background: np.ndarray | None = None, share: float = 1.0
     ) -> tuple[mi.Float, tuple[mi.Float, mi.Float]]:
         """Squared error of each ray of a batch, weighted, mean over rgb, and derivatives of the mean over rays.
 
         Args:
             batch: rays and their target colours.
             background: put behind all photographs (3,); None keeps each photograph's own background.
+            share: of the batch in a step, a factor on the derivatives.
         """
         source = make_leaf_colours(self.tree, self.places, batch.origins, batch.slot, slope=True)
         count = dr.width(batch.slot)
@@ -231,7 +282,7 @@ class OctreeProblem(SparseProblem):
         error = colour - batch.target - (1 - batch.alpha) * (backdrop - own)
         weight = self.scale.weight(colour)
         error *= batch.counted * weight
-        by_colour = error * weight * (2 / (3 * count))
+        by_colour = error * weight * (2 * share / (3 * count))
         by_T = dr.dot(by_colour, backdrop)
         loss = dr.squared_norm(error) * (1 / 3)
         dr.eval(rendered, by_colour, by_T, loss)

@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -35,7 +36,7 @@ from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Expo
 from mivol.optim.photographs.radiance_plan import RadiancePlan, place_grid
 from mivol.optim.photographs.ray_batches import DepthRays, RayBatch, RayBatches, depth_loss_gradient, sample_depth_rays
 from mivol.optim.priors import Neighbours, Rows
-from mivol.optim.problem import Reals, Refinement, SparseProblem
+from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, SparseProblem, to_tensors
 from mivol.photos.region import is_free_space, median_distance
 from mivol.transport.line_integrals.radiance_field import (
     Model,
@@ -50,8 +51,24 @@ from mivol.transport.line_integrals.radiance_source import Baked, bake, vjp_bake
 from mivol.transport.traversal.occupied_cells import OccupiedCells
 
 
+class StepRays(NamedTuple):
+    """The random numbers of a step.
+
+    Attributes:
+        views: numbers of the chosen views.
+        corner: (views, tiles, 2) first pixels of the tiles.
+        background: put behind all photographs (3,); None keeps their own.
+        rng: the generator after these draws.
+    """
+
+    views: np.ndarray
+    corner: np.ndarray
+    background: np.ndarray | None
+    rng: np.random.Generator
+
+
 @dataclasses.dataclass
-class RadianceProblem(SparseProblem):
+class RadianceProblem(SparseProblem, DividedProblem):
     """A radiance field in a box, with photographs.
 
     Attributes:
@@ -60,6 +77,7 @@ class RadianceProblem(SparseProblem):
         plan: plan of the fit.
         seed: root of the random rays.
         safe_point: called between views while visible nodes are found.
+        divide: computes the views of a step elsewhere; None: in this process.
         field: present field; a thin fog at first.
         sky: present background, if the plan has a sky.
         exposure: gains of the photographs, if the plan has gains.
@@ -77,6 +95,7 @@ class RadianceProblem(SparseProblem):
     plan: RadiancePlan
     seed: int = 0
     safe_point: Callable[[], None] = lambda: None
+    divide: Divide | None = None
     field: SphericalGrid = dataclasses.field(init=False)
     sky: Sky | None = dataclasses.field(init=False, default=None)
     exposure: Exposure | None = dataclasses.field(init=False, default=None)
@@ -143,15 +162,54 @@ class RadianceProblem(SparseProblem):
 
         Noise: from the choice of pixels. Bias: as :func:`mivol.transport.line_integrals.radiance_source.bake`.
         """
-        self.set_reals(reals)
-        stage = self.plan.stages[self.stage]
-        rng = np.random.default_rng((self.seed, iteration))
-        chosen = self.batches.choose_views(views or stage.views, rng)
-        batch = self.batches.draw_tiles(stage.shrink, chosen, stage.tiles, rng)
-        loss, slopes = self.batch_loss_and_gradient(batch, self._background(rng), self._draw_depth_rays(chosen, iteration))
-        slopes |= {name: self.scale.gradient_by_reals(slopes[name], reals[name].array) for name in self._colours(reals)}
+        if self.divide is None:
+            found = self.compute_part(reals, iteration, views)
+        else:
+            self.set_reals(reals)
+            count = len(self._draw_step(iteration, views).views)
+            found = to_tensors(self.divide(self, reals, [(iteration, views, (number,)) for number in range(count)]))
+        rng = self._draw_step(iteration, views).rng
         self._first_row = int(rng.integers(dr.width(self._neighbours.after[0])))
-        return dr.mean(loss), {name: mi.TensorXf(slopes[name], value.shape) for name, value in reals.items()}
+        return found.pop("loss").array, found
+
+    def compute_part(self, reals: Reals, iteration: int, views: int, only: Sequence[int] | None = None) -> Reals:
+        """Loss and derivatives of the rays of some views of a step, as shares of the step's mean.
+
+        Args:
+            reals: of the step.
+            iteration, views: as :meth:`loss_and_gradient`.
+            only: indices of the views among the views of the step; None: all. The first has the step's depth rays.
+        """
+        self.set_reals(reals)
+        step = self._draw_step(iteration, views)
+        numbers = list(range(len(step.views)) if only is None else only)
+        share = len(numbers) / len(step.views)
+        batch = self.batches.make_tiles(self.plan.stages[self.stage].shrink, step.views[numbers], step.corner[numbers])
+        depth_rays = self._draw_depth_rays(step.views, iteration) if 0 in numbers else None
+        loss, slopes = self.batch_loss_and_gradient(batch, step.background, depth_rays, share)
+        slopes |= {name: self.scale.gradient_by_reals(slopes[name], reals[name].array) for name in self._colours(reals)}
+        found = {name: mi.TensorXf(slopes[name], value.shape) for name, value in reals.items()}
+        return found | {"loss": mi.TensorXf(dr.mean(loss) * share, (1,))}
+
+    def _draw_step(self, iteration: int, views: int) -> StepRays:
+        """The random numbers of a step."""
+        stage, rng = self.plan.stages[self.stage], np.random.default_rng((self.seed, iteration))
+        chosen = self.batches.choose_views(views or stage.views, rng)
+        corner = self.batches.draw_corners(stage.shrink, chosen, stage.tiles, rng)
+        return StepRays(chosen, corner, self._background(rng), rng)
+
+    def step_state(self) -> dict[str, Any]:
+        """The nodes and the listed cells."""
+        nodes = self.field.nodes
+        return {"stage": self.stage, "has_gains": self.has_gains, "nodes": nodes, "cells": self._cells}
+
+    def take_step_state(self, state: dict[str, Any]) -> None:
+        """Nodes and cells of the same problem in another process; the next reals have a value for each node."""
+        self.stage, self.has_gains, self._cells = state["stage"], state["has_gains"], state["cells"]
+        grid, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
+        rows = math.prod(grid[0]) if state["nodes"] is None else dr.width(state["nodes"]) + 1
+        values = dr.zeros(mi.Float, rows), dr.zeros(mi.Float, rows * row_width(basis_size(degree)))
+        self.field = SphericalGrid(*grid, degree, *values, state["nodes"], levels=self.plan.levels, space=self.batches.space)
 
     def _background(self, rng: np.random.Generator) -> np.ndarray | None:
         random = self.plan.random_background and self.batches.channels == 4
@@ -166,7 +224,11 @@ class RadianceProblem(SparseProblem):
         return sample_depth_rays(points, self.batches.origins[chosen], self.box, self.plan.levels, voxel, rng)
 
     def batch_loss_and_gradient(
-        self, batch: RayBatch, background: np.ndarray | None = None, depth_rays: DepthRays | None = None
+        self,
+        batch: RayBatch,
+        background: np.ndarray | None = None,
+        depth_rays: DepthRays | None = None,
+        share: float = 1.0,
     ) -> tuple[mi.Float, dict[str, mi.Float]]:
         """Squared error of each ray of a batch, weighted, mean over rgb, and derivatives of the mean over rays, by parameter.
 
@@ -174,6 +236,7 @@ class RadianceProblem(SparseProblem):
             batch: rays and their target colours.
             background: put behind all photographs (3,); None keeps each photograph's own background.
             depth_rays: points of the same views; only the derivatives contain the plan's weight times their energy.
+            share: of the batch in a step, a factor on the derivatives of rays.
         """
         source = bake(self.field, self._cells, batch.origins, batch.slot, slope=True)
         model, count = make_model(self.field, self.plan.stop), dr.width(batch.slot)
@@ -184,11 +247,11 @@ class RadianceProblem(SparseProblem):
         backdrop = backdrop if self.sky is None else self.sky.eval(batch.rays.d)
         gain = self.exposure.gains(batch.view) if self.has_gains else None
         errors = compare_rays(batch, rendered.colour, rendered.T, backdrop, self.scale, gain)
-        by_radiance, by_T, loss = errors.by_radiance, errors.by_T, errors.loss
+        by_radiance, by_T, loss = errors.by_radiance * share, errors.by_T * share, errors.loss
         if self.plan.beta > 0:
             # Bounded: at 0 and 1 the prior is satisfied, and its derivative is infinite.
             T = dr.clip(rendered.T, 0.01, 0.99)
-            by_T += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
+            by_T += self.plan.beta * share / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
         dr.eval(rendered, by_radiance, by_T, loss)
         vjp_rays(self._cells, source, model, rendered, RayGradient(by_radiance, by_T), near=self.near)
         if depth_rays is not None:
@@ -199,7 +262,7 @@ class RadianceProblem(SparseProblem):
         if self.sky is not None:
             gradient["sky"] = self.sky.texel_gradient(batch.rays.d, by_radiance * rendered.T)
         if self.exposure is not None:
-            by_log_gain = errors.by_colour * errors.colour if self.has_gains else mi.Color3f(0)
+            by_log_gain = errors.by_colour * errors.colour * share if self.has_gains else mi.Color3f(0)
             gradient["exposure"] = self.exposure.gradient(batch.view, by_log_gain)
         return loss, gradient
 

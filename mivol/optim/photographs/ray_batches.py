@@ -216,12 +216,19 @@ class RayBatches:
 
     def draw_tiles(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
         """Draw ``tiles`` tiles of each of some views; rays of a view are adjacent."""
-        level = self.levels[shrink]
-        corners = level.sizes[views] - TILE + 1
+        return self.make_tiles(shrink, views, self.draw_corners(shrink, views, tiles, rng))
+
+    def draw_corners(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw the first pixels (column, row) of tiles of each of some views: (views, tiles, 2)."""
+        corners = self.levels[shrink].sizes[views] - TILE + 1
         corner = (rng.random((len(views), tiles, 2)) * corners[:, None]).astype(np.uint32)
         # Rays of a view follow its rows: neighbours in the image are close in time.
         order = np.argsort(corner[..., 1] // 32 * 4096 + corner[..., 0], axis=1)
-        corner = np.take_along_axis(corner, order[..., None], axis=1)
+        return np.take_along_axis(corner, order[..., None], axis=1)
+
+    def make_tiles(self, shrink: int, views: np.ndarray, corner: np.ndarray) -> RayBatch:
+        """Rays of the tiles of :meth:`draw_corners`."""
+        tiles = corner.shape[1]
         lane = dr.arange(mi.UInt32, len(views) * tiles * TILE * TILE)
         tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
         first = [dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(corner[..., a]).reshape(-1)), tile) for a in range(2)]

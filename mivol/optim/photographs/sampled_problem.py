@@ -15,7 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -32,7 +32,7 @@ from mivol.optim.loop import Course
 from mivol.optim.photographs.photo_colours import SCALES, compare_rays
 from mivol.optim.photographs.radiance_plan import allocated_bytes, place_grid
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
-from mivol.optim.problem import DifferentiableProblem, Reals
+from mivol.optim.problem import Divide, DividedProblem, Reals, to_tensors
 from mivol.transport.line_integrals.radiance_field import RayGradient
 from mivol.transport.line_integrals.sampled_rays import SampledModel, render_samples, vjp_samples
 from mivol.transport.traversal.occupancy import Occupancy, list_cells
@@ -125,8 +125,15 @@ PRESETS: dict[str, dict[str, SampledPlan]] = {HashField.kind: HASH_GRIDS, NerfFi
 """Presets by the kind of the field."""
 
 
+MOST_PARTS = 8
+"""Parts of a step at most: each launches kernels of its own."""
+
+SAMPLES = "statistics/samples"
+"""Result of a part: number of its samples."""
+
+
 @dataclasses.dataclass
-class SampledProblem(DifferentiableProblem):
+class SampledProblem(DividedProblem):
     """A field that is known at points in a box, with photographs.
 
     Attributes:
@@ -135,6 +142,7 @@ class SampledProblem(DifferentiableProblem):
         plan: plan of the fit.
         seed: root of the first values, rays and samples.
         safe_point: not called; a step is short.
+        divide: computes the views of a step elsewhere; None: in this process.
         field: present field.
         occupancy: map of the cells that rays sample.
         sky: None; what photographs show behind the box is known.
@@ -145,6 +153,7 @@ class SampledProblem(DifferentiableProblem):
     plan: SampledPlan
     seed: int = 0
     safe_point: Callable[[], None] = lambda: None
+    divide: Divide | None = None
     field: SampledField = dataclasses.field(init=False)
     occupancy: Occupancy = dataclasses.field(init=False)
     sky: ClassVar[None] = None
@@ -184,29 +193,60 @@ class SampledProblem(DifferentiableProblem):
         Noise: from the choice of pixels and of samples.
         """
         self.set_reals(reals)
+        if iteration % self.plan.refresh_every == 0:
+            self.refresh_occupancy(iteration, np.random.default_rng((self.seed, iteration)))
+        count = min(views or self.plan.views, len(self.batches.origins))
+        tiles = max(1, round(self.plan.samples / self.samples_a_ray / (TILE**2 * count)))
+        if self.divide is None:
+            found = self.compute_part(reals, iteration, count, tiles, 0, 1)
+        else:
+            parts = min(count, MOST_PARTS)
+            found = to_tensors(self.divide(self, reals, [(iteration, count, tiles, n, parts) for n in range(parts)]))
+        self._follow_samples(float(found.pop(SAMPLES).array[0]) / (count * tiles * TILE**2))
+        loss, decay = found.pop("loss").array, self.plan.weight_decay
+        weights = [name for name in reals if name not in self.field.features]
+        for name in weights:
+            found[name] = mi.TensorXf(dr.fma(decay, reals[name].array, found[name].array), reals[name].shape)
+        return loss, found
+
+    def compute_part(self, reals: Reals, iteration: int, views: int, tiles: int, number: int, parts: int) -> Reals:
+        """Loss, derivatives and number of samples of some views of a step, as shares of the step's mean.
+
+        Args:
+            reals: of the step.
+            iteration: selects the random numbers.
+            views, tiles: views of the step, and tiles of each.
+            number, parts: of the part, and of all parts; the views are dealt to the parts in turn.
+        """
+        self.set_reals(reals)
         rng = np.random.default_rng((self.seed, iteration))
         if iteration % self.plan.refresh_every == 0:
-            self.refresh_occupancy(iteration, rng)
-        chosen = self.batches.choose_views(views or self.plan.views, rng)
-        tiles = max(1, round(self.plan.samples / self.samples_a_ray / (TILE**2 * len(chosen))))
-        batch = self.batches.draw_tiles(1, chosen, tiles, rng)
+            rng.random()  # drew the points of the map
+        chosen = self.batches.choose_views(views, rng)
+        corner = self.batches.draw_corners(1, chosen, tiles, rng)
+        batch = self.batches.make_tiles(1, chosen[number::parts], corner[number::parts])
+        share = len(chosen[number::parts]) / len(chosen)
         dr.eval(batch.rays)
         rendered = render_samples(self.model, batch.rays, float(rng.random()))
         random = self.plan.random_background and self.batches.channels == 4
         backdrop = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in rng.random(3))) if random else batch.background
         errors = compare_rays(batch, rendered.colour, rendered.T, backdrop, self.scale)
         dr.eval(errors)
-        slopes = vjp_samples(rendered, RayGradient(errors.by_radiance, errors.by_T))
+        slopes = vjp_samples(rendered, RayGradient(errors.by_radiance * share, errors.by_T * share))
         kept = 0 if rendered.samples is None else rendered.samples.size
-        self._follow_samples(kept / dr.width(batch.slot))
-        decay = self.plan.weight_decay
-        gradient = {}
+        found = {"loss": mi.TensorXf(dr.mean(errors.loss) * share, (1,)), SAMPLES: mi.TensorXf(mi.Float(kept), (1,))}
         for name, value in reals.items():
-            slope = slopes.get(name, dr.zeros(mi.Float, dr.width(value.array)))
-            if name not in self.field.features:
-                slope = dr.fma(decay, value.array, slope)
-            gradient[name] = mi.TensorXf(slope, value.shape)
-        return dr.mean(errors.loss), gradient
+            found[name] = mi.TensorXf(slopes.get(name, dr.zeros(mi.Float, dr.width(value.array))), value.shape)
+        return found
+
+    def step_state(self) -> dict[str, Any]:
+        """The map of occupied cells."""
+        return {"occupancy": self.occupancy}
+
+    def take_step_state(self, state: dict[str, Any]) -> None:
+        """The map of the same problem in another process."""
+        self.occupancy = state["occupancy"]
+        self._list_cells()
 
     def _follow_samples(self, samples_a_ray: float) -> None:
         """Follow the mean number of samples of a ray; a step changes it by at most a factor of 2."""
