@@ -644,6 +644,8 @@ def optimize(arguments: argparse.Namespace) -> None:
         settings, base = load_experiment(arguments.experiment, arguments)
     folder = arguments.output or Path(settings.output)
     with distribute_fit(arguments, settings) as distribution:
+        if distribution is not None:
+            progress.note = distribution.describe
         given = arguments.resume, progress, arguments.command, notes, distribution
         print(run_experiment(RunContext(settings, base, folder, *given)))
 

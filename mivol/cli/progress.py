@@ -7,7 +7,7 @@ Log messages of a fit (a refined grid, noise in the loss) are printed at once.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
 from rich.console import Console
@@ -20,7 +20,13 @@ T = TypeVar("T")
 
 
 class TerminalProgress:
-    """A :class:`mivol.experiments.fit_kind.Progress` on the error output."""
+    """A :class:`mivol.experiments.fit_kind.Progress` on the error output.
+
+    Attributes:
+        note: clause behind the errors of a fit, as the workers of a cluster.
+    """
+
+    note: Callable[[], str] = staticmethod(lambda: "")
 
     def say(self, lines: Sequence[str]) -> None:
         """Print lines."""
@@ -44,19 +50,20 @@ class TerminalProgress:
 
     def watch(self, iterations: int) -> Display:
         """Return a progress bar of the iterations, with the newest loss and errors."""
-        return Display(iterations)
+        return Display(iterations, self.note)
 
 
-def figures(fit: Fit) -> str:
-    """The newest loss and errors in words."""
+def figures(fit: Fit, note: str = "") -> str:
+    """The newest loss and errors in words, and a note."""
     words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in fit.latest_errors().items()]
-    return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words])
+    return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words, *filter(None, [note])])
 
 
 class Display:
     """Context manager to call after each iteration."""
 
-    def __init__(self, iterations: int) -> None:
+    def __init__(self, iterations: int, note: Callable[[], str] = lambda: "") -> None:
+        self.note = note
         self.console = Console(stderr=True)
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         self.bar = Progress(*columns, console=self.console, auto_refresh=False, disable=not self.console.is_terminal)
@@ -73,12 +80,14 @@ class Display:
 
     def __exit__(self, *exception: object) -> None:
         if self.newest is not None:  # measured once more since the last call
-            self.bar.update(self.task, completed=self.newest.next_iteration, description=figures(self.newest))
+            self.bar.update(self.task, completed=self.newest.next_iteration, description=figures(self.newest, self.note()))
         self.bar.refresh()
         self.bar.stop()
         if self.newest is not None and not self.console.is_terminal:
             fit = self.newest
-            self.console.print(f"{fit.next_iteration} iterations in {fit.seconds:.1f} s: {figures(fit)}", soft_wrap=True)
+            self.console.print(
+                f"{fit.next_iteration} iterations in {fit.seconds:.1f} s: {figures(fit, self.note())}", soft_wrap=True
+            )
 
     def __call__(self, fit: Fit) -> None:
         """Draw at most ten times a second; print new log messages above the bar."""
@@ -86,11 +95,13 @@ class Display:
         for line in fit.log[self.logged :]:
             self.console.print(line, soft_wrap=True, highlight=False, markup=False)
         self.logged = len(fit.log)
-        self.bar.update(self.task, completed=fit.next_iteration, description=figures(fit))
+        self.bar.update(self.task, completed=fit.next_iteration, description=figures(fit, self.note()))
         if self.console.is_terminal:
             if time.monotonic() - self.drawn > 0.1:
                 self.bar.refresh()
                 self.drawn = time.monotonic()
         elif len(fit.evaluations) > self.printed:
-            self.console.print(f"iteration {fit.next_iteration} of {self.iterations}: {figures(fit)}", soft_wrap=True)
+            self.console.print(
+                f"iteration {fit.next_iteration} of {self.iterations}: {figures(fit, self.note())}", soft_wrap=True
+            )
             self.printed = len(fit.evaluations)

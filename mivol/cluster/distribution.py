@@ -17,6 +17,7 @@ from mivol.experiments.fit_kind import FitKind
 from mivol.experiments.scan_fit import ScanFit
 from mivol.experiments.scene_fit import SceneFit
 from mivol.optim.problem import Problem
+from mivol.report.record import Table
 from mivol.validate.reference import Complete
 
 
@@ -55,6 +56,14 @@ class ClusterDistribution:
         key = getattr(kind.settings.truth, "key", "")
         values = {} if kind.truth is None else {key: kind.truth}
         return complete_on(self.pool, share_scene(self.pool, make_source(kind, values), kind.loaded), self.show)
+
+    def describe(self) -> str:
+        """The workers and the time of a step, in a line; only the workers before the first step."""
+        return ", ".join([self.pool.describe(), *([self.times.describe()] if self.times.steps else [])])
+
+    def tables(self) -> list[Table]:
+        """The workers and what they did."""
+        return [self.pool.tabulate()]
 
     def notes(self) -> list[str]:
         """Where the fit ran, and what was lost."""

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from mivol.cluster.address import BATCH_SYSTEMS, ClusterSettings
 from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
 from mivol.errors import MivolError
+from mivol.report.record import Table
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -66,6 +67,7 @@ class _Worker:
     held: set[str] = field(default_factory=set)
     sending: set[str] = field(default_factory=set)
     units: dict[int, Unit] = field(default_factory=dict)
+    done: int = 0
 
 
 class Pool:
@@ -76,6 +78,7 @@ class Pool:
         failures: reasons why jobs could not be submitted; grows while they start.
         lost: number of lost workers.
         repeated: number of units that were sent again.
+        gone: lost workers.
         sent: bytes of inputs sent so far, over all workers.
     """
 
@@ -90,6 +93,7 @@ class Pool:
         self.client, self.settings, self.variant, self.say, self.failures = client, settings, variant, say, failures
         self.workers: dict[str, _Worker] = {}
         self.lost = self.repeated = self.sent = 0
+        self.gone: list[_Worker] = []
         self._inputs: dict[str, tuple[Any, int]] = {}
         self._losses: Counter[int] = Counter()
         self._refused: set[str] = set()
@@ -133,10 +137,11 @@ class Pool:
         )
 
     def describe_dashboard(self) -> str:
-        """Where Dask shows its workers, in words."""
+        """Where Dask shows its workers, in words: its dashboard, or plain pages if the dashboard's library is missing."""
+        link = self.client.dashboard_link
         if importlib.util.find_spec("bokeh") is None:
-            return "Dask's dashboard needs pip install bokeh"
-        return f"Dask's dashboard: {self.client.dashboard_link}"
+            return f"Dask's pages: {link.removesuffix('/status')}/info/main/workers.html (dashboard: pip install bokeh)"
+        return f"Dask's dashboard: {link}"
 
     def _look(self) -> None:
         """Compare the scheduler's list of workers with the pool's."""
@@ -223,6 +228,7 @@ class Pool:
     def _lose(self, address: str) -> None:
         """Forget a lost worker, and take its units back."""
         worker = self.workers.pop(address)
+        self.gone.append(worker)
         self.lost += 1
         for number, unit in worker.units.items():
             self._losses[number] += 1
@@ -362,6 +368,7 @@ class Pool:
                     address, content = content
                     if address in self.workers:
                         self.workers[address].units.pop(name, None)
+                        self.workers[address].done += 1
                 self._take(kind, name, content)
                 found.append((kind, name, content))
                 news = self._news.get_nowait()
@@ -409,6 +416,16 @@ class Pool:
 
         for worker in self.workers.values():
             self.client.loop.add_callback(ask, worker)
+
+    def tabulate(self) -> Table:
+        """Table of all workers that took part, for a page."""
+        present = [(worker, "") for worker in self.workers.values()]
+        rows = [
+            (worker.facts.host, f"{worker.facts.pid}", f"{worker.done}", state)
+            for worker, state in [*present, *((worker, "lost") for worker in self.gone)]
+        ]
+        title = f"Workers of the cluster: {self.describe()}"
+        return Table(title=title, head=("host", "process", "finished pieces of work", ""), rows=tuple(rows))
 
     def describe_losses(self) -> list[str]:
         """A sentence about lost workers and repeated work, for the record; none without a loss."""

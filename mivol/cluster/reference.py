@@ -21,6 +21,7 @@ from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.workplace import Workplace
 from mivol.experiments.render import Passes, choose_integrator, render_in_turn
 from mivol.optim.interrupt import InterruptGuard
+from mivol.report.sweep_page import SweepRow
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.validate.reference import PATHS_PER_PASS, Complete, PreparedReference, ReferenceResult, RenderSetup
@@ -32,6 +33,9 @@ AHEAD = 4
 """Units of a view that may wait for an earlier one, as a multiple of the workers."""
 
 Show = Callable[[str], None]
+
+Page = Callable[[list[SweepRow], bool], None]
+"""Receives the views, and whether some are under way."""
 
 
 def render_batches(
@@ -75,6 +79,14 @@ class _View:
         rows, columns, _ = self.reference.setup.shape
         return rows * columns * self.reference.setup.pass_spp
 
+    def row(self, status: str) -> SweepRow:
+        """The view as a row of a page."""
+        reference = self.reference
+        done, wanted = reference.run.moments.n, reference.count_batches()
+        samples = {} if reference.finished is not None else {"samples a pixel": float(done * reference.setup.pass_spp)}
+        progress = f"{done} of {wanted} batches" if status != "finished" else ""
+        return SweepRow(reference.path.name, {}, status, progress, samples)
+
     def take(self, numbers: range, images: list[np.ndarray], seconds: float) -> None:
         """Add images in the order of their numbers; those beyond the goal are dropped."""
         self.waiting |= {n: (image, seconds / len(images)) for n, image in zip(numbers, images, strict=True)}
@@ -82,18 +94,21 @@ class _View:
             self.reference.add(*batch)
 
 
-def complete_on(pool: Pool, scene: str, show: Show = lambda line: None) -> Complete:
+def complete_on(pool: Pool, scene: str, show: Show = lambda line: None, page: Page = lambda rows, is_running: None) -> Complete:
     """Return the function that renders prepared references on workers.
 
     Args:
         pool: workers.
         scene: content hash of the scene, from :func:`mivol.cluster.packages.share_scene`.
         show: receives the progress of all workers in a line.
+        page: receives the views from time to time, and at the end.
     """
-    return partial(_complete, pool, scene, show)
+    return partial(_complete, pool, scene, show, page)
 
 
-def _complete(pool: Pool, scene: str, show: Show, prepared: Iterator[PreparedReference]) -> Iterator[ReferenceResult]:
+def _complete(
+    pool: Pool, scene: str, show: Show, page: Page, prepared: Iterator[PreparedReference]
+) -> Iterator[ReferenceResult]:
     queue = _Queue(pool, scene, iter(prepared))
     try:
         with InterruptGuard() as stop:
@@ -103,11 +118,15 @@ def _complete(pool: Pool, scene: str, show: Show, prepared: Iterator[PreparedRef
                     (number, numbers), (images, seconds) = next(stream)
                     queue.take(number, numbers, images, seconds)
                     show(queue.describe())
+                    page([*queue.finished, *queue.rows()], True)
                 queue.views.remove(view)
-                yield view.reference.finish()
+                result = view.reference.finish()
+                queue.finished.append(view.row("finished"))
+                yield result
     finally:
         for view in queue.views:
             view.reference.save()
+        page([*queue.finished, *queue.rows("stopped")], False)
 
 
 class _Queue:
@@ -116,6 +135,7 @@ class _Queue:
     def __init__(self, pool: Pool, scene: str, prepared: Iterator[PreparedReference]) -> None:
         self.pool, self.scene, self.prepared = pool, scene, prepared
         self.views: list[_View] = []
+        self.finished: list[SweepRow] = []
         self.count, self.is_all = 0, False
 
     def first(self) -> _View | None:
@@ -154,6 +174,10 @@ class _Queue:
         view = next((view for view in self.views if view.number == number), None)
         if view is not None:
             view.take(numbers, images, seconds)
+
+    def rows(self, status: str = "running") -> list[SweepRow]:
+        """Views under way as rows of a page."""
+        return [view.row(status) for view in self.views]
 
     def describe(self) -> str:
         """Progress in a line."""

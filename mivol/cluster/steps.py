@@ -127,7 +127,7 @@ class StepTimes:
     def describe(self) -> str:
         """Mean time of a step in words."""
         wall, computing = (1e3 * value / max(self.steps, 1) for value in (self.wall, self.computing))
-        return f"a step takes {wall:.3g} ms, of which the slowest worker computes {computing:.3g} ms"
+        return f"a step takes {wall:.3g} ms, {computing:.3g} of them on the slowest worker"
 
 
 class Steps:

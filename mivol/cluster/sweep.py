@@ -9,10 +9,11 @@ are read where the worker runs.
 from __future__ import annotations
 
 import shutil
+import textwrap
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,16 +25,20 @@ from mivol.errors import MivolError
 from mivol.experiments.fit_kind import RunContext
 from mivol.experiments.kinds import run_experiment
 from mivol.experiments.run_folder import EARLIER, KEPT
-from mivol.experiments.sweep import Execute, Sweep, SweepRun, is_fault_of_disk
+from mivol.experiments.sweep import Execute, Sweep, SweepRun, Tell, is_fault_of_disk
 from mivol.files.atomic import disk_faults, lock_folder
 from mivol.optim.interrupt import Interrupted, InterruptGuard
 from mivol.optim.loop import Fit
 from mivol.report.record import RECORD
+from mivol.report.sweep_page import SweepNews
 
 T = TypeVar("T")
 
 SECONDS_BETWEEN_LINES = 1.0
 """Interval between two lines about the progress of all workers."""
+
+LONGEST_LINE = 40
+"""Characters of the progress of a run among that of others."""
 
 SECONDS_TO_STOP = 30.0
 """Time for the workers to return their checkpoints after Ctrl-C."""
@@ -49,7 +54,7 @@ class WorkerProgress:
 
     def say(self, lines: Sequence[str]) -> None:
         """Keep the last line."""
-        self.place.says = lines[-1] if lines else self.place.says
+        self.place.says = textwrap.shorten(lines[-1], LONGEST_LINE, placeholder="...") if lines else self.place.says
 
     def track(self, items: Sequence[T], label: str) -> Iterator[T]:
         """Yield the items, and keep their number."""
@@ -158,9 +163,9 @@ def run_on(pool: Pool, show: Callable[[str], None] = lambda line: None) -> Execu
         show: receives the progress of all workers in a line.
     """
 
-    def execute(sweep: Sweep, runs: Iterator[SweepRun]) -> Iterator[tuple[SweepRun, str]]:
+    def execute(sweep: Sweep, runs: Iterator[SweepRun], tell: Tell) -> Iterator[tuple[SweepRun, str]]:
         with InterruptGuard() as stop:
-            yield from _SweepOnPool(pool, sweep, show, stop).execute(runs)
+            yield from _SweepOnPool(pool, sweep, show, stop, tell).execute(runs)
 
     return execute
 
@@ -168,8 +173,8 @@ def run_on(pool: Pool, show: Callable[[str], None] = lambda line: None) -> Execu
 class _SweepOnPool:
     """A sweep under way."""
 
-    def __init__(self, pool: Pool, sweep: Sweep, show: Callable[[str], None], stop: InterruptGuard) -> None:
-        self.pool, self.sweep, self.show, self.stop = pool, sweep, show, stop
+    def __init__(self, pool: Pool, sweep: Sweep, show: Callable[[str], None], stop: InterruptGuard, tell: Tell) -> None:
+        self.pool, self.sweep, self.show, self.stop, self.tell = pool, sweep, show, stop, tell
         self.shown = self.stopped_at = 0.0
         self.ended = 0
 
@@ -188,6 +193,7 @@ class _SweepOnPool:
             if outcome != REFUSED:
                 write_run(self.sweep.folder / name, files, continues)
             self.ended += 1
+            self.tell(self._news({}))
             if outcome != INTERRUPTED:
                 yield run, reason
         if self.stopped_at:
@@ -213,9 +219,14 @@ class _SweepOnPool:
             raise Interrupted
         if now - self.shown > SECONDS_BETWEEN_LINES:
             self.shown = now
-            with suppress(OSError):
-                lines = [f"{name}: {line}" for name, line in self.pool.collect_progress(0.2).items() if line]
-                self.show(f"{self.pool.describe()}, {self.ended} runs ended; " + ", ".join(lines))
+            progress = self.pool.collect_progress(0.2)
+            lines = [f"{name}: {line}" for name, line in progress.items() if line]
+            self.show(f"{self.pool.describe()}, {self.ended} runs ended; " + ", ".join(lines))
+            self.tell(self._news(progress))
+
+    def _news(self, progress: dict[str, str]) -> SweepNews:
+        under_way = {unit.key: "" for worker in self.pool.workers.values() for unit in worker.units.values()}
+        return SweepNews(under_way | progress, tuple(self.pool.describe_losses()), self.pool.tabulate(), is_running=True)
 
 
 def has_absolute_paths(settings: config.Experiment) -> bool:

@@ -14,7 +14,7 @@ from mivol.experiments.run_folder import BestFiles, BestIterate, RunFolder
 from mivol.optim.loop import Course, Fit, Measure
 from mivol.optim.optimizer import Optimizer
 from mivol.optim.problem import Problem
-from mivol.report.record import RunRecord
+from mivol.report.record import RunRecord, Table
 from mivol.scene.explain import Explanation
 from mivol.validate.reference import Complete
 
@@ -61,8 +61,14 @@ class Distribution(Protocol):
     def complete_references(self, kind: FitKind) -> Complete:
         """Return the function that renders the references of a fit."""
 
+    def describe(self) -> str:
+        """Return the workers and their speed in a line."""
+
     def notes(self) -> list[str]:
         """Return sentences about the workers, for the record, at the end of the fit."""
+
+    def tables(self) -> list[Table]:
+        """Return tables about the workers, for the record, at the end of the run."""
 
 
 @dataclass(frozen=True)

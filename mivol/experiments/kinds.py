@@ -71,6 +71,7 @@ def run_experiment(context: RunContext) -> Path:
             run.record.notes += best.says() + ([] if workers is None else workers.notes())
         with run.stage(kind.stages.write):
             kind.write_outputs(fit, run, best)
+            run.record.tables += [] if workers is None else workers.tables()
     page = write_page(context.folder)
     context.progress.say([*best.says(), run.summary()])
     return page

@@ -13,6 +13,7 @@ import io
 import itertools
 import json
 import re
+import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -29,7 +30,7 @@ from mivol.experiments.kinds import run_experiment
 from mivol.experiments.run_folder import CHECKPOINT
 from mivol.files.atomic import disk_faults, lock_folder, write_whole_text
 from mivol.report.record import RECORD, find_quantity, read_record
-from mivol.report.sweep_page import SweepRow, write_sweep_page
+from mivol.report.sweep_page import SweepNews, SweepRow, write_sweep_page
 
 STATE, TABLE = "sweep.json", "sweep.csv"
 
@@ -195,16 +196,23 @@ def _plain(value: Any) -> str:
 
 # -- Runs --------------------------------------------------------------------------------------------------------------------
 
-Execute = Callable[[Sweep, Iterator[SweepRun]], Iterator[tuple[SweepRun, str]]]
+Tell = Callable[[SweepNews], None]
+"""Receives how the work proceeds."""
+
+Execute = Callable[[Sweep, Iterator[SweepRun], Tell], Iterator[tuple[SweepRun, str]]]
 """Runs combinations, and yields each as it ends, with the reason of a refusal or ""."""
+
+SECONDS_BETWEEN_PAGES = 5.0
+"""Interval between two pages while no run ends."""
 
 
 def run_in_turn(progress: Progress) -> Execute:
     """The function that runs combinations one after another in this process."""
 
-    def execute(sweep: Sweep, runs: Iterator[SweepRun]) -> Iterator[tuple[SweepRun, str]]:
+    def execute(sweep: Sweep, runs: Iterator[SweepRun], tell: Tell) -> Iterator[tuple[SweepRun, str]]:
         for run in runs:
             progress.say([f"run {run.name}"])
+            tell(SweepNews({run.name: ""}, is_running=True))
             try:
                 run_experiment(sweep.context(run, progress))
             except MivolError as error:
@@ -226,7 +234,7 @@ class SweepFolder:
     """The folder of a sweep: which runs have ended, the table and the page."""
 
     def __init__(self, sweep: Sweep) -> None:
-        self.sweep = sweep
+        self.sweep, self.news, self.written = sweep, SweepNews(), 0.0
         self.state: dict[str, dict[str, str]] = {}
         with suppress(OSError, ValueError, TypeError, AttributeError):
             self.state = dict(json.loads((sweep.folder / STATE).read_text(encoding="utf-8"))["runs"])
@@ -246,6 +254,17 @@ class SweepFolder:
         write_whole_text(self.sweep.folder / STATE, json.dumps({"runs": kept}, indent=1, ensure_ascii=False) + "\n")
         self.write()
 
+    def tell(self, news: SweepNews) -> None:
+        """Note how the work proceeds, and write the page from time to time."""
+        self.news = news
+        if time.monotonic() - self.written > SECONDS_BETWEEN_PAGES:
+            self.write()
+
+    def end(self) -> Path:
+        """Write the page of a sweep that is not under way any more."""
+        self.news = replace(self.news, progress={}, is_running=False)
+        return self.write()
+
     def rows(self) -> list[SweepRow]:
         """One row a combination."""
         return [self._row(run) for run in self.sweep.runs]
@@ -253,7 +272,8 @@ class SweepFolder:
     def _row(self, run: SweepRun) -> SweepRow:
         row = SweepRow(run.name, {key: _plain(value) for key, value in run.values.items()})
         if not self.has(run):
-            return row
+            progress = self.news.progress.get(run.name)
+            return row if progress is None else replace(row, status="running", reason=progress)
         if refusal := self.state[run.name]["refused"]:
             return replace(row, status="refused", reason=refusal)
         record = read_record(self.sweep.folder / run.name)
@@ -262,6 +282,7 @@ class SweepFolder:
 
     def write(self) -> Path:
         """Write ``sweep.csv`` and ``sweep.html``; return the page."""
+        self.written = time.monotonic()
         rows = self.rows()
         names = list(dict.fromkeys(name for row in rows for name in row.results))
         text = io.StringIO()
@@ -271,7 +292,7 @@ class SweepFolder:
             results = [row.results.get(name, "") for name in names]
             table.writerow([row.name, *row.values.values(), row.status, *results, row.reason])
         write_whole_text(self.sweep.folder / TABLE, text.getvalue())
-        return write_sweep_page(self.sweep.folder, self.sweep.title, self.sweep.keys, rows)
+        return write_sweep_page(self.sweep.folder, self.sweep.title, self.sweep.keys, rows, self.news)
 
 
 def run_sweep(sweep: Sweep, execute: Execute, say: Callable[[list[str]], None] = lambda lines: None) -> tuple[Path, int]:
@@ -296,9 +317,14 @@ def run_sweep(sweep: Sweep, execute: Execute, say: Callable[[list[str]], None] =
         missing = [run for run in sweep.runs if not state.has(run)]
         kept = len(sweep.runs) - len(missing)
         say([f"sweep of {len(sweep.runs)} runs" + (f", {kept} of them finished before" if kept else "")])
-        for run, refusal in execute(sweep, iter(missing)):
-            state.note(run, refusal)
-            ended = sum(map(state.has, sweep.runs))
-            say([f"{ended} of {len(sweep.runs)} runs: {run.name} " + (f"refused: {refusal}" if refusal else "finished")])
-        page = state.write()
+        try:
+            for run, refusal in execute(sweep, iter(missing), state.tell):
+                state.note(run, refusal)
+                ended = sum(map(state.has, sweep.runs))
+                say([f"{ended} of {len(sweep.runs)} runs: {run.name} " + (f"refused: {refusal}" if refusal else "finished")])
+        except BaseException:
+            with suppress(MivolError):
+                state.end()
+            raise
+        page = state.end()
         return page, sum(row.status == "refused" for row in state.rows())

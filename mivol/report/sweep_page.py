@@ -1,7 +1,8 @@
 """The page of a sweep: a table of all runs with links to their pages, and each result against the swept settings.
 
 Conventions. A result is drawn against each setting with at least two numbers as values. A point is a run; the line is the mean
-over the other settings. The page is one file and loads nothing.
+over the other settings. The page is one file and loads nothing; while runs are under way, a browser reads it again every few
+seconds. The views of a reference on a cluster have the same page, a view in place of a run.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from matplotlib.figure import Figure
 
 from mivol.files import write_whole_text
 from mivol.report.figures import CSS, SERIES, STYLE, empty_figure, inline_svg
-from mivol.report.record import QUANTITIES, Quantity
+from mivol.report.record import QUANTITIES, Quantity, Table
 
 PAGE = "sweep.html"
 
@@ -35,7 +36,7 @@ class SweepRow:
         name: name of its folder.
         values: swept values by setting, as text.
         status: "waiting", "finished", "stopped", "running" or "refused".
-        reason: of a refusal.
+        reason: of a refusal; progress of a running run.
         results: numbers of its record.
         units: unit of each result.
     """
@@ -48,7 +49,26 @@ class SweepRow:
     units: dict[str, str] = field(default_factory=dict)
 
 
-def write_sweep_page(folder: Path, title: str, keys: Sequence[str], rows: Sequence[SweepRow]) -> Path:
+@dataclass(frozen=True)
+class SweepNews:
+    """How the work proceeds: what the page shows beside the runs.
+
+    Attributes:
+        progress: of the runs under way, by name.
+        lines: sentences about workers.
+        workers: table of workers; None without a cluster.
+        is_running: whether work is under way.
+    """
+
+    progress: dict[str, str] = field(default_factory=dict)
+    lines: tuple[str, ...] = ()
+    workers: Table | None = None
+    is_running: bool = False
+
+
+def write_sweep_page(
+    folder: Path, title: str, keys: Sequence[str], rows: Sequence[SweepRow], news: SweepNews | None = None, name: str = PAGE
+) -> Path:
     """Write ``sweep.html``.
 
     Args:
@@ -56,6 +76,8 @@ def write_sweep_page(folder: Path, title: str, keys: Sequence[str], rows: Sequen
         title: heading.
         keys: swept settings.
         rows: all runs.
+        news: how the work proceeds; None: no work is under way.
+        name: of the page; the noun of its rows is "run" for a sweep, otherwise "view".
 
     Returns:
         Path of the page.
@@ -71,10 +93,11 @@ def write_sweep_page(folder: Path, title: str, keys: Sequence[str], rows: Sequen
     )  # fmt: skip
     facts = {
         "title": title, "keys": keys, "columns": columns, "rows": list(zip(rows, cells, strict=True)), "ended": ended,
-        "figures": draw_results(keys, results, rows, units), "theme": CSS,
+        "figures": draw_results(keys, results, rows, units), "theme": CSS, "news": news or SweepNews(),
+        "noun": "run" if name == PAGE else "view",
     }  # fmt: skip
-    write_whole_text(folder / PAGE, environment.get_template("sweep.html.jinja").render(facts))
-    return folder / PAGE
+    write_whole_text(folder / name, environment.get_template("sweep.html.jinja").render(facts))
+    return folder / name
 
 
 def _describe(name: str, units: dict[str, str]) -> str:

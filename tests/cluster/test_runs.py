@@ -33,6 +33,7 @@ from mivol.experiments.render import render_image
 from mivol.experiments.sweep import plan_sweep, run_in_turn, run_sweep
 from mivol.files import read_volume
 from mivol.report.record import read_record
+from mivol.report.sweep_page import SweepRow
 from mivol.scene.camera_rigs import Ring
 from mivol.scene.load import load_scene
 from mivol.validate.reference import render_photographs
@@ -84,7 +85,12 @@ def test_references_do_not_depend_on_workers(client: object, tmp_path: Path, var
 
     def compare(name: str, pool: Pool, show: Callable[[str], None] = lambda line: None) -> None:
         scene = share_scene(pool, SceneSource(path), loaded)
-        found = render_photographs(loaded, tmp_path / name, complete=complete_on(pool, scene, show), **options)
+        pages: list[tuple[list[SweepRow], bool]] = []
+        complete = complete_on(pool, scene, show, lambda rows, is_running: pages.append((rows, is_running)))
+        found = render_photographs(loaded, tmp_path / name, complete=complete, **options)
+        assert [(row.name, row.status) for row in pages[-1][0]] == [(f"view_{n:03d}.exr", "finished") for n in range(3)]
+        assert [row.results["samples a pixel"] for row in pages[-1][0]] == [4.0 * view.batches for view in found]
+        assert [is_running for _, is_running in pages] == [True] * (len(pages) - 1) + [False]
         for one, other in zip(alone, found, strict=True):
             assert (one.batches, one.identity) == (other.batches, other.identity)
             assert np.array_equal(one.mean, other.mean)

@@ -14,8 +14,8 @@ from tiny_experiment import PHOTOS, refused, run, write_experiment
 from mivol.errors import MivolError
 from mivol.experiments import sweep as module
 from mivol.experiments.sweep import Sweep, SweepRun, parse_over, plan_sweep, run_name, run_sweep
-from mivol.report.record import RunRecord, write_record
-from mivol.report.sweep_page import SweepRow, write_sweep_page
+from mivol.report.record import RunRecord, Table, write_record
+from mivol.report.sweep_page import SweepNews, SweepRow, write_sweep_page
 
 
 def test_values_of_the_command_line() -> None:
@@ -70,7 +70,7 @@ def make_execute(refuse: str = "", stop: str = "") -> tuple[module.Execute, list
     """Runs that only write a record; the names of those that were started."""
     started: list[str] = []
 
-    def execute(sweep: Sweep, runs: Iterator[SweepRun]) -> Iterator[tuple[SweepRun, str]]:
+    def execute(sweep: Sweep, runs: Iterator[SweepRun], tell: module.Tell) -> Iterator[tuple[SweepRun, str]]:
         for one in runs:
             started.append(one.name)
             if one.name == stop:
@@ -111,7 +111,7 @@ def test_two_sweeps_of_one_folder(tmp_path: Path) -> None:
     """The second is refused while the first runs."""
     found = plan_sweep(write_experiment(tmp_path) / "fit.toml", ["seed=0..1"], (), tmp_path / "sweep")
 
-    def execute(sweep: Sweep, runs: Iterator[SweepRun]) -> Iterator[tuple[SweepRun, str]]:
+    def execute(sweep: Sweep, runs: Iterator[SweepRun], tell: module.Tell) -> Iterator[tuple[SweepRun, str]]:
         with pytest.raises(MivolError, match='another run uses the folder "sweep"'):
             run_sweep(found, make_execute()[0])
         yield from ()
@@ -133,6 +133,25 @@ def test_page_of_a_sweep(tmp_path: Path) -> None:
     assert "the &lt;loss&gt; became nan." in text
     assert re.findall(r'aria-label="([^"]*)"', text) == ["nRMSE of the volume against fit.spp"]
     assert not re.search(r"(src|href)=\"https?:", text)
+
+
+def test_page_of_a_sweep_under_way(tmp_path: Path) -> None:
+    """Progress of the runs, lost workers and their table; a browser reads the page again until all runs have ended."""
+    path = write_experiment(tmp_path) / "fit.toml"
+    found, seen = plan_sweep(path, ["fit.spp=1,2"], (), tmp_path / "sweep"), []
+    workers = Table(title="Workers: 1 worker", head=("host", "process"), rows=(("node7", "12"), ("node8", "lost")))
+
+    def execute(sweep: Sweep, runs: Iterator[SweepRun], tell: module.Tell) -> Iterator[tuple[SweepRun, str]]:
+        tell(SweepNews({"spp=1": "3 of 4"}, ("1 worker(s) were lost.",), workers, is_running=True))
+        seen.append((sweep.folder / "sweep.html").read_text())
+        yield next(runs), "too slow."
+
+    page, refused = run_sweep(found, execute)
+    for text in ("3 of 4", "running", "1 worker(s) were lost.", "node8", 'http-equiv="refresh"'):
+        assert text in seen[0]
+    assert 'http-equiv="refresh"' not in page.read_text()
+    assert "node8" in page.read_text()
+    assert refused == 1
 
 
 @pytest.mark.slow
