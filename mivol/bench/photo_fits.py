@@ -26,11 +26,13 @@ from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit
 from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan
 from mivol.experiments.gaussian_fit import make_gaussian_plan, start_gaussians
+from mivol.experiments.octree_fit import adapt_octree_plan, make_octree_plan
 from mivol.experiments.photo_data import add_box, read_photos
 from mivol.experiments.sampled_fit import make_sampled_plan, make_sampled_problem
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.octree_problem import OctreeProblem
 from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.sampled_problem import SampledProblem
@@ -38,6 +40,7 @@ from mivol.photos import Photo, Photos, rectify
 from mivol.validate.metrics import ImageScore, average_scores, score_image
 
 __all__ = [
+    "FittedProblem",
     "PhotoFit",
     "PhotoProblem",
     "PhotoSize",
@@ -49,6 +52,10 @@ __all__ = [
 ]
 
 SCRIPT = CHECKOUT / "scenes" / "still_life" / "photographs.py"
+
+
+PUBLIC = "chair", "fox"
+"""Public data sets of photographs, read from MIVOL_DATA."""
 
 
 def load_photographer() -> ModuleType:
@@ -89,16 +96,16 @@ class PhotoSize(Size):
 
 
 def find_photographs(name: str, size: PhotoSize) -> Path | None:
-    """Folder of a data set: the chair from MIVOL_DATA, or photographs of another scene, rendered if they are missing.
+    """Folder of a data set: chair or fox from MIVOL_DATA, or photographs of another scene, rendered if they are missing.
 
     Args:
-        name: "chair", or a scene of the still life's script.
+        name: a word of ``PUBLIC``, or a scene of the still life's script.
         size: folder, number, edge and samples of rendered photographs.
 
     Returns:
-        The folder; None if the chair is missing, which is printed.
+        The folder; None if a public data set is missing, which is printed.
     """
-    if name == "chair":
+    if name in PUBLIC:
         if (DATA / "multiview" / name).is_dir():
             return DATA / "multiview" / name
         say(f"  {name}: left out, its data is missing (MIVOL_DATA names the folder)")
@@ -108,25 +115,29 @@ def find_photographs(name: str, size: PhotoSize) -> Path | None:
     return folder
 
 
+FittedProblem = RadianceProblem | OctreeProblem | SampledProblem | GaussianProblem
+"""A fit of photographs, by one of the models."""
+
+
 @dataclass(frozen=True)
 class PhotoProblem:
     """A fit before its first step.
 
     Attributes:
-        problem: the fitted grid, hash grid or Gaussians.
+        problem: the fitted model.
         train, judged: photographs to fit and to judge by.
         steps: number of steps.
     """
 
-    problem: RadianceProblem | SampledProblem | GaussianProblem
+    problem: FittedProblem
     train: Photos
     judged: Photos
     steps: int
 
     def show(self, photo: Photo) -> np.ndarray:
-        """Render the view of a pinhole photograph (H, W, 3) over its background."""
-        if isinstance(self.problem, RadianceProblem | SampledProblem):
-            return render_view(self.problem.field, photo.camera, photo.background).image
+        """Render the view of a pinhole photograph (H, W, 3) over its background, or over the fitted sky."""
+        if not isinstance(self.problem, GaussianProblem):
+            return render_view(self.problem.field, photo.camera, self.problem.sky or photo.background).image
         return gaussian_fit.render_gaussians(self.problem, photo.camera, photo.background, self.problem.plan.low_pass)
 
     def score(self, views: Iterable[Photo], metrics: tuple[str, ...] = ("psnr",)) -> dict[str, float]:
@@ -146,7 +157,7 @@ def prepare_fit(
     Args:
         folder: folder of the photographs.
         photos: settings of the table ``photos``, besides the path.
-        settings: the table ``field`` or ``gaussians``.
+        settings: the table ``field`` or ``gaussians``, by its name.
         seed: seed of the fit.
         adapt: changes the plan of a grid.
     """
@@ -158,6 +169,9 @@ def prepare_fit(
         plan = adapt_plan(adapt(make_plan(chosen)), train)
         problem = RadianceProblem(make_batches(plan, train), train.box, plan)
         return PhotoProblem(problem, train, judged, sum(stage.steps for stage in plan.stages))
+    if isinstance(chosen, config.OctreeExperiment):
+        planned, _, batches = adapt_octree_plan(make_octree_plan(chosen), chosen.field.preset, train)
+        return PhotoProblem(OctreeProblem(batches, train.box, planned, seed), train, judged, planned.steps)
     if isinstance(chosen, config.HashExperiment | config.NerfExperiment):
         problem = make_sampled_problem(make_sampled_plan(chosen), train, seed)
         return PhotoProblem(problem, train, judged, problem.plan.steps)
@@ -188,7 +202,7 @@ class PhotoFit:
         return reference_seconds(self.processor, self.rate)
 
 
-def fit_photographs(problem: RadianceProblem | SampledProblem | GaussianProblem, walk_side: int) -> PhotoFit:
+def fit_photographs(problem: FittedProblem, walk_side: int) -> PhotoFit:
     """Take all steps of a fit, and measure them.
 
     Args:

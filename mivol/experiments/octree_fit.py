@@ -28,8 +28,10 @@ from mivol.optim.loop import Fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree
 from mivol.optim.photographs.octree_problem import LeafPlan, OctreePlan, OctreeProblem
-from mivol.optim.photographs.radiance_plan import PRESETS
+from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.strategy import suggest_name
+from mivol.photos import Photos
 from mivol.report.record import PlanLine, Table
 from mivol.validate.metrics import score_image
 
@@ -60,12 +62,8 @@ class OctreeFit(FieldFit):
         }
 
     def plan_fit(self) -> list[PlanLine]:
-        begins = self.plan.grid or PRESETS[self.settings.field.preset]
-        grid = adapt_plan(begins, self.photos)
-        last = grid.stages[-1]
-        leaves = replace(self.plan.leaves, shrink=last.shrink, views=last.views, tiles=last.tiles, matte=grid.matte)
-        self.plan = replace(self.plan, grid=grid if self.plan.grid else None, leaves=leaves)
-        self.batches = make_batches(replace(grid, stages=(*(grid.stages if self.plan.grid else ()), last)), self.photos)
+        self.plan, grid, self.batches = adapt_octree_plan(self.plan, self.settings.field.preset, self.photos)
+        leaves = self.plan.leaves
         steps = PlanLine(
             choice=f"{leaves.steps} steps of the octree, photographs shrunk by {leaves.shrink}",
             reason="field.steps times field.effort; the leaves stay in place",
@@ -152,6 +150,20 @@ class OctreeFit(FieldFit):
 
     def gains(self) -> None:
         return None
+
+
+def adapt_octree_plan(plan: OctreePlan, preset: str, photos: Photos) -> tuple[OctreePlan, RadiancePlan, RayBatches]:
+    """Adapt a plan to the photographs.
+
+    Returns:
+        The plan; the plan of its grid, or of a grid of the preset for a plan that begins at a field; and the photographs.
+    """
+    grid = adapt_plan(plan.grid or PRESETS[preset], photos)
+    last = grid.stages[-1]
+    leaves = replace(plan.leaves, shrink=last.shrink, views=last.views, tiles=last.tiles, matte=grid.matte)
+    stages = (*(grid.stages if plan.grid else ()), last)
+    batches = make_batches(replace(grid, stages=stages), photos)
+    return replace(plan, grid=grid if plan.grid else None, leaves=leaves), grid, batches
 
 
 def tabulate_stages(rows: list[tuple[str, ...]], tree: Octree) -> Table:

@@ -6,6 +6,9 @@ h is the output of the network for the features of x (:mod:`mivol.fields.hash_gr
 bounded, so m is a majorant of every table and every network: a fit never has to search for one. Untrained, h is about 0 and f
 about 0.05 m.
 
+:class:`TabulatedDensity` evaluates f at the nodes of a grid, trilinear between them. Rays then cross cells as in voxels, and
+a step of a fit evaluates the network once a node, not at every point of every path.
+
 Conventions. The parameters are tensors: ``table`` (rows, features), and ``weights_k`` (outputs, inputs) of layer k. The field
 is grey, and 0 outside its box.
 
@@ -25,8 +28,9 @@ from mivol.errors import MivolError
 from mivol.fields.hash_encoding import HashEncoding, HashSizes
 from mivol.fields.networks import Network
 from mivol.fields.protocol import BOUNDED, accumulate_tracked
+from mivol.fields.voxels import Voxels
 
-__all__ = ["HashDensity"]
+__all__ = ["HashDensity", "TabulatedDensity"]
 
 SHIFT = 3.0
 """An untrained field has S(-3) = 0.047 of the bound: most of a box is thin."""
@@ -98,10 +102,13 @@ class HashDensity:
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
         unit = self.encoding.to_unit(p)
-        inside = mi.Bool(active) & dr.all((unit >= 0) & (unit <= 1))
+        return [self.eval_unit(unit, mi.Bool(active) & dr.all((unit >= 0) & (unit <= 1)))]
+
+    def eval_unit(self, unit: mi.Point3f, inside: mi.Bool) -> mi.Float:
+        """Values at points of the unit cube; 0 for the lanes outside."""
         layers = [nn.view(self.tensors[f"weights_{k}"]) for k in range(len(self.sizes.density_network.shapes))]
         raw = Network.eval_lanes(layers, self.encoding.encode(self.tensors["table"].array, unit, inside))[0]
-        return [dr.select(inside, self.largest * dr.rcp(1 + dr.exp(SHIFT - raw)), 0)]
+        return dr.select(inside, self.largest * dr.rcp(1 + dr.exp(SHIFT - raw)), 0)
 
     def accumulate(self, p: mi.Point3f, w: mi.Vector3f, d: list[mi.Float], active: mi.Bool) -> None:
         accumulate_tracked(self, p, w, d, active)
@@ -111,3 +118,39 @@ class HashDensity:
 
     def parameters(self) -> dict[str, Any]:
         return self.tensors
+
+
+MOST_NODES = 1 << 27
+"""Largest number of nodes of a table."""
+
+
+class TabulatedDensity:
+    """A hash grid at the nodes of a grid over its box: voxels that follow the tensors, with their derivatives.
+
+    Args:
+        density: the hash grid.
+        nodes: nodes along the longest edge of the box, at least 1; voxels are nearly cubes.
+
+    Raises:
+        MivolError: another number of nodes, or more than ``MOST_NODES`` in the box.
+    """
+
+    def __init__(self, density: HashDensity, nodes: int) -> None:
+        edges = density.encoding.edges
+        res = [max(1, round(nodes * float(edge / edges.max()))) for edge in edges[::-1]]
+        if nodes < 1 or np.prod(res, dtype=np.float64) > MOST_NODES:
+            raise MivolError(
+                f"mivol_hash was given {nodes} nodes along its longest edge; 1 to {MOST_NODES} nodes in its box are expected."
+            )
+        self.density, self.res = density, tuple(res)
+        self.voxels = Voxels(self.tabulate(), density.to_world, "mivol_hash")
+
+    def tabulate(self) -> mi.TensorXf:
+        """Values at the nodes (Z, Y, X, 1); derivatives by the tensors pass through."""
+        z, y, x = dr.meshgrid(*[(dr.arange(mi.Float, n) + 0.5) / n for n in self.res], indexing="ij")
+        values = self.density.eval_unit(mi.Point3f(x, y, z), mi.Bool(True))
+        return mi.TensorXf(values, (*self.res, 1))
+
+    def refresh(self) -> None:
+        """Evaluate the nodes again, after the tensors were replaced."""
+        self.voxels.texture.set_tensor(self.tabulate())

@@ -12,11 +12,12 @@ from mivol.errors import MivolError
 from mivol.fields.bricks import Bricks
 from mivol.fields.field_files import field_from_props
 from mivol.fields.gaussian_field import GaussianField
-from mivol.fields.hash_density import HashDensity
+from mivol.fields.hash_density import HashDensity, TabulatedDensity
 from mivol.fields.protocol import Field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.transfer import Transfer
 from mivol.fields.voxels import read_voxels
+from mivol.transport.media.octree_extinction import LeafField
 from mivol.transport.traversal.grid_blocks import find_stored_distances
 
 
@@ -292,9 +293,12 @@ class HashVolume(ExtinctionVolume):
         width, layers: neurons of a hidden layer, and hidden layers. Default 16 and 1.
         seed: of the first values. Default 0.
         table, weights_0, weights_1, ...: tensors (rows, features) and (outputs, inputs), in place of the first values.
+        nodes: evaluate the network at the nodes of a grid with this number along the longest edge, trilinear between them.
+            Steps of a fit are then several times as fast. Default: at the points of the paths, without a grid.
         to_world: places the unit cube.
 
     The extinction is ``majorant`` times a logistic function, so it stays below for any values. The tensors are its parameters.
+    With ``nodes``, ``data`` (Z, Y, X, 1) shows the values at the nodes.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -303,6 +307,82 @@ class HashVolume(ExtinctionVolume):
     def to_string(self) -> str:
         field = self.mivol_extinction
         return f"mivol_hash[{field.sizes.levels} levels, {sum(dr.width(value) for value in field.tensors.values())} numbers]"
+
+
+class TabulatedHashVolume(VoxelVolume):
+    """``mivol_hash`` with ``nodes``: voxels that follow the tensors of a hash grid."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.tabulated = TabulatedDensity(HashDensity.from_props(props), int(props["nodes"]))
+        self.field = self.tabulated.voxels
+        self.texture = self.field.freezable_texture
+        props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
+        mi.Volume.__init__(self, props)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        for name, value in self.tabulated.density.parameters().items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
+        callback.put("data", self.field.tensor, mi.ParamFlags.Differentiable)  # what the network makes of them
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.tabulated.refresh()
+
+    def to_string(self) -> str:
+        sizes, res = self.tabulated.density.sizes, " x ".join(map(str, self.tabulated.res[::-1]))
+        return f"mivol_hash[{sizes.levels} levels, at {res} nodes]"
+
+
+class OctreeVolume(ExtinctionVolume):
+    """``<volume type="mivol_octree">``: constant leaves of an octree, 1 or 3 channels, as ``sigma_t``, ``sigma_a``, ``sigma_s``
+    or ``albedo``; vacuum elsewhere. Rays cross it exactly, from leaf to leaf.
+
+    Parameters:
+        filename or data: an octree (.npz of mivol or svox: its extinction), or a grid, as a file of a volume or a tensor
+            (Z, Y, X, C), of which voxels of 0 are left out and equal ones joined.
+        tolerance: largest difference of the voxels in a leaf, over the largest value: eight voxels become one leaf as long as
+            they differ less, at most 1. Default 0: only equal voxels.
+        to_world: places the unit cube of the grid, or the cube of the octree (default: the file's place).
+
+    The parameter ``data`` (leaves, C) holds the values, at least 0.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props, LeafField.from_props(props))
+        self.data = self.mivol_extinction.values
+
+    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
+        values = self.mivol_extinction.eval(it.p, None, mi.Bool(active))
+        return (
+            mi.Spectrum(mi.luminance(mi.Color3f(*values))) if mi.is_monochromatic and len(values) == 3 else mi.Spectrum(*values)
+        )
+
+    def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
+        return mi.Vector3f(*self.mivol_extinction.eval(it.p, None, mi.Bool(active)))
+
+    def max_per_channel(self) -> list[float]:
+        return self.mivol_extinction.bound()
+
+    def resolution(self) -> mi.ScalarVector3i:
+        return mi.ScalarVector3i(1 << self.mivol_extinction.depth)
+
+    def channel_count(self) -> int:
+        return self.mivol_extinction.channels
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("data", self.data, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.mivol_extinction.values = self.data
+        self.mivol_extinction.check()
+
+    def to_string(self) -> str:
+        field = self.mivol_extinction
+        return f"mivol_octree[{field.leaves} leaves, depth {field.depth}]"
+
+
+def make_hash_volume(props: mi.Properties) -> HashVolume | TabulatedHashVolume:
+    """A ``mivol_hash``: evaluated at points, or at the nodes of a grid."""
+    return TabulatedHashVolume(props) if "nodes" in props else HashVolume(props)
 
 
 def _towards(it: mi.Interaction3f) -> mi.Vector3f:
@@ -315,5 +395,6 @@ def _towards(it: mi.Interaction3f) -> mi.Vector3f:
 mi.register_texture("mivol_voxels", VoxelVolume)
 mi.register_texture("mivol_sh", SphericalVolume)
 mi.register_texture("mivol_transfer", TransferVolume)
-mi.register_texture("mivol_hash", HashVolume)
+mi.register_texture("mivol_hash", make_hash_volume)
 mi.register_texture("mivol_gaussians", GaussianVolume)
+mi.register_texture("mivol_octree", OctreeVolume)

@@ -133,6 +133,7 @@ def _explain_free_flights(needs: Needs, settings: Settings) -> str:
     reasons = [f"{m.name} emits and scatters" for m in needs.media if m.emits]
     reasons += [f"{m.name} is bounded" for m in needs.media if m.bounded]
     reasons += [f"{m.name} is made of Gaussians" for m in needs.media if m.gaussians]
+    reasons += [f"{m.name} is an octree" for m in needs.media if m.leaves]
     reasons += [f"{name} refracts" for name in needs.refractive]
     if settings.scatterings > 1:
         reasons.insert(0, f"an albedo is above 0 and max_depth is {settings.max_depth}")
@@ -243,6 +244,8 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
         return Choice(
             subject, "exact, one flight in each Gaussian along a ray", "the shortest flight is a flight through the sum"
         )
+    if medium.leaves:
+        return Choice(subject, "exact, leaf by leaf", "the extinction is constant in each leaf")
     if not medium.resolutions:
         return Choice(subject, "exact", "its extinction is a constant")
     if medium.extinction == "rgb":
@@ -392,7 +395,7 @@ def _explain_missing_lamp_rays(needs: Needs, settings: Settings) -> str | None:
     """The reason why lamps cannot have camera rays of their own; None if they can."""
     if settings.scatterings == 0 or settings.hide_emitters or not needs.has_lamps:
         return "the image shows nothing else, or no lamps"
-    if any(m.bounded or m.gaussians for m in needs.media):
+    if any(m.bounded or m.has_own_walk for m in needs.media):
         return "the transmittance to a lamp has no closed form"
     if not needs.are_samples_independent or not needs.is_colour_film:
         return "another sampler or film is asked for"
@@ -405,8 +408,8 @@ def _explain_missing_near_light(needs: Needs, segment: str) -> str | None:
         return "no path in media meets the light of an emitter with a position"
     if any(m.bounded for m in needs.media):
         return "only a majorant of a medium is known"
-    if any(m.gaussians for m in needs.media):
-        return "a medium consists of Gaussians"
+    if any(m.has_own_walk for m in needs.media):
+        return "a medium consists of Gaussians or is an octree"
     return "media lie behind refracting boundaries" if needs.is_sealed else None
 
 
@@ -414,8 +417,8 @@ def _explain_missing_light(needs: Needs) -> str:
     """The reason why the light of media cannot be sampled."""
     if any(m.unread for m in needs.media):
         return "the emission cannot be read while dr.freeze records"
-    if any(m.gaussians for m in needs.media):
-        return "a medium consists of Gaussians, which the table of light does not hold"
+    if any(m.has_own_walk for m in needs.media):
+        return "a medium consists of Gaussians or is an octree, which the table of light does not hold"
     return "an emitting medium fills no shape of its own, or shapes are instances"
 
 

@@ -16,6 +16,7 @@ from mivol.errors import MivolError
 from mivol.fields.gaussian_field import GaussianField
 from mivol.scene_graph import traverse
 from mivol.transport.media.medium_view import ASYMMETRY
+from mivol.transport.media.octree_extinction import LeafField
 from mivol.transport.traversal.box import clip_to_box
 
 COEFFICIENT_PAIRS = (("sigma_t", "albedo"), ("sigma_a", "sigma_s"))
@@ -59,6 +60,12 @@ class Coefficients:
             raise MivolError(
                 f"mivol_medium was given {' and '.join(lights)} beside a sigma_t of mivol_gaussians; give the Gaussians as the "
                 "emission, and nothing else, to show their own colours."
+            )
+        octrees = [n for n in (*given, *lights) if _is_octree(props, n)]
+        if lights and octrees:
+            raise MivolError(
+                f"mivol_medium was given {' and '.join(lights)} and a mivol_octree as {octrees[0]}; a medium that emits needs "
+                "the cells of a grid: give the values as a mivol_voxels."
             )
         shaded = [n for n in given if _is_shaded(props, n)]
         if shaded:
@@ -183,6 +190,10 @@ def is_radiance_field(value: object) -> bool:
 
 def _is_made_of_gaussians(props: mi.Properties, name: str) -> bool:
     return isinstance(getattr(props.get(name, 0.0), "mivol_extinction", None), GaussianField)
+
+
+def _is_octree(props: mi.Properties, name: str) -> bool:
+    return isinstance(getattr(props.get(name, 0.0), "mivol_extinction", None), LeafField)
 
 
 def _is_shaded(props: mi.Properties, name: str) -> bool:

@@ -114,6 +114,8 @@ def _kind_without_grids(medium: MediumFacts) -> str:
     """The kind of a medium without grids."""
     if medium.gaussians:
         return f"{medium.gaussians} Gaussians"
+    if medium.leaves:
+        return f"an octree of {medium.leaves} leaves"
     return f"a bounded {medium.bounded}" if medium.bounded else "homogeneous"
 
 

@@ -34,6 +34,7 @@ from mivol.transport.estimators.lighting.emitters import find_bounding_ball
 from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.medium_view import MediumView, medium_kind
+from mivol.transport.media.octree_extinction import OctreeExtinction
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
 
@@ -84,7 +85,7 @@ def find_needs(
         ),
     )
     scatters = needs.surfaces or any(m.is_scattering for m in media)
-    refused = any(m.bounded or m.gaussians for m in media)
+    refused = any(m.bounded or m.has_own_walk for m in media)
     if recording or refused or not (reads_emission and scatters and any(m.emits for m in media)):
         return needs
     bodies = [boundary.body(view) for boundary, view in zip(boundaries, views, strict=True)]
@@ -162,6 +163,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
         "phase": _phase_name(phase),
         "emits": view.emits,
         "gaussians": sum(p.field.count for p in view.parts if isinstance(p, GaussianExtinction)),
+        "leaves": sum(p.field.leaves for p in view.parts if isinstance(p, OctreeExtinction)),
         "bounded": next((type(p.field).__name__ for p in view.parts if not p.exact_line), None),
     }
     if recording:
@@ -202,7 +204,7 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
 def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridReading]) -> float | None:
     """Bound the optical depth of a medium by its largest extinction times the diameter of its box or ball."""
     bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
-    bounds += [p.field.bound()[0] for p in view.parts if isinstance(p, GaussianExtinction)]
+    bounds += [max(p.field.bound()) for p in view.parts if isinstance(p, GaussianExtinction | OctreeExtinction)]
     constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.is_constant]
     if boundary.box is None:
         return None
@@ -238,6 +240,7 @@ class MediumFacts:
         unread: whether values could not be read because ``dr.freeze`` records.
         bounded: class of a field with only a known majorant along a ray; None with exact optical depths.
         gaussians: number of Gaussians for ray tracing; 0 for other media.
+        leaves: number of leaves of octrees; 0 for other media.
         mean_cosine: mean cosine of the phase function at the first reading [1]; None for a medium that does not scatter, or
             with a near emitter.
         misplaced: names of the grids that lie wholly outside of the shape.
@@ -259,9 +262,15 @@ class MediumFacts:
     unread: bool = False
     bounded: str | None = None
     gaussians: int = 0
+    leaves: int = 0
     mean_cosine: float | None = None
     misplaced: tuple[str, ...] = ()
     bricks: tuple[int, ...] = ()
+
+    @property
+    def has_own_walk(self) -> bool:
+        """Whether rays follow Gaussians, or the leaves of an octree, in place of the cells of a grid."""
+        return self.gaussians > 0 or self.leaves > 0
 
     @property
     def misplacement(self) -> str:

@@ -236,7 +236,7 @@ def choose_segment(needs: Needs, settings: Settings) -> str:
         is_bounded,
         settings.scatterings,
         bool(needs.refractive),
-        any(m.gaussians for m in needs.media),
+        any(m.has_own_walk for m in needs.media),
     )
     return choose_segment_estimator(question)
 

@@ -160,8 +160,8 @@ def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> No
 
 
 def check_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
-    """Refuse requests for the cells of a grid in a medium of Gaussians."""
-    medium = next((m for m in needs.media if m.gaussians), None)
+    """Refuse requests for the cells of a grid in a medium of Gaussians or of an octree."""
+    medium = next((m for m in needs.media if m.has_own_walk), None)
     if medium is None:
         return
     moved = _emitter_placements(needs)
@@ -169,6 +169,8 @@ def check_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
         ("depth" in aovs, "aovs asks for depth", "ask for tau and alpha only"),
         (bool(moved), f"the derivative of {', '.join(moved)} was requested", "use finite differences"),
     ]
+    if medium.leaves:
+        _raise_first(f"the medium in {medium.name} is an octree", reasons, "give its values as a mivol_voxels")
     kind = f"is made of {medium.gaussians} Gaussians that rays are traced through"
     _raise_first(f"the medium in {medium.name} {kind}", reasons, "convert them to a grid (mivol convert)")
 

@@ -89,8 +89,8 @@ def find_unrecorded(scene: mi.Scene, sensor: mi.Sensor, spp: int, needs: Needs, 
         return "tracing takes little of a render of several passes"
     if plan.branches and not for_images:
         return "the host counts the branches of paths"
-    if any(m.bounded or m.gaussians for m in needs.media):
-        return "the host reads majorants and lists Gaussians"
+    if any(m.bounded or m.has_own_walk for m in needs.media):
+        return "the host reads majorants, lists Gaussians and indexes octrees"
     return find_hidden_arrays(scene, sensor)
 
 

@@ -1,13 +1,15 @@
-"""Photographs as grids, hash grids and Gaussians: how good, how soon, how large, and how fast to show?
+"""One table of all representations: how good, how soon, how large, and how fast to show?
 
-    mivol bench representations            # an hour on 2 cores; a part of it without the chair
-    mivol bench representations --quick    # under a minute, small sizes: the figures mean nothing
+    mivol bench representations                 # two hours of processor time
+    mivol bench representations --only chair    # a data set; models = grid,octree for some models
+    mivol bench representations --quick         # a minute, small sizes: the figures mean nothing
 
-The photographs of the still life (200 x 200 pixels; missing photographs are rendered to runs/photographs) and of the chair
-(same size, from MIVOL_DATA, default ../shared/data) are fitted as ``mivol optimize`` does with the settings of the presets. The
-test views judge the fits, over white. Minutes and pixels per second hold for a machine walking 25 M rays per second through the
-tutorial's smoke. Memory is the largest memory of Dr.Jit, without the photographs. Grids are rendered with one ray per pixel;
-Gaussians are splatted.
+The photographs of the still life (200 x 200 pixels; missing photographs are rendered to runs/photographs), of the chair (same
+size) and of the fox (longest edge of 480 pixels; both from MIVOL_DATA, default ../shared/data) are fitted as ``mivol optimize``
+does with the settings of the presets. Test views judge the still life and the chair, over white; every eighth photograph
+judges the fox, whose background nested grids fit (a grid, an octree, a hash grid and a NeRF have one box, and black behind).
+Minutes and rays per second hold for two cores that walk 25 M rays per second through the tutorial's smoke. Memory is the
+largest memory of Dr.Jit, without the photographs. Fields are rendered with one ray per pixel; Gaussians are splatted.
 """
 
 from __future__ import annotations
@@ -22,75 +24,118 @@ import numpy as np
 from drjit.hashgrid import HashGridEncoding
 from matplotlib.ticker import MaxNLocator
 
+from mivol.bench.extinctions import TO_WORLD, smoke
 from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.figures import new_figure, show_images
 from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.harness.timing import Stopwatch, race, ratio_of
-from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs, prepare_fit
+from mivol.bench.photo_fits import FittedProblem, PhotoSize, find_photographs, fit_photographs, prepare_fit
 from mivol.bench.reference_walk import REFERENCE_RATE
+from mivol.bench.scenes import box_scene, constant_light, make_integrator
+from mivol.errors import MivolError
 from mivol.experiments import field_fit
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
 from mivol.fields.networks import Network
-from mivol.optim.photographs.radiance_problem import RadianceProblem
-from mivol.optim.photographs.sampled_problem import SampledProblem
-from mivol.photos import survey_photos
+from mivol.files.image_files import encode_srgb
+from mivol.optim.first_order import Adam
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.loop import begin_fit
+from mivol.optim.parameters import Parameter
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import View
+from mivol.photos import rectify, survey_photos
 from mivol.points import Gaussians, write_gaussians
+from mivol.scene.camera_rigs import parse_rig
+from mivol.validate.metrics import average_scores, psnr
 
 
 @dataclass(frozen=True)
 class RepresentationSize(PhotoSize):
     """Amount of work."""
 
-    edge: int = amount(200, 48, "longest edge of photographs and views [pixels]")
-    grids: tuple[int, ...] = amount((64, 128), (16,), "nodes along the longest edge of the grids")
-    hash_grids: tuple[str, ...] = amount(("minute", "minutes"), ("tiny",), "presets of the fits of hash grids")
-    gaussians: tuple[str, ...] = amount(("minute", "minutes"), ("minute",), "presets of the fits of Gaussians")
+    edge: int = amount(200, 48, "longest edge of photographs and views of the still life and the chair [pixels]")
+    fox_edge: int = amount(480, 48, "longest edge of the photographs of the fox [pixels]")
+    models: tuple[str, ...] = amount(
+        ("grid", "nested grid", "octree", "hash grid", "NeRF", "Gaussians"), doc="models of the table"
+    )
+    longest: int = amount(0, 16, "nodes along the longest edge of the grids; 0: the presets'")
+    hash_grid: str = amount("minute", "tiny", "preset of the hash grid")
+    nerf: str = amount("minutes", "tiny", "preset of the NeRF")
+    gaussians: str = amount("minute", "minute", "preset of the Gaussians")
     effort: float = amount(1.0, 0.02, "factor on the steps of the presets")
+    nerf_effort: float = amount(1.0, 0.02, "factor on the steps of the NeRF")
     samples: int = amount(1 << 17, 1 << 12, "samples of a hash grid")
     rounds: int = amount(7, 2, "timed calls with these samples")
+    smoke_side: int = amount(32, 8, "edge of the views of the smoke [pixels]")
+    smoke_seconds: float = amount(30.0, 0.5, "processor time of each fit of the smoke [s]")
+    smoke_spp: int = amount(2, 2, "samples per pixel of a step of the smoke")
+    smoke_reference: int = amount(256, 16, "samples per pixel of the reference views of the smoke")
+
+
+def list_settings(size: RepresentationSize, has_alpha: bool) -> dict[str, dict]:
+    """Settings of the fit of each model, by its name in the table. Photographs with alpha have equal exposures."""
+    grid = {"effort": size.effort} | ({"longest": size.longest} if size.longest else {})
+    return {
+        "grid": {"field": grid},
+        "nested grid": {"field": {"preset": "capture", **grid} | ({"exposure": False} if has_alpha else {})},
+        "octree": {"field": {"kind": "octree", **grid}},
+        "hash grid": {"field": {"kind": "hash", "preset": size.hash_grid, "effort": size.effort}},
+        "NeRF": {"field": {"kind": "nerf", "preset": size.nerf, "effort": size.nerf_effort}},
+        "Gaussians": {"gaussians": {"preset": size.gaussians, "effort": size.effort}},
+    }
 
 
 def measure(name: str, size: RepresentationSize) -> dict:
-    """Fit the photographs of a data set as grids, hash grids and Gaussians."""
+    """Fit the photographs of a data set by each model."""
     folder = find_photographs(name, size)
     if folder is None:
         return {}
-    fits = {f"grid, {n} nodes": {"field": {"longest": n, "effort": size.effort}} for n in size.grids}
-    fits |= {
-        f"hash grid, {preset}": {"field": {"kind": "hash", "preset": preset, "effort": size.effort}}
-        for preset in size.hash_grids
-    }
-    fits |= {f"Gaussians, {preset}": {"gaussians": {"preset": preset, "effort": size.effort}} for preset in size.gaussians}
-    answer = {}
-    for label, settings in fits.items():
-        answer[label] = figures = fit_and_judge(folder, settings, size)
-        say_row(label, **{key: figures[key] for key in ("psnr", "minutes", "file_mib")})
+    settings, answer = list_settings(size, has_alpha=name != "fox"), {}
+    for label in size.models:
+        if label not in settings:
+            raise MivolError(f'models has "{label}": {", ".join(settings)} are expected.')
+        answer[label] = figures = fit_and_judge(folder, choose_photos(name, folder, label, size), settings[label], size)
+        say_row(label, **{key: value for key, value in figures.items() if isinstance(value, float)})
     return answer
 
 
-def fit_and_judge(folder: Path, settings: dict, size: RepresentationSize) -> dict:
+def choose_photos(name: str, folder: Path, model: str, size: RepresentationSize) -> dict:
+    """The table ``photos`` of a fit: sizes, background and judges."""
+    if name == "fox":
+        nested = {"background": "nested"} if model == "nested grid" else {}
+        return {"held_out": 8, "largest": size.fox_edge, **nested}
+    edge = max(survey_photos(folder, split="test").frames[0].camera.size)
+    return {"background": "white", "judged": "test", "held_out": 0, "scale": min(size.edge / edge, 1.0)}
+
+
+def fit_and_judge(folder: Path, photos: dict, settings: dict, size: RepresentationSize) -> dict:
     """Fit a folder of photographs, and measure.
 
+    Args:
+        folder: folder of the photographs.
+        photos: table ``photos`` of the fit, besides the path.
+        settings: table ``field`` or ``gaussians`` by its name.
+        size: amount of work.
+
     Returns:
-        ``psnr`` [dB] and ``ssim`` of the test views; ``minutes`` and ``shown_pixels_per_second`` of the reference machine;
-        ``processor_seconds`` and ``walk_rays_per_second``; ``held_mib``; ``file_mib``; ``count`` of nodes,
-        numbers of a hash grid, or Gaussians; for the figure the middle view and its photograph.
+        ``psnr`` [dB] and ``ssim`` of the judged views; ``minutes`` and ``shown_pixels_per_second`` of the reference machine;
+        ``processor_seconds`` and ``walk_rays_per_second``; ``held_mib``; ``file_mib``; ``count`` of nodes, leaves,
+        numbers of a hash grid or network, or Gaussians; for the figure the middle view and its photograph.
     """
-    edge = max(survey_photos(folder, split="test").frames[0].camera.size)
-    photos = {"background": "white", "judged": "test", "held_out": 0, "scale": min(size.edge / edge, 1.0)}
     prepared = prepare_fit(folder, photos, settings)
     done = fit_photographs(prepared.problem, size.walk_side)
-    watch, views, images = Stopwatch(), prepared.judged.views, []
+    watch, views, images = Stopwatch(), [rectify(view) for view in prepared.judged.views], []
     prepared.show(views[0])  # compiles
     with watch:
         for view in views:
             images.append(prepared.show(view))
-    pixels = len(views) * views[0].camera.size[0] * views[0].camera.size[1]
+    pixels = sum(view.camera.size[0] * view.camera.size[1] for view in views)
     middle = len(views) // 2
     count, file_bytes = store(prepared.problem)
+    scores = [prepared.judge(image, view, ("psnr", "ssim")) for image, view in zip(images, views, strict=True)]
     return {
-        **prepared.score(views, ("psnr", "ssim")),
+        **average_scores(scores).values,
         "minutes": done.seconds / 60,
         "processor_seconds": done.processor,
         "walk_rays_per_second": done.rate,
@@ -103,17 +148,32 @@ def fit_and_judge(folder: Path, settings: dict, size: RepresentationSize) -> dic
     }
 
 
-def store(problem: object) -> tuple[int, int]:
-    """Number of nodes, numbers of a hash grid, or Gaussians, and the size of their files [bytes]."""
+def table(question: str, answer: dict) -> list[str]:
+    """The table of the representations of a data set, for the docs."""
+    if question in ("samples", "smoke") or not answer:
+        return []
+    head = "| model | PSNR / SSIM | time | memory | file | rays shown |", "|---|---|---|---|---|---|"
+    return [
+        *head,
+        *(
+            f"| {name} | {row['psnr']:.2f} dB / {row['ssim']:.3f} | {row['minutes']:.2g} min | {row['held_mib']:.3g} MiB | "
+            f"{row['file_mib']:.2g} MiB | {row['shown_pixels_per_second'] / 1e6:.2g} M/s |"
+            for name, row in answer.items()
+        ),
+    ]
+
+
+def store(problem: FittedProblem) -> tuple[int, int]:
+    """Number of nodes, leaves, numbers of a hash grid or network, or Gaussians, and the size of their files [bytes]."""
     with TemporaryDirectory() as folder:
-        if isinstance(problem, RadianceProblem | SampledProblem):
-            field_fit.write_result(Path(folder), problem)
-            is_grid = isinstance(problem, RadianceProblem)
-            count = problem.field.rows if is_grid else problem.field.numbers
-        else:
+        if isinstance(problem, GaussianProblem):
             cloud = Gaussians(**problem.cloud)
             write_gaussians(Path(folder) / "gaussians.ply", cloud)
             count = cloud.count
+        else:
+            field_fit.write_result(Path(folder), problem)
+            field = problem.field
+            count = next(getattr(field, name) for name in ("leaves", "rows", "numbers") if hasattr(field, name))
         return count, sum(path.stat().st_size for path in Path(folder).iterdir())
 
 
@@ -163,9 +223,93 @@ def measure_sample_rates(size: RepresentationSize) -> dict:
     return {"rates": rates, "ratio": ratio_of(timings["drjit.hashgrid"], timings["mivol"], "processor")}
 
 
+SMOKE_KEY = "box.interior_medium.sigma_t."
+
+SMOKE_VIEWS, SMOKE_JUDGED = 16, (2, 6, 10, 14)
+"""Views around the smoke, and those that judge."""
+
+
+@dataclass(frozen=True)
+class SmokeFit:
+    """An extinction to fit.
+
+    Attributes:
+        sigma_t: plugin.
+        rates: learning rate of each parameter.
+        domain: of each parameter.
+        epsilon: of Adam, relative to the largest gradient.
+    """
+
+    sigma_t: dict
+    rates: dict[str, float]
+    domain: tuple[float, float] = (-np.inf, np.inf)
+    epsilon: float = 1e-15
+
+
+def list_smoke_fits(majorant: float) -> dict[str, SmokeFit]:
+    """Voxels, and hash grids of no more numbers, evaluated at points of paths and at the nodes of a grid."""
+    place = {"to_world": mi.ScalarTransform4f(np.float32(TO_WORLD))}
+    start = mi.TensorXf(np.full((28, 28, 28, 1), 0.05 * majorant, np.float32))
+    sizes = {"levels": 6, "log2_table": 11, "coarsest": 6, "finest": 40, "width": 16}
+    hashed = {"type": "mivol_hash", "majorant": majorant, **sizes, **place}
+    rates = {"table": 0.05, "weights_0": 0.02, "weights_1": 0.02}
+    return {
+        "voxels": SmokeFit({"type": "mivol_voxels", "data": start, **place}, {"data": 0.5}, (0, np.inf)),
+        "hash grid at nodes": SmokeFit(hashed | {"nodes": 28}, rates),
+        "hash grid at points": SmokeFit(hashed, rates),
+    }
+
+
+def measure_smoke(size: RepresentationSize) -> dict:
+    """How well does a hash grid fit a scattering smoke (``max_depth`` 6), beside voxels of as many numbers, in equal time?
+
+    Each fit takes the same processor time; its first step, which compiles, does not count. PSNR is of the held-out views'
+    sRGB codes.
+    """
+    values = smoke().values
+    light, albedo, integrator = constant_light(), 0.9, make_integrator("mivol", 6)
+    edges = {"width": size.smoke_side, "height": size.smoke_side}
+    rig = parse_rig({"rig": "hemisphere", "count": SMOKE_VIEWS, "lowest": -90, **edges})
+    truth = mi.load_dict(box_scene(values, size.smoke_side, albedo, **light))
+    views = []
+    for number, described in enumerate(rig.sensors(truth)):
+        sensor = mi.load_dict(described)
+        image = mi.render(truth, sensor=sensor, integrator=integrator, spp=size.smoke_reference, seed=number)
+        views.append(View(str(number), sensor, image))
+    answer = {}
+    for name, fit in list_smoke_fits(1.25 * float(values.max())).items():
+        answer[name] = fit_smoke(fit, views, light, albedo, size)
+        say_row(name, **answer[name])
+    best = max(answer[name]["psnr"] for name in answer if name != "voxels")
+    return {"fits": answer, "hash_over_voxels_db": best - answer["voxels"]["psnr"]}
+
+
+def fit_smoke(fit: SmokeFit, views: list[View], light: dict, albedo: float, size: RepresentationSize) -> dict:
+    """Fit an extinction for the given processor time; PSNR of the held-out views, numbers and steps."""
+    parts = box_scene(np.ones((2, 2, 2), np.float32), size.smoke_side, albedo, **light)
+    parts["box"]["interior"] |= {"type": "mivol_medium", "sigma_t": fit.sigma_t}
+    scene, integrator = mi.load_dict(parts), make_integrator("mivol", 6)
+    parameters = [Parameter(SMOKE_KEY + name, lr=rate, domain=fit.domain) for name, rate in fit.rates.items()]
+    train = [view for view in views if int(view.name) not in SMOKE_JUDGED]
+    problem = SceneProblem(scene, train, parameters, integrator, spp=size.smoke_spp)
+    begun = begin_fit(problem, Adam(beta_2=0.99, epsilon=fit.epsilon), 1 << 20)
+    begun.advance()
+    watch = Stopwatch()
+    while watch.processor < size.smoke_seconds:
+        with watch:
+            begun.advance()
+    scores = []
+    for view in (view for view in views if int(view.name) in SMOKE_JUDGED):
+        image = mi.render(scene, sensor=view.sensor, integrator=integrator, spp=size.smoke_reference, seed=1)
+        codes = (encode_srgb(np.clip(np.array(a), 0, 1)) for a in (image, view.reference))
+        scores.append(psnr(*codes, 1.0))
+    numbers = sum(dr.width(value.array) for value in problem.values().values())
+    return {"psnr": float(np.mean(scores)), "steps": begun.next_iteration, "numbers": numbers}
+
+
 def draw(answers: dict, path: Path) -> None:
     """Plot PSNR against minutes, and show a judged view of each fit beside its photograph."""
-    rows = [(question, answer) for question, answer in answers.items() if answer and question != "samples"]
+    rows = [(question, answer) for question, answer in answers.items() if answer and question not in ("samples", "smoke")]
     if not rows:
         return
     columns = 2 + max(len(answer) for _, answer in rows)
@@ -184,7 +328,9 @@ def draw(answers: dict, path: Path) -> None:
 
 QUESTIONS = {
     "samples": measure_sample_rates,
-    "still_life": ask("What are the photographs of the still life as grids, hash grids and Gaussians?", measure, "still_life"),
-    "chair": ask("What are the photographs of the chair as the same models, if its data is here?", measure, "chair"),
+    "smoke": measure_smoke,
+    "chair": ask("What are the photographs of the chair by each model, if its data is here?", measure, "chair"),
+    "still_life": ask("What are the photographs of the still life by each model?", measure, "still_life"),
+    "fox": ask("What are the photographs of the fox by each model, if its data is here?", measure, "fox"),
 }
-STUDY = Study(__name__, __doc__, RepresentationSize, QUESTIONS, draw=draw)
+STUDY = Study(__name__, __doc__, RepresentationSize, QUESTIONS, draw=draw, table=table)

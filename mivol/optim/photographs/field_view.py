@@ -90,8 +90,9 @@ def prepare_view(
 ) -> Callable[[RayBundle], RenderedRays | SampledRays | LeafRays]:
     """Prepare a field for the rays of a camera, which end at the transmittance ``stop``; returns the renderer of rays."""
     if isinstance(field, Octree):
-        index, depth = LeafIndex.find(field), MAX_DEPTH if stop == 0 else -math.log(stop)
-        leaves = make_leaf_colours(field, LeafPlaces.find(field), camera.origin[None], mi.UInt32(0))
+        depth = MAX_DEPTH if stop == 0 else -math.log(stop)
+        index, places = INDEXED.find(field)
+        leaves = make_leaf_colours(field, places, camera.origin[None], mi.UInt32(0))
         return lambda bundle: render_leaves(index, leaves, bundle, depth, distances=True)
     if isinstance(field, SampledField):
         sampled = SampledModel.from_field(field, stop)
@@ -99,6 +100,30 @@ def prepare_view(
     cells, model = find_occupied_cells(field), make_model(field, stop)
     source = bake(field, cells, camera.origin[None], mi.UInt32(0))
     return lambda bundle: render_rays(cells, source, model, bundle)
+
+
+class IndexedLeaves:
+    """The index and the places of the leaves seen last: the views of a film show the same leaves."""
+
+    tree: Octree | None = None
+    variant: str | None = None
+    found: tuple[LeafIndex, LeafPlaces] | None = None
+
+    def find(self, tree: Octree) -> tuple[LeafIndex, LeafPlaces]:
+        """Index and places of the leaves of an octree."""
+        if not (self.tree is not None and mi.variant() == self.variant and have_same_leaves(tree, self.tree)):
+            self.tree, self.variant = tree, mi.variant()
+            self.found = LeafIndex.find(tree), LeafPlaces.find(tree)
+        return self.found
+
+
+def have_same_leaves(a: Octree, b: Octree) -> bool:
+    """Whether two octrees share the arrays of their leaves, in the same place."""
+    same = a.codes is b.codes and a.sizes is b.sizes and a.depth == b.depth
+    return same and np.array_equal(a.to_world, b.to_world)
+
+
+INDEXED = IndexedLeaves()
 
 
 def order_by_tiles(width: int, height: int) -> np.ndarray:

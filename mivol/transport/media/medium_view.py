@@ -29,6 +29,7 @@ from mivol.scene_graph import find_children, list_values, traverse
 from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, Extinction
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
+from mivol.transport.media.octree_extinction import LeafField, OctreeExtinction
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
@@ -294,18 +295,21 @@ def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
 
 
 def _field_part(
-    name: str, field: Field | GaussianField, scale: mi.Float, shows: bool = False
-) -> BoundedExtinction | GaussianExtinction:
+    name: str, field: Field | GaussianField | LeafField, scale: mi.Float, shows: bool = False
+) -> BoundedExtinction | GaussianExtinction | OctreeExtinction:
     """The part of an extinction for a field from a plugin of mivol.
 
     Raises:
         MivolError: a field of another kind; a majorant that is negative or not finite; or a recording, in which no majorant
             can be read and no Gaussians can be listed.
     """
+    if isinstance(field, LeafField):
+        return OctreeExtinction(name, field)
     has_lists = isinstance(field, GaussianField)
     if field.line != BOUNDED and not has_lists:
         raise MivolError(
-            f"{name} is a {type(field).__name__} that declares {field.line!r}; media read {BOUNDED!r} fields and Gaussians."
+            f"{name} is a {type(field).__name__} that declares {field.line!r}; media read {BOUNDED!r} fields, Gaussians and "
+            "octrees."
         )
     if is_recording():
         reason = "whose cells cannot be listed" if has_lists else "whose majorant cannot be read"

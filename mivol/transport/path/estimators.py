@@ -111,7 +111,8 @@ class SegmentNeeds:
         is_bounded: only a majorant of some medium is known.
         scatterings: largest number of scattering events between an emitter and the camera; may be infinite.
         refracts: the boundary of a medium refracts or blurs light, and blocks straight shadow rays.
-        has_gaussians: a medium consists of Gaussians; its cells have no polynomials for drawing distances.
+        has_own_walk: a medium consists of Gaussians or of the leaves of an octree; no cells have polynomials for drawing
+            distances.
     """
 
     scatters: bool
@@ -120,12 +121,12 @@ class SegmentNeeds:
     is_bounded: bool = False
     scatterings: float = 1
     refracts: bool = False
-    has_gaussians: bool = False
+    has_own_walk: bool = False
 
     @property
     def is_single(self) -> bool:
         """Whether straight shadow rays from one scattering event on a segment find all light."""
-        return self.scatterings <= 1 and not (self.emits or self.is_bounded or self.refracts or self.has_gaussians)
+        return self.scatterings <= 1 and not (self.emits or self.is_bounded or self.refracts or self.has_own_walk)
 
 
 @dataclass(frozen=True)

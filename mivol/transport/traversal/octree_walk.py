@@ -298,10 +298,12 @@ class VisitedLeaf:
     dt: mi.Float
 
 
-def clip_to_octree(index: LeafIndex, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float) -> Segment:
-    """Clip world rays, |d| = 1, to the box of the leaves, in float64; ``t_max`` may be infinite."""
+def clip_to_octree(
+    index: LeafIndex, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float, t_min: mi.Float | float = 0.0
+) -> Segment:
+    """Clip intervals of world rays, |d| = 1, to the box of the leaves, in float64; ``t_max`` may be infinite."""
     low, high = index.low, index.high
-    q, v, t0, t1 = clip_to_box(index.from_world, low, high, o, d, mi.Float64(0), mi.Float64(t_max))
+    q, v, t0, t1 = clip_to_box(index.from_world, low, high, o, d, mi.Float64(t_min), mi.Float64(t_max))
     hit = t1 > t0
     t0 = dr.select(hit, t0, 0)
     cell, frac = mi.Vector3i(), mi.Vector3f()

@@ -55,6 +55,7 @@ from mivol.transport.media.channels import to_components, to_scene_channels, to_
 from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import activate, clip_interval
+from mivol.transport.media.octree_extinction import OctreeExtinction
 from mivol.transport.media.optical_depth import segment_optical_depth
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
@@ -374,6 +375,10 @@ def _find_first_collision(
                 hit, rng = delta_tracking(part, scale, ahead, rng)
             elif isinstance(part, GaussianExtinction):
                 hit, rng = sample_gaussian_flight(part, scale, ahead, rng)
+            elif isinstance(part, OctreeExtinction):
+                hit = part.find_collision(scale, ahead, -dr.log(1 - u), channel)
+                rng, (other,) = draw_pcg32(rng, 1)
+                u = dr.select(ahead.active, other, u)
             else:
                 if _uses_delta_tracking(part):
                     hit, rng = delta_tracking_in_blocks(part, scale, ahead, u, rng)
