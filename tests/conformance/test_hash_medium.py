@@ -154,14 +154,15 @@ def test_nodes_hold_the_values_of_the_network(variant_rgb: str) -> None:
     value = np.array(params[key])
     dr.enable_grad(params[key])
     params.update()
-    dr.backward(dr.mean(mi.render(box, params, spp=4, seed=1), axis=None))
+    # Derivatives take the rays of the second seed, and so do the differences.
+    dr.backward(dr.mean(mi.render(box, params, spp=4, seed=1, seed_grad=2), axis=None))
     along = np.array(dr.grad(params[key]), np.float64)
-    h, ends = 0.05 / np.linalg.norm(along), []
+    h, ends = 0.01 / np.linalg.norm(along), []
     for step in (h, -h):
         params[key] = mi.TensorXf(np.float32(value + step * along))
         params.update()
-        ends.append(float(dr.mean(mi.render(box, spp=4, seed=1), axis=None).array[0]))
-    # Absorption is exact along fixed rays; a central difference over 0.05 errs by 1e-3 of itself, float32 by 1e-4.
+        ends.append(float(dr.mean(mi.render(box, spp=4, seed=2), axis=None).array[0]))
+    # Absorption is exact along fixed rays. float32 errs by 1e-7 of a difference of 4e-4, kinks of the network by less than 1 %.
     assert (ends[0] - ends[1]) / (2 * h) == pytest.approx((along**2).sum(), rel=0.01)
 
 
