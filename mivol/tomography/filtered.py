@@ -1,7 +1,6 @@
 """Filtered back-projection in parallel and in cone beams: fast, in a single step and without noise weights.
 
-Back-projection runs voxel by voxel: every voxel reads each view once, interpolated between the pixels at its shadow. The
-operation is not the transpose of the projector, which spreads rays over voxels: do not use it in an iterative solver.
+Back-projection runs voxel by voxel (:mod:`mivol.tomography.backprojection`).
 
 Shares. The inverse is an integral over all lines, each counted once. The share of a ray is its part of a line that the scan
 measures twice; the shares of all rays on a line add up to 1. ``gamma`` is the angle [rad] between a ray and the ray through the
@@ -16,16 +15,14 @@ detectors); Gullberg, Crawford & Tsui 1986, IEEE Trans. Med. Imaging 5, 23 (a ro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import scipy.fft
 
 from mivol.errors import MivolError
-from mivol.threads import check_one_thread
-from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
+from mivol.tomography.backprojection import backproject_layers, backproject_voxels, pixel_matrices
+from mivol.tomography.geometry import ConeBeam, ParallelBeam
 from mivol.tomography.projector import Projector
 
 WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -51,7 +48,7 @@ def filter_ramp(y: np.ndarray, pitch: float, window: str = "ram-lak", cutoff: fl
         cutoff: end of the window over the Nyquist frequency, in (0, 1].
 
     Returns:
-        (..., cols) float64 [1/length].
+        (..., cols) [1/length], float32 if ``y`` is, else float64.
 
     Raises:
         MivolError: an unknown window, or a cutoff outside (0, 1].
@@ -67,7 +64,10 @@ def filter_ramp(y: np.ndarray, pitch: float, window: str = "ram-lak", cutoff: fl
     h[0] = 1.0 / (4 * pitch**2)
     f = 2 * scipy.fft.rfftfreq(size) / cutoff
     kept = np.where(f <= 1, WINDOWS[window](np.minimum(f, 1.0)), 0.0)
-    return pitch * scipy.fft.irfft(scipy.fft.rfft(y, size) * (scipy.fft.rfft(h).real * kept), size)[..., :n]
+    response = pitch * scipy.fft.rfft(h).real * kept
+    spectrum = scipy.fft.rfft(y, size)
+    spectrum *= response.astype(spectrum.real.dtype)
+    return scipy.fft.irfft(spectrum, size, overwrite_x=True)[..., :n]
 
 
 def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
@@ -89,11 +89,13 @@ def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "
         MivolError: another beam, or missing directions.
 
     Bias: the ramp stops at the pixels' Nyquist frequency; few views leave streaks. Values are not clipped at 0.
-    Cost: four reads per voxel and view.
+    Cost: two reads of sixteen neighbours per view and sixteen voxels along z; memory: ``y`` once more in float32.
     """
     beam, weights = projector.geometry, _parallel_weights(projector)
-    weighted, matrices = _pad_detector(y * weights[:, None], pixel_matrices(beam, projector.grid, projector.views), beam.u)
-    return backproject_voxels(matrices, filter_ramp(weighted, beam.pitch[1], window, cutoff), projector.grid, weighted=False)
+    margins = _detector_margins(beam.u)
+    matrices = _shift_columns(pixel_matrices(beam, projector.grid, projector.views), margins[0])
+    images = _filter_views(y, lambda views: weights[views, None], margins, beam.pitch[1], window, cutoff)
+    return backproject_layers(matrices, images, projector.grid)
 
 
 def _parallel_weights(projector: Projector) -> np.ndarray:
@@ -138,10 +140,12 @@ def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutof
     # Positions from the central ray, on the detector scaled to the axis.
     p, q = (beam.u + tau) * scale, beam.v * scale
     cosine = (distance**2 + tau * p) / (distance * np.sqrt(distance**2 + p**2 + q[:, None] ** 2))
-    weighted, matrices = _pad_detector(y * weights[:, None] * cosine, pixel_matrices(beam, grid, projector.views), p)
-    filtered = filter_ramp(weighted, beam.pitch[1] * scale, window, cutoff)
+    margins = _detector_margins(p)
+    matrices = _shift_columns(pixel_matrices(beam, grid, projector.views), margins[0])
     # t of the matrices is the depth over source_to_detector, U the depth over source_to_axis.
-    return backproject_voxels(matrices, filtered * scale**2, grid, weighted=True)
+    cosine *= scale**2
+    images = _filter_views(y, lambda views: weights[views, None] * cosine, margins, beam.pitch[1] * scale, window, cutoff)
+    return backproject_voxels(matrices, images, grid, weighted=True)
 
 
 def check_directions(projector: Projector) -> None:
@@ -213,18 +217,44 @@ def cone_weights(angles: np.ndarray, gamma: np.ndarray, needed: float) -> np.nda
     return steps[:, None] * parker_weights(beta, gamma, excess)
 
 
-def _pad_detector(y: np.ndarray, matrices: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Add columns of 0 to projections and shift their matrices, until the detector reaches equally far on both sides of the
-    axis.
+def _detector_margins(u: np.ndarray) -> tuple[int, int]:
+    """Columns of 0 to add on both sides, until the detector reaches equally far on both sides of the axis.
 
     The filter spreads a row beyond its ends. Voxels with a shadow beyond the shorter side of a displaced detector read the
     added columns.
     """
     missing = round(abs(u[0] + u[-1]) * (len(u) - 1) / (u[-1] - u[0])) if len(u) > 1 else 0
-    on_the_left = missing if u[-1] > -u[0] else 0
+    return (missing, 0) if u[-1] > -u[0] else (0, missing)
+
+
+def _shift_columns(matrices: np.ndarray, columns: int) -> np.ndarray:
+    """The matrices of a detector with ``columns`` more columns before the first."""
     moved = matrices.copy()
-    moved[:, 0] += on_the_left * matrices[:, 2]
-    return np.pad(y, ((0, 0), (0, 0), (on_the_left, missing - on_the_left))), moved
+    moved[:, 0] += columns * matrices[:, 2]
+    return moved
+
+
+FILTER_BYTES = 1 << 26
+"""Memory of the rows filtered at once [byte]."""
+
+
+def _filter_views(
+    y: np.ndarray,
+    weights: Callable[[slice], np.ndarray],
+    margins: tuple[int, int],
+    pitch: float,
+    window: str,
+    cutoff: float,
+) -> np.ndarray:
+    """Filtered views (views, rows, cols and margins) float32, a few at a time; ``weights`` of views multiply them before."""
+    n_views, rows, columns = y.shape
+    images = np.empty((n_views, rows, columns + sum(margins)), np.float32)
+    step = max(1, FILTER_BYTES // (4 * rows * images.shape[2]))
+    for first in range(0, n_views, step):
+        views = slice(first, first + step)
+        weighted = np.multiply(y[views], weights(views), dtype=np.float32, casting="same_kind")
+        images[views] = filter_ramp(np.pad(weighted, ((0, 0), (0, 0), margins)), pitch, window, cutoff)
+    return images
 
 
 def _object_fan(projector: Projector, gamma: np.ndarray) -> float:
@@ -234,88 +264,6 @@ def _object_fan(projector: Projector, gamma: np.ndarray) -> float:
     reach = np.hypot(beam.source_to_axis, beam.axis_offset)
     object_fan = np.arcsin(min(1.0, radius / reach))
     return float(min(object_fan, max(-gamma[0], gamma[-1])))
-
-
-VIEWS_AT_ONCE = 4
-"""Views per kernel; the kernel reads and writes the sums once for all its views."""
-
-
-def pixel_matrices(beam: FlatDetector, grid: VoxelGrid, views: Sequence[int] | np.ndarray | None = None) -> np.ndarray:
-    """(views, 3, 4) float64 matrices from a voxel's indices (x, y, z, 1) to (column t, row t, t) of the shadowed pixel.
-
-    ``t`` is the fraction of the way from the source to the detector's plane; 1 in parallel light.
-    """
-    panels = beam.panels(views)
-    to_corner = panels.corner - panels.source if not beam.whole_lines else panels.source
-    # x - S = t (corner - S + c u + r v): the inverse of the matrix of columns (u, v, corner - S) gives (c t, r t, t).
-    inverse = np.linalg.inv(np.stack([panels.along_u, panels.along_v, to_corner], -1))
-    start = panels.corner if beam.whole_lines else panels.source
-    matrices = np.concatenate([inverse, -np.einsum("nij,nj->ni", inverse, start)[:, :, None]], -1)
-    if beam.whole_lines:
-        matrices[:, 2] = (0.0, 0.0, 0.0, 1.0)
-    index_to_world = np.diag([*grid.voxel_size, 1.0])
-    index_to_world[:3, 3] = [grid.axis(name)[0] for name in "xyz"]
-    return matrices @ index_to_world
-
-
-def backproject_voxels(matrices: np.ndarray, images: np.ndarray, grid: VoxelGrid, weighted: bool) -> np.ndarray:
-    """Sum over views of the pixel at each voxel's shadow, bilinear between pixel centres, 0 beyond the detector's edge.
-
-    Args:
-        matrices: matrices of :func:`pixel_matrices`.
-        images: (views, rows, cols).
-        grid: grid of the result.
-        weighted: whether each reading is divided by t^2.
-
-    Returns:
-        (Z, Y, X) float32.
-
-    Cost: four reads per voxel and view.
-    """
-    check_one_thread()
-    total = dr.zeros(mi.Float, grid.size)
-    shape = tuple(dr.opaque(mi.UInt32, n) for n in grid.shape[:0:-1])
-    size = tuple(dr.opaque(mi.UInt32, n) for n in images.shape[1:])
-    for first in range(0, len(matrices), VIEWS_AT_ONCE):
-        some = slice(first, first + VIEWS_AT_ONCE)
-        for matrix, image in zip(matrices[some], images[some], strict=True):
-            entries = [dr.opaque(mi.Float, float(value)) for value in matrix.ravel()]
-            pixels = mi.Float(np.ascontiguousarray(image, np.float32).ravel())
-            total += _read_view(entries, pixels, grid.size, shape, size, weighted)
-        dr.eval(total)
-    return np.array(total).reshape(grid.shape)
-
-
-def _read_view(
-    entries: list[mi.Float],
-    image: mi.Float,
-    n: int,
-    shape: tuple[mi.UInt32, mi.UInt32],
-    size: tuple[mi.UInt32, mi.UInt32],
-    weighted: bool,
-) -> mi.Float:
-    """Reading of each voxel in a view; ``shape`` is (X, Y) of the grid, ``size`` (rows, cols) of the image."""
-    index = dr.arange(mi.UInt32, n)
-    line, x = index // shape[0], index % shape[0]
-    p = (mi.Float(x), mi.Float(line % shape[1]), mi.Float(line // shape[1]))
-    column, row, t = (
-        dr.fma(a, p[0], dr.fma(b, p[1], dr.fma(c, p[2], d))) for a, b, c, d in (entries[4 * i : 4 * i + 4] for i in range(3))
-    )
-    inverse = dr.rcp(t)
-    column, row = column * inverse, row * inverse
-    seen = t > 0
-    parts = []
-    for place, count in ((row, size[0]), (column, size[1])):
-        last = mi.Float(count - 1)
-        # A pixel is as wide as its pitch: half of the pixel lies beyond the outermost centres.
-        seen &= (place > -0.5) & (place < last + 0.5)
-        inside = dr.clip(place, 0, last)
-        lower = mi.UInt32(inside)
-        parts.append((lower, dr.minimum(lower + 1, count - 1), inside - mi.Float(lower)))
-    (r0, r1, fr), (c0, c1, fc) = parts
-    a, b, c, d = (dr.gather(mi.Float, image, r * size[1] + k, seen) for r in (r0, r1) for k in (c0, c1))
-    value = dr.lerp(dr.lerp(a, b, fc), dr.lerp(c, d, fc), fr)
-    return value * dr.square(inverse) if weighted else value
 
 
 # -- Shares of lines that are measured more than once ----------------------------------------------------------------------
