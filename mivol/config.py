@@ -407,6 +407,15 @@ class SolveSettings(Section):
         return "pcg" if self.name == AUTO else self.name
 
 
+class Slabs(Section):
+    """Reconstruction of a volume beyond memory: slabs of layers along z, each from the detector rows that it needs."""
+
+    memory: Annotated[float, setting("GiB", "most memory of the run", gt=0)] = 4.0
+    format: Annotated[
+        Literal["tiff", "zarr"], setting("1", "tiff: a file for each slice; zarr: OME-Zarr, by the package tensorstore")
+    ] = "tiff"
+
+
 class ScanExperiment(Section):
     """A reconstruction from projections: a file with a table ``[scan]``."""
 
@@ -417,6 +426,7 @@ class ScanExperiment(Section):
         Grid | None, setting("1", "the voxels; absent: those of a Nikon file, or a voxel a pixel of measured circular scans")
     ] = None
     solve: Annotated[SolveSettings, setting("1", "the inversion")] = SolveSettings()
+    slabs: Annotated[Slabs | None, setting("1", "slabs of a volume beyond memory; absent: the whole volume at once")] = None
     held_out_every: Annotated[int, setting("view", "step between views that are not fitted; 0: none", ge=0)] = 0
     checkpoint_every: Annotated[int, setting("iteration", "iterations between two checkpoints", ge=1)] = 5
     variant: Variant = "llvm_ad_rgb"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,6 +56,16 @@ def available_memory() -> int | None:
     second = _group_memory("memory.max", "memory.current", "memory.stat")
     first = _group_memory("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat")
     return int(min(system, second, first))
+
+
+def peak_memory() -> int | None:
+    """Largest memory of this process so far [bytes]; None if the system does not report it."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def check_memory(needed: float, what: str, way_out: str | Callable[[float], str], limit: float | None = None) -> None:

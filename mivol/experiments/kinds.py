@@ -19,6 +19,7 @@ from mivol.experiments.run_folder import CHECKPOINT, BestIterate, RunFolder
 from mivol.experiments.sampled_fit import SampledFit
 from mivol.experiments.scan_fit import ScanFit
 from mivol.experiments.scene_fit import SceneFit
+from mivol.experiments.slab_scan import explain_slabs, run_slabs
 from mivol.optim import checkpoint
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import Fit, begin_fit
@@ -51,6 +52,8 @@ def run_experiment(context: RunContext) -> Path:
         KeyboardInterrupt: Ctrl-C; finished work is kept, and ``context.resume`` continues.
     """
     settings = context.settings
+    if getattr(settings, "slabs", None) is not None:
+        return run_slabs(context)
     if context.resume:
         checkpoint.check_settings(context.folder / CHECKPOINT, config.flat(config.resolved(settings)))
     choose_back_end(settings.variant, settings.threads)
@@ -124,6 +127,9 @@ def explain_experiment(settings: config.Experiment, base: Path, picture: Path | 
         if picture is not None and not issubclass(kind, PhotoFit):
             raise MivolError(f"--output {picture}: only cameras of photographs are drawn, so leave out --output.")
         choose_back_end(settings.variant, settings.threads)
+        if getattr(settings, "slabs", None) is not None:
+            rest = explain_slabs(settings, base, lines.append)
+            return Explanation((*lines, *rest.lines))
         fit = kind(RunContext(settings, base, Path()))
         fit.load(lines.append)
         rest = fit.rehearse(lines.append)

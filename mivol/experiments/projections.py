@@ -15,6 +15,7 @@ from mivol.errors import MivolError
 from mivol.experiments.readings import ScanReadings, nikon_grid, note_order, note_rows, read_scan
 from mivol.files import read_columns, read_volume
 from mivol.files.fetch import resolve_path
+from mivol.files.image_stack import ALL
 from mivol.machine import check_memory
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.solvers import ALL_SOLVERS
@@ -23,7 +24,16 @@ from mivol.tomography.filtered import covers_circle
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
-from mivol.tomography.preprocess import Quanta, Transmission, count_quanta, find_air, fit_air, normalise_air, to_line_integrals
+from mivol.tomography.preprocess import (
+    Air,
+    Quanta,
+    Transmission,
+    count_quanta,
+    find_air,
+    fit_air,
+    normalise_air,
+    to_line_integrals,
+)
 from mivol.tomography.projector import Projector
 from mivol.tomography.rings import RING_WIDTHS, remove_rings
 from mivol.tomography.rotation_axis import find_axis
@@ -211,17 +221,23 @@ def add_noise(geometry: FlatDetector, exact: np.ndarray, truth: np.ndarray, phot
     return Projections(geometry, y, counts, truth, quanta, is_noise_known=True)
 
 
-def read_measured(settings: config.ScanExperiment, base: Path) -> Projections:
+def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL, air: Air | None = None) -> Projections:
     """Read measured projections as line integrals with weights; find the rotation axis of a circular scan if requested.
+
+    Args:
+        settings: settings of the scan.
+        base: folder from which relative paths start.
+        rows: rows of the detector, counted upwards. Their beam is in the middle of the detector.
+        air: light of the air, found before; None: as ``data.air`` says.
 
     Raises:
         MivolError: an unreadable file, or files of different sizes.
     """
-    data, readings = settings.data, read_scan(settings, base)
+    data, readings = settings.data, read_scan(settings, base, rows)
     notes, angles = [*readings.notes, *readings.transmission.notes], readings.angles
     if angles is not None:
         notes += note_order(angles)
-    transmission, light, air_notes = correct_air(readings.transmission, data.air)
+    transmission, light, air_notes = correct_air(readings.transmission, data.air, air)
     notes += air_notes
     measured, weights = to_line_integrals(transmission)
     y, ring_notes = correct_rings(measured, weights, data)
@@ -272,19 +288,22 @@ def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> 
     return found, [said]
 
 
-def correct_air(transmission: Transmission, columns: int | None) -> tuple[Transmission, np.ndarray | None, list[str]]:
+def correct_air(
+    transmission: Transmission, columns: int | None, found: Air | None = None
+) -> tuple[Transmission, np.ndarray | None, list[str]]:
     """Divide a transmission by the light of the air at the edges of the detector, and say so.
 
     Args:
         transmission: transmission of a scan.
         columns: columns without object at each edge; 0: no correction; None: air is looked for.
+        found: air found before, in place of a search.
 
     Returns:
         The corrected transmission; the light, to broadcast against it, or None; notes.
     """
     if columns:
         return normalise_air(transmission, columns), fit_air(transmission.value, columns), []
-    air = find_air(transmission) if columns is None else None
+    air = (found or find_air(transmission)) if columns is None else None
     if air is None or not air.is_needed:
         return transmission, None, []
     least, most = air.factor.min(), air.factor.max()

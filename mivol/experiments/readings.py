@@ -21,8 +21,9 @@ from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files import read_columns, read_projections, read_stack
 from mivol.files.fetch import resolve_path
+from mivol.files.image_stack import ALL, stack_shape
 from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
-from mivol.files.scan_hdf5 import NO_DARKS
+from mivol.files.scan_hdf5 import NO_DARKS, survey_projections
 from mivol.files.source import refusal
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.solvers import SOLVERS
@@ -52,16 +53,34 @@ class ScanReadings:
     notes: tuple[str, ...] = ()
 
 
-def read_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
-    """Read a measured scan.
+def read_scan(settings: config.ScanExperiment, base: Path, rows: slice = ALL) -> ScanReadings:
+    """Read a measured scan, or some rows of its detector, counted upwards.
 
     Raises:
         MivolError: an unreadable file, or files of different sizes.
     """
-    return READERS[type(settings.data)](settings, base)
+    return READERS[type(settings.data)](settings, base, rows)
 
 
-def read_hdf5_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
+def detector_size(settings: config.ScanExperiment, base: Path) -> tuple[int, int, int]:
+    """Return (views, rows, columns) of a measured scan, without its readings if the format allows.
+
+    Raises:
+        MivolError: as :func:`read_scan`.
+    """
+    data = settings.data
+    if isinstance(data, Measured):
+        names = {role: getattr(data, role) for role in ("data", "flats", "darks", "angles")}
+        scan = survey_projections(resolve_path(base, data.file), data.group, names, data.angle_unit)
+        rows = data.rows[1] - data.rows[0] if data.rows else scan.pixels[0]
+        return scan.frames[0], rows, scan.pixels[1]
+    if isinstance(data, Stack):
+        return stack_shape(base / data.file, data.dataset or None)
+    scan = read_nikon(base / data.file)
+    return len(scan.images), *scan.detector
+
+
+def read_hdf5_scan(settings: config.ScanExperiment, base: Path, rows: slice) -> ScanReadings:
     """Read a scan in an HDF5 file.
 
     Raises:
@@ -69,7 +88,8 @@ def read_hdf5_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
     """
     data: Measured = settings.data
     names = {role: getattr(data, role) for role in ("data", "flats", "darks", "angles")}
-    scan = read_projections(resolve_path(base, data.file), data.group, names, data.angle_unit, data.rows)
+    path = resolve_path(base, data.file)
+    scan = read_projections(path, data.group, names, data.angle_unit, _rows_of_file(data.rows, rows))
     fields = scan.projections, scan.flats, scan.darks
     angles = scan.angles
     if angles is None and not isinstance(settings.scan, Table | Matrices):
@@ -79,7 +99,15 @@ def read_hdf5_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
     return ScanReadings(correct_transmission(*fields, data.saturation), angles, intensity=fields, notes=scan.notes)
 
 
-def read_stack_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
+def _rows_of_file(chosen: tuple[int, int] | None, rows: slice) -> slice | None:
+    """Rows of the detector: ``rows`` of the rows that the settings choose."""
+    if rows == ALL:
+        return slice(*chosen) if chosen else None
+    first = chosen[0] if chosen else 0
+    return slice(first + rows.start, first + rows.stop, rows.step)
+
+
+def read_stack_scan(settings: config.ScanExperiment, base: Path, rows: slice) -> ScanReadings:
     """Read a stack of images or an array.
 
     Raises:
@@ -87,9 +115,15 @@ def read_stack_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings
     """
     data: Stack = settings.data
 
+    is_flipped = data.first_row == "highest"
+    if is_flipped and rows != ALL:
+        # The same rows counted downwards: ``rows`` of the flipped rows.
+        last = range(stack_shape(base / data.file, data.dataset or None)[1])[::-1][rows]
+        rows = slice(last[-1], last[0] + 1, -last.step)
+
     def stack(name: str) -> np.ndarray:
-        values = read_stack(base / name, data.dataset or None)
-        return values[:, ::-1] if data.first_row == "highest" else values
+        values = read_stack(base / name, data.dataset or None, rows)
+        return values[:, ::-1] if is_flipped else values
 
     readings = stack(data.file)
     fields, notes = None, ()
@@ -157,7 +191,7 @@ def note_order(angles: np.ndarray) -> list[str]:
     return [f"the angles turn back {len(back)} times ({turned}): they are used as given"]
 
 
-def read_nikon_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings:
+def read_nikon_scan(settings: config.ScanExperiment, base: Path, rows: slice) -> ScanReadings:
     """Read a Nikon scan.
 
     Raises:
@@ -167,11 +201,11 @@ def read_nikon_scan(settings: config.ScanExperiment, base: Path) -> ScanReadings
     scan = read_nikon(base / data.file)
     angles = read_nikon_angles(base / data.angles, len(scan.images)) if data.angles else scan.angles
     geometry = geometry_from_nikon(scan, angles)
-    transmission = assume_quantum_noise(read_nikon_transmission(scan, data.saturation))
+    transmission = assume_quantum_noise(read_nikon_transmission(scan, data.saturation, rows))
     return ScanReadings(transmission, geometry=geometry, notes=tuple(describe_nikon_settings(scan, geometry)))
 
 
-READERS: dict[type, Callable[[config.ScanExperiment, Path], ScanReadings]] = {
+READERS: dict[type, Callable[[config.ScanExperiment, Path, slice], ScanReadings]] = {
     Measured: read_hdf5_scan,
     Stack: read_stack_scan,
     Nikon: read_nikon_scan,

@@ -37,6 +37,7 @@ from mivol.files import (
     vdb_writer,
     vti,
     vtk_legacy,
+    zarr,
 )
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal, refuse_dataset
@@ -76,6 +77,7 @@ _HDF5 = VolumeFormat("HDF5", _starts_with(hdf5.MAGIC), hdf5.read_hdf5)
 _MRC = VolumeFormat("MRC", mrc.is_mrc, mrc.read_mrc)
 _DICOM = VolumeFormat("DICOM", dicom.is_dicom, dicom.read_dicom)
 _TIFF = VolumeFormat("TIFF", tiff.is_tiff, tiff.read_tiff)
+_ZARR = VolumeFormat("Zarr", lambda head: False, zarr.read_zarr)
 _LES = VolumeFormat("LES cloud text", renderer_grids.is_les, renderer_grids.read_les)
 
 #: suffix -> format; a longer suffix is tried first.
@@ -105,6 +107,7 @@ FORMATS: dict[str, VolumeFormat] = {
     ".mat": VolumeFormat("MATLAB", _starts_with(matlab.MAGIC), matlab.read_matlab),
     ".tif": _TIFF,
     ".tiff": _TIFF,
+    ".zarr": _ZARR,
 }
 
 RAW_BYTES = "raw bytes"
@@ -139,6 +142,9 @@ WRITERS: dict[str, Callable[[BinaryIO, np.ndarray, np.ndarray, dict[str, Any]], 
     ".tiff": tiff.write_tiff,
 }
 
+#: suffix -> writer(path, values, to_world, metadata) of a folder.
+FOLDER_WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray, dict[str, Any]], None]] = {".zarr": zarr.write_zarr}
+
 #: suffix -> writer without compression.
 STORED_WRITERS = {**WRITERS, ".npz": npy.write_npz_stored}
 
@@ -161,7 +167,7 @@ def read_volume(
 
     Args:
         path: file; the suffix selects the format, and the first bytes must agree. The folder, or a file, of a DICOM series;
-            a folder of TIFF slices.
+            a folder of TIFF slices, or a Zarr.
         dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .nvdb, .h5, LES text); number or
             ``SeriesInstanceUID`` of a DICOM series; name of the slices, with "#" for numbers, in a folder of several kinds.
         frame: key of :data:`FRAMES`: "file" places the volume as in the header and refuses a degenerate box, "unit" puts the
@@ -258,14 +264,18 @@ def write_volume(
         MivolError: an unknown suffix, values or a placement outside the format, or a full disk.
     """
     path = Path(path)
-    writer = (WRITERS if compress else STORED_WRITERS)[_find_suffix(path, WRITERS)]
+    suffix = _find_suffix(path, WRITERS | FOLDER_WRITERS)
     if isinstance(values, SparseVolumeData):
         to_world = values.to_world if to_world is None else to_world
-        values = values if _find_suffix(path, WRITERS) in SPARSE_READERS else values.dense()
+        values = values if suffix in SPARSE_READERS else values.dense()
     else:
         values = to_values(values, path)
     to_world = np.eye(4) if to_world is None else np.array(to_world, np.float64)
     check_frame(to_world, path)
+    if suffix in FOLDER_WRITERS:
+        FOLDER_WRITERS[suffix](path, values, to_world, dict(metadata or {}))
+        return
+    writer = (WRITERS if compress else STORED_WRITERS)[suffix]
     write_whole(path, lambda file: writer(file, values, to_world, dict(metadata or {})))
 
 
@@ -284,7 +294,7 @@ def is_volume(path: Path) -> bool:
     holds DICOM or TIFF.
     """
     if path.is_dir():
-        return _is_dicom_folder(path) or bool(tiff.group_images(path))
+        return zarr.is_zarr(path) or _is_dicom_folder(path) or bool(tiff.group_images(path))
     if path.name.lower().endswith(VOLUME_SUFFIXES) or _is_nameless_dicom(path):
         return True
     return path.is_file() and not path.name.lower().endswith(tuple(FORMATS)) and raw.find_header(path) is not None
@@ -414,6 +424,8 @@ def _find_format(path: Path, shape: Sequence[int] | None = None, dtype: np.dtype
     """The format of a folder, of DICOM or raw bytes with any other suffix, or of a suffix with which the first bytes agree."""
     if shape is not None or dtype is not None:
         return _raw_format(check_file(path), shape, dtype)
+    if zarr.is_zarr(path):
+        return _ZARR
     if path.is_dir() and _is_dicom_folder(path):
         return _DICOM
     if path.is_dir() and tiff.group_images(path):

@@ -7,8 +7,10 @@ their names: slice.2 before slice.10.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +20,17 @@ from mivol.files.source import check_file, refusal
 from mivol.files.tiff import TIFF, natural_order
 from mivol.files.volume import VolumeData, check_frame, frame_from_steps, to_values
 
+ALL = slice(None)
+"""All rows."""
 
-def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarray:
+
+def read_stack(path: str | os.PathLike, dataset: str | None = None, rows: slice = ALL) -> np.ndarray:
     """Read projections.
 
     Args:
         path: TIFF, .npy, .npz or HDF5 file, or a pattern of TIFF files.
         dataset: name of the array in an .npz or HDF5 file.
+        rows: rows of the images. Other rows are not read from uncompressed TIFF and ``.npy``.
 
     Returns:
         Projections (n, rows, columns), float32.
@@ -32,17 +38,37 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarra
     Raises:
         MivolError: no file, another format, images of different sizes, or numbers that are not finite.
     """
+    files = _find_files(path)
+    if files[0].suffix.lower() in TIFF:
+        stack = read_images(files, rows)
+    elif rows != ALL and (mapped := _map_array(files[0])) is not None:
+        stack = np.asarray(mapped[:, rows], np.float32)
+    else:
+        stack = read_volume(files[0], dataset).values[..., 0][:, rows]
+    check_finite(path, stack)
+    return stack
+
+
+def stack_shape(path: str | os.PathLike, dataset: str | None = None) -> tuple[int, int, int]:
+    """Size (n, rows, columns) of a stack. Uncompressed TIFF and ``.npy`` are not read.
+
+    Args, raises: as :func:`read_stack`.
+    """
+    files = _find_files(path)
+    if files[0].suffix.lower() in TIFF:
+        with _opened(files[0]) as image:
+            return len(files) * getattr(image, "n_frames", 1), image.height, image.width
+    mapped = _map_array(files[0])
+    return (read_volume(files[0], dataset).values if mapped is None else mapped).shape[:3]
+
+
+def _find_files(path: str | os.PathLike) -> list[Path]:
     files = sorted(Path(path).parent.glob(Path(path).name), key=natural_order)
     if not files or Path(path).is_dir():
         check_file(path, in_a_folder=f'name a file in it, or a pattern of TIFF files: "{Path(path).name}/*.tif"')
-    if files[0].suffix.lower() in TIFF:
-        stack = read_images(files)
-    elif len(files) > 1:
+    if len(files) > 1 and files[0].suffix.lower() not in TIFF:
         raise refusal(path, f"{len(files)} files", "one file, or a pattern of TIFF files", "name one of the files")
-    else:
-        stack = read_volume(files[0], dataset).values[..., 0]
-    check_finite(path, stack)
-    return stack
+    return files
 
 
 def check_finite(path: str | os.PathLike, stack: np.ndarray) -> None:
@@ -62,8 +88,12 @@ def check_finite(path: str | os.PathLike, stack: np.ndarray) -> None:
         )
 
 
-def read_images(files: list[Path]) -> np.ndarray:
+def read_images(files: list[Path], rows: slice = ALL) -> np.ndarray:
     """Read the pages of TIFF files.
+
+    Args:
+        files: files.
+        rows: rows of the images.
 
     Returns:
         Pages (n, rows, columns), float32.
@@ -71,20 +101,54 @@ def read_images(files: list[Path]) -> np.ndarray:
     Raises:
         MivolError: errors of :func:`read_stack`.
     """
-    from PIL import Image, ImageSequence
+    from PIL import ImageSequence
 
     pages = []
     for file in files:
         check_file(file)
-        try:
-            with Image.open(file) as image:
-                pages += [np.asarray(page, np.float32) for page in ImageSequence.Iterator(image)]
-        except Exception as error:  # Pillow raises errors of its parser, such as a TypeError without a width
-            raise refusal(file, f"a damaged or foreign file ({error})", "TIFF", "copy the file again") from error
+        if rows != ALL and (mapped := _map_pages(file)) is not None:
+            pages += list(np.asarray(mapped[:, rows], np.float32))
+            continue
+        with _opened(file) as image:
+            pages += [np.asarray(page, np.float32)[rows] for page in ImageSequence.Iterator(image)]
     shapes = {page.shape for page in pages}
     if len(shapes) > 1 or len(next(iter(shapes))) != 2:
         raise refusal(files[0], f"images of shapes {sorted(shapes)[:3]}", "grey images of one size", "crop or convert them")
     return np.stack(pages)
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    """A TIFF file, opened by Pillow."""
+    from PIL import Image
+
+    try:
+        with Image.open(file) as image:
+            yield image
+    except Exception as error:  # Pillow raises errors of its parser, such as a TypeError without a width
+        raise refusal(file, f"a damaged or foreign file ({error})", "TIFF", "copy the file again") from error
+
+
+def _map_pages(file: Path) -> np.ndarray | None:
+    """Pages (n, rows, columns) of an uncompressed TIFF file, on the disk; None for other files."""
+    from tifffile import memmap
+
+    try:
+        pages = memmap(file, mode="r")
+    except Exception:  # compressed, damaged or in pieces: Pillow reads or refuses the file
+        return None
+    return pages.reshape(-1, *pages.shape[-2:]) if pages.ndim in (2, 3) and pages.dtype.kind in "uif" else None
+
+
+def _map_array(file: Path) -> np.ndarray | None:
+    """The array (n, rows, columns) of an ``.npy`` file, on the disk; None for other files."""
+    if file.suffix.lower() != ".npy":
+        return None
+    with suppress(ValueError, OSError):
+        mapped = np.load(file, mmap_mode="r")
+        if mapped.ndim == 3 and mapped.dtype.kind in "uif":
+            return mapped
+    return None
 
 
 def read_slices(

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.files.image_stack import check_finite, read_images
+from mivol.files.image_stack import ALL, check_finite, read_images, stack_shape
 from mivol.files.source import check_file, refusal
 from mivol.files.tiff import TIFF, natural_order
 
@@ -120,19 +120,21 @@ def read_nikon_angles(path: str | os.PathLike, views: int) -> np.ndarray:
     return np.array([angles[number] for number in numbers])
 
 
-def read_nikon_transmission(scan: NikonScan, saturation: float = math.inf) -> np.ndarray:
+def read_nikon_transmission(scan: NikonScan, saturation: float = math.inf, rows: slice = ALL) -> np.ndarray:
     """Return readings divided by the white level, float32 (views, rows, columns).
 
-    Rows start at the lowest, and columns run as seen from the source. Readings of ``saturation`` or more become NaN.
+    Rows start at the lowest, and columns run as seen from the source. Readings of ``saturation`` or more become NaN. ``rows``
+    are counted upwards.
 
     Raises:
         MivolError: an unreadable image, or an image of another size than the detector.
     """
-    readings = read_images(list(scan.images))
-    if readings.shape[1:] != scan.detector:
-        rows, columns = readings.shape[1:]
+    height, columns = stack_shape(scan.images[0])[1:]
+    if (height, columns) != scan.detector:
         expected = "{} x {} as DetectorPixels".format(*scan.detector)
-        raise refusal(scan.path, f"images of {rows} x {columns} pixels", expected, "correct the settings")
+        raise refusal(scan.path, f"images of {height} x {columns} pixels", expected, "correct the settings")
+    down = range(height)[::-1][rows]
+    readings = read_images(list(scan.images), ALL if rows == ALL else slice(down[-1], down[0] + 1, -down.step))
     check_finite(scan.path, readings)
     readings[readings >= saturation] = np.nan
     return readings[:, ::-1, ::-1] / np.float32(scan.white_level)

@@ -98,7 +98,7 @@ def read_projections(
     group: str = "",
     names: Mapping[str, str] | None = None,
     angle_unit: str | None = None,
-    rows: tuple[int, int] | None = None,
+    rows: slice | None = None,
 ) -> ProjectionData:
     """Read the counts of a scan from an HDF5 file of any suffix.
 
@@ -108,7 +108,7 @@ def read_projections(
         names: datasets by role: ``data``, ``flats``, ``darks``, ``angles``. A name replaces what the layout has; with a name of
             ``data``, all roles are read by name. ``other.h5:name`` is a dataset of another file, in the folder of this one.
         angle_unit: "degree" or "radian" in place of the file's; None: as the angles say, else as the covered arc says.
-        rows: first row and the row after the last; None: all rows.
+        rows: rows of the detector, upwards; None: all rows.
 
     Raises:
         MivolError: no HDF5 file, a missing h5py, dataset, link target or compression filter, inconsistent shapes, angles or
@@ -350,7 +350,7 @@ def _dataset(file: Any, path: Path, group: str, name: str) -> Any:
 # -- Numbers -----------------------------------------------------------------------------------------------------------------
 
 
-def _read_frames(path: Path, role: str, frames: Frames, rows: tuple[int, int] | None) -> np.ndarray:
+def _read_frames(path: Path, role: str, frames: Frames, rows: slice | None) -> np.ndarray:
     """Read frames as float32 (n, rows, columns); one image counts as a stack of one."""
     dataset, name, indices = frames
     if dataset.ndim != 3 and not (dataset.ndim == 2 and role != "data"):
@@ -359,22 +359,24 @@ def _read_frames(path: Path, role: str, frames: Frames, rows: tuple[int, int] | 
         raise refusal(f"{path}:{name}", f"values of type {dataset.dtype}", "real numbers", "name another dataset")
     check_storage(path, dataset)
     height, width = dataset.shape[-2:]
-    first, end = rows or (0, height)
+    rows = rows or slice(0, height)
+    first, end, step = rows.start, rows.stop, rows.step or 1
     if not 0 <= first < end <= height:
         raise refusal(
             path, f"data.rows = [{first}, {end}]", f"rows from 0 to {height}, the first before the last", "correct it"
         )
     if dataset.ndim == 2:
-        return np.asarray(dataset[first:end], np.float32)[None]
+        return np.asarray(dataset[first:end:step], np.float32)[None]
     indices = np.arange(len(dataset)) if indices is None else indices
-    size = len(indices) * (end - first) * width
+    count = len(range(first, end, step))
+    size = len(indices) * count * width
     advice = f"give data.rows = [{height // 2}, {height // 2 + 4}] for a few of the {height} rows"
-    check_memory(READING_BYTES * size, f"{path}: {role} of {len(indices)} x {end - first} x {width} pixels", advice)
-    stack = np.empty((len(indices), end - first, width), np.float32)
+    check_memory(READING_BYTES * size, f"{path}: {role} of {len(indices)} x {count} x {width} pixels", advice)
+    stack = np.empty((len(indices), count, width), np.float32)
     # Runs of neighbouring frames: a list of frames is read one by one.
     for run in np.split(np.arange(len(indices)), np.flatnonzero(np.diff(indices) != 1) + 1):
         if len(run):
-            stack[run[0] : run[-1] + 1] = dataset[indices[run[0]] : indices[run[-1]] + 1, first:end]
+            stack[run[0] : run[-1] + 1] = dataset[indices[run[0]] : indices[run[-1]] + 1, first:end:step]
     return stack
 
 

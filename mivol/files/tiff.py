@@ -21,6 +21,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.files.atomic import disk_faults, write_whole
 from mivol.files.npy import check_memory
 from mivol.files.source import check_file, refusal, refuse_dataset, select_dataset
 from mivol.files.volume import VolumeData, frame_from_steps, is_upright, split_frame, to_values
@@ -93,6 +94,28 @@ def write_tiff(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadat
     stored = values if values.shape[3] > 1 else values[..., 0]
     with TiffWriter(file, bigtiff=True, ome=True) as writer:
         writer.write(stored, photometric="minisblack", planarconfig="contig" if values.shape[3] > 1 else None, metadata=named)
+
+
+class TiffSlices:
+    """A folder of TIFF files, a float32 slice each, that is written a few slices at a time.
+
+    Args:
+        path: folder; created.
+        shape: (Z, Y, X).
+    """
+
+    def __init__(self, path: Path, shape: tuple[int, int, int]) -> None:
+        self.path, self.digits = path, max(4, len(str(shape[0])))
+        with disk_faults(path, "room for a folder"):
+            path.mkdir(exist_ok=True)
+
+    def write(self, first: int, values: np.ndarray) -> None:
+        """Write slices (n, Y, X) from z = ``first`` on, each file whole or not at all."""
+        from tifffile import imwrite
+
+        for k, image in enumerate(np.asarray(values, np.float32)):
+            name = self.path / f"slice_{first + k:0{self.digits}}.tif"
+            write_whole(name, lambda file, image=image: imwrite(file, image, photometric="minisblack"))
 
 
 def _volume(path: Path, array: np.ndarray, spacing: np.ndarray, unit: str, notes: tuple[str, ...]) -> VolumeData:

@@ -13,8 +13,8 @@ References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988),
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -112,6 +112,13 @@ class VoxelGrid:
         matrix[:3, 3] = np.asarray(self.centre) - self.extent / 2
         return matrix
 
+    def select_layers(self, layers: slice) -> VoxelGrid:
+        """Return the grid of some layers along z, evenly spaced upwards."""
+        z = self.axis("z")[layers]
+        x_size, y_size, z_size = self.voxel_size
+        shape, size = (len(z), *self.shape[1:]), (x_size, y_size, z_size * (layers.step or 1))
+        return VoxelGrid(shape, size, (*self.centre[:2], float(z[0] + z[-1]) / 2))
+
     def axis(self, name: str) -> np.ndarray:
         """World coordinates [length] of the voxel centres along ``"x"``, ``"y"`` or ``"z"``."""
         i = "xyz".index(name)
@@ -164,6 +171,13 @@ class _TurningDetector:
     def shape(self) -> tuple[int, int, int]:
         """(views, rows, columns)."""
         return len(self.angles), *self.detector
+
+    def select_rows(self, rows: slice) -> Self:
+        """Return the same beam on some rows of the detector, evenly spaced upwards."""
+        v = self.v[rows]
+        pitch = self.pitch[0] * (rows.step or 1), self.pitch[1]
+        offset = float(v[0] + v[-1]) / 2, self.detector_offset[1]
+        return replace(self, detector=(len(v), self.detector[1]), pitch=pitch, detector_offset=offset)
 
     @property
     def u(self) -> np.ndarray:

@@ -63,7 +63,7 @@ def test_datasets_by_name(tmp_path: Path) -> None:
     np.testing.assert_allclose(scan.angles, np.radians(DEGREES[VIEWS]), rtol=1e-15)
     assert read_projections(path, names=names | {"angles": ""}).angles is None
     for part in ("projections", "flats", "darks"):
-        cut = getattr(read_projections(path, names=names, rows=(1, 2)), part)
+        cut = getattr(read_projections(path, names=names, rows=slice(1, 2)), part)
         np.testing.assert_array_equal(cut, getattr(scan, part)[:, 1:2])
     scan = read_projections(path, names=names | {"darks": ""})
     assert not scan.darks.any() and scan.notes == ("no darks: a reading of 0 is taken as no light",)
