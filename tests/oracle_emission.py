@@ -51,13 +51,14 @@ class Ray:
 
 @dataclass(frozen=True)
 class Medium:
-    """A medium in the interval(o, d) of its boundary; `albedo` takes its share off the source."""
+    """A medium in the interval(o, d) of its boundary; `albedo` takes its share off the source; the rule cuts cells."""
 
     sigma: object
     source: object = 0.0
     emission_density: object = 0.0
     albedo: object = 0.0
     interval: Interval = lambda o, d: (-math.inf, math.inf)
+    parts: int = 1
 
     @property
     def fields(self) -> tuple:
@@ -162,7 +163,8 @@ def _cell_radiance(medium: Medium, ray: Ray, background: object, end: float) -> 
     guide = next((f for f in medium.fields if isinstance(f, tuple)), None)
     edges = _finite(np.concatenate([[t0, t1], ray.breaks(guide, t0, t1)]))
     L, T = np.zeros(3), np.ones(3)
-    for a, b in itertools.pairwise(edges):
+    cut = [np.linspace(a, b, medium.parts + 1) for a, b in itertools.pairwise(edges)]
+    for a, b in itertools.chain.from_iterable(map(itertools.pairwise, cut)):
         sigma, source, j = medium.at(ray, a + (b - a) * np.array(GAUSS_2))
         w = share(b - a, *sigma)
         L += T * (w[0] * source[0] + w[1] * source[1])

@@ -17,7 +17,7 @@ class MivolMedium(mi.Medium):
         sigma_a, sigma_s: absorption and scattering [1/length]; each a float, rgb (above 1 allowed) or a volume.
         scale: factor on the extinction, differentiable. Default 1.
         emission: radiance Le of an opaque part of the medium (the source function is (1 - albedo) Le), a float, rgb or a
-            volume; in an extinction grid, with voxels no smaller than the grid's. A ``mivol_sh`` brings its own extinction:
+            volume; its voxels may be an eighth of the extinction's, in any place. A ``mivol_sh`` brings its own extinction:
             give nothing else with it. Default none.
         emission_density: emitted radiance per length, independent of the extinction, in the same forms. Default none.
         a phase function: default isotropic.

@@ -5,14 +5,13 @@ from __future__ import annotations
 import difflib
 
 import mitsuba as mi
-import numpy as np
 
 from mivol.errors import MivolError
 from mivol.scene.choices import choose_media_light, choose_near_light, is_scattering_visible, shares_cells
 from mivol.scene.needs import Needs
 from mivol.transport.line_integrals.aovs import AOVS
+from mivol.transport.media.emission_cells import MAX_PARTS, voxel_to_cell_ratio
 from mivol.transport.media.grid_extinction import have_same_cells
-from mivol.transport.media.medium_view import MediumView
 from mivol.transport.path.estimators import Settings
 
 SHADOWS = ("auto", "exact", "estimated", "grid")
@@ -62,23 +61,14 @@ def check_emission_cells(needs: Needs, settings: Settings) -> None:
                 "extinction: give both the same resolution and to_world."
             )
         for name, volume in (("emission", view.emission), ("albedo", view.albedo)) if view.emission is not None else ():
-            least = _voxel_to_cell_ratio(volume, view) if isinstance(volume, mi.Volume) else 1.0
-            if least < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
+            least = voxel_to_cell_ratio(volume, view) if isinstance(volume, mi.Volume) else 1.0
+            if least * MAX_PARTS < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
                 led = any(p.lattice is not None for p in view.parts)
                 whose, advice = ("extinction", ", or give it as a number") if led else ("emission_density", "")
                 raise MivolError(
                     f"the {name} of the medium in {facts.name} varies over lengths of {least:.2g} of its {whose}'s cells, "
-                    f"which are integrated by two points; resample the {whose} to voxels as small{advice}."
+                    f"of which {MAX_PARTS} parts are integrated; resample the {whose} to smaller voxels{advice}."
                 )
-
-
-def _voxel_to_cell_ratio(volume: mi.Volume, view: MediumView) -> float:
-    """Edge of a voxel of the volume over the longest edge of a walked cell, both in the volume's lengths."""
-    cells = view.walked_lattice
-    place = volume.mivol_to_world if hasattr(volume, "mivol_to_world") else view.stock_boxes[volume.ptr].to_world
-    edges = cells.to_world[:3, :3] / np.array(cells.res[::-1])
-    voxels = np.linalg.solve(place[:3, :3], edges) * np.array(volume.resolution(), dtype=np.float64)[:, None]
-    return 1 / float(np.linalg.norm(voxels, axis=0).max())
 
 
 def check_placements(needs: Needs) -> None:

@@ -67,11 +67,30 @@ def test_grids_in_any_frame(kind, frame):
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= (2e-5 if kind == "mivol_voxels" else 1e-4)
 
 
-def test_light_on_other_cells_than_the_extinction():
-    """A source function may have a grid of its own: it is looked up at the points of the extinction's cells."""
-    m = twins.Medium((rough(1, 0, 3), PLACE), (rough(2, 0, 1, 3, (3, 2, 4)), as_float32(centred(1.7 * np.eye(3)))))
+FINE = {
+    "coarser, inside of cells": ((3, 2, 4), centred(1.7 * np.eye(3)), 4),
+    "finer": ((9, 12, 17), PLACE, 3),
+    "finer, turned": ((9, 7, 8), FRAMES["rotated"], 4),
+    "half of the cells": ((3, 2, 3), PLACE @ np.diag([0.5, 0.5, 0.6, 1]), 2),
+}
+"""Voxels (Z, Y, X) of the emission, its place, and the parts of a cell."""
+
+
+@pytest.mark.slow_for("finer, turned")
+@pytest.mark.parametrize("name", FINE)
+def test_light_on_other_cells_than_the_extinction(name):
+    """A source function has a grid of its own: it is looked up in parts of the extinction's cells. Derivatives too."""
+    shape, place, parts = FINE[name]
+    m = twins.Medium((rough(1, 0.1, 3), PLACE), (rough(2, 0.1, 1, 3, shape), as_float32(place)), parts=parts)
     seen = emitting(m)
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= 4e-6
+    ends = ("sigma_t.data", "emission.data")
+    along, w = directions(seen.scene, ends), np.random.default_rng(2).uniform(size=(len(seen.o), 3))
+    jv, found = changes(seen, along), gradients(seen, list(ends), w)
+    fd = moved(seen.scene, along, lambda: light(seen))
+    assert np.abs(jv - fd).max() <= 2e-4 * np.abs(fd).max()
+    total = [np.sum(g * v) for g, v in zip(found, along.values(), strict=True)]
+    assert abs(sum(total) - (jv * w).sum()) <= 1e-5 * sum(np.abs(total))
 
 
 @pytest.mark.slow_for("gridvolume")
@@ -327,7 +346,7 @@ def test_the_finer_of_emission_and_albedo_brings_the_cells():
 
 
 def test_an_albedo_that_varies_within_the_cells_is_refused():
-    sigma, albedo = (rough(1, 0, 2), PLACE), (rough(2, 0, 1, 1, (5, 8, 6)), PLACE)
+    sigma, albedo = (rough(1, 0, 2), PLACE), (rough(2, 0, 1, 1, (5, 50, 6)), PLACE)
     with refused("the albedo of the medium in box varies over lengths of .* of its extinction's cells"):
         shoot(picture(interior(twins.Medium(sigma, LE, 0.0, albedo))))
     # Without emission there is nothing to be looked at.
@@ -337,13 +356,16 @@ def test_an_albedo_that_varies_within_the_cells_is_refused():
 @pytest.mark.slow_for("gridvolume")
 @pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
 def test_a_source_that_varies_within_the_cells_is_refused(kind):
-    """Two points of a cell would miss it: 16^3 voxels of noise in an extinction of 2^3 are seen with an error of 8 %."""
+    """Eight parts of a cell would miss it."""
     sigma = (rough(1, 0, 2), PLACE)
-    for source in ((rough(2, 0, 1, 3, (5, 4, 7)), PLACE), (rough(2, 0, 1, 3), as_float32(PLACE @ np.diag([0.5, 0.9, 0.9, 1])))):
+    for source in (
+        (rough(2, 0, 1, 3, (5, 4, 57)), PLACE),
+        (rough(2, 0, 1, 3), as_float32(PLACE @ np.diag([0.1, 0.9, 0.9, 1]))),
+    ):
         with refused("the emission of the medium in box varies over lengths of .* of its extinction's cells"):
             shoot(picture(interior(twins.Medium(sigma, source), kind)))
     # In a constant extinction it is the light's cells that are walked: the emission density's, where there are both.
-    fine, coarse = (rough(2, 0, 1, 3, (9, 4, 6)), PLACE), (rough(3, 0, 1, 3), PLACE)
+    fine, coarse = (rough(2, 0, 1, 3, (45, 4, 6)), PLACE), (rough(3, 0, 1, 3), PLACE)
     with refused("the emission of the medium in box varies over lengths of .* of its emission_density's cells"):
         shoot(picture(interior(twins.Medium(0.5, fine, coarse), kind)))
     for m in (twins.Medium(0.5, fine), twins.Medium(0.5, coarse, fine), twins.Medium(sigma, coarse)):

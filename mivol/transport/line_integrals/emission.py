@@ -9,6 +9,7 @@ depend on the extinction.
 Conventions. :mod:`mivol.transport.line_integrals.composite` composites a ray cell by cell. Source function and emission density
 are evaluated at the two points of the cell quadrature (:mod:`mivol.transport.traversal.cell_quadrature`). Cells belong to the
 grid of the extinction, or to the grid of the emission if the extinction has no grid; an interval outside all grids is one cell.
+A cell is cut into equal parts where the voxels of emission or albedo are smaller, or where their box ends inside of cells.
 ``omega`` is the direction from the point to the camera (``wi``).
 
 References: Max 1995 (the emission-absorption integral).
@@ -29,6 +30,7 @@ from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import colours_to_channels, take_tangent, to_spectrum
 from mivol.transport.media.compositing import CellIntegral
+from mivol.transport.media.emission_cells import count_parts
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment, find_end
 from mivol.transport.media.scene_media import SceneMedia
@@ -57,9 +59,9 @@ def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bo
     Raises:
         MivolError: a medium whose grids of extinction do not share their cells.
 
-    Bias: of order dt^4 in the length of a cell; none for a constant source function. Cost: a walk of each medium, and two
-    look-ups
-        of the emission a cell.
+    Bias: of order dt^4 in the length of a part of a cell; none for a constant source function. A box of emission that ends
+        inside of cells is met to a part of a cell.
+    Cost: a walk of each medium, and two look-ups of the emission in a part of a cell.
     """
     line = LineIntegral(media, _EmissionIntegrand.of(media), ray_segment, active)
     return composite_ray(line, [mi.Float(0)] * line.integrand.rows, tangent, skip=not tangent)
@@ -92,18 +94,34 @@ class _EmissionIntegrand:
 
     rows: int
     channels: int
-    points: ClassVar[tuple[float, ...]] = (GAUSS_POINT, 1 - GAUSS_POINT)
+    parts: int
     request: ClassVar[str] = "a medium emits"
     alternative: ClassVar[str] = "take its emission out"
 
     @classmethod
     def of(cls, media: SceneMedia) -> _EmissionIntegrand:
-        return cls(dr.size_v(mi.Spectrum), media.channels)
+        return cls(dr.size_v(mi.Spectrum), media.channels, max((count_parts(b.view) for b in media.bodies), default=1))
+
+    @property
+    def points(self) -> tuple[float, ...]:
+        """Two points in each part of a cell, as fractions of its length."""
+        return tuple((part + p) / self.parts for part in range(self.parts) for p in (GAUSS_POINT, 1 - GAUSS_POINT))
 
     def integrate_cell(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
         source, emission_density = self._detached(piece)
-        shares = [share_opacity(piece.dt, *row) for row in sigma[: self.channels]]
-        density_weights = [weigh_emission_density(piece.dt, *row) for row in sigma[: self.channels]] if emission_density else []
+        dt = piece.dt / self.parts
+        cells = []
+        for part in range(self.parts):
+            here = slice(2 * part, 2 * part + 2)
+            cells.append(self._integrate_part(dt, [row[here] for row in sigma], source[here], emission_density[here]))
+        return cells[0] if self.parts == 1 else [_join_parts(row) for row in zip(*cells, strict=True)]
+
+    def _integrate_part(
+        self, dt: mi.Float, sigma: list[list[mi.Float]], source: list[mi.Spectrum], emission_density: list[mi.Spectrum]
+    ) -> list[CellIntegral]:
+        """Integrate each row over a part of a cell, from extinction [row][point], source function and emission density."""
+        shares = [share_opacity(dt, *row) for row in sigma[: self.channels]]
+        density_weights = [weigh_emission_density(dt, *row) for row in sigma[: self.channels]] if emission_density else []
         integrals = []
         for r in range(self.rows):
             share = shares[r % self.channels]
@@ -121,7 +139,7 @@ class _EmissionIntegrand:
     def integrate_constant(self, piece: RayPiece, sigma: list[mi.Float]) -> list[CellIntegral]:
         finite = dr.isfinite(piece.dt)
         near = RayPiece(piece.body, piece.ray, piece.a, dr.select(finite, piece.dt, 0), piece.on)
-        integrals = self.integrate_cell(near, [[s, s] for s in sigma])
+        integrals = self.integrate_cell(near, [[s] * len(self.points) for s in sigma])
         source, emission_density = self._detached(near)
         return [
             _extend_to_infinity(
@@ -209,16 +227,17 @@ class _EmissionIntegrand:
     def _weights(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> tuple[list, list, list]:
         """Weights at each point: of the source function, of the emission density, of source function times extinction."""
         finite = dr.isfinite(piece.dt)
-        dt = dr.select(finite, piece.dt, 0)
+        dt = dr.select(finite, piece.dt, 0) / self.parts
         rows = sigma[: self.channels]
-        shares = [share_opacity(dt, *row) for row in rows]
-        by_source = _group_by_point([s.weights for s in shares])
-        per_sigma = _group_by_point([s.per_sigma for s in shares])
-        by_density = (
-            _group_by_point([weigh_emission_density(dt, *row).weights for row in rows])
-            if piece.body.view.emission_density is not None
-            else []
-        )
+        by_source, per_sigma, by_density, ahead = [], [], [], [mi.Float(1)] * self.channels
+        for part in range(self.parts):
+            here = [row[2 * part : 2 * part + 2] for row in rows]
+            shares = [share_opacity(dt, *row) for row in here]
+            by_source += _group_by_point([s.weights for s in shares], ahead)
+            per_sigma += _group_by_point([s.per_sigma for s in shares], ahead)
+            if piece.body.view.emission_density is not None:
+                by_density += _group_by_point([weigh_emission_density(dt, *row).weights for row in here], ahead)
+            ahead = [T * s.T for T, s in zip(ahead, shares, strict=True)]
         endless = piece.on & ~finite
         if by_density:
             lengths = [dr.rcp(dr.maximum(row[0], 1e-30)) for row in rows]
@@ -244,6 +263,22 @@ class _EmissionIntegrand:
                 )
             )
         return total
+
+
+def _join_parts(parts: list[CellIntegral]) -> CellIntegral:
+    """A row of a cell from the row of its parts, the nearest first; derivatives by the points of all parts."""
+    joined = parts[-1]
+    for near in parts[-2::-1]:
+        # More extinction in the near part dims the parts behind.
+        dims = near.T * joined.N
+        joined = CellIntegral(
+            near.tau + joined.tau,
+            near.T * joined.T,
+            dr.fma(near.T, joined.N, near.N),
+            near.dtau + joined.dtau,
+            [dN - dims * dtau for dN, dtau in zip(near.dN, near.dtau, strict=True)] + [near.T * dN for dN in joined.dN],
+        )
+    return joined
 
 
 def _extend_to_infinity(
@@ -275,9 +310,9 @@ def _eval_field(field: mi.Volume | mi.Float | mi.Color3f, piece: RayPiece, t: mi
     return dr.select(on, field.eval(there, on), 0)
 
 
-def _group_by_point(pairs: list[tuple[mi.Float, mi.Float]]) -> list[mi.Spectrum]:
-    """A spectrum for each of the two points, from the (first, second) pair of each channel."""
-    return [to_spectrum([pair[q] for pair in pairs]) for q in range(2)]
+def _group_by_point(pairs: list[tuple[mi.Float, mi.Float]], ahead: list[mi.Float]) -> list[mi.Spectrum]:
+    """A spectrum for each of the two points, from the (first, second) pair of each channel and the transmittance ahead."""
+    return [to_spectrum([T * pair[q] for T, pair in zip(ahead, pairs, strict=True)]) for q in range(2)]
 
 
 class Emission:
