@@ -57,6 +57,7 @@ PUBLIC = {
     "write_field": "fields.field_files",
     "write_gaussians": "points",
     "write_points": "points",
+    "write_grids": "files",
     "write_volume": "files",
 }
 """Public names and their modules below ``mivol``. Type checkers read the list below instead."""
@@ -73,6 +74,7 @@ if TYPE_CHECKING:  # for type checkers; at run time __getattr__ imports each nam
     from .files import SparseVolumeData as SparseVolumeData
     from .files import read_sparse_volume as read_sparse_volume
     from .files import read_volume as read_volume
+    from .files import write_grids as write_grids
     from .files import write_volume as write_volume
     from .optim.first_order import Adam as Adam
     from .optim.first_order import RMSprop as RMSprop

@@ -6,6 +6,9 @@ unit cube under ``to_world``. ``mi.traverse`` hands out the very tensor that is 
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -133,9 +136,13 @@ MAX_STORED_SHARE = 0.25
 """Share of stored bricks up to which ``auto`` stores a sparse grid."""
 
 
-def read_voxels(props: mi.Properties) -> Voxels | SparseVoxels:
+def read_voxels(props: mi.Properties, convert: Callable[[np.ndarray], np.ndarray] | None = None) -> Voxels | SparseVoxels:
     """Make a grid from plugin parameters: ``filename`` (with the name of its ``grid``), ``grid`` or ``data`` (with ``bricks``
-    and ``resolution`` if it is sparse); storage, box and sign options.
+    and ``resolution`` if it is sparse); storage, box and sign options, and a factor ``scale``.
+
+    Args:
+        props: parameters of the plugin.
+        convert: function of the values (..., C) before the factor; None keeps them.
 
     Raises:
         MivolError: none or several sources, an unknown storage, or what the source or the grid refuses.
@@ -154,6 +161,13 @@ def read_voxels(props: mi.Properties) -> Voxels | SparseVoxels:
     to_local = np.array(transform.inverse_transpose, dtype=np.float64).T
     own_box = props.get("use_grid_bbox", False)
     values, place = _read_source(props, sources[0], own_box, storage, name)
+    if convert is not None:
+        values = _convert(values, convert)
+    if "scale" in props:
+        factor = parse_factor(props["scale"], name)
+        if isinstance(values, mi.TensorXf):
+            raise refusal(name, "scale beside data", "data alone", "multiply the array")
+        values = _convert(values, lambda array: _multiply(array, factor, name))
     if "filename" in props:
         name = f"{name} ({props['filename']})"
     _check_inverse(check_affine(to_world, f"to_world of {name}"), to_local, f"to_world of {name}")
@@ -186,6 +200,42 @@ def _read_source(
         low, high = np.array(grid.bbox().min), np.array(grid.bbox().max)
         place[:3, :3], place[:3, 3] = np.diag(high - low), low
     return _store(values.reshape((*values.shape[:3], -1)), storage), place
+
+
+def _convert(
+    values: np.ndarray | mi.TensorXf | SparseVolumeData, convert: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray | SparseVolumeData:
+    """The values through a function; bricks stay bricks if the function keeps 0."""
+    if isinstance(values, SparseVolumeData):
+        if convert(np.zeros((1, values.channels), np.float32)).any():
+            values = values.dense()
+        else:
+            return dataclasses.replace(values, values=convert(values.values))
+    return convert(np.array(values))
+
+
+def parse_factor(value: object, name: str) -> np.ndarray:
+    """A factor (1,) or (3,) from a number, an rgb triple or a text of either.
+
+    Raises:
+        MivolError: anything else, or a factor that is negative or not finite.
+    """
+    if isinstance(value, mi.Texture):
+        value = np.array(mi.traverse(value)["value"])
+    try:
+        factor = np.array([float(v) for v in value.replace(",", " ").split()] if isinstance(value, str) else value, np.float64)
+    except ValueError:
+        factor = np.array([np.nan])
+    factor = factor.ravel()
+    if len(factor) not in (1, 3) or not (np.isfinite(factor) & (factor >= 0)).all():
+        raise refusal(name, f"scale {value!r}", "a number or three numbers of at least 0", 'write it as "2" or "1, 0.5, 0.2"')
+    return factor.astype(np.float32)
+
+
+def _multiply(array: np.ndarray, factor: np.ndarray, name: str) -> np.ndarray:
+    if len(factor) == 3 and array.shape[-1] not in (1, 3):
+        raise refusal(name, f"scale of 3 numbers for {array.shape[-1]} channels", "1 or 3 channels", "give one number")
+    return array * factor
 
 
 def _as_grid(values: mi.TensorXf, name: str) -> np.ndarray:

@@ -6,7 +6,16 @@ The room needs no Mitsuba. Grids are float32 (Z, Y, X, C) at voxel centres of th
 from __future__ import annotations
 
 from mivol.files.atomic import whole_file, write_whole, write_whole_bytes, write_whole_text
-from mivol.files.formats import FORMATS, FRAMES, WRITERS, is_sparse_file, read_sparse_volume, read_volume, write_volume
+from mivol.files.formats import (
+    FORMATS,
+    FRAMES,
+    WRITERS,
+    is_sparse_file,
+    read_sparse_volume,
+    read_volume,
+    write_grids,
+    write_volume,
+)
 from mivol.files.image_files import decode_srgb, encode_srgb, read_exr, read_exr_header, stack_layers, write_exr, write_png
 from mivol.files.image_stack import read_slices, read_stack
 from mivol.files.scan_hdf5 import ProjectionData, read_projections
@@ -41,6 +50,7 @@ __all__ = [
     "to_space",
     "whole_file",
     "write_exr",
+    "write_grids",
     "write_png",
     "write_volume",
     "write_whole",

@@ -279,6 +279,35 @@ def write_volume(
     write_whole(path, lambda file: writer(file, values, to_world, dict(metadata or {})))
 
 
+GRID_WRITERS = {".vdb": vdb_writer.write_vdb_grids, ".nvdb": nvdb_writer.write_nvdb_grids}
+"""suffix -> writer of several grids in one file."""
+
+
+def write_grids(path: str | os.PathLike, grids: Mapping[str, VolumeData | SparseVolumeData]) -> None:
+    """Write named grids into one ``.vdb`` or ``.nvdb``, whole or not at all.
+
+    Args:
+        path: destination.
+        grids: volumes of one or three channels by name, each at its own place and of its own resolution; at least one.
+
+    Raises:
+        MivolError: another suffix, no grid, or a volume that :func:`write_volume` refuses.
+
+    Example:
+        >>> write_grids("fire.vdb", {"density": soot, "temperature": heat})
+    """
+    path = Path(path)
+    suffix = _find_suffix(path, GRID_WRITERS)
+    if not grids:
+        raise refusal(path, "no grid", "at least one", "give volumes by name")
+    packed = {}
+    for name, volume in grids.items():
+        values = volume if isinstance(volume, SparseVolumeData) else to_values(volume.values, path)
+        check_frame(volume.to_world, f"{path}, {name}")
+        packed[name] = (vdb_writer.check_fog(values, {"grid": name}, suffix)[0], np.asarray(volume.to_world, np.float64))
+    write_whole(path, lambda file: GRID_WRITERS[suffix](file, packed))
+
+
 # -- Files of volumes alone ----------------------------------------------------------------------------------------------
 
 SHARED_SUFFIXES = (".npy", ".npz", ".csv", ".txt")

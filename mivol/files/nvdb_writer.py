@@ -32,6 +32,16 @@ def write_nvdb(file: BinaryIO, values: np.ndarray | SparseVolumeData, to_world: 
     Args, raises: as of :func:`mivol.files.vdb_writer.write_vdb`.
     """
     volume, name = check_fog(values, metadata, ".nvdb")
+    write_nvdb_grids(file, {name: (volume, to_world)})
+
+
+def write_nvdb_grids(file: BinaryIO, grids: dict[str, tuple[SparseVolumeData, np.ndarray]]) -> None:
+    """Write several grids, each in a segment of its own, by their names."""
+    for name, (volume, to_world) in grids.items():
+        _write_segment(file, name, volume, to_world)
+
+
+def _write_segment(file: BinaryIO, name: str, volume: SparseVolumeData, to_world: np.ndarray) -> None:
     kind, grid_class = TYPES[volume.channels]
     layout, leaves = LAYOUTS[kind], cut_leaves(volume)
     levels = _stack_levels(leaves)

@@ -35,27 +35,38 @@ def write_vdb(file: BinaryIO, values: np.ndarray | SparseVolumeData, to_world: n
         MivolError: another number of channels, other metadata, or nothing but zeros, which no reader can place.
     """
     volume, name = check_fog(values, metadata, ".vdb")
-    channels = volume.channels
+    write_vdb_grids(file, {name: (volume, to_world)})
+
+
+def write_vdb_grids(file: BinaryIO, grids: dict[str, tuple[SparseVolumeData, np.ndarray]]) -> None:
+    """Write several grids; each volume and its placement (4, 4) as of :func:`write_vdb`, by the name of the grid."""
+    head = MAGIC + struct.pack("<3I?", 224, 10, 0, True) + str(uuid.uuid4()).encode()
+    head += _pack_metadata([("creator", "string", b"mivol")]) + struct.pack("<I", len(grids))
+    file.write(head)
+    at = len(head)
+    for name, (volume, to_world) in grids.items():
+        grid, topology, blocks = _pack_grid(name, volume, to_world)
+        descriptor = _pack_text(name) + _pack_text(f"Tree_{TYPES[volume.channels]}_5_4_3") + _pack_text("")
+        begin = at + len(descriptor) + 24
+        after_topology = begin + len(grid) + len(topology)
+        at = after_topology + len(blocks)
+        file.write(descriptor + struct.pack("<3q", begin, after_topology, at) + grid + topology + blocks)
+
+
+def _pack_grid(name: str, volume: SparseVolumeData, to_world: np.ndarray) -> tuple[bytes, bytes, bytes]:
+    """Head, topology and values of a grid."""
     leaves = cut_leaves(volume)
-    topology, blocks = _pack_tree(leaves, channels)
+    topology, blocks = _pack_tree(leaves, volume.channels)
     low, high = leaves.low.min(axis=0), leaves.high.max(axis=0)
-    count = int(np.count_nonzero(leaves.masks))
     facts = [
         ("name", "string", name.encode()),
-        ("class", "string", b"fog volume" if channels == 1 else b"unknown"),
+        ("class", "string", b"fog volume" if volume.channels == 1 else b"unknown"),
         ("file_bbox_min", "vec3i", struct.pack("<3i", *low)),
         ("file_bbox_max", "vec3i", struct.pack("<3i", *high)),
-        ("file_voxel_count", "int64", struct.pack("<q", count)),
+        ("file_voxel_count", "int64", struct.pack("<q", int(np.count_nonzero(leaves.masks)))),
     ]
-    grid = (
-        struct.pack("<I", ZIP | ACTIVE_VALUES) + _pack_metadata(facts) + _pack_transform(find_index_to_world(volume, to_world))
-    )
-    head = MAGIC + struct.pack("<3I?", 224, 10, 0, True) + str(uuid.uuid4()).encode()
-    head += _pack_metadata([("creator", "string", b"mivol")]) + struct.pack("<I", 1)
-    head += _pack_text(name) + _pack_text(f"Tree_{TYPES[channels]}_5_4_3") + _pack_text("")
-    begin = len(head) + 24
-    after_topology = begin + len(grid) + len(topology)
-    file.write(head + struct.pack("<3q", begin, after_topology, after_topology + len(blocks)) + grid + topology + blocks)
+    transform = _pack_transform(find_index_to_world(volume, to_world))
+    return struct.pack("<I", ZIP | ACTIVE_VALUES) + _pack_metadata(facts) + transform, topology, blocks
 
 
 def check_fog(values: np.ndarray | SparseVolumeData, metadata: dict[str, Any], suffix: str) -> tuple[SparseVolumeData, str]:

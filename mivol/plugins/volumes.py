@@ -9,14 +9,16 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.blackbody import read_hot_matter
 from mivol.fields.bricks import Bricks
 from mivol.fields.field_files import field_from_props
 from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.hash_density import HashDensity, TabulatedDensity
 from mivol.fields.protocol import Field
+from mivol.fields.sparse_voxels import SparseVoxels
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.transfer import Transfer
-from mivol.fields.voxels import read_voxels
+from mivol.fields.voxels import Voxels, read_voxels
 from mivol.transport.media.octree_extinction import LeafField
 from mivol.transport.traversal.grid_blocks import find_stored_distances
 
@@ -30,6 +32,8 @@ class VoxelVolume(mi.Volume):
         to_world: places the unit cube.
         use_grid_bbox: place the grid by its file's own box first. Default false.
         signed: permit negative values, as for a ``g``. Default false.
+        scale: factor on the values of a file or grid, a number or three (``"1, 0.5, 0.2"``), which make three channels of one.
+            Default 1.
         storage: dense, sparse (bricks of 8^3 voxels; elsewhere 0) or auto: sparse for a file or grid of at least 128 MiB of
             which at most a quarter would be stored. Default auto.
         bricks, resolution, offset: for sparse ``data`` (bricks, 8, 8, 8, C): ascending numbers (z, y, x) of the bricks among
@@ -40,11 +44,15 @@ class VoxelVolume(mi.Volume):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        self.field = read_voxels(props)
+        self.field = self.read(props)
         self.texture = self.field.freezable_texture
         self.hold_bricks()
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
         super().__init__(props)
+
+    def read(self, props: mi.Properties) -> Voxels | SparseVoxels:
+        """Make the grid from the parameters."""
+        return read_voxels(props)
 
     def hold_bricks(self) -> None:
         """Hold the arrays of a sparse grid: ``dr.freeze`` finds arrays only among a plugin's own attributes."""
@@ -101,6 +109,25 @@ class VoxelVolume(mi.Volume):
 
     def to_string(self) -> str:
         return repr(self.field)
+
+
+class BlackbodyVolume(VoxelVolume):
+    """``<volume type="mivol_blackbody">``: the light of hot matter, an ``emission`` from a grid of temperatures.
+
+    Parameters:
+        filename, grid or data, to_world, use_grid_bbox, storage: the grid of one channel, as of ``mivol_voxels``.
+        kelvin: temperature per unit of the grid [K]. Default 1.
+        offset: value of the grid at 0 K; values below count as 0 K. Default 0.
+        normalize: colour alone: each spectrum is divided by its peak, as in pbrt-v4. Otherwise the radiance is that of a
+            black body, in W m^-2 sr^-1 weighted by the CIE functions. Default false.
+        scale: factor on the radiance, a number or three. Default 1.
+
+    Temperatures become colours voxel by voxel, and colours are interpolated. The parameter ``data`` holds the colours
+    (Z, Y, X, 3); temperatures have no derivative (a ``mivol_transfer`` with a table of colours has).
+    """
+
+    def read(self, props: mi.Properties) -> Voxels | SparseVoxels:
+        return read_voxels(props, read_hot_matter(props).emit)
 
 
 class SphericalVolume(mi.Volume):
@@ -393,6 +420,7 @@ def _towards(it: mi.Interaction3f) -> mi.Vector3f:
 
 # Mitsuba has no register_volume; a volume registered as a texture is found by <volume>. tests/conformance guards this.
 mi.register_texture("mivol_voxels", VoxelVolume)
+mi.register_texture("mivol_blackbody", BlackbodyVolume)
 mi.register_texture("mivol_sh", SphericalVolume)
 mi.register_texture("mivol_transfer", TransferVolume)
 mi.register_texture("mivol_hash", make_hash_volume)

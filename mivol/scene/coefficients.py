@@ -43,6 +43,10 @@ class Coefficients:
         Raises:
             MivolError: both pairs, half of a pair, a negative number, or a radiance field in another place than the emission.
         """
+        if "velocity" in props:
+            raise MivolError(
+                "mivol_medium was given a velocity; motion blur is not there yet: leave it out for a still frame."
+            )
         given = [n for pair in COEFFICIENT_PAIRS for n in pair if n in props]
         if is_radiance_field(props.get("emission", 0.0)) or _is_made_of_gaussians(props, "emission"):
             return cls._of_field(props, given)
