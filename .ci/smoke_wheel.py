@@ -261,6 +261,12 @@ def smoke_poses(folder: Path) -> None:
     check('pip install "mivol[poses]"' in refused, f"the extra that poses need is not named:\n{refused}")
 
 
+def smoke_view(folder: Path) -> None:
+    """The wheel alone has no viser: the extra that brings it is named."""
+    refused = mivol("view", "gaussians.ply", code=1)
+    check('pip install "mivol[viewer]"' in refused, f"the extra that the viewer needs is not named:\n{refused}")
+
+
 def smoke_sweep(folder: Path) -> None:
     """Two fits in turn, and a table of both; the wheel alone has no Dask, and the extra that brings it is named."""
     mivol("sweep", "smoke.toml", "--over", "seed=0,1", "-o", "sweep")
@@ -281,7 +287,7 @@ def smoke_report(folder: Path) -> None:
 
 SMOKES: tuple[Callable[[Path], None], ...] = (
     smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_sweep, smoke_export, smoke_convert,
-    smoke_poses, smoke_report, smoke_demo, smoke_fetch, smoke_validate, smoke_bench,
+    smoke_poses, smoke_view, smoke_report, smoke_demo, smoke_fetch, smoke_validate, smoke_bench,
 )  # fmt: skip
 """In the order in which each finds what it needs."""
 

@@ -15,7 +15,7 @@ ORDER = [
     *("errors", "display", "cite", "threads", "machine", "llvm", "back_end", "kernel_recording", "scene_graph", "numerics"),
     *("space", "files", "photos", "points", "fields", "phase"),
     *("transport", "splatting", "tomography", "scene", "plugins", "optim", "validate", "report", "schema", "config", "doctor"),
-    *("experiments", "cluster", "bench", "cli", "__main__"),
+    *("experiments", "cluster", "view", "bench", "cli", "__main__"),
 ]
 INSIDE = {
     "transport": ["traversal", "media", "estimators", "line_integrals", "path"],

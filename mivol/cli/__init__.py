@@ -333,6 +333,19 @@ def convert_flags() -> list:
     ]  # fmt: skip
 
 
+def view_flags() -> list:
+    """Flags of ``mivol view``."""
+    return [
+        *scene_flags(
+            "run folder, posed photographs, field (.npz), points or Gaussians (.ply, ...), volume (.vdb, ...), or scene (.xml)"
+        ),
+        flag("--photos", type=Path, metavar="FOLDER", help="show the cameras of these photographs too"),
+        flag("--write", type=Path, metavar="FOLDER", help="write crops and films there (default: nothing is written)"),
+        flag("--port", type=int, default=8080, help="port; a taken one is passed over (default: %(default)s)"),
+        DATASET,
+    ]
+
+
 # -- Verbs -----------------------------------------------------------------------------------------------------------------
 
 
@@ -811,6 +824,31 @@ WRITTEN_AS = {".npz": "field", ".obj": "mesh"}
 """Kind of the file by suffix, for suffixes of a single kind."""
 
 
+def view(arguments: argparse.Namespace) -> None:
+    """Look at a run, a model, photographs, a volume or a scene in a browser, until Ctrl-C.
+
+    The page (pip install "mivol[viewer]") is for this machine only: the address has a token, and another host is turned away.
+    Drag to turn, scroll to come closer, W A S D Q E to fly, click a camera to look from there. A run may still be fitting.
+    """
+    import mitsuba as mi
+
+    from mivol.back_end import choose_back_end
+    from mivol.view.page import Page, check_viser, serve
+    from mivol.view.runs import open_subject
+
+    check_viser()
+    choose_back_end(arguments.mode, arguments.threads)
+    mi.set_log_level(mi.LogLevel.Debug if arguments.verbose else mi.LogLevel.Warn)
+    for folder in filter(None, arguments.a.split(";")):
+        mi.file_resolver().append(folder)
+    defines = parse_defines(arguments.define)
+    subject = open_subject(arguments.scene, arguments.photos, arguments.dataset, defines)
+    page = Page(subject, arguments.write, arguments.port)
+    page.warm_up()
+    print(f"open {page.address} in a browser of this machine; Ctrl-C ends the viewer", flush=True)
+    serve(page)
+
+
 def report(arguments: argparse.Namespace) -> None:
     """Write the report page of a run folder again."""
     from mivol.report.page import write_page
@@ -865,6 +903,7 @@ VERBS: dict[str, Verb] = {
     "optimize": Verb(optimize, optimize_flags, describe_settings),
     "sweep": Verb(sweep, sweep_flags),
     "validate": Verb(validate, validate_flags),
+    "view": Verb(view, view_flags),
     "export": Verb(export, export_flags),
     "convert": Verb(convert, convert_flags),
     "report": Verb(report, lambda: [flag("folder", type=Path, help="run folder")]),

@@ -75,6 +75,7 @@ def run_experiment(context: RunContext) -> Path:
         with run.stage(kind.stages.write):
             kind.write_outputs(fit, run, best)
             run.record.tables += [] if workers is None else workers.tables()
+            run.remove_newest()
     page = write_page(context.folder)
     context.progress.say([*best.says(), run.summary()])
     return page

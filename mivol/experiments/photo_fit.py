@@ -269,6 +269,12 @@ class PhotoFit(FitKind):
         values = [self.judge(views[number], ("psnr",))[1].values["psnr"] for number in numbers]
         return {"held_out_psnr" if count == len(views) else "few_psnr": float(np.mean(values))}
 
+    def show(self, run: RunFolder, fit: Fit, evaluation: Evaluation) -> None:
+        # Judged iterates are written as the best ones; without judged views, the newest stands in their files for viewers.
+        files = self.best_files()
+        if files is not None and not evaluation.errors:
+            files.write(run.path)
+
     def finish(self, fit: Fit, run: RunFolder) -> None:
         self.record.notes += fit.log
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.files import write_volume
 from mivol.files.atomic import disk_faults, lock_folder, remove_temporaries
 from mivol.optim import checkpoint
 from mivol.report import figures
@@ -128,6 +129,7 @@ class RunFolder:
             self._copy_to_earlier(present, coming, going)
         for name in present:
             (self.path / name).unlink()
+        self.remove_newest()
 
     def _copy_to_earlier(self, names: list[str], coming: Path, going: Path) -> None:
         """Make ``earlier/`` of these files by a single rename, with two temporary folders."""
@@ -183,6 +185,20 @@ class RunFolder:
         """Add a row to the metrics."""
         append_metrics(self.path, iteration, seconds, **values)
 
+    def write_newest(self, values: np.ndarray, to_world: np.ndarray) -> None:
+        """Write the volume of the newest iterate for a viewer, with at most ``NEWEST_EDGE`` voxels along an edge.
+
+        Args:
+            values: (Z, Y, X) or (Z, Y, X, C).
+            to_world: (4, 4) map of the unit cube to the world.
+        """
+        step = -(-max(values.shape[:3]) // NEWEST_EDGE)
+        write_volume(self.path / NEWEST, np.ascontiguousarray(values[::step, ::step, ::step]), to_world)
+
+    def remove_newest(self) -> None:
+        """Remove the volume for viewers, once the outputs of the run are written."""
+        (self.path / NEWEST).unlink(missing_ok=True)
+
     def write_curves(self) -> None:
         """Plot each number of the metrics against the iteration, as PNG."""
         self.make("curves")
@@ -191,6 +207,12 @@ class RunFolder:
         for name in sorted(names):
             figures.save_figure(figures.plot_curve(rows, name, units=self.record.units), self.path / "curves" / f"{name}.png")
 
+
+NEWEST = "newest.npz"
+"""The volume for viewers; it goes when a run begins anew or ends."""
+
+NEWEST_EDGE = 128
+"""Longest edge of the volume for viewers [voxel]: of larger ones every second, third, ... voxel is written."""
 
 JUDGES = {"nrmse": 1.0, "held_out_psnr": -1.0, "few_psnr": -1.0}
 """Errors to compare iterates, in order of preference. Smaller is better after multiplication by the sign."""

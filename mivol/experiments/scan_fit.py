@@ -144,6 +144,7 @@ class ScanFit(FitKind):
     def show(self, run: RunFolder, fit: Fit, evaluation: Evaluation) -> None:
         if is_preview_due(fit.next_iteration, self.settings.solve.iterations):
             write_preview(run.path, evaluation.values["volume"], tuple(self.grid.extent))
+            run.write_newest(evaluation.values["volume"], self.grid.to_world)
 
     def finish(self, fit: Fit, run: RunFolder) -> None:
         last, state, problem, record = self.settings.solve.iterations, fit.run.state, self.problem.linear_problem, self.record

@@ -54,6 +54,7 @@ from mivol.optim.parameters import GRID, check_names
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import FINAL, HELD_OUT, RenderBatch, View, derive_seed, make_batches
 from mivol.report.cameras import draw_view_cameras
+from mivol.report.pixel_scale import is_preview_due
 from mivol.report.record import Image, PlanLine, Volume
 from mivol.scene.explain import Explanation, explain_scene
 from mivol.scene.load import LoadedScene
@@ -172,6 +173,15 @@ class SceneFit(FitKind):
         last = fit.history[-1]
         is_new = fit.evaluations and fit.evaluations[-1]["iteration"] == last["iteration"]
         run.append(last["iteration"], last["seconds"], loss=last["loss"], **(fit.latest_errors() if is_new else {}))
+        if is_preview_due(fit.next_iteration, self.settings.fit.iterations):
+            self.show_volume(run)
+
+    def show_volume(self, run: RunFolder) -> None:
+        """Write the first fitted grid for a viewer; a fit of other parameters has none."""
+        for name, value in self.problem.values().items():
+            if len(value.shape) == 4 and name not in self.problem.sparse:
+                run.write_newest(np.array(value), grid_to_world(name, self.problem.scene))
+                return
 
     def finish(self, fit: Fit, run: RunFolder) -> None:
         # Once, however often a finished run is resumed.

@@ -80,8 +80,13 @@ def check_settings(path: Path, settings: dict[str, Any]) -> None:
     Raises:
         MivolError: the file is missing, is no checkpoint, or has other settings.
     """
-    saved = _load(path)[1]["fingerprint"]
+    saved = read_settings(path)
     check_same(path, {key: value for key, value in saved.items() if key not in DIGESTS}, settings)
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """The settings of a checkpoint by dotted key, with the digests of its data; raises as :func:`_load`."""
+    return _load(path)[1]["fingerprint"]
 
 
 def _load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -1,0 +1,304 @@
+"""What a viewer shows: a radiance field, Gaussians, points, a scene, photographs, or the model of a run.
+
+Conventions. A subject draws the view of a pinhole as float32 values (H, W, 3) in its own colour space, and the painter turns
+them into a picture for a screen. ``space`` "srgb" means code values, "linear" means radiance. A crop is six numbers, a lower
+and a higher corner [length].
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.experiments.render import (
+    Framing,
+    PointLook,
+    choose_integrator,
+    frame_points,
+    gaussians_for,
+    sky_beside,
+)
+from mivol.fields.field_archives import read_field_view
+from mivol.fields.field_files import read_field, write_field
+from mivol.fields.sky import Sky
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.files.source import check_file, refusal
+from mivol.optim.photographs.field_view import render_view
+from mivol.photos import Camera, PhotoSurvey, survey_photos
+from mivol.photos.camera_path import HomeView, find_home_view
+from mivol.points.cloud import PointCloud, read_points, write_points
+from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians, write_gaussians
+from mivol.points.gaussians import Gaussians
+from mivol.scene.load import load_scene
+from mivol.scene.sensors import to_camera, to_sensor
+from mivol.splatting import Splatter, to_tensors
+from mivol.view.transfer import Transfer, VolumePicture
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the sliders of the page choose.
+
+    Attributes:
+        exposure: exposure value; each unit doubles the light of the picture.
+        crop: box outside of which nothing is shown, six numbers [length]; None shows everything.
+        transfer: transfer function and slices of a volume.
+    """
+
+    exposure: float = 0.0
+    crop: tuple[float, ...] | None = None
+    transfer: Transfer = field(default_factory=Transfer)
+
+
+class Subject(ABC):
+    """Something to look at.
+
+    Attributes:
+        name: name for titles and files.
+        box: (2, 3) lower and higher corner of what is worth seeing [length].
+        home: first view; None: a view of the whole box.
+        space: colour space of drawn values, "srgb" or "linear".
+        is_noisy: whether the mean of several draws with other seeds is a better picture.
+        can_crop: whether :attr:`Look.crop` has an effect, and :meth:`save_crop` writes a file.
+        has_values: whether :attr:`Look.transfer` has an effect.
+        survey: cameras of the photographs that belong to it; None without.
+    """
+
+    name: str
+    box: np.ndarray
+    home: HomeView | None = None
+    space: str = "srgb"
+    is_noisy: bool = False
+    can_crop: bool = False
+    has_values: bool = False
+    survey: PhotoSurvey | None = None
+
+    @abstractmethod
+    def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
+        """Values (H, W, 3) of the view of a pinhole."""
+
+    def save_crop(self, folder: Path, box: Sequence[float]) -> Path:
+        """Write what lies inside a box into a new file of the folder, and return its path.
+
+        Raises:
+            MivolError: nothing inside, or a subject that cannot be cropped.
+        """
+        raise MivolError(f"{self.name} cannot be cropped: convert it first (mivol convert).")
+
+    def refresh(self) -> bool:
+        """Read again what has changed on disk; return whether the pictures change."""
+        return False
+
+    def first_look(self) -> Look:
+        """The look with which the sliders begin."""
+        return Look()
+
+    def first_view(self) -> HomeView:
+        """The view with which a page begins."""
+        place, up, fov, size = Framing().complete(self.home)
+        if place is None:
+            place = frame_points(self.box, up, fov, size)
+        return HomeView(tuple(up), tuple(place[:3]), tuple(place[3:]), fov, size)
+
+
+def inside(places: np.ndarray, box: Sequence[float]) -> np.ndarray:
+    """Which places (N, 3) lie in a box, bool (N,)."""
+    low, high = np.reshape(np.asarray(box, np.float64), (2, 3))
+    return ((places >= low) & (places <= high)).all(axis=1)
+
+
+def new_file(folder: Path, stem: str, suffix: str) -> Path:
+    """A path that does not exist yet: ``stem.suffix``, ``stem-2.suffix``, ..."""
+    folder.mkdir(parents=True, exist_ok=True)
+    number, path = 1, folder / f"{stem}{suffix}"
+    while path.exists():
+        number += 1
+        path = folder / f"{stem}-{number}{suffix}"
+    return path
+
+
+class FieldSubject(Subject):
+    """A radiance field over its sky, or over black."""
+
+    def __init__(self, path: Path) -> None:
+        self.name, self.field, self.sky = path.stem, read_field(path), sky_beside(path)
+        self.home, self.space = read_field_view(path), self.field.space
+        self.box = _box_of(self.field.to_world)
+        self.can_crop = isinstance(self.field, SphericalGrid)
+        self._cropped: tuple[tuple[float, ...] | None, SphericalGrid] = (None, self.field)
+
+    def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
+        if self.can_crop and look.crop != self._cropped[0]:
+            self._cropped = look.crop, self.crop(look.crop)
+        behind: np.ndarray | Sky = np.zeros(3) if self.sky is None else self.sky
+        return render_view(self._cropped[1], camera, behind).image
+
+    def crop(self, box: Sequence[float] | None) -> SphericalGrid:
+        """The field with the nodes inside a box; nested boxes keep theirs."""
+        if box is None:
+            return self.field
+        field = self.field
+        stored, kept = field.stored_nodes(), np.flatnonzero(inside(field.node_positions(), box))
+        density, sh = field.values()
+        if not len(kept):
+            # A field without a node cannot be drawn: one node of vacuum is nothing too.
+            kept, density = np.zeros(1, int), np.full(1, field.activation_function.vacuum, np.float32)
+        return field.with_rows(density[kept], sh[kept], mi.UInt32(stored[kept].astype(np.uint32)))
+
+    def save_crop(self, folder: Path, box: Sequence[float]) -> Path:
+        if not self.can_crop:
+            return super().save_crop(folder, box)
+        if not inside(self.field.node_positions(), box).any():
+            raise MivolError("the box holds nothing of the field: make it larger.")
+        cropped = self.crop(box)
+        path = new_file(folder, f"{self.name}-crop", ".npz")
+        write_field(path, cropped, view=self.home)
+        return path
+
+
+MOST_SPLATTERS = 8
+"""Sizes of pictures whose renderer is kept."""
+
+
+class GaussianSubject(Subject):
+    """Gaussians, or points as discs, over black."""
+
+    can_crop = True
+
+    def __init__(self, path: Path, look: PointLook | None = None) -> None:
+        is_cloud = not is_gaussian_file(check_file(path))
+        cloud = read_points(path) if is_cloud else None
+        self._begin(path.stem, read_gaussians(path) if cloud is None else gaussians_for(cloud, look or PointLook()), cloud)
+        self.home = None if is_cloud else read_gaussian_view(path)
+
+    @classmethod
+    def of_points(cls, name: str, cloud: PointCloud) -> GaussianSubject:
+        """Points as discs."""
+        subject = cls.__new__(cls)
+        subject._begin(name, gaussians_for(cloud, PointLook()), cloud)
+        return subject
+
+    def _begin(self, name: str, gaussians: Gaussians, cloud: PointCloud | None) -> None:
+        self.name, self.gaussians, self.cloud = name, gaussians, cloud
+        if not gaussians.count:
+            raise refusal(name, "no Gaussians", "at least one", "name another file")
+        reach, means = 2 * gaussians.scales().max(axis=1, keepdims=True), gaussians.means.astype(np.float64)
+        self.box = np.array([np.quantile(means - reach, 0.01, axis=0), np.quantile(means + reach, 0.99, axis=0)])
+        self._splatters: OrderedDict[tuple[int, int], Splatter] = OrderedDict()
+        self._cropped: tuple[tuple[float, ...] | None, dict] = (None, to_tensors(gaussians))
+
+    def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
+        if look.crop != self._cropped[0]:
+            kept = self.gaussians
+            if look.crop is not None:
+                kept = kept.select(inside(kept.means, look.crop))
+            self._cropped = look.crop, to_tensors(kept)
+        if camera.size not in self._splatters:
+            is_cloud = self.cloud is not None
+            self._splatters[camera.size] = Splatter(*camera.size, self.gaussians.degree, compensated=is_cloud, discs=is_cloud)
+            if len(self._splatters) > MOST_SPLATTERS:
+                self._splatters.popitem(last=False)
+        self._splatters.move_to_end(camera.size)
+        image, _ = self._splatters[camera.size].forward(self._cropped[1], camera, derivatives=False)
+        return np.array(image)[..., :3]
+
+    def save_crop(self, folder: Path, box: Sequence[float]) -> Path:
+        kept = inside(self.gaussians.means, box)
+        if not kept.any():
+            raise MivolError(f"the box holds none of the {len(kept)} Gaussians or points: make it larger.")
+        path = new_file(folder, f"{self.name}-crop", ".ply")
+        if self.cloud is None:
+            write_gaussians(path, self.gaussians.select(kept), self.home)
+        else:
+            colours = None if self.cloud.colours is None else self.cloud.colours[kept]
+            write_points(path, replace(self.cloud, positions=self.cloud.positions[kept], colours=colours))
+        return path
+
+
+class VolumeSubject(Subject):
+    """A volume of values through a transfer function, or as slices.
+
+    Attributes:
+        picture: the volume, prepared.
+    """
+
+    can_crop = has_values = True
+
+    def __init__(self, path: Path, dataset: str | None = None) -> None:
+        self.name, self.picture = path.name.partition(".")[0], VolumePicture.read(path, dataset)
+        self.box = _box_of(self.picture.volume.to_world)
+
+    def first_look(self) -> Look:
+        return Look(transfer=Transfer((self.picture.background, 1.0)))
+
+    def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
+        return self.picture.draw(camera, look.transfer, look.crop)
+
+    def save_crop(self, folder: Path, box: Sequence[float]) -> Path:
+        cropped, path = self.picture.crop(box), new_file(folder, f"{self.name}-crop", ".nrrd")
+        self.picture.write(path, cropped)
+        return path
+
+
+class SceneSubject(Subject):
+    """A scene of Mitsuba with its own integrator; each draw takes a sample of each pixel."""
+
+    space, is_noisy = "linear", True
+
+    def __init__(self, path: Path, defines: Mapping[str, str] | None = None) -> None:
+        loaded = load_scene(path, defines or {})
+        self.name, self.scene = loaded.name, loaded.scene
+        self.integrator = choose_integrator(self.scene, None if self.scene.integrator() else "mivol")
+        bounds = self.scene.bbox()
+        self.box = np.array([bounds.min, bounds.max], np.float64).reshape(2, 3)
+        if not np.isfinite(self.box).all():
+            self.box = np.array([[-1.0] * 3, [1.0] * 3])
+        sensors = [sensor for sensor in self.scene.sensors() if sensor.class_name() == "PerspectiveCamera"]
+        self.home = find_home_view([to_camera(sensors[0])], self.box) if sensors else None
+
+    def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
+        sensor = mi.load_dict(to_sensor(camera))
+        return np.array(self.integrator.render(self.scene, sensor, seed=seed, spp=1))[..., :3]
+
+
+class PhotoSubject(Subject):
+    """Posed photographs: their cameras, and the points of a reconstruction if there are some."""
+
+    def __init__(self, path: Path) -> None:
+        self.survey = survey_views(path)
+        self.name, self.box = path.name or "photographs", np.asarray(self.survey.box, np.float64)
+        self.home = find_home_view([frame.camera for frame in self.survey.frames], self.box)
+        points = self.survey.points
+        has_points = points is not None and len(points) > 0
+        self.points = GaussianSubject.of_points(self.name, PointCloud(np.asarray(points))) if has_points else None
+
+    def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
+        if self.points is None:
+            return np.zeros((camera.size[1], camera.size[0], 3), np.float32)
+        return self.points.draw(camera, look, seed)
+
+
+HELD_OUT = 8
+"""Step between photographs that do not take part in a fit, unless the data set or a run says which."""
+
+
+def survey_views(path: Path, held_out: int = HELD_OUT) -> PhotoSurvey:
+    """The photographs of a data set; without a split of its own, every ``held_out``-th is held out, as in a fit."""
+    survey = survey_photos(path)
+    if not held_out or any(frame.split != "train" for frame in survey.frames) or len(survey.frames) < 2:
+        return survey
+    return survey_photos(path, held_out=held_out)
+
+
+def _box_of(to_world: np.ndarray) -> np.ndarray:
+    """Corners (2, 3) of the axis-aligned box around the unit cube under a map (4, 4)."""
+    unit = np.array([[x, y, z, 1] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float64)
+    corners = (unit @ np.asarray(to_world, np.float64).T)[:, :3]
+    return np.array([corners.min(axis=0), corners.max(axis=0)])
