@@ -40,6 +40,7 @@ PUBLIC = {
     "RMSprop": "optim.first_order",
     "Splatter": "splatting",
     "VoxelGrid": "tomography.geometry",
+    "convert_pbrt": "scene.pbrt",
     "explain": "experiments.script",
     "fit_gaussians": "experiments.script",
     "fit_photographs": "experiments.script",
@@ -89,6 +90,7 @@ if TYPE_CHECKING:  # for type checkers; at run time __getattr__ imports each nam
     from .points import write_gaussians as write_gaussians
     from .points import write_points as write_points
     from .scene.load import load_scene as load_scene
+    from .scene.pbrt import convert_pbrt as convert_pbrt
     from .splatting import Splatter as Splatter
     from .tomography.geometry import ConeBeam as ConeBeam
     from .tomography.geometry import ParallelBeam as ParallelBeam

@@ -30,6 +30,7 @@ from mivol.files import read_columns, read_exr, read_projections, read_stack, wr
 from mivol.files.mesh import Mesh, read_ply, write_mesh
 from mivol.files.nikon import read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.files.npy import read_archive
+from mivol.files.pbrt_scene import read_pbrt_scene
 from mivol.photos.photo_file import read_mask, read_photo
 from mivol.points.cloud import PointCloud, read_points, write_points
 from mivol.points.gaussian_files import read_gaussians
@@ -175,6 +176,15 @@ SCENE = b"""<scene version="3.0.0">
     </shape>
 </scene>"""
 
+PBRT_SCENE = b"""LookAt 0 0 -4  0 0 0  0 1 0 # the eye
+Camera "perspective" "float fov" [ 40 ] Film "rgb" "integer xresolution" 8
+WorldBegin LightSource "infinite" "blackbody L" 5000 "float scale" [ 2 ]
+AttributeBegin Translate 0 1 0 Rotate 90 1 0 0
+MakeNamedMedium "m" "string type" "uniformgrid" "integer nx" 2 "spectrum sigma_s" [ 300 1 800 2 ] "float density" [ 1 2 ]
+MediumInterface "m" "" Material "interface" Shape "sphere" "float radius" 3 AttributeEnd
+Material "diffuse" "rgb reflectance" [ .1 .2 .3 ] Shape "trianglemesh" "point3 P" [ 0 0 0 1 0 0 0 1 0 ] "bool a" true
+"""
+
 IDENTITY = {"scene": "0" * 64, "integrator": "volpath", "max_depth": 2, "channels_alone": False, "pass_spp": 16}
 
 
@@ -266,6 +276,7 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "vdb level set": (".vdb", _of_openvdb, lambda path: mivol.read_volume(path, "ball")),
     "nvdb": (".nvdb", _volume, mivol.read_volume),
     "nvdb packed": (".nvdb", _packed_nvdb, mivol.read_volume),
+    "pbrt scene": (".pbrt", _bytes(PBRT_SCENE), read_pbrt_scene),
     "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
     "matlab": (".mat", _matlab, mivol.read_volume),
     "matlab hdf5": (".mat", _matlab_hdf5, mivol.read_volume),

@@ -31,6 +31,7 @@ volume = mivol.read_volume(Path("a.vol"))
 print(volume.values.shape, volume.meta.get("space"))
 mivol.write_volume("a.vdb", mivol.SparseVolumeData.from_dense(volume.values, volume.to_world))
 mivol.write_grids("grids.vdb", {"density": volume})
+print(mivol.convert_pbrt("cloud.pbrt", "cloud.xml"))
 print(mivol.read_sparse_volume("a.vdb").bricks.shape)
 
 photos = mivol.load_photos("photographs", background="white", held_out=8)

@@ -758,9 +758,21 @@ def convert(arguments: argparse.Namespace) -> None:
     A field (.npz) is the mivol_sh of a scene, an octree (--to octree) or a hash grid or a NeRF (a grid with --to grid).
     Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
+    A scene of pbrt-v4 (.pbrt) becomes Mitsuba XML (.xml) with media of mivol.
     """
+    if arguments.output.suffix.lower() == ".xml" and arguments.source.suffix.lower() == ".pbrt":
+        print(_convert_scene(arguments))
+        return
     is_array = bool(_raw_layout(arguments)) or _is_array(_check_dataset(arguments.source, arguments.dataset))
     print((_convert_volume if is_array else _convert_cloud)(arguments))
+
+
+def _convert_scene(arguments: argparse.Namespace) -> str:
+    """Convert a scene of pbrt; return the lines to print."""
+    import mitsuba as mi
+
+    mi.set_variant(arguments.mode)
+    return mivol.convert_pbrt(arguments.source, arguments.output)
 
 
 def _convert_volume(arguments: argparse.Namespace) -> str:

@@ -78,7 +78,7 @@ def blackbody_xyz(temperature: np.ndarray) -> np.ndarray:
     Error: 1e-4 at 1000 K and above, from the trapezium rule at 1 nm between 360 and 830 nm.
     """
     temperature = _check_temperature(temperature)
-    nm, matching = _weighted_matching_functions()
+    nm, matching = weighted_matching_functions()
     flat = temperature.ravel()
     xyz = [planck(nm, flat[i : i + CHUNK_SIZE, None]) @ matching for i in range(0, flat.size, CHUNK_SIZE)]
     return np.concatenate(xyz).reshape(*temperature.shape, 3) if xyz else np.zeros((*temperature.shape, 3))
@@ -177,7 +177,7 @@ def read_hot_matter(props: mi.Properties) -> HotMatter:
     return HotMatter(kelvin, offset, bool(props.get("normalize", False)), name)
 
 
-def _weighted_matching_functions() -> tuple[np.ndarray, np.ndarray]:
+def weighted_matching_functions() -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths (n,) [nm], and the matching functions times the quadrature weights (n, 3) [nm]."""
     if mi.variant() is None:
         raise MivolError("no variant of Mitsuba is active, which keeps the CIE tables; call mitsuba.set_variant first.")

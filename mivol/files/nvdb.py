@@ -180,6 +180,15 @@ def read_sparse_nvdb(path: Path, dataset: str | None = None) -> SparseVolumeData
     return _read_grid(b"".join(chunks), path, name)
 
 
+def name_grids(path: Path) -> list[str]:
+    """The names of the grids of a file, as :func:`read_nvdb` takes them.
+
+    Raises:
+        MivolError: a damaged or truncated file.
+    """
+    return list(_list_grids(read_bytes(path), path))
+
+
 def _take(data: bytes, at: int, count: int, path: Path) -> bytes:
     if count < 0 or at < 0 or at + count > len(data):
         found = f"{len(data)} bytes, where {count} more are announced at byte {at}"
