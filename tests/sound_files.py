@@ -33,7 +33,7 @@ from mivol.files.npy import read_archive
 from mivol.files.pbrt_scene import read_pbrt_scene
 from mivol.photos.photo_file import read_mask, read_photo
 from mivol.points.cloud import PointCloud, read_points, write_points
-from mivol.points.gaussian_files import read_gaussians
+from mivol.points.gaussian_files import read_gaussians, write_gaussians
 from mivol.report import record
 from mivol.report.page import write_page
 from mivol.validate.moments import Moments
@@ -307,6 +307,8 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "spz 2": (".spz", _bytes(spz_bytes(random_gaussians(5, 1), 2)), read_gaussians),
     "spz 4": (".spz", _bytes(spz_bytes(random_gaussians(5, 1), 4)), read_gaussians),
     "splat": (".splat", _bytes(splat_bytes(random_gaussians(5, 0))), read_gaussians),
+    "sog": (".sog", lambda path: write_gaussians(path, random_gaussians(5, 1)), read_gaussians),
+    "glb": (".glb", lambda path: write_gaussians(path, random_gaussians(5, 1)), read_gaussians),
     "ksplat": (".ksplat", _bytes(ksplat_bytes([in_buckets(random_gaussians(5, 1))], 1)), read_gaussians),
     "points": (".ply", _cloud, read_points),
     "points npy": (".npy", _cloud, read_points),

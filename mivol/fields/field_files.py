@@ -171,7 +171,7 @@ def write_field(
         return [path]
     kind = FIELD_FORMATS[suffix]
     if level is not None and kind.write is not _write_mesh:
-        raise refusal(path, f"a level for a {kind.name}", "none", "levels are for meshes: write .ply or .obj")
+        raise refusal(path, f"a level for a {kind.name}", "none", "levels are for meshes: write .ply, .obj or .glb")
     if isinstance(field, Octree) and kind.write not in (_write_npz, _write_svox):
         field = field.to_grid()
     return kind.write(path, field, WriteOptions(level, sky, half, view))
@@ -216,7 +216,8 @@ def _write_volume_pair(path: Path, field: SphericalGrid) -> list[Path]:
 
 
 def _write_mesh(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
-    write_mesh(path, extract_surface(field, options.level))
+    mesh = extract_surface(field, options.level)
+    write_mesh(path, mesh if options.view is None else replace(mesh, up=options.view.up))
     return [path]
 
 
@@ -232,6 +233,7 @@ FIELD_FORMATS: dict[str, FieldFormat] = {
     ".nrrd": FieldFormat("pair of NRRD volumes", _write_volumes),
     ".ply": FieldFormat("mesh with colours", _write_mesh),
     ".obj": FieldFormat("mesh with colours", _write_mesh),
+    ".glb": FieldFormat("mesh with colours", _write_mesh),
     ".xml": FieldFormat("scene of Mitsuba", _write_scene),
 }
 """Suffix -> format. The longest suffix that fits a name counts."""

@@ -1,4 +1,4 @@
-"""Triangle meshes on disk: Stanford's ``.ply`` (binary, little endian) and Wavefront's ``.obj`` (text).
+"""Triangle meshes on disk: Stanford's ``.ply`` (binary, little endian), Wavefront's ``.obj`` (text) and glTF's ``.glb``.
 
 Own reader and writers: plyfile is under the GPL.
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from mivol.files import source
 from mivol.files.atomic import write_whole
+from mivol.files.gltf import write_glb_mesh
 from mivol.files.image_files import decode_srgb
 from mivol.files.source import refusal
 
@@ -37,6 +38,7 @@ class Mesh:
         faces: indices of points (F, 3).
         normals: unit normals (V, 3) pointing outwards, optional.
         colours: code values (V, 3) in 0..1, optional.
+        up: upward direction, which a ``.glb`` turns to its y; other formats leave it out.
 
     Raises:
         MivolError: inconsistent shapes, or an index without a point.
@@ -46,6 +48,7 @@ class Mesh:
     faces: np.ndarray
     normals: np.ndarray | None = None
     colours: np.ndarray | None = None
+    up: tuple[float, ...] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         per_point = [a for a in (self.points, self.normals, self.colours) if a is not None]
@@ -124,5 +127,9 @@ def _write_obj(file: BinaryIO, mesh: Mesh) -> None:
     np.savetxt(file, number, fmt="f %d %d %d" if mesh.normals is None else "f %d//%d %d//%d %d//%d")
 
 
+def _write_glb(file: BinaryIO, mesh: Mesh) -> None:
+    write_glb_mesh(file, mesh.points, mesh.faces, mesh.normals, mesh.colours, mesh.up)
+
+
 #: suffix -> writer of a mesh to a binary file.
-MESH_WRITERS: dict[str, Callable[[BinaryIO, Mesh], None]] = {".ply": _write_ply, ".obj": _write_obj}
+MESH_WRITERS: dict[str, Callable[[BinaryIO, Mesh], None]] = {".ply": _write_ply, ".obj": _write_obj, ".glb": _write_glb}

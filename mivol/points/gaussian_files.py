@@ -13,11 +13,15 @@ from typing import BinaryIO
 
 from mivol.files.atomic import write_whole
 from mivol.files.ply import read_comments, read_layout, read_tables
-from mivol.files.source import check_file, parse_reals, select_by_suffix
+from mivol.files.source import check_file, parse_reals, refusal, select_by_suffix
 from mivol.photos.camera_path import HomeView
 from mivol.points.compact_files import read_ksplat, read_splat, read_spz
+from mivol.points.compact_writers import write_ksplat, write_splat, write_spz
+from mivol.points.gaussian_gltf import read_gaussian_glb, write_gaussian_glb
+from mivol.points.gaussian_page import write_gaussian_page
 from mivol.points.gaussian_ply import is_compressed, parse_compressed_tables, parse_tables, write_gaussian_ply
 from mivol.points.gaussians import Gaussians
+from mivol.points.sog import read_sog, write_sog
 
 
 def _read_ply(path: Path) -> Gaussians:
@@ -30,11 +34,21 @@ GAUSSIAN_READERS: dict[str, Callable[[Path], Gaussians]] = {
     ".spz": read_spz,
     ".splat": read_splat,
     ".ksplat": read_ksplat,
+    ".sog": read_sog,
+    ".glb": read_gaussian_glb,
 }
 """Suffix -> reader(path)."""
 
-GAUSSIAN_WRITERS: dict[str, Callable[[BinaryIO, Gaussians], None]] = {".ply": write_gaussian_ply}
-"""Suffix -> writer(file, gaussians)."""
+GAUSSIAN_WRITERS: dict[str, Callable[[BinaryIO, Gaussians], None]] = {
+    ".ply": write_gaussian_ply,
+    ".spz": write_spz,
+    ".splat": write_splat,
+    ".ksplat": write_ksplat,
+    ".sog": write_sog,
+    ".glb": write_gaussian_glb,
+    ".html": write_gaussian_page,
+}
+"""Suffix -> writer(file, gaussians). A ``.html`` is a page that shows the Gaussians; it is not read."""
 
 
 def is_gaussian_file(path: Path) -> bool:
@@ -69,14 +83,18 @@ def write_gaussians(path: str | os.PathLike, gaussians: Gaussians, view: HomeVie
     Args:
         path: destination.
         gaussians: contents.
-        view: first view; a ``.ply`` keeps it as a comment, other formats leave it out.
+        view: first view; a ``.ply`` keeps it as a comment, a ``.html`` begins with it, other formats leave it out.
 
     Raises:
         MivolError: an unknown suffix, numbers that no renderer can draw, or a full disk.
     """
     path = Path(path)
     writer = select_by_suffix(path, GAUSSIAN_WRITERS)
+    if path.name.lower().endswith(".compressed.ply"):
+        raise refusal(path, "a name for PlayCanvas' compressed .ply, which is read only", "another", "write a .sog or an .spz")
     gaussians.check(path)
+    if view is not None and writer is write_gaussian_page:
+        writer = partial(write_gaussian_page, view=view)
     if view is not None and writer is write_gaussian_ply:
         comment = " ".join([VIEW_COMMENT, *(f"{number:.9g}" for number in view.numbers)])
         writer = partial(write_gaussian_ply, comment=comment)

@@ -51,6 +51,13 @@ def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaus
     has_codes = COLOURS[0] not in names and set(CODES) <= set(names)
     colours = CODES if has_codes else COLOURS
     missing = [name for name in (*MEANS, *colours, "opacity", *SCALES, *ROTATION) if name not in names]
+    if missing == ["scale_2"]:
+        raise refusal(
+            Path(path),
+            "2D Gaussians (discs with two scales)",
+            "3D Gaussians, with three",
+            "export 3D Gaussians, or convert it to points by the program that wrote it",
+        )
     if missing:
         raise refusal(
             Path(path),

@@ -246,7 +246,7 @@ def test_the_verb(variant_rgb: None, tmp_path: Path, capsys: pytest.CaptureFixtu
         made = main(["export", str(tmp_path / "field.npz"), str(tmp_path / f"out{suffix}")])
         assert made == (1 if suffix == ".svox.npz" else 0)  # an octree's format
     names = ("out.npz", "out.svox2.npz", "out.vol", "out-colour.vol", "out.nrrd", "out-colour.nrrd", "out.ply", "out.obj")
-    names += ("out.xml", "out-field.npz")
+    names += ("out.glb", "out.xml", "out-field.npz")
     printed = capsys.readouterr()
     assert printed.out.split() == [str(tmp_path / name) for name in names] and "--to octree" in printed.err
     assert main(["export", str(tmp_path / "field.npz"), str(tmp_path / "out.vdb")]) == 1
