@@ -82,7 +82,8 @@ class Bricks:
     def find_corners(self, cell: mi.Vector3i, ahead: object, active: mi.Bool) -> Nodes:
         """Find the 8 corners of a cell, near and far along ``ahead``; a node beyond the border is the node at the border.
 
-        Cost: one look-up in the table, and one for each corner in another brick than the near corner (0.4 on average).
+        Cost: one look-up in the table, and seven more where a cell of any of the lanes that are computed together (SIMD) lies
+        in several bricks.
         """
         return find_corners(self.table, self.res, self.offset, cell, ahead, active)
 
@@ -103,29 +104,81 @@ def find_corners(
     active: mi.Bool,
 ) -> Nodes:
     """Implement :meth:`Bricks.find_corners` for a loop, whose state holds the table alone."""
+    brick, inner = _split_planes(res, offset, cell, ahead)
+    return _find_nodes(table, brick[0], inner[0], list(zip(brick[1] - brick[0], inner[1] - inner[0], strict=True)), active)
+
+
+def find_face(
+    table: mi.UInt32,
+    res: tuple[int, int, int],
+    offset: tuple[int, int, int],
+    cell: mi.Vector3i,
+    ahead: object,
+    through: object,
+    is_far: mi.Bool,
+    active: mi.Bool,
+) -> Nodes:
+    """Find the 4 corners in the near or far face of a cell across the axis ``through``.
+
+    The order is that of the two other axes, the lower axis fastest: (y, z), (x, z) or (x, y).
+    """
+    brick, inner = _split_planes(res, offset, cell, ahead)
+    steps = [(far - near, move - place) for near, far, place, move in zip(brick[0], brick[1], inner[0], inner[1], strict=True)]
+    is_beyond = through & is_far
+    brick, inner = dr.select(is_beyond, brick[1], brick[0]), dr.select(is_beyond, inner[1], inner[0])
+    first = [dr.select(through.x, y, x) for x, y in zip(steps[0], steps[1], strict=True)]
+    second = [dr.select(through.z, y, z) for y, z in zip(steps[1], steps[2], strict=True)]
+    return _find_nodes(table, brick, inner, [tuple(first), tuple(second)], active)
+
+
+def _split_planes(
+    res: tuple[int, int, int], offset: tuple[int, int, int], cell: mi.Vector3i, ahead: object
+) -> tuple[tuple[mi.Vector3i, mi.Vector3i], tuple[mi.Vector3i, mi.Vector3i]]:
+    """The near and the far plane of a cell along each axis: their bricks, and their places in a brick."""
     z, y, x = res
     top, shift = mi.Vector3i(x - 1, y - 1, z - 1), mi.Vector3i(*offset[::-1])
     low, high = dr.clip(cell, 0, top) + shift, dr.clip(cell + 1, 0, top) + shift
-    near, far = dr.select(ahead, low, high), dr.select(ahead, high, low)
+    planes = dr.select(ahead, low, high), dr.select(ahead, high, low)
     strides, inner = _brick_strides(res, offset), _inner_strides()
-    brick, step = (near >> BITS) * strides, ((far >> BITS) - (near >> BITS)) * strides
-    near, far = (near & (EDGE - 1)) * inner, (far & (EDGE - 1)) * inner
-    brick, crosses = brick.x + brick.y + brick.z, step != 0
-    own = dr.gather(mi.UInt32, table, mi.UInt32(brick), active)
-    index, stored = [], []
-    for q in range(8):
-        first = own
-        if q:
-            axes = [a for a in range(3) if q >> a & 1]
-            beyond, other = mi.Bool(False), brick
-            for a in axes:
-                beyond, other = beyond | crosses[a], other + step[a]
-            # Few lanes look up: a gather costs its active lanes.
-            first = dr.select(beyond, dr.gather(mi.UInt32, table, mi.UInt32(other), active & beyond), own)
-        place = (far if q & 4 else near).z + (far if q & 2 else near).y + (far if q & 1 else near).x
-        index.append(first + mi.UInt32(place))
-        stored.append(first < ABSENT)
-    return Nodes(index, stored)
+    return tuple((p >> BITS) * strides for p in planes), tuple((p & (EDGE - 1)) * inner for p in planes)
+
+
+def _find_nodes(
+    table: mi.UInt32,
+    brick: mi.Vector3i,
+    place: mi.Vector3i,
+    steps: list[tuple[mi.Int32, mi.Int32]],
+    active: mi.Bool,
+) -> Nodes:
+    """Find a node and its neighbours by any of some steps; bit k of the number of a neighbour is step k.
+
+    Args:
+        table: first slots.
+        brick, place: brick and place of the node, an axis each.
+        steps: change of the brick and of the place in it.
+        active: lanes to look up.
+    """
+    number, place = brick.x + brick.y + brick.z, place.x + place.y + place.z
+    own = dr.gather(mi.UInt32, table, mi.UInt32(number), active)
+    numbers, places, leaves = [number], [place], [mi.Bool(False)]
+    for change, move in steps:
+        leaves += [other | (change != 0) for other in leaves]
+        numbers += [other + change for other in numbers]
+        places += [other + move for other in places]
+
+    def look_up(own: mi.UInt32, numbers: list[mi.Int32], leaves: list[mi.Bool]) -> list[mi.UInt32]:
+        found = [dr.gather(mi.UInt32, table, mi.UInt32(n), on) for n, on in zip(numbers, leaves, strict=True)]
+        return [dr.select(on, first, own) for first, on in zip(found, leaves, strict=True)]
+
+    def repeat(own: mi.UInt32, numbers: list[mi.Int32], leaves: list[mi.Bool]) -> list[mi.UInt32]:
+        return [mi.UInt32(own) for _ in numbers]
+
+    # A gather costs the same for any number of lanes; most cells lie in one brick, and a branch passes them by.
+    leaves = [active & other for other in leaves]
+    others = dr.if_stmt((own, numbers[1:], leaves[1:]), leaves[-1], look_up, repeat, label="other bricks")
+    firsts = [own, *others]
+    index = [first + mi.UInt32(p) for first, p in zip(firsts, places, strict=True)]
+    return Nodes(index, [first < ABSENT for first in firsts])
 
 
 def _brick_strides(res: tuple[int, int, int], offset: tuple[int, int, int]) -> mi.Vector3i:

@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.fields.bricks import Nodes, find_corners
+from mivol.fields.bricks import Nodes, find_face
 from mivol.numerics import fast_max, fast_min
 from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks
@@ -88,15 +88,17 @@ def walk_cells(
         halts: whether the visitor may stop inside a cell. It then returns its state and the walked distance, at most
             ``cell.dt``, and is called again from there.
 
-    Cost: a step for each cell or empty region, at most X + Y + Z + 6 steps; 4 reads a step and channel (8 a visited cell if
-        empty blocks are skipped, or if the grid is sparse).
+    Cost: a step for each cell or empty region, at most X + Y + Z + 6 steps, and one more wherever a ray enters cells from an
+        empty region; 4 reads a step and channel.
     """
     # Dr.Jit makes every object that a loop's body names part of the loop's state: so the body names these arrays only, and
     # neither the lattice nor the segment.
     empty_distances, length = lattice.empty_distances, segment.length
     skip, is_sparse = empty_distances is not None, lattice.bricks is not None
     table, offset = (lattice.bricks.table, lattice.bricks.offset) if is_sparse else (None, None)
-    carries = not (skip or is_sparse)
+    has_leaps = skip or is_sparse
+    # Without arrays to read, no step prepares a read.
+    prepares = has_leaps and len(reads) > 0
     res = lattice.res
     blocks_y, blocks_x = count_blocks(res[1]), count_blocks(res[2])
 
@@ -117,10 +119,9 @@ def walk_cells(
     s, s_rest = mi.Float(0), mi.Float(0)  #                                     world length walked, and its lost digits
     stride, top = _strides(lattice.res)
     near, far = _planes(cell, ahead, lattice.res)  #                            flat offsets of the corners, an axis each
-    if is_sparse:
-        corners = [[[mi.Float(0) for _ in range(8)] for _ in range(r.channels)] for r in reads]
-    else:
-        corners = read_nodes(reads, Nodes(_box(near, far)), active)
+    knows = mi.Bool(prepares)  #                                                whether the near corners are known
+    through = dr.mask_t(mi.Vector3f)(False, False, True)  #                     axis of the last plane crossed
+    corners = _first_corners(lattice, reads, cell, ahead, has_leaps, active)
 
     while dr.hint(active, label="lattice walk"):
         # -- Cells to cross at once: one, or what is left of an empty block and the empty ones around it -----------------
@@ -133,33 +134,41 @@ def walk_cells(
             full = distance == 0
             inner = (cell + 1) & (BLOCK - 1)
             span = dr.select(full, 0, dr.select(ahead, BLOCK - 1 - inner, inner) + (distance - 1) * BLOCK)
-        if is_sparse:
-            corners = read_nodes(reads, find_corners(table, res, offset, cell, ahead, full), full)
-        elif skip:
-            near, far = _planes(cell, ahead, res)
-            corners = read_nodes(reads, Nodes(_box(near, far)), full)
+        # -- Read four corners across the last plane; out of an empty region, first the near ones across z in a step of 0 ----
+        waits = mi.Bool(False)
+        if prepares:
+            waits = full & ~knows
+            x, y = knows & through.x, knows & through.y
+            across = dr.mask_t(mi.Vector3f)(x, y, ~(x | y))
+            if is_sparse:
+                face = find_face(table, res, offset, cell, ahead, across, knows, full)
+            else:
+                near, far = _planes(cell, ahead, res)
+                face = Nodes(_face(near, dr.select(knows, far, near), far - near, across))
+            corners = _shift(corners, across, read_nodes(reads, face, full))
 
         # -- Distance to the planes ahead, and visit ----------------------------------------------------------------------
         reach = (mi.Vector3f(span) + (1 - frac)) * pace
         plane = fast_min(fast_min(reach.x, reach.y), reach.z)
         left = (length - s) - s_rest
-        dt = fast_min(plane, left)
+        dt = dr.select(waits, 0, fast_min(plane, left))
         visited = Cell(corners, cell, ahead, frac, speed * dt, s, dt)
         if halts:
-            state, dt = visit(state, visited, active & full)
+            state, dt = visit(state, visited, active & full & ~waits)
         else:
-            state = visit(state, visited, active & full)
+            state = visit(state, visited, active & full & ~waits)
 
         # -- Leave through one face: a tie is a step of length 0 through the next ------------------------------------------
         through_x = reach.x <= plane
         through_y = ~through_x & (reach.y <= plane)
         through_z = ~(through_x | through_y)
-        if halts:
-            arrives = dt >= plane
+        if halts or prepares:
+            arrives = ~waits & (dt >= plane)
             through_x, through_y, through_z = through_x & arrives, through_y & arrives, through_z & arrives
+            knows = full & (waits | arrives)
         through = dr.mask_t(mi.Vector3f)(through_x, through_y, through_z)
         s, s_rest = _add(s, s_rest, dt)
-        active &= dt < left if halts else plane < left
+        active &= dt < left if halts else waits | (plane < left)
         if until is not None:
             active &= ~until(state)
 
@@ -172,16 +181,33 @@ def walk_cells(
         else:
             passed = dr.select(through, passed + 1, passed)
             cell = dr.clip(dr.select(through, cell + sign, cell), -1, top)
-        if carries:
+        if not has_leaps:
             near = dr.select(through, far, near)
             far = dr.select(through, dr.clip(far + sign * stride, 0, top * stride), far)
-            corners = _shift(corners, through, read_nodes(reads, Nodes(_far_face(near, far, through)), active))
+            corners = _shift(corners, through, read_nodes(reads, Nodes(_face(near, far, far - near, through)), active))
         # The fraction is found from the entry point, not from the last cell: the rounding of 3e-8 in a step has the same sign
         # in every step, and would carry a ray 1e-5 of a cell off its course in 256. speed * s and the number of planes passed
         # are nearly equal; the fused multiply-add subtracts them before it rounds, so that only the remainder is rounded.
         course = dr.fma(speed, s_rest, dr.fma(speed_rest, s, entry))
         frac = fast_min(fast_max(dr.fma(speed, s, -passed) + course, 0), 1)
     return state
+
+
+def _first_corners(
+    lattice: Lattice, reads: Sequence[NodeArray], cell: mi.Vector3i, ahead: Mask3, only_near: bool, active: mi.Bool
+) -> list:
+    """The corners [array][channel][corner] of the first cell; or only those near across z, in place of the far ones."""
+    near, far = _planes(cell, ahead, lattice.res)
+    if not only_near:
+        return read_nodes(reads, Nodes(_box(near, far)), active)
+    across_z = dr.mask_t(mi.Vector3f)(False, False, True)
+    if lattice.bricks is None:
+        face = Nodes(_face(near, near, far - near, across_z))
+    else:
+        bricks = lattice.bricks
+        face = find_face(bricks.table, bricks.res, bricks.offset, cell, ahead, across_z, mi.Bool(False), active)
+    unknown = [[[mi.Float(0) for _ in range(8)] for _ in range(r.channels)] for r in reads]
+    return _shift(unknown, across_z, read_nodes(reads, face, active))
 
 
 def _add(total: mi.Float, rest: mi.Float, term: mi.Float) -> tuple[mi.Float, mi.Float]:
@@ -218,14 +244,13 @@ def _box(near: mi.Vector3i, far: mi.Vector3i) -> list[mi.UInt32]:
     return [mi.UInt32(k + j + i) for k in (near.z, far.z) for j in (near.y, far.y) for i in (near.x, far.x)]
 
 
-def _far_face(near: mi.Vector3i, far: mi.Vector3i, through: Mask3) -> list[mi.UInt32]:
-    """Flat node indices of the 4 far corners across the axis ``through``.
+def _face(near: mi.Vector3i, far: mi.Vector3i, wide: mi.Vector3i, through: Mask3) -> list[mi.UInt32]:
+    """Flat node indices of the 4 corners in the plane ``far`` across the axis ``through``, ``wide`` apart along the others.
 
     The order is that of the two other axes, the lower axis fastest: (y, z), (x, z) or (x, y).
     """
     base = dr.select(through, far, near)
     base = base.x + base.y + base.z
-    wide = far - near
     first = dr.select(through.x, wide.y, wide.x)
     second = dr.select(through.z, wide.y, wide.z)
     return [mi.UInt32(base), mi.UInt32(base + first), mi.UInt32(base + second), mi.UInt32(base + first + second)]
