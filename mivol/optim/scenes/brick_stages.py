@@ -1,8 +1,11 @@
 """Bricks of sparse grids that appear and vanish between the stages of a fit.
 
 Conventions. ``data`` (bricks, 8, 8, 8, C) and ``bricks`` are the parameters of a sparse grid
-(:mod:`mivol.fields.sparse_voxels`). Bricks whose values are all at most a threshold vanish. Their neighbours, 26 a brick,
-appear if the gradient asks for them: a trial step with all neighbours at 0 measures where a rise of the values lowers the loss.
+(:mod:`mivol.fields.sparse_voxels`). Bricks whose values are all at most a threshold vanish. Neighbours of the others, 26 a
+brick, appear if the gradient asks for them. A trial step with all neighbours at 0 measures the *pull* of each brick: by how
+much the loss falls if all its voxels rise. A neighbour appears if its pull exceeds the root mean square of the pulls of the
+stored bricks. These fall to the noise of the gradient as the fit converges; the sign alone would let in half of all neighbours
+by noise.
 """
 
 from __future__ import annotations
@@ -93,8 +96,8 @@ def adapt_bricks(problem: BrickProblem, reals: Reals, iteration: int, threshold:
     gradients = problem.loss_and_gradient(trial, iteration)[1]
     messages, after = [], {}
     for name, numbers in tried.items():
-        asked = numbers[_find_asked(np.array(gradients[name]))]
-        after[name] = np.union1d(kept[name], np.setdiff1d(asked, before[name]))
+        asked = numbers[_find_asked(np.array(gradients[name]), np.isin(numbers, before[name]))]
+        after[name] = np.union1d(kept[name], asked)
         problem.set_brick_numbers(name, after[name])
         new, gone = len(np.setdiff1d(after[name], before[name])), len(np.setdiff1d(before[name], after[name]))
         messages.append(f"{len(after[name])} bricks ({new} appeared, {gone} vanished)")
@@ -119,10 +122,10 @@ def _find_kept(values: np.ndarray, numbers: np.ndarray, threshold: float) -> np.
     return numbers[(largest > threshold) | (largest == largest.max()) & (largest.max() <= threshold)]
 
 
-def _find_asked(gradient: np.ndarray) -> np.ndarray:
-    """The bricks in which rises lower the loss more than they raise it."""
-    flat = gradient.reshape(len(gradient), -1)
-    return -np.minimum(flat, 0).sum(axis=1) > np.maximum(flat, 0).sum(axis=1)
+def _find_asked(gradient: np.ndarray, stored: np.ndarray) -> np.ndarray:
+    """The bricks that are not stored and pull harder than the stored bricks do in the root mean square."""
+    pull = -gradient.reshape(len(gradient), -1).sum(axis=1, dtype=np.float64)
+    return ~stored & (pull > np.sqrt(np.mean(np.square(pull[stored]))))
 
 
 def _carry(tensor: mi.TensorXf, before: np.ndarray, after: np.ndarray) -> mi.TensorXf:
