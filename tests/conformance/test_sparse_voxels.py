@@ -19,6 +19,7 @@ from scattering_scenes import PLACE, cases, close_up, sun
 import mivol
 from mivol.errors import MivolError
 from mivol.fields import voxels
+from mivol.fields.bricks import Bricks
 from mivol.files import SparseVolumeData, check_bricks, write_volume
 from mivol.scene_graph import find_children
 from mivol.transport.media.grid_integral import integrate_tau
@@ -161,6 +162,76 @@ def test_images_and_derivatives_are_those_of_the_dense_grid(name: str, channels:
     # Sums over 1600 lanes in any order: 40 roundings of the sum of magnitudes.
     assert np.abs(own - gradients[0]).max() <= 40 * ROUNDING * np.abs(gradients[0]).max()
     assert np.abs(own).max() > 0
+
+
+ROLES: dict[str, dict] = {
+    "albedo, one scattering": {"roles": ("albedo",), "depth": 2},
+    "albedo, flights": {"roles": ("albedo",), "depth": 5, **SUN},
+    "emission": {"roles": ("emission",), "depth": 1},
+    "emission density": {"roles": ("emission_density",), "depth": 3},
+    "all, each in its own place": {"roles": ("sigma_t", "albedo", "emission"), "depth": 4, "moves": True, **SUN},
+    "all, absorbing": {"roles": ("sigma_t", "emission"), "depth": 1, "moves": True},
+}
+"""The sparse grids of a medium, and whether each has another place and resolution than the extinction."""
+
+
+def grids_of(roles: tuple[str, ...], moves: bool, is_sparse: bool, channels: int) -> dict[str, dict]:
+    """The grids of a medium; where ``moves``, they have resolutions of their own, and boxes that end in it or beyond."""
+    grids = {}
+    for k, role in enumerate(("sigma_t", "albedo", "emission", "emission_density")):
+        if role not in roles and role != "sigma_t":
+            continue
+        rng, shape = np.random.default_rng(30 + k), (13 + 3 * k * moves, 17 - 2 * k * moves, 15)
+        values = np.maximum(patches(rng, shape, 1 if role == "sigma_t" else channels), 0.01).astype(np.float32)
+        if role == "albedo":
+            values /= values.max() * 1.1
+        move = np.eye(4)
+        if moves and k:
+            move[:3, :3], move[:3, 3] = np.diag([1.1, 0.8, 1.3 - 0.2 * k]), (-0.05, 0.1, 0.05 * k)
+        place = mi.ScalarTransform4f(PLACE @ move)
+        given = (
+            plugin(cut(values, (k, 3, 7)))
+            if is_sparse and role in roles
+            else {"type": "mivol_voxels", "data": mi.TensorXf(values)}
+        )
+        grids[role] = given | {"to_world": place}
+    return grids
+
+
+@pytest.mark.parametrize("channels", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", cases(ROLES, slow=("albedo, one scattering", "emission density", "all, absorbing")))
+def test_other_grids_of_a_medium_are_their_dense_twins(name: str, channels: int) -> None:
+    """As the test before, for albedo and emission, and for grids of several resolutions and places in one medium."""
+    given = dict(ROLES[name])
+    roles, depth, moves = given.pop("roles"), given.pop("depth"), given.pop("moves", False)
+    images, gradients = [], []
+    for is_sparse in (False, True):
+        grids = {"albedo": 0.0 if depth == 1 else 0.8} | grids_of(roles, moves, is_sparse, channels)
+        integrator = {"type": "mivol", "max_depth": depth}
+        smoke = {"type": "mivol_medium", **grids}
+        scene = close_up({"smoke": box_of(smoke, PLACE), "integrator": integrator, **(given or {"sky": sky(0.7)})}, res=10)
+        params = mi.traverse(scene)
+        images.append(np.array(mi.render(scene, seed=1, spp=4)))
+        keys = [f"{INSIDE}{role}.data" for role in roles]
+        for key in keys:
+            dr.enable_grad(params[key])
+        dr.backward(dr.mean(dr.square(mi.render(scene, params, seed=2, spp=4)), axis=None))
+        found = [np.array(dr.grad(params[key])) for key in keys]
+        if is_sparse:
+            bricks = [find_children(scene.shapes()[0].interior_medium())[role].mivol_bricks for role in roles]
+            found = [unfold(g, b) for g, b in zip(found, bricks, strict=True)]
+        gradients.append(found)
+    assert np.abs(images[1] - images[0]).max() <= ROUNDING * images[0].max()
+    for own, dense in zip(gradients[1], gradients[0], strict=True):
+        # Sums over 1600 lanes in any order: 40 roundings of the sum of magnitudes.
+        assert np.abs(own - dense).max() <= 40 * ROUNDING * np.abs(dense).max()
+        assert np.abs(own).max() > 0
+
+
+def unfold(values: np.ndarray, bricks: Bricks) -> np.ndarray:
+    """The dense grid (Z, Y, X, C) of values in bricks."""
+    places = np.stack(np.unravel_index(np.array(bricks.stored), bricks.counts), axis=1).astype(np.int32)
+    return SparseVolumeData(values, places, bricks.res, np.eye(4), bricks.offset).dense()
 
 
 @pytest.mark.parametrize("depth", [1, pytest.param(4, marks=pytest.mark.slow)])

@@ -145,7 +145,9 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
         else _part(name, params, children[name], kind, boundary, places)
         for name in names
     ]
-    albedo_arrays = [v for k, v in values if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
+    of_albedo = "sigma_s." if "sigma_s" in names else "albedo."
+    # The numbers of the bricks of a sparse grid are no values.
+    albedo_arrays = [v for k, v in values if k.startswith(of_albedo) and not k.endswith(".bricks")]
     albedo = _field(params, "albedo") if "sigma_s" not in names else None
     emission, emission_density = _field(params, "emission"), _field(params, "emission_density")
     emission_arrays = [v for k, v in values if k.startswith("emission") and k.endswith((".data", ".value.value"))]
