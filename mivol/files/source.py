@@ -188,6 +188,8 @@ def decompress(data: bytes, codec: str, limit: int, path: object) -> bytes:
             raise refusal(path, found, expected, "correct the header")
         if not stream.eof:
             raise refusal(path, f"a {codec} stream that breaks off", "its end", "the file is truncated: copy it again")
+        if not stream.unused_data and len(pieces) == 1:
+            return piece
         rest = stream.unused_data.lstrip(b"\0")
     return b"".join(pieces)
 

@@ -19,11 +19,13 @@ import re
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from mivol.errors import MivolError
 from mivol.files.npy import check_memory
 from mivol.files.source import check_file, decompress, refusal, select_dataset
 from mivol.files.sparse_volume import SparseVolumeData, allocate_bricks
@@ -64,6 +66,9 @@ LEAF = 1 << LEVELS[-1]
 
 BUFFER = 1 << 16
 """Bytes that are read from a file at once."""
+
+MASK = LEAF**3 // 8
+"""Bytes of the mask of a leaf."""
 
 LEAVES_AT_ONCE = 2048
 """Leaves whose values are placed together: few calls of NumPy, and little memory beside the result."""
@@ -154,18 +159,22 @@ class _Stream:
     at: int = 0
 
     def take(self, count: int) -> bytes:
-        self._advance(count)
+        # A large file has 100,000 leaves, and takes four pieces of each: no further call here.
+        end = self.at + count
+        if count < 0 or end > self.size:
+            raise self._refusal(count)
+        self.at = end
         return self.file.read(count)
 
     def skip(self, count: int) -> None:
-        self._advance(count)
+        if count < 0 or self.at + count > self.size:
+            raise self._refusal(count)
+        self.at += count
         self.file.seek(self.at)
 
-    def _advance(self, count: int) -> None:
-        if count < 0 or self.at + count > self.size:
-            found = f"{self.size} bytes, where {count} more are announced at byte {self.at}"
-            raise refusal(self.path, found, "a whole file", "the file is truncated or damaged: copy it again")
-        self.at += count
+    def _refusal(self, count: int) -> MivolError:
+        found = f"{self.size} bytes, where {count} more are announced at byte {self.at}"
+        return refusal(self.path, found, "a whole file", "the file is truncated or damaged: copy it again")
 
     def unpack(self, codes: str) -> tuple:
         return struct.unpack("<" + codes, self.take(struct.calcsize("<" + codes)))
@@ -453,7 +462,7 @@ class _TreeReader:
         joins = self.kind != "bool" and self.compression & ACTIVE_VALUES
         for k, (node, count) in enumerate(zip(leaves, counts, strict=True)):
             begin = stream.at
-            if joins and stream.take(LEAF**3 // 8 + 1)[-1] == 0:
+            if joins and stream.take(MASK + 1)[-1] == 0:
                 plain[k] = True
                 blocks.append(self._read_stored(count))
             else:
@@ -479,14 +488,20 @@ class _TreeReader:
         has_child, is_on = self._read_mask(count), self._read_mask(count)
         values = self._read_values(count, is_on)
         matters = is_on | (values != self.background).any(axis=1)
-        for index in np.flatnonzero(has_child | matters):
-            place = _child_origin(origin, int(index), log2, below)
-            if not has_child[index]:
+        indices = np.flatnonzero(has_child | matters)
+        places = _child_origins(origin, indices, log2, below)
+        holds_leaves = level + 1 == len(LEVELS) - 1
+        # The masks of the leaves of a node lie one after the other.
+        masks = self.stream.take(MASK * int(np.count_nonzero(has_child))) if holds_leaves else b""
+        at = 0
+        for index, place, is_node in zip(indices.tolist(), places, has_child[indices].tolist(), strict=True):
+            if not is_node:
                 yield Node(place, 1 << below, values[index], bool(is_on[index]))
-            elif level + 1 < len(LEVELS) - 1:
+            elif not holds_leaves:
                 yield from self._read_inner(place, level + 1)
             else:
-                yield Node(place, LEAF, None, self.stream.take(LEAF**3 // 8))
+                yield Node(place, LEAF, None, masks[at : at + MASK])
+                at += MASK
 
     def _read_mask(self, count: int) -> np.ndarray:
         return np.unpackbits(np.frombuffer(self.stream.take(count // 8), np.uint8), bitorder="little").astype(bool)
@@ -528,15 +543,18 @@ class _TreeReader:
         data = self._read_stored(count)
         return np.frombuffer(data, "<f2" if self.is_half else dtype).astype(dtype).reshape(count, components)
 
+    @cached_property
+    def _bytes_of_value(self) -> int:
+        dtype, components = TYPES[self.kind]
+        return np.dtype("<f2" if self.is_half else dtype).itemsize * components
+
     def _read_stored(self, count: int) -> bytes:
         """Read the bytes of ``count`` stored values."""
-        dtype, components = TYPES[self.kind]
-        stored = "<f2" if self.is_half else dtype
-        size, stream = np.dtype(stored).itemsize * components * count, self.stream
+        size, stream = self._bytes_of_value * count, self.stream
         if self.is_half and count == 0:
             data = b""  # OpenVDB writes no size for an empty block of half numbers, but one for other numbers
         elif self.compression & (ZIP | BLOSC):
-            held = stream.unpack("q")[0]
+            held = int.from_bytes(stream.take(8), "little", signed=True)
             # A negative number is the size of data that compression would have made longer.
             data = stream.take(-held) if held <= 0 else self._decompress(stream.take(held), size)
         else:
@@ -572,10 +590,10 @@ def decompress_blosc(data: bytes, size: int, path: Path) -> bytes:
         raise refusal(path, f"damaged Blosc data ({error})", "a sound frame", "copy the file again") from error
 
 
-def _child_origin(origin: Coord, index: int, log2: int, below: int) -> Coord:
+def _child_origins(origin: Coord, indices: np.ndarray, log2: int, below: int) -> list[Coord]:
     last = (1 << log2) - 1
-    steps = (index >> 2 * log2, index >> log2 & last, index & last)
-    return tuple(start + (step << below) for start, step in zip(origin, steps, strict=True))
+    steps = (indices >> 2 * log2, indices >> log2 & last, indices & last)
+    return list(zip(*((start + (step << below)).tolist() for start, step in zip(origin, steps, strict=True)), strict=True))
 
 
 def _find_active_box(nodes: list[Node]) -> tuple[Coord, Coord, int]:
