@@ -1,17 +1,22 @@
 """Procedural volumes: seeded densities for demos and tests, with the same numbers on every machine.
 
 Conventions. A recipe maps points (..., 3) in the unit cube, as (x, y, z), and a generator to values in [0, 1]. Volumes sample
-the recipe at voxel centres, so every resolution shows the same object. PROCEDURAL lists the recipes.
+the recipe at voxel centres, so every resolution shows the same object. PROCEDURAL lists the recipes. A cumulus is made in
+bricks: no array of the whole box exists at any time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.spatial import KDTree
 
 from mivol.errors import MivolError
+from mivol.files import SparseVolumeData
+from mivol.files.sparse_volume import EDGE, VOXELS
 
 
 def tangle(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -71,3 +76,66 @@ def make_procedural(name: str, shape: Sequence[int], seed: int, peak: float) -> 
     z, y, x = np.meshgrid(*axes, indexing="ij")
     values = PROCEDURAL[name](np.stack([x, y, z], axis=-1), np.random.default_rng(seed))
     return (peak * values[..., None]).astype(np.float32)
+
+
+CHUNK = 4096
+"""Bricks of a cumulus that are made at once."""
+
+OCTAVES = [(8 * 2**k, 0.62**k) for k in range(5)]
+"""Period of each octave of noise of a cumulus [1/length], and its amplitude."""
+
+
+class Cumulus:
+    """Signed depth below the surface of a cloud, at points of the unit cube; positive inside.
+
+    The cloud is a heap of balls over a flat base, with octaves of noise on its surface.
+    """
+
+    def __init__(self, balls: int = 26, seed: int = 11) -> None:
+        rng = np.random.default_rng(seed)
+        angle, away = rng.uniform(0, 2 * np.pi, balls), 0.3 * np.sqrt(rng.uniform(0, 1, balls))
+        radius = rng.uniform(0.05, 0.12, balls) * (1.2 - 1.6 * away)
+        height = 0.2 + rng.uniform(0, 0.38, balls) * (1 - away / 0.32) + radius / 2
+        self.balls = np.column_stack([0.5 + away * np.cos(angle), 0.5 + away * np.sin(angle), height, radius])
+        grids = [rng.uniform(-1, 1, (n, n, n, 1)).astype(np.float32) for n, _ in OCTAVES]
+        self.noise = [mi.Texture3f(mi.TensorXf(grid), wrap_mode=dr.WrapMode.Repeat) for grid in grids]
+
+    def depth(self, p: mi.Point3f, erosion: float = 0.045) -> mi.Float:
+        """Depth [length]; the noise moves the surface by at most twice the erosion."""
+        inside = mi.Float(-1)
+        for x, y, z, radius in self.balls.tolist():
+            inside = dr.maximum(inside, radius - dr.norm(p - mi.Point3f(x, y, z)))
+        eroded = sum(amplitude * noise.eval(p)[0] for (_, amplitude), noise in zip(OCTAVES, self.noise, strict=True))
+        return dr.minimum(inside + erosion * eroded, (p.z - 0.2) + 0.3 * erosion * eroded)
+
+
+def make_cumulus(voxels: int, extinction: float = 150.0, cumulus: Cumulus | None = None) -> SparseVolumeData:
+    """Make a cloud in bricks, in about 3 % of its box.
+
+    Args:
+        voxels: voxels along each edge of the box.
+        extinction: extinction in the cloud [1/length], for a box of edge 1; it rises from 0 at the surface within four voxels.
+        cumulus: shape of the cloud; None: that of the default seed.
+    """
+    cumulus = cumulus or Cumulus()
+    counts = -(-voxels // EDGE)
+    # A brick whose middle lies more than three bricks outside of the surface has no voxel inside.
+    index = dr.arange(mi.UInt32, counts**3)
+    places = (index // counts**2, index // counts % counts, index % counts)
+    middle = mi.Point3f(*((mi.Float(k) + 0.5) * (EDGE / voxels) for k in places[::-1]))
+    near = dr.compress(cumulus.depth(middle) > -EDGE / voxels * 3).numpy()
+    values, numbers = [], []
+    for begin in range(0, len(near), CHUNK):
+        bricks = near[begin : begin + CHUNK]
+        node = dr.arange(mi.UInt32, len(bricks) * VOXELS)
+        brick, inner = dr.gather(mi.UInt32, mi.UInt32(bricks), node // VOXELS), node % VOXELS
+        z = brick // counts**2 * EDGE + inner // EDGE**2
+        y = brick // counts % counts * EDGE + inner // EDGE % EDGE
+        x = brick % counts * EDGE + inner % EDGE
+        depth = cumulus.depth(mi.Point3f(*((mi.Float(k) + 0.5) / voxels for k in (x, y, z))))
+        block = np.array(extinction * dr.clip(depth * voxels / 4, 0, 1)).reshape(-1, EDGE, EDGE, EDGE, 1)
+        held = block.any(axis=(1, 2, 3, 4))
+        values.append(block[held])
+        numbers.append(bricks[held])
+    rows = np.stack(np.unravel_index(np.concatenate(numbers), (counts,) * 3), axis=1).astype(np.int32)
+    return SparseVolumeData(np.concatenate(values), rows, (voxels,) * 3, np.eye(4))

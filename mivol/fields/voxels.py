@@ -129,8 +129,7 @@ STORAGES = ("auto", "dense", "sparse")
 """Values of the property ``storage``."""
 
 LEAST_SPARSE_BYTES = 128 << 20
-"""Size of a dense grid [bytes] from which ``auto`` stores a sparse one: below, memory is cheap, and a walk takes 1.3 to 1.45
-times as long in a sparse grid."""
+"""Size of a dense grid [bytes] from which ``auto`` stores a sparse one: below, memory is cheap."""
 
 MAX_STORED_SHARE = 0.25
 """Share of stored bricks up to which ``auto`` stores a sparse grid."""

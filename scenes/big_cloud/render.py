@@ -14,66 +14,15 @@ import time
 from pathlib import Path
 
 import mivol
+from mivol.fields.procedural import make_cumulus
 from mivol.files import write_png
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-EDGE = 8
-"""Voxels along the edge of a brick."""
-CHUNK = 4096
-"""Bricks that are made at once."""
 EXTINCTION = 150.0
 """Extinction [1/length] in the cloud, whose box has the edge 1."""
-OCTAVES = [(8 * 2**k, 0.62**k) for k in range(5)]
-"""Period of each octave of noise [1/length], and its amplitude."""
-
-
-class Cumulus:
-    """Signed depth below the surface of a cloud, at points of the unit cube; positive inside."""
-
-    def __init__(self, balls: int = 26, seed: int = 11) -> None:
-        rng = np.random.default_rng(seed)
-        angle, away = rng.uniform(0, 2 * np.pi, balls), 0.3 * np.sqrt(rng.uniform(0, 1, balls))
-        radius = rng.uniform(0.05, 0.12, balls) * (1.2 - 1.6 * away)
-        height = 0.2 + rng.uniform(0, 0.38, balls) * (1 - away / 0.32) + radius / 2
-        self.balls = np.column_stack([0.5 + away * np.cos(angle), 0.5 + away * np.sin(angle), height, radius])
-        grids = [rng.uniform(-1, 1, (n, n, n, 1)).astype(np.float32) for n, _ in OCTAVES]
-        self.noise = [mi.Texture3f(mi.TensorXf(grid), wrap_mode=dr.WrapMode.Repeat) for grid in grids]
-
-    def depth(self, p: mi.Point3f, erosion: float = 0.045) -> mi.Float:
-        """Depth [length]; the base of the cloud is flat."""
-        inside = mi.Float(-1)
-        for x, y, z, radius in self.balls.tolist():
-            inside = dr.maximum(inside, radius - dr.norm(p - mi.Point3f(x, y, z)))
-        eroded = sum(amplitude * noise.eval(p)[0] for (_, amplitude), noise in zip(OCTAVES, self.noise, strict=True))
-        return dr.minimum(inside + erosion * eroded, (p.z - 0.2) + 0.3 * erosion * eroded)
-
-
-def make_cloud(voxels: int, cumulus: Cumulus) -> mivol.SparseVolumeData:
-    """The extinction of the cloud in bricks; rises from 0 at its surface within four voxels."""
-    counts = -(-voxels // EDGE)
-    # Bricks whose middle lies far outside have no voxel inside: the noise moves the surface by at most twice the erosion.
-    index = dr.arange(mi.UInt32, counts**3)
-    places = (index // counts**2, index // counts % counts, index % counts)
-    middle = mi.Point3f(*((mi.Float(k) + 0.5) * (EDGE / voxels) for k in places[::-1]))
-    near = dr.compress(cumulus.depth(middle) > -EDGE / voxels * 3)
-    values, numbers = [], []
-    for begin in range(0, dr.width(near), CHUNK):
-        bricks = near.numpy()[begin : begin + CHUNK]
-        node = dr.arange(mi.UInt32, len(bricks) * EDGE**3)
-        brick, inner = dr.gather(mi.UInt32, mi.UInt32(bricks), node // EDGE**3), node % EDGE**3
-        z = brick // counts**2 * EDGE + inner // EDGE**2
-        y = brick // counts % counts * EDGE + inner // EDGE % EDGE
-        x = brick % counts * EDGE + inner % EDGE
-        depth = cumulus.depth(mi.Point3f(*((mi.Float(k) + 0.5) / voxels for k in (x, y, z))))
-        block = np.array(EXTINCTION * dr.clip(depth * voxels / 4, 0, 1)).reshape(-1, EDGE, EDGE, EDGE, 1)
-        held = block.any(axis=(1, 2, 3, 4))
-        values.append(block[held])
-        numbers.append(bricks[held])
-    rows = np.stack(np.unravel_index(np.concatenate(numbers), (counts,) * 3), axis=1).astype(np.int32)
-    return mivol.SparseVolumeData(np.concatenate(values), rows, (voxels,) * 3, np.eye(4))
 
 
 def make_scene(cloud: mivol.SparseVolumeData, size: int, spp: int) -> mi.Scene:
@@ -121,7 +70,7 @@ def main() -> None:
     given.output.mkdir(parents=True, exist_ok=True)
 
     before, start = peak_memory(), time.perf_counter()
-    cloud = make_cloud(given.voxels, Cumulus())
+    cloud = make_cumulus(given.voxels, EXTINCTION)
     share = np.count_nonzero(cloud.values) / given.voxels**3
     print(
         f"{len(cloud.values)} bricks, {share:.1%} of {given.voxels}^3 voxels above 0: {cloud.values.nbytes / 1e6:.0f} MB, a "
@@ -142,7 +91,7 @@ def main() -> None:
         dr.enable_grad(params[key])
         dr.backward(dr.mean(mi.render(scene, params, spp=1), axis=None))
         derivative = dr.grad(params[key])
-        print(f"derivatives by {derivative.shape[0] * EDGE**3} voxels, {peak_memory() - before:.0f} MB more than before")
+        print(f"derivatives by {dr.width(derivative.array)} voxels, {peak_memory() - before:.0f} MB more than before")
 
 
 if __name__ == "__main__":

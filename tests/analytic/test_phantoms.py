@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields.procedural import PROCEDURAL, inside, make_procedural
+from mivol.fields.procedural import PROCEDURAL, Cumulus, inside, make_cumulus, make_procedural
 from mivol.tomography import phantoms
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import SHEPP_LOGAN, EllipsoidPhantom, random_ellipsoids, shepp_logan
@@ -215,3 +216,15 @@ def test_an_object_ends_before_its_box() -> None:
         points = np.full((5, 3), 0.5)
         points[:, axis] += [-0.42, 0.45, 0.48, -0.5, 0.1]
         np.testing.assert_allclose(inside(points), [1, 0.5, 0, 0, 1], atol=1e-12)
+
+
+def test_a_cumulus_in_bricks_is_the_whole_cloud(variant_rgb: str) -> None:
+    """Its depth at every voxel centre of the box: no brick is left out."""
+    n, cumulus = 64, Cumulus(balls=9, seed=3)
+    cloud = make_cumulus(n, 150.0, cumulus)
+    z, y, x = np.meshgrid(*[(np.arange(n, dtype=np.float32) + 0.5) / n] * 3, indexing="ij")
+    depth = np.array(cumulus.depth(mi.Point3f(x.ravel(), y.ravel(), z.ravel()))).reshape(n, n, n, 1)
+    whole = 150 * np.clip(depth * n / 4, 0, 1)
+    assert 0.005 < np.count_nonzero(whole) / n**3 < 0.1 and len(cloud.values) < 8**3 / 2
+    # Half an ulp of a coordinate of 1, times the steepest slope: 150 n / 4, and at most 10 by the noise.
+    assert np.abs(cloud.dense() - whole).max() <= 150 * n / 4 * 10 * 2.0**-24

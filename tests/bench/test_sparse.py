@@ -1,0 +1,53 @@
+"""Study of sparse grids: bars, table, and the answers of small sizes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mivol.bench.studies import sparse
+
+
+def rates(dense: float, skipped: float, own: float) -> dict:
+    return {
+        "dense, every cell": dense,
+        "dense, empty blocks skipped": skipped,
+        "sparse": own,
+        "sparse over dense": own / skipped,
+    }
+
+
+def test_bars_and_table() -> None:
+    row = {"camera order": rates(1e6, 4e6, 6e6), "random order": rates(1e6, 2e6, 1e6), "sparse over dense": 0.866}
+    walk = {"threads": row, "smoke": {"skipped": sparse.MISSING}}
+    answers = {
+        "read": {"skipped": sparse.MISSING},
+        "walk": walk,
+        "memory": {
+            "peak_bytes": {"medium": 219e6, "gradient": 950e6},
+            "held_over_bricks": 1.03,
+            "first_picture": {"both": 2.0},
+        },
+        "picture": {"mivol over volpath": {"variance_x_time_mean_over_pixels": 12, "z": 0.3, "z_bound": 4.0}},
+        "fit": {"time": 0.4, "memory": 0.2},
+    }
+    met = [bar["met"] for name, a in answers.items() for bar in sparse.STUDY.bars(name, a)]
+    assert met == [False, False, True, False, False, True, True, True, True, True]
+    assert sparse.tabulate("walk", walk)[2:] == [
+        "| threads | 4.00 / 2.00 | 6.00 / 1.00 | 1.50 / 0.50 |",
+        f"| smoke | skipped: {sparse.MISSING} | | |",
+    ]
+    assert sparse.tabulate("read", answers["read"]) == [f"| read | skipped: {sparse.MISSING} |"]
+
+
+@pytest.mark.slow
+def test_answers(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sparse, "DATA", tmp_path)
+    size = sparse.SparseSize.quick()
+    answers = sparse.STUDY.answer(list(sparse.QUESTIONS), size)
+    assert answers["read"] == answers["walk"]["smoke"] == {"skipped": sparse.MISSING}
+    assert answers["walk"]["cloud"]["bricks"] == answers["memory"]["bricks"]
+    assert answers["memory"]["held_bytes"]["data"] == answers["memory"]["bytes_of_bricks"]
+    assert [b["met"] for b in answers["bars"] if b["figure"].startswith("|z|")] == [True]
+    assert answers["fit"]["sparse"]["log"] and answers["fit"]["memory"] < 1
