@@ -632,6 +632,17 @@ class NerfSettings(Section):
     direction: Annotated[int, setting("1", "frequencies of the direction; absent: preset", ge=0, le=16)] | None = None
     branch: Annotated[int, setting("neuron", "hidden neurons of the colours; absent: preset", ge=1, le=1024)] | None = None
     relu: Annotated[int, setting("1", "1: density by a ReLU, 0: by softplus; absent: preset", ge=0, le=1)] | None = None
+    harmonics: (
+        Annotated[int, setting("1", "degree of harmonics for the colours (NeRF-SH); -1: a branch; absent: preset", ge=-1, le=4)]
+        | None
+    ) = None
+    coarse: (
+        Annotated[int, setting("sample", "samples of a ray by a coarse network; 0: one network; absent: preset", ge=0, le=1024)]
+        | None
+    ) = None
+    fine: (
+        Annotated[int, setting("sample", "samples where the coarse network has weight; absent: preset", ge=0, le=1024)] | None
+    ) = None
     samples: Annotated[int, setting("sample", "samples of a step; absent: preset", ge=256, le=1 << 22)] | None = None
     cells: Annotated[int, setting("cell", "cells of the map of occupied space; absent: preset", ge=4, le=256)] | None = None
 
@@ -654,7 +665,13 @@ class OctreeSettings(Section):
     """The octree and its fit: a grid first, or a field of a file."""
 
     kind: Annotated[Literal["octree"], setting("1", "a grid, its octree, and a fit of the leaves")]
-    start: Annotated[str, setting("path", "field (.npz) to begin at, a grid or an octree; empty: fit a grid first")] = ""
+    start: Annotated[
+        str,
+        setting(
+            "path",
+            "field (.npz) to begin at: grid, octree, hash grid or NeRF; hash or nerf: fit one first; empty: fit a grid first",
+        ),
+    ] = ""
     preset: Annotated[str, setting("1", "of the grid: tiny, cpu, fine or gpu", min_length=1)] = "cpu"
     effort: Annotated[float, setting("1", "factor on the steps of grid and octree", gt=0)] = 1.0
     longest: (

@@ -52,7 +52,7 @@ def test_it_is_kept_without_outputs(path: Path) -> None:
 
 def test_each_is_run() -> None:
     """A new notebook needs a test below."""
-    assert [path.stem for path in NOTEBOOKS] == ["light_in_a_smoke", "mivol_in_ten_minutes"]
+    assert [path.stem for path in NOTEBOOKS] == ["light_in_a_smoke", "mivol_in_ten_minutes", "seven_representations"]
 
 
 @pytest.mark.slow
@@ -78,3 +78,17 @@ def test_mivol_in_ten_minutes(
     assert nrmse(ours[0]) < min(0.5 * start, nrmse(theirs[0]))
     assert all(np.isfinite(curve).all() and (np.diff(curve[:, 0]) > 0).all() for _, curve in (ours, theirs))
     assert "max_depth is 6" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_seven_representations(
+    two_threads: None, no_window: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every representation shows the views that it was not fitted to: better than white paper, which has 11 dB."""
+    monkeypatch.chdir(tmp_path)
+    results = executed("seven_representations")["results"]
+    assert list(results) == [
+        "dense grid", "network", "octree", "grid with harmonics", "plenoxels", "hash grid", "gaussians"
+    ]  # fmt: skip
+    assert all(row["psnr"] > 18 and row["view"].shape[:2] == (64, 64) for row in results.values()), results
+    assert "its leaves fitted" in capsys.readouterr().out

@@ -320,7 +320,7 @@ def convert_flags() -> list:
         DATASET,
         SHAPE,
         DTYPE,
-        flag("--to", choices=(*KINDS, "field", "mesh", "octree", "grid"),
+        flag("--to", choices=(*KINDS, "field", "mesh", "octree", "grid", "hash", "nerf"),
              help="kind of the output (default: as the source, if possible)"),
         flag("--resolution", type=int,
              help="for a field or a mesh: voxels along the longest edge (default: 128); for Gaussians from a field: Gaussians "
@@ -755,7 +755,8 @@ def export(arguments: argparse.Namespace) -> None:
 def convert(arguments: argparse.Namespace) -> None:
     """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats; volumes too.
 
-    A field (.npz) is the mivol_sh of a scene, an octree (--to octree) or a hash grid or a NeRF (a grid with --to grid).
+    A field (.npz) is the mivol_sh of a scene, an octree, a hash grid or a NeRF; --to grid, octree, hash or nerf turns one into
+    another, hash and nerf also Gaussians, by a fit to views of the source.
     Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     A scene of pbrt-v4 (.pbrt) becomes Mitsuba XML (.xml) with media of mivol.
@@ -795,6 +796,10 @@ def _convert_cloud(arguments: argparse.Namespace) -> str:
     if not is_points_file(source) and source.suffix.lower() != ".npz":
         _check_contents(source)
     kind = _check_conversion(arguments)
+    if kind in ("hash", "nerf"):
+        from mivol.experiments.network_conversion import convert_to_network
+
+        return convert_to_network(source, target, kind, arguments.mode)
     if source.suffix.lower() == ".npz" and target.suffix.lower() == ".npz":
         from mivol.experiments import octree_conversion
 
@@ -814,8 +819,14 @@ def _check_conversion(arguments: argparse.Namespace) -> str | None:
     source, target = arguments.source, arguments.output
     from_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
     kind = arguments.to or WRITTEN_AS.get(target.suffix.lower())
+    if kind in ("hash", "nerf"):
+        if not is_field or arguments.resolution or arguments.box:
+            raise MivolError(f"{target}: --to {kind} writes an .npz, fitted to views of the source: leave out other flags.")
+        return kind
     if from_field and is_field and arguments.to not in ("grid", "octree"):
-        raise MivolError(f"{target}: a grid becomes an octree with --to octree, and another field a grid with --to grid.")
+        raise MivolError(
+            f"{target}: --to says what a field becomes: octree, hash or nerf; a field other than a grid also becomes a grid."
+        )
     if kind in ("octree", "grid") and not (from_field and is_field):
         raise MivolError(f"{target}: --to {kind} makes an .npz from a radiance field (.npz); make a field first: --to field.")
     if is_field != (kind in ("field", "octree", "grid")):

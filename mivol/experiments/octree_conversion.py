@@ -21,7 +21,7 @@ from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.source import check_file
 from mivol.optim.photographs.field_view import order_by_tiles, prepare_view, render_view
-from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree
+from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree, build_octree_of_points
 from mivol.optim.photographs.radiance_plan import place_grid
 from mivol.photos import pixel_centres, rays
 from mivol.scene.explain import Explanation
@@ -42,9 +42,10 @@ def convert_to_octree(source: Path, target: Path, resolution: int | None, varian
     """Write a radiance field as an octree.
 
     Args:
-        source: field (.npz) with a single level, or an octree of svox, which is read as it is.
+        source: grid with a single level, hash grid or NeRF (.npz), or an octree of svox, which is read as it is.
         target: file ending in .npz, or .svox.npz.
-        resolution: leaves along the edge of the octree's cube, rounded up to a power of two; None means two leaves a voxel.
+        resolution: leaves along the edge of the octree's cube, rounded up to a power of two; None means two leaves a voxel of
+            a grid, and 128 leaves for a hash grid or a NeRF.
         variant: Mitsuba variant of the views.
 
     Returns:
@@ -56,16 +57,16 @@ def convert_to_octree(source: Path, target: Path, resolution: int | None, varian
     """
     set_variant(variant)
     field = read_field(source)
-    if isinstance(field, SampledField):
-        raise MivolError(
-            f"{source} is a {field.noun}, and an octree is made from a grid: mivol convert FILE grid.npz --to grid."
-        )
     if resolution is not None:
         if isinstance(field, Octree):
             raise MivolError(f"{source} is an octree, whose leaves stay as they are: leave out --resolution.")
         check_depth((resolution - 1).bit_length())
     depth = 0 if resolution is None else max((resolution - 1).bit_length(), 1)
-    tree = field if isinstance(field, Octree) else build_octree(field, LookAround(field), OctreeRecipe(depth))
+    if isinstance(field, Octree):
+        tree = field
+    else:
+        build = build_octree_of_points if isinstance(field, SampledField) else build_octree
+        tree = build(field, LookAround(field), OctreeRecipe(depth))
     write_field(target, tree, view=read_field_view(source))
     written = read_field(target)  # as it will be read: rounded values
     return "\n".join([f"{target}: {describe_leaves(tree)}", *_describe_loss(source, field, target, written)])
@@ -114,7 +115,9 @@ def sample_to_grid(field: SampledField, resolution: int) -> tuple[SphericalGrid,
     return grid, f"{size}\n{loss}"
 
 
-def _describe_loss(source: Path, field: SphericalGrid | Octree, target: Path, written: SphericalGrid | Octree) -> list[str]:
+def _describe_loss(
+    source: Path, field: SphericalGrid | Octree | SampledField, target: Path, written: SphericalGrid | Octree
+) -> list[str]:
     """Difference between views of two fields, and the sizes of their files, in lines."""
     sizes = [path.stat().st_size for path in (source, target)]
     speeds = [] if isinstance(field, SampledField) else [describe_speed(written, field, source.name)]
@@ -156,11 +159,11 @@ def views_psnr(field: SphericalGrid | Octree, other: SphericalGrid | Octree | Sa
 
 
 class LookAround:
-    """Rays from all sides of the box of a grid, view by view: a pixel a half voxel, at most ``LOOK_EDGE`` along an edge."""
+    """Rays from all sides of the box of a field, view by view: a pixel a half voxel, at most ``LOOK_EDGE`` along an edge."""
 
-    def __init__(self, grid: SphericalGrid) -> None:
-        edge = min(LOOK_EDGE, 4 * max(grid.res))
-        self.cameras = cameras_around(grid.to_world, edge, LOOKS)
+    def __init__(self, field: SphericalGrid | SampledField) -> None:
+        edge = min(LOOK_EDGE, 4 * max(field.res)) if isinstance(field, SphericalGrid) else LOOK_EDGE
+        self.cameras = cameras_around(field.to_world, edge, LOOKS)
 
     def __call__(self) -> Iterator[RayBundle]:
         for camera in self.cameras:

@@ -1,4 +1,4 @@
-"""A fit of an octree to photographs: the fit of a grid, its octree, and a fit of the leaves, in one run.
+"""A fit of an octree to photographs: the fit of a grid, a hash grid or a NeRF, its octree, and a fit of the leaves, in one run.
 
 Conventions. As for :mod:`mivol.experiments.field_fit`; ``field.npz`` is the octree. ``stages/`` has the grid and its octree
 before the fit of the leaves, each with its quality, time and size on the page. There is no sky and there are no gains.
@@ -19,17 +19,20 @@ from mivol.errors import MivolError
 from mivol.experiments.field_fit import FieldFit, adapt_plan, explain_plan, make_batches, set_background, write_result
 from mivol.experiments.octree_conversion import describe_leaves, describe_speed
 from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.sampled_fit import explain_sampled_plan, make_sampled_problem
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.octree import Octree
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole
-from mivol.optim.loop import Fit
+from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree
+from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree, build_octree_of_points
 from mivol.optim.photographs.octree_problem import LeafPlan, OctreePlan, OctreeProblem
 from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan
 from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.photographs.sampled_problem import PRESETS as PRESETS_OF_NETWORKS
+from mivol.optim.photographs.sampled_problem import SampledPlan
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Photos
 from mivol.report.record import PlanLine, Table
@@ -38,22 +41,33 @@ from mivol.validate.metrics import score_image
 STAGES = "grid", "octree", "octree, its leaves fitted"
 """Names of the stages on the page."""
 
+NETWORKS = {"hash": "minute", "nerf": "minutes"}
+"""Presets of the networks that ``field.start`` names: the first level of a template of two."""
+
+
+AnyField = SphericalGrid | Octree | SampledField
+"""A field at which an octree can begin."""
+
 
 class OctreeFit(FieldFit):
     """A fit of an octree.
 
     Attributes:
         stage_rows: name, PSNR, time and size of each finished stage.
+        network: the fitted hash grid or NeRF, if ``field.start`` asks for one.
     """
 
     settings: OctreeExperiment
     problem: OctreeProblem
+    network: SampledField | None = None
 
     def make_plan(self, settings: OctreeExperiment) -> OctreePlan:
         return make_octree_plan(settings)
 
     def describe_run(self) -> dict[str, Any]:
         start = self.settings.field.start or f"a grid, preset {self.settings.field.preset}"
+        if start in NETWORKS:
+            start = f"a {PRESETS_OF_NETWORKS[start][NETWORKS[start]].model.noun}, preset {NETWORKS[start]}"
         return {
             "method": f"an octree of harmonics from {start}, its leaves fitted to photographs",
             "seeds": {"fit": self.settings.seed},
@@ -74,20 +88,51 @@ class OctreeFit(FieldFit):
             reason=f"field.keep_weight; eight become one if views change by less than {self.plan.recipe.tolerance:g}",
         )
         if self.plan.grid is None:
-            first = PlanLine(choice=f"begins at {self.settings.field.start}", reason="field.start")
-            return [first, built, steps]
+            first = [PlanLine(choice=f"begins at {self.settings.field.start}", reason="field.start")]
+            if self.settings.field.start in NETWORKS:
+                first = explain_sampled_plan(make_network_plan(self.settings), self.photos, self.batches)
+            return [*first, built, steps]
         return [*explain_plan(grid, self.photos, self.batches), built, steps]
 
-    def make_problem(self) -> OctreeProblem:
+    def render_data(self, run: RunFolder) -> None:
+        """Fit the hash grid or the NeRF at which the octree begins; a run that is continued reads it."""
         self.stage_rows: list[tuple[str, ...]] = []
-        self.clock, self.built, self.start = 0.0, 0.0, None
+        self.clock, self.fitted = 0.0, 0.0
+        if self.settings.field.start not in NETWORKS:
+            return
+        run.make("stages")
+        path = run.path / "stages" / f"{self.settings.field.start}.npz"
+        if run.is_resumed and path.is_file():
+            self.network = read_start(path, self.photos.space, self.photos.white)
+            return
+        plan = make_network_plan(self.settings)
+        problem = make_sampled_problem(plan, self.photos, self.settings.seed)
+        fit = begin_fit(problem, plan.optimizer, plan.course())
+        fit.complete()
+        self.clock = self.fitted = fit.seconds
+        write_field(path, problem.field.scale_colours(self.photos.white), view=self.home_view)
+        self.network = read_start(path, self.photos.space, self.photos.white)
+        self.add_stage(run, self.network.noun, self.network, path)
+        cells = np.array(self.network.region.occupied)
+        count, size = f"{int(cells.sum())} of {len(cells)} cells", f"{len(cells) / 8 / 2**20:.2f}"
+        self.stage_rows.append(("its occupied cells", count, "-", "-", size, f"{self.clock:.0f}"))
+
+    def make_problem(self) -> OctreeProblem:
+        self.built, self.start = 0.0, self.network
         box, plan = self.photos.box, self.plan
         if plan.grid is not None:
             return OctreeProblem(self.batches, box, plan, self.settings.seed)
-        self.start = read_start(self.context.base / self.settings.field.start, self.photos.space, self.photos.white)
+        if self.start is None:
+            self.start = read_start(self.context.base / self.settings.field.start, self.photos.space, self.photos.white)
         begun = time.perf_counter()
-        tree = self.start if isinstance(self.start, Octree) else build_octree(self.start, self._view_rays, plan.recipe)
-        self.built = time.perf_counter() - begun
+        if isinstance(self.start, Octree):
+            tree = self.start
+        elif isinstance(self.start, SampledField):
+            degree = 2 if self.settings.field.degree is None else self.settings.field.degree
+            tree = build_octree_of_points(self.start, self._view_rays, plan.recipe, degree)
+        else:
+            tree = build_octree(self.start, self._view_rays, plan.recipe)
+        self.built = self.fitted + time.perf_counter() - begun
         return OctreeProblem(self.batches, box, plan, self.settings.seed, tree)
 
     def _view_rays(self) -> Any:
@@ -106,24 +151,27 @@ class OctreeFit(FieldFit):
         elif self.start is not None:
             if isinstance(self.start, SphericalGrid):
                 self.add_stage(run, STAGES[0], self.start)
+            elif isinstance(self.start, SampledField) and self.network is None:
+                self.add_stage(run, self.start.noun, self.start)
             self.clock = self.built
             self.add_stage(run, STAGES[1], self.problem.tree)
 
-    def add_stage(self, run: RunFolder, name: str, field: SphericalGrid | Octree, path: Any = None) -> str:
+    def add_stage(self, run: RunFolder, name: str, field: AnyField, path: Any = None) -> str:
         """Write the field of a stage, and note its quality, time and size; returns a clause for the log."""
         if path is None:
             path = run.path / "stages" / f"{name}.npz"
             write_field(path, field.scale_colours(self.photos.white), view=self.home_view)
         written = read_field(path)  # as it is read: rounded values
+        count = count_parts(field)
         psnr = self.mean_psnr(written.scale_colours(1 / self.photos.white))
         size = path.stat().st_size
-        count = f"{field.leaves} leaves" if isinstance(field, Octree) else f"{len(field.stored_nodes())} nodes"
+        held = 4 * field.numbers if isinstance(field, SampledField) else field.bytes
         quality = "-" if psnr is None else f"{psnr:.2f}"
-        self.stage_rows.append((name, count, quality, f"{size / 2**20:.2f}", f"{field.bytes / 2**20:.1f}", f"{self.clock:.0f}"))
+        self.stage_rows.append((name, count, quality, f"{size / 2**20:.2f}", f"{held / 2**20:.1f}", f"{self.clock:.0f}"))
         write_whole(run.path / "stages" / "stages.json", lambda file: file.write(json.dumps(self.stage_rows).encode()))
         return f"{name}: {quality} dB, {count}, a file of {size / 2**20:.2f} MiB, after {self.clock:.0f} s"
 
-    def mean_psnr(self, field: SphericalGrid | Octree) -> float | None:
+    def mean_psnr(self, field: AnyField) -> float | None:
         """Mean PSNR [dB] of the judged views; None without such views."""
         if self.judged is None:
             return None
@@ -152,6 +200,20 @@ class OctreeFit(FieldFit):
         return None
 
 
+def count_parts(field: AnyField) -> str:
+    """Leaves, nodes or numbers of a field, with the word."""
+    if isinstance(field, Octree):
+        return f"{field.leaves} leaves"
+    return f"{field.numbers} numbers" if isinstance(field, SampledField) else f"{len(field.stored_nodes())} nodes"
+
+
+def make_network_plan(settings: OctreeExperiment) -> SampledPlan:
+    """The plan of the hash grid or the NeRF that ``field.start`` names."""
+    kind = settings.field.start
+    plan = PRESETS_OF_NETWORKS[kind][NETWORKS[kind]]
+    return replace(plan, steps=max(1, round(plan.steps * settings.field.effort)))
+
+
 def adapt_octree_plan(plan: OctreePlan, preset: str, photos: Photos) -> tuple[OctreePlan, RadiancePlan, RayBatches]:
     """Adapt a plan to the photographs.
 
@@ -172,18 +234,13 @@ def tabulate_stages(rows: list[tuple[str, ...]], tree: Octree) -> Table:
     return Table(title=f"Stages: {describe_leaves(tree)}", head=head, rows=tuple(rows))
 
 
-def read_start(path: Any, space: str, white: float) -> SphericalGrid | Octree:
+def read_start(path: Any, space: str, white: float) -> AnyField:
     """Read the field at which a fit begins.
 
     Raises:
-        MivolError: as :func:`mivol.fields.field_files.read_field`, a hash grid or a NeRF, nested levels, or colours of
-            another space.
+        MivolError: as :func:`mivol.fields.field_files.read_field`, nested levels, or colours of another space.
     """
     field = read_field(path)
-    if isinstance(field, SampledField):
-        raise MivolError(
-            f"{path} is a {field.noun}, and field.start is a grid or an octree: mivol convert FILE grid.npz --to grid."
-        )
     if field.space != space:
         raise MivolError(
             f"{path} has colours in {field.space} and the photographs are {space}: set photos.space to the field's."

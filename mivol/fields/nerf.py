@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import ClassVar
 
 import drjit as dr
@@ -29,15 +29,19 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.harmonics import basis_size, harmonic_degree
 from mivol.fields.networks import colour_lanes, colour_rows, has_blas, list_blocks, multiply, multiply_transposed, rows_of
 from mivol.fields.sampled_field import PointValues, Region, SampledField
 from mivol.threads import map_arrays
 
 __all__ = ["NerfField", "NerfSizes"]
 
+PARTS = "weight", "bias"
+"""Published names of the parts of a layer."""
+
 LIMITS = {
     "depth": (1, 16), "width": (1, 1024), "skip": (0, 15), "place": (0, 16), "direction": (0, 16), "branch": (1, 1024),
-    "relu": (0, 1),
+    "relu": (0, 1), "harmonics": (-1, 4), "coarse": (0, 1024), "fine": (0, 1024),
 }  # fmt: skip
 """Smallest and largest values of :class:`NerfSizes`."""
 
@@ -53,6 +57,10 @@ class NerfSizes:
         place, direction: frequencies of their encodings.
         branch: neurons of the hidden layer of the colours.
         relu: 1 for a density max(0, y), 0 for softplus(y - 1).
+        harmonics: degree of the harmonics of the direction that the trunk's last layer gives (NeRF-SH); -1: a branch sees the
+            direction.
+        coarse, fine: samples of a ray by a coarse network of the same sizes, and samples that follow from them; 0: one network,
+            whose samples follow a map of occupied cells.
     """
 
     depth: int = 8
@@ -62,6 +70,9 @@ class NerfSizes:
     direction: int = 4
     branch: int = 128
     relu: int = 0
+    harmonics: int = -1
+    coarse: int = 0
+    fine: int = 0
 
     def __post_init__(self) -> None:
         for name, (low, high) in LIMITS.items():
@@ -69,6 +80,8 @@ class NerfSizes:
                 raise MivolError(f"found a NeRF with {name} = {getattr(self, name)}, expected {low} to {high}.")
         if self.skip >= self.depth:
             raise MivolError(f"found a NeRF with skip = {self.skip}, expected less than its {self.depth} layers; 0 is none.")
+        if (self.coarse > 0) != (self.fine > 0):
+            raise MivolError(f"found a NeRF with {self.coarse} coarse and {self.fine} fine samples, expected both or none.")
 
     @property
     def inputs(self) -> tuple[int, int]:
@@ -81,13 +94,21 @@ class NerfSizes:
         place, direction = self.inputs
         shapes = {f"pts_linears.{k}": (self.width, self.width + place * (k == self.skip)) for k in range(self.depth)}
         shapes["pts_linears.0"] = self.width, place
-        shapes |= {"alpha_linear": (1, self.width), "feature_linear": (self.width, self.width)}
+        shapes |= {"alpha_linear": (1, self.width)}
+        if self.harmonics >= 0:
+            return shapes | {"sh_linear": (3 * basis_size(self.harmonics), self.width)}
+        shapes |= {"feature_linear": (self.width, self.width)}
         return shapes | {"views_linears.0": (self.branch, self.width + direction), "rgb_linear": (3, self.branch)}
 
     @property
     def size(self) -> int:
-        """Number of weights and biases."""
+        """Number of weights and biases of a network."""
         return sum(out * (inputs + 1) for out, inputs in self.layers.values())
+
+    @property
+    def networks(self) -> int:
+        """Number of networks: the fine one comes first."""
+        return 2 if self.coarse else 1
 
     def split(self, weights: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Views of the weights (outputs, inputs) and biases (outputs,) of each layer."""
@@ -100,22 +121,29 @@ class NerfSizes:
 
     def first_weights(self, rng: np.random.Generator) -> np.ndarray:
         """Uniform weights with the variance of Glorot and Bengio (2010), and biases of 0."""
-        weights = np.zeros(self.size, np.float32)
-        for matrix, _ in self.split(weights).values():
-            bound = math.sqrt(6 / sum(matrix.shape))
-            matrix[:] = rng.uniform(-bound, bound, matrix.shape)
-        return weights
+        weights = np.zeros((self.networks, self.size), np.float32)
+        for network in weights:
+            for matrix, _ in self.split(network).values():
+                bound = math.sqrt(6 / sum(matrix.shape))
+                matrix[:] = rng.uniform(-bound, bound, matrix.shape)
+        return weights.ravel()
 
     def count_numbers(self, edges: np.ndarray) -> int:
         """Number of fitted numbers, in a box with any edges."""
-        return self.size
+        return self.networks * self.size
 
     def describe(self, edges: np.ndarray) -> tuple[str, str]:
         """Layers, and their numbers."""
         joined = f", the place again after layer {self.skip}" if self.skip else ""
+        seen = f"{self.direction} of the direction"
+        head = f"{self.branch} neurons for the colours"
+        if self.harmonics >= 0:
+            head, seen = f"harmonics of degree {self.harmonics} for the colours", "no direction"
+        rounds = f"; {self.coarse} samples of a ray by a coarse network, {self.fine} more" if self.coarse else ""
+        number = "a network" if self.networks == 1 else "two networks"
         return (
-            f"a network of {self.depth} layers x {self.width}{joined}, {self.branch} neurons for the colours",
-            f"{self.size} weights; {self.place} frequencies of the place, {self.direction} of the direction",
+            f"{number} of {self.depth} layers x {self.width}{joined}, {head}{rounds}",
+            f"{self.networks * self.size} weights; {self.place} frequencies of the place, {seen}",
         )
 
 
@@ -135,7 +163,7 @@ class NerfField(SampledField):
 
     kind: ClassVar[str] = "nerf"
     noun: ClassVar[str] = "NeRF"
-    own_arrays: ClassVar[dict[str, tuple[str, tuple[int, ...] | None]]] = {"sizes": ("iu", (7,)), "frame": ("f", (4,))}
+    own_arrays: ClassVar[dict[str, tuple[str, tuple[int, ...] | None]]] = {"sizes": ("iu", (10,)), "frame": ("f", (4,))}
 
     sizes: NerfSizes
     to_world: np.ndarray
@@ -169,7 +197,9 @@ class NerfField(SampledField):
 
         Args:
             arrays: ``pts_linears.0.weight`` (outputs, inputs), ``pts_linears.0.bias`` (outputs,), ..., ``alpha_linear``,
-                ``feature_linear``, ``views_linears.0`` and ``rgb_linear``, as ``np.load`` reads them from an ``.npz``.
+                ``feature_linear``, ``views_linears.0`` and ``rgb_linear``, as ``np.load`` reads them from an ``.npz`` and
+                :func:`mivol.files.safetensors.read_safetensors` from a safetensors file. A NeRF-SH has ``sh_linear``
+                (3 basis, inputs), channel by channel, in place of the last three.
             to_world: (4, 4), unit cube to world: the box outside of which the field is 0.
             frame: origin (x, y, z) and unit of the places that the network was trained with [length].
 
@@ -177,9 +207,10 @@ class NerfField(SampledField):
             MivolError: a missing layer, shapes that disagree, or values that are not finite.
         """
         depth = sum(name.startswith("pts_linears.") and name.endswith(".weight") for name in arrays)
-        heads = ["alpha_linear", "feature_linear", "views_linears.0", "rgb_linear"]
+        has_harmonics = "sh_linear.weight" in arrays
+        heads = ["alpha_linear", *(["sh_linear"] if has_harmonics else ["feature_linear", "views_linears.0", "rgb_linear"])]
         for layer in [*(f"pts_linears.{k}" for k in range(max(depth, 1))), *heads]:
-            for part in ("weight", "bias"):
+            for part in PARTS:
                 if f"{layer}.{part}" not in arrays:
                     raise MivolError(f"found no {layer}.{part} among the weights of a NeRF, expected all layers: export it.")
         shape = {name: np.shape(arrays[name]) for name in arrays}
@@ -188,11 +219,15 @@ class NerfField(SampledField):
             raise MivolError(f"found {flat[0]} of the shape {shape[flat[0]]}, expected (outputs, inputs): export it again.")
         width, place = shape["pts_linears.0.weight"]
         skip = next((k for k in range(1, depth) if shape[f"pts_linears.{k}.weight"][1] != width), 0)
-        branch, seen = shape["views_linears.0.weight"]
-        sizes = NerfSizes(depth, width, skip, (place - 3) // 6, (seen - width - 3) // 6, branch, 1)
+        if has_harmonics:
+            degree = harmonic_degree(shape["sh_linear.weight"][0] // 3)
+            sizes = NerfSizes(depth, width, skip, (place - 3) // 6, 0, 1, 1, degree)
+        else:
+            branch, seen = shape["views_linears.0.weight"]
+            sizes = NerfSizes(depth, width, skip, (place - 3) // 6, (seen - width - 3) // 6, branch, 1)
         weights = np.empty(sizes.size, np.float32)
         for layer, parts in sizes.split(weights).items():
-            for part, target in zip(("weight", "bias"), parts, strict=True):
+            for part, target in zip(PARTS, parts, strict=True):
                 name = f"{layer}.{part}"
                 if shape[name] != target.shape:
                     raise MivolError(f"found {name} of the shape {shape[name]}, expected {target.shape} by the other layers.")
@@ -201,12 +236,30 @@ class NerfField(SampledField):
                     raise MivolError(f"found {name} with values that are not finite, expected numbers: export it again.")
         return cls(sizes, np.asarray(to_world, np.float64), mi.Float(weights), frame=tuple(map(float, frame)))
 
+    def to_published(self) -> dict[str, np.ndarray]:
+        """The weights of the (fine) network in the layout of :meth:`from_published`."""
+        parts = self.sizes.split(self.weights.numpy())
+        named = ((f"{name}.{kind}", part) for name, own in parts.items() for kind, part in zip(PARTS, own, strict=True))
+        return {name: part.copy() for name, part in named}
+
+    @property
+    def coarse(self) -> NerfField | None:
+        if not self.sizes.coarse:
+            return None
+        own = dr.gather(mi.Float, self.weights, dr.arange(mi.UInt32, self.sizes.size) + self.sizes.size)
+        dr.eval(own)
+        return replace(self, sizes=replace(self.sizes, coarse=0, fine=0), weights=own)
+
+    @property
+    def rounds(self) -> tuple[int, int]:
+        return self.sizes.coarse, self.sizes.fine
+
     @classmethod
     def parameter_names(cls) -> tuple[str, ...]:
         return ("weights",)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        return {"weights": (self.sizes.size,)}
+        return {"weights": (self.sizes.networks * self.sizes.size,)}
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {"sizes": np.array(astuple(self.sizes)), "frame": np.array(self.frame, np.float64)}
@@ -229,6 +282,10 @@ class NerfField(SampledField):
 
     def eval(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> tuple[mi.Float, mi.Color3f]:
         layers, h = self._lane_trunk(p)
+        if self.sizes.harmonics >= 0:
+            basis, sums = dr.sh_eval(d, self.sizes.harmonics), list(nn.matvec(*_view(layers, "sh_linear", h)))
+            raw = [sum((y * s for y, s in zip(basis, sums[c * len(basis) :], strict=False)), mi.Float(0)) for c in range(3)]
+            return self._lane_density(layers, h), colour_lanes(raw, self.space, self.white)
         seen = nn.CoopVec(*nn.matvec(*_view(layers, "feature_linear", h)), *encode_lanes(list(d), self.sizes.direction))
         hidden = dr.maximum(nn.matvec(*_view(layers, "views_linears.0", seen)), 0)
         raw = list(nn.matvec(*_view(layers, "rgb_linear", hidden)))
@@ -283,7 +340,8 @@ class NerfField(SampledField):
 
     def _evaluate_rows(self, p: mi.Point3f, d: mi.Vector3f) -> PointValues:
         """Values by products of matrices; the adjoint computes all layers again, block by block."""
-        places, directions, layers = rows_of(list(p)), rows_of(list(d)), self.sizes.split(self.weights.numpy())
+        seen = list(d) if self.sizes.harmonics < 0 else dr.sh_eval(d, self.sizes.harmonics)
+        places, directions, layers = rows_of(list(p)), self._spread(seen, dr.width(p)), self.sizes.split(self.weights.numpy())
         sigma, colour = dr.empty(mi.Float, len(places)), dr.empty(mi.Float, 3 * len(places))
         sigma_rows, written = sigma.numpy(), colour.numpy().reshape(-1, 3)
 
@@ -302,7 +360,8 @@ class NerfField(SampledField):
                 return self._vjp_block(layers, places[block], directions[block], by_sigma[block], by_colour[block])
 
             # Sums over blocks of one size in one order: the same for any number of threads.
-            return {"weights": mi.Float(np.sum(map_arrays(differentiate, list_blocks(len(places)), dr.thread_count()), axis=0))}
+            total = np.sum(map_arrays(differentiate, list_blocks(len(places)), dr.thread_count()), axis=0)
+            return {"weights": mi.Float(np.pad(total, (0, (self.sizes.networks - 1) * self.sizes.size)))}
 
         return PointValues(sigma, mi.Color3f(dr.unravel(mi.Color3f, colour)), vjp)
 
@@ -317,10 +376,27 @@ class NerfField(SampledField):
         seen, hidden, raw = self._branch_rows(layers, h, directions)
         values = colour_rows(raw, self.space, self.white)
         by_raw = by_colour * (values if self.space == "linear" else values * (1 - values))
+        if self.sizes.harmonics >= 0:
+            by_sums = (by_raw[:, :, None] * directions[:, None]).reshape(len(h), -1)
+            by_h = _transpose(layers["sh_linear"], own["sh_linear"], h, by_sums)
+        else:
+            by_h = self._vjp_branch(layers, own, h, (seen, hidden), by_raw)
+        self._vjp_trunk(layers, own, rows, by_h, by_sigma)
+        return gradient
+
+    def _vjp_branch(
+        self, layers: dict, own: dict, h: np.ndarray, branch: tuple[np.ndarray, np.ndarray], by_raw: np.ndarray
+    ) -> np.ndarray:
+        """Derivatives of the colours by the outputs of the trunk; ``branch`` has the branch's inputs and hidden layer."""
+        seen, hidden = branch
         by_hidden = _transpose(layers["rgb_linear"], own["rgb_linear"], hidden, by_raw) * (hidden > 0)
         by_seen = _transpose(layers["views_linears.0"], own["views_linears.0"], seen, by_hidden)
         by_feature = np.ascontiguousarray(by_seen[:, : self.sizes.width])
-        by_h = _transpose(layers["feature_linear"], own["feature_linear"], h, by_feature)
+        return _transpose(layers["feature_linear"], own["feature_linear"], h, by_feature)
+
+    def _vjp_trunk(self, layers: dict, own: dict, rows: list[np.ndarray], by_h: np.ndarray, by_sigma: np.ndarray) -> None:
+        """Add the derivatives by the weights of the trunk and of the density, from those by the outputs of the trunk."""
+        h = rows[-1]
         slope = self._density_and_slope(_apply(layers["alpha_linear"], h)[:, 0])[1]
         by_h += _transpose(layers["alpha_linear"], own["alpha_linear"], h, (by_sigma * slope)[:, None])
         for k in reversed(range(self.sizes.depth)):
@@ -329,7 +405,10 @@ class NerfField(SampledField):
                 by_h, output = by_h[:, self.sizes.inputs[0] :], output[:, self.sizes.inputs[0] :]
             name = f"pts_linears.{k}"
             by_h = _transpose(layers[name], own[name], rows[k], by_h * (output > 0))
-        return gradient
+
+    def _spread(self, columns: list[mi.Float], count: int) -> np.ndarray:
+        """Rows of columns, of which some may be one number for all points."""
+        return rows_of([column + dr.zeros(mi.Float, count) for column in columns])
 
     def _encode_places(self, places: np.ndarray) -> np.ndarray:
         frame = np.float32(self.frame)
@@ -344,7 +423,10 @@ class NerfField(SampledField):
         return rows
 
     def _branch_rows(self, layers: dict, h: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Inputs and hidden layer of the colours, and their raw values."""
+        """Inputs and hidden layer of the colours, and their raw values; ``directions`` are harmonics for a NeRF-SH."""
+        if self.sizes.harmonics >= 0:
+            sums = _apply(layers["sh_linear"], h).reshape(len(h), 3, -1)
+            return h, h, np.einsum("ncb,nb->nc", sums, directions)
         feature = _apply(layers["feature_linear"], h)
         seen = np.concatenate([feature, encode_rows(directions, self.sizes.direction)], axis=1)
         hidden = np.maximum(_apply(layers["views_linears.0"], seen), 0)

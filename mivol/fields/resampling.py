@@ -129,8 +129,28 @@ def sample_field(field: SampledField, res: tuple[int, int, int], to_world: np.nd
     Raises:
         MivolError: no matter in the box.
     """
+    nodes, density, places = sample_voxels(field, res, to_world)
+    sh = project_colours(field, places, degree)
+    stored = mi.UInt32(nodes.astype(np.uint32))
+    edge = voxel_edge(res, to_world)
+    return SphericalGrid.from_rows(res, to_world, np.minimum(density, OPAQUE / edge), sh, stored, space=field.space)
+
+
+def voxel_edge(res: tuple[int, int, int], to_world: np.ndarray) -> float:
+    """Cube root of the volume of a voxel [length]."""
+    return float(np.abs(np.linalg.det(to_world[:3, :3])) / np.prod(res)) ** (1 / 3)
+
+
+def sample_voxels(
+    field: SampledField, res: tuple[int, int, int], to_world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The voxels of a grid that hold matter of a field: flat numbers (n,), mean densities (n,), centres of mass (n, 3).
+
+    Raises:
+        MivolError: no matter in the box.
+    """
     z, y, x = res
-    edge = float(np.abs(np.linalg.det(to_world[:3, :3])) / (x * y * z)) ** (1 / 3)
+    edge = voxel_edge(res, to_world)
     numbers, densities, centres = [], [], []
     for start in range(0, x * y * z, NODES):
         node = np.arange(start, min(start + NODES, x * y * z))
@@ -139,14 +159,17 @@ def sample_field(field: SampledField, res: tuple[int, int, int], to_world: np.nd
         kept = mean * edge > EMPTY
         weight = sigma[kept] / sigma[kept].sum(axis=1, keepdims=True)
         numbers.append(node[kept])
-        densities.append(np.minimum(mean[kept], OPAQUE / edge))
+        densities.append(mean[kept].astype(np.float32))
         centres.append((weight[..., None] * places[kept]).sum(axis=1))
     nodes, density, places = map(np.concatenate, (numbers, densities, centres))
     if not len(nodes):
         raise MivolError("found no matter in the box of the grid, expected some: give another box.")
-    sh = np.concatenate([_project_colours(field, places[k : k + NODES], degree) for k in range(0, len(nodes), NODES)])
-    stored = mi.UInt32(nodes.astype(np.uint32))
-    return SphericalGrid.from_rows(res, to_world, density.astype(np.float32), sh, stored, space=field.space)
+    return nodes, density, places
+
+
+def project_colours(field: SampledField, places: np.ndarray, degree: int = 2) -> np.ndarray:
+    """Harmonics (n, basis, 3) of a field's colours at places (n, 3), by least squares over ``DIRECTIONS`` directions."""
+    return np.concatenate([_project_colours(field, places[k : k + NODES], degree) for k in range(0, len(places), NODES)])
 
 
 def _sample_voxels(

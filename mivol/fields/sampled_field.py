@@ -109,6 +109,16 @@ class SampledField(ABC):
     region: Region | None
     white: float
 
+    @property
+    def coarse(self) -> SampledField | None:
+        """The field that tells where rays are sampled more densely; None: samples follow the occupied cells."""
+        return None
+
+    @property
+    def rounds(self) -> tuple[int, int]:
+        """Samples of a ray in the rounds of coarse and fine; 0 without a coarse field."""
+        return 0, 0
+
     @classmethod
     @abstractmethod
     def random(cls, sizes: FieldSizes, to_world: np.ndarray, seed: int = 0, space: str = "srgb") -> Self:

@@ -12,11 +12,13 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.fields.nerf import NerfField, NerfSizes
+from mivol.files.safetensors import read_safetensors, write_safetensors
 from mivol.optim.photographs.sampled_problem import find_region
 
 PLACE = np.array([[2.0, 0, 0, -1], [0, 1.5, 0, -0.5], [0, 0, 3.0, 0], [0, 0, 0, 1]])
 FRAME = 0.0, 0.25, 1.5, 1.5
 SIZES = NerfSizes(depth=4, width=8, skip=2, place=3, direction=2, branch=6)
+SPHERICAL = NerfSizes(depth=4, width=8, skip=2, place=3, direction=0, branch=1, harmonics=1)
 Weights = dict[str, np.ndarray]
 
 
@@ -56,6 +58,11 @@ def twin(arrays: Weights, p: np.ndarray, d: np.ndarray, relu: bool, linear: bool
     h = np.maximum(layer("pts_linears.3", h), 0)
     y = layer("alpha_linear", h)[:, 0]
     sigma = np.maximum(y, 0) if relu else np.log1p(np.exp(y - 1))
+    if "sh_linear.weight" in arrays:  # degree 1, channel by channel
+        a, (x, y, z) = np.sqrt(3 / (4 * np.pi)), d.T
+        basis = np.stack([np.full(len(d), 1 / np.sqrt(4 * np.pi)), -a * y, a * z, -a * x], axis=1)
+        raw = np.einsum("ncb,nb->nc", layer("sh_linear", h).reshape(-1, 3, 4), basis)
+        return sigma / FRAME[3], np.exp(raw) if linear else 1 / (1 + np.exp(-raw))
     seen = np.hstack([layer("feature_linear", h), encode(d, [1, 2])])
     raw = layer("rgb_linear", np.maximum(layer("views_linears.0", seen), 0))
     return sigma / FRAME[3], np.exp(raw) if linear else 1 / (1 + np.exp(-raw))
@@ -64,11 +71,14 @@ def twin(arrays: Weights, p: np.ndarray, d: np.ndarray, relu: bool, linear: bool
 @pytest.mark.parametrize("relu", [False, True])
 @pytest.mark.parametrize("space", ["srgb", "linear"])
 @pytest.mark.parametrize("which", ["rows", "lanes"])
-def test_values_and_derivatives_equal_a_twin_in_float64(variant_rgb: str, which: str, space: str, relu: bool) -> None:
+@pytest.mark.parametrize("head", ["branch", "harmonics"])
+def test_values_and_derivatives_equal_a_twin_in_float64(
+    variant_rgb: str, head: str, which: str, space: str, relu: bool
+) -> None:
     """By matrices in memory and in the lanes of a kernel: all outputs, and weights and biases of each layer."""
     from dataclasses import replace
 
-    arrays, n, linear = published(), 40, space == "linear"
+    arrays, n, linear = published(SIZES if head == "branch" else SPHERICAL), 40, space == "linear"
     p, d = points(n)
     dr.eval(p, d)
     field = replace(NerfField.from_published(arrays, PLACE, FRAME), space=space)
@@ -109,6 +119,46 @@ def test_a_published_network_is_read_from_an_npz(variant_rgb: str, tmp_path: Pat
     assert field.frame == (0, 0, 0, 1)
     assert (field.sizes.depth, field.sizes.width, field.sizes.skip, field.sizes.branch) == (4, 8, 2, 6)
     assert (field.sizes.place, field.sizes.direction, field.sizes.relu) == (3, 2, 1)
+
+
+@pytest.mark.parametrize("sizes", [SIZES, SPHERICAL])
+def test_weights_survive_a_safetensors_file(variant_rgb: str, tmp_path: Path, sizes: NerfSizes) -> None:
+    arrays = published(sizes)
+    field = NerfField.from_published(arrays, PLACE, FRAME)
+    write_safetensors(tmp_path / "weights.safetensors", field.to_published())
+    read = read_safetensors(tmp_path / "weights.safetensors")
+    assert set(read) == set(arrays) and all(np.array_equal(read[name], value) for name, value in arrays.items())
+    again = NerfField.from_published(read, PLACE, FRAME)
+    assert again.sizes.harmonics == sizes.harmonics and np.array_equal(again.weights, field.weights)
+
+
+def with_header(text: bytes) -> bytes:
+    return len(text).to_bytes(8, "little") + text
+
+
+def test_a_safetensors_file_of_another_program_is_read(tmp_path: Path) -> None:
+    """Written byte by byte: a header with metadata, a BF16 and an I64 array."""
+    header = b'{"__metadata__":{"a":"b"},"x":{"dtype":"BF16","shape":[2],"data_offsets":[0,4]},'
+    header += b'"n":{"dtype":"I64","shape":[1],"data_offsets":[4,12]}}'
+    numbers = b"\x80\x3f\x00\xc0" + (7).to_bytes(8, "little")  # 1 and -2 as upper halves of float32
+    (tmp_path / "a.safetensors").write_bytes(with_header(header) + numbers)
+    read = read_safetensors(tmp_path / "a.safetensors")
+    assert read["x"].tolist() == [1.0, -2.0] and read["n"].tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"PK\x03\x04 no such file at all", "no header of safetensors"),
+        (b"\x02\0\0\0\0\0\0\0[]", "no header of safetensors"),
+        (with_header(b'{"x":{"dtype":"F32","shape":[9],"data_offsets":[0,4]}}') + bytes(4), "against its shape"),
+        (with_header(b'{"x":{"dtype":"C8","shape":[1],"data_offsets":[0,4]}}') + bytes(4), "of the type C8"),
+    ],
+)
+def test_broken_safetensors_are_refused(tmp_path: Path, data: bytes, said: str) -> None:
+    (tmp_path / "a.safetensors").write_bytes(data)
+    with pytest.raises(MivolError, match=said):
+        read_safetensors(tmp_path / "a.safetensors")
 
 
 def test_a_network_gets_its_occupied_cells(variant_rgb: str) -> None:

@@ -27,7 +27,7 @@ def test_the_chair_is_left_out_where_it_is_not(
 def test_all_fits_see_the_same_photographs(variant_rgb: str, tmp_path: Path) -> None:
     small = {"photo_folder": str(tmp_path / "photographs"), "photo_side": 32, "photo_views": 9, "edge": 16}
     answer = STUDY.answer(("still_life",), replace(RepresentationSize.quick(), **small))["still_life"]
-    assert set(answer) == {"grid, 16 nodes", "hash grid, tiny", "Gaussians, minute"}
+    assert set(answer) == {"grid", "nested grid", "octree", "hash grid", "NeRF", "Gaussians"}
     assert len({result["photograph"].tobytes() for result in answer.values()}) == 1
     for result in answer.values():
         # Half the edge of the files, which have 32 pixels.
@@ -37,9 +37,11 @@ def test_all_fits_see_the_same_photographs(variant_rgb: str, tmp_path: Path) -> 
         seconds = result["processor_seconds"] / dr.thread_count() * result["walk_rays_per_second"] / 25e6
         assert result["minutes"] == pytest.approx(seconds / 60)
     # As published: places, normals, opacity, scales, rotation (14 numbers of 4 bytes), harmonics; a header of less than 4 kB.
-    gaussians = answer["Gaussians, minute"]
+    gaussians = answer["Gaussians"]
     headers = [gaussians["file_mib"] * 2**20 - 4 * gaussians["count"] * (14 + 3 * (d + 1) ** 2) for d in range(4)]
     assert any(0 < header < 4096 for header in headers)
+    lines = STUDY.table("still_life", answer)
+    assert len(lines) == 2 + len(answer) and f"| octree | {answer['octree']['psnr']:.2f} dB" in "\n".join(lines)
     STUDY.draw({"still_life": answer}, tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 

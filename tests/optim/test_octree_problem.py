@@ -13,14 +13,23 @@ from ball_photos import BOX, CUBE, PLAN, WHITE, ball, camera, error_of, photo
 
 from mivol.errors import MivolError
 from mivol.fields.field_files import write_field
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree, max_weights, merge_siblings
+from mivol.optim.photographs.octree_building import (
+    OctreeRecipe,
+    build_octree,
+    build_octree_of_points,
+    max_weights,
+    merge_siblings,
+)
 from mivol.optim.photographs.octree_problem import LeafPlan, OctreePlan, OctreeProblem
 from mivol.optim.photographs.radiance_plan import RadianceStage
 from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.photographs.sampled_problem import find_region
 from mivol.photos import Photo
 
 
@@ -68,6 +77,25 @@ def test_an_octree_shows_the_grid(variant_rgb: str, photos: list[Photo]) -> None
     # The same amount of matter: sums of extinction times volume.
     amounts = [float((t.values()[0] * (8.0**t.sizes) * 8.0**-t.depth).sum()) for t in (tree, coarser)]
     np.testing.assert_allclose(amounts[0], amounts[1], rtol=0.25)
+
+
+def test_an_octree_shows_a_hash_grid(variant_rgb: str, photos: list[Photo]) -> None:
+    """Straight from points: the extinction of a leaf is the mean over its points, and views differ little."""
+    place = np.diag([2.0, 2, 2, 1])
+    place[:3, 3] = -1
+    sizes = HashSizes(levels=2, log2_table=10, coarsest=2, finest=4, width=8, geometry=4)
+    field = HashField.random(sizes, place, seed=1)
+    field = field.with_parameters(field.parameters() | {"table": field.parameters()["table"] * 1e4})
+    field = find_region(field, 16)
+    tree = build_octree_of_points(field, looks(RayBatches.from_photos(photos, [1])), OctreeRecipe(4, 0.0, 0.0), degree=2)
+    assert (tree.sizes == 0).all() and tree.depth == 4
+    middles = tree.middles() @ tree.to_world[:3, :3].T + tree.to_world[:3, 3]
+    own = np.array(field.density(mi.Point3f(np.ascontiguousarray(middles.T, np.float32))))
+    # The mean over a leaf of an eighth of a cell's volume differs from its middle by the curvature of the density.
+    assert np.abs(tree.values()[0] - own).max() < 0.05 * own.max()
+    views = [render_view(one, camera(2.5), WHITE).image for one in (tree, field)]
+    assert np.sqrt(np.mean((views[0] - views[1]) ** 2)) < 0.02
+    assert views[1].std() > 0.02
 
 
 def test_equal_siblings_become_one_leaf(variant_rgb: str, photos: list[Photo]) -> None:

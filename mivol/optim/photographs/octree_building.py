@@ -1,4 +1,4 @@
-"""An octree from a grid: leaves where views see matter, means over each leaf, and larger leaves where views hardly differ.
+"""An octree of a grid or a field: leaves where views see matter, means over a leaf, larger leaves where views hardly differ.
 
 The fine leaves are half voxels of the grid, or smaller. In a half voxel the grid has eight corners and no kink but that of the
 activation, so two Gauss points along each axis give the mean extinction, and the mean colour weighted by the extinction:
@@ -25,12 +25,15 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.harmonics import local_frame
 from mivol.fields.octree import MAX_DEPTH, MAX_LEAVES, Octree, check_depth, interleave, separate
+from mivol.fields.resampling import project_colours, sample_voxels
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
+from mivol.optim.photographs.radiance_plan import place_grid
 from mivol.transport.line_integrals.leaf_radiance import LeafColours, raise_leaf_weights
 from mivol.transport.line_integrals.radiance_field import RayBundle
 from mivol.transport.traversal.octree_walk import LeafIndex
 
-__all__ = ["OctreeRecipe", "ViewRays", "build_octree"]
+__all__ = ["OctreeRecipe", "ViewRays", "build_octree", "build_octree_of_points"]
 
 ViewRays = Callable[[], Iterable[RayBundle]]
 """Returns the rays of all views, view by view."""
@@ -92,6 +95,51 @@ def build_octree(grid: SphericalGrid, rays: ViewRays, recipe: OctreeRecipe = Oct
     if recipe.depth and recipe.depth < depth:
         tree = _limit_depth(tree, recipe.depth)
     return tree
+
+
+POINTS_DEPTH = 7
+"""Depth of the octree of a field that is known at points, without another depth: 128 leaves along the longest edge."""
+
+
+def build_octree_of_points(
+    field: SampledField, rays: ViewRays, recipe: OctreeRecipe = OctreeRecipe(), degree: int = 2
+) -> Octree:
+    """Make an octree straight from a hash grid or a NeRF.
+
+    A leaf has the mean extinction of the points in it, and the colour at its centre of mass, projected onto harmonics. Colours
+    are only evaluated in leaves that a view sees.
+
+    Args:
+        field: with a region, in an upright box.
+        rays: rays of the views that decide which leaves are seen.
+        recipe: depth (0: ``POINTS_DEPTH``), threshold and tolerance.
+        degree: of the harmonics.
+
+    Raises:
+        MivolError: a depth out of range, no matter, or no view that sees some.
+    """
+    depth = recipe.depth or POINTS_DEPTH
+    check_depth(depth)
+    low = field.to_world[:3, 3]
+    res, place = place_grid(np.array([low, low + field.edges]), 2**depth)
+    nodes, density, middles = sample_voxels(field, res, place)
+    cells = np.stack([nodes % res[2], nodes // res[2] % res[1], nodes // (res[2] * res[1])], axis=1)
+    codes = interleave(cells, depth)
+    order = np.argsort(codes)
+    codes, density, middles = codes[order], density[order], middles[order]
+    cube = place @ np.diag([*(2.0**depth / np.array(res[::-1], np.float64)), 1.0])
+
+    def make(kept: np.ndarray, sh: np.ndarray) -> Octree:
+        sizes = np.zeros(int(kept.sum()), np.uint8)
+        return Octree.from_rows(depth, cube, codes[kept], sizes, density[kept], sh, space=field.space)
+
+    everything = np.ones(len(codes), bool)
+    weights = max_weights(make(everything, np.zeros((len(codes), 1, 3), np.float32)), rays)
+    kept = weights >= recipe.keep_weight
+    if not kept.any():
+        raise MivolError(f"no view shows matter in the {field.noun}: check the box, the cameras and the threshold.")
+    tree = make(kept, project_colours(field, middles[kept], degree))
+    return merge_siblings(tree, weights[kept], recipe.tolerance)
 
 
 def _check_grid(grid: SphericalGrid, recipe: OctreeRecipe) -> int:

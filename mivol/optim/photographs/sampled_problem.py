@@ -34,7 +34,7 @@ from mivol.optim.photographs.radiance_plan import allocated_bytes, place_grid
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.optim.problem import Divide, DividedProblem, Reals, to_tensors
 from mivol.transport.line_integrals.radiance_field import RayGradient
-from mivol.transport.line_integrals.sampled_rays import SampledModel, render_samples, vjp_samples
+from mivol.transport.line_integrals.sampled_rays import SampledModel, render_hierarchical, render_samples, vjp_samples
 from mivol.transport.traversal.occupancy import Occupancy, list_cells
 
 __all__ = ["PRESETS", "SampledPlan", "SampledProblem", "check_memory", "find_region"]
@@ -193,7 +193,8 @@ class SampledProblem(DividedProblem):
         Noise: from the choice of pixels and of samples.
         """
         self.set_reals(reals)
-        if iteration % self.plan.refresh_every == 0:
+        is_hierarchical = self.field.coarse is not None
+        if not is_hierarchical and iteration % self.plan.refresh_every == 0:
             self.refresh_occupancy(iteration, np.random.default_rng((self.seed, iteration)))
         count = min(views or self.plan.views, len(self.batches.origins))
         tiles = max(1, round(self.plan.samples / self.samples_a_ray / (TILE**2 * count)))
@@ -220,21 +221,29 @@ class SampledProblem(DividedProblem):
         """
         self.set_reals(reals)
         rng = np.random.default_rng((self.seed, iteration))
-        if iteration % self.plan.refresh_every == 0:
+        is_hierarchical = self.field.coarse is not None
+        if not is_hierarchical and iteration % self.plan.refresh_every == 0:
             rng.random()  # drew the points of the map
         chosen = self.batches.choose_views(views, rng)
         corner = self.batches.draw_corners(1, chosen, tiles, rng)
         batch = self.batches.make_tiles(1, chosen[number::parts], corner[number::parts])
         share = len(chosen[number::parts]) / len(chosen)
         dr.eval(batch.rays)
-        rendered = render_samples(self.model, batch.rays, float(rng.random()))
+        u = float(rng.random())
+        if is_hierarchical:
+            renders = render_hierarchical(self.model, batch.rays, u)
+        else:
+            renders = (render_samples(self.model, batch.rays, u),)
         random = self.plan.random_background and self.batches.channels == 4
         backdrop = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in rng.random(3))) if random else batch.background
-        errors = compare_rays(batch, rendered.colour, rendered.T, backdrop, self.scale)
-        dr.eval(errors)
-        slopes = vjp_samples(rendered, RayGradient(errors.by_radiance * share, errors.by_T * share))
-        kept = 0 if rendered.samples is None else rendered.samples.size
-        found = {"loss": mi.TensorXf(dr.mean(errors.loss) * share, (1,)), SAMPLES: mi.TensorXf(mi.Float(kept), (1,))}
+        # The coarse field has a loss of its own (Mildenhall et al. 2020, eq. 6); the reported one is of the field.
+        compared = [compare_rays(batch, one.colour, one.T, backdrop, self.scale) for one in renders]
+        dr.eval(compared)
+        pairs = zip(renders, compared, strict=True)
+        each = [vjp_samples(one, RayGradient(errors.by_radiance * share, errors.by_T * share)) for one, errors in pairs]
+        slopes = join_slopes(each)
+        kept = sum(0 if one.samples is None else one.samples.size for one in renders)
+        found = {"loss": mi.TensorXf(dr.mean(compared[0].loss) * share, (1,)), SAMPLES: mi.TensorXf(mi.Float(kept), (1,))}
         for name, value in reals.items():
             found[name] = mi.TensorXf(slopes.get(name, dr.zeros(mi.Float, dr.width(value.array))), value.shape)
         return found
@@ -283,6 +292,17 @@ class SampledProblem(DividedProblem):
         self.samples_a_ray = float(arrays["samples_a_ray"])
         self.set_reals(reals)
         self._list_cells()
+
+
+def join_slopes(each: list[dict[str, mi.Float]]) -> dict[str, mi.Float]:
+    """Derivatives of a field, and of its coarse one behind them in the same arrays."""
+    if len(each) == 1:
+        return each[0]
+    joined, coarse = each
+    for name, slope in joined.items():
+        own = dr.width(coarse[name])
+        dr.scatter_add(slope, coarse[name], dr.arange(mi.UInt32, own) + own)
+    return joined
 
 
 def find_region(

@@ -35,6 +35,7 @@ import mitsuba as mi
 
 from mivol.fields.sampled_field import PointValues, SampledField
 from mivol.numerics import one_minus_exp
+from mivol.transport.line_integrals.hierarchical_samples import Strata, cut_into_strata, merge_rounds
 from mivol.transport.line_integrals.radiance_field import RayBundle, RayGradient
 from mivol.transport.traversal.lattice import clip_to_grid
 from mivol.transport.traversal.occupancy import list_cells
@@ -42,7 +43,15 @@ from mivol.transport.traversal.occupied_cells import OccupiedCells
 from mivol.transport.traversal.occupied_walk import OccupiedCell, walk_occupied_cells
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 
-__all__ = ["RaySamples", "SampledModel", "SampledRays", "draw_samples", "render_samples", "vjp_samples"]
+__all__ = [
+    "RaySamples",
+    "SampledModel",
+    "SampledRays",
+    "draw_samples",
+    "render_hierarchical",
+    "render_samples",
+    "vjp_samples",
+]
 
 
 @dataclass(frozen=True)
@@ -183,19 +192,72 @@ def render_samples(model: SampledModel, rays: RayBundle, u: float | None = None)
         rays: world rays, |d| = 1; evaluated.
         u: uniform number in [0, 1), the seed of the samples; None: middles of strata.
     """
+    if model.field.coarse is not None:
+        return render_hierarchical(model, rays, u)[0]
     width = dr.width((rays.o, rays.d))
     samples = draw_samples(model.cells, rays, model.step, u)
     if samples is None:
         return SampledRays(dr.zeros(mi.Color3f, width), dr.full(mi.Float, 1, width), dr.zeros(mi.Float, width))
     drawn = samples.size
-    samples = _drop_hidden(model, rays, samples)
+    rendered = _render_at(model.field, rays, _drop_hidden(model, rays, samples))
+    rendered.drawn = drawn
+    return rendered
+
+
+def render_hierarchical(model: SampledModel, rays: RayBundle, u: float | None = None) -> tuple[SampledRays, SampledRays]:
+    """Integrate along rays with samples in two rounds (:mod:`.hierarchical_samples`).
+
+    Args:
+        model: a field with a coarse one.
+        rays: world rays, |d| = 1; evaluated.
+        u: uniform number in [0, 1), the seed of the samples; None: even samples.
+
+    Returns:
+        The result of the field at the samples of both rounds, and of the coarse field at those of the first.
+    """
+    width, field, (first, second) = dr.width((rays.o, rays.d)), model.field, model.field.rounds
+    strata = cut_into_strata(model.cells, rays, first, u)
+    if strata is None:
+        empty = SampledRays(dr.zeros(mi.Color3f, width), dr.full(mi.Float, 1, width), dr.zeros(mi.Float, width))
+        return empty, empty
+    dt = dr.gather(mi.Float, strata.dt, dr.arange(mi.UInt32, dr.width(strata.t)) // first)
+    coarse = _render_at(field.coarse, rays, RaySamples(*_place(strata, first, strata.t, dt)))
+    weights = _find_weights(coarse.samples, coarse.values.sigma)
+    t, dt = merge_rounds(strata, weights, second, u)
+    return _render_at(field, rays, RaySamples(*_place(strata, first + second, t, dt))), coarse
+
+
+def _place(strata: Strata, number: int, t: mi.Float, dt: mi.Float) -> tuple:
+    """Arguments of :class:`RaySamples`."""
+    ray, start, counts = strata.packed(number)
+    dr.eval(dt)
+    return ray, t, dt, start, counts
+
+
+def _render_at(field: SampledField, rays: RayBundle, samples: RaySamples) -> SampledRays:
+    """Integrate a field at given samples."""
     p, d = samples.points(rays), samples.directions(rays)
     dr.eval(p, d)
-    values = model.field.evaluate(p, d)
+    values = field.evaluate(p, d)
     colour, tau, distance = _composite(samples, values)
-    rendered = SampledRays(colour, dr.exp(-tau), distance, drawn, samples, values)
+    rendered = SampledRays(colour, dr.exp(-tau), distance, samples.size, samples, values)
     dr.eval(rendered.colour, rendered.T, rendered.distance)
     return rendered
+
+
+@dr.syntax
+def _find_weights(samples: RaySamples, sigma: mi.Float) -> mi.Float:
+    """Compositing weight of each sample."""
+    weights = dr.zeros(mi.Float, samples.size)
+    tau, k = dr.zeros(mi.Float, dr.width(samples.count)), mi.UInt32(0)
+    while dr.hint(k < samples.count, exclude=[weights]):
+        at = samples.first + k
+        thickness = dr.gather(mi.Float, sigma, at) * dr.gather(mi.Float, samples.dt, at)
+        dr.scatter(weights, dr.exp(-tau) * one_minus_exp(thickness), at)
+        tau += thickness
+        k += 1
+    dr.eval(weights)
+    return weights
 
 
 def _drop_hidden(model: SampledModel, rays: RayBundle, samples: RaySamples) -> RaySamples:
