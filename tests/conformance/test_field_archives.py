@@ -131,7 +131,7 @@ HOSTILE_NERFS = {
     "weights of nothing": ({"weights": np.full(375, np.nan, np.float32)}, "weights with values that are not finite"),
     "no unit": ({"frame": np.array([0, 0, 0, 0.0])}, "expected finite numbers and a unit above 0"),
     "one round of two": ({"sizes": np.array([2, 6, 1, 2, 1, 5, 1, -1, 8, 0])}, "8 coarse and 0 fine samples, expected both"),
-    "a skip behind the trunk": ({"sizes": np.array([2, 6, 2, 2, 1, 5, 1, -1, 0, 0])}, "skip = 2, expected less than its 2 layers"),
+    "a skip behind the trunk": ({"sizes": np.array([2, 6, 2, 2, 1, 5, 1, -1, 0, 0])}, "skip = 2, expected less than its 2"),
 }
 
 
