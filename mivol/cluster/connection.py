@@ -107,12 +107,15 @@ def _connect_address(distributed: Any, settings: ClusterSettings) -> Client:
 
 DASK = {
     "distributed.comm.timeouts.connect": "120s", "distributed.comm.timeouts.tcp": "300s",
-    "distributed.scheduler.worker-ttl": None,
+    "distributed.scheduler.worker-ttl": None, "distributed.deploy.lost-worker-timeout": "24h",
     "distributed.worker.profile.enabled": False, "distributed.admin.system-monitor.interval": "2s",
-    "distributed.admin.tick.interval": "200ms",
+    "distributed.admin.tick.interval": "2s", "distributed.scheduler.work-stealing": False,
+    "distributed.scheduler.active-memory-manager.start": False,
 }  # fmt: skip
 """Settings of Dask for clusters that mivol starts. A busy machine, or a long compilation in a worker, is no lost worker; and
-profiles of Python code take time from workers that compute in kernels."""
+profiles of Python code take time from workers that compute in kernels. After ``lost-worker-timeout``, Dask ends the supervisor
+of a worker that is absent at that moment, although it may be starting another worker after a second loss. Ticks, stealing and
+the memory manager took half of the processor time of an idle owner; calls to actors need none of them."""
 
 OWN_GROUP = "import os; os.setpgid(0, 0)"
 """Code at the start of a local worker. Ctrl-C in a terminal reaches the owner's group of processes. In a worker, Mitsuba would

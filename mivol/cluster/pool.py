@@ -115,6 +115,7 @@ class Pool:
         """
         started = time.monotonic()
         expected = 1 if self.settings.scheduler != "local" else self.settings.workers
+        self._look()
         while len(self.workers) < expected or self._joining:
             check()
             self._look()
@@ -213,7 +214,7 @@ class Pool:
 
     def _refuse(self, address: str, error: Exception) -> None:
         """Refuse a worker that could not begin; a worker lost in the meantime is forgotten."""
-        if self._joining.pop(address, None) is None or isinstance(error, OSError):
+        if self._joining.pop(address, None) is None or is_loss(error):
             return
         reason = f"{type(error).__name__}: {error}".rstrip(": ")
         fault = MivolError(
@@ -349,9 +350,9 @@ class Pool:
                     self.sent += self._inputs[digest][1]
                 worker.sending.clear()
                 result = await worker.actor.work(unit.function, *unit.args)
-            except OSError:
-                return  # the list of workers tells of the loss
             except Exception as error:
+                if is_loss(error):
+                    return  # the list of workers tells of it
                 result = Failure(error)
             self._news.put(("done", number, (worker.address, result)))
 
@@ -432,6 +433,12 @@ class Pool:
         if not self.lost:
             return []
         return [f"{self.lost} worker(s) of the cluster were lost, and {self.repeated} piece(s) of work were done again."]
+
+
+def is_loss(error: Exception) -> bool:
+    """Whether an error of Dask tells of a lost worker: of its connection, or of the actor that it held."""
+    is_actor = isinstance(error, RuntimeError) and str(error).startswith("Worker holding Actor was lost")
+    return isinstance(error, OSError) or is_actor or type(error).__name__ in ("KilledWorker", "FutureCancelledError")
 
 
 def describe_unit(unit: Unit) -> str:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -38,7 +40,7 @@ from mivol.bench.harness.contests import (
     mean_of_rounds,
 )
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
-from mivol.bench.harness.study import Size, Study, amount, ask, without_arrays
+from mivol.bench.harness.study import Size, Study, SweptQuestion, amount, ask, without_arrays
 from mivol.bench.harness.timing import Stopwatch, Timing, race, ratio_of
 from mivol.errors import MivolError
 from mivol.report.figures import STYLE
@@ -110,6 +112,38 @@ def test_exit_codes(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "the means differ (|z|: toy; |z|: toy)" in capsys.readouterr().err
     assert TOY.run(["--quick", "--only", "width", *options]) == 1
     assert "mivol bench toy: it has no width; ask for its height." in capsys.readouterr().err
+
+
+def test_only_questions_without_times_go_to_a_cluster(capsys: pytest.CaptureFixture) -> None:
+    """A refusal before workers start."""
+    assert TOY.run(["--cluster", "local:1"], lambda study, args: pytest.fail("workers were started")) == 1
+    assert "mivol bench toy: height measures times, which other processes" in capsys.readouterr().err
+
+
+def test_pieces_of_a_question_on_workers(
+    variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer of workers that finish in another order is the answer of this process, order included."""
+    squares = SweptQuestion(
+        "How large?",
+        lambda size: [3, 1, 2],
+        lambda piece, size: {"square": piece**2 * size.height},
+        lambda size, found: {"metres": size.height, "squares": list(found.items())},
+    )
+    toy = replace(TOY, questions={"height": squares}, promises={}, on_request=())
+    pool = SimpleNamespace(
+        describe=lambda: "3 workers",
+        run=lambda units: ((unit.key, unit.function(None, *unit.args)) for unit in sorted(units, key=lambda unit: unit.key)),
+    )
+    monkeypatch.setattr(catalogue, "load_study", lambda name: toy)
+    options, answers = ["--out", str(tmp_path), "--variant", variant_rgb], []
+    for more in ([], ["--cluster", "local:3"]):
+        assert toy.run([*options, *more], lambda study, args: nullcontext(partial(catalogue.answer_on, pool, study.name))) == 0
+        said = capsys.readouterr()
+        answers.append(json.loads(said.out)["height"])
+    assert answers[0] == answers[1]
+    assert answers[0]["squares"] == [[3, {"square": 27.0}], [1, {"square": 3.0}], [2, {"square": 12.0}]]
+    assert "3 workers, 3 of 3 pieces" in said.err
 
 
 def test_every_amount_of_work_is_an_option(capsys: pytest.CaptureFixture) -> None:
@@ -372,7 +406,7 @@ def test_changes_since_an_older_result(tmp_path: Path, capsys: pytest.CaptureFix
         def parse(self, argv: list[str]) -> SimpleNamespace:
             return SimpleNamespace(size=SimpleNamespace(name="quick"), only=("walk", "run"), out=tmp_path)
 
-        def run(self, argv: list[str]) -> int:
+        def run(self, argv: list[str], open_cluster: object = None) -> int:
             runs.append(argv)
             write(tmp_path / "new.json", 4.0)
             return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import asyncio
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -151,6 +152,29 @@ def test_work_that_kills_its_workers_ends() -> None:
     assert (pool.lost, pool.repeated) == (2, 2)
     with pytest.raises(MivolError, match=r"work view 3 \(len\) ended 3 workers"):
         pool._lose("w2")
+
+
+@pytest.mark.parametrize(
+    ("error", "is_told"),
+    [
+        (RuntimeError("Worker holding Actor was lost.  Status: error"), False),
+        (OSError("connection closed"), False),
+        (RuntimeError("a bug"), True),
+    ],
+)
+def test_a_lost_actor_is_no_error_of_the_work(error: Exception, is_told: bool) -> None:
+    """Dask's words for a worker that is gone: its units come back when the list of workers tells of the loss."""
+    pool = make_pool(0)
+    pool.client.loop = SimpleNamespace(add_callback=lambda work: asyncio.run(work()))
+
+    class Actor:
+        async def work(self, *args: object) -> None:
+            raise error
+
+    pool.workers["w0"].actor = Actor()
+    pool._send(pool.workers["w0"], 3, Unit("view 3", len))
+    assert pool._news.empty() != is_told
+    assert list(pool.workers["w0"].units) == [3]
 
 
 def test_errors_of_work_are_values() -> None:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
 import math
 import pkgutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from mivol.bench import studies
 from mivol.bench.harness.bars import say
-from mivol.bench.harness.study import Study
+from mivol.bench.harness.study import Answer, Size, Study, SweptQuestion
+from mivol.cluster.connection import open_pool
+from mivol.cluster.pool import Pool, Unit
+from mivol.cluster.workplace import Workplace
 from mivol.errors import MivolError
 from mivol.optim.strategy import suggest_name
 
@@ -43,6 +50,43 @@ def list_studies() -> str:
     return "\n".join(f"{name:<{width}}  {(load_study(name).doc or '').splitlines()[0]}" for name in study_names())
 
 
+def compute_piece(place: Workplace, study: str, question: str, piece: Any, size: Size) -> dict:
+    """Answer a piece of a question in a worker."""
+    return load_study(study).questions[question].compute(piece, size)
+
+
+def answer_on(pool: Pool, study: str, name: str, question: SweptQuestion, size: Size) -> dict:
+    """Answer a question on workers. A piece depends on its number and the size only, so the answer does not depend on workers.
+
+    Args:
+        pool: workers.
+        study, name: names of the study and of its question.
+        question: the question.
+        size: amount of work.
+
+    Raises:
+        MivolError: a refusal of a worker, or as :meth:`mivol.cluster.pool.Pool.run`.
+    """
+    pieces, found = list(question.split(size)), {}
+    for piece, answer in pool.run(Unit(piece, compute_piece, (study, name, piece, size)) for piece in pieces):
+        found[piece] = answer
+        say(f"  {pool.describe()}, {len(found)} of {len(pieces)} pieces")
+    return question.join(size, {piece: found[piece] for piece in pieces})
+
+
+@contextmanager
+def open_cluster(study: Study, args: argparse.Namespace) -> Iterator[Answer]:
+    """What answers swept questions of a study on the workers of ``--cluster``, of one thread each.
+
+    Raises:
+        MivolError: as :func:`mivol.cluster.connection.open_pool`.
+    """
+    with open_pool(args.cluster, args.variant, 1, say) as pool:
+        yield partial(answer_on, pool, study.name)
+        for line in pool.describe_losses():
+            say(line)
+
+
 def run_study(name: str, argv: Sequence[str], older: Path | None = None) -> int:
     """Run a study.
 
@@ -61,7 +105,7 @@ def run_study(name: str, argv: Sequence[str], older: Path | None = None) -> int:
     if older is not None:
         before, args = read_result(older), study.parse(argv)
         check_kind(name, before, args.size.name, args.only)
-    code = study.run(argv)
+    code = study.run(argv, open_cluster)
     if before is not None and code == 0:
         changes = find_changes(before, read_result(args.out / f"{study.stem}.json"))
         say("\n".join(changes) or f"no figure has changed by {NOTABLE:.0%} or more")

@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report.record import describe_machine, package_versions
 
-__all__ = ["Question", "Size", "Study", "amount", "ask"]
+__all__ = ["Question", "Size", "Study", "SweptQuestion", "amount", "ask"]
 
 
 def amount(full: Any, quick: Any = None, doc: str = "", kind: type | None = None) -> Any:
@@ -71,6 +72,42 @@ def ask(text: str, measure: Callable[..., dict], *arguments: object) -> Question
     return question
 
 
+class SweptQuestion:
+    """A question whose answer joins the answers to pieces, as scenes of a seed each, without a time among them.
+
+    Attributes:
+        split: size -> pieces, plain Python.
+        compute: piece, size -> answer to the piece.
+        join: size, answers by piece in their order -> answer.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        split: Callable[[Any], Sequence[Any]],
+        compute: Callable[[Any, Any], dict],
+        join: Callable[[Any, dict[Any, dict]], dict],
+    ) -> None:
+        """Make a question.
+
+        Args:
+            text: the question.
+            split, compute, join: as the attributes.
+        """
+        self.__doc__ = text
+        self.split, self.compute, self.join = split, compute, join
+
+    def __call__(self, size: Any) -> dict:
+        return self.join(size, {piece: self.compute(piece, size) for piece in self.split(size)})
+
+
+Answer = Callable[[str, SweptQuestion, Any], dict]
+"""Name of a question, the question, size -> answer, computed elsewhere."""
+
+OpenCluster = Callable[["Study", argparse.Namespace], AbstractContextManager[Answer]]
+"""Study, parsed command line -> what answers its swept questions."""
+
+
 @dataclass(frozen=True)
 class Study:
     """A study.
@@ -111,26 +148,39 @@ class Study:
         """Stem of the names of the JSON file and the figure, and default name of their folder."""
         return f"bench_{self.name}"
 
-    def answer(self, names: Sequence[str], size: Size) -> dict:
-        """Ask questions in turn; the answers by name, and the figures with a bar under ``bars``."""
+    def answer(self, names: Sequence[str], size: Size, elsewhere: Answer | None = None) -> dict:
+        """Ask questions in turn; the answers by name, and the figures with a bar under ``bars``.
+
+        Args:
+            names: of the questions.
+            size: amount of work.
+            elsewhere: answers swept questions on the workers of a cluster; None: in this process.
+        """
         answers, bars = {}, []
         for name in names:
             say(f"{name}: {(self.questions[name].__doc__ or '').splitlines()[0]}")
-            answers[name] = self.questions[name](size)
+            question = self.questions[name]
+            answers[name] = question(size) if elsewhere is None else elsewhere(name, question, size)
             if lines := self.table(name, answers[name]):
                 say("\n".join(lines))
             bars += self.bars(name, answers[name])
         return {"bars": bars, **answers}
 
-    def run(self, argv: Sequence[str]) -> int:
+    def run(self, argv: Sequence[str], open_cluster: OpenCluster | None = None) -> int:
         """Read the command line, ask the questions, print the answers, and write JSON and figure.
+
+        Args:
+            argv: the command line.
+            open_cluster: opens what answers swept questions, with ``--cluster``.
 
         Returns:
             Exit code: 0, or 1 after a refusal or if means differ that must agree.
         """
         args = self.parse(argv)
         try:
-            result = self.measure(args)
+            self.check_cluster(args)
+            with nullcontext() if args.cluster is None else open_cluster(self, args) as elsewhere:
+                result = self.measure(args, elsewhere)
         except MivolError as error:
             say(f"mivol bench {self.name}: {error}")
             return 1
@@ -138,11 +188,11 @@ class Study:
             say(f"the means differ ({'; '.join(differing)}): the ratios are meaningless")
         return 1 if differing else 0
 
-    def measure(self, args: argparse.Namespace) -> dict:
-        """Ask the questions of a parsed command line, and write the result, which is returned."""
+    def measure(self, args: argparse.Namespace, elsewhere: Answer | None = None) -> dict:
+        """Ask the questions of a parsed command line, and write the result, which is returned; as :meth:`answer`."""
         mi.set_variant(args.variant)
         start, load = time.perf_counter(), mean_load()
-        answers = self.answer(args.only, args.size)
+        answers = self.answer(args.only, args.size, elsewhere)
         result = header(args.size.name, args.variant, load, start) | answers
         args.out.mkdir(parents=True, exist_ok=True)
         self.draw({name: answer for name, answer in answers.items() if name != "bars"}, args.out / f"{self.stem}.png")
@@ -151,11 +201,24 @@ class Study:
         sys.stdout.write(text)
         return result
 
+    def check_cluster(self, args: argparse.Namespace) -> None:
+        """Refuse ``--cluster`` for questions with times.
+
+        Raises:
+            MivolError: with the question.
+        """
+        timed = [name for name in args.only if not isinstance(self.questions[name], SweptQuestion)]
+        if args.cluster is not None and timed:
+            raise MivolError(
+                f"{timed[0]} measures times, which other processes on the machine change: leave out --cluster "
+                "(mivol bench random_scenes has questions for a cluster)."
+            )
+
     def parse(self, argv: Sequence[str]) -> argparse.Namespace:
         """Parse the command line; the process ends with a usage message if an argument is wrong.
 
         Returns:
-            ``size``, ``only`` (the questions), ``out`` (the folder) and ``variant``.
+            ``size``, ``only`` (the questions), ``out`` (the folder), ``cluster`` (None: no cluster) and ``variant``.
         """
         default = [name for name in self.questions if name not in self.on_request]
         parser = argparse.ArgumentParser(
@@ -164,6 +227,9 @@ class Study:
         parser.add_argument("--quick", action="store_true", help="small sizes, for CI: the times mean nothing")
         parser.add_argument("--only", default=",".join(default), help=f"questions to ask, of {','.join(self.questions)}")
         parser.add_argument("--out", type=Path, default=Path("runs") / self.stem, help="folder of the JSON file and the figure")
+        parser.add_argument(
+            "--cluster", metavar="WHERE", help="workers for questions without times: local:N, an address, a file"
+        )
         parser.add_argument("--variant", default="llvm_ad_rgb", help="variant of Mitsuba (llvm_ad_rgb)")
         self._add_amounts(parser.add_argument_group("amount of work"))
         args = parser.parse_args(argv)

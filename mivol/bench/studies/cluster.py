@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ import numpy as np
 
 from mivol import config
 from mivol.back_end import choose_back_end
+from mivol.bench.harness.bars import AT_MOST, Promise
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.cluster.connection import open_pool
 from mivol.cluster.distribution import ClusterDistribution
@@ -29,6 +30,7 @@ from mivol.cluster.packages import SceneSource, share_scene
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.reference import complete_on
 from mivol.cluster.scaling import Network, Workload, say_limit, step_seconds
+from mivol.cluster.steps import Steps
 from mivol.cluster.workplace import Workplace
 from mivol.experiments.examples import copy_example
 from mivol.experiments.fit_kind import RunContext
@@ -141,6 +143,46 @@ def measure_messages(size: ClusterSize) -> dict:
     return {"seconds": found, "latency": small, "bandwidth": bandwidth}
 
 
+STEP_SECONDS = 0.1
+"""Time of the work of each worker in a step [s]."""
+
+
+class WaitingTwin:
+    """A twin whose part of a step takes a fixed time: it sleeps, so that other processes of the machine do not change it."""
+
+    def take_state(self, state: dict[str, Any]) -> None:
+        """Nothing: the time does not depend on a state."""
+
+    def compute(self, what: str, arrays: Sequence[dict[str, np.ndarray]], parts: Sequence[tuple]) -> dict[str, np.ndarray]:
+        """A gradient of the size of the reals, after the time of a step."""
+        time.sleep(STEP_SECONDS)
+        return {name: value.astype(np.float64) for name, value in arrays[0].items()}
+
+
+def make_waiting_twin(place: Workplace, content: None) -> WaitingTwin:
+    """The twin of a step of fixed time."""
+    return WaitingTwin()
+
+
+def measure_overhead(size: ClusterSize) -> dict:
+    """What does a step of 100 ms of work on two workers take beyond that time, by the number of its reals?"""
+    found = {}
+    with two_workers() as (pool, _):
+        for edge in (1, 40, 64):
+            steps, rows = Steps(pool, make_waiting_twin, None), []
+            reals = [{"sigma_t": np.zeros(edge**3, np.float32)}]
+            for _ in range(7 * size.rounds):
+                taken = measure(pool, lambda steps=steps, reals=reals: steps.compute("", reals, [(0,), (1,)]))
+                rows.append({"overhead": steps.times.last, "processor": taken["owner"] + max(taken["workers"])})
+            rows = rows[1:] or rows  # the first makes the twin
+            found[f"{edge}^3"] = {
+                "median": float(np.median([row["overhead"] for row in rows])),
+                "fastest": min(row["overhead"] for row in rows),
+                "processor": float(np.mean([row["processor"] for row in rows])),
+            }
+    return found
+
+
 def measure_cluster(size: ClusterSize) -> dict:
     """Time of two workers over one process, overhead of a step, and the model of larger numbers of workers."""
     messages, gradient, reference = measure_messages(size), measure_gradient(size), measure_reference(size)
@@ -173,6 +215,12 @@ def make_workloads(size: ClusterSize, gradient: dict, reference: dict) -> list[W
 
 def table(question: str, answer: dict) -> list[str]:
     """Markdown lines of the answer."""
+    if question == "overhead":
+        return [
+            f"a step of {1e3 * STEP_SECONDS:.0f} ms with {name} reals takes {1e3 * row['median']:.2g} ms more (median; fastest "
+            f"{1e3 * row['fastest']:.2g} ms; processor time of owner and worker {1e3 * row['processor']:.2g} ms)"
+            for name, row in answer.items()
+        ]
     names = "reference", "gradient"
     lines = [f"{name}: two workers take {answer[name]['ratio']:.3f} of the time of one process" for name in names]
     for size, taken in answer["messages"]["seconds"].items():
@@ -186,4 +234,14 @@ def table(question: str, answer: dict) -> list[str]:
     return lines
 
 
-STUDY = Study(__name__, __doc__, ClusterSize, {"cluster": measure_cluster}, table=table)
+PROMISES = {
+    "cluster": [
+        Promise("reference of all views, time over one process", ("reference", "ratio"), AT_MOST, 0.55),
+        Promise("gradient over all views, time over one process", ("gradient", "ratio"), AT_MOST, 0.65),
+    ],
+    "overhead": [Promise("overhead of a step of 100 ms with 40^3 reals [ms]", ("40^3", "median"), AT_MOST, 15.0, 1e3)],
+}
+
+STUDY = Study(
+    __name__, __doc__, ClusterSize, {"overhead": measure_overhead, "cluster": measure_cluster}, table=table, promises=PROMISES
+)

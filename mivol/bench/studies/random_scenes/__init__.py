@@ -4,6 +4,7 @@
     mivol bench random_scenes --quick            # a minute: a dozen scenes
     mivol bench random_scenes --only hard
     mivol bench random_scenes --only built
+    mivol bench random_scenes --cluster local:4  # a scene is a piece of work
 
 trials: random scenes (:mod:`mivol.bench.studies.random_scenes.generate`) with homogeneous media and grids, grey and rgb, in
 boxes and balls, one, two side by side, or one inside the other, behind boundaries that transmit, refract or blur light; with
@@ -38,7 +39,7 @@ from mivol.bench.extinctions import as_dense_as_smoke, smoke, threads_in_space
 from mivol.bench.harness.bars import AT_MOST, Bar, judge, judge_agreement, say, say_row
 from mivol.bench.harness.contests import compare_means, mean_of_rounds
 from mivol.bench.harness.figures import new_figure
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import Size, Study, SweptQuestion, amount
 from mivol.bench.scenes import box_scene, constant_light, emitter_inside, make_integrator, milky_glass, sun_and_sky
 from mivol.bench.studies.random_scenes.generate import RandomScene, draw_built_scene, draw_scene
 from mivol.errors import MivolError
@@ -70,27 +71,43 @@ class RandomSize(Size):
 # -- Random scenes ----------------------------------------------------------------------------------------------------------
 
 
-def measure_trials(size: RandomSize) -> dict:
-    """Do the means of random scenes agree with volpath's, and is every pixel finite and not negative?"""
-    return try_scenes(draw_scene, size)
+def make_trials(text: str, draw: DrawScene, resize: Callable[[RandomSize], RandomSize]) -> SweptQuestion:
+    """A question about random scenes; a scene is a piece.
 
+    Args:
+        text: the question.
+        draw: makes a scene.
+        resize: puts the number of scenes into ``scenes``.
+    """
 
-def measure_built(size: RandomSize) -> dict:
-    """The same for random scenes as people build them: rooms, floors, glass, fog, and lamps inside."""
-    return try_scenes(draw_built_scene, replace(size, scenes=size.built_scenes))
+    def split(size: RandomSize) -> list[int]:
+        return list(range(size.first, size.first + resize(size).scenes))
 
-
-def try_scenes(draw: DrawScene, size: RandomSize) -> dict:
-    """Compare all scenes, and count the refusals."""
-    trials, refused = {}, Counter()
-    for seed in range(size.first, size.first + size.scenes):
-        trials[seed] = trial = try_scene(seed, size, draw)
-        refused.update(trial.get("refused", []))
+    def compute(seed: int, size: RandomSize) -> dict:
+        trial = try_scene(seed, resize(size), draw)
         outcome = trial.get("refused", [f"z {trial.get('z')} of {trial.get('z_bound')}"])[0]
         say(f"  scene {seed}: {outcome}: {', '.join(trial['features'])}")
         gc.collect()
         dr.flush_malloc_cache()
-    return {"scenes": size.scenes, "refusals": dict(refused), "trials": trials}
+        return trial
+
+    def join(size: RandomSize, trials: dict[int, dict]) -> dict:
+        refused = Counter(reason for trial in trials.values() for reason in trial.get("refused", []))
+        return {"scenes": resize(size).scenes, "refusals": dict(refused), "trials": trials}
+
+    return SweptQuestion(text, split, compute, join)
+
+
+measure_trials = make_trials(
+    "Do the means of random scenes agree with volpath's, and is every pixel finite and not negative?",
+    draw_scene,
+    lambda size: size,
+)
+measure_built = make_trials(
+    "The same for random scenes as people build them: rooms, floors, glass, fog, and lamps inside.",
+    draw_built_scene,
+    lambda size: replace(size, scenes=size.built_scenes),
+)
 
 
 def try_scene(seed: int, size: RandomSize, draw: DrawScene) -> dict:
@@ -171,21 +188,27 @@ HARD: dict[str, Callable[[], dict]] = {
 """Hard scenes, rendered with unlimited depth."""
 
 
-def measure_hard(size: RandomSize) -> dict:
-    """Is the radiance of every path of hard scenes finite and not negative?"""
-    answer = {}
-    for name, parts in HARD.items():
-        scene, integrator = mi.load_dict(parts()), make_integrator("mivol", -1)
-        answer[name] = counts = {"paths": 0, "not_finite": 0, "negative": 0, "brightest": 0.0}
-        for k in range(size.hard_pictures):
-            image = np.array(mi.render(scene, integrator=integrator, spp=1, seed=k))
-            counts["paths"] += image.shape[0] * image.shape[1]
-            counts["not_finite"] += int(np.sum(~np.isfinite(image)))
-            counts["negative"] += int(np.sum(image < 0))
-            counts["brightest"] = max(counts["brightest"], float(np.nanmax(image)))
-        dr.flush_malloc_cache()
-        say_row(name, **counts)
-    return answer
+def try_hard(name: str, size: RandomSize) -> dict:
+    """Count the radiances of a hard scene that are not finite or negative."""
+    scene, integrator = mi.load_dict(HARD[name]()), make_integrator("mivol", -1)
+    counts = {"paths": 0, "not_finite": 0, "negative": 0, "brightest": 0.0}
+    for k in range(size.hard_pictures):
+        image = np.array(mi.render(scene, integrator=integrator, spp=1, seed=k))
+        counts["paths"] += image.shape[0] * image.shape[1]
+        counts["not_finite"] += int(np.sum(~np.isfinite(image)))
+        counts["negative"] += int(np.sum(image < 0))
+        counts["brightest"] = max(counts["brightest"], float(np.nanmax(image)))
+    dr.flush_malloc_cache()
+    say_row(name, **counts)
+    return counts
+
+
+measure_hard = SweptQuestion(
+    "Is the radiance of every path of hard scenes finite and not negative?",
+    lambda size: list(HARD),
+    try_hard,
+    lambda size, counts: counts,
+)
 
 
 # -- Bars and figure --------------------------------------------------------------------------------------------------------
