@@ -191,7 +191,7 @@ class Detector(Section, tag_field="beam"):
     """Settings of both circular beams; measured data bring the detector's size and the angles."""
 
     views: Annotated[int, setting("view", "number of views, evenly over the arc", ge=1)] = 90
-    arc: Annotated[float, setting("degree", "angle of the whole scan", gt=0, le=360)] = 180.0
+    arc: Annotated[float, setting("degree", "angle of the whole scan; above 360 for several turns", gt=0, le=36000)] = 180.0
     detector: Annotated[tuple[Count, Count], setting("pixel", "(rows, columns)")] = (1, 128)
     pitch: Annotated[float | tuple[float, float], setting("length", "pixel distance: one, or (rows, columns)")] = 1.0
     detector_offset: Annotated[
@@ -209,6 +209,16 @@ class Cone(Detector, kw_only=True, tag="cone"):
 
     source_to_axis: Annotated[float, setting("length", "source to rotation axis", gt=0)]
     source_to_detector: Annotated[float, setting("length", "source to detector", gt=0)]
+    lift: Annotated[float, setting("length", "rise of source and detector a turn, of a helix; z = 0 in the middle")] = 0.0
+    sources: Annotated[
+        tuple[tuple[float, float], ...],
+        setting("length", "shift of each of several sources along (columns, z); each has all views, one after the other"),
+    ] = ()
+
+
+def is_circle(scan: object) -> bool:
+    """Whether one source turns on a circle, or the light is parallel: the beam then has a rotation axis to find."""
+    return isinstance(scan, Parallel) or (isinstance(scan, Cone) and not scan.lift and not scan.sources)
 
 
 class Table(Section, kw_only=True, tag_field="beam", tag="table"):
@@ -438,7 +448,9 @@ class ScanExperiment(Section):
             raise ValueError('scan.beam = "data" and data.source = "nikon" go together: give both, or neither')
         if getattr(self.data, "rows", None) and not isinstance(self.scan, Parallel):
             raise ValueError('data.rows cuts the detector of a beam = "parallel": leave it out')
-        is_measured = isinstance(self.data, Measured | Stack) and isinstance(self.scan, Detector)
+        if isinstance(self.scan, Cone) and not is_circle(self.scan) and getattr(self.data, "find_axis", None):
+            raise ValueError("data.find_axis needs one source on a circle, found scan.lift or scan.sources: leave it out")
+        is_measured = isinstance(self.data, Measured | Stack) and isinstance(self.scan, Detector) and is_circle(self.scan)
         if self.grid is None and not (isinstance(self.data, Nikon) or is_measured):
             raise ValueError('the key "grid" is missing: give it')
 

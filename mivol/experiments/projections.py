@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, OfData, Parallel, Readings, Table
+from mivol.config import Cone, Ellipsoids, Known, Matrices, OfData, Parallel, Readings, Table, is_circle
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
-from mivol.experiments.readings import ScanReadings, nikon_grid, note_order, note_rows, read_scan
+from mivol.experiments.readings import ScanReadings, even_angles, nikon_grid, note_order, note_rows, read_scan
 from mivol.files import read_columns, read_volume
 from mivol.files.fetch import resolve_path
 from mivol.files.image_stack import ALL
@@ -22,7 +22,7 @@ from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.cone_axis import axis_from_fans, cone_axis_offset
 from mivol.tomography.filtered import covers_circle
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
-from mivol.tomography.panel_views import COLUMNS, PanelViews, panels_from_matrices
+from mivol.tomography.panel_views import COLUMNS, PanelViews, helix, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import (
     Air,
@@ -80,13 +80,10 @@ def describe_beam(settings: config.ScanExperiment) -> str:
 def make_geometry(settings: config.ScanExperiment, base: Path) -> FlatDetector:
     """Return beam and detector of computed projections."""
     scan = settings.scan
-    angles = np.arange(0) if isinstance(scan, Table | Matrices) else even_angles(scan)
+    if isinstance(scan, Table | Matrices):
+        return make_beam(settings, base, np.arange(0), scan.detector)
+    angles = even_angles(scan, scan.views * max(1, len(getattr(scan, "sources", ()))))
     return make_beam(settings, base, angles, scan.detector)
-
-
-def even_angles(scan: Detector) -> np.ndarray:
-    """Angles [rad] spread evenly over the arc."""
-    return np.radians(scan.arc) * np.arange(scan.views) / scan.views
 
 
 def make_beam(
@@ -101,7 +98,8 @@ def make_beam(
         return panels_from_matrices(matrices, detector, settings.grid.centre, scan.first_pixel)
     offsets = {"axis_offset": scan.axis_offset if axis_offset is None else axis_offset, "detector_offset": scan.detector_offset}
     if isinstance(scan, Cone):
-        return ConeBeam(angles, detector, scan.source_to_axis, scan.source_to_detector, scan.pitch, **offsets)
+        beam = ConeBeam(angles, detector, scan.source_to_axis, scan.source_to_detector, scan.pitch, **offsets)
+        return beam if is_circle(scan) else helix(beam, scan.lift, scan.sources)
     return ParallelBeam(angles, detector, scan.pitch, **offsets)
 
 
@@ -244,7 +242,7 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
     notes += ring_notes
     removed = None if y is measured else (measured - y)[:, y.shape[1] // 2]
     offset = None
-    if isinstance(settings.scan, Parallel | Cone):
+    if is_circle(settings.scan):
         offset, axis_notes = resolve_axis(settings, base, y, weights, angles)
         notes += axis_notes
     unused = int((weights == 0).sum())

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Matrices, Measured, Nikon, Stack, Table
+from mivol.config import Detector, Matrices, Measured, Nikon, Stack, Table
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files import read_columns, read_projections, read_stack
@@ -93,7 +93,7 @@ def read_hdf5_scan(settings: config.ScanExperiment, base: Path, rows: slice) -> 
     fields = scan.projections, scan.flats, scan.darks
     angles = scan.angles
     if angles is None and not isinstance(settings.scan, Table | Matrices):
-        angles = np.radians(settings.scan.arc) * np.arange(len(scan.projections)) / len(scan.projections)
+        angles = even_angles(settings.scan, len(scan.projections))
     elif angles is not None:
         check_unit(np.degrees(angles), "degree", 'set data.angle_unit = "radian"')
     return ScanReadings(correct_transmission(*fields, data.saturation), angles, intensity=fields, notes=scan.notes)
@@ -148,11 +148,17 @@ def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.n
     if isinstance(settings.scan, Table | Matrices):
         return None
     if not data.angles:
-        return np.radians(settings.scan.arc) * np.arange(views) / views
+        return even_angles(settings.scan, views)
     angles = read_columns(base / data.angles, 1)[:, 0]
     if len(angles) != views:
         raise MivolError(f"{data.angles} has {len(angles)} angles for {views} projections: give one for each.")
     return to_radians(angles, data.angle_unit)
+
+
+def even_angles(scan: Detector, views: int) -> np.ndarray:
+    """Angles [rad] of ``views`` views, spread evenly over the arc, for each of several sources."""
+    runs = max(1, len(getattr(scan, "sources", ())))
+    return np.radians(scan.arc) * np.tile(np.arange(views // runs) / max(1, views // runs), runs)
 
 
 def to_radians(angles: np.ndarray, unit: str) -> np.ndarray:

@@ -24,7 +24,7 @@ import numpy as np
 
 from mivol import config
 from mivol.back_end import choose_back_end
-from mivol.config import AUTO, Cone, Ellipsoids, Known, Parallel
+from mivol.config import AUTO, Ellipsoids, Known
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import RunContext, Say
 from mivol.experiments.projections import (
@@ -129,8 +129,8 @@ def _check_settings(settings: config.ScanExperiment) -> None:
         raise MivolError('slabs need projections by rows, found data.source = "volume": use "shepp_logan" or measured data.')
     if settings.solve.name == "ml-tr" or getattr(settings.data, "drift", 0):
         raise MivolError("slabs take neither ml-tr nor data.drift, which need all rows at once: choose another solver.")
-    if not isinstance(settings.scan, Parallel | Cone | config.OfData):
-        raise MivolError('slabs need a circle about z, found a table of views: choose beam = "parallel" or "cone".')
+    if not (config.is_circle(settings.scan) or isinstance(settings.scan, config.OfData)):
+        raise MivolError("slabs need a circle about z, found another trajectory: leave out [slabs].")
 
 
 def _computed_source(settings: config.ScanExperiment, base: Path) -> RowSource:

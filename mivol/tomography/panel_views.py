@@ -97,6 +97,31 @@ def _first_index(wrong: np.ndarray) -> int:
     return int(np.flatnonzero(wrong)[0])
 
 
+def helix(beam: ConeBeam, lift: float, shifts: Sequence[Sequence[float]] = ()) -> PanelViews:
+    """Lift source and detector of a cone beam with the angle, and give it several sources.
+
+    Args:
+        beam: cone beam. With ``n`` shifts its views are ``n`` runs of equal length, a run of each source.
+        lift: rise a turn, along z [length]. The middle of the angles is at the height of the beam.
+        shifts: shift of each source along (the detector's columns, z) [length]; none: one source, not shifted.
+
+    Raises:
+        MivolError: views that do not divide among the sources.
+    """
+    panels, views = beam.panels(), len(beam.angles)
+    shifts = np.reshape(shifts or ((0.0, 0.0),), (-1, 2))
+    if views % len(shifts):
+        raise MivolError(f"found {views} views of {len(shifts)} sources, expected as many views of each source.")
+    shift = np.repeat(shifts, views // len(shifts), axis=0)
+    middle = (beam.angles.min() + beam.angles.max()) / 2
+    rise = (lift * (beam.angles - middle) / (2 * np.pi))[:, None] * np.array([0.0, 0.0, 1.0])
+    u = panels.along_u / np.linalg.norm(panels.along_u, axis=1, keepdims=True)
+    source = panels.source + rise + shift[:, :1] * u + shift[:, 1:] * np.array([0.0, 0.0, 1.0])
+    rows, columns = beam.detector
+    centre = panels.corner + rise + (columns - 1) / 2 * panels.along_u + (rows - 1) / 2 * panels.along_v
+    return PanelViews(np.hstack([source, centre, panels.along_u, panels.along_v]), beam.detector)
+
+
 MIN_SINGULAR_VALUE = 1e-12
 """Smallest over largest singular value of a matrix below which float64 cannot place its source."""
 
