@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import drjit as dr
 import msgspec
 import numpy as np
 
@@ -119,6 +120,7 @@ class ScanFit(FitKind):
         storage = choose_storage(self.settings.solve, self.problem.linear_problem.A)
         self.record.plan.append(storage.line)
         storage.apply(self.problem)
+        dr.flush_malloc_cache()
         self.record.plan += estimate_noise(self.problem, self.settings.solve, self.data)
         self.noise = expected_noise(self.settings, self.problem, self.data)
 
@@ -215,7 +217,10 @@ def make_problem(
     solve = settings.solve
     a = projector.subset(kept)
     prior = make_prior(solve, a, data, kept)
+    # Dr.Jit keeps arrays that are no longer used for later calls: as much again as a solver needs.
+    dr.flush_malloc_cache()
     x0 = start_volume(solve, a, data, kept)
+    dr.flush_malloc_cache()
     if ALL_SOLVERS[solve.name].problem is LeastSquares:
         least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, solve.nonnegative, prior)
         return ProjectionProblem(least_squares, times=view_times(data)[kept] if getattr(settings.data, "drift", 0) else None)

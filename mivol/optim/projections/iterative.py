@@ -21,6 +21,7 @@ from mivol.optim.projections.linear_problems import (
     SmoothedTV,
     SolverState,
     apply_weights,
+    blocks,
     dot,
     flat_weights,
     flatten,
@@ -49,18 +50,21 @@ def ordered_subsets_sart(
     """
     check_sweeps(problem, n_subsets, relaxation, decay)
     a = problem.A
-    blocks = _blocks(problem, n_subsets)
+    subsets = _blocks(problem, n_subsets)
     if state is None:
         state = SolverState(start_field(a, problem.x0), 0, np.nan, np.nan)
     while True:
-        x, norm2 = state.x, 0.0
+        x, norm2 = state.x.copy(), 0.0
         strength = np.asarray(relaxation * decay**state.iteration, x.dtype)
-        for block in blocks:
+        for block in subsets:
             r = (block.b - block.a @ x) * block.used
             norm2 += dot(r, r)
-            x = x + strength * block.per_voxel * (block.a.T @ (block.per_ray * r))
+            change = block.a.T @ (block.per_ray * r)
+            change *= block.per_voxel
+            change *= strength
+            x += change
             if problem.nonnegative:
-                x = np.maximum(x, 0)
+                np.maximum(x, 0, out=x)
         state = SolverState(x, state.iteration + 1, norm2 / 2, float(np.sqrt(norm2)))
         yield state
 
@@ -159,9 +163,9 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
         step = _descend(problem, weights, state.x, g, direction) or _descend(problem, weights, state.x, g, downhill)
         if step is None:
             return
-        x, r = state.x + step[0], state.memory["residual"] - step[1]
+        x, r = np.add(state.x, step[0], out=step[0]), state.memory["residual"] - step[1]
         if problem.nonnegative:
-            x = np.maximum(x, 0)  # rounding: the step ends in the domain
+            np.maximum(x, 0, out=x)  # rounding: the step ends in the domain
         state = _ls_state(problem, x, state.iteration + 1, r, {"residual": r, **memory})
         yield state
 
@@ -171,23 +175,36 @@ def _direction(
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
     """The conjugate direction, the scaled descent direction, and memory for the next direction; None at the minimum."""
     x, memory, prior = state.x, state.memory, problem.prior
-    g = -(problem.A.T @ apply_weights(weights, memory["residual"]))
+    g = problem.A.T @ apply_weights(weights, memory["residual"])
+    np.negative(g, out=g)
     if prior:
-        g = g + prior.gradient(x)
-    free = (x > 0) | (g < 0) if problem.nonnegative else None
-    z = g
-    if data_diagonal is not None:
-        z = g * reciprocal(data_diagonal if not prior else data_diagonal + prior.separable(x))
-    z = z if free is None else z * free
+        g += prior.gradient(x)
+    z = _scaled_gradient(problem, x, g, data_diagonal)
     gz = dot(g, z)
     if not gz > 0:
         return None
-    direction = -z
+    downhill = np.negative(z, out=z)
+    direction = downhill.copy()
     if "direction" in memory:
-        beta = max(0.0, (gz - dot(memory["gradient"], z)) / float(memory["gz"]))
-        last = memory["direction"] if free is None else memory["direction"] * free
-        direction = direction + np.asarray(beta, x.dtype) * last
-    return direction, -z, {"direction": direction, "gradient": g, "gz": np.asarray(gz)}
+        beta = np.asarray(max(0.0, (gz + dot(memory["gradient"], downhill)) / float(memory["gz"])), x.dtype)
+        for part in blocks(len(x)):
+            last = beta * memory["direction"][part]
+            direction[part] += last * ((x[part] > 0) | (g[part] < 0)) if problem.nonnegative else last
+    return direction, downhill, {"direction": direction, "gradient": g, "gz": np.asarray(gz)}
+
+
+def _scaled_gradient(problem: LeastSquares, x: np.ndarray, g: np.ndarray, data_diagonal: np.ndarray | None) -> np.ndarray:
+    """The gradient over the diagonal of the majoriser, 0 at voxels that the bound holds."""
+    z = np.ones_like(g)
+    if data_diagonal is not None:
+        z = problem.prior.separable(x) if problem.prior else np.zeros_like(g)
+        z += data_diagonal
+    largest = float(np.max(z, initial=0.0))
+    for part in blocks(len(x)):
+        z[part] = g[part] * reciprocal(z[part], largest)
+        if problem.nonnegative:
+            z[part] *= (x[part] > 0) | (g[part] < 0)
+    return z
 
 
 def _descend(
@@ -205,15 +222,17 @@ def _descend(
     if lowest is None:
         return None
     step = np.asarray(lowest[0], x.dtype) * direction
-    if not problem.nonnegative or (x + step).min() >= 0:
+    if not problem.nonnegative or all((x[part] + step[part]).min() >= 0 for part in blocks(len(x))):
         return step, np.asarray(lowest[0], x.dtype) * lowest[1]
-    projected = np.maximum(x + step, 0) - x
-    lowest = minimum(projected)
+    for part in blocks(len(x)):
+        step[part] = np.maximum(x[part] + step[part], 0) - x[part]
+    lowest = minimum(step)
     if lowest is None:
         return None
     # Beyond length 1 the projected step could leave the domain again.
     length = np.asarray(min(1.0, lowest[0]), x.dtype)
-    return length * projected, length * lowest[1]
+    step *= length
+    return step, length * lowest[1]
 
 
 def cgls(problem: LeastSquares, state: SolverState | None = None) -> Iterator[SolverState]:
