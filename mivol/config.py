@@ -285,11 +285,12 @@ class Readings(Section):
     ) = None
     drift: Annotated[int, setting("iteration", "fits of a drift of the light to each pixel; 0: none", ge=0)] = 0
     rings: Annotated[
-        Literal["none", "gain", "sort"],
+        Literal["none", "gain", "sort", "fit"],
         setting(
             "1",
-            "steps between columns to remove, which make rings; gain: a constant factor of each pixel; sort: the sorted values "
-            "of each pixel, for factors that change with the brightness; blurs the projections",
+            "steps between columns to remove, which make rings; gain: a constant factor of each pixel; fit: gain, and what is "
+            "left as unknowns beside the volume; sort: the sorted values of each pixel, for factors that change with the "
+            "brightness; blurs the projections",
         ),
     ] = "none"
     ring_width: (
@@ -297,7 +298,7 @@ class Readings(Section):
             int,
             setting(
                 "pixel",
-                "gain: period along the detector of which half is removed, and more of a shorter one; sort: columns of the "
+                "gain, fit: period along the detector of which half is removed, more of a shorter one; sort: columns of the "
                 "median, an odd number; absent: 14 and 7",
                 ge=3,
             ),
@@ -373,7 +374,10 @@ class SolveSettings(Section):
         Literal["empty", "filtered"] | None,
         setting("1", "first volume; absent: auto takes filtered if the views allow it, others empty"),
     ] = None
-    iterations: Annotated[int, setting("iteration", "largest number of iterations", ge=1)] = 20
+    iterations: (
+        Annotated[int, setting("iteration", 'largest number of iterations; absent: 20, with data.rings = "fit" 80', ge=1)]
+        | None
+    ) = None
     nonnegative: Annotated[bool, setting("1", "keep every voxel at or above 0")] = True
     subsets: Annotated[int, setting("1", "subsets of views, for os-sart", ge=1)] = 10
     relaxation: Annotated[float, setting("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
@@ -446,6 +450,9 @@ class ScanExperiment(Section):
     def __post_init__(self) -> None:
         if isinstance(self.scan, OfData) != isinstance(self.data, Nikon):
             raise ValueError('scan.beam = "data" and data.source = "nikon" go together: give both, or neither')
+        if getattr(self.data, "rings", "none") == "fit" and (self.data.drift or self.solve.solver in ("fbp", "fdk", "ml-tr")):
+            other = f"data.drift = {self.data.drift}" if self.data.drift else f"{self.solve.solver}"
+            raise ValueError(f'data.rings = "fit" needs least squares with constant gains, found {other}: use rings = "gain"')
         if getattr(self.data, "rows", None) and not isinstance(self.scan, Parallel):
             raise ValueError('data.rows cuts the detector of a beam = "parallel": leave it out')
         if isinstance(self.scan, Cone) and not is_circle(self.scan) and getattr(self.data, "find_axis", None):

@@ -279,8 +279,10 @@ def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> 
     """
     if data.rings == "none":
         return y, []
-    width = RING_WIDTHS[data.rings] if data.ring_width is None else data.ring_width
-    found = remove_rings(y, weights, data.rings, width)
+    # The gains that the solver fits are counted from what the filter leaves.
+    method = "gain" if data.rings == "fit" else data.rings
+    width = RING_WIDTHS[method] if data.ring_width is None else data.ring_width
+    found = remove_rings(y, weights, method, width)
     size = float(np.sqrt(np.mean((y - found) ** 2)))
     said = f'ring removal (data.rings = "{data.rings}", {width} columns) changed the line integrals by {size:.2g} (RMS)'
     return found, [said]

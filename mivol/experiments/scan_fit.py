@@ -32,6 +32,8 @@ from mivol.experiments.projections import (
 )
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.solver_choice import (
+    GAIN_ITERATIONS,
+    ITERATIONS,
     check_grid,
     check_noise,
     choose_storage,
@@ -44,7 +46,7 @@ from mivol.experiments.solver_choice import (
 from mivol.files import write_exr, write_volume
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Course, Fit
-from mivol.optim.projections.inversion import LinearSolve, ProjectionProblem, fit_drift
+from mivol.optim.projections.inversion import DriftFit, GainFit, LightFit, LinearSolve, ProjectionProblem, update_light
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.cameras import draw_scanner
@@ -54,12 +56,15 @@ from mivol.report.record import LINES, SINOGRAM, Image, PlanLine, Volume
 from mivol.scene.explain import Explanation
 from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
-from mivol.tomography.preprocess import interpolate_gaps
+from mivol.tomography.preprocess import LightDrift, interpolate_gaps
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
 
-RING_CITATIONS = {"gain": ("vo_2018", "eilers_2003"), "sort": ("vo_2018",)}
+RING_CITATIONS = {"gain": ("vo_2018", "eilers_2003"), "fit": ("vo_2018", "eilers_2003"), "sort": ("vo_2018",)}
 """Citations by ``data.rings``."""
+
+GAIN_TURN = 4
+"""Iterations of the solver between two fits of the gains."""
 
 
 class ScanFit(FitKind):
@@ -105,7 +110,9 @@ class ScanFit(FitKind):
         self.held_out = held_out_views(self.settings, views)
         self.kept = fitted_views(self.held_out, views)
         say(f"  held out  {len(self.held_out)} views")
-        solve, self.choices = resolve_solver(self.settings.solve, Projector(self.data.geometry, grid, self.kept))
+        iterations = GAIN_ITERATIONS if getattr(self.settings.data, "rings", "none") == "fit" else ITERATIONS
+        walk = Projector(self.data.geometry, grid, self.kept)
+        solve, self.choices = resolve_solver(self.settings.solve, walk, iterations)
         self.settings = msgspec.structs.replace(self.settings, solve=solve)
         self.record.plan += self.choices
         self.projector = make_projector(self.settings, self.data, grid)
@@ -156,7 +163,10 @@ class ScanFit(FitKind):
         record.plan += explain_prior(problem.prior, state)
         if self.data.is_noise_known:
             record.results["discrepancy"] = state.residual_norm / expected_residual_norm(problem, self.settings.solve.name)
-        self.data = subtract_drift(self.problem, self.data, self.held_out, state)
+        self.data = subtract_light(self.problem, self.data, state)
+        if isinstance(self.problem.light, GainFit):
+            size = float(np.std(self.data.removed_rings[0]))
+            record.notes.append(f'rings: the gains of the columns scatter by {size:.2%} in the middle row (data.rings = "fit")')
 
     def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
         volume = fit.run.state.x.reshape(self.projector.grid.shape)
@@ -223,11 +233,18 @@ def make_problem(
     dr.flush_malloc_cache()
     if ALL_SOLVERS[solve.name].problem is LeastSquares:
         least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, solve.nonnegative, prior)
-        return ProjectionProblem(least_squares, times=view_times(data)[kept] if getattr(settings.data, "drift", 0) else None)
+        return ProjectionProblem(least_squares, light=choose_light(settings, view_times(data)[kept]))
     if data.quanta is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
     quanta = data.quanta.select_views(kept)
     return ProjectionProblem(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
+
+
+def choose_light(settings: config.ScanExperiment, times: np.ndarray) -> LightFit | None:
+    """Return the unknowns of the light that the settings ask for, at the times of the fitted views."""
+    if getattr(settings.data, "drift", 0):
+        return DriftFit(times)
+    return GainFit(times) if getattr(settings.data, "rings", "none") == "fit" else None
 
 
 def view_times(data: Projections) -> np.ndarray:
@@ -235,12 +252,17 @@ def view_times(data: Projections) -> np.ndarray:
     return np.linspace(-1.0, 1.0, len(data.y))
 
 
-def subtract_drift(problem: ProjectionProblem, data: Projections, held_out: np.ndarray, state: SolverState) -> Projections:
-    """Subtract the drift of the light from the line integrals; the fitted views determine the drift."""
-    if problem.times is None:
+def subtract_light(problem: ProjectionProblem, data: Projections, state: SolverState) -> Projections:
+    """Subtract the fitted light from the line integrals of all views; the fitted views determine it."""
+    if problem.light is None:
         return data
-    drift = fit_drift(problem.linear_problem, state.x, problem.times)
-    return replace(data, y=data.y - drift.eval(view_times(data)))
+    last = LightDrift(*(state.memory[name] for name in ("offset", "slope")))
+    drift = update_light(problem.linear_problem, problem.light, last, state.x)
+    change = drift.eval(view_times(data))
+    removed = data.removed_rings
+    if removed is not None:
+        removed = removed + change[:, change.shape[1] // 2]
+    return replace(data, y=data.y - change, removed_rings=removed)
 
 
 def start_volume(solve: config.SolveSettings, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
@@ -273,7 +295,8 @@ def make_solver(settings: config.ScanExperiment, noise: float | None) -> LinearS
     shared = {name: getattr(solve, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     if solve.discrepancy:
         shared["stop_norm"] = solve.discrepancy * noise
-    return LinearSolve(solver=solve.name, drift=getattr(settings.data, "drift", 0), **shared)
+    turn = getattr(settings.data, "drift", 0) or (GAIN_TURN if getattr(settings.data, "rings", "none") == "fit" else 0)
+    return LinearSolve(solver=solve.name, drift=turn, **shared)
 
 
 def data_norm(task: LeastSquares | PoissonCounts) -> float:

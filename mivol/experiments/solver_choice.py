@@ -42,12 +42,19 @@ def tv_strength(settings: config.SolveSettings) -> float:
     return 1.0 if settings.name == AUTO and settings.tv_unit == "noise" else 0.0
 
 
-def resolve_solver(settings: config.SolveSettings, walk: Projector) -> tuple[config.SolveSettings, list[PlanLine]]:
+ITERATIONS, GAIN_ITERATIONS = 20, 80
+"""Iterations if the settings leave them open, without and with unknown gains of the pixels."""
+
+
+def resolve_solver(
+    settings: config.SolveSettings, walk: Projector, iterations: int = ITERATIONS
+) -> tuple[config.SolveSettings, list[PlanLine]]:
     """Put values in place of all open settings.
 
     Args:
         settings: settings of a file.
         walk: projector of the fitted views, through the requested voxels.
+        iterations: iterations if the settings leave them open.
 
     Returns:
         Complete settings, and their reasons.
@@ -55,7 +62,14 @@ def resolve_solver(settings: config.SolveSettings, walk: Projector) -> tuple[con
     name = settings.solver
     start, start_line = resolve_start(settings, walk)
     parts, parts_line = resolve_supersampling(settings, walk)
-    settled = msgspec.structs.replace(settings, name=name, tv=tv_strength(settings), start=start, supersampling=parts)
+    settled = msgspec.structs.replace(
+        settings,
+        name=name,
+        tv=tv_strength(settings),
+        start=start,
+        supersampling=parts,
+        iterations=settings.iterations or iterations,
+    )
     by_table = "it has the least error with few, noisy and many views in the table of docs/benchmarks.md"
     reason = by_table if settings.name == AUTO else ALL_SOLVERS[name].promises
     return settled, [PlanLine(choice=f"solver: {name}", reason=reason), *start_line, *parts_line]

@@ -112,6 +112,7 @@ RESUMED = {
     "pcg from fdk": ["solve.start=filtered"],
     "pcg of stored rows": [PARALLEL, "solve.storage=matrix"],
     "pcg of a light that drifts": ['data={source="stack", file="y.npy", reading="line_integral", drift=2, find_axis=false}'],
+    "pcg of unknown gains": ['data={source="stack", file="y.npy", reading="line_integral", rings="fit", find_axis=false}'],
     "cgls": ["solve.nonnegative=false"],
     "sirt": [],
     "sirt from fdk": ["solve.start=filtered"],
@@ -130,7 +131,7 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
 
     Pages and curves are left out: they are drawn of these numbers."""
     changes = ["data.photons=1e4", f"solve.name={case.split()[0]}", *RESUMED[case]]
-    if "drifts" in case:
+    if "drifts" in case or "gains" in case:
         chosen = config.load(folder / "fit.toml", changes[:1])
         data = projections.make_data(chosen, folder, projections.make_grid(chosen, folder))
         np.save(folder / "y.npy", data.y + np.linspace(0, 0.1, 18)[:, None, None] * np.linspace(-1, 1, 14))

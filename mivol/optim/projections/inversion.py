@@ -1,10 +1,11 @@
 """Projections as a problem of the fit loop, with linear solvers as optimizers.
 
 Conventions. A solver needs products with the operator beyond a gradient, and therefore runs separate iterations.
-:func:`solve_with_drift` alternates between object and light drift (block descent): a few iterations of the solver explain
-``b - drift``, then the drift is fitted to the remaining part of ``b``. Each turn lowers the joint weighted least squares.
+:func:`solve_with_light` alternates between object and light (block descent): a few iterations of the solver explain ``b -
+light``, then the light (a drift, or gains of pixels) is fitted to the remaining part of ``b``. Each turn lowers the joint
+weighted least squares.
 
-References: :func:`mivol.tomography.preprocess.fit_light_drift`.
+References: :func:`mivol.tomography.preprocess.fit_light_drift`, :func:`mivol.tomography.rings.fit_gains`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import numpy as np
 
@@ -23,9 +24,49 @@ from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts,
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.optim.strategy import setting
 from mivol.tomography.preprocess import LightDrift, fit_light_drift
+from mivol.tomography.rings import fit_gains
 
 KEY = "x"
 """Name of the volume among the values."""
+
+
+class LightFit(Protocol):
+    """Unknowns of the light beside the volume.
+
+    Attributes:
+        times: (views,) times at which a :class:`LightDrift` is evaluated.
+    """
+
+    times: np.ndarray
+
+    def update(self, light: LightDrift, residual: np.ndarray, weights: np.ndarray) -> LightDrift:
+        """Fit the light to ``residual`` = b - A x (views, rows, cols), from the light of the last turn."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class DriftFit:
+    """Offset and slope of each pixel; ``times`` preferably centred at 0."""
+
+    times: np.ndarray
+
+    def update(self, light: LightDrift, residual: np.ndarray, weights: np.ndarray) -> LightDrift:
+        return fit_light_drift(residual, weights, self.times)
+
+
+OVER_RELAXATION = 1.9
+"""Step of the gains over the step that fits the residual: block descent converges below 2, and most quickly near it."""
+
+
+@dataclass(frozen=True, eq=False)
+class GainFit:
+    """A constant gain of each pixel, as an offset."""
+
+    times: np.ndarray
+
+    def update(self, light: LightDrift, residual: np.ndarray, weights: np.ndarray) -> LightDrift:
+        step = fit_gains(residual - light.offset, weights)
+        return LightDrift(light.offset + OVER_RELAXATION * step, light.slope)
 
 
 @dataclass
@@ -35,13 +76,13 @@ class ProjectionProblem(Problem):
     Attributes:
         linear_problem: the problem of line integrals.
         x: (n,) the reconstructed volume; None before the first step.
-        times: (views,) time of each view, for drifting light; constant light: None.
+        light: unknowns of the light; None: it is known.
         safe_point: called before each iteration.
     """
 
     linear_problem: LeastSquares | PoissonCounts
     x: np.ndarray | None = None
-    times: np.ndarray | None = None
+    light: LightFit | None = None
     safe_point: Callable[[], None] = lambda: None
 
     def initial_reals(self) -> Reals:
@@ -62,7 +103,7 @@ class LinearSolve(Optimizer, tag="solve"):
 
     solver: Annotated[str, setting("1", "key of ALL_SOLVERS", min_length=1)] = "pcg"
     subsets: Annotated[int, setting("1", "subsets of views, for os-sart", ge=1)] = 10
-    drift: Annotated[int, setting("iteration", "interval between fits of the light drift; 0: never", ge=0)] = 0
+    drift: Annotated[int, setting("iteration", "interval between fits of the light; 0: never", ge=0)] = 0
     relaxation: Annotated[float, setting("1", "relaxation of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
     decay: Annotated[float, setting("1", "factor on the relaxation per sweep", gt=0, le=1)] = 0.99
     window: Annotated[str, setting("1", "key of mivol.tomography.filtered.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
@@ -97,8 +138,8 @@ class SolverRun(OptimizerRun):
         solver = ALL_SOLVERS[self.settings.solver]
         problem, options = self.problem.linear_problem, self.settings.options()
         solver.check(problem, **options)
-        if self.problem.times is not None and self.settings.drift:
-            self._states = solve_with_drift(solver.run, problem, self.problem.times, self.settings.drift, state, **options)
+        if self.problem.light is not None and self.settings.drift:
+            self._states = solve_with_light(solver.run, problem, self.problem.light, self.settings.drift, state, **options)
         else:
             self._states = solver.run(problem, state, **options)
         self._store(state)
@@ -136,26 +177,26 @@ INNER = "inner."
 """Prefix for the names of the solver's own memory."""
 
 
-def solve_with_drift(
+def solve_with_light(
     run: Callable[..., Iterator[SolverState]],
     problem: LeastSquares,
-    times: np.ndarray,
+    light: LightFit,
     every: int,
     state: SolverState | None = None,
     **options: object,
 ) -> Iterator[SolverState]:
-    """Iterations of a solver, with a new fit of the drift after every ``every`` iterations.
+    """Iterations of a solver, with a new fit of the light after every ``every`` iterations.
 
     Args:
         run: of a least-squares :class:`~mivol.optim.projections.linear_problems.Solver`.
         problem: ``A`` is a projector, ``b`` and ``weights`` are (views, rows, cols).
-        times: (views,) time of each view, preferably centred at 0.
+        light: unknowns of the light.
         every: iterations of a turn.
         state: state to resume from; the memory holds the whole turn.
         options: options of the solver.
 
     Yields:
-        States of the solver, with the drift (``offset``, ``slope``) in their memory.
+        States of the solver, with the light (``offset``, ``slope``) in their memory.
     """
     done, turn, inner = 0, 0, None
     drift = LightDrift(*np.zeros((2, *problem.b.shape[1:])))
@@ -166,7 +207,7 @@ def solve_with_drift(
         own = {name.removeprefix(INNER): value for name, value in memory.items()}
         inner = replace(state, iteration=turn, memory=own)
     while True:
-        states = run(replace(problem, b=problem.b - drift.eval(times)), inner, **options)
+        states = run(replace(problem, b=problem.b - drift.eval(light.times)), inner, **options)
         for inner in itertools.islice(states, every - turn):
             done, turn = done + 1, turn + 1
             memory = {INNER + name: value for name, value in inner.memory.items()}
@@ -174,11 +215,11 @@ def solve_with_drift(
             yield replace(inner, iteration=done, memory=memory | drift_memory)
         if inner is None:
             return
-        drift = fit_drift(problem, inner.x, times)
+        drift = update_light(problem, light, drift, inner.x)
         problem, inner, turn = replace(problem, x0=inner.x), None, 0
 
 
-def fit_drift(problem: LeastSquares, x: np.ndarray, times: np.ndarray) -> LightDrift:
-    """The drift with the best fit to the residual of the volume ``x``."""
+def update_light(problem: LeastSquares, light: LightFit, last: LightDrift, x: np.ndarray) -> LightDrift:
+    """The light fitted to the residual of the volume ``x``, from the light of the last turn."""
     residual = problem.b - (problem.A @ np.reshape(x, -1)).reshape(problem.b.shape)
-    return fit_light_drift(residual, problem.weights, times)
+    return light.update(last, residual, problem.weights)
