@@ -198,6 +198,18 @@ class Detector(Section, tag_field="beam"):
         tuple[float, float], setting("length", "shift of the detector's middle along (rows, columns)")
     ] = (0.0, 0.0)
     axis_offset: Annotated[float, setting("length", "rotation axis from the middle, along the columns")] = 0.0
+    tilt: Annotated[
+        float,
+        setting("degree", "how far the axis leans towards the detector (laminography); 0: across the light", gt=-90, lt=90),
+    ] = 0.0
+    refine: Annotated[
+        tuple[Literal["shift", "axis", "tilt"], ...],
+        setting(
+            "1",
+            "geometry as unknowns of the fit; shift: displacement and turn of the detector in each view; axis: the axis along "
+            "the columns; tilt: the axis along and across the light; held-out views decide whether the result is used",
+        ),
+    ] = ()
 
 
 class Parallel(Detector, tag="parallel"):
@@ -265,6 +277,15 @@ class Known(Simulated, kw_only=True, tag_field="source", tag="volume"):
     scale: Annotated[float, setting("1/length", "factor on the volume's values", gt=0)] = 1.0
 
 
+class Phase(Section, kw_only=True):
+    """Paganin's filter of a single material."""
+
+    delta_beta: Annotated[float, setting("1", "delta / beta of the material: decrement over absorption index", gt=0)]
+    distance: Annotated[float, setting("mm", "object to detector; for a cone divided by the magnification", gt=0)]
+    energy: Annotated[float, setting("keV", "of the light", ge=1, le=1000)]
+    pixel: Annotated[float, setting("um", "edge of a pixel at the object", gt=0)]
+
+
 class Readings(Section):
     """Settings of all measured projections."""
 
@@ -284,6 +305,16 @@ class Readings(Section):
         | None
     ) = None
     drift: Annotated[int, setting("iteration", "fits of a drift of the light to each pixel; 0: none", ge=0)] = 0
+    zingers: Annotated[
+        float, setting("1", "pixels this many deviations brighter or darker than their neighbours are not used; 0: off", ge=0)
+    ] = 0.0
+    phase: Annotated[Phase | None, setting("1", "Paganin's filter, for a single material near the detector")] = None
+    hardening: Annotated[
+        int, setting("1", "degree of a polynomial that straightens line integrals of a single material; 0: off", ge=0, le=5)
+    ] = 0
+    scatter: Annotated[bool, setting("1", "with data.hardening: also fit a constant scattered light, of a single material")] = (
+        False
+    )
     rings: Annotated[
         Literal["none", "gain", "sort", "fit"],
         setting(

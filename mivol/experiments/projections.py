@@ -31,12 +31,14 @@ from mivol.tomography.preprocess import (
     count_quanta,
     find_air,
     fit_air,
+    interpolate_gaps,
     normalise_air,
     to_line_integrals,
 )
 from mivol.tomography.projector import Projector
-from mivol.tomography.rings import RING_WIDTHS, remove_rings
+from mivol.tomography.rings import RING_WIDTHS, find_zingers, remove_rings
 from mivol.tomography.rotation_axis import find_axis
+from mivol.tomography.single_material import filter_phase
 
 RAY_BYTES = 3 * 8
 """Memory per ray of a computed scan [byte]: exact value, noisy value and weight, in float64."""
@@ -55,6 +57,7 @@ class Projections:
         quanta: numbers of quanta, if known: simulated, or from readings with flats and darks.
         notes: notes for the report.
         removed_rings: (views, cols) removed from the middle row, for the report; None without ring removal.
+        pictures: (name, before, after) of other corrections, for the report; the middle row (views, cols).
         is_noise_known: whether 1 / weights are the variances; otherwise 1 / weights are only proportional to the variances.
     """
 
@@ -66,6 +69,7 @@ class Projections:
     notes: tuple[str, ...] = ()
     is_noise_known: bool = False
     removed_rings: np.ndarray | None = None
+    pictures: tuple[tuple[str, np.ndarray, np.ndarray], ...] = ()
 
     def digest(self) -> str:
         """SHA-256 of projections and weights."""
@@ -97,6 +101,7 @@ def make_beam(
         matrices = read_columns(base / scan.file, COLUMNS).reshape(-1, 3, 4)
         return panels_from_matrices(matrices, detector, settings.grid.centre, scan.first_pixel)
     offsets = {"axis_offset": scan.axis_offset if axis_offset is None else axis_offset, "detector_offset": scan.detector_offset}
+    offsets["tilt"] = np.radians(scan.tilt)
     if isinstance(scan, Cone):
         beam = ConeBeam(angles, detector, scan.source_to_axis, scan.source_to_detector, scan.pitch, **offsets)
         return beam if is_circle(scan) else helix(beam, scan.lift, scan.sources)
@@ -236,7 +241,8 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
     if angles is not None:
         notes += note_order(angles)
     transmission, light, air_notes = correct_air(readings.transmission, data.air, air)
-    notes += air_notes
+    transmission, corrections, pictures = correct_pixels(data, transmission)
+    notes += [*air_notes, *corrections]
     measured, weights = to_line_integrals(transmission)
     y, ring_notes = correct_rings(measured, weights, data)
     notes += ring_notes
@@ -260,8 +266,39 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
         else None
     )
     return Projections(
-        geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=is_noise_known, removed_rings=removed
+        geometry,
+        y,
+        weights,
+        quanta=quanta,
+        notes=tuple(notes),
+        is_noise_known=is_noise_known,
+        removed_rings=removed,
+        pictures=tuple(pictures),
     )
+
+
+def correct_pixels(
+    data: config.Readings, transmission: Transmission
+) -> tuple[Transmission, list[str], list[tuple[str, np.ndarray, np.ndarray]]]:
+    """Leave out zingers and remove phase contrast, if the settings ask for it; notes and pictures say so.
+
+    Raises:
+        MivolError: as :func:`mivol.tomography.single_material.filter_phase`.
+    """
+    notes, pictures = [], []
+    middle = transmission.value.shape[1] // 2
+    if data.zingers:
+        found = find_zingers(transmission, data.zingers)
+        before = transmission.value[:, middle]
+        transmission = replace(transmission, value=np.where(found, np.nan, transmission.value))
+        pictures.append(("zingers", before, interpolate_gaps(before[None], ~found[None, :, middle])[0]))
+        notes.append(f"{found.sum()} of {found.size} pixels are zingers or hot (data.zingers = {data.zingers:g}): not used")
+    if data.phase is not None:
+        before, chosen = transmission.value[:, middle], data.phase
+        transmission, length = filter_phase(transmission, chosen.delta_beta, chosen.distance, chosen.energy, chosen.pixel)
+        pictures.append(("phase", before, transmission.value[:, middle]))
+        notes.append(f"Paganin's filter of a single material has a length of {length:.3g} pixels (data.phase)")
+    return transmission, notes, pictures
 
 
 def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> tuple[np.ndarray, list[str]]:
@@ -320,6 +357,8 @@ def resolve_axis(
     An offset in the settings replaces the search, unless ``data.find_axis = true``.
     """
     search, known = settings.data.find_axis, settings.scan.axis_offset
+    if settings.scan.tilt and search is None:
+        return None, [f"the axis is tilted by {settings.scan.tilt:g} degrees: it is where scan.axis_offset has it, {known:g}"]
     if search or (search is None and not known):
         offset, note = find_rotation_axis(settings, base, y, weights, angles)
         return offset, [note]

@@ -31,6 +31,7 @@ from mivol.experiments.projections import (
     read_measured,
 )
 from mivol.experiments.run_folder import BestIterate, RunFolder
+from mivol.experiments.scan_corrections import refine_geometry, straighten_lines
 from mivol.experiments.solver_choice import (
     GAIN_ITERATIONS,
     ITERATIONS,
@@ -50,7 +51,7 @@ from mivol.optim.projections.inversion import DriftFit, GainFit, LightFit, Linea
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.cameras import draw_scanner
-from mivol.report.figures import plot_ring_removal, save_figure
+from mivol.report.figures import plot_moves, plot_ring_removal, save_figure
 from mivol.report.pixel_scale import is_preview_due, write_preview
 from mivol.report.record import LINES, SINOGRAM, Image, PlanLine, Volume
 from mivol.scene.explain import Explanation
@@ -104,11 +105,13 @@ class ScanFit(FitKind):
         say(f"  grid      {' x '.join(map(str, grid.shape))} voxels of {' x '.join(f'{edge:g}' for edge in edges)}")
         views, rows, columns = self.data.y.shape
         say(f"  scan      {views} views of {rows} x {columns} pixels, {describe_beam(self.settings)}")
+        self.data = straighten_lines(self.settings, self.data)
+        self.held_out = held_out_views(self.settings, views)
+        self.data, self.alignment = refine_geometry(self.settings, grid, self.data, self.held_out)
+        self.kept = fitted_views(self.held_out, views)
         for note in self.data.notes:
             say(f"  data      {note}")
         self.record.notes += self.data.notes
-        self.held_out = held_out_views(self.settings, views)
-        self.kept = fitted_views(self.held_out, views)
         say(f"  held out  {len(self.held_out)} views")
         iterations = GAIN_ITERATIONS if getattr(self.settings.data, "rings", "none") == "fit" else ITERATIONS
         walk = Projector(self.data.geometry, grid, self.kept)
@@ -171,6 +174,11 @@ class ScanFit(FitKind):
     def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
         volume = fit.run.state.x.reshape(self.projector.grid.shape)
         write_outputs(run, self.projector, self.grid, self.data, self.held_out, volume)
+        if self.alignment is not None:
+            moves, found = self.alignment.moves, self.alignment
+            save_figure(plot_moves(moves, found.before, found.after), run.path / "moves.png")
+            caption = "fitted moves of the detector, and the residual of held-out views without and with them"
+            self.record.images.append(Image(path="moves.png", role="picture", caption=caption))
         write_best(run, self.grid, best)
 
     def rehearse(self, say: Say) -> Explanation:
@@ -340,6 +348,9 @@ def write_outputs(
         before, after = data.y[:, middle] + data.removed_rings, data.y[:, middle]
         save_figure(plot_ring_removal(before, after), run.path / "rings.png")
         record.images.append(Image(path="rings.png", role="picture", caption=f"ring removal in {caption}, each line one view"))
+    for name, before, after in data.pictures:
+        save_figure(plot_ring_removal(before, after), run.path / f"{name}.png")
+        record.images.append(Image(path=f"{name}.png", role="picture", caption=f"{name} in {caption}, each line one view"))
     run.write_curves()
     record.results["views"] = float(projector.n_views - len(held_out))
     if data.truth is not None:

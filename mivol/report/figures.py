@@ -273,6 +273,29 @@ def plot_ring_removal(before: NDArray, after: NDArray) -> Figure:
     return figure
 
 
+def plot_moves(moves: NDArray, before: NDArray, after: NDArray) -> Figure:
+    """Plot where the detector stood in each view, and the residual of held-out views without and with it.
+
+    Args:
+        moves: (views, 3) along rows and columns [pixel], turn [rad].
+        before, after: (held-out views,) mean squared residuals.
+    """
+    with mpl.rc_context(STYLE):
+        figure = empty_figure(8.4, 3.0)
+        left, middle, right = figure.subplots(1, 3)
+        left.plot(moves[:, 0], label="along the rows")
+        left.plot(moves[:, 1], label="along the columns")
+        left.set(xlabel="view", ylabel="shift [pixel]")
+        left.legend()
+        middle.plot(np.degrees(moves[:, 2]))
+        middle.set(xlabel="view", ylabel="turn [degree]")
+        right.plot(np.sqrt(before), "o", label="as given")
+        right.plot(np.sqrt(after), "o", label="fitted")
+        right.set(xlabel="held-out view", ylabel="residual (RMS)", ylim=(0, None))
+        right.legend()
+    return figure
+
+
 def _show_pixels(axes: Axes, rgb: NDArray[np.uint8], aspect: float) -> None:
     axes.imshow(rgb, aspect=rgb.shape[1] / rgb.shape[0] / aspect)
     axes.set(xticks=[], yticks=[])

@@ -165,7 +165,14 @@ class PencilRays:
 
 
 class _TurningDetector:
-    """A flat detector that turns with the beam about the z axis."""
+    """A flat detector that turns with the beam about the z axis.
+
+    Tilt. The axis leans by ``tilt`` towards the detector: the light runs along ``cos(tilt) w + sin(tilt) z``, and the rows
+    along ``cos(tilt) z - sin(tilt) w`` (laminography; 0: the light is perpendicular to the axis).
+
+    Moves. In a view, the detector stands displaced by (along v, along u) pixels, and turned in its plane about its middle, from
+    the columns towards the rows [rad]. The object then appears displaced the other way.
+    """
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -191,6 +198,37 @@ class _TurningDetector:
         rows = self.detector[0]
         return (np.arange(rows) - (rows - 1) / 2) * self.pitch[0] + self.detector_offset[0]
 
+    @property
+    def is_upright(self) -> bool:
+        """Whether all views have their columns along the rotation axis, and their light perpendicular to it."""
+        return not self.tilt and self.moves is None
+
+    def _axes(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Directions (views, 3) of the columns, of the rows and of the light."""
+        u, w = _beam_axes(self.angles[index])
+        if not self.tilt:
+            return u, np.broadcast_to(_Z, u.shape), w
+        c, s = np.cos(self.tilt), np.sin(self.tilt)
+        return u, c * _Z - s * w, c * w + s * _Z
+
+    def _panels(self, index: np.ndarray, source: np.ndarray, corner: np.ndarray, u: np.ndarray, v: np.ndarray) -> Panels:
+        """The panels of views, moved; ``u`` and ``v`` are directions."""
+        along_u, along_v = self.pitch[1] * u, self.pitch[0] * v
+        if self.moves is None:
+            return Panels(source, corner, along_u, along_v)
+        rows, columns = (n - 1 for n in self.detector)
+        row, column, turn = self.moves[index].T[..., None]
+        middle = corner + (columns / 2 + column) * along_u + (rows / 2 + row) * along_v
+        c, s = np.cos(turn), np.sin(turn)
+        along_u, along_v = self.pitch[1] * (c * u + s * v), self.pitch[0] * (c * v - s * u)
+        return Panels(source, middle - columns / 2 * along_u - rows / 2 * along_v, along_u, along_v)
+
+    def _pixels(self, panels: Panels) -> np.ndarray:
+        """Positions (views, rows, cols, 3) of the pixels' middles."""
+        rows, columns = (np.arange(n, dtype=float) for n in self.detector)
+        row = panels.corner[:, None, None] + rows[:, None, None] * panels.along_v[:, None, None]
+        return row + columns[:, None] * panels.along_u[:, None, None]
+
 
 @with_short_repr
 @dataclass(frozen=True, eq=False)
@@ -204,6 +242,8 @@ class ParallelBeam(_TurningDetector):
         axis_offset: position of the rotation axis on the detector, from the middle of the detector along +u [length]. An axis
             at column ``c`` (pixel centres are whole numbers) means ``(c - (columns - 1) / 2) * pitch``.
         detector_offset: shift of the detector's middle (along v, along u) [length]; along u the shift cancels ``axis_offset``.
+        tilt: angle by which the axis leans towards the detector [rad]; 0: the light is perpendicular to the axis.
+        moves: (views, 3) displacement (along v, along u) [pixel] and turn in its plane [rad] of the detector; None: 0.
     """
 
     angles: np.ndarray
@@ -211,6 +251,8 @@ class ParallelBeam(_TurningDetector):
     pitch: float | tuple[float, float] = 1.0
     axis_offset: float = 0.0
     detector_offset: tuple[float, float] = (0.0, 0.0)
+    tilt: float = 0.0
+    moves: np.ndarray | None = None
     whole_lines: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
@@ -218,7 +260,13 @@ class ParallelBeam(_TurningDetector):
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Points of the lines nearest the rotation axis, and unit directions, each (views, rows, cols, 3) float64."""
-        u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
+        index = view_index(views, len(self.angles))
+        if not self.is_upright:
+            panels = self.panels(index)
+            pixels = self._pixels(panels)
+            d = panels.source[:, None, None]
+            return pixels - (pixels * d).sum(-1, keepdims=True) * d, np.broadcast_to(d, pixels.shape)
+        u, w = _beam_axes(self.angles[index])
         v_of_row, u_of_col = self.v, self.u
         o = np.zeros((len(u), *self.detector, 3))
         o += u_of_col[:, None] * u[:, None, None, :]
@@ -227,8 +275,9 @@ class ParallelBeam(_TurningDetector):
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
         """The detector's plane through the axis; ``source`` is the direction of the light."""
-        u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
-        return Panels(w, self.u[0] * u + self.v[0] * _Z, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
+        index = view_index(views, len(self.angles))
+        u, v, w = self._axes(index)
+        return self._panels(index, w, self.u[0] * u + self.v[0] * v, u, v)
 
 
 @with_short_repr
@@ -244,6 +293,8 @@ class ConeBeam(_TurningDetector):
         pitch: distance of pixel centres on the detector [length], a number or (along v, along u).
         axis_offset: distance of the rotation axis from the central ray along +u, in the axis' plane (not magnified) [length].
         detector_offset: shift of the detector's middle from the central ray (along v, along u) [length].
+        tilt: angle by which the axis leans towards the detector [rad]; 0: the central ray is perpendicular to the axis.
+        moves: (views, 3) displacement (along v, along u) [pixel] and turn in its plane [rad] of the detector; None: 0.
     """
 
     angles: np.ndarray
@@ -253,6 +304,8 @@ class ConeBeam(_TurningDetector):
     pitch: float | tuple[float, float] = 1.0
     axis_offset: float = 0.0
     detector_offset: tuple[float, float] = (0.0, 0.0)
+    tilt: float = 0.0
+    moves: np.ndarray | None = None
     whole_lines: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
@@ -266,7 +319,12 @@ class ConeBeam(_TurningDetector):
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The source, and unit directions towards the pixel centres, each (views, rows, cols, 3) float64."""
-        u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
+        index = view_index(views, len(self.angles))
+        if not self.is_upright:
+            panels = self.panels(index)
+            d = self._pixels(panels) - panels.source[:, None, None]
+            return np.broadcast_to(panels.source[:, None, None], d.shape), d / np.linalg.norm(d, axis=-1, keepdims=True)
+        u, w = _beam_axes(self.angles[index])
         v_of_row, u_of_col = self.v, self.u
         source = self._sources(u, w)
         d = np.zeros((len(u), *self.detector, 3))
@@ -277,10 +335,11 @@ class ConeBeam(_TurningDetector):
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
         """Source and detector of each view."""
-        u, w = _beam_axes(self.angles[view_index(views, len(self.angles))])
+        index = view_index(views, len(self.angles))
+        u, v, w = self._axes(index)
         source = self._sources(u, w)
-        corner = source + (self.u[0] + self.axis_offset) * u + self.v[0] * _Z + self.source_to_detector * w
-        return Panels(source, corner, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
+        corner = source + (self.u[0] + self.axis_offset) * u + self.v[0] * v + self.source_to_detector * w
+        return self._panels(index, source, corner, u, v)
 
     def _sources(self, u: np.ndarray, w: np.ndarray) -> np.ndarray:
         return -self.axis_offset * u - self.source_to_axis * w
@@ -316,6 +375,13 @@ def _check_detector(beam: ParallelBeam | ConeBeam) -> None:
     offsets = [beam.axis_offset, *np.atleast_1d(beam.detector_offset).tolist()]
     if _to_finite(offsets).shape != (3,):
         raise MivolError(f"Found offsets {offsets} of axis and detector (v, u), expected three finite lengths.")
+    if not abs(beam.tilt) < np.pi / 2:
+        raise MivolError(f"Found a tilt of {beam.tilt} rad, expected less than a quarter of a turn either way.")
+    if beam.moves is not None:
+        moves = _to_finite(beam.moves)
+        if moves.shape != (len(angles), 3):
+            raise MivolError(f"Found moves of shape {np.shape(beam.moves)}, expected three finite numbers a view.")
+        object.__setattr__(beam, "moves", _make_read_only(moves))
     object.__setattr__(beam, "angles", _make_read_only(angles))
     object.__setattr__(beam, "detector", detector)
     object.__setattr__(beam, "pitch", tuple(map(float, pitch)))

@@ -1,4 +1,4 @@
-"""Rings: steps between the columns of a sinogram, such as of pixels whose gain the flats do not have.
+"""Faults of pixels: rings, steps between the columns of a sinogram by gains that the flats do not have; and zingers.
 
 :func:`remove_rings` removes them from line integrals alone. :func:`fit_gains` finds what is left as the residual of a volume.
 """
@@ -11,7 +11,7 @@ from scipy.sparse import diags_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from mivol.errors import MivolError
-from mivol.tomography.preprocess import interpolate_gaps
+from mivol.tomography.preprocess import Transmission, interpolate_gaps
 
 RING_WIDTHS = {"gain": 14, "sort": 7}
 """Default width [column] by method, chosen by a head and forty ellipsoids in 129 columns with gains of 2 %: 6 and 10 leave more
@@ -82,6 +82,37 @@ def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
     second = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(columns - 2, columns)).tocsr()[is_smooth]
     normal = eye_array(columns) + (width / (2 * np.pi)) ** 4 * second.T @ second
     return y - steps - spsolve(normal.tocsc(), (width / (2 * np.pi)) ** 4 * (second.T @ bend[is_smooth]))
+
+
+def find_zingers(transmission: Transmission, threshold: float) -> np.ndarray:
+    """Find pixels hit by cosmic rays and hot pixels: (views, rows, cols) bool.
+
+    A pixel is compared with the median of the 3 x 3 pixels around it, and with the median of the same pixel in the views
+    before and after: it must differ from both medians by ``threshold`` deviations, the same way. The deviation of a
+    difference is that of the noise, and at least the robust deviation of all differences in the view.
+
+    Args:
+        transmission: (views, rows, cols) with its variance.
+        threshold: deviations above which a pixel is not used.
+    """
+    value = transmission.value
+    seen = np.isfinite(value)
+    filled = interpolate_gaps(np.where(seen, value, 0.0), seen)
+    noise = np.sqrt(np.where(seen, np.maximum(transmission.variance, 0.0), 0.0))
+    size = (1, 3 if value.shape[1] >= 3 else 1, 3)
+    shape = (3, 1, 1) if len(value) >= 3 else (1, 1, 1)
+    # A hot pixel is hot in all views: the neighbours in the view alone tell.
+    around, before = filled - median_filter(filled, size), filled - median_filter(filled, shape)
+    scale = 1.4826 * np.median(np.abs(around), axis=(1, 2), keepdims=True)
+    far = around / np.maximum(np.maximum(noise, scale), 1e-12)
+    near = before / np.maximum(noise, 1e-12)
+    jumps = (np.abs(far) > threshold) & (np.abs(near) > threshold) & (far * near > 0)
+    hot = np.mean(np.abs(far) > threshold, axis=0) > HOT_SHARE
+    return seen & (jumps | hot)
+
+
+HOT_SHARE = 0.75
+"""Share of the views in which a hot pixel differs from its neighbours: a detail of the object moves on."""
 
 
 def fit_gains(residual: np.ndarray, weights: np.ndarray, period: float = GAIN_PERIOD) -> np.ndarray:

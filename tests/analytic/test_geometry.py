@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -333,3 +334,30 @@ def test_edges_do_not_ripple_in_finer_unknowns(variant_rgb: str) -> None:
         errors[parts] = [nrmse(voxel_means(state.x.reshape(a.grid.shape), grid.shape), truth) for state in states]
     assert errors[1][-1] > 1.33 * min(errors[1])
     assert errors[2][-1] < 1.1 * min(errors[2]) < 1.1 * min(errors[1])
+
+
+@pytest.mark.parametrize("kind", ["parallel", "cone"])
+def test_moved_and_tilted_detectors(kind: str) -> None:
+    """Rays by hand: a pixel of a detector that is displaced, turned about its middle, and leans with the light."""
+    angles, tilt = np.array([0.3, 1.9]), 0.2
+    moves = np.array([[0.5, -1.25, 0.1], [0.0, 2.0, -0.3]])
+    more = {"pitch": (0.5, 0.25), "axis_offset": 0.3, "detector_offset": (0.1, 0.2), "tilt": tilt, "moves": moves}
+    beam = ConeBeam(angles, (4, 6), 5.0, 9.0, **more) if kind == "cone" else ParallelBeam(angles, (4, 6), **more)
+    o, d = beam.rays()
+    for view, angle in enumerate(angles):
+        row, column, turn = moves[view]
+        u = np.array([np.cos(angle), np.sin(angle), 0])
+        w = np.array([-np.sin(angle) * np.cos(tilt), np.cos(angle) * np.cos(tilt), np.sin(tilt)])
+        v = np.cross(u, w)
+        offset = 0.2 - (0.3 if kind == "parallel" else 0.0)
+        source = -0.3 * u - 5 * w
+        middle = (offset + 0.25 * column) * u + (0.1 + 0.5 * row) * v + (source + 9 * w if kind == "cone" else 0)
+        across, up = np.cos(turn) * u + np.sin(turn) * v, np.cos(turn) * v - np.sin(turn) * u
+        pixel = middle + (1 - 2.5) * 0.25 * across + (3 - 1.5) * 0.5 * up
+        light = w if kind == "parallel" else (pixel - source) / np.linalg.norm(pixel - source)
+        np.testing.assert_allclose(d[view, 3, 1], light, atol=1e-14)
+        np.testing.assert_allclose(np.cross(pixel - o[view, 3, 1], light), 0, atol=1e-14)
+    with pytest.raises(MivolError, match="moves of shape"):
+        replace(beam, moves=moves[:, :2])
+    with pytest.raises(MivolError, match="tilt of 2 rad"):
+        replace(beam, tilt=2)

@@ -12,8 +12,9 @@ from mivol.errors import MivolError
 from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import random_ellipsoids, shepp_logan
+from mivol.tomography.preprocess import Transmission
 from mivol.tomography.projector import Projector
-from mivol.tomography.rings import RING_WIDTHS, fit_gains, remove_rings
+from mivol.tomography.rings import RING_WIDTHS, find_zingers, fit_gains, remove_rings
 from mivol.validate.metrics import nrmse
 
 
@@ -98,6 +99,24 @@ def test_gains_of_a_residual_are_its_mean_without_slow_changes() -> None:
     wanted[1, 4] = 0
     np.testing.assert_allclose(fit_gains(residual, weights, 9), wanted, atol=1e-12)
     assert not fit_gains(residual[..., :2], weights[..., :2]).any()
+
+
+def test_zingers_and_hot_pixels_are_found() -> None:
+    """A bright pixel in one view, a dark one in another, and one that is bright in all; noise of five deviations is not."""
+    rng = np.random.default_rng(2)
+    value = 0.5 + 0.01 * rng.standard_normal((40, 6, 30))
+    value[3, 2, 7] += 0.3
+    value[9, 4, 20] -= 0.3
+    value[:, 1, 12] += 0.3
+    value[5, 5, 5] = np.nan
+    found = find_zingers(Transmission(value, np.full(value.shape, 1e-4)), 8.0)
+    wanted = np.zeros(value.shape, bool)
+    wanted[3, 2, 7] = wanted[9, 4, 20] = True
+    wanted[:, 1, 12] = True
+    np.testing.assert_array_equal(found, wanted)
+    # A step that stays is an edge, and a row alone has neighbours too.
+    edge = np.where(np.arange(30) < 11, 0.2, 0.9) * np.ones((5, 1, 1))
+    assert not find_zingers(Transmission(edge, np.full(edge.shape, 1e-4)), 8.0).any()
 
 
 COLUMNS, VIEWS, PITCH = 129, 180, 2.2 / 129

@@ -1,0 +1,89 @@
+"""Corrections of a scan that need its geometry: beam hardening and scattered light, and a fitted geometry.
+
+Each returns the projections with a line that says what was done. Without the setting the same projections return.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mivol import config
+from mivol.errors import MivolError
+from mivol.experiments.projections import Projections, grid_of_detector
+from mivol.optim.projections.alignment import Alignment, align_views
+from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
+from mivol.tomography.projector import Projector
+from mivol.tomography.single_material import fit_hardening
+
+MOST_ROWS = 8
+"""Rows in the middle of a parallel beam's detector by which beam hardening is fitted."""
+
+
+def straighten_lines(settings: config.ScanExperiment, data: Projections) -> Projections:
+    """Straighten line integrals against beam hardening and scattered light, if the settings ask for it.
+
+    Raises:
+        MivolError: a degree of 1, scatter alone, another beam than a circle, or as :func:`fit_hardening`.
+    """
+    degree, with_scatter = getattr(settings.data, "hardening", 0), getattr(settings.data, "scatter", False)
+    if not degree:
+        if with_scatter:
+            raise MivolError("found data.scatter without data.hardening, expected both: set data.hardening = 2 or more.")
+        return data
+    if degree == 1:
+        raise MivolError("found data.hardening = 1, which changes nothing, expected a degree of 2 to 5, or 0.")
+    beam = data.geometry
+    if not isinstance(beam, ParallelBeam | ConeBeam):
+        raise MivolError("found data.hardening with a table of views, expected a beam on a circle: leave it out.")
+    part = slice(None)
+    if isinstance(beam, ParallelBeam) and beam.is_upright and data.y.shape[1] > MOST_ROWS:
+        first = (data.y.shape[1] - MOST_ROWS) // 2
+        part = slice(first, first + MOST_ROWS)
+        beam = replace(beam, detector=(MOST_ROWS, data.y.shape[2]), detector_offset=(0.0, beam.detector_offset[1]))
+    found = fit_hardening(Projector(beam, grid_of_detector(beam)), data.y[:, part], data.weights[:, part], degree, with_scatter)
+    y, weights = found.straighten(data.y, data.weights)
+    terms = " ".join(f"{c:+.3g} y^{k}" for k, c in enumerate(found.coefficients, 2))
+    light = f", scattered light {found.scatter:.3g} of the light" if with_scatter else ""
+    note = (
+        f"line integrals y are straightened to y {terms}{light} (data.hardening = {degree}): their misfit to one material "
+        f"falls to {found.misfit:.2f} of what it was"
+    )
+    middle = y.shape[1] // 2
+    picture = ("hardening", data.y[:, middle], y[:, middle])
+    return replace(data, y=y, weights=weights, notes=(*data.notes, note), pictures=(*data.pictures, picture))
+
+
+def refine_geometry(
+    settings: config.ScanExperiment, grid: VoxelGrid, data: Projections, held_out: np.ndarray
+) -> tuple[Projections, Alignment | None]:
+    """Fit the geometry as unknowns, if the settings ask for it.
+
+    Raises:
+        MivolError: as :func:`align_views`.
+    """
+    names = getattr(settings.scan, "refine", ())
+    if not names:
+        return data, None
+    found = align_views(data.geometry, grid, data.y, data.weights, names, held_out)
+    lines = []
+    if "shift" in names:
+        size = np.sqrt(np.mean((found.moves - found.moves.mean(0)) ** 2, axis=0))
+        lines.append(
+            f"views shifted by {size[0]:.2g} +- {found.sigma[0]:.1g} (rows) and {size[1]:.2g} +- {found.sigma[1]:.1g} pixels "
+            f"(columns), turned by {np.degrees(size[2]):.2g} +- {np.degrees(found.sigma[2]):.1g} degrees (RMS)"
+        )
+    if "axis" in names:
+        lines.append(f"the axis {found.axis[0]:+.3f} +- {found.axis[1]:.3f} pixels from where it was")
+    if "tilt" in names:
+        (along, across), (along_sigma, across_sigma) = np.degrees(found.tilt)
+        lines.append(
+            f"the axis tilted by {along:.3f} +- {along_sigma:.3f} degrees along the light and {across:.3f} +- "
+            f"{across_sigma:.3f} across it"
+        )
+    ratio = np.sqrt(found.after.mean() / max(found.before.mean(), 1e-30))
+    judged = f"the residual of {len(found.after)} held-out views falls to {ratio:.2f}"
+    used = judged if found.is_needed else f"{judged}, no more than by chance: the geometry stays as it was"
+    note = f"fitted geometry (scan.refine): {'; '.join(lines)}; {used}"
+    return replace(data, geometry=found.beam, notes=(*data.notes, note)), found

@@ -1,0 +1,88 @@
+"""Geometry as unknowns of the fit: moves of views, the axis and its tilt, found again in computed scans."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mivol.errors import MivolError
+from mivol.optim.projections.alignment import align_views
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.phantoms import random_ellipsoids
+
+NONE = np.arange(0)
+
+
+def scan(views: int, rows: int, columns: int, **changes) -> tuple[ParallelBeam, VoxelGrid, np.ndarray]:
+    """A beam, voxels, and exact line integrals of the beam with changes, up to 2."""
+    beam = ParallelBeam(np.arange(views) * np.pi / views, (rows, columns))
+    y = random_ellipsoids(40, 3, 0.4 * columns).project(replace(beam, **changes))
+    return beam, VoxelGrid((rows, columns, columns)), 2 * y / y.max()
+
+
+def without_gauge(moves: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Moves along the columns without those of a displaced object."""
+    design = np.stack([np.cos(angles), np.sin(angles)], 1)
+    return moves - design @ np.linalg.lstsq(design, moves, rcond=None)[0]
+
+
+def test_shifts_of_a_slice_are_found(variant_rgb) -> None:
+    """One row, 24 views, shifts of a pixel: found to a tenth; held-out views say that they are needed."""
+    rng = np.random.default_rng(4)
+    moves = np.zeros((24, 3))
+    moves[:, 1] = rng.standard_normal(24)
+    beam, grid, y = scan(24, 1, 48, moves=moves)
+    found = align_views(beam, grid, y, np.ones(y.shape), ["shift"], NONE)
+    error = without_gauge(found.moves[:, 1] - moves[:, 1], beam.angles)
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert found.is_needed and found.beam.moves is not None and not found.moves[:, [0, 2]].any()
+    assert found.after.mean() < 0.1 * found.before.mean()
+
+
+def test_still_views_stay(variant_rgb) -> None:
+    beam, grid, y = scan(24, 1, 48)
+    found = align_views(beam, grid, y, np.ones(y.shape), ["shift"], NONE, rounds=3)
+    assert not found.is_needed and found.beam is beam
+
+
+@pytest.mark.parametrize(
+    ("refine", "views", "said"),
+    [
+        (["shifts"], 24, "found scan.refine = .*expected some of shift, axis, tilt"),
+        ([], 24, "expected some of"),
+        (["shift"], 7, "found 7 views, expected at least 8"),
+        (["tilt"], 24, "found 1 rows, expected at least 8"),
+    ],
+)
+def test_refusals(variant_rgb, refine: list[str], views: int, said: str) -> None:
+    beam = ParallelBeam(np.arange(views) * np.pi / views, (1, 16))
+    with pytest.raises(MivolError, match=said):
+        align_views(beam, VoxelGrid((1, 16, 16)), np.zeros(beam.shape), np.ones(beam.shape), refine, NONE)
+
+
+@pytest.mark.slow
+def test_shifts_and_turns_of_ninety_views(variant_rgb) -> None:
+    """Shifts of a pixel along rows and columns, turns of half a degree, 1e4 quanta: found to .05 pixels and .1 degree."""
+    rng = np.random.default_rng(0)
+    moves = rng.standard_normal((90, 3)) * [1, 1, 0.01]
+    beam, grid, exact = scan(90, 32, 96, moves=moves)
+    counts = np.maximum(rng.poisson(1e4 * np.exp(-exact)), 1.0)
+    found = align_views(beam, grid, -np.log(counts / 1e4), counts, ["shift"], NONE)
+    error = found.moves - moves
+    error[:, 1] = without_gauge(error[:, 1], beam.angles)
+    error[:, 0] -= error[:, 0].mean()
+    assert (np.sqrt(np.mean(error**2, axis=0)) < [0.05, 0.05, 0.002]).all()
+    assert found.is_needed
+
+
+@pytest.mark.slow
+def test_tilt_of_the_axis(variant_rgb) -> None:
+    """A degree along the light and half a degree across it: within a sixth of a degree, and of four deviations."""
+    moves = np.tile([0, 0, 0.01], (48, 1))
+    beam, grid, y = scan(48, 24, 64, tilt=0.02, moves=moves)
+    found = align_views(beam, grid, y, np.ones(y.shape), ["tilt"], NONE)
+    error = found.tilt[0] - [0.02, 0.01]
+    assert (np.abs(error) < 0.003).all() and (np.abs(error) < 4 * found.tilt[1]).all()
+    assert found.is_needed
