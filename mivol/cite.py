@@ -242,6 +242,28 @@ CITATIONS: dict[str, Citation] = {
         "Optics Express 26(22), 28396-28412",
         "https://doi.org/10.1364/OE.26.028396",
     ),
+    "paganin_2002": Citation(
+        "D. Paganin, S. C. Mayo, T. E. Gureyev, P. R. Miller, S. W. Wilkins",
+        2002,
+        "Simultaneous phase and amplitude extraction from a single defocused image of a homogeneous object",
+        "Journal of Microscopy 206(1), 33-40",
+        "https://doi.org/10.1046/j.1365-2818.2002.01010.x",
+    ),
+    "penczek_1994": Citation(
+        "P. A. Penczek, R. A. Grassucci, J. Frank",
+        1994,
+        "The ribosome at improved resolution: new techniques for merging and orientation refinement in 3D cryo-electron "
+        "microscopy of biological particles",
+        "Ultramicroscopy 53(3), 251-270",
+        "https://doi.org/10.1016/0304-3991(94)90038-8",
+    ),
+    "krumm_2008": Citation(
+        "M. Krumm, S. Kasperl, M. Franz",
+        2008,
+        "Reducing non-linear artifacts of multi-material objects in industrial 3D computed tomography",
+        "NDT & E International 41(4), 242-251",
+        "https://doi.org/10.1016/j.ndteint.2007.12.001",
+    ),
     "eilers_2003": Citation(
         "P. H. C. Eilers",
         2003,

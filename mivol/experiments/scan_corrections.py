@@ -21,6 +21,16 @@ MOST_ROWS = 8
 """Rows in the middle of a parallel beam's detector by which beam hardening is fitted."""
 
 
+def correction_citations(settings: config.ScanExperiment) -> list[str]:
+    """Keys of ``mivol.cite.CITATIONS`` of the corrections that the settings ask for."""
+    asked = {
+        "paganin_2002": getattr(settings.data, "phase", None),
+        "krumm_2008": getattr(settings.data, "hardening", 0),
+        "penczek_1994": getattr(settings.scan, "refine", ()),
+    }
+    return [key for key, is_set in asked.items() if is_set]
+
+
 def straighten_lines(settings: config.ScanExperiment, data: Projections) -> Projections:
     """Straighten line integrals against beam hardening and scattered light, if the settings ask for it.
 
@@ -41,7 +51,7 @@ def straighten_lines(settings: config.ScanExperiment, data: Projections) -> Proj
     if isinstance(beam, ParallelBeam) and beam.is_upright and data.y.shape[1] > MOST_ROWS:
         first = (data.y.shape[1] - MOST_ROWS) // 2
         part = slice(first, first + MOST_ROWS)
-        beam = replace(beam, detector=(MOST_ROWS, data.y.shape[2]), detector_offset=(0.0, beam.detector_offset[1]))
+        beam = replace(beam.select_rows(part), detector_offset=(0.0, beam.detector_offset[1]))
     found = fit_hardening(Projector(beam, grid_of_detector(beam)), data.y[:, part], data.weights[:, part], degree, with_scatter)
     y, weights = found.straighten(data.y, data.weights)
     terms = " ".join(f"{c:+.3g} y^{k}" for k, c in enumerate(found.coefficients, 2))
@@ -66,6 +76,8 @@ def refine_geometry(
     names = getattr(settings.scan, "refine", ())
     if not names:
         return data, None
+    if not isinstance(data.geometry, ParallelBeam | ConeBeam):
+        raise MivolError("found scan.refine on another trajectory, expected a parallel or cone beam on a circle: leave it out.")
     found = align_views(data.geometry, grid, data.y, data.weights, names, held_out)
     lines = []
     if "shift" in names:

@@ -31,7 +31,7 @@ from mivol.experiments.projections import (
     read_measured,
 )
 from mivol.experiments.run_folder import BestIterate, RunFolder
-from mivol.experiments.scan_corrections import refine_geometry, straighten_lines
+from mivol.experiments.scan_corrections import correction_citations, refine_geometry, straighten_lines
 from mivol.experiments.solver_choice import (
     GAIN_ITERATIONS,
     ITERATIONS,
@@ -94,7 +94,7 @@ class ScanFit(FitKind):
             "plan": [
                 PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias")
             ],
-            "citations": ["mitsuba3", "drjit", *ALL_SOLVERS[name].cites, *prior, *rings],
+            "citations": ["mitsuba3", "drjit", *ALL_SOLVERS[name].cites, *prior, *rings, *correction_citations(settings)],
         }
 
     def load(self, say: Say) -> None:

@@ -129,6 +129,15 @@ def _check_settings(settings: config.ScanExperiment) -> None:
         raise MivolError('slabs need projections by rows, found data.source = "volume": use "shepp_logan" or measured data.')
     if settings.solve.name == "ml-tr" or getattr(settings.data, "drift", 0):
         raise MivolError("slabs take neither ml-tr nor data.drift, which need all rows at once: choose another solver.")
+    whole = {
+        'data.rings = "fit"': getattr(settings.data, "rings", "none") == "fit",
+        "data.hardening": getattr(settings.data, "hardening", 0),
+        "scan.refine": getattr(settings.scan, "refine", ()),
+        "scan.tilt": getattr(settings.scan, "tilt", 0.0),
+    }
+    found = [name for name, is_set in whole.items() if is_set]
+    if found:
+        raise MivolError(f"slabs do not take {found[0]}, which needs all rows at once: leave it out, or leave out [slabs].")
     if not (config.is_circle(settings.scan) or isinstance(settings.scan, config.OfData)):
         raise MivolError("slabs need a circle about z, found another trajectory: leave out [slabs].")
 

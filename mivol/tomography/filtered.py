@@ -105,6 +105,7 @@ def _parallel_weights(projector: Projector) -> np.ndarray:
         raise MivolError(
             f"Found {type(beam).__name__}, expected a ParallelBeam: fdk is filtered back-projection of a ConeBeam."
         )
+    _check_tilt(beam.tilt)
     angles, u = beam.angles[projector.views], beam.u
     if not covers_circle(angles, np.pi):
         gap = np.degrees(widest_gap(angles, np.pi)[0])
@@ -115,6 +116,18 @@ def _parallel_weights(projector: Projector) -> np.ndarray:
     if covers_circle(angles, 2 * np.pi):
         return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_weights(u)
     return np.broadcast_to(angle_steps(angles, np.pi)[:, None], (len(angles), len(u)))
+
+
+MOST_TILT = 0.1
+"""Tilt [rad] up to which the ramp along the rows serves: its cosine, by which values are wrong, is then 0.995."""
+
+
+def _check_tilt(tilt: float) -> None:
+    if abs(tilt) > MOST_TILT:
+        raise MivolError(
+            f"found an axis tilted by {np.degrees(tilt):.3g} degrees, expected at most {np.degrees(MOST_TILT):.1f} for "
+            "filtered back-projection: choose an iterative solver."
+        )
 
 
 def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
@@ -187,6 +200,7 @@ def _circle_weights(projector: Projector) -> np.ndarray:
             f"Found {type(beam).__name__}, expected a ConeBeam on a circle: fbp is for parallel beams, for any other "
             "trajectory choose an iterative solver."
         )
+    _check_tilt(beam.tilt)
     distance, tau = beam.source_to_axis, beam.axis_offset
     gamma = np.arctan2((beam.u + tau) * _scale_to_axis(beam), distance) - np.arctan2(tau, distance)
     return cone_weights(beam.angles[projector.views], gamma, _object_fan(projector, gamma))

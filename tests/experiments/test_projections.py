@@ -85,7 +85,8 @@ def test_some_ray_must_meet_the_grid(views: int, asked: list[int], seen: float) 
 
 def scan(**data: object) -> SimpleNamespace:
     """The settings of a measured scan in parallel light of 2 x 3 pixels of 1 x 0.5."""
-    data = {"air": 0, "find_axis": False, "drift": 0, "saturation": 99.0, "rings": "none", "ring_width": None} | data
+    plain = {"air": 0, "find_axis": False, "drift": 0, "saturation": 99.0, "rings": "none", "ring_width": None}
+    data = plain | {"zingers": 0.0, "phase": None} | data
     beam = Parallel(views=2, detector=(2, 3), pitch=(1.0, 0.5), axis_offset=0.25)
     return SimpleNamespace(data=SimpleNamespace(**data), scan=beam, solve=config.SolveSettings("pcg"))
 
@@ -98,7 +99,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> ScanReadings:
     found = ScanReadings(
         Transmission(value, np.full(value.shape, 1e-4)), np.array([0.0, 1.0]), None, ("r", "f", "d"), ("noted",)
     )
-    monkeypatch.setattr(projections, "read_scan", lambda chosen, base: found)
+    monkeypatch.setattr(projections, "read_scan", lambda chosen, base, rows=None: found)
     return found
 
 

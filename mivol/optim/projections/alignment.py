@@ -12,7 +12,7 @@ large detectors are averaged over blocks.
 Gauge. A displaced object cannot be told from views displaced by ``a cos(theta) + b sin(theta)`` along the columns and by a
 constant along the rows: both are removed from the moves.
 
-References: Penczek, Renka & Schomberg 1994, J. Opt. Soc. Am. A 11, 1 (projection matching); Gursoy et al. 2017, Sci. Rep. 7,
+References: Penczek, Grassucci & Frank 1994, Ultramicroscopy 53, 251 (projection matching); Gursoy et al. 2017, Sci. Rep. 7,
 11818 (rounds of reconstruction and alignment); White 1980, Econometrica 48, 817 (variance from the scatter of parts).
 """
 

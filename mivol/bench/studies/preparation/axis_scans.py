@@ -42,6 +42,7 @@ class AxisScan:
         return self.offset + (self.columns - 1) / 2
 
     def beam(self) -> ParallelBeam:
+        """The beam, with pixels of 1."""
         angles = np.radians(self.arc) * np.arange(self.views) / self.views
         return ParallelBeam(angles, (self.rows, self.columns), 1.0, axis_offset=self.offset)
 
