@@ -576,7 +576,7 @@ def written(
     weights = np.full(y.shape, 4.0)
     weights[..., 0] = 0 if is_noise_known else 4.0
     beam = ParallelBeam(np.arange(len(y)) / len(y), y.shape[1:])
-    facts = {"is_noise_known": is_noise_known, "removed_rings": removed_rings}
+    facts = {"is_noise_known": is_noise_known, "removed_rings": removed_rings, "pictures": ()}
     data = SimpleNamespace(y=y, weights=weights, truth=truth, geometry=beam, **facts)
     write_outputs(run, Half(), GRID, data, held_out, np.arange(24.0, dtype=np.float32).reshape(GRID.shape))
     return record
