@@ -53,7 +53,7 @@ def test_convert_makes_gaussians_of_points_where_asked(tmp_path: Path) -> None:
 def test_convert_refuses_a_format_that_it_does_not_write(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.ply").write_bytes(inria_bytes(random_gaussians(2, 0)))
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.drc")]) == 1
-    assert "the suffix '.spz', expected one of .ply, .npy" in capsys.readouterr().err
+    assert "the suffix '.drc', expected one of .ply, .npy" in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "none.ply"), str(tmp_path / "b.ply")]) == 1
     assert "nothing there" in capsys.readouterr().err
 

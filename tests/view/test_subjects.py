@@ -73,6 +73,8 @@ def test_a_saved_crop_holds_the_same(tmp_path: Path, name: str) -> None:
     else:
         cropped = read_volume(path)
         assert cropped.values.shape == (8, 8, 4, 1) and np.allclose(cropped.to_world, np.diag([0.5, 1, 1, 1]))
+        right = read_volume(subject.save_crop(tmp_path / "crops", (0.5, 0, 0, 1, 1, 1)))
+        assert np.allclose(right.to_world[:3, 3], (0.5, 0, 0)) and np.allclose(np.diag(right.to_world), (0.5, 1, 1, 1))
     with pytest.raises(MivolError, match="make it larger"):
         subject.save_crop(tmp_path / "crops", (2, 2, 2, 3, 3, 3))
 
