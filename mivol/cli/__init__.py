@@ -625,16 +625,30 @@ def reference(arguments: argparse.Namespace) -> None:
 
 
 def poses(arguments: argparse.Namespace) -> None:
-    """Find the poses of a folder of photographs, and write them to FOLDER/sparse/0 for mivol optimize.
+    """Find the poses of a folder of photographs or of a video, and write them to FOLDER/sparse/0 for mivol optimize.
 
-    COLMAP searches (pip install "mivol[poses]"); nothing is downloaded, and no GPU is needed.
+    COLMAP searches (pip install "mivol[poses]"); nothing is downloaded, and no GPU is needed. Of a video, sharp frames between
+    which the camera moved become photographs in a folder of the video's name. The same command continues after Ctrl-C.
     """
-    from mivol.photos.poses import find_poses
+    from mivol.photos import video
+    from mivol.photos.poses import check_colmap, find_poses
+    from mivol.report.poses_page import write_poses_page
 
-    found = find_poses(arguments.folder, lambda stage: print(stage, file=sys.stderr))
+    check_colmap()
+
+    def say(line: str) -> None:
+        print(line, file=sys.stderr)
+
+    place = arguments.folder
+    is_video = place.suffix.lower() in video.SUFFIXES and not place.is_dir()
+    if arguments.fps is not None and not is_video:
+        raise MivolError(f"--fps is for videos, and {place} is none: leave it out.")
+    place = video.extract_frames(place, arguments.fps, say) if is_video else place
+    found = find_poses(place, say)
     print(found.describe())
-    folder = shlex.quote(str(arguments.folder))
-    print(f"mivol explain {folder} -o cameras.png draws the cameras; mivol optimize {folder} fits Gaussians")
+    print(write_poses_page(place, found))
+    folder = shlex.quote(str(place))
+    print(f"mivol view {folder} shows the cameras; mivol optimize {folder} fits Gaussians")
 
 
 def optimize(arguments: argparse.Namespace) -> None:
@@ -922,7 +936,13 @@ VERBS: dict[str, Verb] = {
     "explain": Verb(explain, explain_flags),
     "render": Verb(render, render_flags),
     "reference": Verb(reference, reference_flags),
-    "poses": Verb(poses, lambda: [flag("folder", type=Path, help="folder of photographs, in images/ or in itself")]),
+    "poses": Verb(
+        poses,
+        lambda: [
+            flag("folder", type=Path, help="folder of photographs, in images/ or in itself; or a video (.mp4, .mov, ...)"),
+            flag("--fps", type=float, help="frames of a video a second, at most (default: 2, and at most 300 in all)"),
+        ],
+    ),
     "optimize": Verb(optimize, optimize_flags, describe_settings),
     "sweep": Verb(sweep, sweep_flags),
     "validate": Verb(validate, validate_flags),

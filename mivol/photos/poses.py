@@ -15,6 +15,7 @@ import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,9 @@ EXHAUSTIVE = 150
 
 LONGEST = 2000
 """Longest edge of a photograph in the search for features [pixel]."""
+
+WORK = ".mivol-poses"
+"""Folder beside the photographs for features and matches, while the search goes on."""
 
 DIRECT = (".png", ".jpg", ".jpeg")
 """Suffixes that COLMAP reads; others are converted."""
@@ -93,11 +97,13 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None) -> 
     Raises:
         MivolError: a missing pycolmap, poses that exist already, too few photographs, a damaged photograph, or photographs
             without overlap.
-        KeyboardInterrupt: Ctrl-C; nothing is written.
+        KeyboardInterrupt: Ctrl-C; features and matches stay in ``WORK``, and the next search of the same photographs
+            continues with them.
     """
     images, names = _check_folder(folder)
-    with tempfile.TemporaryDirectory(prefix="mivol-poses-") as place:
-        work = Path(place)
+    work = folder / WORK
+    _begin_work(work, images, names)
+    try:
         job = {
             "images": str(_prepare(images, names, work / "images")),
             "names": list(_group_by_lens(images, names).values()),
@@ -112,15 +118,43 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None) -> 
         if not models:
             found = f"{len(names)} photographs without enough overlap"
             raise refusal(folder, found, "photographs that show the same parts from several places", AGAIN)
-        return _keep(folder, models, names)
+        poses = _keep(folder, models, names)
+    except MivolError:
+        shutil.rmtree(work, ignore_errors=True)
+        raise
+    shutil.rmtree(work, ignore_errors=True)
+    return poses
+
+
+def check_colmap() -> None:
+    """Refuse to begin without pycolmap.
+
+    Raises:
+        MivolError: pycolmap is missing.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise MivolError('poses need pycolmap, which is not installed: pip install "mivol[poses]".')
+
+
+def _begin_work(work: Path, images: Path, names: list[str]) -> None:
+    """Make the folder of features and matches, or keep one that an interrupted search of the same photographs left."""
+    facts = [[name, (images / name).stat().st_size, (images / name).stat().st_mtime_ns] for name in names]
+    listed = work / "photographs.json"
+    with suppress(OSError, ValueError):
+        if json.loads(listed.read_text(encoding="utf-8")) == facts:
+            for part in ("images", "models"):
+                shutil.rmtree(work / part, ignore_errors=True)
+            return
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    listed.write_text(json.dumps(facts), encoding="utf-8")
 
 
 def _check_folder(folder: Path) -> tuple[Path, list[str]]:
     """The folder of the images, and the names of the photographs in it."""
     if not folder.is_dir():
         raise refusal(folder, "no folder", "a folder of photographs", "check the path")
-    if importlib.util.find_spec("pycolmap") is None:
-        raise MivolError('poses need pycolmap, which is not installed: pip install "mivol[poses]".')
+    check_colmap()
     kind = find_format(folder)
     if kind is not None:
         way_out = f"mivol optimize {folder}, or remove them first"

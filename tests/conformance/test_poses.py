@@ -14,6 +14,7 @@ from mivol.errors import MivolError
 from mivol.photos import poses, survey_photos
 from mivol.photos.listing import list_photographs
 from mivol.photos.photo_file import ORIENTATION, read_lens_facts
+from mivol.report import poses_page
 
 
 @pytest.fixture
@@ -56,7 +57,10 @@ def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict:
     return asked
 
 
-def test_the_largest_model_is_kept_and_the_rest_is_named(folder: Path, job: dict, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_largest_model_is_kept_and_the_rest_is_named(
+    folder: Path, job: dict, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(poses_page, "write_poses_page", lambda folder, found: folder / "poses.html")
     assert main(["poses", str(folder)]) == 0
     said = capsys.readouterr().out
     for fact in (
@@ -116,6 +120,42 @@ def test_what_cannot_have_poses_is_refused(folder: Path, job: dict, tmp_path: Pa
     (folder / "images" / "a.jpg").write_bytes(b"no image")
     with pytest.raises(MivolError, match=r"a.jpg: found a damaged or foreign file"):
         poses.find_poses(folder)
+
+
+def test_a_page_shows_cameras_and_errors(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "a b")
+    found = poses.Poses(folder / "sparse" / "0", ("a.png", "b.png"), ("c<d>.png",), 0.734, 12, 1)
+    text = poses_page.write_poses_page(folder, found).read_text()
+    for fact in ("2 of 3", "0.73 pixels", "c&lt;d&gt;.png", "data:image/png;base64,", f"mivol view &#x27;{folder}&#x27;"):
+        assert fact in text
+    assert "http" not in text
+
+
+def test_an_interrupted_search_continues(folder: Path, job: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its features stay for the same photographs, and go with other ones."""
+    run = poses._run
+
+    def interrupt(*given: object) -> None:
+        (folder / poses.WORK / "database.db").write_text("features")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(poses, "_run", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        poses.find_poses(folder)
+    seen: list[bool] = []
+
+    def look(*given: object) -> object:
+        seen.append((folder / poses.WORK / "database.db").exists())
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+        return run(*given)
+
+    monkeypatch.setattr(poses, "_run", look)
+    with pytest.raises(KeyboardInterrupt):
+        poses.find_poses(folder)
+    Image.fromarray(pixels(8, 8)).save(folder / "images" / "new.png")
+    poses.find_poses(folder)
+    assert seen == [True, False] and not (folder / poses.WORK).exists()
 
 
 def test_pycolmap_is_asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

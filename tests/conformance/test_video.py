@@ -1,0 +1,96 @@
+"""Frames of a video: the sharp ones, where the camera moved; what is no such video is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import PIL.ImageFilter
+import pytest
+
+from mivol.cli import main
+from mivol.errors import MivolError
+from mivol.experiments.film import write_video
+from mivol.photos import video
+
+pytest.importorskip("imageio_ffmpeg")
+# imageio-ffmpeg leaves the pipes of its program to the garbage collector.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+FPS = 8
+"""Frames a second of the films: with two frames kept a second, each piece has four frames."""
+
+
+def wall() -> np.ndarray:
+    """Blocks of random greys, 96 x 400."""
+    blocks = np.random.default_rng(0).integers(0, 255, (24, 100), np.uint8)
+    return np.repeat(np.kron(blocks, np.ones((4, 4), np.uint8))[..., None], 3, axis=2)
+
+
+def view(shift: int, blur: float = 0.0) -> np.ndarray:
+    """The wall from a place, 96 x 128."""
+    image = PIL.Image.fromarray(wall()[:, shift : shift + 128])
+    return np.asarray(image.filter(PIL.ImageFilter.GaussianBlur(blur)))
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    """Six seconds: two of a walk, two at rest, two of a walk; the second frame of each four is sharp, the others blurred."""
+    shifts = [*range(0, 64, 4), *[64] * 16, *range(64, 128, 4)]
+    frames = [view(shift, 0.0 if number % 4 == 1 else 2.0) for number, shift in enumerate(shifts)]
+    return write_video(tmp_path / "walk.mp4", frames, fps=FPS)
+
+
+def test_sharp_frames_of_a_moving_camera_are_kept(film: Path) -> None:
+    """12 pieces; of the four at rest only the first has moved since the one before."""
+    said: list[str] = []
+    folder = video.extract_frames(film, say=said.append)
+    files = sorted((folder / "images").iterdir())
+    assert (
+        folder == film.with_suffix("")
+        and len(files) == 9
+        and said == [f"{folder / 'images'}: 9 sharp frames of 6 s; 3 without motion are left out"]
+    )
+    kept = [np.asarray(PIL.Image.open(file)) for file in files]
+    blurred = video.sharpness(view(0, 2.0))
+    assert min(video.sharpness(image) for image in kept) > 4 * blurred
+    assert np.abs(kept[1].astype(int) - view(20)).mean() < 12  # the sharp frame of the second piece, after compression
+
+
+def test_frames_are_not_taken_twice(film: Path) -> None:
+    folder = video.extract_frames(film)
+    before = {file: file.stat().st_mtime_ns for file in (folder / "images").iterdir()}
+    said: list[str] = []
+    video.extract_frames(film, say=said.append)
+    assert {file: file.stat().st_mtime_ns for file in (folder / "images").iterdir()} == before
+    assert "the frames that are there are used" in said[0]
+
+
+def test_a_shift_is_measured() -> None:
+    grey = wall()[:, :, 0].astype(np.float32)
+    assert video.motion(grey[:, :128], grey[:, 12:140]) == pytest.approx(12 / 128)
+    assert video.motion(grey[:, :128], grey[:, :128]) == 0
+
+
+def test_what_gives_no_photographs_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    still = write_video(tmp_path / "still.mp4", [view(0)] * 24, fps=FPS)
+    with pytest.raises(MivolError, match="1 frame between which the camera moved, of 6 pieces"):
+        video.extract_frames(still)
+    assert list((tmp_path / "still").iterdir()) == []
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(MivolError, match=r"text\.mp4: found no video that ffmpeg reads"):
+        video.extract_frames(tmp_path / "text.mp4")
+    with pytest.raises(MivolError, match="found no file"):
+        video.extract_frames(tmp_path / "none.mp4")
+    with pytest.raises(MivolError, match="--fps 0"):
+        video.extract_frames(still, rate=0)
+    monkeypatch.setattr(video, "LONGEST", 1.0)
+    with pytest.raises(MivolError, match="cut it"):
+        video.extract_frames(still)
+
+
+def test_a_rate_is_for_videos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pycolmap")
+    assert main(["poses", str(tmp_path), "--fps", "2"]) == 1
+    assert "--fps is for videos" in capsys.readouterr().err
