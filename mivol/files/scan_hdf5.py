@@ -296,6 +296,7 @@ def _nxtomo(file: Any, path: Path, entry: str, names: Mapping[str, str]) -> _Sca
 def _nxtomo_angles(file: Any, path: Path, entry: str, holder: str, key: np.ndarray) -> Frames | None:
     places = (f"{entry}/sample", f"{entry}/data", f"{entry}/sample/transformations", holder)
     name = next((f"{place}/rotation_angle" for place in places if has_link(file, f"{place}/rotation_angle")), None)
+    name = name or _angles_by_name(file, entry, holder, len(key))
     if name is None:
         return None
     angles, views = find_item(file, path, name), np.flatnonzero(key == VIEW)
@@ -305,6 +306,23 @@ def _nxtomo_angles(file: Any, path: Path, entry: str, holder: str, key: np.ndarr
             "correct them, or name others: data.angles",
         )  # fmt: skip
     return Frames(angles, name, views if angles.size == len(key) else None)
+
+
+ANGLE_WORDS = "theta", "rot", "angle"
+"""Parts of the names of motors that turn a sample."""
+
+
+def _angles_by_name(file: Any, entry: str, holder: str, frames: int) -> str | None:
+    """Name of one number per frame beside a detector's frames, called after a motor that turns; None if there is none."""
+    for group in (f"{entry}/{holder.rpartition('/')[2]}", holder):
+        for child in sorted(map(to_text, file[group])) if is_group(file, group) else ():
+            try:
+                item = file[f"{group}/{child}"] if any(word in child.lower() for word in ANGLE_WORDS) else None
+            except (KeyError, OSError):  # a link that misses its target
+                continue
+            if item is not None and getattr(item, "ndim", 0) == 1 and item.size == frames and item.dtype.kind == "f":
+                return f"{group}/{child}"
+    return None
 
 
 def _nxtomo_entries(file: Any) -> list[str]:
@@ -317,10 +335,21 @@ def _nxtomo_entries(file: Any) -> list[str]:
 
 
 def _key_name(entry: Any) -> str | None:
-    """Name of ``image_key`` below an entry."""
+    """Name of ``image_key`` below an entry: of the first detector whose frames are there, else of the first detector."""
     holders = [f"instrument/{to_text(name)}" for name in entry["instrument"]] if is_group(entry, "instrument") else []
     holders += ["data"]
-    return next((f"{h}/image_key" for h in holders if is_group(entry, h) and has_link(entry[h], "image_key")), None)
+    holders = [h for h in holders if is_group(entry, h) and has_link(entry[h], "image_key")]
+    chosen = next((h for h in holders if _has_frames(entry, h)), holders[0] if holders else None)
+    return None if chosen is None else f"{chosen}/image_key"
+
+
+def _has_frames(entry: Any, holder: str) -> bool:
+    """Whether the frames of a detector can be read: a link may miss its target."""
+    name = next((n for n in (f"{holder}/data", "data/data") if has_link(entry, n)), None)
+    try:
+        return name is not None and getattr(entry[name], "ndim", 0) == 3
+    except (KeyError, OSError):
+        return False
 
 
 def _first_detector(file: Any, entry: str) -> Any:

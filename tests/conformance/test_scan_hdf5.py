@@ -154,7 +154,20 @@ def test_a_compression_without_its_filter(tmp_path: Path, monkeypatch: pytest.Mo
     assert read_projections(path, names=names).projections.shape == (4, 1, 2)
     monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: False)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(
-        MivolError, match=r"/d compressed by filter 1 \(deflate\), .*: pip install .mivol\[lab"
-    ):
+    with pytest.raises(MivolError, match=r"/d compressed by filter 1 \(deflate\), .*: pip install .mivol\[lab"):
         read_projections(path, names=names)
+
+
+def test_a_detector_whose_frames_are_missing_gives_way(tmp_path: Path) -> None:
+    """GDA lists a second detector first, whose file is missing, and the angles beside the frames by the name of the motor."""
+    path = write_nxtomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        del file["entry/sample/rotation_angle"], file["entry/data/rotation_angle"], file["entry/data/data"]
+        lost = file.create_group("entry/instrument/camera")
+        lost["data"], lost["image_key"] = h5py.ExternalLink("gone.h5", "d"), KEY
+        beside = file.create_group("entry/detector")
+        beside["gts_theta_set"] = h5py.ExternalLink("gone.h5", "t")
+        beside["gts_theta_value"], beside["gts_theta_count"] = DEGREES, np.arange(10)
+    scan = read_projections(path)
+    np.testing.assert_array_equal(scan.projections, FRAMES[VIEWS])
+    np.testing.assert_allclose(scan.angles, np.radians(DEGREES[VIEWS]))

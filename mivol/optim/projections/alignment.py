@@ -62,7 +62,7 @@ class Alignment:
         moves: (views, 3) fitted moves: (rows, columns) [pixel], turn [rad].
         axis: displacement of the axis along the columns [pixel], and its standard deviation.
         tilt: tilts along the light and across it [rad] and their standard deviations, (2, 2).
-        sigma: standard deviation of the moves (rows, columns, turn), as a mean over the views.
+        sigma: standard deviation of the moves (rows, columns, turn) of a typical view (median).
         before, after: (held-out views,) mean squared residual without and with the fitted geometry.
         is_needed: whether ``after`` is below ``before`` by more than chance.
     """
@@ -321,7 +321,7 @@ def _deviations(fit: _Fit, steps: list[np.ndarray], own: list[int], common: list
     sigma, shared = np.zeros(3), np.zeros(3)
     for k, axis in enumerate(own):
         share, rest = remaining([step[: 3 * views].reshape(views, 3)[:, axis] for step in steps])
-        variance = fit.noise * np.linalg.inv(fit.own)[:, k, k].mean() / share
+        variance = fit.noise * np.median(np.linalg.inv(fit.own)[:, k, k]) / share
         sigma[axis] = math.hypot(math.sqrt(variance), rest)
     if common:
         inverse = np.linalg.pinv(fit.common)
