@@ -363,7 +363,9 @@ class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
 class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
     """Projections as images or arrays, with flat and dark fields in other files."""
 
-    file: Annotated[str, setting("path", "TIFF, .npy, .npz, HDF5 (views, rows, cols), or a TIFF pattern", min_length=1)]
+    file: Annotated[
+        str, setting("path", "TIFF, EDF, HIS, MRC, .npy, .npz, HDF5 (views, rows, cols), or a pattern of images", min_length=1)
+    ]
     reading: Annotated[
         Literal["intensity", "transmission", "line_integral"],
         setting("1", "quantity of a pixel; an intensity needs flats"),

@@ -20,8 +20,10 @@ import numpy as np
 
 from mivol import config
 from mivol.errors import MivolError
+from mivol.files.formats import HEAD, read_volume
 from mivol.files.hdf5 import is_hdf5
-from mivol.files.image_stack import read_images
+from mivol.files.image_stack import IMAGES, read_images
+from mivol.files.mrc import find_tilt_angles, is_mrc, read_tilt_angles
 from mivol.files.nikon import SECTION, read_nikon
 from mivol.files.scan_hdf5 import half_turns_in_radians, is_scan, survey_projections
 from mivol.files.source import read_columns, refusal
@@ -83,7 +85,7 @@ def draft_scan(path: Path, changes: Sequence[str] = ()) -> ScanDraft:
         config.apply_change(given, change)
     kind = find_scan(path)
     if kind is None and not (path.is_file() and is_hdf5(path)):
-        expected = "a scan in HDF5, an .xtekct file, or a folder of TIFF files"
+        expected = "a scan in HDF5, an .xtekct file, a tilt series (MRC with .rawtlt, .tlt or .mdoc), or a folder of images"
         raise refusal(path, "no scan", expected, "name one of them, or write a TOML file")
     draft = SCAN_KINDS[kind or HDF5][1](path, given)
     name = path.resolve().stem
@@ -250,12 +252,47 @@ def _draft_nikon(path: Path, given: dict[str, Any]) -> ScanDraft:
     return _finish(raw, lines, len(scan.images))
 
 
+# -- Tilt series ---------------------------------------------------------------------------------------------------------
+
+
+def _is_tilt_series(path: Path) -> bool:
+    """Whether a file is MRC, with a file of tilt angles beside it."""
+    if not path.is_file() or find_tilt_angles(path) is None:
+        return False
+    with path.open("rb") as file:
+        return is_mrc(file.read(HEAD))
+
+
+def _draft_tilt_series(path: Path, given: dict[str, Any]) -> ScanDraft:
+    volume, table = read_volume(path), find_tilt_angles(path)
+    assert table is not None
+    angles, stack = read_tilt_angles(table), volume.values[..., 0]
+    views, rows, columns = stack.shape
+    if len(angles) != views:
+        raise refusal(table, f"{len(angles)} angles", f"{views}, one for each image of {path.name}", "correct it")
+    reading, why = guess_reading(path, stack[views // 2])
+    lines = [
+        f"found: a tilt series in MRC: {_count(views, 'view')} of {rows} x {columns} pixels",
+        f"found: angles from {angles[0]:.4g} to {angles[-1]:.4g} degrees in {table.name}",
+        f"assumed: {why}: the pixels are taken as {reading}s; data.reading sets it",
+        "assumed: a parallel beam, and a tilt axis along the columns of pixels (an aligned series)",
+    ]
+    scan: dict[str, Any] = {"beam": "parallel"}
+    if volume.meta["unit"] == "A":
+        scan["pitch"] = [float(f"{edge:.8g}") for edge in volume.spacing[1::-1]]
+        lines.append(f"found: pixels of {scan['pitch'][0]:.6g} x {scan['pitch'][1]:.6g} angstrom (rows, columns)")
+    data = {"source": "stack", "file": str(path), "reading": reading, "angles": str(table), "find_axis": False, "air": 0}
+    lines.append("chosen: the axis is in the middle; data.find_axis = true looks for it, if the views cover half a turn")
+    raw = {"scan": scan, "data": data}
+    return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], views)
+
+
 # -- TIFF ------------------------------------------------------------------------------------------------------------------
 
 
 def has_scan_files(folder: Path) -> bool:
     """Whether flats, darks or a file of angles lie beside the images of a folder: they tell a scan from slices of a volume."""
-    if any(group.words & (FLAT_WORDS | DARK_WORDS) for group in group_images(folder)):
+    if any(group.words & (FLAT_WORDS | DARK_WORDS) for group in group_images(folder, IMAGES)):
         return True
     for file in folder.iterdir():
         if file.suffix.lower() in ANGLE_FILES:
@@ -266,7 +303,7 @@ def has_scan_files(folder: Path) -> bool:
 
 
 def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
-    groups = group_images(path)
+    groups = group_images(path, IMAGES)
     darks = [group for group in groups if group.words & DARK_WORDS]
     flats = [group for group in groups if group.words & FLAT_WORDS and group not in darks]
     views = [group for group in groups if group not in darks and group not in flats]
@@ -379,6 +416,7 @@ HDF5, TIFF_FOLDER = "hdf5", "tiff"
 SCAN_KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, dict[str, Any]], ScanDraft]]] = {
     "nikon": (lambda path: any(map(_is_nikon, path.iterdir() if path.is_dir() else [path])), _draft_nikon),
     HDF5: (lambda path: any(map(is_scan, path.iterdir() if path.is_dir() else [path])), _draft_hdf5),
-    TIFF_FOLDER: (lambda path: path.is_dir() and bool(group_images(path)), _draft_tiff),
+    "mrc": (_is_tilt_series, _draft_tilt_series),
+    TIFF_FOLDER: (lambda path: path.is_dir() and bool(group_images(path, IMAGES)), _draft_tiff),
 }
 """Recognition and draft of each kind of scan, in this order."""

@@ -19,9 +19,10 @@ from mivol import config
 from mivol.config import Detector, Matrices, Measured, Nikon, Stack, Table
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
-from mivol.files import read_columns, read_projections, read_stack
+from mivol.files import read_projections, read_stack
 from mivol.files.fetch import resolve_path
 from mivol.files.image_stack import ALL, stack_shape
+from mivol.files.mrc import read_tilt_angles
 from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.files.scan_hdf5 import NO_DARKS, survey_projections
 from mivol.files.source import refusal
@@ -149,7 +150,7 @@ def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.n
         return None
     if not data.angles:
         return even_angles(settings.scan, views)
-    angles = read_columns(base / data.angles, 1)[:, 0]
+    angles = read_tilt_angles(base / data.angles)
     if len(angles) != views:
         raise MivolError(f"{data.angles} has {len(angles)} angles for {views} projections: give one for each.")
     return to_radians(angles, data.angle_unit)

@@ -103,6 +103,8 @@ FORMATS: dict[str, VolumeFormat] = {
     ".mrc": _MRC,
     ".map": _MRC,
     ".rec": _MRC,
+    ".st": _MRC,
+    ".ali": _MRC,
     ".dcm": _DICOM,
     ".mat": VolumeFormat("MATLAB", _starts_with(matlab.MAGIC), matlab.read_matlab),
     ".tif": _TIFF,

@@ -6,6 +6,7 @@ their names: slice.2 before slice.10.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -23,12 +24,18 @@ from mivol.files.volume import VolumeData, check_frame, frame_from_steps, to_val
 ALL = slice(None)
 """All rows."""
 
+DETECTOR_IMAGES = (".edf", ".his")
+"""Suffixes of images of detectors, read by the package fabio."""
+
+IMAGES = (*TIFF, *DETECTOR_IMAGES)
+"""Suffixes of images of which a pattern takes several."""
+
 
 def read_stack(path: str | os.PathLike, dataset: str | None = None, rows: slice = ALL) -> np.ndarray:
     """Read projections.
 
     Args:
-        path: TIFF, .npy, .npz or HDF5 file, or a pattern of TIFF files.
+        path: TIFF, EDF, HIS, MRC, .npy, .npz or HDF5 file, or a pattern of TIFF, EDF or HIS files.
         dataset: name of the array in an .npz or HDF5 file.
         rows: rows of the images. Other rows are not read from uncompressed TIFF and ``.npy``.
 
@@ -39,7 +46,7 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None, rows: slice 
         MivolError: no file, another format, images of different sizes, or numbers that are not finite.
     """
     files = _find_files(path)
-    if files[0].suffix.lower() in TIFF:
+    if files[0].suffix.lower() in IMAGES:
         stack = read_images(files, rows)
     elif rows != ALL and (mapped := _map_array(files[0])) is not None:
         stack = np.asarray(mapped[:, rows], np.float32)
@@ -55,6 +62,9 @@ def stack_shape(path: str | os.PathLike, dataset: str | None = None) -> tuple[in
     Args, raises: as :func:`read_stack`.
     """
     files = _find_files(path)
+    if files[0].suffix.lower() in DETECTOR_IMAGES:
+        frames = _read_detector_images(files[0])
+        return len(files) * len(frames), *frames.shape[1:]
     if files[0].suffix.lower() in TIFF:
         with _opened(files[0]) as image:
             return len(files) * getattr(image, "n_frames", 1), image.height, image.width
@@ -66,7 +76,7 @@ def _find_files(path: str | os.PathLike) -> list[Path]:
     files = sorted(Path(path).parent.glob(Path(path).name), key=natural_order)
     if not files or Path(path).is_dir():
         check_file(path, in_a_folder=f'name a file in it, or a pattern of TIFF files: "{Path(path).name}/*.tif"')
-    if len(files) > 1 and files[0].suffix.lower() not in TIFF:
+    if len(files) > 1 and files[0].suffix.lower() not in IMAGES:
         raise refusal(path, f"{len(files)} files", "one file, or a pattern of TIFF files", "name one of the files")
     return files
 
@@ -89,7 +99,7 @@ def check_finite(path: str | os.PathLike, stack: np.ndarray) -> None:
 
 
 def read_images(files: list[Path], rows: slice = ALL) -> np.ndarray:
-    """Read the pages of TIFF files.
+    """Read the pages of TIFF files, or the frames of EDF and HIS files.
 
     Args:
         files: files.
@@ -106,6 +116,9 @@ def read_images(files: list[Path], rows: slice = ALL) -> np.ndarray:
     pages = []
     for file in files:
         check_file(file)
+        if file.suffix.lower() in DETECTOR_IMAGES:
+            pages += list(_read_detector_images(file)[:, rows])
+            continue
         if rows != ALL and (mapped := _map_pages(file)) is not None:
             pages += list(np.asarray(mapped[:, rows], np.float32))
             continue
@@ -115,6 +128,36 @@ def read_images(files: list[Path], rows: slice = ALL) -> np.ndarray:
     if len(shapes) > 1 or len(next(iter(shapes))) != 2:
         raise refusal(files[0], f"images of shapes {sorted(shapes)[:3]}", "grey images of one size", "crop or convert them")
     return np.stack(pages)
+
+
+def _read_detector_images(file: Path) -> np.ndarray:
+    """Frames (n, rows, columns), float32, of an EDF or HIS file.
+
+    Raises:
+        MivolError: no fabio, or a damaged file.
+    """
+    try:
+        import fabio
+    except ImportError as error:
+        found = f"an image in {file.suffix[1:].upper()} but no fabio"
+        raise refusal(file, found, "an installed fabio", 'install it: pip install "mivol[lab]"') from error
+    log = logging.getLogger("fabio")
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        with fabio.open(str(file)) as image:
+            # getframe of a file with a single frame opens the file of that number beside it.
+            several = (np.asarray(image.getframe(k).data) for k in range(image.nframes))
+            frames = [np.asarray(image.data)] if image.nframes == 1 else list(several)
+        if len({frame.shape for frame in frames}) != 1 or frames[0].ndim != 2 or frames[0].dtype.kind not in "uif":
+            raise ValueError(f"frames of shapes {[frame.shape for frame in frames[:3]]}")
+    except Exception as error:  # fabio's parsers raise errors of many classes
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        way_out = "copy the file again"
+        raise refusal(file, f"a damaged or foreign file ({reason})", file.suffix[1:].upper(), way_out) from error
+    finally:
+        log.setLevel(level)
+    return np.stack(frames).astype(np.float32)
 
 
 @contextmanager

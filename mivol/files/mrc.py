@@ -7,13 +7,14 @@ note says so.
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from mivol.files.source import check_file, refusal, refuse_dataset
+from mivol.files.source import check_file, read_columns, refusal, refuse_dataset
 from mivol.files.volume import VolumeData, frame_from_steps, is_upright, split_frame, to_values
 
 #: Place of the word ``MAP`` in the header [byte].
@@ -67,6 +68,36 @@ def read_mrc(path: Path, dataset: str | None = None) -> VolumeData:
         "notes": () if has_spacing else ("the header has a voxel size of 0: a voxel counts as 1.",),
     }
     return VolumeData(values, frame_from_steps(values.shape[2::-1], np.diag(spacing), origin), meta)
+
+
+TILT_ANGLES = (".rawtlt", ".tlt", ".mdoc")
+"""Suffixes of files with the angles of a tilt series, in the order in which they are taken."""
+
+
+def find_tilt_angles(series: Path) -> Path | None:
+    """The file of angles beside a tilt series: ``a.rawtlt``, ``a.tlt``, ``a.mdoc`` or ``a.mrc.mdoc`` of ``a.mrc``."""
+    names = [f"{stem}{suffix}" for suffix in TILT_ANGLES for stem in (series.stem, series.name)]
+    return next((series.parent / name for name in names if (series.parent / name).is_file()), None)
+
+
+def read_tilt_angles(path: Path) -> np.ndarray:
+    """Read the angles (views,) of a tilt series [degree]: a number a line, or ``TiltAngle`` in the sections of a ``.mdoc``.
+
+    Raises:
+        MivolError: no file, no angle, or text that is no number.
+    """
+    if path.suffix.lower() != ".mdoc":
+        return read_columns(path, 1)[:, 0]
+    text = check_file(path).read_text(encoding="utf-8", errors="replace")
+    sections = re.findall(r"(?ms)^\[ZValue\s*=\s*(\d+)\](.*?)(?=^\[|\Z)", text)
+    found = {int(number): re.search(r"(?m)^TiltAngle\s*=\s*(\S+)\s*$", body) for number, body in sections}
+    try:
+        angles = np.array([float(found[number].group(1)) for number in range(len(found))])
+    except (KeyError, AttributeError, ValueError):
+        angles = np.empty(0)
+    if not len(angles) or not np.isfinite(angles).all():
+        raise refusal(path, f"{len(sections)} sections ZValue", "a number TiltAngle in each, from 0 upwards", "correct it")
+    return angles
 
 
 def write_mrc(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:

@@ -246,12 +246,12 @@ class ImageGroup(NamedTuple):
         raise refusal(folder, f"other images between {first.name} and its like", "one folder a kind", "move them apart")
 
 
-def group_images(folder: Path) -> list[ImageGroup]:
-    """Group the TIFF files of a folder and of the folders in it by their names without numbers; the largest groups first."""
+def group_images(folder: Path, suffixes: tuple[str, ...] = TIFF) -> list[ImageGroup]:
+    """Group the images of a folder and of the folders in it by their names without numbers; the largest groups first."""
     groups: dict[str, list[Path]] = {}
     inner = [entry for entry in folder.iterdir() if entry.is_dir()]
     for file in (file for place in (folder, *inner) for file in place.iterdir()):
-        if file.suffix.lower() in TIFF:
+        if file.suffix.lower() in suffixes:
             groups.setdefault(re.sub(r"\d+", "#", str(file.relative_to(folder))), []).append(file)
     found = [ImageGroup(name, sorted(files, key=natural_order)) for name, files in groups.items()]
     return sorted(found, key=lambda group: -group.size)

@@ -1,0 +1,151 @@
+"""Zarr, EDF and tilt series in MRC: files of their own libraries, and ours read by them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mivol.cli import main
+from mivol.errors import MivolError
+from mivol.files import read_volume, write_volume
+from mivol.files.image_stack import read_stack, stack_shape
+from mivol.files.mrc import read_tilt_angles
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.phantoms import shepp_logan
+
+VALUES = np.arange(2 * 3 * 4, dtype=np.float32).reshape(2, 3, 4)
+PLACE = VoxelGrid((2, 3, 4), (0.5, 1.0, 2.0), (3.0, 0.0, -1.0)).to_world
+
+
+def test_ours_is_read_by_tensorstore_and_by_us(tmp_path: Path) -> None:
+    store = pytest.importorskip("tensorstore")
+    write_volume(tmp_path / "a.zarr", VALUES, PLACE, metadata={"unit": "um"})
+    spec = {"driver": "zarr", "kvstore": {"driver": "file", "path": str(tmp_path / "a.zarr/0")}}
+    np.testing.assert_array_equal(store.open(spec).result().read().result(), VALUES)
+    about = json.loads((tmp_path / "a.zarr/.zattrs").read_text())["multiscales"][0]
+    assert about["datasets"][0]["coordinateTransformations"][0]["scale"] == [2.0, 1.0, 0.5]
+    assert about["datasets"][0]["coordinateTransformations"][1]["translation"] == [-2.0, -1.0, 2.25]
+    found = read_volume(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(found.values[..., 0], VALUES)
+    np.testing.assert_allclose(found.to_world, PLACE, atol=1e-12)
+    assert found.meta["unit"] == "um"
+    colours = np.stack([VALUES, 2 * VALUES], -1)
+    write_volume(tmp_path / "a.zarr", colours, PLACE)
+    np.testing.assert_array_equal(read_volume(tmp_path / "a.zarr").values, colours)
+
+
+@pytest.mark.parametrize("driver", ["zarr", "zarr3"])
+def test_zarr_of_tensorstore(tmp_path: Path, driver: str) -> None:
+    """A plain array; then a group (OME-Zarr 0.5 with axes t, z, y, x and two levels) around the same numbers."""
+    store = pytest.importorskip("tensorstore")
+    for name, values in (("p", VALUES.astype(np.uint16)), ("g/0", VALUES[None].astype(np.uint16)), ("g/1", VALUES[None, :1])):
+        spec = {"driver": driver, "kvstore": {"driver": "file", "path": str(tmp_path / name)}}
+        dtype = "uint16" if values.dtype == np.uint16 else "float32"
+        store.open(spec, create=True, dtype=getattr(store, dtype), shape=values.shape).result().write(values).result()
+    np.testing.assert_array_equal(read_volume(tmp_path / "p").values[..., 0], VALUES)
+    levels = [
+        {"path": str(k), "coordinateTransformations": [{"type": "scale", "scale": [1, 2 * (k + 1), 3, 4]}]} for k in (0, 1)
+    ]
+    axes = [{"name": n, "type": "time" if n == "t" else "space"} for n in "tzyx"]
+    scales = [{"axes": axes, "datasets": levels}]
+    if driver == "zarr3":
+        about = {"zarr_format": 3, "node_type": "group", "attributes": {"ome": {"version": "0.5", "multiscales": scales}}}
+        (tmp_path / "g/zarr.json").write_text(json.dumps(about))
+    else:
+        (tmp_path / "g/.zgroup").write_text('{"zarr_format": 2}')
+        (tmp_path / "g/.zattrs").write_text(json.dumps({"multiscales": scales}))
+    found = read_volume(tmp_path / "g")
+    np.testing.assert_array_equal(found.values[..., 0], VALUES)
+    np.testing.assert_allclose(found.spacing, (4, 3, 2))
+    assert read_volume(tmp_path / "g", "1").values.shape == (1, 3, 4, 1)
+    assert main(["explain", str(tmp_path / "g")]) == 0
+    assert main(["convert", str(tmp_path / "g"), str(tmp_path / "g.nrrd")]) == 0
+
+
+def test_zarr_says_what_is_missing(tmp_path: Path) -> None:
+    """A chunk without a file, a damaged one, and metadata that are no JSON."""
+    pytest.importorskip("tensorstore")
+    write_volume(tmp_path / "a.zarr", VALUES)
+    chunk = tmp_path / "a.zarr/0/0/0/0"
+    chunk.write_bytes(chunk.read_bytes()[:20])
+    with pytest.raises(MivolError, match="a damaged chunk"):
+        read_volume(tmp_path / "a.zarr")
+    chunk.unlink()
+    assert "1 of 1 chunks have no file" in read_volume(tmp_path / "a.zarr").meta["notes"][0]
+    (tmp_path / "a.zarr/.zattrs").write_text("{")
+    with pytest.raises(MivolError, match="damaged JSON"):
+        read_volume(tmp_path / "a.zarr")
+    with pytest.raises(MivolError, match="turned axes for Zarr"):
+        write_volume(tmp_path / "b.zarr", VALUES, np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+
+
+def test_frames_of_edf(tmp_path: Path) -> None:
+    """EDF written by fabio, a file a view."""
+    edf = pytest.importorskip("fabio.edfimage")
+    for k, image in enumerate(VALUES):
+        edf.EdfImage(data=image, header={"k": str(k)}).write(str(tmp_path / f"a_{k}.edf"))
+    np.testing.assert_array_equal(read_stack(tmp_path / "a_*.edf"), VALUES)
+    np.testing.assert_array_equal(read_stack(tmp_path / "a_*.edf", rows=slice(1, 3)), VALUES[:, 1:3])
+    assert stack_shape(tmp_path / "a_*.edf") == (2, 3, 4)
+    (tmp_path / "a_0.edf").write_bytes((tmp_path / "a_0.edf").read_bytes()[:100])
+    with pytest.raises(MivolError, match=r"a_0\.edf: found a damaged or foreign file"):
+        read_stack(tmp_path / "a_*.edf")
+
+
+def write_series(folder: Path) -> np.ndarray:
+    """A tilt series of a head: 41 transmissions over 120 degrees in MRC, by mrcfile; returns the angles."""
+    mrcfile = pytest.importorskip("mrcfile")
+    angles = np.linspace(-60, 60, 41)
+    beam = ParallelBeam(np.radians(angles), (12, 32), 0.07)
+    with mrcfile.new(folder / "series.mrc") as file:
+        file.set_data(np.exp(-shepp_logan().project(beam)).astype(np.float32))
+        file.voxel_size = 7.0
+    return angles
+
+
+@pytest.mark.parametrize("suffix", [".rawtlt", ".tlt", ".mdoc", ".mrc.mdoc"])
+def test_a_tilt_series_needs_no_toml(tmp_path: Path, capsys, suffix: str) -> None:
+    angles = write_series(tmp_path)
+    lines = "\n".join(f"{a:.3f}" for a in angles)
+    if suffix.endswith("mdoc"):
+        lines = "PixelSpacing = 7\n" + "".join(
+            f"\n[ZValue = {k}]\nTiltAngle = {a:.3f}\nStage = 1 2\n" for k, a in enumerate(angles)
+        )
+    (tmp_path / f"series{suffix}").write_text(lines)
+    assert main(["explain", str(tmp_path / "series.mrc")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "a tilt series in MRC: 41 views of 12 x 32 pixels" in said and "angles from -60 to 60 degrees" in said
+    assert "pixels of 7 x 7 angstrom" in said and 'reading = "transmission"' in said
+    (tmp_path / f"series{suffix}").write_text(lines.rpartition("\n[ZValue" if suffix.endswith("mdoc") else "\n")[0])
+    assert main(["explain", str(tmp_path / "series.mrc")]) != 0
+    assert "found 40 angles, expected 41" in " ".join("".join(capsys.readouterr()).split())
+
+
+def test_a_tilt_series_becomes_a_volume(variant_rgb: str, tmp_path: Path) -> None:
+    write_series(tmp_path)
+    (tmp_path / "series.rawtlt").write_text("\n".join(map(str, np.linspace(-60, 60, 41))))
+    flags = ["-o", str(tmp_path / "run"), "--set", "solve.iterations=3", "--set", "held_out_every=0"]
+    assert main(["optimize", str(tmp_path / "series.mrc"), *flags]) == 0
+    assert read_volume(tmp_path / "run/volumes/reconstruction.npz").values.shape == (12, 32, 32, 1)
+
+
+def test_a_folder_of_edf_is_a_scan(tmp_path: Path, capsys) -> None:
+    edf = pytest.importorskip("fabio.edfimage")
+    beam = ParallelBeam(np.pi * np.arange(20) / 20, (4, 32), 0.07)
+    readings = 1000 * np.exp(-shepp_logan().project(beam))
+    for k, image in enumerate(readings):
+        edf.EdfImage(data=image.astype(np.float32)).write(str(tmp_path / f"scan_{k:03d}.edf"))
+    for k in range(2):
+        edf.EdfImage(data=np.full((4, 32), 1000 + k, np.float32)).write(str(tmp_path / f"ref_{k}.edf"))
+    assert main(["explain", str(tmp_path)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "scan_#.edf: 20 views of 4 x 32 pixels" in said and "ref_#.edf: 2 flats" in said
+
+
+def test_angles_of_an_mdoc_without_angles_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.mdoc").write_text("[ZValue = 0]\nStage = 3\n")
+    with pytest.raises(MivolError, match="found 1 sections ZValue, expected a number TiltAngle in each"):
+        read_tilt_angles(tmp_path / "a.mdoc")
