@@ -70,6 +70,12 @@ MOST_LAYERS, VIEWS_OF_LOOP = 16, 64
 64 views fit into a first-level cache."""
 
 
+def have_layers(matrices: np.ndarray) -> bool:
+    """Whether the row of a shadow in parallel light depends on z alone, in the same way in all views: to 1e-9 rows a voxel."""
+    rows = matrices[:, 1]
+    return bool(np.abs(rows[:, :2]).max() < 1e-9 and np.ptp(rows, axis=0).max() < 1e-9)
+
+
 def backproject_layers(matrices: np.ndarray, images: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """As :func:`backproject_voxels` without weights, for parallel light about z: a shadow's row depends on z alone.
 

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.fft
 
 from mivol.errors import MivolError
-from mivol.tomography.backprojection import backproject_layers, backproject_voxels, pixel_matrices
+from mivol.tomography.backprojection import backproject_layers, backproject_voxels, have_layers, pixel_matrices
 from mivol.tomography.geometry import ConeBeam, ParallelBeam
 from mivol.tomography.projector import Projector
 
@@ -89,13 +89,16 @@ def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "
         MivolError: another beam, or missing directions.
 
     Bias: the ramp stops at the pixels' Nyquist frequency; few views leave streaks. Values are not clipped at 0.
-    Cost: two reads of sixteen neighbours per view and sixteen voxels along z; memory: ``y`` once more in float32.
+    Cost: two reads of sixteen neighbours per view and sixteen voxels along z; four reads per voxel and view with a tilt, or
+    with a detector that moves along v. Memory: ``y`` once more in float32.
     """
     beam, weights = projector.geometry, _parallel_weights(projector)
     margins = _detector_margins(beam.u)
     matrices = _shift_columns(pixel_matrices(beam, projector.grid, projector.views), margins[0])
     images = _filter_views(y, lambda views: weights[views, None], margins, beam.pitch[1], window, cutoff)
-    return backproject_layers(matrices, images, projector.grid)
+    if have_layers(matrices):
+        return backproject_layers(matrices, images, projector.grid)
+    return backproject_voxels(matrices, images, projector.grid, weighted=False)
 
 
 def _parallel_weights(projector: Projector) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.tomography.backprojection import backproject_layers, backproject_voxels, pixel_matrices
+from mivol.tomography.backprojection import backproject_layers, backproject_voxels, have_layers, pixel_matrices
 from mivol.tomography.filtered import (
     BLEND_COLUMNS,
     WINDOWS,
@@ -242,4 +242,15 @@ def test_layers_at_once_equal_voxel_by_voxel(variant_rgb: str, grid: VoxelGrid) 
     matrices = pixel_matrices(beam, grid)
     expected = backproject_voxels(matrices, images, grid, weighted=False)
     assert np.abs(backproject_layers(matrices, images, grid) - expected).max() < 12 * 4 * 12 * 2.0**-24
-    assert (expected > 1).any()
+    assert (expected > 1).any() and have_layers(matrices)
+
+
+def test_a_tilt_leaves_the_layers(variant_rgb: str) -> None:
+    """With a tilt of .05 a shadow's row depends on x and y: each voxel is read by itself, and the tilted ball is found."""
+    beam = ParallelBeam(turn(96, 360), (60, 60), tilt=0.05)
+    assert not have_layers(pixel_matrices(beam, VoxelGrid((48, 48, 48))))
+    ball = EllipsoidPhantom(np.eye(3)[None] / 6.0, np.array([[14.0, 0.0, 5.0]]), np.array([1.0]))
+    grid = VoxelGrid((48, 48, 48))
+    volume = filtered_backprojection(Projector(beam, grid), ball.project(beam))
+    z, y, x = np.indices(grid.shape)[:, volume > 0.5].mean(1) - 23.5
+    assert np.abs([x - 14, y, z - 5]).max() < 0.1

@@ -58,7 +58,14 @@ def test_an_axis_is_found_on_a_circle_only() -> None:
             config.from_dict(tomllib.loads(raw), "t.toml")
 
 
-LIMITS = {"helix": 0.18, "sources": 0.142, "missing_wedge": 0.324, "half_acquisition": 0.26, "region_of_interest": 0.66}
+LIMITS = {
+    "laminography": 0.18,
+    "helix": 0.18,
+    "sources": 0.142,
+    "missing_wedge": 0.324,
+    "half_acquisition": 0.26,
+    "region_of_interest": 0.66,
+}
 """The errors of scenes/trajectories/README.md and 3 %, for other processors: fits without noise have no random numbers."""
 
 
