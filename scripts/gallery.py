@@ -139,6 +139,13 @@ ENTRIES = {
         ("scenes/scan_view/tables.py --size 240 --spp 8 --iterations 1 -o {out}",),
         drawn("tooth.png"),
     ),
+    "explosion": Entry(
+        "An explosion, from a .vdb with density and temperature",
+        "Simulated, written as bricks, and rendered from the file: black bodies in soot that scatters, over a plain at dusk.",
+        "python scenes/explosion/render.py",
+        ("scenes/explosion/render.py --cells 80 --size 240 --spp 160 -o {out}",),
+        drawn("explosion.png"),
+    ),
     "fire": Entry(
         "A fire, from temperature and soot",
         "Black bodies behind soot, over a floor that they light, at an exposure that is chosen from the picture.",

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-EXTINCTION = 150.0
+EXTINCTION = 240.0
 """Extinction [1/length] in the cloud, whose box has the edge 1."""
 
 
@@ -40,12 +40,12 @@ def make_scene(cloud: mivol.SparseVolumeData, size: int, spp: int) -> mi.Scene:
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "mivol", "max_depth": 24},
+            "integrator": {"type": "mivol", "max_depth": 48},
             "sensor": {"type": "perspective", "fov": 29, "to_world": view, "film": film,
                        "sampler": {"type": "independent", "sample_count": spp}},
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.07, 0.17, 0.42]}},
-            "sun": {"type": "directional", "direction": [0.8, 0.25, -0.55],
-                    "irradiance": {"type": "rgb", "value": [4.4, 3.9, 3.2]}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.06, 0.15, 0.38]}},
+            "sun": {"type": "directional", "direction": [0.8, 0.45, -0.5],
+                    "irradiance": {"type": "rgb", "value": [8.5, 7.6, 6.4]}},
             "cloud": {"type": "cube", "to_world": to_world().scale(0.5).translate(1), "bsdf": {"type": "null"},
                       "interior": droplets},
         }

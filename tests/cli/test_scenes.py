@@ -67,6 +67,7 @@ SCRIPTS = {
     "big_cloud": "render.py",
     "bonsai": "scan.py",
     "cloud": "models.py",
+    "explosion": "render.py",
     "fire": "render.py",
     "fog": "render.py",
     "knot": "render.py",
@@ -304,6 +305,20 @@ def test_a_big_cloud(tmp_path: Path, script: Script) -> None:
     assert 50 < bricks < 12**3 and f"derivatives by {512 * bricks} voxels" in said
     assert read_sparse_volume(tmp_path / "cloud.vdb").values.shape[0] == bricks
     assert (tmp_path / "cloud.png").stat().st_size > 500
+
+
+@pytest.mark.slow
+def test_an_explosion(tmp_path: Path, script: Script) -> None:
+    """Two grids of one file, with their own boxes; hot gas lies where there is soot, and shines."""
+    said = script("explosion", "--cells", 32, "--size", 24, "--spp", 8, "-o", tmp_path)
+    hottest = float(re.search(r"up to (\d+) K", said).group(1))
+    assert 1500 < hottest < 2600
+    soot, heat = (read_volume(tmp_path / "fire.vdb", name) for name in ("density", "temperature"))
+    assert soot.values.shape != heat.values.shape and 0.1 < soot.values.max() < 2 and heat.values.max() > 1500
+    centres = [volume.to_world[:3, :3] @ [0.5, 0.5, 0.5] + volume.to_world[:3, 3] for volume in (soot, heat)]
+    assert np.abs(centres[0][:2]).max() < 1.5 and np.linalg.norm(centres[0] - centres[1]) < 3
+    image = read_exr(tmp_path / "explosion.exr")[0]
+    assert image["R"].max() > 3 * image["B"].max() > 0
 
 
 def test_an_exposure_is_chosen_by_the_brightest_hundredth() -> None:

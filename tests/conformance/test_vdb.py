@@ -21,10 +21,12 @@ import pytest
 from conformance.test_bad_files import refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scattering_scenes import pencils
 
 import mivol
 from mivol.files import SparseVolumeData, check_bricks, read_sparse_volume, read_volume, vdb, write_volume
 from mivol.files.formats import convert_volume
+from scenes import sky
 
 PLACED = np.array([[0.5, 0, 0, 1], [0, 0, -0.5, 2], [0, 0.25, 0, 3], [0, 0, 0, 1]])
 """Index to world of the first grid: x of the index runs along x, y along z, z against y."""
@@ -142,6 +144,40 @@ def test_bricks_hold_what_the_dense_box_holds(openvdb_file: Path, name: str) -> 
     assert np.array_equal(sparse.to_world, dense.to_world) and sparse.meta == dense.meta
     check_bricks(sparse, name=name, minimum=None)
     assert sparse.values.any(axis=(1, 2, 3, 4)).all()
+
+
+LAYERS = {(0, 0): 14.0, (7, 7): 14.0 + 2 - 0.25}
+"""Voxel (y, z) of a row along x: the sum of its 24 values: 8 in a tile of 1, 8 in a tile of 0.5 that is off, 8 of the value
+outside, 0.25, of which the last is 2 in the last row."""
+
+
+@pytest.mark.usefixtures("variant_rgb")
+@pytest.mark.parametrize("storage", ["dense", "sparse"])
+def test_light_through_tiles_and_background(tmp_path: Path, storage: str) -> None:
+    """Beer and Lambert: the optical depth of a row is the sum of its voxels times their edge, the outer half voxels included.
+
+    ``openvdb_10_background.vdb.gz`` is of OpenVDB 10.0.1: index x runs along y of the world in steps of 0.25, y along x in
+    steps of 0.5, z against z in steps of 1, from (1, 2, 3).
+    """
+    path = tmp_path / "a.vdb"
+    path.write_bytes(gzip.decompress((Path(__file__).parent / "openvdb_10_background.vdb.gz").read_bytes()))
+    place = read_volume(path).to_world
+    grid = {"type": "mivol_voxels", "filename": str(path), "use_grid_bbox": True, "storage": storage}
+    box = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f(place) @ mi.ScalarTransform4f().scale(0.5).translate(1),
+        "bsdf": {"type": "null"},
+        "interior": {"type": "mivol_medium", "sigma_t": grid, "albedo": 0.0},
+    }
+    begins = [(1 + 0.5 * y, -2.0, 3.0 - z) for y, z in LAYERS]
+    seen = pencils({"box": box, "sky": sky(1.0)}, np.array(begins), np.array([[0.0, 1, 0]]))
+    light = np.array(mi.render(seen.scene, integrator=mi.load_dict({"type": "mivol", "max_depth": 1}), spp=1))[0, :, 0]
+    np.testing.assert_allclose(-np.log(light), 0.25 * np.array(list(LAYERS.values())), rtol=1e-5)
+    # Half a voxel outside of the last centre the value is that of the voxel, and beyond there is vacuum.
+    edges = np.array([(1 - 0.499 * 0.5, -2, 3), (1 - 0.501 * 0.5, -2, 3), (1 + 7.499 * 0.5, -2, 3), (1 + 7.501 * 0.5, -2, 3)])
+    seen = pencils({"box": box, "sky": sky(1.0)}, edges, np.array([[0.0, 1, 0]]))
+    light = np.array(mi.render(seen.scene, integrator=mi.load_dict({"type": "mivol", "max_depth": 1}), spp=1))[0, :, 0]
+    np.testing.assert_allclose(-np.log(light), [3.5, 0, 3.5, 0], rtol=1e-5, atol=1e-7)
 
 
 def test_bricks_never_need_the_dense_box(tmp_path: Path) -> None:
