@@ -26,9 +26,9 @@ import scipy.fft
 HEIGHT = 1.5
 """Height of the box over its width."""
 STEPS, DT = 46, 0.5
-AMBIENT, FLAME = 300.0, 2600.0
+AMBIENT, FLAME = 300.0, 1900.0
 """Temperatures of the air, and of gas that has just burned [K]."""
-BURN, EXPANSION, SOOT, COOLING, LIFT, CONFINE = 0.04, 1.2, 2.2, 0.04, 0.55, 0.22
+BURN, EXPANSION, SOOT, COOLING, LIFT, CONFINE = 0.05, 1.2, 2.0, 0.04, 0.55, 0.22
 """Share of fuel that burns in a step; divergence and soot of burned fuel; cooling at FLAME; buoyancy; vorticity confinement."""
 SHOWN = 0.85
 """Of white: where the brightest fiftieth of the pixels lies in the picture."""
