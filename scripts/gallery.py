@@ -143,7 +143,7 @@ ENTRIES = {
         "An explosion, from a .vdb with density and temperature",
         "Simulated, written as bricks, and rendered from the file: black bodies in soot that scatters, over a plain at dusk.",
         "python scenes/explosion/render.py",
-        ("scenes/explosion/render.py --cells 80 --size 240 --spp 160 -o {out}",),
+        ("scenes/explosion/render.py --cells 80 --size 240 --spp 256 -o {out}",),
         drawn("explosion.png"),
     ),
     "fire": Entry(
@@ -155,9 +155,9 @@ ENTRIES = {
     ),
     "big_cloud": Entry(
         "A cloud of 1024 x 1024 x 1024 voxels",
-        "Sparse in memory, under a sun and a sky; all scattering up to 23 times.",
+        "Sparse in memory, under a sun and a sky; all scattering up to 47 times.",
         "python scenes/big_cloud/render.py",
-        ("scenes/big_cloud/render.py --voxels 512 --size 240 --spp 64 -o {out}",),
+        ("scenes/big_cloud/render.py --voxels 512 --size 240 --spp 96 -o {out}",),
         drawn("cloud.png"),
     ),
 }

@@ -45,7 +45,7 @@ def make_scene(cloud: mivol.SparseVolumeData, size: int, spp: int) -> mi.Scene:
                        "sampler": {"type": "independent", "sample_count": spp}},
             "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.06, 0.15, 0.38]}},
             "sun": {"type": "directional", "direction": [0.8, 0.45, -0.5],
-                    "irradiance": {"type": "rgb", "value": [8.5, 7.6, 6.4]}},
+                    "irradiance": {"type": "rgb", "value": [6.6, 5.9, 5.0]}},
             "cloud": {"type": "cube", "to_world": to_world().scale(0.5).translate(1), "bsdf": {"type": "null"},
                       "interior": droplets},
         }

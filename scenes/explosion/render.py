@@ -26,9 +26,9 @@ import scipy.fft
 HEIGHT = 1.5
 """Height of the box over its width."""
 STEPS, DT = 46, 0.5
-AMBIENT, FLAME = 300.0, 1900.0
+AMBIENT, FLAME = 300.0, 2050.0
 """Temperatures of the air, and of gas that has just burned [K]."""
-BURN, EXPANSION, SOOT, COOLING, LIFT, CONFINE = 0.05, 1.2, 2.0, 0.04, 0.55, 0.22
+BURN, EXPANSION, SOOT, COOLING, LIFT, CONFINE = 0.04, 1.2, 2.2, 0.04, 0.55, 0.22
 """Share of fuel that burns in a step; divergence and soot of burned fuel; cooling at FLAME; buoyancy; vorticity confinement."""
 SHOWN = 0.85
 """Of white: where the brightest fiftieth of the pixels lies in the picture."""
@@ -180,9 +180,9 @@ def make_scene(path: Path, size: int, spp: int) -> mi.Scene:
             "integrator": {"type": "mivol", "max_depth": 8},
             "sensor": {"type": "perspective", "fov": 25, "to_world": view, "film": film,
                        "sampler": {"type": "independent", "sample_count": spp}},
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.7, 1.1, 2.0]}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.08, 0.125, 0.22]}},
             "sun": {"type": "directional", "direction": [0.9, 0.35, -0.25],
-                    "irradiance": {"type": "rgb", "value": [14.0, 7.5, 3.2]}},
+                    "irradiance": {"type": "rgb", "value": [3.0, 1.6, 0.7]}},
             "floor": {"type": "rectangle", "to_world": to_world().scale(400),
                       "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.30, 0.27, 0.23]}}},
             "fire": {"type": "cube", "to_world": to_world(box) @ to_world().scale(0.5).translate(1),
