@@ -28,9 +28,10 @@ from mivol.errors import MivolError
 from mivol.fields.hash_encoding import HashEncoding, HashSizes
 from mivol.fields.networks import Network
 from mivol.fields.protocol import BOUNDED, accumulate_tracked
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.voxels import Voxels
 
-__all__ = ["HashDensity", "TabulatedDensity"]
+__all__ = ["FittedDensity", "HashDensity", "TabulatedDensity"]
 
 SHIFT = 3.0
 """An untrained field has S(-3) = 0.047 of the bound: most of a box is thin."""
@@ -124,19 +125,42 @@ MOST_NODES = 1 << 27
 """Largest number of nodes of a table."""
 
 
+class FittedDensity:
+    """The extinction of a hash grid or a NeRF that was fitted to photographs, with the tensors that it depends on.
+
+    Attributes:
+        field: with a region, in an upright box.
+        tensors: parameters by name; those of the colours alone are left out.
+    """
+
+    def __init__(self, field: SampledField) -> None:
+        self.field, self.to_world = field, field.to_world
+        self.tensors = {name: value for name, value in field.parameters().items() if not name.startswith("colour")}
+
+    def eval_unit(self, unit: mi.Point3f, inside: mi.Bool) -> mi.Float:
+        """Values at points of the unit cube; 0 in cells that are not occupied, and for the lanes outside."""
+        rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in self.to_world[:3]]
+        p = mi.Point3f(*(dr.fma(r[0], unit.x, dr.fma(r[1], unit.y, dr.fma(r[2], unit.z, r[3]))) for r in rows))
+        changed = self.field.with_parameters(self.field.parameters() | self.tensors)
+        return dr.select(inside & self.field.region.holds(p), changed.eval_density(p), 0)
+
+    def parameters(self) -> dict[str, Any]:
+        return self.tensors
+
+
 class TabulatedDensity:
-    """A hash grid at the nodes of a grid over its box: voxels that follow the tensors, with their derivatives.
+    """A hash grid or a NeRF at the nodes of a grid over its box: voxels that follow the tensors, with their derivatives.
 
     Args:
-        density: the hash grid.
+        density: the hash grid, or the density of a fitted field.
         nodes: nodes along the longest edge of the box, at least 1; voxels are nearly cubes.
 
     Raises:
         MivolError: another number of nodes, or more than ``MOST_NODES`` in the box.
     """
 
-    def __init__(self, density: HashDensity, nodes: int) -> None:
-        edges = density.encoding.edges
+    def __init__(self, density: HashDensity | FittedDensity, nodes: int) -> None:
+        edges = np.linalg.norm(density.to_world[:3, :3], axis=0)
         res = [max(1, round(nodes * float(edge / edges.max()))) for edge in edges[::-1]]
         if nodes < 1 or np.prod(res, dtype=np.float64) > MOST_NODES:
             raise MivolError(

@@ -133,6 +133,10 @@ class SampledField(ABC):
         """Extinction at points, without derivatives; the points are evaluated."""
 
     @abstractmethod
+    def eval_density(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float:
+        """Extinction at points in the lanes of a kernel; attached to the parameters."""
+
+    @abstractmethod
     def eval(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> tuple[mi.Float, mi.Color3f]:
         """Extinction and colour at points in the lanes of a kernel; attached to the parameters."""
 

@@ -1,5 +1,5 @@
 """Volumes: "mivol_voxels", a dense grid; "mivol_transfer", a grid seen through a table; "mivol_sh", a radiance field;
-"mivol_gaussians", Gaussians for ray tracing; "mivol_hash", an extinction of a hash grid.
+"mivol_gaussians", Gaussians for ray tracing; "mivol_hash" and "mivol_network", extinctions of networks; "mivol_octree", leaves.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.blackbody import read_hot_matter
 from mivol.fields.bricks import Bricks
-from mivol.fields.field_files import field_from_props
+from mivol.fields.field_files import field_from_props, read_field
 from mivol.fields.gaussian_field import GaussianField
-from mivol.fields.hash_density import HashDensity, TabulatedDensity
+from mivol.fields.hash_density import FittedDensity, HashDensity, TabulatedDensity
 from mivol.fields.protocol import Field
+from mivol.fields.sampled_field import SampledField
 from mivol.fields.sparse_voxels import SparseVoxels
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.transfer import Transfer
@@ -336,11 +337,16 @@ class HashVolume(ExtinctionVolume):
         return f"mivol_hash[{field.sizes.levels} levels, {sum(dr.width(value) for value in field.tensors.values())} numbers]"
 
 
-class TabulatedHashVolume(VoxelVolume):
-    """``mivol_hash`` with ``nodes``: voxels that follow the tensors of a hash grid."""
+class TabulatedVolume(VoxelVolume):
+    """Voxels that follow the tensors of a hash grid or a NeRF.
 
-    def __init__(self, props: mi.Properties) -> None:
-        self.tabulated = TabulatedDensity(HashDensity.from_props(props), int(props["nodes"]))
+    Args:
+        density: the field.
+        nodes: nodes along the longest edge of its box.
+    """
+
+    def __init__(self, props: mi.Properties, density: HashDensity | FittedDensity, nodes: int) -> None:
+        self.tabulated = TabulatedDensity(density, nodes)
         self.field = self.tabulated.voxels
         self.texture = self.field.freezable_texture
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
@@ -355,8 +361,29 @@ class TabulatedHashVolume(VoxelVolume):
         self.tabulated.refresh()
 
     def to_string(self) -> str:
-        sizes, res = self.tabulated.density.sizes, " x ".join(map(str, self.tabulated.res[::-1]))
-        return f"mivol_hash[{sizes.levels} levels, at {res} nodes]"
+        return f"{type(self.tabulated.density).__name__}[at {' x '.join(map(str, self.tabulated.res[::-1]))} nodes]"
+
+
+class NetworkVolume(TabulatedVolume):
+    """``<volume type="mivol_network">``: the extinction of a hash grid or a NeRF fitted to photographs, by its weights.
+
+    Parameters:
+        filename: a hash grid or a NeRF (.npz), of a fit or from published weights.
+        nodes: nodes of a grid along the longest edge of the field's box; the network is evaluated there, trilinear between
+            them. Default 64.
+
+    The weights that the density depends on are its parameters: ``table`` and ``density_weights``, or ``weights``. ``data``
+    (Z, Y, X, 1) shows the values at the nodes.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        if "filename" not in props:
+            raise MivolError("mivol_network was given no filename: give a hash grid or a NeRF (.npz).")
+        path = str(mi.file_resolver().resolve(props["filename"]))
+        field = read_field(path)
+        if not isinstance(field, SampledField):
+            raise MivolError(f"{path} is a {type(field).__name__}, a hash grid or a NeRF is expected: give it as a mivol_sh.")
+        super().__init__(props, FittedDensity(field), int(props.get("nodes", 64)))
 
 
 class OctreeVolume(ExtinctionVolume):
@@ -407,9 +434,11 @@ class OctreeVolume(ExtinctionVolume):
         return f"mivol_octree[{field.leaves} leaves, depth {field.depth}]"
 
 
-def make_hash_volume(props: mi.Properties) -> HashVolume | TabulatedHashVolume:
+def make_hash_volume(props: mi.Properties) -> HashVolume | TabulatedVolume:
     """A ``mivol_hash``: evaluated at points, or at the nodes of a grid."""
-    return TabulatedHashVolume(props) if "nodes" in props else HashVolume(props)
+    if "nodes" in props:
+        return TabulatedVolume(props, HashDensity.from_props(props), int(props["nodes"]))
+    return HashVolume(props)
 
 
 def _towards(it: mi.Interaction3f) -> mi.Vector3f:
@@ -426,3 +455,4 @@ mi.register_texture("mivol_transfer", TransferVolume)
 mi.register_texture("mivol_hash", make_hash_volume)
 mi.register_texture("mivol_gaussians", GaussianVolume)
 mi.register_texture("mivol_octree", OctreeVolume)
+mi.register_texture("mivol_network", NetworkVolume)

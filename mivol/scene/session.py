@@ -294,10 +294,14 @@ def _find_derived_owners(medium: mi.Medium) -> list[mi.Object]:
     known = traverse_medium(medium).properties
     volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
     stands = [n for n, v in volumes.items() if n.startswith("sigma_") or hasattr(v, "mivol_extinction")]
-    read = [n for n in stands if f"{n}.table" not in known]
+    read = [n for n in stands if not any(f"{n}.{source}" in known for source in SOURCES)]
     return [medium.phase_function(), *(v for n, v in volumes.items() if n not in read)]
 
 
 def _is_computed(params: mi.SceneParameters, key: str) -> bool:
     """Whether a plugin computes the parameter from its other parameters, such as the grid of a ``mivol_transfer``."""
-    return key == "data" and "table" in params
+    return key == "data" and any(source in params for source in SOURCES)
+
+
+SOURCES = "table", "weights"
+"""Parameters from which plugins compute their ``data``: of a ``mivol_transfer``, a hash grid and a NeRF."""

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from ball_photos import ball
 from false_alarms import assert_precise, assert_same_mean
 
+from mivol.fields.field_files import write_field
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
+from mivol.fields.nerf import NerfField, NerfSizes
+from mivol.optim.photographs.sampled_problem import find_region
 from mivol.validate.moments import Moments
 
 SIZES = {"levels": 3, "log2_table": 7, "coarsest": 2, "finest": 8, "width": 8}
@@ -15,8 +23,9 @@ RUNS = 12
 KEY = "box.interior_medium.sigma_t."
 
 
-def scene(max_depth: int = 2, albedo: float = 0.0, **more: object) -> mi.Scene:
+def scene(max_depth: int = 2, albedo: float = 0.0, volume: dict | None = None, **more: object) -> mi.Scene:
     """The unit cube in white light: a pixel is the transmittance of the cube, if nothing scatters."""
+    own = {"type": "mivol_hash", "majorant": 8.0, "seed": 4, **SIZES, **more}
     place = mi.ScalarTransform4f()
     return mi.load_dict(
         {
@@ -37,7 +46,7 @@ def scene(max_depth: int = 2, albedo: float = 0.0, **more: object) -> mi.Scene:
                 "interior": {
                     "type": "mivol_medium",
                     "albedo": albedo,
-                    "sigma_t": {"type": "mivol_hash", "majorant": 8.0, "seed": 4, **SIZES, **more},
+                    "sigma_t": volume or own,
                 },
             },
         }
@@ -164,6 +173,43 @@ def test_nodes_hold_the_values_of_the_network(variant_rgb: str) -> None:
         ends.append(float(dr.mean(mi.render(box, spp=4, seed=2), axis=None).array[0]))
     # Absorption is exact along fixed rays. float32 errs by 1e-7 of a difference of 4e-4, kinks of the network by less than 1 %.
     assert (ends[0] - ends[1]) / (2 * h) == pytest.approx((along**2).sum(), rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["hash", "nerf"])
+def test_a_fitted_network_is_an_extinction_by_its_weights(variant_rgb: str, tmp_path: Path, kind: str) -> None:
+    """``mivol_network``: the density of a file at nodes, and derivatives of an image by the weights, against differences."""
+    if kind == "hash":
+        sizes = HashSizes(levels=2, log2_table=8, coarsest=2, finest=4, width=8, geometry=2)
+        field, name = HashField.random(sizes, np.eye(4), seed=1), "density_weights"
+    else:
+        sizes = NerfSizes(depth=2, width=8, skip=0, place=2, direction=1, branch=4)
+        field, name = NerfField.random(sizes, np.eye(4), seed=1), "weights"
+    values = {key: value * (2e3 if key == "table" else 1) for key, value in field.parameters().items()}
+    write_field(tmp_path / "f.npz", find_region(field.with_parameters(values), 4))
+    box = scene(volume={"type": "mivol_network", "filename": str(tmp_path / "f.npz"), "nodes": 6})
+    params, key = mi.traverse(box), KEY + name
+    nodes = np.array(params[KEY + "data"])
+    assert nodes.shape == (6, 6, 6, 1) and nodes.std() > 0.01 * nodes.mean() > 0
+    value = np.array(params[key])
+    dr.enable_grad(params[key])
+    params.update()
+    dr.backward(dr.mean(mi.render(box, params, spp=4, seed=1, seed_grad=2), axis=None))
+    along = np.array(dr.grad(params[key]), np.float64)
+    h, ends = 0.02 / np.linalg.norm(along), []
+    for step in (h, -h):
+        params[key] = mi.TensorXf(np.float32(value + step * along))
+        params.update()
+        ends.append(float(dr.mean(mi.render(box, spp=4, seed=2), axis=None).array[0]))
+    # As above: float32 errs by 1e-7 of a difference of more than 1e-3.
+    assert (ends[0] - ends[1]) / (2 * h) == pytest.approx((along**2).sum(), rel=0.01)
+
+
+def test_a_network_needs_a_file_of_one(variant_rgb: str, tmp_path: Path) -> None:
+    with pytest.raises((RuntimeError, ValueError), match="given no filename"):
+        mi.load_dict({"type": "mivol_network"})
+    write_field(tmp_path / "grid.npz", ball())
+    with pytest.raises((RuntimeError, ValueError), match="is a SphericalGrid, a hash grid or a NeRF is expected"):
+        mi.load_dict({"type": "mivol_network", "filename": str(tmp_path / "grid.npz")})
 
 
 @pytest.mark.parametrize(
