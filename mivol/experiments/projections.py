@@ -25,6 +25,7 @@ from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, Voxe
 from mivol.tomography.panel_views import COLUMNS, PanelViews, helix, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import (
+    AIR_RANGE,
     Air,
     Quanta,
     Transmission,
@@ -241,6 +242,8 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
     if angles is not None:
         notes += note_order(angles)
     transmission, light, air_notes = correct_air(readings.transmission, data.air, air)
+    if readings.intensity is not None:
+        check_light(transmission)
     transmission, corrections, pictures = correct_pixels(data, transmission)
     notes += [*air_notes, *corrections]
     measured, weights = to_line_integrals(transmission)
@@ -275,6 +278,21 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
         removed_rings=removed,
         pictures=tuple(pictures),
     )
+
+
+def check_light(transmission: Transmission) -> None:
+    """Refuse views that are brighter than the light without object.
+
+    Raises:
+        MivolError: a median transmission above ``AIR_RANGE``.
+    """
+    finite = transmission.value[np.isfinite(transmission.value)]
+    middle = float(np.median(finite)) if finite.size else 0.0
+    if middle > AIR_RANGE[1]:
+        raise MivolError(
+            f"found views with {middle:.3g} times the light of the flats (median), expected at most {AIR_RANGE[1]:g}: give "
+            "flats of the same exposure, or set data.air to the columns of air at each edge."
+        )
 
 
 def correct_pixels(

@@ -72,6 +72,10 @@ class Calibration:
         return np.where(lost, np.nan, readings - self.dark)
 
 
+FULL_SCALES, FULL_SHARE = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 16)), 0.01
+"""Largest numbers of a detector's bits, and the share of flats at that number above which they seem saturated."""
+
+
 def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, saturation: float = np.inf) -> Calibration:
     """Calibrate a detector by flats and darks. A pixel is dead if its flats are saturated or not above its darks.
 
@@ -108,6 +112,13 @@ def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, satura
         gain = max(float(flats.var(0, ddof=1)[alive].mean()) - dark_variance, 0.0) / float(light[alive].mean())
         if len(darks) == 1:
             notes = ("one dark: its noise is unknown, and the scatter of the flats counts as noise of quanta",)
+    full = float(flats.max())
+    share = float(np.mean(flats == full))
+    if full in FULL_SCALES and share > FULL_SHARE:
+        notes += (
+            f"{share:.0%} of the flats' pixels are {full:g}, the largest number of their bits: the flats seem saturated, "
+            f"data.saturation = {full:g} leaves such pixels out",
+        )
     return Calibration(dark, np.where(alive, light, np.nan), dark_variance, gain, len(flats), len(darks), saturation, notes)
 
 

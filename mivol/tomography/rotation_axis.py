@@ -394,6 +394,8 @@ def _held_out_misfit(
 def _object_radius(y: np.ndarray, column: float) -> int:
     """Pixels from the axis to the outermost pixel that ever sees a tenth of the densest ray, plus a tenth."""
     seen = np.flatnonzero((y > 0.1 * y.max()).any(axis=(0, 1)))
+    if not len(seen):
+        raise MivolError("found no line integral above 0, expected an object that absorbs light: check flats and views.")
     return int(np.ceil(1.1 * np.abs(seen - column).max()))
 
 

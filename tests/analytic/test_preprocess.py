@@ -7,7 +7,14 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.tomography import preprocess
-from mivol.tomography.preprocess import LightDrift, Transmission, correct_transmission, count_quanta, to_line_integrals
+from mivol.tomography.preprocess import (
+    LightDrift,
+    Transmission,
+    calibrate,
+    correct_transmission,
+    count_quanta,
+    to_line_integrals,
+)
 
 
 def test_noise_of_which_the_form_is_known() -> None:
@@ -277,3 +284,18 @@ def test_flats_without_noise_count_nothing() -> None:
     readings, flats, darks = fields()
     with pytest.raises(MivolError, match="scatter no more than darks"):
         count_quanta(readings, np.repeat(flats.mean(0, keepdims=True), 2, 0), darks)
+
+
+def test_saturated_flats_are_named() -> None:
+    """A twentieth of the pixels at the largest number of 12 bits; the same share at another number is a bright flat."""
+    rng = np.random.default_rng(3)
+    flats = rng.uniform(2000, 3000, (4, 5, 20))
+    flats[:, :, 3] = 4095
+    darks = rng.uniform(0, 10, (4, 5, 20))
+    found = calibrate(flats, flats, darks).notes
+    assert found == (
+        "5% of the flats' pixels are 4095, the largest number of their bits: the flats seem saturated, data.saturation = 4095 "
+        "leaves such pixels out",
+    )
+    flats[:, :, 3] = 4094
+    assert calibrate(flats, flats, darks).notes == ()

@@ -266,3 +266,13 @@ def test_angles_of_a_stack(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(readings.read_angles(chosen, Path("b"), 2), np.radians([10, 20]))
     with pytest.raises(MivolError, match="a has 2 angles for 3 projections"):
         readings.read_angles(chosen, Path("b"), 3)
+
+
+def test_views_brighter_than_the_flats_are_refused() -> None:
+    """The median decides, and pixels that are not finite do not count."""
+    value = np.full((2, 2, 3), 1.2)
+    value[0, 0] = np.nan, 9.0, 9.0
+    projections.check_light(Transmission(value, value))
+    projections.check_light(Transmission(np.full((1, 1, 2), np.nan), value))
+    with pytest.raises(MivolError, match="found views with 4 times the light of the flats .* set data.air"):
+        projections.check_light(Transmission(np.full((2, 2, 3), 4.0), value))
