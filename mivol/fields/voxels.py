@@ -131,7 +131,7 @@ STORAGES = ("auto", "dense", "sparse")
 LEAST_SPARSE_BYTES = 128 << 20
 """Size of a dense grid [bytes] from which ``auto`` stores a sparse one: below, memory is cheap."""
 
-MAX_STORED_SHARE = 0.25
+MAX_STORED_SHARE = 0.5
 """Share of stored bricks up to which ``auto`` stores a sparse grid."""
 
 

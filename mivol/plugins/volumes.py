@@ -36,7 +36,7 @@ class VoxelVolume(mi.Volume):
         scale: factor on the values of a file or grid, a number or three (``"1, 0.5, 0.2"``), which make three channels of one.
             Default 1.
         storage: dense, sparse (bricks of 8^3 voxels; elsewhere 0) or auto: sparse for a file or grid of at least 128 MiB of
-            which at most a quarter would be stored. Default auto.
+            which at most half would be stored. Default auto.
         bricks, resolution, offset: for sparse ``data`` (bricks, 8, 8, 8, C): ascending numbers (z, y, x) of the bricks among
             those of the box, voxels of the box ``x, y, z``, and voxels of the first brick before the box (default 0, 0, 0).
 

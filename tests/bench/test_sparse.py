@@ -25,7 +25,8 @@ def test_bars_and_table() -> None:
         "read": {"skipped": sparse.MISSING},
         "walk": walk,
         "memory": {
-            "peak_bytes": {"medium": 219e6, "gradient": 950e6},
+            "held_bytes": {"all": 219e6},
+            "peak_bytes": {"gradient": 950e6},
             "held_over_bricks": 1.03,
             "first_picture": {"both": 2.0},
         },
