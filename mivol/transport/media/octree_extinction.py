@@ -129,16 +129,20 @@ class LeafField:
         return row, inside & is_leaf
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f | None, active: mi.Bool) -> list[mi.Float]:
+        """Values at world points, a list of channels; 0 outside of the leaves."""
         row, on = self.find_rows(p, mi.Bool(active))
         return read_leaf(self.values.array, self.channels, row, on)
 
     def accumulate(self, p: mi.Point3f, w: mi.Vector3f | None, d: list[mi.Float], active: mi.Bool) -> None:
+        """Add derivatives by the values at points to the gradient of the leaves."""
         accumulate_tracked(self, p, w, d, active)
 
     def bound(self) -> list[float]:
+        """Largest value of each channel."""
         return [float(v) for v in np.array(dr.detach(self.values)).max(axis=0)]
 
     def parameters(self) -> dict[str, Any]:
+        """The values of the leaves, as ``data``."""
         return {"data": self.values}
 
 
