@@ -133,7 +133,8 @@ class Painter:
         self.subject, self.send, self.clock, self.look = subject, send, clock, look
         self.drawn = 0
         self._pages: dict[Hashable, Canvas] = {}
-        self._cost = 1e-6  # seconds per pixel, learned
+        # A draw of n pixels takes about fixed + cost n seconds; both are learned.
+        self._fixed, self._cost = 0.0, 1e-6
 
     def see(self, page: Hashable, camera: Camera) -> None:
         """Draw a page anew, from another camera."""
@@ -181,29 +182,40 @@ class Painter:
         return to_picture(np.asarray(values) / count, self.subject.space, self.look.exposure)
 
     def warm_up(self, camera: Camera) -> None:
-        """Draw twice at the largest coarse size: compiles the kernels, then learns the cost of a pixel."""
-        camera = scale_camera(camera, EDGES[0])
-        self.subject.draw(camera, self.look, 0)
-        start = self.clock()
-        self.subject.draw(camera, self.look, 0)
-        self._cost = (self.clock() - start) / (camera.size[0] * camera.size[1])
+        """Draw a small and a large coarse picture twice each: compiles the kernels, then learns the time of a draw."""
+        times, counts, largest = [], [], min(EDGES[0], max(camera.size))
+        for edge in (max(largest // 6, 1), largest):
+            small = scale_camera(camera, edge)
+            self.subject.draw(small, self.look, 0)
+            start = self.clock()
+            self.subject.draw(small, self.look, 0)
+            times.append(self.clock() - start)
+            counts.append(small.size[0] * small.size[1])
+        self._cost = max((times[1] - times[0]) / (counts[1] - counts[0]), times[1] / counts[1] / 10)
+        self._fixed = max(times[0] - self._cost * counts[0], 0.0)
 
     # -- Pieces --------------------------------------------------------------------------------------------------------
 
     def _timed(self, camera: Camera, seed: int) -> np.ndarray:
-        """Values of a camera; learns the cost of a pixel."""
-        start = self.clock()
+        """Values of a camera; learns the time of a draw."""
+        start, expected = self.clock(), self._expect(camera.size[0] * camera.size[1])
         values = self.subject.draw(camera, self.look, seed)
-        cost = (self.clock() - start) / (camera.size[0] * camera.size[1])
         # A first draw of a size compiles kernels: one slow draw moves the estimate by at most a factor of 2.
-        self._cost = 0.5 * self._cost + 0.5 * min(cost, 3 * self._cost)
+        ratio = 0.5 + 0.5 * min((self.clock() - start) / expected, 3)
+        self._fixed, self._cost = ratio * self._fixed, ratio * self._cost
         self.drawn += 1
         return values
+
+    def _expect(self, pixels: float) -> float:
+        """Time of a draw [s]."""
+        return self._fixed + self._cost * pixels
 
     def _draw_coarse(self, page: Hashable) -> None:
         canvas = self._pages[page]
         shares = (canvas.camera.size[0] * canvas.camera.size[1]) / max(canvas.camera.size) ** 2
-        edge = next((edge for edge in EDGES if edge**2 * shares * self._cost <= SOON), EDGES[-1])
+        # Where the fixed part alone takes too long, fewer pixels do not help.
+        soon = max(SOON, 2 * self._fixed)
+        edge = next((edge for edge in EDGES if self._expect(edge**2 * shares) <= soon), EDGES[-1])
         values = self._timed(scale_camera(canvas.camera, edge), 0)
         canvas.is_coarse = True
         self._send(page, values, False)
@@ -213,7 +225,9 @@ class Painter:
         camera = scale_camera(canvas.camera, LONGEST)
         width, height = camera.size
         pieces = 1
-        while pieces < 16 and width * height * self._cost / pieces > SOON and height // (2 * pieces) >= 16:
+        while pieces < 16 and height // (2 * pieces) >= 16:
+            if width * height * self._cost / pieces <= max(SOON - self._fixed, self._fixed):
+                break
             pieces *= 2
         top = sum(map(len, canvas.rows))
         rows = min(-(-height // pieces), height - top)
