@@ -71,9 +71,12 @@ def start_server(port: int, token: str) -> Any:
     """Start viser behind the gate, on the loopback address.
 
     Raises:
-        MivolError: a gate that does not hold.
+        MivolError: a port that no server can have, or a gate that does not hold.
     """
     import viser
+
+    if not 1 <= port <= 65535:
+        raise MivolError(f"--port {port}: found no port, expected 1 to 65535; leave it out for {PORT}.")
 
     found = {"port": port}
     with guard_server(token, lambda: found["port"]), quiet():
