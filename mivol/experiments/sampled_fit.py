@@ -113,13 +113,21 @@ def explain_sampled_plan(plan: SampledPlan, photos: Photos, batches: RayBatches)
     model, numbers = plan.sizes.describe(box[1] - box[0])
     behind = "alpha marks the object" if photos.views[0].alpha is not None else "photos.background"
     most = plan.cells * plan.samples_a_cell
+    why = (
+        f"{plan.samples_a_cell:g} along a cell of the map of occupied space, {plan.cells} cells an edge; the number of rays grows "
+        "as the map empties"
+    )
+    if first := getattr(plan.sizes, "coarse", 0):
+        most = 2 * first + plan.sizes.fine
+        why = (
+            f"{first} by the coarse network, and by the other at these and at {plan.sizes.fine} more: field.coarse, field.fine"
+        )
     return [
         PlanLine(choice=f"{len(photos.views)} photographs, a box of {edges} [length]", reason=photos.survey.box_from),
         PlanLine(choice=model, reason=numbers),
         PlanLine(
             choice=f"{plan.samples} samples a step, about {most:.0f} a ray at first",
-            reason=f"{plan.samples_a_cell:g} along a cell of the map of occupied space, {plan.cells} cells an edge; "
-            "the number of rays grows as the map empties",
+            reason=why,
         ),
         PlanLine(choice=f"{plan.steps} steps", reason="field.effort"),
         PlanLine(choice="no field behind the box", reason=behind),
