@@ -113,10 +113,8 @@ def explain_sampled_plan(plan: SampledPlan, photos: Photos, batches: RayBatches)
     model, numbers = plan.sizes.describe(box[1] - box[0])
     behind = "alpha marks the object" if photos.views[0].alpha is not None else "photos.background"
     most = plan.cells * plan.samples_a_cell
-    why = (
-        f"{plan.samples_a_cell:g} along a cell of the map of occupied space, {plan.cells} cells an edge; the number of rays grows "
-        "as the map empties"
-    )
+    spacing = f"{plan.samples_a_cell:g} along a cell of the map of occupied space, {plan.cells} cells an edge"
+    why = f"{spacing}; the number of rays grows as the map empties"
     if first := getattr(plan.sizes, "coarse", 0):
         most = 2 * first + plan.sizes.fine
         why = (
