@@ -1,0 +1,15 @@
+"""Slices from TIFF to TIFF: the contestant that is always there, and its table."""
+
+from __future__ import annotations
+
+import pytest
+
+from mivol.bench.studies import scan_size
+
+
+def test_slices_go_from_tiff_to_tiff(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A head of 48 columns from 48 views is found to half of what an empty volume misses; its skull is a voxel thick."""
+    monkeypatch.setattr(scan_size, "PEERS", {})
+    answer = scan_size.measure_slices(scan_size.ScanSize(n=48, views=48, slices=3))
+    assert set(answer) == {"mivol"} and answer["mivol"]["nrmse"] < 0.5
+    assert scan_size.table("slices", answer)[2].startswith("| mivol | ")
