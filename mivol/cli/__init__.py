@@ -778,8 +778,16 @@ def convert(arguments: argparse.Namespace) -> None:
     if arguments.output.suffix.lower() == ".xml" and arguments.source.suffix.lower() == ".pbrt":
         print(_convert_scene(arguments))
         return
-    is_array = bool(_raw_layout(arguments)) or _is_array(_check_dataset(arguments.source, arguments.dataset))
+    is_array = bool(_raw_layout(arguments)) or _becomes_volume(arguments.source, arguments.output)
+    is_array = is_array or _is_array(_check_dataset(arguments.source, arguments.dataset))
     print((_convert_volume if is_array else _convert_cloud)(arguments))
+
+
+def _becomes_volume(source: Path, target: Path) -> bool:
+    """Whether an archive, as a fit writes volumes, is to be written in a format of volumes alone."""
+    from mivol.files.formats import VOLUME_SUFFIXES
+
+    return source.suffix.lower() in (".npz", ".npy") and target.name.lower().endswith(VOLUME_SUFFIXES)
 
 
 def _convert_scene(arguments: argparse.Namespace) -> str:

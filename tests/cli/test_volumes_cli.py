@@ -63,6 +63,17 @@ def test_formats_convert_into_each_other(tmp_path: Path, capsys: pytest.CaptureF
         np.testing.assert_array_equal(read_volume(tmp_path / f"c{target}").values[..., 2], 3 * values[..., 0])
 
 
+@pytest.mark.parametrize("target", ["b.vdb", "b.nvdb", "b.vti"])
+def test_the_volume_of_a_fit_converts(tmp_path: Path, target: str) -> None:
+    """Fits write ``.npz``; Blender, Houdini and ParaView read others."""
+    values = np.abs(np.nan_to_num(VALUES)) + 1
+    write_volume(tmp_path / "a.npz", values, PLACE)
+    assert run("convert", tmp_path / "a.npz", tmp_path / target) == 0
+    volume = read_volume(tmp_path / target)
+    np.testing.assert_array_equal(volume.values, values)
+    np.testing.assert_allclose(volume.to_world, PLACE, atol=1e-12)
+
+
 def test_convert_says_what_is_rounded_and_clipped(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Numbers wider than float32, and the distances of a level set (of OpenVDB's own file)."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
