@@ -116,7 +116,8 @@ def check_same(path: Path, saved: dict[str, Any], current: dict[str, Any]) -> No
     """
     current = json.loads(json.dumps(current))
     for key in sorted({*saved, *current}):
-        if key in GROWABLE_SETTINGS and saved.get(key, 0) <= current.get(key, 0):
+        # None: the number of iterations is left to the kind of fit.
+        if key in GROWABLE_SETTINGS and (saved.get(key) or 0) <= (current.get(key) or 0):
             continue
         if saved.get(key) != current.get(key):
             raise MivolError(

@@ -155,3 +155,11 @@ def test_a_full_disk_leaves_the_last_checkpoint(tmp_path: Path, monkeypatch: pyt
         written(path, {"a": 2})
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_iterations_that_the_kind_of_fit_chooses_resume(tmp_path: Path) -> None:
+    """Without a number of iterations in either run, and with one in the second; a number that is gone is another run."""
+    checkpoint.check_same(tmp_path, {"solve.iterations": None}, {"solve.iterations": None})
+    checkpoint.check_same(tmp_path, {"solve.iterations": None}, {"solve.iterations": 30})
+    with pytest.raises(MivolError, match="solve.iterations is 30 there and None here"):
+        checkpoint.check_same(tmp_path, {"solve.iterations": 30}, {"solve.iterations": None})
