@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from mivol.cli import main
+from mivol.errors import MivolError
+from mivol.view import page
 from mivol.view.gate import cookie_name, find_fault
 
 PORT, TOKEN = 8080, "a-token"
@@ -39,3 +42,16 @@ def test_requests_with_the_token_pass(path: str, headers: dict[str, str]) -> Non
 )
 def test_other_requests_are_turned_away(path: str, headers: dict[str, str], word: str) -> None:
     assert word in find_fault(path, headers, TOKEN, PORT)
+
+
+def test_viser_is_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before the path is looked at: the wheel alone names its extra."""
+    monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
+    assert main(["view", "nothing"]) == 1
+    assert 'pip install "mivol[viewer]"' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("port", [0, 70_000])
+def test_ports_that_no_server_has_are_refused(port: int) -> None:
+    with pytest.raises(MivolError, match="expected 1 to 65535"):
+        page.start_server(port, TOKEN)
