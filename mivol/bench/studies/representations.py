@@ -1,7 +1,7 @@
 """One table of all representations: how good, how soon, how large, and how fast to show?
 
     mivol bench representations                 # two hours of processor time
-    mivol bench representations --only chair    # a data set; models = grid,octree for some models
+    mivol bench representations --only chair    # a data set; --models grid octree for some models
     mivol bench representations --quick         # a minute, small sizes: the figures mean nothing
 
 The photographs of the still life (200 x 200 pixels; missing photographs are rendered to runs/photographs), of the chair (same
