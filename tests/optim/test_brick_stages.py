@@ -83,7 +83,7 @@ def test_neighbours_and_rows() -> None:
     values = np.array([0.0, 0.5, 0.2])[:, None] * np.ones((1, 4))
     assert _find_kept(values, np.array([3, 5, 9]), 0.2).tolist() == [5]
     assert _find_kept(values, np.array([3, 5, 9]), 0.7).tolist() == [5]
-    # Pulls 3, 1, -3, 5, 2; those of the stored bricks are 1 and -3, with a root mean square of 2.24.
+    # Pulls 3, 1, -3, 5, 2; those of the stored bricks are 1 and -3, with a median size of 2.
     gradient = np.array([[-2.0, -1.0], [-2.0, 1.0], [4.0, -1.0], [-5.0, 0.0], [-1.0, -1.0]])
     stored = np.array([False, True, True, False, False])
     assert _find_asked(gradient, stored).tolist() == [True, False, False, True, False]

@@ -3,7 +3,7 @@
 Conventions. ``data`` (bricks, 8, 8, 8, C) and ``bricks`` are the parameters of a sparse grid
 (:mod:`mivol.fields.sparse_voxels`). Bricks whose values are all at most a threshold vanish. Neighbours of the others, 26 a
 brick, appear if the gradient asks for them. A trial step with all neighbours at 0 measures the *pull* of each brick: by how
-much the loss falls if all its voxels rise. A neighbour appears if its pull exceeds the root mean square of the pulls of the
+much the loss falls if all its voxels rise. A neighbour appears if its pull exceeds the median size of the pulls of the
 stored bricks. These fall to the noise of the gradient as the fit converges; the sign alone would let in half of all neighbours
 by noise.
 """
@@ -123,9 +123,9 @@ def _find_kept(values: np.ndarray, numbers: np.ndarray, threshold: float) -> np.
 
 
 def _find_asked(gradient: np.ndarray, stored: np.ndarray) -> np.ndarray:
-    """The bricks that are not stored and pull harder than the stored bricks do in the root mean square."""
+    """The bricks that are not stored and pull harder than the stored bricks do in the median."""
     pull = -gradient.reshape(len(gradient), -1).sum(axis=1, dtype=np.float64)
-    return ~stored & (pull > np.sqrt(np.mean(np.square(pull[stored]))))
+    return ~stored & (pull > np.median(np.abs(pull[stored])))
 
 
 def _carry(tensor: mi.TensorXf, before: np.ndarray, after: np.ndarray) -> mi.TensorXf:
