@@ -195,7 +195,8 @@ def render_works(findings: Sequence[Finding]) -> bool:
     return any(f.state == OK for f in variants) and all(f.state == OK for f in versions)
 
 
-def _format_findings(findings: Sequence[Finding]) -> list[str]:
+def format_findings(findings: Sequence[Finding]) -> list[str]:
+    """The findings as lines, with their advice."""
     lines = []
     for finding in findings:
         lines.append(f"{finding.state:<6}{finding.subject:<14}{finding.value}")
@@ -215,7 +216,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="mivol doctor", description="Check whether a render works on this machine.")
     parser.parse_args(argv)
     findings = diagnose()
-    print("\n".join(_format_findings(findings)))
+    print("\n".join(format_findings(findings)))
     works = [f.subject for f in findings if f.state == OK and f.subject.endswith(("_ad_rgb", "_ad_mono"))]
     if render_works(findings):
         print(f"\nRenders work here, with {' and '.join(works)}.")

@@ -29,7 +29,10 @@ MOST_LOSSES = 3
 """Workers that a unit may lose. Work that kills its worker would go on for ever otherwise."""
 
 SECONDS_BETWEEN_LOOKS = 1.0
-"""Interval between two looks at the list of workers."""
+"""Interval between two looks at the list of workers, while a worker with work has been silent for as long."""
+
+SECONDS_WITHOUT_LOOK = 5.0
+"""Interval between two looks while all workers answer: others may have come."""
 
 SECONDS_WITHOUT_WORKERS = 60.0
 """Time to wait for a worker after the last one was lost; a batch system may take longer to start one."""
@@ -68,6 +71,7 @@ class _Worker:
     sending: set[str] = field(default_factory=set)
     units: dict[int, Unit] = field(default_factory=dict)
     done: int = 0
+    heard: float = field(default_factory=time.monotonic)
 
 
 class Pool:
@@ -145,10 +149,13 @@ class Pool:
         return f"Dask's dashboard: {link}"
 
     def _look(self) -> None:
-        """Compare the scheduler's list of workers with the pool's."""
-        if time.monotonic() - self._looked < SECONDS_BETWEEN_LOOKS:
+        """Compare the scheduler's list of workers with the pool's, from time to time."""
+        now, most = time.monotonic(), SECONDS_BETWEEN_LOOKS
+        silent = [worker for worker in self.workers.values() if worker.units and now - worker.heard > most]
+        is_quiet = self._has_begun and self.workers and not self._joining and not silent
+        if now - self._looked < (SECONDS_WITHOUT_LOOK if is_quiet else most):
             return
-        self._looked = time.monotonic()
+        self._looked = now
         try:
             present = set(self.client.scheduler_info(n_workers=-1)["workers"])
             is_running = self.client.status == "running"
@@ -200,6 +207,8 @@ class Pool:
     def _admit(self, address: str, actor: Any, facts: Facts) -> None:
         """Take a checked worker into the pool; after the beginning, an unequal worker is left out."""
         self._joining.pop(address, None)
+        if facts.doctor:
+            self.say("\n".join([f"mivol doctor on {facts.host} ({address}):", *facts.doctor]))
         try:
             check_worker(address, facts)
             if self._has_begun:
@@ -339,6 +348,7 @@ class Pool:
     def _send(self, worker: _Worker, number: int, unit: Unit) -> None:
         """Send a unit, after the inputs that the worker lacks."""
         missing = [digest for digest in unit.needs if digest not in worker.held]
+        worker.heard = worker.heard if worker.units else time.monotonic()
         worker.units[number] = unit
         worker.sending |= set(missing)
 
@@ -370,6 +380,7 @@ class Pool:
                     if address in self.workers:
                         self.workers[address].units.pop(name, None)
                         self.workers[address].done += 1
+                        self.workers[address].heard = time.monotonic()
                 self._take(kind, name, content)
                 found.append((kind, name, content))
                 news = self._news.get_nowait()
@@ -457,14 +468,14 @@ def check_worker(address: str, facts: Facts, own: Facts | None = None) -> None:
     """
     place = f"worker {address} on {facts.host}"
     own = own or find_facts()
+    if facts.fault:
+        raise MivolError(f"{place} cannot render: {facts.fault.rstrip('.')}; follow mivol doctor there, or stop this worker.")
     for name, expected in own.software.items():
         if facts.software.get(name) != expected:
             raise MivolError(
                 f"{place} has {name} {facts.software.get(name, 'none')}, and this process {expected}: results would depend on "
                 "the worker, so install the same versions there."
             )
-    if facts.fault:
-        raise MivolError(f"{place} cannot render: {facts.fault.rstrip('.')}; run mivol doctor there.")
     if facts.dask_threads != 1:
         raise MivolError(
             f"{place} has {facts.dask_threads} threads of Dask, and two threads lose gradients silently: start it with "

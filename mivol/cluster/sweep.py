@@ -221,7 +221,7 @@ class _SweepOnPool:
             self.shown = now
             progress = self.pool.collect_progress(0.2)
             lines = [f"{name}: {line}" for name, line in progress.items() if line]
-            self.show(f"{self.pool.describe()}, {self.ended} runs ended; " + ", ".join(lines))
+            self.show(", ".join([self.pool.describe(), f"{self.ended} runs ended", *lines]))
             self.tell(self._news(progress))
 
     def _news(self, progress: dict[str, str]) -> SweepNews:

@@ -25,6 +25,7 @@ import numpy as np
 import mivol
 from mivol import llvm, machine
 from mivol.back_end import set_threads, set_variant
+from mivol.doctor import FAULT, diagnose, format_findings
 from mivol.errors import MivolError
 from mivol.threads import check_one_thread
 
@@ -63,6 +64,7 @@ class Facts(NamedTuple):
         memory: free memory [bytes]; 0 if unknown.
         dask_threads: threads of the Dask worker; 1 outside of a worker.
         fault: why the variant does not work there; empty if it works.
+        doctor: lines of ``mivol doctor`` about faults there.
     """
 
     host: str
@@ -73,10 +75,11 @@ class Facts(NamedTuple):
     memory: int
     dask_threads: int = 1
     fault: str = ""
+    doctor: tuple[str, ...] = ()
 
 
 def find_facts(dask_threads: int = 1, fault: str = "") -> Facts:
-    """Facts of this process."""
+    """Facts of this process; with a fault, also what ``mivol doctor`` finds here."""
     software = {
         "mivol": mivol.__version__, "mivol code": hash_code(), "Mitsuba": mitsuba.__version__, "Dr.Jit": drjit.__version__,
         "NumPy": np.__version__, "Python": ".".join(map(str, sys.version_info[:2])),
@@ -84,7 +87,8 @@ def find_facts(dask_threads: int = 1, fault: str = "") -> Facts:
     }  # fmt: skip
     memory = machine.available_memory() or 0
     cores = machine.count_cores()
-    return Facts(socket.gethostname(), os.getpid(), software, find_cpu_features(), cores, memory, dask_threads, fault)
+    found = tuple(format_findings([one for one in diagnose() if one.state == FAULT])) if fault else ()
+    return Facts(socket.gethostname(), os.getpid(), software, find_cpu_features(), cores, memory, dask_threads, fault, found)
 
 
 class Failure(NamedTuple):
@@ -117,7 +121,7 @@ class Workplace:
             set_variant(variant)
             set_threads(threads or machine.count_cores())
         except MivolError as error:
-            fault = str(error)
+            fault = str(error).partition("\n")[0]
         return find_facts(get_worker().state.nthreads, fault)
 
     def keep(self, digest: str, value: Any) -> None:

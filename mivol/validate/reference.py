@@ -25,6 +25,7 @@ import numpy as np
 
 from mivol.back_end import check_variant
 from mivol.errors import MivolError
+from mivol.files.atomic import lock_folder
 from mivol.optim.interrupt import InterruptGuard
 from mivol.photos.transforms import write_transforms
 from mivol.scene.description import content_hash
@@ -584,7 +585,8 @@ def render_photographs(
         reference: settings of :func:`render_reference`, ``max_depth`` among them.
 
     Raises:
-        MivolError: a scene without sensors, a sensor that is not perspective, or as :func:`render_reference`.
+        MivolError: a scene without sensors, a sensor that is not perspective, another process that renders into the folder, or
+            as :func:`render_reference`.
     """
     loaded = scene if isinstance(scene, LoadedScene) else load_scene(scene, reference.pop("overrides", None))
     looks = list(range(len(loaded.scene.sensors()))) if sensors is None else list(sensors)
@@ -600,6 +602,7 @@ def render_photographs(
     prepared = (prepare_reference(loaded, folder / name, sensor=look, **reference) for name, look in views)
     if complete is None:
         complete = complete_in_turn if is_shown else complete_quietly
-    made = list(complete(prepared))
+    with lock_folder(folder):
+        made = list(complete(prepared))
     write_transforms(folder / "transforms.json", cameras, [names[number] for number in test])
     return made

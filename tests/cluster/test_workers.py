@@ -31,6 +31,7 @@ from mivol.cluster.scaling import Network, Workload, best_workers, say_limit, st
 from mivol.cluster.scene_steps import make_blocks
 from mivol.cluster.sweep import WorkerProgress, has_absolute_paths, read_files, write_run
 from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
+from mivol.doctor import FAULT, Finding
 from mivol.errors import MivolError
 from mivol.optim.scenes.views import View
 
@@ -111,10 +112,23 @@ def test_other_software_is_refused(name: str) -> None:
 
 def test_workers_that_cannot_render_are_named() -> None:
     own = find_facts()
-    with pytest.raises(MivolError, match="on node7 cannot render: no LLVM; run mivol doctor there"):
+    with pytest.raises(MivolError, match="on node7 cannot render: no LLVM; follow mivol doctor there"):
         check_worker("tls://a:1", own._replace(host="node7", fault="no LLVM."))
     with pytest.raises(MivolError, match="2 threads of Dask.*--nthreads 1"):
         check_worker("tls://a:1", own._replace(dask_threads=2))
+
+
+def test_mivol_doctor_runs_on_workers_that_cannot_render(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its faults are told with the host, before the refusal; other software of that worker is no news then."""
+    faulty = Finding("LLVM", FAULT, "none usable", ("install LLVM 20",))
+    monkeypatch.setattr("mivol.cluster.workplace.diagnose", lambda: [Finding("Python", "ok", "3.11"), faulty])
+    facts = find_facts(fault="no LLVM.")._replace(host="node7", software={})
+    assert [line.split() for line in facts.doctor] == [["FAULT", "LLVM", "none", "usable"], [">", "install", "LLVM", "20"]]
+    pool, said = make_pool(0), []
+    pool.say = said.append
+    with pytest.raises(MivolError, match="on node7 cannot render: no LLVM; follow"):
+        pool._admit("tls://a:1", None, facts)
+    assert said[0].startswith("mivol doctor on node7 (tls://a:1):\nFAULT LLVM")
 
 
 def test_the_smaller_group_of_cpus_is_refused() -> None:
