@@ -18,12 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from mivol import config
 from mivol.back_end import choose_back_end
 from mivol.bench.harness.bars import AT_MOST, Promise
 from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.studies.cluster_kills import write_experiments
 from mivol.cluster.connection import open_pool
 from mivol.cluster.distribution import ClusterDistribution
 from mivol.cluster.packages import SceneSource, share_scene
@@ -33,9 +35,11 @@ from mivol.cluster.scaling import Network, Workload, say_limit, step_seconds
 from mivol.cluster.steps import Steps
 from mivol.cluster.workplace import Workplace
 from mivol.experiments.examples import copy_example
+from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.fit_kind import RunContext
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scene_fit import SceneFit
+from mivol.optim.problem import to_arrays
 from mivol.scene.camera_rigs import Ring
 from mivol.scene.load import load_scene
 from mivol.validate.reference import render_photographs
@@ -143,6 +147,32 @@ def measure_messages(size: ClusterSize) -> dict:
     return {"seconds": found, "latency": small, "bandwidth": bandwidth}
 
 
+def measure_photographs(size: ClusterSize) -> dict:
+    """Time of a view in a step of a grid for photographs, and of the owner's part, in one process of one thread."""
+    choose_back_end("llvm_ad_rgb", 1)
+    with tempfile.TemporaryDirectory() as name:
+        write_experiments(Path(name))
+        changes = ['field.preset="cpu"', "field.longest=64", "field.degree=2"]
+        settings = config.load(Path(name) / "grid.toml", changes)
+        kind = FieldFit(RunContext(settings, Path(name), Path(name) / "run"))
+        kind.load(lambda line: None)
+        problem = kind.make_problem()
+        reals, views = problem.initial_reals(), problem.plan.stages[0].views
+        run, seconds = problem.plan.optimizer.begin(problem), {"view": [], "step": []}
+        for iteration in range(2 * size.rounds + 1):  # the first compiles kernels
+            start = time.process_time()
+            to_arrays(problem.compute_part(reals, iteration, 0, (0,)))
+            middle = time.process_time()
+            run.step(iteration, 1.0)
+            dr.eval(run.reals)
+            dr.sync_thread()
+            seconds["view"].append(middle - start)
+            seconds["step"].append(time.process_time() - middle)
+        view, step = (float(np.median(seconds[name][1:])) for name in ("view", "step"))
+        numbers = sum(int(np.prod(value.shape)) for value in reals.values())
+    return {"views": views, "numbers": numbers, "view": view, "step": step, "owner": max(step - views * view, 0.1 * step)}
+
+
 STEP_SECONDS = 0.1
 """Time of the work of each worker in a step [s]."""
 
@@ -186,6 +216,7 @@ def measure_overhead(size: ClusterSize) -> dict:
 def measure_cluster(size: ClusterSize) -> dict:
     """Time of two workers over one process, overhead of a step, and the model of larger numbers of workers."""
     messages, gradient, reference = measure_messages(size), measure_gradient(size), measure_reference(size)
+    photographs = measure_photographs(size)
     network = Network(messages["latency"], messages["bandwidth"])
     rows = [
         {
@@ -193,12 +224,13 @@ def measure_cluster(size: ClusterSize) -> dict:
             "seconds": [step_seconds(load, network, workers) for workers in WORKERS],
             "limit": say_limit(load, network),
         }
-        for load in make_workloads(size, gradient, reference)
+        for load in make_workloads(size, gradient, reference, photographs)
     ]
-    return {"messages": messages, "gradient": gradient, "reference": reference, "scaling": rows}
+    found = {"messages": messages, "gradient": gradient, "reference": reference, "photographs": photographs}
+    return found | {"scaling": rows}
 
 
-def make_workloads(size: ClusterSize, gradient: dict, reference: dict) -> list[Workload]:
+def make_workloads(size: ClusterSize, gradient: dict, reference: dict, photographs: dict) -> list[Workload]:
     """The measured workloads, and larger ones by views, pixels and voxels. A step sends float32 and returns float64."""
     path = float(np.median([row["one"] for row in reference["rounds"]])) / (size.views * size.side**2 * size.spp)
     block, blocks, owner = gradient["one"] / gradient["blocks"], gradient["blocks"], gradient["owner"]
@@ -207,6 +239,8 @@ def make_workloads(size: ClusterSize, gradient: dict, reference: dict) -> list[W
     return [
         Workload(f"step of {size.views} views of 64^2 pixels, 40^3 voxels", blocks, block, 12 * 40**3, owner),
         Workload("step of 256 views of 256^2 pixels, 128^3 voxels", 256, view, 12 * 128**3, owner),
+        Workload(f"step of {photographs['views']} photographs, a grid of {photographs['numbers']:,} numbers",
+                 photographs["views"], photographs["view"], 12 * photographs["numbers"], photographs["owner"]),
         Workload(f"reference of {size.views} views of {size.side}^2 pixels", 32 * size.views, batch * path, 12 * size.side**2,
                  streams=True),
         Workload("reference of 64 views of 1024^2 pixels, 256 samples", 64 * 256, 2**20 * path, 12 * 1024**2, streams=True),
