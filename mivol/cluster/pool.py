@@ -104,7 +104,7 @@ class Pool:
         self._joining: dict[str, Any] = {}
         self._news: queue.SimpleQueue[tuple[str, Any, Any]] = queue.SimpleQueue()
         self._looked, self._alone_since, self._numbers = 0.0, time.monotonic(), 0
-        self._has_begun = False
+        self._has_begun, self._joins = False, 0
 
     # -- Workers -----------------------------------------------------------------------------------------------------
 
@@ -187,9 +187,10 @@ class Pool:
 
     def _join(self, address: str) -> None:
         """Begin the checks of a worker."""
-        future = self.client.submit(
-            Workplace, actor=True, workers=[address], allow_other_workers=False, pure=False, key=f"mivol-{id(self)}-{address}"
-        )
+        # A worker may have the address of a lost one, whose actor Dask remembers by its key: each attempt has a key of its own.
+        self._joins += 1
+        key = f"mivol-{id(self)}-{self._joins}"
+        future = self.client.submit(Workplace, actor=True, workers=[address], allow_other_workers=False, pure=False, key=key)
         self._joining[address] = future
 
         async def begin() -> None:
@@ -238,6 +239,7 @@ class Pool:
     def _lose(self, address: str) -> None:
         """Forget a lost worker, and take its units back."""
         worker = self.workers.pop(address)
+        worker.actor = None
         self.gone.append(worker)
         self.lost += 1
         for number, unit in worker.units.items():
@@ -347,7 +349,7 @@ class Pool:
 
     def _send(self, worker: _Worker, number: int, unit: Unit) -> None:
         """Send a unit, after the inputs that the worker lacks."""
-        missing = [digest for digest in unit.needs if digest not in worker.held]
+        actor, missing = worker.actor, [digest for digest in unit.needs if digest not in worker.held]
         worker.heard = worker.heard if worker.units else time.monotonic()
         worker.units[number] = unit
         worker.sending |= set(missing)
@@ -355,11 +357,11 @@ class Pool:
         async def work() -> None:
             try:
                 for digest in missing:
-                    await worker.actor.keep(digest, self._inputs[digest][0])
+                    await actor.keep(digest, self._inputs[digest][0])
                     worker.held.add(digest)
                     self.sent += self._inputs[digest][1]
                 worker.sending.clear()
-                result = await worker.actor.work(unit.function, *unit.args)
+                result = await actor.work(unit.function, *unit.args)
             except Exception as error:
                 if is_loss(error):
                     return  # the list of workers tells of it
@@ -381,6 +383,8 @@ class Pool:
                         self.workers[address].units.pop(name, None)
                         self.workers[address].done += 1
                         self.workers[address].heard = time.monotonic()
+                    elif isinstance(content, Failure):
+                        kind = "lost"  # an error of a lost worker, whose unit goes to another
                 self._take(kind, name, content)
                 found.append((kind, name, content))
                 news = self._news.get_nowait()

@@ -168,6 +168,18 @@ def test_work_that_kills_its_workers_ends() -> None:
         pool._lose("w2")
 
 
+def test_a_worker_at_the_address_of_a_lost_one_joins() -> None:
+    """Dask remembers the failed actor of a lost worker by its key, so each attempt has another key."""
+    pool, keys = make_pool(0), []
+    pool.client.submit = lambda *args, key, **options: keys.append(key)
+    pool.client.loop = SimpleNamespace(add_callback=lambda begin: None)
+    for _ in range(2):
+        pool._join("w1")
+    assert len(set(keys)) == 2
+    pool._lose("w0")
+    assert [worker.actor for worker in pool.gone] == [None]
+
+
 @pytest.mark.parametrize(
     ("error", "is_told"),
     [
