@@ -29,7 +29,7 @@ import numpy as np
 
 from mivol.bench.extinctions import DATA, TO_WORLD, threads_in_space
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, Promise, judge_agreement
-from mivol.bench.harness.contests import agreement_figures, compete, gain_figures, image_errors, render_method
+from mivol.bench.harness.contests import agreement_figures, compete, finite_or_none, gain_figures, image_errors, render_method
 from mivol.bench.harness.study import Size, Study, amount
 from mivol.bench.harness.timing import Contestant, fastest, peak_bytes, race
 from mivol.bench.reference_walk import camera_rays
@@ -289,6 +289,8 @@ def measure_picture(size: SparseSize) -> dict:
     for name, spp in zip(methods, size.image_spp, strict=True):
         answer[name]["spp"] = spp
     gains = gain_figures(contest, "volpath", "mivol", counts) | agreement_figures(contest, "volpath", "mivol", counts, 1)
+    # Pixels of the sky alone have no noise by mivol, and an infinite ratio.
+    gains = {name: None if value is None else finite_or_none(value) for name, value in gains.items()}
     return answer | {"dense_grid_bytes": dense_bytes, "mivol over volpath": gains}
 
 
