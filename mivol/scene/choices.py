@@ -296,20 +296,10 @@ def choose_successive_paths(needs: Needs, settings: Settings, segment: str) -> t
     return SUCCESSIVE_PATHS, [Choice(subject, many, "path lengths differ, and lanes would wait for the longest path")]
 
 
-MIN_BRANCHING = {"llvm": 1 << 18, "cuda": 0, "metal": 0}
-"""Number of samples from which paths branch for derivatives. Branches save variance, but the host reads how many there are, so
-they cannot be recorded. (Variance x time of traced branches over recorded whole paths, two cores, 147,456 samples: 1.8 in jade,
-1.4 in wax behind glass, 1.2 in tissue, 1.1 in thin smoke, 0.97 beside a lamp, 0.93 in smoke over a floor, 0.88 under a spot.)
-Without recordings, branches pay from the first sample on."""
-
-
 def choose_branches(needs: Needs, settings: Settings, segment: str) -> tuple[bool, list[Choice]]:
     """Choose whether paths branch at their first collision, for derivatives."""
     if segment != "free_flight" or settings.scatterings < 1 or not needs.are_samples_independent:
         return False, []
-    if needs.film_samples < MIN_BRANCHING[needs.variant.split("_")[0]]:
-        why = "with few samples, tracing branches takes longer than they save"
-        return False, [Choice("derivatives", "whole paths", why)]
     why = "colliding paths cause most noise of derivatives, and few camera rays may collide"
     return True, [Choice("derivatives", "paths branch where they first collide", why)]
 

@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.kernel_recording import RecordedTask, is_recording
+from mivol.kernel_recording import RecordedTask
 from mivol.scene.media_light import MediaLight
 from mivol.scene.needs import Needs
 from mivol.scene.plan import Plan, Readings, build_estimators
@@ -87,8 +87,6 @@ def find_unrecorded(scene: mi.Scene, sensor: mi.Sensor, spp: int, needs: Needs, 
     if count_passes(sensor, spp, plan.pass_rays) > 1:
         # A recording launches all its passes at once: Ctrl-C would act after the last.
         return "tracing takes little of a render of several passes"
-    if plan.branches and not for_images:
-        return "the host counts the branches of paths"
     if any(m.bounded or m.has_own_walk for m in needs.media):
         return "the host reads majorants, lists Gaussians and indexes octrees"
     return find_hidden_arrays(scene, sensor)
@@ -182,7 +180,7 @@ def _walk_paths(estimators: Estimators, rays: CameraRays) -> tuple[mi.Spectrum, 
 
 def render_tangent(estimators: Estimators, rays: CameraRays, aovs: list[str]) -> tuple:
     """The derivative of the radiance along camera rays, alpha and AOVs, for the film."""
-    prepare_derivatives(estimators, rays.ray, rays.on_film)
+    prepare_derivatives(estimators, rays.ray)
     black = zero_radiance(rays.ray)
     score = Tangent(black, black)
     score, _ = walk_path(estimators, rays.sampler, rays.ray, score)
@@ -190,9 +188,8 @@ def render_tangent(estimators: Estimators, rays: CameraRays, aovs: list[str]) ->
 
 
 def _replay(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, branches: bool) -> None:
-    prepare_derivatives(estimators, rays.ray, rays.on_film)
-    # The number of branches is read on the host, which is impossible while Dr.Jit records.
-    if branches and not is_recording():
+    prepare_derivatives(estimators, rays.ray)
+    if branches:
         replay_branches(estimators, rays, dL)
     else:
         _replay_whole(estimators, rays, dL)

@@ -38,8 +38,8 @@ __all__ = [
     "REVERSE",
     "Factor",
     "Primal",
-    "PrimalBehind",
     "Replay",
+    "Rest",
     "Tangent",
     "Term",
     "TrackedFactor",
@@ -156,23 +156,24 @@ class Primal:
 
 
 @dataclass
-class PrimalBehind:
-    """Sum the radiance of a path behind its first factor.
+class Rest:
+    """Follow a path again, and report the radiance behind each of its factors to a function, without derivatives.
 
     Attributes:
-        L: the radiance so far.
-        is_behind: lanes behind the first factor.
+        L: radiance from further along the path.
+        report: called with each factor and the radiance behind the factor.
     """
 
     L: mi.Spectrum
-    is_behind: mi.Bool
+    report: Callable[[Factor, mi.Spectrum], None]
     purpose = IMAGE
 
-    def add(self, term: Term) -> PrimalBehind:
-        return PrimalBehind(self.L + dr.select(self.is_behind, term.value, 0), self.is_behind)
+    def add(self, term: Term) -> Rest:
+        return Rest(self.L - term.value, self.report)
 
-    def scale(self, factor: Factor) -> PrimalBehind:
-        return PrimalBehind(self.L, dr.full(mi.Bool, True, dr.width(self.L)))
+    def scale(self, factor: Factor) -> Rest:
+        self.report(factor, self.L)
+        return self
 
 
 @dataclass

@@ -10,6 +10,7 @@ References: Heitz et al. 2015, Eq. 6 (the projected area).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -17,7 +18,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.transport.media.channels import to_part_channels, to_scene_channels, to_spectrum
-from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval
+from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval, Weight
 from mivol.transport.media.grid_extinction import SummedExtinction, add_to_cell, have_same_cells
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.box import UNIT_CUBE, Box, clip_to_ball, clip_to_box, is_in_box
@@ -185,15 +186,22 @@ class Body:
         turned = self._jvp_microflakes(interval.ray.d)
         return [r + t * turned for r, t in zip(rows, self.optical_depth(interval, channels), strict=True)]
 
-    def vjp_optical_depth(self, interval: RayInterval, weight: list[mi.Float]) -> None:
-        """Add ``weight`` (d loss / d tau of each channel) times this interval to the gradients of the exact parts."""
+    def vjp_optical_depth(self, interval: RayInterval, weight: Weight) -> None:
+        """Add ``weight`` (d loss / d tau of each channel) times this interval to the gradients of the exact parts.
+
+        A weight that depends on the cell is for media of grids that share their cells, without followed microflakes.
+        """
         if self.microflakes_gradient is not None:
             amount = self.optical_depth(interval, len(weight))
             self._vjp_microflakes(interval.ray.d, weight, amount, interval.active)
-        weight = [self.area(interval.ray.d) * w for w in weight]
+        area = self.area(interval.ray.d)
         for part, gradient in self._parts_with_gradients():
             if part.exact_line:
-                part.vjp(gradient, to_part_channels(weight, part.channels), interval)
+                part.vjp(
+                    gradient,
+                    _map_weight(weight, lambda rows, n=part.channels: to_part_channels([area * w for w in rows], n)),
+                    interval,
+                )
 
     def jvp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Tangent of the coefficient [1/length] of a part at a point of a ray."""
@@ -269,6 +277,11 @@ class Body:
             if part.is_constant:
                 for c, w in enumerate(to_part_channels(weight, part.channels)):
                     dr.scatter_add(gradient, w, mi.UInt32(c), active)
+
+
+def _map_weight(weight: Weight, change: Callable[[list[mi.Float]], list[mi.Float]]) -> Weight:
+    """A weight whose channels are changed by a function."""
+    return (lambda lower: change(weight(lower))) if callable(weight) else change(weight)
 
 
 def is_followed(microflakes: list[mi.Float] | None) -> bool:

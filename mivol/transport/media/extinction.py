@@ -14,6 +14,7 @@ the scale and the parameters of the part: ``jvp`` multiplies by the derivative, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -27,6 +28,16 @@ from mivol.transport.traversal.lattice import Lattice
 from mivol.transport.traversal.rays import Ray
 
 __all__ = ["ExactExtinction", "Extinction", "RayInterval", "ConstantExtinction", "BoundedExtinction"]
+
+
+Weight = list | Callable
+"""d loss / d tau, a number for each channel: a list for all of a ray, or a function from the lower node of a cell (a
+``mi.Vector3i``) to the list of the cell."""
+
+
+def weight_in_cell(weight: Weight, lower: mi.Vector3i) -> list[mi.Float]:
+    """The weight in the cell with a lower node."""
+    return weight(lower) if callable(weight) else weight
 
 
 @dataclass
@@ -96,8 +107,10 @@ class ExactExtinction(Extinction, Protocol):
     def jvp(self, tangent: Any, interval: RayInterval) -> list[mi.Float]:
         """Tangent of the optical depth, the scale included."""
 
-    def vjp(self, gradient: Any, weight: list[mi.Float], interval: RayInterval) -> None:
-        """Add ``weight`` (d loss / d tau) times the interval to a gradient: the transpose of :meth:`jvp`."""
+    def vjp(self, gradient: Any, weight: Weight, interval: RayInterval) -> None:
+        """Add ``weight`` (d loss / d tau) times the interval to a gradient: the transpose of :meth:`jvp`. Only grids take a
+        weight that depends on the cell.
+        """
 
 
 @dataclass

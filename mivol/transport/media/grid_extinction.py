@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.activation import Activation
-from mivol.transport.media.extinction import ExactExtinction, RayInterval
+from mivol.transport.media.extinction import ExactExtinction, RayInterval, Weight, weight_in_cell
 from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_segment
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, read_nodes, walk_cells
 from mivol.transport.traversal.interpolation import (
@@ -116,7 +116,7 @@ class GridExtinction(NodeValues):
         lattice = self.lattice.where_derivatives()
         return integrate_segment(lattice, tangent, clip_interval(lattice, interval), interval.active)
 
-    def vjp(self, gradient: NodeGradient, weight: list[mi.Float], interval: RayInterval) -> None:
+    def vjp(self, gradient: NodeGradient, weight: Weight, interval: RayInterval) -> None:
         backproject_segment(self.lattice, gradient, weight, clip_interval(self.lattice, interval), interval.active)
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
@@ -183,13 +183,14 @@ class ActivatedGridExtinction(NodeValues):
     def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
         return self._integrate(self.lattice.where_derivatives(), interval, tangent=tangent)
 
-    def vjp(self, gradient: NodeGradient, weight: list[mi.Float], interval: RayInterval) -> None:
+    def vjp(self, gradient: NodeGradient, weight: Weight, interval: RayInterval) -> None:
         def visit(state: None, cell: Cell, on: mi.Bool) -> None:
             row = [mi.Float(0)] * 8
             for p in gauss_points(cell):
                 _, slope = self.activation.value_and_slope(interpolate(cell.corners[0][0], p))
                 row = [r + slope * w for r, w in zip(row, node_weights(p, cell, self.lattice.res), strict=True)]
-            gradient.add(0, cell.lower, [0.5 * cell.dt * weight[0] * r for r in row], on)
+            w = 0.5 * cell.dt * weight_in_cell(weight, cell.lower)[0]
+            gradient.add(0, cell.lower, [w * r for r in row], on)
             return state
 
         lattice, reads = self.lattice.where_derivatives(), [NodeArray(dr.detach(self.values))]

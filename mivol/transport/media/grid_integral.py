@@ -21,6 +21,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.numerics import minimum
+from mivol.transport.media.extinction import Weight, weight_in_cell
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, walk_cells
 from mivol.transport.traversal.interpolation import gauss_points, interpolate, node_weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
@@ -170,14 +171,14 @@ def gradient_bytes(res: tuple[int, int, int], channels: int) -> int:
 
 
 def backproject_segment(
-    lattice: Lattice, target: NodeGradient, weight: list[mi.Float], segment: Segment, active: mi.Bool = True
+    lattice: Lattice, target: NodeGradient, weight: Weight, segment: Segment, active: mi.Bool = True
 ) -> None:
     """Add ``weight`` times the row of ``A`` of each lane to a gradient: the transpose ``A^T``.
 
     Args:
         lattice: place of the grid. Empty blocks are walked too, since an empty voxel has a derivative if it is stored.
         target: the gradient.
-        weight: d loss / d tau of each lane, an entry a channel.
+        weight: d loss / d tau of each lane.
         segment: from :func:`mivol.transport.traversal.lattice.clip_to_grid`.
         active: lanes to project back.
 
@@ -187,7 +188,7 @@ def backproject_segment(
     def visit(state: None, cell: Cell, on: mi.Bool) -> None:
         a, b = (node_weights(p, cell, lattice.res) for p in gauss_points(cell))
         row = [0.5 * cell.dt * (wa + wb) for wa, wb in zip(a, b, strict=True)]
-        for channel, w in enumerate(weight):
+        for channel, w in enumerate(weight_in_cell(weight, cell.lower)):
             target.add(channel, cell.lower, [w * r for r in row], on)
         return state
 

@@ -5,11 +5,15 @@ Conventions. Rows have a number for each channel of the extinction of the scene;
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import minimum
+from mivol.transport.media.body import Body
 from mivol.transport.media.channels import colours_to_channels, to_spectrum
+from mivol.transport.media.extinction import Weight
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
     RaySegment,
@@ -99,15 +103,17 @@ def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectru
     vjp_rows(media, segment, colours_to_channels(weight, media.channels), active & dr.any(weight != 0))
 
 
-def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
-    """Like :func:`vjp_optical_depth`, with a ``weight`` for each channel."""
+def vjp_rows(
+    media: SceneMedia, segment: RaySegment, weight: list[mi.Float] | Callable[[Body], Weight], active: mi.Bool
+) -> None:
+    """Like :func:`vjp_optical_depth`, with a ``weight`` for each channel, or the weight of each medium by a function."""
 
     if not media.follows_extinction:
         return
     bounded = bounded_parts(media.bodies)
 
     def visit(points: list[PointReservoir], interval: MediumInterval) -> list[PointReservoir]:
-        interval.body.vjp_optical_depth(interval, weight)
+        interval.body.vjp_optical_depth(interval, weight(interval.body) if callable(weight) else weight)
         return _pass(points, bounded, interval)
 
     points = revisit_media(
@@ -115,7 +121,8 @@ def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], act
     )
     for (body, part), point in zip(bounded, points, strict=True):
         # After the walk: Dr.Jit loses what is differentiated in a loop with respect to an array that already has a gradient.
-        on, each = active & (point.total > 0), [w * point.total for w in weight]
+        rows = weight(body) if callable(weight) else weight
+        on, each = active & (point.total > 0), [w * point.total for w in rows]
         body.vjp_part_at(part, segment.ray, point.t, each, on)
 
 

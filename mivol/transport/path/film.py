@@ -55,7 +55,6 @@ class CameraRays:
         ray: rays in world space.
         weight: importance of the sensor.
         position: position of the sample on the film [pixel].
-        on_film: position as a share of the crop [1], in [0, 1); samples in the border of a wide filter lie outside.
     """
 
     sampler: mi.Sampler | SpreadSampler
@@ -63,7 +62,6 @@ class CameraRays:
     ray: mi.RayDifferential3f
     weight: mi.Spectrum
     position: mi.Point2f
-    on_film: mi.Point2f
 
 
 RadianceFunction = Callable[[CameraRays], tuple]
@@ -161,7 +159,7 @@ def _camera_rays(samples: RenderSamples, base: mi.Sampler, index: int, per_pass:
     ray, weight = _sample_rays(samples, time, on_film, aperture)
     # A box filter adds a sample to its pixel, for any position inside the pixel.
     place = mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
-    return CameraRays(sampler, per_pass, ray, weight, place, mi.Point2f(on_film))
+    return CameraRays(sampler, per_pass, ray, weight, place)
 
 
 def find_batch_views(sensor: mi.Sensor) -> mi.SensorPtr | None:

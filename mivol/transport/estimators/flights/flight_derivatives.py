@@ -5,14 +5,14 @@ r"""Derivatives of free flights, with respect to the coefficients of media along
 with the in-scattered radiance L_s at t, and the radiance L_t arriving at t from further along the ray. A flight of length t
 with the radiance L at its end estimates this derivative by
 
-.. math:: -(L - b) \int_0^t \partial\sigma\,dt' + (L - b)\,\frac{\partial\sigma(t)}{\sigma(t) + \kappa}\,[\text{collision}]
+.. math:: -\int_0^t (L - b)\,\partial\sigma\,dt' + (L - b)\,\frac{\partial\sigma(t)}{\sigma(t) + \kappa}\,[\text{collision}]
           + \ell\,(\alpha \hat L_s - b)\,\frac{\kappa\,\partial\sigma(s)}{\sigma(s) + \kappa}
 
 The first term is an exact walk along the flight. Collisions alone would miss the derivative in regions without extinction.
 Therefore collisions have the weight sigma / (sigma + kappa), and a probe has the rest: a point s drawn uniformly from the
 length l of the flight in the media. Both are unbiased, since the mean over all flights of an integral over [0, t] is the
-integral of T times its integrand. The baseline b does not change the mean, since the same two terms without L have the mean 0.
-A baseline about as bright as L removes most of the noise.
+integral of T times its integrand. A baseline b about as bright as L removes most of the noise (:mod:`.baseline`); inside the
+integral it stands at t', at collisions at t, and at probes at s.
 
 A homogeneous medium that is thick enough to make paths collide needs no probes: kappa is 0. Without followed extinction there
 are neither probes nor kept shadow rays.
@@ -36,19 +36,20 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.flights.baseline import Baseline, BaselineSums
 from mivol.transport.estimators.flights.gaussian_light import GaussianLight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import Collision, FlightPoint, PathSegment
 from mivol.transport.media.body import Body, emission_slope, eval_albedo, eval_emission
 from mivol.transport.media.channels import colours_to_channels, take_tangent, to_spectrum
-from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
+from mivol.transport.media.extinction import Weight
+from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth, vjp_rows
 from mivol.transport.media.ray_intervals import RaySegment, start_passages
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import FineRay, Ray
 
 __all__ = [
     "FlightSegment",
-    "Baseline",
     "Probe",
     "ProbeTerm",
     "Probes",
@@ -63,28 +64,6 @@ PROBE_TAU = 0.6
 
 MIN_ALBEDO = 0.1
 """Albedo below which probes estimate the derivatives by the albedo [1]; above, L / albedo is at most 10 L."""
-
-
-@dataclass
-class Baseline:
-    """The baseline b of derivatives of flights: a radiance subtracted from the light found by the flight.
-
-    Attributes:
-        first: baseline of flights before the first scattering event, for each lane [radiance].
-        later: baseline of later flights [radiance].
-    """
-
-    first: mi.Spectrum
-    later: mi.Spectrum
-
-    def at_depth(self, depth: mi.UInt32) -> mi.Spectrum:
-        """The baseline of flights after ``depth`` scattering events."""
-        return dr.select(depth == 0, self.first, self.later)
-
-    @property
-    def for_branches(self) -> Baseline:
-        """The baseline of paths starting at their first collision."""
-        return Baseline(self.later, self.later)
 
 
 # -- A flight ------------------------------------------------------------------------------------------------------------
@@ -119,13 +98,9 @@ class FlightSegment:
     dL: mi.Spectrum | None = None
 
     @property
-    def _baseline_light(self) -> mi.Spectrum:
-        """The baseline at the camera, from the end of the flight; 0 for paths that may not scatter any more."""
-        if self.baseline is None:
-            return mi.Spectrum(0)
-        return dr.select(
-            self.segment.may_scatter, self.segment.beta * self.weight * self.baseline.at_depth(self.segment.depth), 0
-        )
+    def _scattered(self) -> mi.Spectrum:
+        """Throughput at the end of the flight; 0 for paths that may not scatter any more, which have no baseline."""
+        return dr.select(self.segment.may_scatter, self.segment.beta * self.weight, 0)
 
     @property
     def emitted(self) -> mi.Spectrum:
@@ -165,7 +140,10 @@ class FlightSegment:
         vjp_optical_depth(media, self._to_emission, -dL * sampled.gain * value, sampled.point.on)
 
     def jvp_light(self) -> mi.Spectrum:
-        total = -self._baseline_light * self._jvp_extinction
+        total = mi.Spectrum(0)
+        if self.baseline is not None:
+            # A baseline that varies would need a second walk.
+            total -= self._scattered * self.baseline.average * self._jvp_extinction
         if self.gaussian_light is not None:
             total += self.gaussian_light.jvp()
         if self.emission is None:
@@ -192,10 +170,12 @@ class FlightSegment:
 
     def vjp(self, dlog: mi.Spectrum) -> None:
         media, ray, hit = self.media, self.segment.ray, self.collision
-        rest = dlog if self.baseline is None else dlog - self.dL * self._baseline_light
-        vjp_optical_depth(media, self.passed, -rest, self.active)
+        self._vjp_passed(dlog)
         for body, on in media.bodies_at(hit.body, hit.on & self.segment.may_scatter):
             name, weight = _collision_weight(media, body, ray, hit.t, on)
+            rest = dlog
+            if self.baseline is not None:
+                rest = rest - self.dL * self._scattered * self.baseline.at_point(body, ray, hit.t, on)
             body.vjp_extinction_at(
                 ray, dr.select(on, hit.t, 0), colours_to_channels(dr.select(on, rest * weight, 0), media.channels), on, name
             )
@@ -205,6 +185,34 @@ class FlightSegment:
                 albedo = eval_albedo(body, hit.mei, on)
                 if dr.grad_enabled(albedo):
                     dr.backward_from(dr.select(on, dlog * _albedo_ratio(albedo), 0))
+
+    def _vjp_passed(self, dlog: mi.Spectrum) -> None:
+        """Add the derivatives of the transmittance up to the end of the flight."""
+        if self.baseline is None:
+            vjp_optical_depth(self.media, self.passed, -dlog, self.active)
+            return
+        scattered, channels = self.dL * self._scattered, self.media.channels
+
+        def weight(body: Body) -> Weight:
+            b = self.baseline.along(body, self.segment.ray, self.active)
+            if callable(b):
+                return lambda lower: colours_to_channels(scattered * b(lower) - dlog, channels)
+            return colours_to_channels(scattered * b - dlog, channels)
+
+        vjp_rows(self.media, self.passed, weight, self.active & dr.any((dlog != 0) | (scattered != 0)))
+
+    def collect(self, sums: BaselineSums, L: mi.Spectrum) -> None:
+        """Add the collision at the end of the flight to the sums of a baseline.
+
+        Args:
+            sums: the sums.
+            L: light behind the flight, at the camera [radiance].
+        """
+        hit, scattered = self.collision, self._scattered
+        on = hit.on & self.segment.may_scatter & dr.any(scattered != 0)
+        weight = scattered * collision_weights(self.media, self.segment.ray, hit)
+        light = L / dr.select(scattered != 0, scattered, 1)
+        sums.add(self.segment.ray, hit.t, hit.body, dr.square(weight), light, on)
 
     def jvp_transmittance(self) -> mi.Spectrum:
         media, hit, change = self.media, self.collision, mi.Spectrum(self._jvp_extinction)
@@ -337,7 +345,7 @@ class ProbeTerm:
         if body.view.albedo is not None:
             bracket = bracket * dr.detach(eval_albedo(body, self.mei, on))
         if self.baseline is not None:
-            bracket = bracket - self.baseline.at_depth(self.probe.depth)
+            bracket = bracket - self.baseline.at_point(body, self.probe.ray, self.probe.t, on)
         return name, self._gain * bracket * _probe_extinction(self.media, body) * weight
 
     def vjp(self, dL: mi.Spectrum) -> None:

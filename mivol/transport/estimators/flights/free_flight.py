@@ -38,7 +38,8 @@ import mitsuba as mi
 
 from mivol.fields.gaussian_line import WhitenedLine
 from mivol.numerics import fast_max, fast_min, minimum
-from mivol.transport.estimators.flights.flight_derivatives import Baseline, FlightSegment
+from mivol.transport.estimators.flights.baseline import Baseline
+from mivol.transport.estimators.flights.flight_derivatives import FlightSegment
 from mivol.transport.estimators.flights.gaussian_light import GaussianLight
 from mivol.transport.estimators.flights.tracking import delta_tracking, delta_tracking_in_blocks
 from mivol.transport.estimators.scores import IMAGE
@@ -226,7 +227,7 @@ class FreeFlight:
         media: media of the scene.
 
     Attributes:
-        baseline: baseline of the derivatives (:mod:`.flight_derivatives`); None means 0.
+        baseline: baseline of the derivatives (:mod:`.baseline`); None means 0.
         bodies: media of the scene.
         emitting: media with an emission by position.
         has_gaussian_light: a medium of Gaussians emits light.
