@@ -158,10 +158,10 @@ def test_branches_walk_side_by_side_by_their_length() -> None:
 
 
 @pytest.mark.parametrize(
-    ("collided", "noise", "count"), [(1000, 0.5, 1), (400, 0.5, 2), (300, 0.03, 1), (100, 0.03, 2), (1, 0.5, 8), (0, 0.5, 8)]
+    ("collided", "noise", "count"), [(1000, 0.5, 1), (400, 0.5, 2), (400, 0.03, 1), (100, 0.03, 3), (1, 0.5, 8), (0, 0.5, 8)]
 )
 def test_fewer_collisions_and_more_noise_need_more_branches(collided: int, noise: float, count: int) -> None:
-    """sqrt(13 noise / share), rounded, at most 8; never more branches than stems."""
+    """sqrt(26 noise / share), rounded, at most 8; never more branches than stems."""
     assert int(count_branches(1000, mi.UInt32(collided), mi.Float(noise))[0]) == count
     assert count * collided <= 1000
 
@@ -268,8 +268,8 @@ def test_baseline_in_a_white_furnace_is_the_light_of_the_sky():
 def test_collisions_count_as_their_derivatives_weigh():
     """A white box of sigma 3, which is thick and needs no probes, and a black box of 0.25, with kappa = 0.6 / 2.
 
-    The light behind collisions is that of the sky, or 0, and the numbers of collisions are read from the sums. At most 3 % of the
-    paths from the white box meet the black one, as a square of 2 x 2 at a distance of 4 (1.6 % of all directions), and
+    The light behind collisions is that of the sky, or 0, and the numbers of collisions are read from the sums. At most 3 % of
+    the paths from the white box meet the black one, as a square of 2 x 2 at a distance of 4 (1.6 % of all directions), and
     1 - exp(-0.5) of them end there.
     """
     sigma, light, kappa = np.array([3.0, 0.25]), np.array([0.5, 0.0]), np.array([0.0, 0.3])

@@ -42,7 +42,7 @@ __all__ = ["count_branches", "prepare_derivatives", "replay_branches"]
 MAX_BRANCHES = 8
 """Largest number of branches of a path."""
 
-BALANCE = 13.0
+BALANCE = 26.0
 """(B a) / (A b) times the share of stems with a collision, over the noise of the light at collisions (``Baseline.noise``): B
 grows with this noise."""
 
@@ -182,7 +182,8 @@ class _Branches:
 def _gather_collisions(collision: FirstCollision, index: mi.UInt32) -> FirstCollision:
     ray = collision.ray
     o, d, maxt, time = (gather_lanes(values, index) for values in (ray.o, ray.d, ray.maxt, ray.time))
-    rest = (gather_lanes(values, index) for values in (collision.t, collision.body, collision.beta, collision.on))
+    state = (collision.t, collision.body, collision.beta, collision.eta, collision.depth, collision.on)
+    rest = (gather_lanes(values, index) for values in state)
     return FirstCollision(FineRay(o, d, maxt, time, ray.wavelengths), *rest)
 
 

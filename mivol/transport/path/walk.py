@@ -128,13 +128,14 @@ class Path:
 
 @dataclass
 class FirstCollision:
-    """Collisions of camera paths on their first segment.
+    """The first collisions of camera paths with a medium.
 
     Attributes:
-        ray: camera ray.
+        ray: ray of the segment that ends at the collision.
         t: distance of the collision [length].
         body: index of the medium.
         beta: throughput up to the collision [1].
+        eta, depth: as of :class:`Path`, at the collision.
         on: lanes with a collision.
     """
 
@@ -142,7 +143,28 @@ class FirstCollision:
     t: mi.Float64
     body: mi.UInt32
     beta: mi.Spectrum
+    eta: mi.Float
+    depth: mi.UInt32
     on: mi.Bool
+
+    @classmethod
+    def none(cls, path: Path) -> FirstCollision:
+        """No collision yet."""
+        n = dr.width(path.ray)
+        t, body, off = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.full(mi.Bool, False, n)
+        return cls(path.ray, t, body, mi.Spectrum(path.beta), mi.Float(path.eta), mi.UInt32(path.depth), off)
+
+    def keep(self, path: Path, hit: Collision, on: mi.Bool) -> FirstCollision:
+        """The collisions so far, with those of some lanes at the end of the segment of a path."""
+        return FirstCollision(
+            dr.select(on, path.ray, self.ray),
+            dr.select(on, hit.t, self.t),
+            dr.select(on, hit.body, self.body),
+            dr.select(on, path.beta, self.beta),
+            dr.select(on, path.eta, self.eta),
+            dr.select(on, path.depth, self.depth),
+            self.on | on,
+        )
 
 
 def start_path(
@@ -242,7 +264,7 @@ def walk_path(
 
 
 def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Score) -> tuple[Score, FirstCollision]:
-    """Walk a path from the camera, and stop at a collision on its first segment.
+    """Walk a path from the camera, and stop at its first collision with a medium.
 
     Args:
         estimators: estimators of the render; their segments end in media.
@@ -255,15 +277,25 @@ def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: S
     path = start_path(estimators, clip_camera_ray(ray), score, sampler, dr.full(mi.Bool, True, n))
     path = leave_camera(estimators, path, media.medium_at(ray))
     path = _start_reservoirs(estimators, path, *(("first", "later") if media.has_surfaces else ("first",)))
-    path, event = _follow_segment(estimators, path)
-    path = _add_emitted_light(estimators, path, event)
-    hit = event.collision
-    collision = FirstCollision(path.ray, hit.t, hit.body, mi.Spectrum(path.beta), hit.on)
-    if media.has_surfaces:
-        # The other paths continue behind the first surface.
+
+    def advance(path: Path, first: FirstCollision) -> tuple[Path, FirstCollision]:
+        path, event = _follow_segment(estimators, path)
+        path = _add_emitted_light(estimators, path, event)
+        hit = event.collision
+        first = first.keep(path, hit, path.active & hit.on)
+        if not media.has_surfaces:
+            path.active = dr.full(mi.Bool, False, n)
+            return path, first
+        # Paths that collide stop; the others continue behind the surface.
         without = replace(event, collision=replace(hit, on=dr.full(mi.Bool, False, n)))
-        path = _walk_to_end(estimators, _scatter(estimators, path, without))
-    return _add_reservoirs(estimators, path).score, collision
+        return _scatter(estimators, path, without), first
+
+    first = FirstCollision.none(path)
+    if media.has_surfaces:
+        path, first = dr.while_loop(state=(path, first), cond=lambda path, first: path.active, body=advance, label="stem")
+    else:
+        path, first = advance(path, first)
+    return _add_reservoirs(estimators, path).score, first
 
 
 def walk_branch(
@@ -280,7 +312,7 @@ def walk_branch(
         The score, and the number of scattering events of the path.
     """
     path = start_path(estimators, collision.ray, score, sampler, mi.Bool(collision.on))
-    path.beta = mi.Spectrum(collision.beta)
+    path.beta, path.eta, path.depth = mi.Spectrum(collision.beta), mi.Float(collision.eta), mi.UInt32(collision.depth)
     path = _sample_first_emitter(estimators, _start_reservoirs(estimators, path, "later"))
     hit = make_collision(estimators.media, collision.ray, collision.t, collision.body, collision.on)
     path = _walk_to_end(estimators, _scatter(estimators, path, PathEvent.from_collision(hit, sampler.next_1d())))
