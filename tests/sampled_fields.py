@@ -24,6 +24,7 @@ class Slab:
     to_world: np.ndarray = field(default_factory=lambda: CUBE)
     space: str = "srgb"
     region: Region | None = None
+    coarse: None = None
 
     def density(self, p: mi.Point3f) -> mi.Float:
         return dr.select((p.x >= self.low) & (p.x <= self.high), mi.Float(self.sigma), 0)

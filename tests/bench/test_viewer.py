@@ -10,4 +10,4 @@ from mivol.bench.studies import viewer
 @pytest.mark.parametrize("name", ["balls.ply", "field.npz", "volume.nrrd"])
 def test_pictures_are_drawn_and_timed(variant_rgb: str, name: str) -> None:
     answer = viewer.measure_pictures(name, viewer.ViewerSize.quick())
-    assert 0 < answer["clock"] and 48 <= answer["width"] <= 64 and name in viewer.table("", answer)[0]
+    assert answer["clock"] > 0 and 48 <= answer["width"] <= 64 and name in viewer.table("", answer)[0]

@@ -57,7 +57,7 @@ def test_leaves_as_large_as_asked_for(field: Path, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     "target, options, words",
     [
-        ("tree.npz", [], "--to octree"),
+        ("tree.npz", [], "--to says what a field becomes: octree"),
         ("tree.ply", ["--to", "octree"], "--to octree makes an .npz from"),
         ("tree.npz", ["--to", "octree", "--resolution", "8192"], "depth 13"),
         ("tree.npz", ["--to", "grid"], "makes a grid from an octree, a hash grid or a NeRF"),

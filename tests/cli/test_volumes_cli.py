@@ -154,7 +154,7 @@ def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pyte
 @pytest.mark.parametrize(
     ("name", "head", "found", "way_out"),
     [
-        ("a.st", bytes(208) + b"MAP " + bytes(812), "an MRC file", "name it .mrc"),
+        ("a.map3", bytes(208) + b"MAP " + bytes(812), "an MRC file", "name it .mrc"),
         ("a.m5", b"MATLAB 5.0 MAT-file", "a MATLAB file", "name it .mat"),
         ("a.lsm", b"II*\0" + bytes(8), "a TIFF file", "name it .tif"),
         ("a.raw", bytes(64), "raw bytes", ".nhdr or .mhd"),

@@ -259,9 +259,7 @@ def test_angles_of_a_stack(monkeypatch: pytest.MonkeyPatch) -> None:
     beam = Parallel(views=2, detector=(2, 3), arc=90.0)
     chosen = SimpleNamespace(data=SimpleNamespace(angles="", angle_unit="degree"), scan=beam)
     np.testing.assert_allclose(readings.read_angles(chosen, Path(), 3), np.radians([0, 30, 60]))
-    monkeypatch.setattr(
-        readings, "read_columns", lambda path, n: np.array([[10.0], [20.0]]) if (str(path), n) == ("b/a", 1) else 0
-    )
+    monkeypatch.setattr(readings, "read_tilt_angles", lambda path: np.array([10.0, 20.0]) if str(path) == "b/a" else 0)
     chosen.data.angles = "a"
     np.testing.assert_allclose(readings.read_angles(chosen, Path("b"), 2), np.radians([10, 20]))
     with pytest.raises(MivolError, match="a has 2 angles for 3 projections"):
