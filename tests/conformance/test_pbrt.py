@@ -227,7 +227,7 @@ def test_directions_of_the_equal_area_mapping() -> None:
     assert np.abs(counts - 2500).max() < 6 * np.sqrt(2500)
 
 
-def test_a_sky_keeps_its_directions(tmp_path: Path) -> None:
+def test_a_sky_keeps_its_directions(tmp_path: Path, two_threads: None) -> None:
     """An image in pbrt's mapping whose colour tells the direction, under a transform; Mitsuba's sky says the same."""
     n = 64
     grid = np.random.default_rng(1).normal(size=(3, 400000))
