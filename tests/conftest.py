@@ -164,8 +164,12 @@ def artefacts(request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture
 def whole_paths(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Derivatives replay the very paths of a picture, or of forward derivatives, of their seed: paths have no branches."""
+    """Derivatives replay the very paths of a picture, or of forward derivatives, of their seed: paths have no branches, and the
+    baseline of reverse derivatives is that of forward ones, its mean in all blocks."""
+    from mivol.transport.estimators.flights.baseline import Baseline
+
     monkeypatch.setattr("mivol.scene.plan.choose_branches", lambda *_: (False, []))
+    monkeypatch.setattr(Baseline, "_read", lambda self, block, active: self.average)
 
 
 @pytest.fixture(autouse=True)
