@@ -428,7 +428,7 @@ def test_collections_are_put_off_for_a_while() -> None:
 @pytest.mark.parametrize("way", ["picture", "reverse", "forward"])
 def test_paths_are_recorded_without_them(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
     seen, room = [], session if way == "forward" else render_tasks
-    name = "render_tangent" if way == "forward" else "walk_path"
+    name = {"picture": "walk_path", "reverse": "replay_branches", "forward": "render_tangent"}[way]
     walk = getattr(room, name)
     monkeypatch.setattr(room, name, lambda *a, **k: seen.append(gc.isenabled()) or walk(*a, **k))
     scene = close_up({"smoke": smoke(rough_grid(1), 0.5)[0], "sky": scenes.sky(1.0)}, res=2)

@@ -188,7 +188,7 @@ def test_plan_branches_paths_with_free_flights() -> None:
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("name", "key", "depth"),
-    [("sun", "albedo", 4), ("sun", "g", 4), ("floor", "floor", 4), ("rgb", "density", 4)],
+    [("sun", "albedo", 4), ("sun", "g", 4), ("floor", "floor", 4), ("rgb", "density", 4), ("glass", "density", 5)],
 )
 def test_branches_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean derivative equals the mean of whole paths, along a random direction in the upper half."""
