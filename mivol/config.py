@@ -27,7 +27,7 @@ from mivol.optim.priors import PRIORS
 from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.optim.schedules import SCHEDULES, Constant
 from mivol.optim.strategy import setting, suggest_name, union_type
-from mivol.scene.camera_rigs import Hemisphere, LookAts, Ring, SceneSensors
+from mivol.scene.sensors import Hemisphere, LookAts, Ring, SceneSensors
 from mivol.schema import check_keys, explain_error
 from mivol.tomography.filtered import WINDOWS
 from mivol.validate.metrics import METRICS

@@ -12,7 +12,7 @@ from mivol.optim.priors import HuberTotalVariation
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 from mivol.optim.second_order import GaussNewton
-from mivol.scene.camera_rigs import Hemisphere
+from mivol.scene.sensors import Hemisphere
 
 import mitsuba as mi
 import numpy as np

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import oracle_phase as oracle
 
-from mivol.phase.scattering_angle import ScatteringAngle
+from mivol.phase.closed_forms import ScatteringAngle
 
 EPS = 2.0**-23
 NEAR = np.geomspace(1e-6, 1, 200)

@@ -632,7 +632,7 @@ def poses(arguments: argparse.Namespace) -> None:
     """
     from mivol.photos import video
     from mivol.photos.poses import check_colmap, find_poses
-    from mivol.report.poses_page import write_poses_page
+    from mivol.report.cameras import write_poses_page
 
     check_colmap()
 

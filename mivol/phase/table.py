@@ -22,8 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.phase.closed_forms import LARGEST, WEIGHT
-from mivol.phase.scattering_angle import INV_TWO_PI, ScatteringAngle
+from mivol.phase.closed_forms import INV_TWO_PI, LARGEST, WEIGHT, ScatteringAngle
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,8 @@ from mivol.phase.closed_forms import (
     COSINE_SQUARED,
     WEIGHT,
     Domain,
+    ScatteringAngle,
+    angle_between,
     choose_lobe,
     eval_draine,
     eval_hg,
@@ -30,8 +32,8 @@ from mivol.phase.closed_forms import (
     sample_draine,
     sample_hg,
     sample_rayleigh,
+    scattered_direction,
 )
-from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table, check_values
 from mivol.scene_graph import traverse
 

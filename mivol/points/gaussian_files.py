@@ -15,8 +15,7 @@ from mivol.files.atomic import write_whole
 from mivol.files.ply import read_comments, read_layout, read_tables
 from mivol.files.source import check_file, parse_reals, refusal, select_by_suffix
 from mivol.photos.camera_path import HomeView
-from mivol.points.compact_files import read_ksplat, read_splat, read_spz
-from mivol.points.compact_writers import write_ksplat, write_splat, write_spz
+from mivol.points.compact_files import read_ksplat, read_splat, read_spz, write_ksplat, write_splat, write_spz
 from mivol.points.gaussian_gltf import read_gaussian_glb, write_gaussian_glb
 from mivol.points.gaussian_page import write_gaussian_page
 from mivol.points.gaussian_ply import is_compressed, parse_compressed_tables, parse_tables, write_gaussian_ply

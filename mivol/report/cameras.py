@@ -1,4 +1,4 @@
-"""Figures of cameras and scanners around their box, from the side and from above.
+"""Figures of cameras and scanners around their box, from the side and from above, and the page after a search for poses.
 
 Conventions. The colour shows the split. A camera is drawn as its pinhole with the four edges of its field of view. The up axis
 is the world axis, of either sign, nearest to the mean upward direction of the cameras. Of nested boxes, the side view and the
@@ -10,7 +10,11 @@ the apex of a pyramid of parallel light points in the direction of the light. A 
 
 from __future__ import annotations
 
+import base64
+import html
 import itertools
+import shlex
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,13 +29,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from mivol.files import write_whole_text
 from mivol.optim.scenes.views import View
-from mivol.photos import SPLITS, PhotoFrame, Photos, PhotoSurvey
+from mivol.photos import SPLITS, PhotoFrame, Photos, PhotoSurvey, survey_photos
+from mivol.photos.poses import Poses
 from mivol.photos.region import nested_boxes, points_in_box
 from mivol.report.figures import FAINT, INK, SERIES, STYLE, save_figure
 from mivol.report.record import Image
-from mivol.scene.camera_rigs import find_media_box
-from mivol.scene.sensors import to_camera
+from mivol.scene.sensors import find_media_box, to_camera
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
 EDGE = 0.12
@@ -437,3 +442,43 @@ def _pictures(folder: Path, survey: PhotoSurvey) -> list[Image]:
     for part in parts:
         plot_cameras(survey, folder / f"cameras_{part}.png", part)
     return [Image(path=f"cameras_{part}.png", role="picture", caption=CAPTIONS[part]) for part in parts]
+
+
+# -- Page after a search for poses ------------------------------------------------------------------------------------------
+
+
+PAGE = "poses.html"
+
+PAGE_STYLE = (
+    "body{font:16px sans-serif;max-width:60em;margin:2em auto;padding:0 1em}img{width:100%}pre{background:#eee;padding:.7em}"
+)
+
+
+def write_poses_page(folder: Path, poses: Poses) -> Path:
+    """Write ``poses.html`` into the folder of the photographs, with everything in it.
+
+    Raises:
+        MivolError: a full disk, or a model that the reader refuses.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        plot_cameras(survey_photos(folder), Path(place) / "cameras.png")
+        picture = base64.b64encode((Path(place) / "cameras.png").read_bytes()).decode()
+    name = shlex.quote(str(folder))
+    rows = [
+        ("photographs with a pose", f"{len(poses.posed)} of {len(poses.posed) + len(poses.unposed)}"),
+        ("mean reprojection error", f"{poses.error:.2f} pixels"),
+        ("points", str(poses.points)),
+        ("cameras (lens and size)", str(poses.cameras)),
+        ("without a pose", ", ".join(poses.unposed) or "none"),
+        ("in models of their own", ", ".join(", ".join(names) for names in poses.others) or "none"),
+    ]
+    table = "".join(f"<tr><th align=left>{html.escape(head)}</th><td>{html.escape(cell)}</td></tr>" for head, cell in rows)
+    text = (
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Poses of {html.escape(folder.name)}</title>'
+        f"<style>{PAGE_STYLE}</style></head><body><h1>Poses of {html.escape(folder.name)}</h1><table>{table}</table>"
+        f"<p>The cameras, with the box of a fit. An error above 1.5 pixels is a sign of blur, or of a subject that moved.</p>"
+        f'<img alt="cameras" src="data:image/png;base64,{picture}"><p>Next:</p>'
+        f"<pre>mivol view {html.escape(name)}\nmivol optimize --as gaussians {html.escape(name)}</pre></body></html>\n"
+    )
+    write_whole_text(folder / PAGE, text)
+    return folder / PAGE

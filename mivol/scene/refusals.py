@@ -10,7 +10,7 @@ from mivol.errors import MivolError
 from mivol.scene.choices import choose_media_light, choose_near_light, is_scattering_visible, shares_cells
 from mivol.scene.needs import Needs
 from mivol.transport.line_integrals.aovs import AOVS
-from mivol.transport.media.emission_cells import MAX_PARTS, voxel_to_cell_ratio
+from mivol.transport.line_integrals.emission import MAX_PARTS, voxel_to_cell_ratio
 from mivol.transport.media.grid_extinction import have_same_cells
 from mivol.transport.path.estimators import Settings
 

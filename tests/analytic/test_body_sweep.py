@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.line_integrals.body_sweep import BodySweep
+from mivol.transport.line_integrals.composite import BodySweep
 from mivol.transport.line_integrals.integrand import LineIntegral
 from mivol.transport.media.body import Body
 from mivol.transport.media.compositing import CellIntegral, transmittance_of

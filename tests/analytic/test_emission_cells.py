@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.media.emission_cells import MAX_PARTS, count_parts, voxel_to_cell_ratio
+from mivol.transport.line_integrals.emission import MAX_PARTS, count_parts, voxel_to_cell_ratio
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.lattice import Lattice
 from scenes import FRAMES

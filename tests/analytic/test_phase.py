@@ -20,6 +20,8 @@ from mivol.phase.closed_forms import (
     ASYMMETRY,
     NEXT_TO_ONE,
     WEIGHT,
+    ScatteringAngle,
+    angle_between,
     choose_lobe,
     droplets,
     eval_draine,
@@ -30,9 +32,9 @@ from mivol.phase.closed_forms import (
     sample_draine,
     sample_hg,
     sample_rayleigh,
+    scattered_direction,
 )
 from mivol.phase.measured import ALIASES, NAMES, named_medium
-from mivol.phase.scattering_angle import ScatteringAngle, angle_between, scattered_direction
 from mivol.phase.table import Lookup, Table
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from false_alarms import assert_same_mean, assert_same_variance, fresh
 
-from mivol.bench.studies.preparation.axis_scans import AXIS_SCANS
+from mivol.bench.studies.preparation import AXIS_SCANS
 from mivol.errors import MivolError
 from mivol.files import write_volume
 from mivol.tomography import cone_axis

@@ -20,8 +20,16 @@ from mivol.bench.extinctions import TO_WORLD
 from mivol.bench.harness.timing import Timing
 from mivol.bench.reference_walk import GridRays, camera_rays
 from mivol.bench.studies import optical_depth as study
-from mivol.bench.studies.optical_depth import STUDY, OpticalDepthSize, gradient_step
-from mivol.bench.studies.optical_depth.peers import delta_survival, exact_tau, ratio_survival, tracking, volpath
+from mivol.bench.studies.optical_depth import (
+    STUDY,
+    OpticalDepthSize,
+    delta_survival,
+    exact_tau,
+    gradient_step,
+    ratio_survival,
+    tracking,
+    volpath,
+)
 from mivol.report.figures import SERIES
 
 ALL_SOLVERS = ("mivol", "volpath", "ratio tracking", "delta tracking", "marching", "drjit.dda.integrate")

@@ -18,7 +18,7 @@ from mivol.bench.studies.radiance_field import (
     STUDY,
     FitChoice,
     RadianceSize,
-    fields,
+    contestants,
     fit_mivol,
     fit_peer,
     follow,
@@ -28,15 +28,15 @@ from mivol.bench.studies.radiance_field import (
     peer_step,
     to_peer,
 )
-from mivol.bench.studies.radiance_field.fields import (
+from mivol.bench.studies.radiance_field.contestants import (
     FIELDS,
+    Peer,
     middle_cameras,
     photograph,
     ring_cameras,
     tiled_pixels,
     trace,
 )
-from mivol.bench.studies.radiance_field.peer import Peer
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, Photo, intrinsics
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
@@ -170,11 +170,11 @@ def test_the_fitted_field_is_the_chair_where_there_is_one(monkeypatch: pytest.Mo
 
     if there:
         (tmp_path / "multiview" / "chair").mkdir(parents=True)
-    monkeypatch.setattr(fields, "DATA", tmp_path)
-    monkeypatch.setattr(fields, "load_photos", ask)
-    monkeypatch.setattr(fields, "make_shell", lambda size: ask("shell"))
+    monkeypatch.setattr(contestants, "DATA", tmp_path)
+    monkeypatch.setattr(contestants, "load_photos", ask)
+    monkeypatch.setattr(contestants, "make_shell", lambda size: ask("shell"))
     with pytest.raises(Asked) as calls:
-        fields.fit_field(TINY)
+        contestants.fit_field(TINY)
     chair = (tmp_path / "multiview" / "chair", {"split": "train", "background": "white", "scale": 0.5})
     assert calls.value.args == (chair if there else ("shell", {}))
 

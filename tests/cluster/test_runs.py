@@ -34,8 +34,8 @@ from mivol.experiments.sweep import plan_sweep, run_in_turn, run_sweep
 from mivol.files import read_volume
 from mivol.report.record import read_record
 from mivol.report.sweep_page import SweepRow
-from mivol.scene.camera_rigs import Ring
 from mivol.scene.load import load_scene
+from mivol.scene.sensors import Ring
 from mivol.validate.reference import render_photographs
 
 pytestmark = pytest.mark.slow

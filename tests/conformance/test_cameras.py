@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.scene.camera_rigs import RIGS, Hemisphere, LookAts, Ring, SceneSensors, find_media_box, look_at, parse_rig
+from mivol.scene.sensors import RIGS, Hemisphere, LookAts, Ring, SceneSensors, find_media_box, look_at, parse_rig
 
 BOX = np.array([[-1.0, 0.0, 2.0], [3.0, 1.0, 4.0]])
 CENTER = BOX.mean(axis=0)

@@ -14,7 +14,7 @@ from mivol.errors import MivolError
 from mivol.photos import poses, survey_photos
 from mivol.photos.listing import list_photographs
 from mivol.photos.photo_file import ORIENTATION, read_lens_facts
-from mivol.report import poses_page
+from mivol.report import cameras
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict:
 def test_the_largest_model_is_kept_and_the_rest_is_named(
     folder: Path, job: dict, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(poses_page, "write_poses_page", lambda folder, found: folder / "poses.html")
+    monkeypatch.setattr(cameras, "write_poses_page", lambda folder, found: folder / "poses.html")
     assert main(["poses", str(folder)]) == 0
     said = capsys.readouterr().out
     for fact in (
@@ -125,7 +125,7 @@ def test_what_cannot_have_poses_is_refused(folder: Path, job: dict, tmp_path: Pa
 def test_a_page_shows_cameras_and_errors(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path / "a b")
     found = poses.Poses(folder / "sparse" / "0", ("a.png", "b.png"), ("c<d>.png",), 0.734, 12, 1)
-    text = poses_page.write_poses_page(folder, found).read_text()
+    text = cameras.write_poses_page(folder, found).read_text()
     for fact in ("2 of 3", "0.73 pixels", "c&lt;d&gt;.png", "data:image/png;base64,", f"mivol view &#x27;{folder}&#x27;"):
         assert fact in text
     assert "http" not in text

@@ -30,8 +30,7 @@ from scipy import stats
 from mivol.errors import MivolError
 from mivol.files.image_files import read_exr, write_exr
 from mivol.photos import Camera, Lens, intrinsics, load_photos, project, rays
-from mivol.scene.camera_rigs import Ring
-from mivol.scene.sensors import to_camera, to_sensor
+from mivol.scene.sensors import Ring, to_camera, to_sensor
 from mivol.validate import reference
 from mivol.validate.moments import Moments
 from mivol.validate.reference import render_photographs, render_reference

@@ -24,10 +24,9 @@ from mivol.phase.measured import NAMES, named_medium
 from mivol.phase.table import Table
 from mivol.photos import Camera
 from mivol.photos.camera import PIXELS_LOST
-from mivol.scene.camera_rigs import Ring, parse_rig
 from mivol.scene.description import parse_dict, parse_file
 from mivol.scene.refusals import check_quadrature
-from mivol.scene.sensors import to_sensor
+from mivol.scene.sensors import Ring, parse_rig, to_sensor
 from mivol.transport.path.estimators import Settings
 from mivol.validate.metrics import score_image
 from mivol.validate.reference_file import check_identity

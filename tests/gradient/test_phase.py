@@ -9,8 +9,7 @@ import oracle_phase as oracle
 import pytest
 from phase_angles import EPS, f32, lanes
 
-from mivol.phase.closed_forms import eval_draine, eval_hg, normalise_weights
-from mivol.phase.scattering_angle import ScatteringAngle, angle_between
+from mivol.phase.closed_forms import ScatteringAngle, angle_between, eval_draine, eval_hg, normalise_weights
 from mivol.phase.table import Lookup, Table
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

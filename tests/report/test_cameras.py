@@ -38,7 +38,7 @@ from mivol.report.cameras import (
     select_views,
 )
 from mivol.report.figures import INK
-from mivol.scene.camera_rigs import find_media_box
+from mivol.scene.sensors import find_media_box
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews
 

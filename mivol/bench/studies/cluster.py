@@ -40,8 +40,8 @@ from mivol.experiments.fit_kind import RunContext
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scene_fit import SceneFit
 from mivol.optim.problem import to_arrays
-from mivol.scene.camera_rigs import Ring
 from mivol.scene.load import load_scene
+from mivol.scene.sensors import Ring
 from mivol.validate.reference import render_photographs
 
 WORKERS = (1, 2, 4, 8, 16, 32, 100, 1000)

@@ -44,8 +44,8 @@ from mivol.photos import Camera
 from mivol.photos.camera import intrinsics
 from mivol.photos.camera_path import aim_camera
 from mivol.photos.transforms import write_transforms
-from mivol.scene.camera_rigs import Ring
 from mivol.scene.load import load_scene
+from mivol.scene.sensors import Ring
 from mivol.validate.reference import render_photographs
 
 

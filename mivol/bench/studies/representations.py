@@ -46,7 +46,7 @@ from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 from mivol.photos import rectify, survey_photos
 from mivol.points import Gaussians, write_gaussians
-from mivol.scene.camera_rigs import parse_rig
+from mivol.scene.sensors import parse_rig
 from mivol.validate.metrics import average_scores, psnr
 
 

@@ -16,7 +16,7 @@ interval and a part inside is taken in the first or the last cell.
 Where two peaks swap, N jumps by alpha_i alpha_j |c_i - c_j| times the transmittance in front of them; derivatives are taken at
 a fixed order.
 
-Conventions. As of :mod:`mivol.transport.line_integrals.body_sweep`, with a Gaussian in the place of a cell: N depends on its
+Conventions. As of :mod:`mivol.transport.line_integrals.composite`, with a Gaussian in the place of a cell: N depends on its
 optical depth and its colour. Gaussians without shown colours absorb the light behind them.
 
 Source: sorting and compositing by peaks, Moenne-Loccoz et al., 3D Gaussian Ray Tracing, 2024, Eq. 5 (they sort in a buffer for
@@ -80,7 +80,7 @@ class _CrossedGaussian:
 
 
 class GaussianSweep:
-    """The sweep over a medium of Gaussians, like :class:`mivol.transport.line_integrals.body_sweep.BodySweep` over cells.
+    """The sweep over a medium of Gaussians, like :class:`mivol.transport.line_integrals.composite.BodySweep` over cells.
 
     Args:
         interval: interval of the ray in the medium.

@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.phase.closed_forms import eval_hg, sample_hg
-from mivol.phase.scattering_angle import angle_between, scattered_direction
+from mivol.phase.closed_forms import angle_between, eval_hg, sample_hg, scattered_direction
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantEmitterSample
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.scores import IMAGE, Factor, TrackedTerm

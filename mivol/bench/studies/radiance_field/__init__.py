@@ -5,9 +5,9 @@
     mivol bench radiance_field --only photographs  # 40 minutes, a third of them for one fit
     mivol bench radiance_field --quick             # under two minutes, small sizes: the times mean nothing
 
-The peer (:mod:`mivol.bench.studies.radiance_field.peer`) takes uniform steps through textures. Fields: a thin shell, a fog that
-fills the box, and a fitted scene (the chair of NeRF's synthetic scenes from MIVOL_DATA, fitted here for a minute; without the
-data, views of the shell, and the JSON records this). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
+The peer (:mod:`mivol.bench.studies.radiance_field.contestants`) takes uniform steps through textures. Fields: a thin shell, a
+fog that fills the box, and a fitted scene (the chair of NeRF's synthetic scenes from MIVOL_DATA, fitted here for a minute;
+without the data, views of the shell, and the JSON records this). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
 
 step: forward and backward, the same 65,536 rays for both, in turns; ratios of processor time, with those of the wall clock.
 Three kinds of rays: ``camera``, the pixels of one view; ``pixels``, random pixels of 8 views, as the loader of the tutorial
@@ -41,11 +41,12 @@ from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import Study, amount
 from mivol.bench.harness.timing import Stopwatch, race, ratio_of
 from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs, prepare_fit
-from mivol.bench.studies.radiance_field.fields import (
+from mivol.bench.studies.radiance_field.contestants import (
     BLACK,
     BOX,
     STOP,
     FieldSize,
+    Peer,
     load_field,
     make_camera,
     middle_cameras,
@@ -55,7 +56,6 @@ from mivol.bench.studies.radiance_field.fields import (
     to_bundle,
     trace,
 )
-from mivol.bench.studies.radiance_field.peer import Peer
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import Fit
 from mivol.optim.photographs.field_view import render_view
