@@ -1,0 +1,238 @@
+"""What a path on the command line holds: which kind of input it is, how it is loaded, and what ``mivol explain`` says of it."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mivol.errors import MivolError
+
+if TYPE_CHECKING:
+    from mivol.experiments.found_scan import ScanDraft
+    from mivol.points.summary import FileSummary
+    from mivol.scene.explain import Explanation
+    from mivol.scene.load import LoadedScene
+
+
+def explain(arguments: argparse.Namespace) -> int:
+    """Say what mivol would do with a scene or an experiment, and why, before it renders more than a small preview.
+
+    For photographs, explain lists present and missing data, and draws the cameras with --output. For points and
+    Gaussians, it prints their number, extent, sizes and opacities; for a volume or a field, its size, values and place. The
+    folder of a DICOM series is a volume; so is a folder of TIFF files without flats, darks and angles, unless --set makes it
+    a scan. A refusal comes after the facts, with exit code 1.
+    """
+    from mivol.photos import find_format
+    from mivol.points.summary import is_points_file
+
+    if (code := explain_array(arguments)) is not None:
+        return code
+    if is_fit(arguments):
+        from mivol.experiments.kinds import explain_experiment
+
+        answer = explain_experiment(*load_experiment(arguments.scene, arguments), arguments.output)
+    elif not is_points_file(arguments.scene) and (arguments.scene.is_dir() or find_format(arguments.scene)):
+        return explain_photos(arguments.scene, arguments.output)
+    else:
+        answer = _explain_file(arguments)
+    print(answer.text)
+    return int(bool(answer.refusal))
+
+
+def _explain_file(arguments: argparse.Namespace) -> Explanation | FileSummary:
+    """Explain points, Gaussians or a scene."""
+    from mivol.points.summary import is_points_file, summarize_file
+
+    if is_points_file(arguments.scene):
+        return summarize_file(arguments.scene)
+    from mivol.scene.explain import explain_scene
+
+    return explain_scene(load_named_scene(arguments).scene, arguments.max_depth, noise=arguments.noise)
+
+
+def explain_array(arguments: argparse.Namespace) -> int | None:
+    """Explain a scan, or describe a volume or a field, and return the exit code; None for anything else."""
+    from mivol.experiments.found_scan import TIFF_FOLDER, find_scan
+    from mivol.files.formats import describe_volume
+
+    layout = raw_layout(arguments)
+    is_array = bool(layout) or holds_volume(check_dataset(arguments.scene, arguments.dataset))
+    if not layout and (draft := draft_scan_of(arguments.scene, arguments, is_array)):
+        return explain_scan(draft)
+    if not is_array and arguments.scene.suffix.lower() == ".npz":
+        from mivol.experiments.octree_conversion import describe_field
+
+        print(describe_field(arguments.scene, arguments.mode).text)
+        return 0
+    if not is_array:
+        return None
+    print(describe_volume(arguments.scene, arguments.dataset, **layout))
+    if arguments.dataset is None and arguments.scene.is_dir() and find_scan(arguments.scene) == TIFF_FOLDER:
+        print(
+            "a volume, for want of flats, darks and angles: mivol optimize takes it as a scan, mivol explain does so with --set"
+        )
+    return 0
+
+
+def explain_scan(draft: ScanDraft) -> int:
+    """Print what was found, the steps of the fit, and the TOML file that says the same."""
+    from mivol import config
+    from mivol.experiments.kinds import explain_experiment
+
+    answer = explain_experiment(config.from_dict(draft.raw), Path())
+    print("\n".join([*draft.lines, answer.text, "", "# the same as a TOML file, for mivol optimize", draft.toml]))
+    return int(bool(answer.refusal))
+
+
+def draft_scan_of(path: Path, arguments: argparse.Namespace, is_array: bool = False) -> ScanDraft | None:
+    """Return the settings of a scan without a TOML file; None for anything else.
+
+    An HDF5 file without the layout of a scan counts as one if its suffix is not that of a volume, or with ``--set``;
+    ``--dataset`` makes it a volume. So does a folder of TIFF files for ``is_array``: it is a scan with flats, darks or angles.
+
+    Raises:
+        MivolError: as :func:`mivol.experiments.found_scan.draft_scan`.
+    """
+    from mivol.experiments.found_scan import TIFF_FOLDER, draft_scan, find_scan, has_scan_files
+    from mivol.files.hdf5 import is_hdf5
+
+    is_photographs = arguments.preset is not None or arguments.model is not None
+    if is_photographs or getattr(arguments, "dataset", None) is not None or path.suffix.lower() == ".toml":
+        return None
+    is_named = path.is_file() and is_hdf5(path) and (arguments.set or not is_array)
+    kind = find_scan(path)
+    if kind == TIFF_FOLDER and is_array and not arguments.set and not has_scan_files(path):
+        return None
+    return draft_scan(path, arguments.set) if is_named or kind else None
+
+
+def is_fit(arguments: argparse.Namespace) -> bool:
+    """Whether a fit is to be explained; refuse ``--set`` for anything else."""
+    has_model = arguments.preset is not None or arguments.model is not None
+    is_experiment = arguments.scene.suffix.lower() == ".toml" or has_model
+    if arguments.set and not is_experiment:
+        raise MivolError(f"--set is for fits, and {arguments.scene} is not a fit: give --as, or the file of an experiment.")
+    return is_experiment
+
+
+def check_contents(path: Path) -> None:
+    """Refuse a volume, and binary data that no reader takes, in place of a scene, an experiment or a cloud."""
+    from mivol.files.formats import is_unread, refuse_unread
+
+    if is_unread(path):
+        raise refuse_unread(path)
+    if holds_volume(path):
+        raise MivolError(f"{path}: found a volume, expected a scene, a fit or points; render, explain and convert take it.")
+
+
+def holds_volume(path: Path) -> bool:
+    """Whether a file or a folder is a volume; a folder of photographs with cameras is none."""
+    from mivol.files.formats import is_volume
+    from mivol.photos import find_format
+
+    return is_volume(path) and not (path.is_dir() and find_format(path))
+
+
+def raw_layout(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Shape and type of raw bytes from the flags; empty without them."""
+    if arguments.shape is None and arguments.dtype is None:
+        return {}
+    words = (arguments.shape or "").split(",")
+    if arguments.shape is not None and not all(re.fullmatch(r"\s*\d{1,9}\s*", word, re.ASCII) for word in words):
+        raise MivolError(f"--shape: found {arguments.shape!r}, expected Z,Y,X; write --shape 64,128,128.")
+    return {"shape": None if arguments.shape is None else tuple(map(int, words)), "dtype": arguments.dtype}
+
+
+def check_dataset(path: Path, dataset: str | None) -> Path:
+    """Return the file; refuse ``--dataset`` for a file that is no volume."""
+    if dataset is not None and not holds_volume(path):
+        raise MivolError(f"--dataset names an array of a volume, and {path} is no volume: leave it out.")
+    return path
+
+
+def explain_photos(path: Path, picture: Path | None) -> int:
+    """Print the facts of a data set, and draw the cameras into an image."""
+    from mivol.experiments.photo_data import note_on_alpha
+    from mivol.photos import survey_photos
+    from mivol.report.cameras import plot_cameras
+
+    survey = survey_photos(path)
+    print(survey.describe())
+    if note := note_on_alpha(survey):
+        print(note)
+    print("--as gaussians, grid, hash, nerf or octree explains a fit; --as grid --preset capture is for a place around cameras")
+    if picture is not None:
+        plot_cameras(survey, picture)
+        print(picture)
+    return 0
+
+
+def load_named_scene(arguments: argparse.Namespace) -> LoadedScene:
+    """Load the scene of the flags, with variant and threads.
+
+    Raises:
+        MivolError: an unknown variant, a define without "=", or an invalid scene.
+    """
+    import mitsuba as mi
+
+    from mivol.back_end import choose_back_end
+    from mivol.scene.load import load_scene
+
+    check_contents(arguments.scene)
+    choose_back_end(arguments.mode, arguments.threads)
+    mi.set_log_level(mi.LogLevel.Debug if arguments.verbose else mi.LogLevel.Warn)
+    for folder in filter(None, arguments.a.split(";")):
+        mi.file_resolver().append(folder)
+    return load_scene(arguments.scene, parse_defines(arguments.define))
+
+
+def parse_defines(pairs: list[str]) -> dict[str, str]:
+    """Convert ``name=value`` pairs to a dict.
+
+    Raises:
+        MivolError: a pair without "=".
+    """
+    wrong = next((pair for pair in pairs if "=" not in pair), None)
+    if wrong is not None:
+        raise MivolError(f'-D "{wrong}" defines nothing: write -D name=value.')
+    return dict(pair.split("=", 1) for pair in pairs)
+
+
+def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path]:
+    """Load the experiment of a TOML file or of photographs, with --preset and --set.
+
+    Returns:
+        The settings, and the folder from which their relative paths start.
+
+    Raises:
+        MivolError: a preset of the other model, a model for a file that is no data set, or as ``config.load``.
+    """
+    from mivol import config
+    from mivol.photos import find_format
+
+    check_contents(path)
+    if path.is_dir() or (path.suffix.lower() == ".json" and find_format(path)):
+        model = arguments.model or next(iter(config.MODELS))
+        _check_preset(model, arguments.preset)
+        return config.of_photographs(path, model, arguments.preset, arguments.set), Path()
+    if arguments.preset is not None or arguments.model is not None:
+        is_experiment = path.suffix.lower() == ".toml"
+        fault = f"--as and --preset are for photographs, and {path} {'is an experiment' if is_experiment else 'holds none'}"
+        advice = "its tables [gaussians] or [field] name model and preset" if is_experiment else "leave them out"
+        raise MivolError(f"{fault}: {advice}.")
+    return config.load(path, arguments.set), path.parent
+
+
+def _check_preset(model: str, preset: str | None) -> None:
+    """Refuse a preset that only the other model has; a preset of no model is refused with the settings."""
+    from mivol.optim.gaussians.gaussian_plan import PRESETS as GAUSSIANS
+    from mivol.optim.photographs.radiance_plan import PRESETS as GRIDS
+    from mivol.optim.photographs.sampled_problem import PRESETS as SAMPLED
+
+    presets = {"gaussians": GAUSSIANS, "grid": GRIDS, **SAMPLED, "octree": GRIDS}
+    other = next((name for name, known in presets.items() if preset in known), model)
+    if preset not in presets[model] and other != model:
+        known = ", ".join(presets[model])
+        raise MivolError(f"--preset {preset} is a preset of --as {other}, and --as {model} has {known}: add --as {other}.")
