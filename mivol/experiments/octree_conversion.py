@@ -20,10 +20,9 @@ from mivol.fields.resampling import sample_field
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.source import check_file
-from mivol.optim.photographs.field_view import order_by_tiles, prepare_view, render_view
+from mivol.optim.photographs.field_view import CameraRays, prepare_view, render_view
 from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree, build_octree_of_points
 from mivol.optim.photographs.radiance_plan import place_grid
-from mivol.photos import pixel_centres, rays
 from mivol.scene.explain import Explanation
 from mivol.transport.line_integrals.radiance_field import RayBundle
 from mivol.validate.metrics import psnr
@@ -135,9 +134,9 @@ TIMED_EDGE, TURNS = 800, 7
 def describe_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree, other_name: str) -> str:
     """Pixels a second of two fields and their ratio: a view of the whole box, ready to render, by processor time."""
     camera = cameras_around(other.to_world, TIMED_EDGE)[1]
-    o, d = rays(camera, pixel_centres(camera.size).reshape(-1, 2)[order_by_tiles(*camera.size)])
-    points, directions = (np.ascontiguousarray(np.float32(a.T)) for a in (np.broadcast_to(o, d.shape), d))
-    bundle = RayBundle(mi.Point3f(points), mi.Vector3f(directions))
+    view = CameraRays.from_camera(camera)
+    _, bundle = view.make(0, view.count)
+    dr.eval(bundle)
     renders = [prepare_view(one, camera, stop=1e-3) for one in (field, other)]
     seconds = np.empty((TURNS + 1, 2))
     for turn, which in np.ndindex(seconds.shape):
@@ -167,10 +166,8 @@ class LookAround:
 
     def __call__(self) -> Iterator[RayBundle]:
         for camera in self.cameras:
-            o, d = rays(camera, pixel_centres(camera.size).reshape(-1, 2))
-            origin = np.broadcast_to(o, d.shape)
-            points, directions = (np.ascontiguousarray(np.float32(a.T)) for a in (origin, d))
-            yield RayBundle(mi.Point3f(points), mi.Vector3f(directions))
+            view = CameraRays.from_camera(camera)
+            yield view.make(0, view.count)[1]
 
 
 def describe_leaves(tree: Octree) -> str:

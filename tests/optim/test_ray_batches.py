@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
+from mivol.optim.photographs.field_view import CameraRays
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
+from mivol.photos.lens import Fisheye, Lens
 
 
 def test_batches_have_rays_and_pixels_of_their_views(variant_rgb: str, photos: list[Photo]) -> None:
@@ -24,6 +26,22 @@ def test_batches_have_rays_and_pixels_of_their_views(variant_rgb: str, photos: l
     half = np.array(views.all_pixels(2, 1).rays.d).T[0]
     assert np.abs(half - d[0:2, 0:2].mean(axis=(0, 1))).max() < 1e-3
     assert views.digest() != RayBatches.from_photos(photos[1:4], (1, 2)).digest()
+
+
+@pytest.mark.parametrize("lens", [Lens(), Lens(0.05, p1=0.01), Fisheye(0.01)])
+def test_rays_of_a_camera_cover_its_pixels(variant_rgb: str, lens: Lens | Fisheye) -> None:
+    """Edges are no multiples of a tile, and the second pass begins within a tile."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0], (1, 2, 3)
+    pose[:3, 0] *= np.linalg.det(pose[:3, :3])
+    camera = Camera(intrinsics(20, 25, 5, 4), (11, 7), pose, lens)
+    view, found = CameraRays.from_camera(camera), np.full((77, 3), np.nan)
+    for start, count in ((0, 40), (40, view.count - 40)):
+        pixel, bundle = view.make(start, count)
+        found[np.array(pixel)] = np.array(bundle.d).T
+        np.testing.assert_array_equal(np.array(bundle.o).T, np.float32([(1, 2, 3)]))
+    # Both are rounded from float64.
+    np.testing.assert_allclose(found.reshape(7, 11, 3), rays(camera, pixel_centres((11, 7)))[1], atol=6e-8)
 
 
 def test_smallest_view_is_a_tile(variant_rgb: str) -> None:

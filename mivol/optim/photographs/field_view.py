@@ -14,6 +14,7 @@ from mivol.fields.octree import Octree
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
+from mivol.optim.photographs.ray_batches import TILE
 from mivol.photos import Camera, pixel_centres, rays
 from mivol.transport.line_integrals.leaf_radiance import LeafPlaces, LeafRays, make_leaf_colours, render_leaves
 from mivol.transport.line_integrals.radiance_field import (
@@ -27,6 +28,50 @@ from mivol.transport.line_integrals.radiance_field import (
 from mivol.transport.line_integrals.radiance_source import bake
 from mivol.transport.line_integrals.sampled_rays import SampledModel, SampledRays, render_samples
 from mivol.transport.traversal.octree_walk import LeafIndex
+
+
+@dataclass(frozen=True)
+class CameraRays:
+    """Rays through the pixel centres of a camera, by tiles of ``TILE`` x ``TILE``; tiles at the border repeat border pixels.
+
+    Attributes:
+        camera: with any lens.
+        directions: Float, x, y and z of the direction of each pixel in the world, row by row; None for a lens without
+            distortion, whose rays are computed where they are used.
+    """
+
+    camera: Camera
+    directions: mi.Float | None
+
+    @classmethod
+    def from_camera(cls, camera: Camera) -> CameraRays:
+        """The rays of a camera."""
+        if not camera.distortion:
+            return cls(camera, None)
+        _, d = rays(camera, pixel_centres(camera.size))
+        return cls(camera, mi.Float(d.astype(np.float32).reshape(-1)))
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return math.prod(-(-n // TILE) for n in self.camera.size) * TILE * TILE
+
+    def make(self, start: int, count: int) -> tuple[mi.UInt32, RayBundle]:
+        """Pixels, numbered row by row, and world rays of the lanes from ``start``."""
+        width, height = (dr.opaque(mi.UInt32, n) for n in self.camera.size)
+        across = dr.opaque(mi.UInt32, -(-self.camera.size[0] // TILE))
+        lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
+        column = dr.minimum(tile % across * TILE + within % TILE, width - 1)
+        row = dr.minimum(tile // across * TILE + within // TILE, height - 1)
+        pixel = row * width + column
+        o = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in self.camera.origin))
+        if self.directions is not None:
+            return pixel, RayBundle(o, dr.gather(mi.Vector3f, self.directions, pixel))
+        (fx, _, cx), (_, fy, cy) = ([dr.opaque(mi.Float64, float(v)) for v in numbers] for numbers in self.camera.K[:2])
+        local = mi.Vector3d((mi.Float64(column) + 0.5 - cx) / fx, (cy - 0.5 - mi.Float64(row)) / fy, -1)
+        turn = ([dr.opaque(mi.Float64, float(v)) for v in numbers[:3]] for numbers in self.camera.to_world[:3])
+        return pixel, RayBundle(o, mi.Vector3f(dr.normalize(mi.Vector3d(*(dr.dot(mi.Vector3d(*t), local) for t in turn)))))
 
 
 @dataclass(frozen=True)
@@ -63,25 +108,22 @@ def render_view(
         field known at points, the bias of :mod:`mivol.transport.line_integrals.sampled_rays`; of an octree, the bias of
         :func:`mivol.transport.line_integrals.leaf_radiance.make_leaf_colours`.
     """
-    render = prepare_view(field, camera, stop)
+    render, view = prepare_view(field, camera, stop), CameraRays.from_camera(camera)
     width, height = camera.size
-    order = order_by_tiles(width, height)
-    pixels = pixel_centres(camera.size).reshape(-1, 2)[order]
-    values = np.empty((width * height, 5), np.float32)
+    values, distance = dr.zeros(mi.Float, 4 * width * height), dr.zeros(mi.Float, width * height)
     at_once = SAMPLED_PASS if isinstance(field, SampledField) else PASS
-    for start in range(0, len(order), at_once):
-        o, d = rays(camera, pixels[start : start + at_once])
-        o = np.broadcast_to(o, d.shape)
-        bundle = RayBundle(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
+    for start in range(0, view.count, at_once):
+        pixel, bundle = view.make(start, min(at_once, view.count - start))
         rendered = render(bundle)
         behind = background.eval(bundle.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
         colour = rendered.colour + rendered.T * behind
-        dr.eval(colour, rendered.T, rendered.distance)
-        values[order[start : start + at_once]] = np.stack([*map(np.array, (*colour, rendered.T, rendered.distance))], axis=1)
-    values = values.reshape(height, width, 5)
+        dr.scatter(values, mi.ArrayXf([*colour, rendered.T]), pixel)
+        dr.scatter(distance, rendered.distance, pixel)
+        dr.eval(values, distance)
+    values, distance = np.array(values).reshape(height, width, 4), np.array(distance).reshape(height, width)
     opacity = 1 - values[..., 3]
     with np.errstate(invalid="ignore", divide="ignore"):
-        depth = np.where(opacity > 0, values[..., 4] / opacity, np.nan)
+        depth = np.where(opacity > 0, distance / opacity, np.nan)
     return FieldView(values[..., :3], opacity, depth)
 
 
@@ -124,9 +166,3 @@ def have_same_leaves(a: Octree, b: Octree) -> bool:
 
 
 INDEXED = IndexedLeaves()
-
-
-def order_by_tiles(width: int, height: int) -> np.ndarray:
-    """Flat numbers of pixels, tile by tile of 4 x 4."""
-    row, column = np.divmod(np.arange(width * height), width)
-    return np.lexsort((column % 4, row % 4, column // 4, row // 4))
