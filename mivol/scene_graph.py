@@ -33,12 +33,12 @@ def find_children(node: mi.Object) -> dict[str, mi.Object]:
 def _add_object(
     found: mi.SceneParameters, names: set[str], node: mi.Object, parent: mi.Object | None, name: str, flags: int
 ) -> None:
-    """Add an object, its parameters, and the objects in it that have not been found yet.
+    """Add an object, its parameters, and the new objects inside.
 
     Args:
         found: parameters to add to.
         names: names of the objects found so far, without the root.
-        node, parent: the object, and the object that holds it; None for the root.
+        node, parent: object, and its owner; None for the root.
         name: path of the object; empty for the root.
         flags: flags that the object passes on to its parameters.
     """

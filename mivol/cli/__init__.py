@@ -275,9 +275,9 @@ def optimize(arguments: argparse.Namespace) -> None:
 
 
 def sweep(arguments: argparse.Namespace) -> int:
-    """Fit an experiment with several values of some settings: a run folder each, one table and one page of all.
+    """Fit an experiment with several values of some settings: a run folder for each fit, a table and a page of the sweep.
 
-    All combinations are checked first. The same command again runs what is missing and continues interrupted runs.
+    Every combination is checked before the first fit. The same command again runs missing fits and continues interrupted fits.
     """
     from mivol.cli.cluster import sweep
 

@@ -1,4 +1,4 @@
-"""What a path on the command line holds: which kind of input it is, how it is loaded, and what ``mivol explain`` says of it."""
+"""Inputs of the command line: recognise the kind of a path, load it, and explain it (``mivol explain``)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _explain_file(arguments: argparse.Namespace) -> Explanation | FileSummary:
 
 
 def explain_array(arguments: argparse.Namespace) -> int | None:
-    """Explain a scan, or describe a volume or a field, and return the exit code; None for anything else."""
+    """Explain a scan, or describe a volume or a field, and return the exit code; None for other inputs."""
     from mivol.experiments.found_scan import TIFF_FOLDER, find_scan
     from mivol.files.formats import describe_volume
 
@@ -87,10 +87,11 @@ def explain_scan(draft: ScanDraft) -> int:
 
 
 def draft_scan_of(path: Path, arguments: argparse.Namespace, is_array: bool = False) -> ScanDraft | None:
-    """Return the settings of a scan without a TOML file; None for anything else.
+    """Return the settings of a scan without a TOML file; None for other inputs.
 
-    An HDF5 file without the layout of a scan counts as one if its suffix is not that of a volume, or with ``--set``;
-    ``--dataset`` makes it a volume. So does a folder of TIFF files for ``is_array``: it is a scan with flats, darks or angles.
+    An HDF5 file without the layout of a scan counts as a scan if its suffix is no volume suffix, or with ``--set``;
+    ``--dataset`` makes it a volume. A folder of TIFF files that ``is_array`` counts as a scan if it has flats, darks or angles,
+    or with ``--set``.
 
     Raises:
         MivolError: as :func:`mivol.experiments.found_scan.draft_scan`.
@@ -128,7 +129,7 @@ def check_contents(path: Path) -> None:
 
 
 def holds_volume(path: Path) -> bool:
-    """Whether a file or a folder is a volume; a folder of photographs with cameras is none."""
+    """Whether a file or a folder is a volume; a folder of photographs with cameras is not."""
     from mivol.files.formats import is_volume
     from mivol.photos import find_format
 

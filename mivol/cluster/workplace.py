@@ -1,7 +1,7 @@
-"""What runs inside of a worker: its facts, the inputs that it keeps, and one piece of work after another.
+"""The part of mivol inside a worker: facts about the worker, stored inputs, and the work itself, piece by piece.
 
-Conventions. A workplace is an actor of Dask. Its methods run one after another on one thread, the only thread of the process
-that uses Dr.Jit. ``async`` methods run beside them, on the thread of the network, and never touch Dr.Jit. Arguments and results
+Conventions. A workplace is an actor of Dask. Its methods run one after another on the only thread of the process that uses
+Dr.Jit. ``async`` methods run at the same time on the network thread, and never touch Dr.Jit. Arguments and results
 are NumPy arrays and plain Python; no object of Mitsuba leaves the process.
 """
 

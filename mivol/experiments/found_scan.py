@@ -1,7 +1,7 @@
-"""A scan without a TOML file: what its files tell, what is assumed, what is chosen, and the TOML that says the same.
+"""A scan without a TOML file: facts from its files, assumptions, choices, and an equivalent TOML file.
 
-Kinds of scans (``SCAN_KINDS``) are recognised by content: a file of settings of a Nikon scanner, an HDF5 file with a layout of
-a scan, a folder with one of both, or a folder of TIFF files without cameras.
+Kinds of scans (``SCAN_KINDS``) are recognised by content: a settings file of a Nikon scanner, an HDF5 file with the layout of a
+scan, a folder with such a file, or a folder of TIFF files without cameras.
 
 Conventions. Paths in the settings are relative to the working directory. Lengths are in mm if the files tell the size of a
 pixel, in pixels otherwise.

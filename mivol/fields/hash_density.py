@@ -126,11 +126,11 @@ MOST_NODES = 1 << 27
 
 
 class FittedDensity:
-    """The extinction of a hash grid or a NeRF that was fitted to photographs, with the tensors that it depends on.
+    """The extinction of a hash grid or a NeRF fitted to photographs, with its tensors.
 
     Attributes:
         field: with a region, in an upright box.
-        tensors: parameters by name; those of the colours alone are left out.
+        tensors: parameters by name, without parameters of the colours alone.
     """
 
     def __init__(self, field: SampledField) -> None:

@@ -1,13 +1,13 @@
-r"""The contract of a radiance field that is known only at points: hash grids and networks.
+r"""The contract of a radiance field known only at points: hash grids and networks.
 
 .. math:: (\sigma, c) = f(x, \omega; \theta)
 
-Line integrals sample such a field (:mod:`mivol.transport.line_integrals.sampled_rays`). One estimator and one adjoint serve
-all of them: the adjoint asks for the products of derivatives at the same points.
+Line integrals sample the field (:mod:`mivol.transport.line_integrals.sampled_rays`). One estimator and one adjoint serve every
+sampled field: the adjoint evaluates the products with derivatives at the same points.
 
-Conventions. Points and directions are in the world; directions are those of travel, |d| = 1. The extinction is in 1/length,
+Conventions. Points and directions are in the world; directions point along the travel, |d| = 1. The extinction is in 1/length,
 colours are sRGB code values or radiance (``space``). A field is 0 outside its box, the unit cube under ``to_world``, and is
-asked only inside.
+evaluated only inside.
 """
 
 from __future__ import annotations

@@ -84,12 +84,12 @@ def find_dicom(folder: Path) -> Iterator[Path]:
 
 
 def read_dicom(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read a series: ``path`` is its folder, or one of its files.
+    """Read the series in a folder, or the series to which a file belongs.
 
     Args:
-        path: folder (folders in it are searched too), or a file; a file brings the other files of its series in its folder.
-        dataset: ``SeriesInstanceUID``, or ``SeriesNumber`` (with .1, .2, ... if several series have it); without it, the series
-            of the file, or the only one of the folder.
+        path: folder, searched with its subfolders, or a file; a file brings the other files of its series in the same folder.
+        dataset: ``SeriesInstanceUID``, or ``SeriesNumber`` (followed by .1, .2, ... if several series share the number);
+            default: the series of the file, or the only series of the folder.
 
     Raises:
         MivolError: no pydicom, damaged files, several series, gaps, two slices in one place, or colours.

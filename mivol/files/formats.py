@@ -214,7 +214,7 @@ SPARSE_READERS: dict[str, Callable[[Path, str | None], SparseVolumeData]] = {
 
 
 def is_sparse_file(path: str | os.PathLike) -> bool:
-    """Whether the suffix of a file is that of a format that is sparse itself."""
+    """Whether the suffix of a file names a sparse format."""
     return str(path).lower().endswith(tuple(SPARSE_READERS))
 
 

@@ -22,7 +22,7 @@ NUMBERS = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", 
 
 
 def read_matlab(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read an array of three or four dimensions: ``dataset``, or the only one of the file.
+    """Read an array of three or four dimensions: ``dataset``, or the only array of the file.
 
     Raises:
         MivolError: a damaged file, several arrays and no name, or numbers that are not real.

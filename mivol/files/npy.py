@@ -37,7 +37,7 @@ def read_npy(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 def read_npz(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read an array of an archive: ``dataset``, else ``values``, else the only array of rank 3 or 4."""
+    """Read an array of an archive: ``dataset``, by default ``values`` or the only array of rank 3 or 4."""
     arrays = read_archive(path)
     grids = [name for name, array in arrays.items() if array.ndim in (3, 4)]
     name = select_dataset(path, "values" if dataset is None and "values" in grids else dataset, grids)
@@ -122,7 +122,7 @@ DAMAGE = (
 
 
 def read_archive(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays of an archive by name: all of them, or the named one if it is there.
+    """Read arrays of an archive by name: every array, or the named array if present.
 
     Raises:
         FileNotFoundError: a missing file.

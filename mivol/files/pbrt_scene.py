@@ -1,4 +1,4 @@
-"""Scenes of pbrt-v4 (``.pbrt``): directives with their parameters, and the graphics state that each of them meets.
+"""Scenes of pbrt-v4 (``.pbrt``): directives with their parameters and the current graphics state.
 
 Conventions. A transform maps from the space of an object to the world, as columns; before ``WorldBegin`` it maps from the world
 to the camera. Lists of numbers are float64 arrays. Included files are read from the folder of the file that names them.
@@ -103,7 +103,7 @@ class _Reader:
         self.objects = 0
 
     def read(self, path: Path) -> None:
-        """Read a file, and files that it includes."""
+        """Read a file and its included files."""
         self.depth += 1
         if self.depth > DEEPEST:
             raise refusal(path, f"more than {DEEPEST} files within each other", "fewer", "correct the Include directives")

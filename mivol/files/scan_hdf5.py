@@ -313,7 +313,7 @@ ANGLE_WORDS = "theta", "rot", "angle"
 
 
 def _angles_by_name(file: Any, entry: str, holder: str, frames: int) -> str | None:
-    """Name of one number per frame beside a detector's frames, called after a motor that turns; None if there is none."""
+    """Name of the dataset of angles, one per frame, beside a detector's frames and named after a motor; None if missing."""
     for group in (f"{entry}/{holder.rpartition('/')[2]}", holder):
         for child in sorted(map(to_text, file[group])) if is_group(file, group) else ():
             try:

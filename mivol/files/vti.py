@@ -48,7 +48,7 @@ Take = Callable[[int], bytes]
 
 
 def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read an array of a ``.vti``: ``dataset``, else the active scalars, else the only array.
+    """Read an array of a ``.vti``: ``dataset``, by default the active scalars or the only array.
 
     Raises:
         MivolError: other data than an image, several pieces, an unknown compressor or type, or inconsistent sizes.

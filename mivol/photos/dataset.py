@@ -1,7 +1,7 @@
 """Posed photographs: the images of a data set with their cameras, in one size and one colour space.
 
-Conventions. Cameras are those of :mod:`mivol.photos.camera`, pixels those of :mod:`mivol.photos.photo_file`. The survey
-(:mod:`mivol.photos.survey`) finds the photographs and their box.
+Conventions. :mod:`mivol.photos.camera` defines cameras, :mod:`mivol.photos.photo_file` pixels. :mod:`mivol.photos.survey` finds
+the photographs and their box.
 """
 
 from __future__ import annotations

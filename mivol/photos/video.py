@@ -40,15 +40,15 @@ SMALL = 128
 
 
 def extract_frames(video: Path, rate: float | None = None, say: Callable[[str], None] = lambda line: None) -> Path:
-    """Write sharp frames of a video to ``images/`` in a folder of the video's name beside it, whole or not at all.
+    """Write sharp frames of a video to ``images/`` in a folder beside the video and of the same name; complete or not at all.
 
     Args:
         video: the file.
         rate: frames a second, at most; None: ``RATE``, or less for a long video.
-        say: receives a line on what is found and done.
+        say: receives lines about findings and progress.
 
     Returns:
-        The folder. Frames that are there already are kept as they are.
+        The folder. Existing frames are kept.
 
     Raises:
         MivolError: a missing imageio-ffmpeg, a file that is no video, a video that is too long, or a camera that stands still.

@@ -169,7 +169,7 @@ def _tile(name: str, value: float | None, units: dict[str, str]) -> tuple[str, s
 
 
 def _curves(rows: Sequence[dict], units: dict[str, str]) -> list[str]:
-    """Curves of all quantities in the metrics: those of ``QUANTITIES`` first, then the others by name."""
+    """Curves of the quantities in the metrics: first the keys of ``QUANTITIES``, then further quantities by name."""
     names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
     ordered = [name for name in QUANTITIES if name in names] + sorted(names - set(QUANTITIES))
     labels = {name: f"{find_quantity(name, units).label} against iterations" for name in ordered}

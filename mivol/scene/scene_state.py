@@ -1,8 +1,8 @@
-"""The state of a scene's parameters: what has changed since a plan was made, and what a recording follows by itself.
+"""The state of a scene's parameters: changes since a plan was made, and changes that a recording follows.
 
 Conventions. A plan holds as long as no parameter has changed. A recording (:mod:`mivol.kernel_recording`) holds longer: it
 reads the values of volumes, textures and phase functions anew in every call. All other parameters are part of its key, since
-some of them decide on the host what is traced: the place of a shape, the ``scale`` of a stock medium.
+parameters such as the place of a shape or the ``scale`` of a stock medium decide on the host which code is traced.
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ class SceneState:
 
 
 def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
-    """Why a recording would miss arrays or derivatives of a scene; None if it finds all.
+    """Reason why a recording would miss arrays or derivatives of a scene; None if it finds every array.
 
-    A recording must find all arrays. Dr.Jit finds those of Mitsuba's plugins, and those that are attributes of a Python plugin.
-    It aborts the process for an array that it does not find.
+    A recording must find every array. Dr.Jit finds the arrays of Mitsuba's plugins and the attributes of Python plugins. It
+    aborts the process at an array outside both.
     """
     if mi.variant().partition("_")[0] not in RECORDED_BACK_ENDS:
         return f"recordings have not been tried with {mi.variant()}"

@@ -1,10 +1,10 @@
 """Exact line integrals of a grid, and their transpose, for rays that seldom cross one of its axes.
 
-Rays of a scanner are such rays: the rows of the detector lie across the axis. A cell is four columns of two nodes along the
-axis. A ray moves between columns where it crosses another axis. Where it crosses a layer of the axis, and after every PIECE
-voxels, it starts afresh from its place in float64. The loop over cells then has two planes to look for, two columns to change
-and no compensated sums: half the instructions of the general walk (:mod:`mivol.transport.traversal.grid_walk`). The integrals
-are those of :mod:`mivol.transport.media.grid_integral` to rounding, for one channel and no empty blocks.
+Most rays of a scanner are of this kind: the rows of the detector lie across the axis. A cell is four columns of two nodes along
+the axis. A ray moves between columns at the planes of the other axes. At each layer of the axis, and after every PIECE voxels,
+the ray starts afresh from its position in float64. The loop over cells then tests two planes, changes two columns and needs no
+compensated sums: half the instructions of the general walk (:mod:`mivol.transport.traversal.grid_walk`). The integrals equal
+:mod:`mivol.transport.media.grid_integral` to rounding, for one channel and no empty blocks.
 
 Conventions. Axes are numbered x, y, z. The nodes are padded by one on each side with the values of the outermost nodes, so no
 index is clamped. Cells are those of :mod:`mivol.transport.traversal.lattice`. Columns of a cell are numbered near (0) or far

@@ -191,7 +191,7 @@ MISFIT_ERROR, SPARSE_ERROR = 0.04, 0.02
 directions in half a turn. Measured for heads and blocks on 120 columns: rms .18, .056 and .041 in 40, 90 and 180 directions."""
 
 FAR = 5.0
-"""Distance of the refined from the rough column [standard deviation of the rough one] beyond which it is said."""
+"""Distance of the refined from the rough column [standard deviations of the rough column] beyond which mivol reports it."""
 
 
 def _directions(angles: np.ndarray) -> int:
@@ -237,7 +237,7 @@ def _opposite_views(y: np.ndarray, angles: np.ndarray, n_views: int) -> tuple[np
 
 
 MIRRORED_LINES = 1440
-"""Most rows of all views that are compared with their mirror images."""
+"""Largest number of rows, over the views, compared with their mirror images."""
 
 
 class _Node(NamedTuple):
@@ -254,9 +254,9 @@ def _signed(angle: np.ndarray) -> np.ndarray:
 
 
 def _nodes(own: np.ndarray, mirrored: np.ndarray, step: float) -> list[_Node] | None:
-    """One mirrored view at the same angle, or two views on either side, at least one of which is mirrored; None if missing.
+    """Find a mirrored view at the same angle, or two neighbours of which at least one is mirrored; None if missing.
 
-    A side has mirrored views if the nearest is at most 1.25 steps away, else the view's own neighbours.
+    On each side, a mirrored view within 1.25 steps is taken, otherwise the nearest view itself.
 
     Args:
         own, mirrored: angles from the view to the others and to the mirrored views [rad].

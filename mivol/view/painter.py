@@ -1,4 +1,4 @@
-"""When what is drawn: requests in a queue of which the newest wins, coarse pictures first, full ones when a camera rests.
+"""Schedule of the drawings: the newest request wins; coarse pictures come first, full pictures when the camera rests.
 
 Conventions. Times are seconds of one clock. A picture is uint8 (H, W, 3), sRGB. Sizes are (width, height) [pixel]. Only the
 thread that calls :meth:`Painter.step` draws.
@@ -113,13 +113,13 @@ class Painter:
     """Draws the pictures of all pages, a piece at a time.
 
     Args:
-        subject: what is drawn.
+        subject: drawn model.
         send: receives the name of a page, a picture, and whether it is full.
         look: first look.
         clock: seconds.
 
     Attributes:
-        look: what the sliders say; set by :meth:`change`.
+        look: values of the sliders, set by :meth:`change`.
         drawn: number of pieces drawn so far.
     """
 

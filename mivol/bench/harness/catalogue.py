@@ -76,7 +76,7 @@ def answer_on(pool: Pool, study: str, name: str, question: SweptQuestion, size: 
 
 @contextmanager
 def open_cluster(study: Study, args: argparse.Namespace) -> Iterator[Answer]:
-    """What answers swept questions of a study on the workers of ``--cluster``, of one thread each.
+    """Pool for the swept questions of a study: the workers of ``--cluster``, with one thread each.
 
     Raises:
         MivolError: as :func:`mivol.cluster.connection.open_pool`.

@@ -2,9 +2,9 @@
 
     mivol bench cluster
 
-All is measured on this machine with two local workers of one thread, in turns with one process of one thread. The machine may
-be busy, so time is processor time. For streaming units it is the slowest worker, or half of all processor time if that is more
-(two cores). For steps it is the slowest worker and the owner, one after the other. ``mivol.cluster.scaling`` is fitted to these
+Two local workers of one thread alternate with one process of one thread, on this machine. The machine may be busy, so time is
+processor time: for streaming units the time of the slowest worker, and at least half of the total (two cores); for steps the
+times of the slowest worker and of the owner, added. ``mivol.cluster.scaling`` is fitted to these
 figures: larger workloads scale them by views, pixels and voxels.
 """
 

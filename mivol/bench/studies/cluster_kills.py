@@ -3,9 +3,9 @@
     mivol bench cluster_kills
     mivol bench cluster_kills --only render --kills 5
 
-A run of each verb is repeated on two local workers of one thread. A signal kills one of them after a random share of the time
-that the run takes undisturbed; Dask starts another. Results are compared with those of the undisturbed run. A kill that comes
-after the end of its run is repeated. Fits stop before their pages, which the owner alone writes.
+The study repeats a run of each verb on two local workers of one thread. A signal kills a worker after a random share of the
+undisturbed time, and Dask starts a new worker. The results must equal the undisturbed results. A kill after the end of its run
+is repeated. Fits stop before the report page, which the owner writes without workers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One table of all representations: how good, how soon, how large, and how fast to show?
+"""How do all representations compare: quality, time, size, and speed of rendering?
 
     mivol bench representations                 # two hours of processor time
     mivol bench representations --only chair    # a data set; --models grid octree for some models
@@ -226,7 +226,7 @@ def measure_sample_rates(size: RepresentationSize) -> dict:
 SMOKE_KEY = "box.interior_medium.sigma_t."
 
 SMOKE_VIEWS, SMOKE_JUDGED = 16, (2, 6, 10, 14)
-"""Views around the smoke, and those that judge."""
+"""Training views around the smoke, and held-out views."""
 
 
 @dataclass(frozen=True)

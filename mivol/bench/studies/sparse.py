@@ -4,10 +4,10 @@
 
 Volumes: smoke.vdb of the OpenVDB samples (from MIVOL_DATA; left out if it is not there, and the JSON says so), thin threads in
 1 % of their box, and a cumulus (:func:`mivol.fields.procedural.make_cumulus`). The dense peer walks in its faster way: every
-cell, or empty blocks skipped. Rates are those of the fastest of several walks in turns, for all threads, by processor
-time, since other work on the machine changes the wall clock. Memory is counted (arrays of the medium), and measured as the peak
-of a process of its own less the peak of the same process with a grid of one brick. A fit is steps of Adam with bricks that
-appear and vanish; its time is that of a step, trials of neighbours included, over a step of the dense fit.
+cell, or empty blocks skipped. A rate is the fastest of several walks in turns, over all threads, in processor time, since other
+work on the machine changes the wall clock. Memory is counted (arrays of the medium), and measured: the peak of a separate
+process, less its peak for a grid of one brick. A fit takes steps of Adam; bricks appear and vanish. Its time is the time of a
+step, trials of neighbours included, over the time of a dense step.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class SparseSize(Size):
 
 
 def smoke_file() -> Path | None:
-    """smoke.vdb, or None where the data folder does not hold it."""
+    """smoke.vdb; None if the data folder lacks it."""
     path = DATA / "volumes_vdb" / "smoke.vdb"
     return path if path.is_file() else None
 
@@ -185,7 +185,7 @@ def cloud_scene(grid: dict, side: int) -> dict:
 
 
 def measure_memory(size: SparseSize) -> dict:
-    """What do the cloud and a density gradient of it take, and how long does its first picture take?"""
+    """How much memory do the cloud and its density gradient need, and how long does its first picture take?"""
     with tempfile.TemporaryDirectory() as folder:
         paths = {"cloud": Path(folder) / "cloud.vdb", "one brick": Path(folder) / "one.vdb"}
         cloud = make_cumulus(size.cloud_res)
@@ -298,7 +298,7 @@ def measure_picture(size: SparseSize) -> dict:
 
 
 def measure_fit(size: SparseSize) -> dict:
-    """What do time and memory of a fit with bricks that appear and vanish cost, over those of the dense fit?"""
+    """How large are time and memory of a fit whose bricks appear and vanish, over time and memory of the dense fit?"""
     truth = smoke_puff(size.fit_res)
     views = views_of(truth, size)
     start = SparseVolumeData.from_dense(np.where(smoke_puff(size.fit_res, 0.6) > 0, np.float32(1), np.float32(0)))

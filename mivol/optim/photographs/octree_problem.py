@@ -136,7 +136,7 @@ class OctreeProblem(SparseProblem, DividedProblem):
         seed: root of the random rays.
         tree: present octree; None while the grid is fitted, given for a plan without a grid.
         divide: computes the views of a step elsewhere; None: in this process.
-        grid: problem of the grid; None once there is an octree.
+        grid: problem of the grid; None after the octree was made.
         report: called with the grid and its octree when one becomes the other.
         safe_point: called between views while visible matter is found.
     """

@@ -104,7 +104,7 @@ def align_views(
     this prediction judges the result: a geometry that lowers it by less than ``CLEAR`` standard errors and a tenth is not used.
 
     Args:
-        beam: the geometry as it is known.
+        beam: the nominal geometry.
         grid: voxels of the reconstruction.
         y: line integrals (views, rows, cols).
         weights: inverse variances.
@@ -297,7 +297,7 @@ def _improve(
 
 
 def _fix_gauge(moves: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Moves without those of a displaced object."""
+    """Moves, without the part equivalent to a displaced object."""
     object_moves = np.stack([np.cos(angles), np.sin(angles)], 1)
     fixed = moves.copy()
     fixed[:, 1] -= object_moves @ np.linalg.lstsq(object_moves, moves[:, 1], rcond=None)[0]

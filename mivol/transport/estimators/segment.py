@@ -121,8 +121,8 @@ class SegmentEstimate:
         transmittance: factor on the light behind the segment.
         collision: collision with a medium before the end; None from estimators without collisions.
         probe: point of the flight for derivatives; None in images, from estimators without probes, and if collisions suffice.
-        chance: uniform random number in [0, 1), by which a path keeps one of its probes and one of its shadow rays; None in
-            images and from estimators without collisions.
+        chance: uniform random number in [0, 1), which selects one probe and one shadow ray of a path; None in images and from
+            estimators without collisions.
     """
 
     end: SegmentEnd

@@ -1,7 +1,7 @@
-"""Blocks of cells of a sparse grid: where they are occupied, their bounds, and means, from the stored bricks alone.
+"""Blocks of cells of a sparse grid, from the stored bricks alone: occupancy, bounds and means.
 
-Conventions. Blocks are those of :mod:`mivol.transport.traversal.grid_blocks`, bricks those of :mod:`mivol.fields.bricks`. A
-node that is not stored has the value 0. Sums run in another order than in a dense grid, so means differ by rounding.
+Conventions. :mod:`mivol.transport.traversal.grid_blocks` defines blocks, :mod:`mivol.fields.bricks` bricks. A node outside the
+stored bricks has the value 0. Sums run in another order than in a dense grid, so means differ by rounding.
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ class SpreadSampler:
         return SpreadSampler(*(dr.gather(type(v), v, index, active) for v in (self.bits, self.state, self.lead)))
 
     def branch(self, number: mi.UInt32, count: mi.UInt32) -> SpreadSampler:
-        """The numbers of one of ``count`` continuations of a path; those of all continuations of a pixel are spread."""
+        """Random numbers for one of ``count`` continuations of a path, stratified over the continuations of a pixel."""
         # Other dimensions than those of the path itself.
         state = _permute_state(fork_state(self.state, 1))
         return SpreadSampler(dr.brev(dr.brev(self.bits) * count + number), state, dr.full(mi.Float, -1, dr.width(state)))

@@ -61,7 +61,7 @@ SAMPLERS = {"volpath": "independent", "volpath, multijitter": "multijitter"}
 
 PEER = "prbvolpath"
 MORE_ROUNDS = 4
-"""Factor on the rounds of gradients of one colour: the variance of one number is known to a factor of 1.5 by 24 rounds."""
+"""Factor on the rounds of single-number gradients, whose variance 24 rounds measure only within a factor of 1.5."""
 
 DENSE = 0.3
 """Voxels with at least this share of the largest value count."""

@@ -45,8 +45,8 @@ class _Draw:
         rng: source of all random numbers.
         channel: channel of rgb extinctions; None: all three.
         features: names of the parts so far.
-        is_rgb: an extinction has three channels.
-        is_built: more media are homogeneous, some of them with an extinction in rgb.
+        is_rgb: whether an extinction has three channels.
+        is_built: whether to draw more homogeneous media, some with an rgb extinction.
     """
 
     rng: np.random.Generator

@@ -66,7 +66,7 @@ DEEP_PIECES = 2 * int(NEGLIGIBLE_TAU / MAX_PIECE_TAU)
 twice as many as needed for a constant extinction."""
 
 BISECTIONS = 12
-"""Bisections in the logarithm of the fraction of a cell at which it becomes dark: from [2^-30, 1] to 0.5 % of it."""
+"""Bisections to find the fraction of a cell at which light becomes negligible: in its logarithm, from [2^-30, 1] to 0.5 %."""
 
 CONSTANT_PIECES = 64
 """Least number of pieces of a region of constant extinction, which may be as long as the medium."""
