@@ -180,9 +180,7 @@ def measure(scene: str, spp: int, rounds: int, seed: int = 0) -> dict[str, list[
         found[f"finite differences, {name}"] = [difference(spp, seed + r) for r in range(rounds)]
     for name in METHODS:
         gradient = Derivative(scene, name).gradient
-        found[f"gradient, {name}"] = [
-            gradient(max(1, spp // 8), seed + rounds + r) for r in range(rounds)
-        ]
+        found[f"gradient, {name}"] = [gradient(max(1, spp // 8), seed + rounds + r) for r in range(rounds)]
     return found
 
 
@@ -194,18 +192,14 @@ def summarize(values: Sequence[float]) -> tuple[float, float]:
 def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("--scene", choices=SCENES, help="one scene; default: all")
-    parser.add_argument(
-        "--spp", type=int, default=4096, help="samples per pixel; an eighth for gradients"
-    )
+    parser.add_argument("--spp", type=int, default=4096, help="samples per pixel; an eighth for gradients")
     parser.add_argument("--rounds", type=int, default=16, help="renders with their own seeds, at least 2")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     args = parser.parse_args(words)
     mi.set_variant(args.variant)
     register_patched()
     for scene in [args.scene] if args.scene else SCENES:
-        found = {
-            name: summarize(values) for name, values in measure(scene, args.spp, args.rounds).items()
-        }
+        found = {name: summarize(values) for name, values in measure(scene, args.spp, args.rounds).items()}
         truth, error = found["finite differences, volpath"]
         print(f"{scene}: derivative of the mean of the image along log sigma_t")
         for name, (mean, se) in found.items():

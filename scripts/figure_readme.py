@@ -1,6 +1,6 @@
 """Draw the picture of the README from a finished demo: what was seen, what is predicted, and the volume beside the truth.
 
-    scripts/figure_readme.py [runs/demo] [docs/demo.png]
+scripts/figure_readme.py [runs/demo] [docs/demo.png]
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def main(folder: Path, out: Path) -> None:
     held = [i for i in record.images if i.held_out and i.path.endswith(".exr")]
     view = held[0].view
     pair = {i.role: image(folder, i.path) for i in held if i.view == view}
-    volume = {v.role: read_volume(folder / v.path).values[..., 0] for v in record.volumes }
+    volume = {v.role: read_volume(folder / v.path).values[..., 0] for v in record.volumes}
     middle = volume["truth"].shape[0] // 2
     top = volume["truth"].max()
     panels = [

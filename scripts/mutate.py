@@ -8,8 +8,9 @@ failing, an import that breaks does not.
     scripts/mutate.py --sample 12 --seed 7   twelve, drawn by the seed
     scripts/mutate.py --only '*lattice*'     those whose file, test or list matches
     scripts/mutate.py --random 60 --seed 7   not these: 60 faults drawn from the whole package, and the share that the
-                                             tests of their modules notice (the folder mutation/); from a part
-                                             of it with --only 'mivol/scene/*'; without the first 40 with --from 41
+                                             tests of their lines notice; from a part of it with --only 'mivol/scene/*';
+                                             without the first 40 with --from 41. The default suite is run once first, to
+                                             record which tests run which line; --lines FILE keeps the recording.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mutation.faults import Fault, draw_faults, read_package
-from mutation.guards import index_guards
+from mutation.guards import group_entries, read_recording, record_suite
 from mutation.survivors import Checkout, judge_all, report
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -180,8 +181,11 @@ def judge_random(args: argparse.Namespace) -> None:
     # Each process of tests takes its share of the cores, as tests/conftest.py does for those of pytest-xdist.
     os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(args.jobs)
     faults = draw(args.only, args.random, args.seed)[args.first - 1 :]
-    guards = index_guards(ROOT, [(e.file, e.test) for e in load_entries()])
     with copies(args.jobs + 1) as (untouched, *broken):
+        recording = args.lines or untouched.parent / "lines"
+        if not recording.exists():
+            record_suite(untouched, args.jobs, recording)
+        guards = read_recording(recording, ROOT, group_entries((e.file, e.test) for e in load_entries()))
         first = Checkout(broken[0], untouched, args.limit, args.rounds)
         checkouts = [first, *(replace(first, broken=copy) for copy in broken[1:])]
         report(judge_all(faults, guards, checkouts), len(faults), lambda line: print(line, flush=True))
@@ -196,7 +200,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the random choice")
     parser.add_argument("--from", dest="first", type=int, default=1, metavar="N", help="of --random: continue at the Nth fault")
     parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
-    parser.add_argument("--rounds", type=int, default=4, choices=(1, 2, 3, 4), help="of --random: 3 leave out slow tests")
+    parser.add_argument("--rounds", type=int, default=3, choices=(1, 2, 3), help="of --random: 2 leave out slow tests")
+    parser.add_argument("--lines", type=Path, metavar="FILE", help="of --random: recording to read, or to write if missing")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)
     if args.random is not None:

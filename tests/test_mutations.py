@@ -187,65 +187,99 @@ def test_lines_are_drawn_alike():
     assert 140 <= lines.count(1) <= 260
 
 
+SMALL = """import os
+
+SIZE = 3
+
+
+def scale(x, factor=2):
+    if (x
+            > 0):
+        return [
+            x,
+            factor * x,
+        ]
+    return x
+
+
+class Box:
+    edge = 1
+"""
+"""A module whose statements have several lines."""
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (7, range(7, 9)),  # the head of a condition, without its block
+        (8, range(7, 9)),
+        (11, range(9, 13)),  # a part of a statement
+        (13, range(13, 14)),
+        (6, range(7, 14)),  # the import computes a default value: the function stands for it
+        (17, range(17, 18)),  # and an attribute of a class: the class stands for it
+        (3, range(1, 19)),  # and a constant: the file stands for it
+    ],
+)
+def test_lines_of_a_statement(line: int, expected: range) -> None:
+    assert guards.lines_of(SMALL, line) == expected
+
+
 @pytest.fixture
-def index(tmp_path: Path) -> guards.Guards:
-    """The guards of a small checkout: a package that passes a name on, a helper of tests, and three tests."""
+def index() -> guards.Guards:
+    """Five tests, of which four run line 13; one of them is in the file called like the module."""
+    names = ("tests/test_b.py::t", "tests/test_b.py::u", "tests/test_b.py::p[1]", "tests/test_a.py::t", "tests/test_b.py::p[2]")
+    tests = [guards.RunTest(name, 20.0, size) for name, size in zip(names, (10, 30, 40, 90, 20), strict=True)]
+    runners = {("mivol/a.py", 13): [1, 2, 3, 4], ("mivol/a.py", 7): [0], ("mivol/b.py", 13): [0]}
+    texts = {"tests/test_a.py": "", "tests/test_b.py": "from mivol import other, a_b"}
+    return guards.Guards(tests, runners, {"mivol/a.py": ["tests/test_c.py::t"]}, texts)
+
+
+def fault_at(line: int, file: str = "mivol/a.py") -> object:
+    return faults.Fault(file, line, 0, "", "", "operator")
+
+
+def test_the_most_specific_tests_of_a_line_come_first(index) -> None:
+    """The file called like the module, then tests that run few lines, then further variants of the same test."""
+    found = [test.name for test in index.find_runners(fault_at(13), SMALL)]
+    assert found == ["tests/test_a.py::t", "tests/test_b.py::p[2]", "tests/test_b.py::u", "tests/test_b.py::p[1]"]
+
+
+def test_the_first_round_is_short_and_slow_tests_come_last(index, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guards, "FIRST", 45.0)
+    monkeypatch.setattr(guards, "SECOND", 25.0)
+    assert index.rounds(fault_at(13), SMALL) == [
+        ["tests/test_c.py::t", "tests/test_a.py::t", "tests/test_b.py::p[2]"],
+        ["tests/test_b.py::u"],
+        ["-m", "slow", "tests/test_a.py", "tests/test_b.py", "tests/test_c.py"],
+    ]
+
+
+def test_a_line_that_no_test_runs_is_left_to_slow_tests_of_its_module(index) -> None:
+    """The files called like it, or that name it."""
+    assert index.rounds(fault_at(13, "mivol/room/b.py"), SMALL) == [[], [], ["-m", "slow", "tests/test_b.py"]]
+    assert index.rounds(fault_at(13, "mivol/other/__init__.py"), SMALL) == [[], [], ["-m", "slow", "tests/test_b.py"]]
+    assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], [], []]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("bare_pytest")
+def test_a_recording_tells_which_tests_run_a_line(tmp_path: Path) -> None:
+    """Lines of a shared fixture belong to every test that uses it; a test that fails is recorded like others."""
+    (tmp_path / "scripts").symlink_to(ROOT / "scripts")
     for name, text in {
-        "pkg/__init__.py": "from pkg.d import f\nfrom .h import g\n",
-        "pkg/a.py": "",
-        "pkg/b.py": "import pkg.e\n",
-        "pkg/d.py": "",
-        "pkg/e.py": "",
-        "pkg/h.py": 'register_volume("grid", g)\n',
-        "pkg/room/c.py": "",
-        "pkg/other/__init__.py": "",
-        "pkg/other/said.py": 'raise ValueError(f"{n} rooms have no door: add one")\n',
-        "tests/helper.py": "import pkg.e\n",
-        "tests/one/test_a.py": "from pkg.b import x\nload('grid')\n",
-        "tests/two/test_more.py": "from pkg import a, b, f\n",
-        "tests/two/test_other.py": "import pkg\nfrom helper import x\npkg.g()\nraises(match='3 rooms have no door')\n",
+        "mivol/__init__.py": "",
+        "mivol/a.py": "def f():\n    return 1\n\n\ndef g():\n    return 2\n",
+        "tests/test_a.py": "import pytest\nfrom mivol.a import f, g\n"
+        "@pytest.fixture(scope='module')\ndef two(): return g()\n"
+        "def test_f(): assert f() == 2\ndef test_g(two): assert two == 2\ndef test_h(two): assert two + f() == 3\n",
     }.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    entries = [("pkg/a.py", f"{OTHER}::t"), ("pkg/a.py", f"{MORE}::t"), ("pkg/a.py", f"{MORE}::t")]
-    return guards.index_guards(tmp_path, entries, package="pkg")
-
-
-ONE, MORE, OTHER = "tests/one/test_a.py", "tests/two/test_more.py", "tests/two/test_other.py"
-
-
-def test_tests_named_like_a_module_and_named_by_its_mutations_come_first(index) -> None:
-    """A package is called like its folder."""
-    assert index.rounds("pkg/a.py") == [[ONE, f"{OTHER}::t", f"{MORE}::t"], [OTHER, MORE], [], ["-m", "slow", ONE, OTHER, MORE]]
-    assert index.rounds("pkg/other/__init__.py")[0] == [OTHER]
-
-
-def test_tests_that_import_a_module_come_nearest_first(index) -> None:
-    """Through the package that passes a name on as if directly, through a plugin's name, a helper of tests, or a module."""
-    direct = {
-        "pkg/a.py": [MORE],
-        "pkg/b.py": [ONE, MORE],
-        "pkg/d.py": [MORE],
-        "pkg/h.py": [ONE, OTHER],
-        "pkg/__init__.py": [OTHER],
-    }
-    assert index.importing == {**direct, "pkg/e.py": [ONE, MORE, OTHER]}
-    assert index.rounds("pkg/b.py") == [[], [ONE, MORE], [OTHER], ["-m", "slow", ONE, MORE]]
-
-
-def test_tests_that_expect_a_message_of_a_module_are_asked(index) -> None:
-    assert index.expecting == {"pkg/other/said.py": [OTHER]}
-    assert index.rounds("pkg/other/said.py")[:2] == [[], [OTHER]]
-
-
-def test_the_second_round_has_few_files(index) -> None:
-    index.importing["pkg/b.py"] = [f"tests/test_{k}.py" for k in range(guards.MOST_FILES + 1)]
-    assert index.rounds("pkg/b.py")[1] == index.importing["pkg/b.py"][:-1]
-    assert index.rounds("pkg/b.py")[2] == [ONE, OTHER, MORE, index.importing["pkg/b.py"][-1]]
-
-
-def test_a_module_that_no_test_names_or_imports_takes_all_tests(index) -> None:
-    assert index.rounds("pkg/room/c.py") == [[], [], [ONE, MORE, OTHER], []]
+    guards.record_suite(tmp_path, 1, tmp_path / "lines")
+    index = guards.read_recording(tmp_path / "lines", tmp_path, {})
+    source = (tmp_path / "mivol" / "a.py").read_text()
+    names = {line: {t.function.rpartition("::")[2] for t in index.find_runners(fault_at(line), source)} for line in (2, 6)}
+    assert names == {2: {"test_f", "test_h"}, 6: {"test_g", "test_h"}}
 
 
 HALVING = "def half(x):\n    return x / 2\ndef least(x):\n    return x if x < 9 else 9\n"
@@ -265,13 +299,19 @@ def checkout(tmp_path: Path, bare_pytest: None) -> object:
     return survivors.Checkout(tmp_path / "broken", tmp_path / "untouched", 60.0)
 
 
+def guards_of_halving(*names: str) -> guards.Guards:
+    """Guards by which these tests run every line."""
+    tests = [guards.RunTest(f"tests/test_halving.py::{name}", 1.0, 4) for name in names or ("test_red_anyway", "test_half")]
+    return guards.Guards(tests, {("halving.py", line): range(len(tests)) for line in range(1, 5)}, {}, {})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("old", "new", "killer"), [("/", "*", "tests/test_halving.py::test_half"), ("<", "<=", "")])
 def test_a_fault_is_killed_by_a_test_that_is_green_without_it(checkout, old: str, new: str, killer: str) -> None:
     """9 is returned for 9 by either comparison: that fault is no fault. A test that is red anyway kills nothing."""
     start = HALVING.index(f" {old} ") + 1
     fault = faults.Fault("halving.py", 2, start, old, new, "operator")
-    index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
+    index = guards_of_halving()
     verdict = survivors.judge_fault(checkout, fault, index)
     assert (verdict.killed, verdict.test) == (bool(killer), killer)
     assert (checkout.broken / "halving.py").read_text() == HALVING
@@ -280,7 +320,7 @@ def test_a_fault_is_killed_by_a_test_that_is_green_without_it(checkout, old: str
 @pytest.mark.slow
 def test_a_fault_that_nothing_can_be_imported_with_is_killed(checkout) -> None:
     fault = faults.Fault("halving.py", 1, 0, "def half(x):", "half = 1 +\\\n", "operator")
-    index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
+    index = guards_of_halving()
     assert survivors.judge_fault(checkout, fault, index).killed
 
 
@@ -292,7 +332,7 @@ def test_a_test_that_is_red_by_chance_kills_nothing(checkout) -> None:
     for copy in (checkout.broken, checkout.untouched):
         (copy / "tests" / "test_halving.py").write_text(text + "    m.touch()\n    assert not first\n")
     fault = faults.Fault("halving.py", 2, HALVING.index("/"), "/", "*", "operator")
-    index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
+    index = guards_of_halving("test_half")
     assert not survivors.judge_fault(checkout, fault, index).killed
     assert mark.exists()
 
@@ -301,7 +341,7 @@ def test_a_test_that_does_not_end_kills(checkout) -> None:
     (checkout.broken / "tests" / "test_halving.py").write_text("import time\ndef test_half(): time.sleep(60)\n")
     hasty = survivors.Checkout(checkout.broken, checkout.untouched, 1.0)
     fault = faults.Fault("halving.py", 2, HALVING.index("/"), "/", "*", "operator")
-    index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
+    index = guards_of_halving("test_half")
     assert survivors.judge_fault(hasty, fault, index).test == "a test that does not end"
 
 

@@ -1,183 +1,212 @@
-"""Which tests guard a module: the files of tests named like the module, those that expect its messages or import it, and the
-tests of its mutations.
+"""Which tests guard a line: the tests that run it, the most specific first.
 
-Nothing is written down for this: file names, texts, imports and the entries of tests/mutations say it.
+A recording of the default suite (:mod:`mutation.recorder`) tells which lines each test runs, and how long the test takes.
 """
 
 from __future__ import annotations
 
 import ast
+import os
+import pickle
 import re
-from collections.abc import Iterable, Iterator
+import subprocess
+import sys
+import tempfile
+from array import array
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
-__all__ = ["Guards", "index_guards"]
+from mutation.faults import Fault
+
+__all__ = ["Guards", "RunTest", "group_entries", "lines_of", "read_recording", "record_suite"]
+
+FIRST, SECOND = 60.0, 300.0
+"""Recorded time of the tests in the first round and in the second [s]."""
 
 MOST_FILES = 8
-"""Files of tests in the second round. Half of the tests import some modules; all of those would be most of the suite."""
+"""Files of tests whose slow tests are run."""
 
-SHORTEST_TEXT = 16
-"""Letters of a text that tests and a module share only if the tests expect a message of the module."""
+
+@dataclass(frozen=True)
+class RunTest:
+    """A test of the recording.
+
+    Attributes:
+        name: its node id.
+        seconds: its time.
+        size: lines of the package that it runs.
+    """
+
+    name: str
+    seconds: float
+    size: int
+
+    @property
+    def file(self) -> str:
+        """File of the test."""
+        return self.name.partition("::")[0]
+
+    @property
+    def function(self) -> str:
+        """Node id without the parameters."""
+        return self.name.partition("[")[0]
 
 
 @dataclass
 class Guards:
-    """Tests by module.
+    """Tests by line.
 
     Attributes:
-        tests: the tests that the mutations of a file name.
-        named: the files of tests that are named like a file.
-        expecting: the files of tests that expect a message of a file.
-        importing: the files of tests that import a file, directly or through another module, the nearest first.
-        files: every file of tests.
+        tests: the tests of the recording.
+        runners: indices into ``tests`` by (file of the package, line).
+        listed: the tests of the entries of tests/mutations, by file of the package.
+        texts: text of each file of tests.
     """
 
-    tests: dict[str, list[str]] = field(default_factory=dict)
-    named: dict[str, list[str]] = field(default_factory=dict)
-    expecting: dict[str, list[str]] = field(default_factory=dict)
-    importing: dict[str, list[str]] = field(default_factory=dict)
-    files: list[str] = field(default_factory=list)
+    tests: list[RunTest] = field(default_factory=list)
+    runners: dict[tuple[str, int], Iterable[int]] = field(default_factory=dict)
+    listed: dict[str, list[str]] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
 
-    def rounds(self, file: str) -> list[list[str]]:
-        """The arguments of pytest for a fault in a file, round by round, the likeliest and cheapest tests first.
+    def find_runners(self, fault: Fault, source: str) -> list[RunTest]:
+        """The tests that run the statement of a fault: tests in files called like the module first, then the most specific.
 
-        1. the files of tests named like the file, and the single tests that its mutations name;
-        2. the rest of the files that hold those tests, the files that expect its messages, and the nearest files that import
-           it, MOST_FILES in all;
-        3. the tests of the other modules in its folder, and as many importing files again; without either, all tests;
-        4. the slow tests of rounds 1 and 2.
+        The most specific test runs the fewest lines. One variant of each test comes before the further variants of all tests.
+        """
+        lines = lines_of(source, fault.line)
+        found = {k for line in lines for k in self.runners.get((fault.file, line), ())}
+        chosen = sorted(
+            (self.tests[k] for k in found), key=lambda t: (not is_named_like(t.file, fault.file), t.size, t.seconds)
+        )
+        variants: Counter[str] = Counter()
+        ranks = {}
+        for test in chosen:
+            ranks[test.name] = variants[test.function]
+            variants[test.function] += 1
+        return sorted(chosen, key=lambda t: ranks[t.name] > 0)
+
+    def rounds(self, fault: Fault, source: str) -> list[list[str]]:
+        """The arguments of pytest for a fault, round by round.
+
+        1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them;
+        2. more tests that run its line, ``SECOND`` seconds of them;
+        3. the slow tests of the files that are called like its module, that hold tests of its line, or that name its module.
 
         A round may be empty.
         """
-        named, tests, importing = self.named.get(file, []), self.tests.get(file, []), self.importing.get(file, [])
-        first = [*named, *(t for t in tests if file_of(t) not in named)]
-        candidates = _unique([*map(file_of, tests), *self.expecting.get(file, []), *importing])
-        second = [t for t in candidates if t not in named][:MOST_FILES]
-        near = [f for f in sorted({*self.tests, *self.named}) if Path(f).parent == Path(file).parent]
-        around = _unique(t for f in near for t in (*self.named.get(f, []), *map(file_of, self.tests.get(f, []))))
-        around += [t for t in importing[: 2 * MOST_FILES] if t not in around]
-        third = [t for t in around or self.files if t not in (*named, *second)]
-        own = _unique([*named, *second])
-        return [first, second, third, ["-m", "slow", *own] if own else []]
+        runners = self.find_runners(fault, source)
+        first, rest = split_by_time(runners, FIRST)
+        second = split_by_time(rest, SECOND)[0]
+        listed = self.listed.get(fault.file, [])
+        named = [file for file in self.texts if is_named_like(file, fault.file)]
+        naming = [file for file, text in self.texts.items() if re.search(rf"\b{module_name(fault.file)}\b", text)]
+        around = [*named, *(test.file for test in runners), *(name.partition("::")[0] for name in listed), *naming]
+        files = unique(around)[:MOST_FILES]
+        one = unique([*listed, *(test.name for test in first)])
+        return [one, [test.name for test in second if test.name not in one], ["-m", "slow", *files] if files else []]
 
 
-def file_of(test: str) -> str:
-    """The file of a test."""
-    return test.partition("::")[0]
+def split_by_time(tests: Sequence[RunTest], seconds: float) -> tuple[list[RunTest], list[RunTest]]:
+    """The first tests up to this time, at least one, and the others."""
+    total = 0.0
+    for k, test in enumerate(tests):
+        total += test.seconds
+        if total > seconds and k:
+            return list(tests[:k]), list(tests[k:])
+    return list(tests), []
 
 
-def _unique(tests: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(tests))
+def unique(names: Iterable[str]) -> list[str]:
+    """The names without repetition, in their order."""
+    return list(dict.fromkeys(names))
 
 
-def index_guards(root: Path, entries: Iterable[tuple[str, str]], package: str = "mivol") -> Guards:
-    """Look through the tests of a checkout.
-
-    Args:
-        root: the checkout; its tests are the files tests/**/test_*.py.
-        entries: (file of the package, test that guards it) pairs.
-        package: the folder of the package.
-    """
-    modules = {_module(p.relative_to(root)): str(p.relative_to(root)) for p in sorted((root / package).rglob("*.py"))}
-    helpers = {p.stem: str(p.relative_to(root)) for p in sorted((root / "tests").glob("*.py"))}
-    names = modules | helpers
-    names |= {
-        name: file for m, f in modules.items() if Path(f).stem == "__init__" for name, file in _exports(root / f, m, names)
-    }
-    for file in modules.values():
-        plugins = re.findall(r"register_\w+\(\s*\"(\w+)\"", (root / file).read_text())
-        names |= {f"'{plugin}'": file for plugin in plugins}  # quoted, as no module is
-    imports = {file: _files_of(root / file, names) for file in (*modules.values(), *helpers.values())}
-    imports[modules[package]] = set()  # every test imports the package itself, for what it passes on or for nothing
-    guards = Guards()
-    for file, test in entries:
-        if test not in guards.tests.setdefault(file, []):
-            guards.tests[file].append(test)
-    reached, messages = {}, {file: "\n".join(_texts(root / file)) for file in modules.values()}
-    all_messages = "\n".join(messages.values())
-    for path in sorted((root / "tests").rglob("test_*.py")):
-        name = str(path.relative_to(root))
-        guards.files.append(name)
-        reached[name] = _distances(_files_of(path, names), imports)
-        expected = [text for text in _long_parts(path) if text in all_messages]
-        for file in modules.values():
-            if any(text in messages[file] for text in expected):
-                guards.expecting.setdefault(file, []).append(name)
-            if path.stem.removeprefix("test_") == _name(Path(file)):
-                guards.named.setdefault(file, []).append(name)
-    # Among tests equally far from a module, those that reach the fewest modules are about it rather than about the whole.
-    for name in sorted(reached, key=lambda name: (len(reached[name]), name)):
-        for file in reached[name].keys() & set(modules.values()):
-            guards.importing.setdefault(file, []).append(name)
-    for file, tests in guards.importing.items():
-        tests.sort(key=lambda name: reached[name][file])
-    return guards
+def is_named_like(test: str, file: str) -> bool:
+    """Whether a file of tests is called like a module; a package is called like its folder."""
+    return Path(test).stem.removeprefix("test_") == module_name(file)
 
 
-def _distances(start: set[str], imports: dict[str, set[str]]) -> dict[str, int]:
-    """The number of imports between a test and each file that the test reaches."""
-    found, front, distance = {}, set(start), 0
-    while front:
-        found |= dict.fromkeys(front, distance)
-        front = {f for file in front for f in imports[file]} - set(found)
-        distance += 1
-    return found
+def module_name(file: str) -> str:
+    """The last part of a module's dotted name."""
+    path = Path(file)
+    return path.parent.name if path.stem == "__init__" else path.stem
 
 
 @cache
-def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
+def lines_of(source: str, line: int) -> range:
+    """The lines that run whenever the statement of this line runs.
 
-
-def _texts(path: Path) -> Iterator[str]:
-    """The constant texts of a file, also within formatted ones, without its docstrings."""
-    tree = _tree(path)
-    alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in alone:
-            yield node.value
-
-
-def _long_parts(path: Path) -> set[str]:
-    """The sentences of a file's texts, between numbers, quotation marks and the operators of regular expressions."""
-    parts = (part.strip() for text in _texts(path) for part in re.split(r"[\d\n\"'\\^$.*+?()\[\]{}|<>:=]+", text))
-    return {part for part in parts if len(part) >= SHORTEST_TEXT and " " in part}
-
-
-def _exports(path: Path, package: str, names: dict[str, str]) -> Iterator[tuple[str, str]]:
-    """The (dotted name, file that defines it) pairs of what a package imports to pass on."""
-    for node in ast.walk(_tree(path)):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            module = f"{package}.{node.module}" if node.level else node.module
-            if module in names:
-                yield from ((f"{package}.{alias.asname or alias.name}", names[module]) for alias in node.names)
-
-
-def _files_of(path: Path, names: dict[str, str]) -> set[str]:
-    """The files that a file imports; a name that a package only passes on counts as imported from where it is defined."""
-    found = set()
-    for node in ast.walk(_tree(path)):
-        if isinstance(node, ast.Import):
-            found |= {names[alias.name] for alias in node.names if alias.name in names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            dotted = [f"{node.module}.{alias.name}" for alias in node.names]
-            found |= {names.get(name) or names[node.module] for name in dotted if name in names or node.module in names}
-        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            name = f"{node.value.id}.{node.attr}"  # mivol.optimize after import mivol
-            found |= {names[name]} if name in names else set()
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            name = f"'{node.value}'"  # a plugin, as a scene names it
-            found |= {names[name]} if name in names else set()
+    A simple statement has its own lines, and a compound statement the lines of its head. The head of a function or a class, and
+    a statement outside functions, run during the import; the lines of the function, the class or the file then stand for them.
+    """
+    tree = ast.parse(source)
+    found = range(1, source.count("\n") + 2)
+    node: ast.AST | None = tree
+    in_function = False
+    while node is not None:
+        children = [n for n in statements_in(node) if n.lineno <= line <= n.end_lineno]
+        node = children[0] if children else None
+        if node is None:
+            break
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found = range(node.body[0].lineno, node.end_lineno + 1)
+            in_function = isinstance(node, ast.FunctionDef) and line >= node.body[0].lineno
+        elif in_function:
+            body = getattr(node, "body", None)
+            last = body[0].lineno - 1 if body and line < body[0].lineno else node.end_lineno
+            found = range(node.lineno, max(node.lineno, last) + 1)
     return found
 
 
-def _name(path: Path) -> str:
-    """The last part of a module's dotted name: a package is called like its folder."""
-    return _module(path).rpartition(".")[2]
+def statements_in(node: ast.AST) -> list[ast.stmt]:
+    """The statements of the blocks of a node."""
+    blocks = [getattr(node, name, []) for name in ("body", "orelse", "finalbody")]
+    handlers = [handler.body for handler in getattr(node, "handlers", [])]
+    cases = [case.body for case in getattr(node, "cases", [])]
+    return [child for block in (*blocks, *handlers, *cases) if isinstance(block, list) for child in block]
 
 
-def _module(path: Path) -> str:
-    parts = path.with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+def record_suite(copy: Path, jobs: int, target: Path) -> None:
+    """Run the default suite of a checkout under the recorder, and write the recording.
+
+    Raises:
+        RuntimeError: pytest wrote no recording.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        env = dict(os.environ, PYTHONPATH=f"{copy}{os.pathsep}{copy / 'scripts'}", PYTHONDONTWRITEBYTECODE="1")
+        env["MIVOL_LINES"] = str(Path(folder) / "lines")
+        env.pop("PYTEST_XDIST_WORKER_COUNT", None)
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutation.recorder"]
+        command += ["-n", str(jobs), "--dist", "worksteal"] if jobs > 1 else ["-p", "no:xdist"]
+        done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
+        parts = sorted(Path(folder).iterdir())
+        if not parts:
+            raise RuntimeError(
+                f"pytest ends with {done.returncode} and wrote no recording:\n{(done.stdout + done.stderr)[-2000:]}"
+            )
+        tests, runners = [], {}
+        for part in parts:
+            own, lines = pickle.loads(part.read_bytes())
+            for place, indices in lines.items():
+                runners.setdefault(place, array("H")).extend(k + len(tests) for k in indices)
+            tests += own
+        target.write_bytes(pickle.dumps((tests, runners)))
+
+
+def read_recording(path: Path, root: Path, listed: dict[str, list[str]]) -> Guards:
+    """The guards of a recording of :func:`record_suite`."""
+    tests, runners = pickle.loads(path.read_bytes())
+    texts = {str(p.relative_to(root)): p.read_text() for p in sorted((root / "tests").rglob("test_*.py"))}
+    return Guards([RunTest(*test) for test in tests], runners, listed, texts)
+
+
+def group_entries(entries: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Tests by file of the package, from (file, test) pairs."""
+    listed: dict[str, list[str]] = {}
+    for file, test in entries:
+        if test not in listed.setdefault(file, []):
+            listed[file].append(test)
+    return listed

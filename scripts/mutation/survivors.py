@@ -1,7 +1,6 @@
-"""Break a line of the package at random, run the tests that guard its module, and tell whether one of them noticed.
+"""Break a line of the package at random, run the tests that guard it, and tell whether one of them noticed.
 
-A fault is killed where a test that is green on the untouched checkout is red twice, or does not end, on the broken one. What
-survives its module's own tests is shown those of the modules in the same folder as well, and then its module's slow ones.
+A fault is killed if a test that is green on the untouched checkout is red twice, or does not end, on the broken checkout.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import queue
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -47,7 +47,7 @@ class Checkout:
     Attributes:
         broken, untouched: their folders.
         limit: seconds that one test may take before it counts as one that does not end.
-        rounds: how many rounds of :meth:`guards.Guards.rounds` are run: 3 leave out the slow ones.
+        rounds: how many rounds of :meth:`guards.Guards.rounds` are run: 2 leave out the slow tests.
         green: what is known of tests of the untouched copy; shared by all who judge.
         lock: of ``green``.
     """
@@ -55,7 +55,7 @@ class Checkout:
     broken: Path
     untouched: Path
     limit: float
-    rounds: int = 4
+    rounds: int = 3
     green: dict[str, bool] = field(default_factory=dict)
     lock: Lock = field(default_factory=Lock)
 
@@ -75,21 +75,24 @@ def run_pytest(copy: Path, arguments: Sequence[str], limit: float) -> tuple[int,
     env = dict(os.environ, PYTHONPATH=str(copy), PYTHONDONTWRITEBYTECODE="1", PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-rfE", "-p", "no:cacheprovider"]
     # The clock runs for one test at a time and ends the process from a thread of its own, whatever a kernel does.
-    command += ["-o", f"faulthandler_timeout={limit}", "-o", "faulthandler_exit_on_timeout=true", *arguments]
+    command += ["-o", f"faulthandler_timeout={limit}", "-o", "faulthandler_exit_on_timeout=true"]
     if all("::" in argument for argument in arguments):
-        # Tests that mutations name are few, so the slow ones of them are run too.
-        command += ["-m", "slow or not slow"]
-    done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
+        command += ["-m", "slow or not slow"]  # entries of tests/mutations name slow tests, too
+    with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:  # hundreds of tests are too long for a command line
+        file.write("\n".join(arguments))
+        file.flush()
+        command += [f"@{file.name}"]
+        done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
     return done.returncode, done.stdout + done.stderr
 
 
 def judge_fault(checkout: Checkout, fault: Fault, guards: Guards) -> Verdict:
-    """Break the copy, run the tests of the module round by round until one is red, mend the copy."""
+    """Break the copy, run the tests of the line round by round until one is red, mend the copy."""
     start, file = time.perf_counter(), checkout.broken / fault.file
     whole = file.read_text()
     file.write_text(fault.apply(whole))
     try:
-        for tests in guards.rounds(fault.file)[: checkout.rounds]:
+        for tests in guards.rounds(fault, whole)[: checkout.rounds]:
             killed, test = _red(checkout, tests) if tests else (False, "")
             if killed:
                 return Verdict(fault, True, test, time.perf_counter() - start)
