@@ -101,7 +101,7 @@ EXPERIMENTS = (
 CAPTURE = {"photos": {"largest": 240, "box": "middle"}, "show": {"views": 64}}
 """Defaults of a file with ``field.preset = "capture"``: photograph size resolved by the grids, nested boxes, views."""
 
-NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "show")
+NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "keep_state", "show")
 """Settings without effect on result and checkpoint."""
 
 

@@ -314,6 +314,14 @@ class ScanExperiment(Section):
     slabs: Annotated[Slabs | None, setting("1", "slabs of a volume beyond memory; absent: the whole volume at once")] = None
     held_out_every: Annotated[int, setting("view", "step between views that are not fitted; 0: none", ge=0)] = 0
     checkpoint_every: Annotated[int, setting("iteration", "iterations between two checkpoints", ge=1)] = 5
+    keep_state: Annotated[
+        bool,
+        setting(
+            "1",
+            "keep the solver's state of a finished run, so that more iterations continue as if it had not ended; otherwise "
+            "they continue from its volume",
+        ),
+    ] = False
     variant: Variant = "llvm_ad_rgb"
     threads: Threads = 0
     output: Output = "runs/scan"

@@ -8,7 +8,6 @@ displaced along v, a helix, or another trajectory breaks the symmetry.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from mivol.files.mrc import read_tilt_angles
 from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.files.scan_hdf5 import NO_DARKS, survey_projections
 from mivol.files.source import refusal
-from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.linear_problems import LeastSquares, last_state
 from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews, geometry_from_nikon
@@ -349,5 +348,5 @@ def _blocks(pixels: int) -> tuple[int, int, int]:
 def _residuals(projector: Projector, y: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Squared residuals (views,) after a few iterations."""
     problem = LeastSquares(projector, y, mask, nonnegative=False)
-    *_, state = itertools.islice(SOLVERS["cgls"].run(problem), ITERATIONS)
+    state = last_state(SOLVERS["cgls"].run(problem), ITERATIONS)
     return np.sum(mask * (y - projector @ state.x.reshape(projector.grid.shape)) ** 2, axis=(1, 2))

@@ -168,14 +168,15 @@ class RunFolder:
                 (self.path / name).mkdir(exist_ok=True)
 
     def summary(self) -> str:
-        """Return the results of the record in a line."""
+        """Return the results of the record and the time of its stages in a line."""
         words = []
         for name, value in self.record.results.items():
             quantity = find_quantity(name, self.record.units)
             if value is not None:
                 figure = f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
                 words.append(f"{quantity.label} {figure} {quantity.symbol}".rstrip())
-        return f"saved: {', '.join(words)}"
+        times = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in self.record.timings.items())
+        return f"saved: {', '.join(words)}" + (f" ({times})" if times else "")
 
     def rewind(self, iteration: int) -> None:
         """Remove the metrics after an iteration, to keep a resumed run from repeating rows."""

@@ -44,7 +44,7 @@ from mivol.experiments.solver_choice import (
     resolve_solver,
     tv_strength,
 )
-from mivol.files import write_exr, write_volume
+from mivol.files import read_volume, write_exr, write_volume
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Course, Fit
 from mivol.optim.projections.inversion import DriftFit, GainFit, LightFit, LinearSolve, ProjectionProblem, update_light
@@ -124,15 +124,19 @@ class ScanFit(FitKind):
         return list(self.data.notes)
 
     def make_problem(self) -> ProjectionProblem:
-        return make_problem(self.settings, self.projector, self.data, self.kept)
+        walk = self.projector.subset(self.kept)
+        storage = choose_storage(self.settings.solve, walk)
+        self.record.plan.append(storage.line)
+        return make_problem(self.settings, storage.apply(walk), self.data, self.kept)
 
     def prepare(self, run: RunFolder) -> None:
-        storage = choose_storage(self.settings.solve, self.problem.linear_problem.A)
-        self.record.plan.append(storage.line)
-        storage.apply(self.problem)
-        dr.flush_malloc_cache()
+        self.problem.read_finished = lambda: self._continue_from(run.path)
         self.record.plan += estimate_noise(self.problem, self.settings.solve, self.data)
         self.noise = expected_noise(self.settings, self.problem, self.data)
+
+    def _continue_from(self, folder: Path) -> np.ndarray:
+        self.record.notes.append(f"the run continues from {FINISHED}: keep_state = true keeps the solver's state")
+        return read_finished(folder, self.projector.grid)
 
     def optimizer(self) -> LinearSolve:
         return make_solver(self.settings, self.noise)
@@ -180,6 +184,9 @@ class ScanFit(FitKind):
             caption = "fitted moves of the detector, and the residual of held-out views without and with them"
             self.record.images.append(Image(path="moves.png", role="picture", caption=caption))
         write_best(run, self.grid, best)
+        if not self.settings.keep_state:
+            fit.run.is_left_to_outputs = True
+            fit.save()
 
     def rehearse(self, say: Say) -> Explanation:
         settings = self.settings
@@ -187,8 +194,9 @@ class ScanFit(FitKind):
             check_directions(self.projector)
         # Back-projection alone takes longer than the other steps of this rehearsal.
         cheap = msgspec.structs.replace(settings, solve=msgspec.structs.replace(settings.solve, start="empty"))
-        problem = make_problem(cheap, self.projector, self.data, self.kept)
-        storage = choose_storage(settings.solve, problem.linear_problem.A).line
+        walk = self.projector.subset(self.kept)
+        storage = choose_storage(settings.solve, walk).line
+        problem = make_problem(cheap, walk, self.data, self.kept)
         make_solver(settings, expected_noise(settings, problem, self.data)).begin(problem)
         for line in (*self.choices, storage):
             say(f"  {line.choice}, because {line.reason}")
@@ -224,16 +232,19 @@ def make_projector(settings: config.ScanExperiment, data: Projections, grid: Vox
     return Projector(data.geometry, unknowns)
 
 
-def make_problem(
-    settings: config.ScanExperiment, projector: Projector, data: Projections, kept: np.ndarray
-) -> ProjectionProblem:
+def make_problem(settings: config.ScanExperiment, a: Projector, data: Projections, kept: np.ndarray) -> ProjectionProblem:
     """Return the solver's problem for the fitted views.
+
+    Args:
+        settings: settings with a resolved solver.
+        a: projector of the fitted views.
+        data: projections.
+        kept: indices of the fitted views.
 
     Raises:
         MivolError: ML-TR without counts.
     """
     solve = settings.solve
-    a = projector.subset(kept)
     prior = make_prior(solve, a, data, kept)
     # Dr.Jit keeps arrays that are no longer used for later calls: as much again as a solver needs.
     dr.flush_malloc_cache()
@@ -358,6 +369,27 @@ def write_outputs(
     if len(held_out):
         z = (data.y - predicted)[held_out] * np.sqrt(data.weights[held_out])
         record.results["held_out_rms_of_residual_over_noise"] = float(np.sqrt(np.mean(z**2)))
+
+
+FINISHED = "volumes/reconstruction.npz"
+"""The volume from which a finished run continues."""
+
+
+def read_finished(folder: Path, unknowns: VoxelGrid) -> np.ndarray:
+    """The volume of a finished run, (n,) on the grid of the unknowns: those in a voxel have its value.
+
+    Raises:
+        MivolError: no such volume, or one of another size.
+    """
+    volume = read_volume(folder / FINISHED).values[..., 0]
+    parts = [n // edge for n, edge in zip(unknowns.shape, volume.shape, strict=True)]
+    if tuple(k * edge for k, edge in zip(parts, volume.shape, strict=True)) != unknowns.shape:
+        raise MivolError(
+            f"{folder / FINISHED}: found {volume.shape} voxels, expected a divisor of {unknowns.shape}: run without --resume."
+        )
+    for axis, k in enumerate(parts):
+        volume = np.repeat(volume, k, axis)
+    return volume.reshape(-1)
 
 
 def write_best(run: RunFolder, grid: VoxelGrid, best: BestIterate) -> None:

@@ -45,6 +45,7 @@ from mivol.files.atomic import write_whole_text
 from mivol.files.tiff import TiffSlices
 from mivol.files.zarr import ZarrSlices
 from mivol.machine import peak_memory
+from mivol.optim.projections.linear_problems import last_state
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.page import write_page
 from mivol.report.pixel_scale import PREVIEW, write_preview
@@ -70,7 +71,8 @@ BASE_BYTES = 350 << 20
 """Memory of Python, Dr.Jit and Mitsuba before the first slab [byte]."""
 
 RAY_BYTES, VOXEL_BYTES = {"direct": 60, "iterative": 160}, {"direct": 12, "iterative": 60}
-"""Memory per ray and per unknown of a slab [byte], measured by ``mivol bench scan_size``."""
+"""Memory per ray and per unknown of a slab [byte]. ``mivol bench scan_size --only whole`` prints the peak beside the planned
+memory, with ``--solver pcg`` that of an iterative solver."""
 
 PREVIEW_STEP, PREVIEW_UPDATES = 8, 1 << 34
 """Layers between two slices of the preview, and most readings of pixels by voxels: about ten seconds on two cores."""
@@ -412,14 +414,11 @@ def _iterate(settings: config.ScanExperiment, data: Projections, slab: VoxelGrid
     """Solve a slab as a scan of its own."""
     solve = settings.solve
     projector = Projector(data.geometry, subdivide_grid(slab, solve.supersampling, data.geometry))
-    problem = make_problem(settings, projector, data, np.arange(projector.n_views))
-    choose_storage(solve, projector).apply(problem)
+    operator = choose_storage(solve, projector).apply(projector)
+    problem = make_problem(settings, operator, data, np.arange(projector.n_views))
     estimate_noise(problem, solve, data)
     options = make_solver(settings, None).options()
-    states = ALL_SOLVERS[solve.name].run(problem.linear_problem, None, **options)
-    state = None
-    for state in itertools.islice(states, solve.iterations):  # noqa: B007  (only the last state counts)
-        pass
+    state = last_state(ALL_SOLVERS[solve.name].run(problem.linear_problem, None, **options), solve.iterations)
     if state is None:
         return np.zeros(slab.shape, np.float32)
     return voxel_means(state.x.reshape(projector.grid.shape), slab.shape)

@@ -8,7 +8,6 @@ into memory, and the size of the noise.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -22,7 +21,13 @@ from mivol.experiments.projections import Projections
 from mivol.machine import check_memory
 from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
-from mivol.optim.projections.linear_problems import SmoothedTV, SolverState, expected_residual_norm, scale_tv_to_noise
+from mivol.optim.projections.linear_problems import (
+    SmoothedTV,
+    SolverState,
+    expected_residual_norm,
+    last_state,
+    scale_tv_to_noise,
+)
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions
@@ -128,10 +133,9 @@ class Storage:
     is_stored: bool
     line: PlanLine
 
-    def apply(self, problem: ProjectionProblem) -> None:
-        """Put the chosen operator into the solver's problem."""
-        if self.is_stored:
-            problem.linear_problem = replace(problem.linear_problem, A=store_matrix(problem.linear_problem.A))
+    def apply(self, walk: Projector) -> Projector:
+        """Return the chosen operator."""
+        return store_matrix(walk) if self.is_stored else walk
 
 
 def choose_storage(settings: config.SolveSettings, walk: Projector) -> Storage:
@@ -199,7 +203,7 @@ def estimate_noise(problem: ProjectionProblem, settings: config.SolveSettings, d
     if task.prior is None or settings.tv_unit == "length" or data.is_noise_known:
         return []
     n = PLAIN_ITERATIONS[settings.start]
-    *_, state = (None, *itertools.islice(projected_cg(replace(task, prior=None)), n))
+    state = last_state(projected_cg(replace(task, prior=None)), n)
     if state is None:
         return []
     left = state.residual_norm / expected_residual_norm(task, "pcg")

@@ -13,3 +13,12 @@ def test_slices_go_from_tiff_to_tiff(variant_rgb: str, monkeypatch: pytest.Monke
     answer = scan_size.measure_slices(scan_size.ScanSize(n=48, views=48, slices=3))
     assert set(answer) == {"mivol"} and answer["mivol"]["nrmse"] < 0.5
     assert scan_size.table("slices", answer)[2].startswith("| mivol | ")
+
+
+@pytest.mark.slow
+def test_a_whole_volume_is_stopped_and_resumed(variant_rgb: str) -> None:
+    """Sixteen layers fit into the memory: the first of two slabs is written before the stop, the second after it."""
+    answer = scan_size.measure_whole(scan_size.ScanSize.quick())
+    assert (answer["slabs"], answer["stopped_after"]) == (2, 1)
+    assert answer["nrmse"] < 0.5
+    assert scan_size.table("whole", answer)[0].startswith("| slabs |")

@@ -240,6 +240,9 @@ def test_the_summary_is_what_was_recorded(tmp_path: Path) -> None:
     # A count is said to the last digit.
     run.record.results = {"gaussians": 12345.0}
     assert run.summary() == "saved: Gaussians 12345"
+    # The time of all stages, not that of the iterations alone.
+    run.record.timings = {"projections": 0.25, "solve": 77.04}
+    assert run.summary() == "saved: Gaussians 12345 (projections 0.2 s, solve 77.0 s)"
 
 
 SCAN = {

@@ -164,10 +164,10 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
 
 @pytest.mark.slow
 def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
-    """Four iterations, then two more: every number as if there had been six; fewer than there are is another run. What is on
-    record is the command as it was typed, and the last line on the console is what was saved."""
+    """Four iterations, then two more, with the state kept: every number as if there had been six; fewer than there are is
+    another run. What is on record is the command as it was typed, and the last line on the console is what was saved."""
     assert run(folder, to="whole") == 0
-    assert run(folder, "solve.iterations=4", to="more") == 0
+    assert run(folder, "solve.iterations=4", "keep_state=true", to="more") == 0
     assert run(folder, "--resume", to="more") == 0
     said = capsys.readouterr().err.splitlines()
     losses = [[(row["iteration"], row["loss"], row["nrmse"]) for row in rows_of(folder, to)] for to in ("whole", "more")]
@@ -179,6 +179,47 @@ def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, ca
     assert f"nRMSE of the volume {record['results']['nrmse']:.4g}" in said[-1]
     assert run(folder, "--resume", "solve.iterations=3", to="more") == 1
     assert "solve.iterations is 6 there and 3 here" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["pcg", "pcg, finer unknowns", "pcg of unknown gains", "sart"])
+def test_a_finished_run_continues_from_its_volume(
+    variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    """The checkpoint of a finished run holds neither volume nor memory: it is smaller than the volume. More iterations start at
+    the volume, and the record says so: sart depends on nothing else, conjugate gradients go further down. Without more, the
+    volume stays."""
+    changes = {
+        "pcg, finer unknowns": ["solve.supersampling=2"],
+        "pcg of unknown gains": ['data={source="stack", file="y.npy", reading="line_integral", rings="fit", find_axis=false}'],
+        "sart": ["solve.name=sart"],
+    }.get(case, [])
+    monkeypatch.setattr(kinds, "write_page", lambda folder: folder)
+    monkeypatch.setattr(RunFolder, "write_curves", lambda run: None)
+    for picture in ("film_of_volume", "draw_scanner"):
+        monkeypatch.setattr(scan_fit, picture, lambda *arguments: [])
+    if "gains" in case:
+        chosen = config.load(folder / "fit.toml")
+        data = projections.make_data(chosen, folder, projections.make_grid(chosen, folder))
+        np.save(folder / "y.npy", data.y + 0.1 * np.sin(np.arange(14)))
+    assert run(folder, "solve.iterations=4", *changes) == 0
+    volume = read_volume(folder / "run/volumes/reconstruction.npz").values
+    # A volume of 12^3 float32 is smaller than the text of the settings: the arrays are compared.
+    with np.load(folder / "run/checkpoint.npz") as arrays:
+        assert sum(arrays[name].size for name in arrays if "offset" not in name and "slope" not in name) < 10
+    assert run(folder, "--resume", "solve.iterations=4", *changes) == 0
+    assert np.array_equal(read_volume(folder / "run/volumes/reconstruction.npz").values, volume)
+    assert run(folder, "--resume", *changes) == 0
+    losses = [row["loss"] for row in rows_of(folder)]
+    assert len(losses) == 6
+    if case == "sart":
+        assert run(folder, *changes, to="whole") == 0
+        assert losses == [row["loss"] for row in rows_of(folder, "whole")]
+    # The mean of finer unknowns explains the data less well than they did, and gains change what there is to explain.
+    earlier = {"pcg": 3, "pcg, finer unknowns": 4}.get(case, 0)
+    assert losses[5] < losses[earlier]
+    notes = json.loads((folder / "run/run.json").read_text())["notes"]
+    assert any("continues from volumes/reconstruction.npz" in note for note in notes)
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from small_scan import GRID, VIEWS, Views, problem_for, run
 
 from mivol.cite import list_citations
 from mivol.optim.projections.iterative import _Counts
-from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SmoothedTV, SolverState
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SmoothedTV, SolverState, last_state
 from mivol.optim.projections.solvers import SOLVERS
 
 
@@ -262,6 +264,36 @@ def test_saved_state_continues_bit_for_bit(scan, name):
         assert a.iteration == b.iteration
         assert a.objective == b.objective
         np.testing.assert_array_equal(a.x, b.x)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_field_alone_continues(scan, name):
+    """Without memory: conjugate gradients begin anew and go further down; the others depend on the field only, to the bit."""
+    problem = problem_for(name, scan)
+    whole = run(name, problem, 6)
+    rest = run(name, problem, 3, state=replace(whole[2], memory={}))
+    assert [state.iteration for state in rest] == [4, 5, 6]
+    if name in ("cgls", "pcg"):
+        assert rest[-1].objective < rest[0].objective < whole[2].objective
+    else:
+        np.testing.assert_array_equal(rest[-1].x, whole[-1].x)
+
+
+def test_only_the_last_state_is_kept():
+    """States of a few fields each would add up; the generator of this test keeps none."""
+    alive: weakref.WeakSet[SolverState] = weakref.WeakSet()
+
+    def states():
+        for iteration in range(1, 6):
+            # The one that the caller still holds while it asks for the next.
+            assert len(alive) <= 1
+            state = SolverState(np.zeros(1), iteration, 0.0, 0.0)
+            alive.add(state)
+            yield state
+            del state
+
+    assert last_state(states(), 4).iteration == 4
+    assert last_state(iter(()), 4) is None
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -103,11 +103,11 @@ def solve_by_default(y: np.ndarray, weights: np.ndarray, is_noise_known: bool, w
     iterations = GAIN_ITERATIONS if with_gains else ITERATIONS
     solve, _ = resolve_solver(config.SolveSettings(), Projector(BEAM, GRID), iterations)
     walk = Projector(BEAM, subdivide_grid(GRID, solve.supersampling, BEAM))
+    walk = choose_storage(solve, walk).apply(walk)
     data, views = Projections(BEAM, y, weights, is_noise_known=is_noise_known), np.arange(VIEWS)
     start, prior = start_volume(solve, walk, data, views), make_prior(solve, walk, data, views)
     light = GainFit(np.zeros(VIEWS)) if with_gains else None
     problem = ProjectionProblem(LeastSquares(walk, y, weights, start, solve.nonnegative, prior), light=light)
-    choose_storage(solve, walk).apply(problem)
     estimate_noise(problem, solve, data)
     run = LinearSolve(drift=GAIN_TURN if with_gains else 0).begin(problem)
     for iteration in range(iterations):

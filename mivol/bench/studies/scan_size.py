@@ -1,30 +1,38 @@
 """How long does a slice of a large scan take, from TIFF to TIFF, beside algotom and astra-toolbox on the processor?
 
     mivol bench scan_size [--n 512] [--views 512] [--slices 32]
+    mivol bench scan_size --only whole [--edge 1024] [--memory 4] [--solver fbp]
 
 Exact views of the Shepp-Logan head are written as TIFF, one file a view, with as many rows as slices. Each contestant reads
 them, reconstructs all slices by filtered back-projection (ramp without a window), and writes a TIFF file a slice. mivol takes
 slabs within 2 GiB. algotom (``fbp_reconstruction`` on the processor, compiled by numba) and astra-toolbox (FBP, ``linear``) are
 left out where they are not installed. Times are processor times of the whole path, the shorter of two runs; the first may
 compile.
+
+whole: a head of ``edge`` voxels along each edge, from as many views, rows and columns, by slabs in a run folder. The
+run is stopped after half of its slabs and resumed. The peak is that of the process; slabs are planned for ``memory``. It needs
+eight bytes of disk for each voxel.
 """
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from mivol import config
 from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.study import Size, Study, amount
-from mivol.experiments.slab_scan import plan_slabs, reconstruct_slab
+from mivol.experiments.fit_kind import NullProgress, RunContext
+from mivol.experiments.slab_scan import STATE, plan_slabs, reconstruct_slab, run_slabs
 from mivol.files.image_stack import read_images
 from mivol.files.tiff import TiffSlices
 from mivol.machine import peak_memory
@@ -46,14 +54,17 @@ class ScanSize(Size):
     n: int = amount(512, quick=64, doc="columns of the detector, and voxels along x and y")
     views: int = amount(512, quick=64, doc="views over half a turn")
     slices: int = amount(32, quick=4, doc="rows of the detector, and slices")
+    edge: int = amount(1024, quick=32, doc="voxels along each edge of the whole volume, and views, rows and columns")
+    memory: float = amount(4.0, quick=0.343, doc="memory of its slabs [GiB]")
+    solver: str = amount("fbp", doc="its solver")
 
 
-def write_views(folder: Path, size: ScanSize) -> ParallelBeam:
+def write_views(folder: Path, n: int, views: int, slices: int) -> ParallelBeam:
     """Write the views, a file each."""
     from tifffile import imwrite
 
-    beam = ParallelBeam(np.pi * np.arange(size.views) / size.views, (size.slices, size.n), 2 / size.n)
-    for view in range(size.views):
+    beam = ParallelBeam(np.pi * np.arange(views) / views, (slices, n), 2 / n)
+    for view in range(views):
         image = shepp_logan().integrate_lines(*beam.rays([view]), whole_lines=True)[0]
         imwrite(folder / f"view_{view:05d}.tif", image.astype(np.float32), photometric="minisblack")
     return beam
@@ -65,10 +76,10 @@ def measure_slices(size: ScanSize) -> dict[str, dict[str, float]]:
     with TemporaryDirectory() as folder:
         views = Path(folder) / "views"
         views.mkdir()
-        beam = write_views(views, size)
+        beam = write_views(views, size.n, size.views, size.slices)
         grid = VoxelGrid((size.slices, size.n, size.n), 2 / size.n)
         truth = shepp_logan().voxelise(grid, 2)
-        contestants: dict[str, Contestant] = {"mivol": _mivol(views, size)}
+        contestants: dict[str, Contestant] = {"mivol": _mivol(slab_settings(views, size.n, MEMORY))}
         contestants |= {name: make(beam) for name, (module, make) in PEERS.items() if importlib.util.find_spec(module)}
         for name, run in contestants.items():
             target = Path(folder) / name.replace(" ", "_")
@@ -87,19 +98,23 @@ def measure_slices(size: ScanSize) -> dict[str, dict[str, float]]:
     return answer
 
 
-def _mivol(views: Path, size: ScanSize) -> Contestant:
-    settings = config.from_dict(
+def slab_settings(views: Path, n: int, memory: float, **solve: Any) -> config.ScanExperiment:
+    """Settings of a scan of ``n`` columns whose views are written, by slabs within ``memory`` [GiB]."""
+    return config.from_dict(
         {
             "title": "scan_size",
-            "scan": {"beam": "parallel", "pitch": 2 / size.n},
+            "scan": {"beam": "parallel", "pitch": 2 / n},
             "data": {
                 "source": "stack", "file": str(views / "view_*.tif"), "reading": "line_integral", "find_axis": False, "air": 0
             },
-            "slabs": {"memory": MEMORY},
+            "slabs": {"memory": memory},
+            "solve": solve,
         },
         "scan_size",
     )  # fmt: skip
 
+
+def _mivol(settings: config.ScanExperiment) -> Contestant:
     def run(_: Path, target: Path) -> None:
         plan = plan_slabs(settings, Path())
         writer = TiffSlices(target, plan.grid.shape)
@@ -107,6 +122,55 @@ def _mivol(views: Path, size: ScanSize) -> Contestant:
             writer.write(layers.start, reconstruct_slab(plan, layers))
 
     return run
+
+
+# -- A whole volume --------------------------------------------------------------------------------------------------------
+
+JUDGED = 8
+"""Slices that are compared with the truth."""
+
+
+class _StopAfter(NullProgress):
+    """Stops a run, as Ctrl-C does, after some slabs."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def track(self, items: Sequence[Any], label: str) -> Iterator[Any]:
+        yield from items[: self.count]
+        raise KeyboardInterrupt
+
+
+def measure_whole(size: ScanSize) -> dict[str, float]:
+    """How much memory and time does a large volume take by slabs, stopped in the middle and resumed?"""
+    n = size.edge
+    with TemporaryDirectory() as folder:
+        views = Path(folder) / "views"
+        views.mkdir()
+        write_views(views, n, n, n)
+        settings, run = slab_settings(views, n, size.memory, name=size.solver), Path(folder) / "run"
+        count = len(plan_slabs(settings, Path()).layers)
+        start = time.process_time()
+        try:
+            run_slabs(RunContext(settings, Path(), run, progress=_StopAfter(count // 2)))
+        except KeyboardInterrupt:
+            done = len(json.loads((run / STATE).read_text())["done"])
+            say_row("stopped", slabs=done, of=count, seconds=time.process_time() - start)
+        run_slabs(RunContext(settings, Path(), run, resume=True))
+        answer = {"slabs": float(count), "stopped_after": float(done), "seconds": time.process_time() - start}
+        memory = peak_memory()
+        answer |= {"memory": size.memory} | ({} if memory is None else {"peak_gib": memory / 2**30})
+        files, grid = sorted((run / "volumes/slices").glob("*.tif")), VoxelGrid((n, n, n), 2 / n)
+        judged = range(n // (2 * JUDGED), n, max(1, n // JUDGED))
+        pairs = [
+            (read_images([files[z]])[0], shepp_logan().voxelise(grid.select_layers(slice(z, z + 1)), 2)[0]) for z in judged
+        ]
+        answer["nrmse"] = nrmse(*(np.stack(part) for part in zip(*pairs, strict=True)))
+    say_row("whole", **answer)
+    return answer
+
+
+# -- Peers -----------------------------------------------------------------------------------------------------------------
 
 
 def _slice_by_slice(reconstruct: Callable[[np.ndarray], np.ndarray]) -> Contestant:
@@ -156,8 +220,14 @@ PEERS: dict[str, tuple[str, Callable[[ParallelBeam], Contestant]]] = {
 """Name -> (module, contestant)."""
 
 
-def table(question: str, answer: dict[str, dict[str, float]]) -> list[str]:
+def table(question: str, answer: dict[str, Any]) -> list[str]:
     """Markdown table."""
+    if question == "whole":
+        return [
+            "| " + " | ".join(answer) + " |",
+            "|---:" * len(answer) + "|",
+            "| " + " | ".join(f"{v:.4g}" for v in answer.values()) + " |",
+        ]
     ours = answer["mivol"]["seconds_a_slice"]
     rows = ["| fbp | processor time a slice [s] | over mivol |", "|---|---:|---:|"]
     return rows + [
@@ -165,4 +235,5 @@ def table(question: str, answer: dict[str, dict[str, float]]) -> list[str]:
     ]
 
 
-STUDY = Study(__name__, __doc__, ScanSize, {"slices": measure_slices}, table=table)
+QUESTIONS = {"slices": measure_slices, "whole": measure_whole}
+STUDY = Study(__name__, __doc__, ScanSize, QUESTIONS, table=table, on_request=("whole",))

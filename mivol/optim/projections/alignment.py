@@ -18,7 +18,6 @@ References: Penczek, Grassucci & Frank 1994, Ultramicroscopy 53, 251 (projection
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +27,7 @@ from scipy.ndimage import gaussian_filter
 
 from mivol.errors import MivolError
 from mivol.optim.projections.iterative import projected_cg
-from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.linear_problems import LeastSquares, last_state
 from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
@@ -211,7 +210,7 @@ def _predict(
     if start is None:
         start = _filtered(part, y[kept])
     problem = LeastSquares(part, y[kept], mask[kept], start, nonnegative=True)
-    *_, state = (None, *itertools.islice(projected_cg(problem), ITERATIONS))
+    state = last_state(projected_cg(problem), ITERATIONS)
     x = start if state is None else state.x
     return x, (a @ np.reshape(x, grid.shape)).astype(float)
 

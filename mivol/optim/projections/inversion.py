@@ -78,12 +78,14 @@ class ProjectionProblem(Problem):
         x: (n,) the reconstructed volume; None before the first step.
         light: unknowns of the light; None: it is known.
         safe_point: called before each iteration.
+        read_finished: reads the volume (n,) from which the checkpoint of a finished run continues.
     """
 
     linear_problem: LeastSquares | PoissonCounts
     x: np.ndarray | None = None
     light: LightFit | None = None
     safe_point: Callable[[], None] = lambda: None
+    read_finished: Callable[[], np.ndarray] | None = None
 
     def initial_reals(self) -> Reals:
         """An empty dictionary: the solver takes its start from the problem of line integrals."""
@@ -126,7 +128,10 @@ class SolverRun(OptimizerRun):
 
     Attributes:
         state: the latest state; None before the first iteration.
+        is_left_to_outputs: whether checkpoints leave out the volume and the solver's memory, because the run is finished.
     """
+
+    is_left_to_outputs = False
 
     def __init__(self, settings: LinearSolve, problem: ProjectionProblem) -> None:
         super().__init__(problem)
@@ -167,11 +172,23 @@ class SolverRun(OptimizerRun):
         return state.objective
 
     def pack(self) -> dict[str, np.ndarray]:
-        return {} if self.state is None else self.state.to_arrays()
+        if self.state is None:
+            return {}
+        if not self.is_left_to_outputs:
+            return self.state.to_arrays()
+        light = {name: self.state.memory[name] for name in LIGHT if name in self.state.memory}
+        arrays = replace(self.state, memory=light).to_arrays()
+        del arrays[KEY]
+        return arrays
 
     def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        if arrays and KEY not in arrays:
+            arrays = {**arrays, KEY: self.problem.read_finished()}
         self._resume(SolverState.from_arrays(arrays) if arrays else None)
 
+
+LIGHT = ("offset", "slope", "turn")
+"""Names of the light in the memory of :func:`solve_with_light`."""
 
 INNER = "inner."
 """Prefix for the names of the solver's own memory."""

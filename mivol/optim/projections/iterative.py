@@ -9,7 +9,7 @@ curvature).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -154,6 +154,8 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
             x = np.maximum(x, 0)
         r = flatten(problem.b, a.dtype) - a @ x
         state = _ls_state(problem, x, 0, r, {"residual": r})
+    elif "residual" not in state.memory:
+        state = replace(state, memory={"residual": flatten(problem.b, a.dtype) - a @ state.x})
     while True:
         directions = _direction(problem, state, data_diagonal, weights)
         if directions is None:
@@ -263,6 +265,8 @@ def transmission_likelihood(problem: PoissonCounts, state: SolverState | None = 
     if state is None:
         x = np.maximum(start_field(a, problem.x0), 0)
         state = counts.state(x, 0, a @ x)
+    elif "line" not in state.memory:
+        state = replace(state, memory={"line": a @ state.x})
     while True:
         x, line = state.x, state.memory["line"].astype(np.float64)
         gradient = a.T @ counts.slope(line).astype(a.dtype)

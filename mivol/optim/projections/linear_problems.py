@@ -6,7 +6,7 @@ dtype. Sums are float64 in a fixed order: a run is bitwise repeatable with a rep
 
 A solver is a generator. The generator yields a :class:`SolverState` per iteration, without end or until the minimum. The caller
 controls progress, checkpoints and stopping. Arrays of a state are never overwritten, and ``run(problem, state=saved)``
-continues an interrupted run.
+continues an interrupted run. A state without memory continues from its field alone.
 
 References: Morozov 1966 (discrepancy principle); Huber 1964; Charbonnier et al. 1997 (half-quadratic majoriser); Rudin, Osher &
 Fatemi 1992 (total variation).
@@ -14,6 +14,7 @@ Fatemi 1992 (total variation).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -171,6 +172,14 @@ class SolverState:
         memory = {name.removeprefix("memory."): arrays[name] for name in arrays if name.startswith("memory.")}
         scalars = int(arrays["iteration"]), float(arrays["objective"]), float(arrays["residual_norm"])
         return cls(arrays["x"], *scalars, memory)
+
+
+def last_state(states: Iterator[SolverState], count: int) -> SolverState | None:
+    """The state after at most ``count`` iterations; None without an iteration. Earlier states are not kept."""
+    state = None
+    for state in itertools.islice(states, count):  # noqa: B007  (only the last state counts)
+        pass
+    return state
 
 
 def accept_all(problem: object, **options: object) -> None:

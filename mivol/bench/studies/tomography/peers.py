@@ -187,7 +187,7 @@ def run_solvers(scan: Slice) -> dict[str, Curve]:
 
     def states(name: str, x0: np.ndarray | None = None) -> Iterator[np.ndarray]:
         wanted = config.SolveSettings(name, iterations=STEPS.get(name, 1))
-        a = store_matrix(walk) if choose_storage(wanted, walk).is_stored else walk
+        a = choose_storage(wanted, walk).apply(walk)
         problem = LeastSquares(a, scan.y, scan.weights, x0, nonnegative=name not in ("cgls", "fbp"))
         yield from (state.x for state in ALL_SOLVERS[name].run(problem))
 
@@ -204,10 +204,10 @@ def default_states(scan: Slice) -> Iterator[np.ndarray]:
     """States of the solver that mivol chooses (``solve.name = "auto"``)."""
     wanted, _ = resolve_solver(config.SolveSettings(), Projector(scan.beam, scan.grid))
     walk = Projector(scan.beam, subdivide_grid(scan.grid, wanted.supersampling, scan.beam))
+    walk = choose_storage(wanted, walk).apply(walk)
     data, all_views = Projections(scan.beam, scan.y, scan.weights, is_noise_known=scan.photons > 0), np.arange(len(scan.y))
     start, prior = start_volume(wanted, walk, data, all_views), make_prior(wanted, walk, data, all_views)
     problem = ProjectionProblem(LeastSquares(walk, scan.y, scan.weights, start, wanted.nonnegative, prior))
-    choose_storage(wanted, walk).apply(problem)
     estimate_noise(problem, wanted, data)
     for state in ALL_SOLVERS[wanted.name].run(problem.linear_problem):
         yield voxel_means(state.x.reshape(walk.grid.shape), scan.grid.shape)
