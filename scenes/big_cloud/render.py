@@ -9,13 +9,13 @@ exists at any time. Printed: bricks, their size beside that of a dense grid, sec
 from __future__ import annotations
 
 import argparse
-import resource
 import time
 from pathlib import Path
 
 import mivol
 from mivol.fields.procedural import make_cumulus
 from mivol.files import write_png
+from mivol.machine import peak_memory
 
 import drjit as dr
 import mitsuba as mi
@@ -52,11 +52,6 @@ def make_scene(cloud: mivol.SparseVolumeData, size: int, spp: int) -> mi.Scene:
     )  # fmt: skip
 
 
-def peak_memory() -> float:
-    """Largest memory of this process so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--voxels", type=int, default=1024, help="voxels along each edge of the box")
@@ -83,7 +78,7 @@ def main() -> None:
     del cloud
     image = mi.render(scene)
     write_png(given.output / "cloud.png", np.array(image))
-    seconds, more = time.perf_counter() - start, peak_memory() - before
+    seconds, more = time.perf_counter() - start, (peak_memory() - before) / 1e6
     print(f"rendered in {seconds:.1f} s, {more:.0f} MB more than before: {given.output}/cloud.png")
     if given.gradient:
         params = mi.traverse(scene)
@@ -91,7 +86,7 @@ def main() -> None:
         dr.enable_grad(params[key])
         dr.backward(dr.mean(mi.render(scene, params, spp=1), axis=None))
         derivative = dr.grad(params[key])
-        print(f"derivatives by {dr.width(derivative.array)} voxels, {peak_memory() - before:.0f} MB more than before")
+        print(f"derivatives by {dr.width(derivative.array)} voxels, {(peak_memory() - before) / 1e6:.0f} MB more than before")
 
 
 if __name__ == "__main__":

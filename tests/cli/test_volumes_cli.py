@@ -31,11 +31,16 @@ def test_explain_describes_a_volume(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "1 values are below 0" in text and "1 values are NaN or Inf" in text
 
 
-@pytest.mark.parametrize("target", ["b.vdb", "b.vol", "b.nrrd", "b.npz"])
-def test_convert_keeps_values_and_place(tmp_path: Path, target: str) -> None:
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [("a.nrrd", f"b{suffix}") for suffix in (".vdb", ".vol", ".nrrd", ".npz")]
+    + [("a.npz", f"b{suffix}") for suffix in (".vdb", ".nvdb", ".vti")],
+)
+def test_convert_keeps_values_and_place(tmp_path: Path, source: str, target: str) -> None:
+    """Fits write ``.npz``; Blender, Houdini and ParaView read others."""
     values = np.abs(np.nan_to_num(VALUES)) + 1
-    write_volume(tmp_path / "a.nrrd", values, PLACE)
-    assert run("convert", tmp_path / "a.nrrd", tmp_path / target) == 0
+    write_volume(tmp_path / source, values, PLACE)
+    assert run("convert", tmp_path / source, tmp_path / target) == 0
     volume = read_volume(tmp_path / target)
     np.testing.assert_array_equal(volume.values, values)
     np.testing.assert_allclose(volume.to_world, PLACE, atol=1e-12)
@@ -61,17 +66,6 @@ def test_formats_convert_into_each_other(tmp_path: Path, capsys: pytest.CaptureF
     for target in SPATIAL:
         assert run("convert", tmp_path / f"a{source}", tmp_path / f"c{target}") == 0
         np.testing.assert_array_equal(read_volume(tmp_path / f"c{target}").values[..., 2], 3 * values[..., 0])
-
-
-@pytest.mark.parametrize("target", ["b.vdb", "b.nvdb", "b.vti"])
-def test_the_volume_of_a_fit_converts(tmp_path: Path, target: str) -> None:
-    """Fits write ``.npz``; Blender, Houdini and ParaView read others."""
-    values = np.abs(np.nan_to_num(VALUES)) + 1
-    write_volume(tmp_path / "a.npz", values, PLACE)
-    assert run("convert", tmp_path / "a.npz", tmp_path / target) == 0
-    volume = read_volume(tmp_path / target)
-    np.testing.assert_array_equal(volume.values, values)
-    np.testing.assert_allclose(volume.to_world, PLACE, atol=1e-12)
 
 
 def test_convert_says_what_is_rounded_and_clipped(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
