@@ -48,7 +48,7 @@ class Bricks:
         offset: nodes of the first brick before the box (Z, Y, X).
         table: UInt32, the first slot of each brick of the box (z, y, x); ``ABSENT`` if the brick is not stored.
         stored: UInt32, ascending numbers of the stored bricks.
-        distances: UInt8, distance of each block of cells to the nearest block with a stored node, for a walk to skip.
+        distances: UInt8, packed distance of each block of cells to the nearest one with a stored node, for a walk to skip.
     """
 
     res: tuple[int, int, int]

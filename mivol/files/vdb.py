@@ -457,8 +457,8 @@ class _TreeReader:
         values = np.empty((len(leaves), LEAF**3, components), dtype)
         values[:] = self.background
         plain, blocks = np.zeros(len(leaves), bool), []
-        masks = _unpack_masks(leaves).reshape(len(leaves), -1)
-        counts = masks.sum(axis=1).tolist()
+        bits = _join_masks(leaves)
+        masks, counts = np.unpackbits(bits, axis=1, bitorder="little").view(bool), np.bitwise_count(bits).sum(axis=1).tolist()
         joins = self.kind != "bool" and self.compression & ACTIVE_VALUES
         for k, (node, count) in enumerate(zip(leaves, counts, strict=True)):
             begin = stream.at
@@ -469,7 +469,8 @@ class _TreeReader:
                 stream.seek(begin)
                 values[k] = self._read_leaf(node).reshape(LEAF**3, components)
         stored = np.frombuffer(b"".join(blocks), "<f2" if self.is_half else dtype).reshape(-1, components)
-        values[masks & plain[:, None]] = stored
+        # Numbers of voxels, not a mask: NumPy places by numbers six times as fast.
+        values.reshape(-1, components)[np.flatnonzero(masks & plain[:, None])] = stored
         return values
 
     def _read_value(self) -> np.ndarray:
@@ -605,22 +606,24 @@ def _find_active_box(nodes: list[Node]) -> tuple[Coord, Coord, int]:
     active = sum(node.edge**3 for node in tiles)
     for begin in range(0, len(leaves), LEAVES_AT_ONCE):
         some = leaves[begin : begin + LEAVES_AT_ONCE]
-        masks, origins = _unpack_masks(some), np.array([node.origin for node in some], np.int64)
-        spans = np.stack([masks.any(axis=axes) for axes in ((2, 3), (1, 3), (1, 2))], axis=1)
-        filled = spans[:, 0].any(axis=1)
+        # A byte of a mask is a row of voxels along z.
+        rows, origins = _join_masks(some).reshape(-1, LEAF, LEAF), np.array([node.origin for node in some], np.int64)
+        along_y, along_z = np.bitwise_or.reduce(rows, axis=1), np.bitwise_or.reduce(rows, axis=(1, 2))
+        bits = np.unpackbits(along_z[:, None], axis=1, bitorder="little")
+        spans = np.stack([rows.any(axis=2), along_y != 0, bits != 0], axis=1)
+        filled = along_z != 0
         lows.append((origins + spans.argmax(axis=2))[filled])
         highs.append((origins + LEAF - 1 - spans[:, :, ::-1].argmax(axis=2))[filled])
-        active += int(np.count_nonzero(masks))
+        active += int(np.bitwise_count(rows).sum())
     if not active:
         return (0, 0, 0), (0, 0, 0), 0
     low, high = np.concatenate(lows).min(axis=0), np.concatenate(highs).max(axis=0)
     return tuple(map(int, low)), tuple(map(int, high)), active
 
 
-def _unpack_masks(leaves: list[Node]) -> np.ndarray:
-    """The active voxels of leaves, bool (n, 8, 8, 8)."""
-    bits = np.frombuffer(b"".join(node.mask for node in leaves), np.uint8)
-    return np.unpackbits(bits, bitorder="little").astype(bool).reshape(-1, LEAF, LEAF, LEAF)
+def _join_masks(leaves: list[Node]) -> np.ndarray:
+    """The masks of leaves, uint8 (n, 64)."""
+    return np.frombuffer(b"".join([node.mask for node in leaves]), np.uint8).reshape(-1, MASK)
 
 
 def _cut_tile(node: Node, first: np.ndarray, last: np.ndarray) -> np.ndarray:

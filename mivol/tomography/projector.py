@@ -36,7 +36,7 @@ from mivol.tomography.column_integral import (
 from mivol.tomography.geometry import Geometry, VoxelGrid, view_index
 from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_segment
 from mivol.transport.traversal.box import clip_to_box
-from mivol.transport.traversal.grid_blocks import find_empty_distances
+from mivol.transport.traversal.grid_blocks import find_empty_distances, read_distances
 from mivol.transport.traversal.lattice import Lattice, clip_to_grid
 
 if TYPE_CHECKING:
@@ -247,7 +247,8 @@ class Projector:
         empty = padded = None
         if self._pays_to_prepare:
             empty = find_empty_distances(mi.TensorXf(values, (*self.grid.shape, 1)))
-            if self._along is not None and dr.mean(dr.select(empty > 0, 1.0, 0.0))[0] < MAX_EMPTY:
+            is_empty = read_distances(empty, self.grid.shape) > 0
+            if self._along is not None and dr.mean(dr.select(is_empty, 1.0, 0.0))[0] < MAX_EMPTY:
                 padded = self._kernels.pad(values)
         y = None
         for rays in self._passes():

@@ -48,17 +48,19 @@ def test_half_empty(skip):
 
 def test_gaps_are_the_distances_between_blocks():
     """Chebyshev distances of integers, by brute force over the blocks that hold anything: equal, not close."""
-    from mivol.transport.traversal.grid_blocks import BLOCK, REACH, bound_blocks, find_empty_distances
+    from mivol.transport.traversal.grid_blocks import BLOCK, REACH, bound_blocks, find_empty_distances, read_distances
 
     rng = np.random.default_rng(32)
     values = np.where(rng.uniform(size=(23, 90, 41)) < 2e-4, 1, 0)
-    empty_distances = np.array(find_empty_distances(tensor(values))).reshape(*(-(-(n + 1) // BLOCK) for n in values.shape))
+    packed = find_empty_distances(tensor(values))
+    empty_distances = np.array(read_distances(packed, values.shape)).reshape(*(-(-(n + 1) // BLOCK) for n in values.shape))
     held = np.argwhere(np.array(bound_blocks(tensor(values))).reshape(empty_distances.shape) > 0)
     assert 1 < len(held) < empty_distances.size / 4
     away = np.abs(np.indices(empty_distances.shape).reshape(3, -1).T[:, None] - held).max(axis=2).min(axis=1)
     assert away.max() > 2
     np.testing.assert_array_equal(empty_distances.ravel(), np.minimum(away, REACH))
-    assert np.all(np.array(find_empty_distances(tensor(np.zeros((9, 9, 9))))) == REACH)
+    assert dr.width(packed) == -(-empty_distances.size // 2)  # two blocks in a byte
+    assert np.all(np.array(read_distances(find_empty_distances(tensor(np.zeros((9, 9, 9)))), (9, 9, 9))) == REACH)
 
 
 @pytest.mark.parametrize("skip", [False, True])

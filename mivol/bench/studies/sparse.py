@@ -15,8 +15,6 @@ from __future__ import annotations
 import gc
 import json
 import math
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -38,6 +36,7 @@ from mivol.errors import MivolError
 from mivol.fields.bricks import Bricks
 from mivol.fields.procedural import make_cumulus
 from mivol.files import SparseVolumeData, read_sparse_volume, write_volume
+from mivol.machine import peak_memory
 from mivol.optim.events import AdaptBricks
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course, begin_fit
@@ -247,18 +246,10 @@ def measure_child(path: str, side: str, task: str) -> dict:
     dr.sync_thread()
     seconds = {"load": loaded - start, "picture": time.process_time() - loaded, "both": time.process_time() - start}
     voxels = find_children(scene.shapes()[0].interior_medium())["sigma_t"]
-    arrays = {name: getattr(voxels, name) for name in ("data", "table", "distances", "stored", "bricks")}
+    # The parameter ``bricks`` shares the memory of ``stored``.
+    arrays = {name: getattr(voxels, name) for name in ("data", "table", "distances", "stored")}
     held = {name: byte_count(array) for name, array in arrays.items()}
     return {"seconds": seconds, "held": held | {"all": sum(held.values())}, "peak": peak_memory()}
-
-
-def peak_memory() -> int:
-    """Largest memory of this process so far [bytes]."""
-    status = Path("/proc/self/status")
-    if status.is_file():
-        # The counter of getrusage begins with the memory of the parent.
-        return 1024 * int(status.read_text().partition("VmHWM:")[2].split()[0])
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def byte_count(array: object) -> int:
@@ -291,7 +282,7 @@ def measure_picture(size: SparseSize) -> dict:
     gains = gain_figures(contest, "volpath", "mivol", counts) | agreement_figures(contest, "volpath", "mivol", counts, 1)
     # Pixels of the sky alone have no noise by mivol, and an infinite ratio.
     gains = {name: None if value is None else finite_or_none(value) for name, value in gains.items()}
-    return answer | {"dense_grid_bytes": dense_bytes, "mivol over volpath": gains}
+    return answer | {"dense_grid_bytes": dense_bytes, "peak_bytes_of_the_process": peak_memory(), "mivol over volpath": gains}
 
 
 # -- Fits -------------------------------------------------------------------------------------------------------------------
@@ -319,6 +310,7 @@ def measure_fit(size: SparseSize) -> dict:
     sparse, dense = answer["sparse"], answer["dense"]
     answer["time"] = sparse["processor_seconds_per_step"] / dense["processor_seconds_per_step"]
     answer["memory"] = sparse["peak_bytes"] / dense["peak_bytes"]
+    answer["volume_error"] = sparse["volume_error"] / dense["volume_error"]
     return answer
 
 
@@ -358,7 +350,10 @@ def views_of(truth: np.ndarray, size: SparseSize) -> list[View]:
 
 
 def run_fit(name: str, grid: dict, views: list[View], truth: np.ndarray, size: SparseSize) -> dict:
-    """Steps of a fit: processor time of a step without the first two, peak memory, and the error at the end."""
+    """Steps of a fit: processor time of a step without the first two, peak memory, and the errors at the end.
+
+    The error of the volume is the root mean square of its difference from the truth, over that of the truth.
+    """
     scene = fit_scene(grid)
     problem = SceneProblem(scene, views, [Parameter(KEY, domain=(0.0, 50.0), lr=0.3)], spp=4)
     steps = size.fit_steps if name == "sparse" else size.fit_dense_steps
@@ -377,6 +372,9 @@ def run_fit(name: str, grid: dict, views: list[View], truth: np.ndarray, size: S
     answer["peak_bytes"] = peak_bytes(run)
     seconds = np.diff(stamps)
     answer["processor_seconds_per_step"] = float(np.mean(seconds[2:] if len(seconds) > 3 else seconds[-1:]))
+    voxels = find_children(scene.shapes()[0].interior_medium())["sigma_t"].field
+    fitted = np.array(voxels.tensor) if voxels.bricks is None else voxels.volume().dense()
+    answer["volume_error"] = float(np.linalg.norm(fitted - truth) / np.linalg.norm(truth))
     if name == "sparse":
         answer["bricks"] = len(problem.brick_numbers(KEY))
     return answer

@@ -2,13 +2,15 @@
 
 Conventions. Block b of an axis holds the cells b 2^shift - 1 to (b + 1) 2^shift - 2, and all nodes touching these cells.
 Distances are Chebyshev distances (the largest of the distances along the three axes), counted in blocks. From a block at
-distance k a ray may cross k - 1 blocks in a step.
+distance k a ray may cross k - 1 blocks in a step. A walk reads *packed* distances: two blocks share a byte, the first one has
+its lower four bits.
 
 References: Cohen & Sheffer 1994 (proximity clouds); Szirmay-Kalos et al. 2011 (super-grids).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -35,6 +37,8 @@ __all__ = [
     "find_occupied_blocks",
     "find_empty_distances",
     "find_stored_distances",
+    "read_distance",
+    "read_distances",
     "reduce_blocks",
     "BlockRanges",
     "find_block_ranges",
@@ -50,8 +54,8 @@ BLOCK = 1 << SHIFT
 """Edge of a block [cells]. (An edge of 2 is no faster on threads in a grid of 512^3.)"""
 
 REACH = 15
-"""Largest stored distance [blocks]; larger distances count as this distance. A ray crosses an empty box of 128^3 cells in 3
-steps.
+"""Largest stored distance [blocks]: that of four bits. Larger distances count as this distance. A ray crosses an empty box of
+128^3 cells in 3 steps.
 """
 
 
@@ -134,30 +138,51 @@ def _over_axis(flat: mi.Float, shape: tuple[int, int, int], shift: int, reductio
 
 
 def find_empty_distances(values: mi.TensorXf) -> mi.UInt8:
-    """Find the distances of :func:`find_distances_of_bounds` for a grid (Z, Y, X, C)."""
+    """Find the packed distances of :func:`find_distances_of_bounds` for a grid (Z, Y, X, C)."""
     return find_distances_of_bounds(bound_blocks(values), values.shape[:3])
 
 
 def find_distances_of_bounds(bounds: mi.Float | mi.Bool, res: tuple[int, int, int]) -> mi.UInt8:
-    """Find the distance of each block to the nearest non-empty block.
+    """Find the packed distance of each block to the nearest non-empty block.
 
     Args:
         bounds: from :func:`bound_blocks`, or whether each block is occupied.
         res: resolution of the grid (Z, Y, X).
 
     Returns:
-        Flat array over the blocks: Chebyshev distances [blocks], 0 for a non-empty block, at most ``REACH``.
+        Chebyshev distances [blocks], 0 for a non-empty block, at most ``REACH``; a byte for two blocks (z, y, x).
 
     Cost: at most 6 ``REACH`` look-ups a block.
     """
     occupied = bounds if dr.is_mask_v(bounds) else bounds > 0
-    return find_distances(occupied, tuple(count_blocks(n) for n in res))
+    return _pack(find_distances(occupied, tuple(count_blocks(n) for n in res)))
 
 
 def find_stored_distances(bricks: Bricks) -> mi.UInt8:
-    """Find the distance of each block to the nearest block with a stored node of a sparse grid."""
+    """Find the packed distance of each block to the nearest block with a stored node of a sparse grid."""
     counts = tuple(count_blocks(n) for n in bricks.res)
-    return find_distances(occupied_blocks(None, bricks, SHIFT, counts), counts)
+    return _pack(find_distances(occupied_blocks(None, bricks, SHIFT, counts), counts))
+
+
+def _pack(distances: mi.UInt8) -> mi.UInt8:
+    """Pack the distances of two blocks into a byte."""
+    count = dr.width(distances)
+    first = dr.arange(mi.UInt32, (count + 1) // 2) * 2
+    low, high = (dr.gather(mi.UInt8, distances, block, block < count) for block in (first, first + 1))
+    packed = mi.UInt8(mi.UInt32(low) | (mi.UInt32(high) << 4))
+    dr.eval(packed)
+    return packed
+
+
+def read_distance(packed: mi.UInt8, block: mi.UInt32, active: mi.Bool = True) -> mi.Int32:
+    """Read the distance of a block."""
+    pair = mi.UInt32(dr.gather(mi.UInt8, packed, block >> 1, active))
+    return mi.Int32((pair >> ((block & 1) << 2)) & 15)
+
+
+def read_distances(packed: mi.UInt8, res: tuple[int, int, int]) -> mi.Int32:
+    """Read the distances of all blocks (z, y, x) of a grid (Z, Y, X)."""
+    return read_distance(packed, dr.arange(mi.UInt32, math.prod(count_blocks(n) for n in res)))
 
 
 def find_distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:

@@ -22,7 +22,7 @@ import mitsuba as mi
 from mivol.fields.bricks import Nodes, find_face
 from mivol.numerics import fast_max, fast_min
 from mivol.transport.traversal.box import clip_to_box
-from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks
+from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks, read_distance
 from mivol.transport.traversal.lattice import Lattice, Mask3, Segment
 from mivol.transport.traversal.rays import Ray
 
@@ -130,7 +130,7 @@ def walk_cells(
         if skip:
             block = (cell + 1) >> SHIFT
             index = (block.z * blocks_y + block.y) * blocks_x + block.x
-            distance = mi.Int32(dr.gather(mi.UInt8, empty_distances, mi.UInt32(index), active))
+            distance = read_distance(empty_distances, mi.UInt32(index), active)
             full = distance == 0
             inner = (cell + 1) & (BLOCK - 1)
             span = dr.select(full, 0, dr.select(ahead, BLOCK - 1 - inner, inner) + (distance - 1) * BLOCK)

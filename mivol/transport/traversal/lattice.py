@@ -36,7 +36,7 @@ class Lattice:
     Attributes:
         values: TensorXf (Z, Y, X, C), at voxel centres; (bricks, 8, 8, 8, C) of a sparse grid.
         to_world: (4, 4) float64, unit cube to world.
-        empty_distances: distance of each block of cells to the nearest non-empty block
+        empty_distances: packed distance of each block of cells to the nearest non-empty block
             (:mod:`mivol.transport.traversal.grid_blocks`); None to walk all blocks.
         block_ranges: :class:`mivol.transport.traversal.grid_blocks.BlockRanges` for tracking; None to walk every cell.
         from_world: (3, 4) map from the world to lattice coordinates; made from ``to_world`` by default.
