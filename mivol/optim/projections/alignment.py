@@ -4,10 +4,13 @@ Rounds alternate between volume and geometry. A few iterations of pcg explain th
 round. Then the unknowns move by a Gauss-Newton step on the residual, whose derivatives are differences of the predicted views
 along rows and columns, or of predictions with another tilt. The volume continues from round to round. Its adaption to wrong
 views slows the rounds: an error of the geometry shrinks by a factor ``1 - c`` a round, where c is the share of the curvature
-that remains after the volume has adapted. Standard deviations are those of the reduced curvature.
+that remains after the volume has adapted.
 
 Smoothing. Projections are smoothed by ``SMOOTHING`` pixels first, so an error of a pixel is a small fraction of a detail, and
-large detectors are averaged over blocks.
+large detectors are averaged over blocks. Neighbouring residuals are then correlated. Counted as independent, they give
+standard deviations five times too small. With smoothing G, slopes J and normal equations N = J^T J, the moves of a view have
+the covariance ``N^-1 J^T G G^T J N^-1`` times the variance of the noise before smoothing. The residual of held-out views tells
+this variance, because the volume adapts to the noise of the others.
 
 Gauge. A displaced object cannot be told from views displaced by ``a cos(theta) + b sin(theta)`` along the columns and by a
 constant along the rows: both are removed from the moves.
@@ -141,7 +144,8 @@ def align_views(
     )
     better = np.log(np.maximum(before, TINY) / np.maximum(after, TINY))
     is_needed = better.mean() > max(CLEAR * better.std(ddof=1) / math.sqrt(len(better)), LEAST_GAIN)
-    sigma, common_sigma = _deviations(fit, steps, own, common)
+    spread = _moves_spread(_slopes(predicted)[..., own], mask, fit.own) if own else np.empty(0)
+    sigma, common_sigma = _deviations(fit, float(after.mean()) * spread, steps, own, common)
     moves, found = state.moves * [factor, factor, 1.0], state.common * [factor, 1.0, 1.0]
     shifted = _State(moves, found)
     axis = found[0] + moves[:, 1].mean(), (common_sigma[0] if common[:1] == [0] else sigma[1] / math.sqrt(len(y))) * factor
@@ -191,8 +195,12 @@ def _reduce(
     )
     shape = tuple(max(1, -(-n // (block[0] if axis == 0 else factor))) for axis, n in enumerate(grid.shape))
     coarse = VoxelGrid(shape, tuple(grid.extent / np.array(shape[::-1])), grid.centre)
-    widths = (0, SMOOTHING if rows >= 8 else 0, SMOOTHING)
-    return small, coarse, gaussian_filter(values, widths, mode="nearest"), mask, factor
+    return small, coarse, _smooth(values), mask, factor
+
+
+def _smooth(images: np.ndarray) -> np.ndarray:
+    """Images (views, rows, cols) smoothed along the columns, and along 8 rows or more."""
+    return gaussian_filter(images, (0, SMOOTHING if images.shape[1] >= 8 else 0, SMOOTHING), mode="nearest")
 
 
 def _predict(
@@ -249,7 +257,6 @@ class _Fit:
     own: np.ndarray
     common: np.ndarray
     gradients: np.ndarray
-    noise: float
 
 
 def _improve(
@@ -266,8 +273,7 @@ def _improve(
     """The unknowns after a step, the step (views x moves, then the common unknowns), and its equations."""
     slopes = _slopes(predicted)
     moves, shared = np.zeros((len(residual), 3)), np.zeros(3)
-    noise = float((mask * residual**2).sum() / mask.sum())
-    fit = _Fit(np.empty(0), np.empty(0), np.empty(0), noise)
+    fit = _Fit(np.empty(0), np.empty(0), np.empty(0))
     if own:
         j = slopes[..., own]
         normal = np.einsum("vrci,vrc,vrcj->vij", j, mask, j)
@@ -304,11 +310,31 @@ def _fix_gauge(moves: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return fixed
 
 
-def _deviations(fit: _Fit, steps: list[np.ndarray], own: list[int], common: list[int]) -> tuple[np.ndarray, np.ndarray]:
+def _moves_spread(slopes: np.ndarray, mask: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Variances (own moves,) of a typical view (median) over the variance of its smooth readings.
+
+    Args:
+        slopes: J, derivatives of the readings by the moves (views, rows, cols, own moves).
+        mask: (views, rows, cols), 1 where readings count.
+        normal: N (views, own moves, own moves).
+    """
+    middle = (mask.shape[1] // 2, mask.shape[2] // 2)
+    point = np.zeros((1, *mask.shape[1:]))
+    point[0, *middle] = 1.0
+    reduction = float((_smooth(point) ** 2).sum())
+    smooth = np.stack([_smooth(mask * part) for part in np.moveaxis(slopes, -1, 0)], -1)
+    inverse = np.linalg.inv(normal)
+    covariance = inverse @ np.einsum("vrci,vrcj->vij", smooth, smooth) @ inverse / reduction
+    return np.median(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
+
+
+def _deviations(
+    fit: _Fit, variances: np.ndarray, steps: list[np.ndarray], own: list[int], common: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviations of the moves (3,) and of the common unknowns (3,); 0 for those that are known.
 
     Of the curvature of a fixed volume, the share ``c`` = 1 - (last step over the step before) remains. The rounds that were
-    not taken would add ``step (1 - c) / c``.
+    not taken would add ``step (1 - c) / c``. ``variances`` are those of the moves due to noise.
     """
     views = (len(steps[-1]) - 3) // 3
 
@@ -319,9 +345,8 @@ def _deviations(fit: _Fit, steps: list[np.ndarray], own: list[int], common: list
 
     sigma, shared = np.zeros(3), np.zeros(3)
     for k, axis in enumerate(own):
-        share, rest = remaining([step[: 3 * views].reshape(views, 3)[:, axis] for step in steps])
-        variance = fit.noise * np.median(np.linalg.inv(fit.own)[:, k, k]) / share
-        sigma[axis] = math.hypot(math.sqrt(variance), rest)
+        _, rest = remaining([step[: 3 * views].reshape(views, 3)[:, axis] for step in steps])
+        sigma[axis] = math.hypot(math.sqrt(variances[k]), rest)
     if common:
         inverse = np.linalg.pinv(fit.common)
         scatter = (fit.gradients - fit.gradients.mean(0)).T @ (fit.gradients - fit.gradients.mean(0))
