@@ -13,6 +13,13 @@ from scenes import FRAMES
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
+
+def shift_along_x(x: float) -> np.ndarray:
+    to_world = np.eye(4)
+    to_world[0, 3] = x
+    return to_world
+
+
 CASES = {
     "the same voxels": (8, np.eye(4), 1),
     "coarser": (4, np.eye(4), 1),
@@ -21,6 +28,7 @@ CASES = {
     "beyond the box": (8, np.diag([2.0, 2, 2, 1]), 1),
     "ends at a voxel's face": (4, np.diag([0.5, 0.5, 0.5, 1]), 2),
     "ends at a voxel's centre": (4, np.diag([0.5625, 0.5625, 0.5625, 1]), 1),
+    "begins at a voxel's face": (4, shift_along_x(0.125), 2),
     "ends anywhere": (4, np.diag([0.53, 1, 1, 1]), 4),
     "turned": (4, FRAMES["rotated"], 4),
 }
