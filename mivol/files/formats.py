@@ -361,7 +361,7 @@ def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> st
     array = volume.meta.get("grid") or volume.meta.get("dataset")
     lines = [
         f"{path}: {_find_format(path, **layout).name}" + (f", array {array!r}" if array else ""),
-        f"voxels (x, y, z): {size}, {channels} channel{'s' if channels > 1 else ''} of {volume.meta['dtype']}, {memory}",
+        f"voxels (x, y, z): {size}, {channels} channel{'s' if channels > 1 else ''} of {volume.meta.get('dtype', 'float32')}, {memory}",
         f"box: {format_point(corners.min(axis=0))} to {format_point(corners.max(axis=0))}"
         + (" around the turned axes" if is_turned else "")
         + f"; voxel {format_point(volume.spacing)}",
@@ -406,7 +406,7 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
         facts["unit"] = volume.meta["unit"]
     if suffix in SPARSE_READERS and "grid" in volume.meta:
         facts["grid"] = str(volume.meta["grid"]).partition("[")[0]
-    if np.dtype(str(volume.meta["dtype"]).replace("text", "float32")).name in WIDE_TYPES:
+    if np.dtype(str(volume.meta.get("dtype", "float32")).replace("text", "float32")).name in WIDE_TYPES:
         lost.append(f"{volume.meta['dtype']} (numbers are rounded to float32)")
     if volume.meta.get("class") == "level set":
         lost.append("the distances of the level set (its fog is written)")

@@ -27,6 +27,7 @@ from PIL import Image
 
 from mivol import files
 from mivol.errors import MivolError
+from mivol.files import formats
 
 #: what the hand-made files with spacing (1.5, 2, 2.5) and first centre (10, 20, 30) must give for 4 x 3 x 2 voxels.
 PLACE = np.array([[6, 0, 0, 9.25], [0, 6, 0, 19], [0, 0, 5, 28.75], [0, 0, 0, 1]])
@@ -451,6 +452,18 @@ def test_round_trip(tmp_path: Path, shape: tuple[int, ...], suffix: str, compres
     volume = files.read_volume(tmp_path / f"a{suffix}")
     assert_volume(volume, values, to_world)
     assert volume.meta["space"] == "RAS"
+
+
+def test_a_reader_of_values_and_place_alone_serves_every_verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new format is a reader and an entry in the table. Facts about the file are a courtesy."""
+    values = np.arange(24, dtype=np.float32).reshape(2, 3, 4, 1)
+    made_up = formats.VolumeFormat("made up", lambda head: head == b"MADE", lambda path, _: files.VolumeData(values, np.eye(4)))
+    monkeypatch.setitem(formats.FORMATS, ".made", made_up)
+    source, target = tmp_path / "a.made", tmp_path / "a.nrrd"
+    source.write_bytes(b"MADE")
+    assert "1 channel of float32" in formats.describe_volume(source)
+    formats.convert_volume(source, target)
+    assert_volume(files.read_volume(target), values, np.eye(4))
 
 
 def test_npy_round_trip_of_a_strided_array(tmp_path: Path) -> None:
