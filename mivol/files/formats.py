@@ -359,9 +359,10 @@ def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> st
     corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ volume.to_world[:3].T
     is_turned = np.count_nonzero(volume.to_world[:3, :3]) > 3
     array = volume.meta.get("grid") or volume.meta.get("dataset")
+    dtype = volume.meta.get("dtype", "float32")
     lines = [
         f"{path}: {_find_format(path, **layout).name}" + (f", array {array!r}" if array else ""),
-        f"voxels (x, y, z): {size}, {channels} channel{'s' if channels > 1 else ''} of {volume.meta.get('dtype', 'float32')}, {memory}",
+        f"voxels (x, y, z): {size}, {channels} channel{'s' if channels > 1 else ''} of {dtype}, {memory}",
         f"box: {format_point(corners.min(axis=0))} to {format_point(corners.max(axis=0))}"
         + (" around the turned axes" if is_turned else "")
         + f"; voxel {format_point(volume.spacing)}",

@@ -36,8 +36,8 @@ class VolumeData:
     Attributes:
         values: float32 (Z, Y, X, C), C-contiguous; negative and non-finite numbers are kept (:func:`check_volume`).
         to_world: unit cube to the physical frame of the file, float64 (4, 4).
-        meta: facts of the file, each of which a reader may leave out: ``path``, ``format``, ``dtype`` (on disk; default float32),
-            ``space`` ("RAS", "LPS" or None), and facts of the format.
+        meta: facts of the file, each optional: ``path``, ``format``, ``dtype`` (on disk; default float32), ``space`` ("RAS",
+            "LPS" or None), and facts of the format.
     """
 
     values: np.ndarray
