@@ -115,9 +115,13 @@ def test_exit_codes(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_only_questions_without_times_go_to_a_cluster(capsys: pytest.CaptureFixture) -> None:
-    """A refusal before workers start."""
+    """A refusal before workers start, which names the studies that take a cluster, and no other."""
     assert TOY.run(["--cluster", "local:1"], lambda study, args: pytest.fail("workers were started")) == 1
-    assert "mivol bench toy: height measures times, which other processes" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "mivol bench toy: height measures times or memory of this machine" in said
+    for name in catalogue.study_names():
+        kinds = {isinstance(question, SweptQuestion) for question in catalogue.load_study(name).questions.values()}
+        assert kinds == {name in said.rpartition("which")[2]}, name
 
 
 def test_pieces_of_a_question_on_workers(

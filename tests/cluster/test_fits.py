@@ -6,69 +6,36 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ball_photos import ball, camera, photo
 from local_workers import kill_worker, some_workers
 
 from mivol import config
+from mivol.bench.studies.cluster_kills import write_experiments
 from mivol.cluster.distribution import ClusterDistribution
 from mivol.cluster.steps import Steps
 from mivol.experiments.fit_kind import RunContext
 from mivol.experiments.kinds import run_experiment
-from mivol.files import read_volume, write_png
-from mivol.files.image_files import decode_srgb
-from mivol.photos.transforms import write_transforms
+from mivol.files import read_volume
 from mivol.report.record import read_record
 
-ROOT = Path(__file__).resolve().parents[2]
-
-PHOTOS = """title = "a ball"
-threads = 1
-[photos]
-path = "photographs"
-background = "white"
-box = [[-1, -1, -1], [1, 1, 1]]
-held_out = 0
-judged = "test"
-[show]
-frames = 0
-views = 0
-every = 20
-"""
-SCAN = """title = "a head"
-threads = 1
-held_out_every = 5
-scan = { beam = "parallel", views = 20, detector = [2, 24], pitch = 0.09 }
-data = { source = "shepp_logan", photons = 1e4 }
-grid = { shape = [2, 16, 16], voxel_size = 0.125 }
-"""
-KINDS = {
-    "grid": PHOTOS + '[field]\npreset = "tiny"\nlongest = 20\ndegree = 1\neffort = 0.2\n',
-    "octree": PHOTOS + '[field]\nkind = "octree"\npreset = "tiny"\nlongest = 16\ndegree = 0\neffort = 0.1\nsteps = 60\n',
-    "hash": PHOTOS + '[field]\nkind = "hash"\npreset = "tiny"\neffort = 0.15\n',
-    "gaussians": PHOTOS + '[gaussians]\npreset = "tiny"\nstart = 100\nmost = 200\neffort = 0.1\nviews = 3\n',
-    "scan": SCAN + 'solve = { name = "pcg", iterations = 5, tv = 0.1, storage = "walk" }\n',
-    "stored": SCAN + 'solve = { name = "os-sart", subsets = 4, iterations = 3, storage = "matrix" }\n',
+CHANGES = {
+    "grid": [],
+    "octree": [],
+    "hash": [],
+    "gaussians": [],
+    "scan": ["solve.iterations=5", "solve.tv=0.1"],
+    "stored": ['solve={name="os-sart", subsets=4, iterations=3, storage="matrix"}'],
 }
-"""An experiment of each kind with a few steps."""
+"""Changes of an experiment of each kind; "stored" is the scan with stored rows."""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The experiments, and photographs of the ball."""
+    """The experiments of the study of kills, and photographs of its ball."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
     found = tmp_path_factory.mktemp("fits")
-    for name, text in KINDS.items():
-        (found / f"{name}.toml").write_text(text)
-    (found / "photographs").mkdir()
-    names = [f"view_{number}.png" for number in range(8)]
-    for number, name in enumerate(names):
-        seen = photo(ball(16), number, 24)
-        alpha = seen.alpha[..., None]
-        write_png(found / "photographs" / name, np.concatenate([decode_srgb(seen.image), alpha], axis=2))
-    cameras = {name: camera(number, 24) for number, name in enumerate(names)}
-    write_transforms(found / "photographs" / "transforms.json", cameras, [names[-1]])
+    write_experiments(found)
     return found
 
 
@@ -89,7 +56,7 @@ def read_result(run: Path) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", CHANGES)
 def test_a_fit_does_not_depend_on_workers(client: object, folder: Path, tmp_path: Path, kind: str) -> None:
     """Rationale: a part depends on the step only, and sums of float32 numbers in float64 do not depend on their order.
 
@@ -106,7 +73,7 @@ def test_a_fit_does_not_depend_on_workers(client: object, folder: Path, tmp_path
                 return compute(steps, *args, **more)
 
             patch.setattr(Steps, "compute", strike)
-            settings = config.load(folder / f"{kind}.toml")
+            settings = config.load(folder / f"{'scan' if kind == 'stored' else kind}.toml", CHANGES[kind])
             run_experiment(RunContext(settings, folder, tmp_path / name, distribution=ClusterDistribution(pool)))
             assert pool.lost == (killed >= 0)
         said = " ".join(read_record(tmp_path / name).notes)

@@ -135,6 +135,18 @@ def change_state(kind: str, problem: DividedProblem, gradient: dict[str, mi.Tens
         problem.refresh_occupancy(16, np.random.default_rng(1))
 
 
+def test_a_worker_begins_another_fit_of_the_same_octree(batches: RayBatches) -> None:
+    """A worker keeps its problem for a fit of equal data and plan; that one begins with the grid again."""
+    tree = make_problem("octree", batches).step_state()
+    new, used = (OctreeProblem(batches, BOX, replace(LEAVES, grid=PLAN)) for _ in range(2))
+    used.take_step_state(tree)
+    assert used.grid is None
+    used.take_step_state(new.step_state())
+    reals = new.initial_reals()
+    expected, found = (one.compute_part(reals, 0, 0, (0,)) for one in (new, used))
+    assert all(np.array_equal(np.array(value), np.array(found[name])) for name, value in expected.items())
+
+
 def test_several_photographs_a_step_are_their_mean(batches: RayBatches) -> None:
     """The loss and gradient of a step of three photographs are the means of three steps of one; each view counts once."""
     three, ones = make_problem("gaussians", batches), make_problem("gaussians", batches)

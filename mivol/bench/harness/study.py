@@ -202,7 +202,7 @@ class Study:
         return result
 
     def check_cluster(self, args: argparse.Namespace) -> None:
-        """Refuse ``--cluster`` for questions with times.
+        """Refuse ``--cluster`` for questions that measure this machine.
 
         Raises:
             MivolError: with the question.
@@ -210,8 +210,8 @@ class Study:
         timed = [name for name in args.only if not isinstance(self.questions[name], SweptQuestion)]
         if args.cluster is not None and timed:
             raise MivolError(
-                f"{timed[0]} measures times, which other processes on the machine change: leave out --cluster "
-                "(mivol bench random_scenes has questions for a cluster)."
+                f"{timed[0]} measures times or memory of this machine, or starts workers of its own: leave out --cluster, "
+                "which random_scenes, depth and preparation take."
             )
 
     def parse(self, argv: Sequence[str]) -> argparse.Namespace:

@@ -138,29 +138,29 @@ grid = { shape = [24, 24, 24], voxel_size = 0.083 }
 solve = { name = "pcg", iterations = 30, storage = "walk" }
 """
 EXPERIMENTS = {
-    "grid.toml": BALL + '[field]\npreset = "tiny"\nlongest = 24\ndegree = 1\neffort = 0.3\n',
-    "gaussians.toml": BALL + '[gaussians]\npreset = "tiny"\nstart = 200\nmost = 400\neffort = 0.3\nviews = 2\n',
-    "scan.toml": HEAD,
+    "grid": BALL + '[field]\npreset = "tiny"\nlongest = 20\ndegree = 1\neffort = 0.2\n',
+    "octree": BALL + '[field]\nkind = "octree"\npreset = "tiny"\nlongest = 16\ndegree = 0\neffort = 0.1\nsteps = 60\n',
+    "hash": BALL + '[field]\nkind = "hash"\npreset = "tiny"\neffort = 0.15\n',
+    "nerf": BALL + '[field]\nkind = "nerf"\npreset = "tiny"\neffort = 0.05\n',
+    "gaussians": BALL + '[gaussians]\npreset = "tiny"\nstart = 100\nmost = 200\neffort = 0.1\nviews = 3\n',
+    "scan": HEAD,
 }
-"""Experiments beside the example demo, by file."""
+"""Experiments beside the example demo."""
 
 VERBS: dict[str, Verb] = {
     "reference": run_reference,
     "render": run_render,
     "validate": run_validate,
     "optimize_scene": run_fit("demo/fit.toml", [*SCENE, "fit.iterations=6"]),
-    "optimize_grid": run_fit("grid.toml", []),
-    "optimize_gaussians": run_fit("gaussians.toml", []),
-    "optimize_scan": run_fit("scan.toml", []),
     "sweep": run_sweep_of_fits,
-}
+} | {f"optimize_{name}": run_fit(f"{name}.toml", []) for name in EXPERIMENTS}
 
 
 def write_experiments(folder: Path) -> None:
     """The example demo, photographs of a ball of many colours, and a scan."""
     copy_example("demo", folder / "demo")
     for name, text in EXPERIMENTS.items():
-        (folder / name).write_text(text)
+        (folder / f"{name}.toml").write_text(text)
     z, y, x = np.meshgrid(*3 * [np.linspace(-1, 1, 16)], indexing="ij")
     colours = np.stack([np.sin(3 * x), np.cos(4 * y), np.sin(3 * z + 1)], axis=-1)[..., None, :]
     ball = SphericalGrid.from_dense(60 * (0.6 - np.sqrt(x * x + y * y + z * z)), colours, np.diag([2.0, 2, 2, 1]) + OFFSET)

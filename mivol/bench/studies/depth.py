@@ -13,7 +13,6 @@ source text for this module.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from matplotlib import colormaps
 
 from mivol.bench.harness.bars import AT_MOST, Bar, judge, say_row
 from mivol.bench.harness.figures import new_figure
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import Size, Study, SweptQuestion, amount
 from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, sample_lines
 from mivol.transport.traversal.box import Box
 
@@ -75,21 +74,28 @@ def missing_share(once: np.ndarray, every: np.ndarray) -> tuple[float, float]:
 
 def measure_cell(light: str, phase: str, albedo: float, tau: float, n: int, seed: int = 0) -> dict:
     """Measure one cell of the table from n lines."""
-    start, scene = time.perf_counter(), make_cube(light, phase, albedo, tau / CUBE_DEPTH)
+    scene = make_cube(light, phase, albedo, tau / CUBE_DEPTH)
     once, every = (trace_lines(scene, limit, n, seed) for limit in (2, -1))
     error, standard_error = missing_share(once, every)
     say_row(f"{light}, {phase}, albedo {albedo:g}, tau {tau:g}", error=error, standard_error=standard_error)
     return {
         **{"medium": "cube", "light": light, "phase": phase, "albedo": albedo, "tau": tau},
         **{"once": once.mean(), "all": every.mean(), "error": error, "standard_error": standard_error},
-        "seconds": round(time.perf_counter() - start, 2),
     }
 
 
-def measure_table(size: DepthSize) -> dict:
-    """Which share is missing at depth 2, e = 1 - S2 / S, by light, phase function, albedo and optical depth?"""
-    cells = [measure_cell(*table, albedo, tau, size.lines) for table in TABLES for tau in size.taus for albedo in ALBEDOS]
+def join_cells(size: DepthSize, found: dict[tuple, dict]) -> dict:
+    """The whole table."""
+    cells = list(found.values())
     return {"lines": size.lines, "cells": cells, "as the module holds it": table_source(cells) if size.taus == TAUS else []}
+
+
+measure_table = SweptQuestion(
+    "Which share is missing at depth 2, e = 1 - S2 / S, by light, phase function, albedo and optical depth?",
+    lambda size: [(*table, albedo, tau) for table in TABLES for tau in size.taus for albedo in ALBEDOS],
+    lambda cell, size: measure_cell(*cell, size.lines),
+    join_cells,
+)
 
 
 def cells_of(cells: list[dict], light: str, phase: str) -> dict[tuple[float, float], dict]:

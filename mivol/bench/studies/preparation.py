@@ -26,7 +26,7 @@ import numpy as np
 
 from mivol import config
 from mivol.bench.harness.bars import say_row
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import Size, Study, SweptQuestion, amount
 from mivol.experiments.projections import Projections
 from mivol.experiments.scan_fit import GAIN_TURN, start_volume
 from mivol.experiments.solver_choice import (
@@ -59,20 +59,31 @@ class PreparationSize(Size):
 # -- Axis -------------------------------------------------------------------------------------------------------------------
 
 
-def measure_axis(size: PreparationSize) -> dict:
-    """How far is the rotation axis of twenty computed scans from its true column?"""
-    rows = {}
-    for name, scan in AXIS_SCANS.items():
-        light = correct_transmission(*scan.readings())
-        air = find_air(light)
-        y, weights = to_line_integrals(air.normalise(light) if air and air.is_needed else light)
-        axis = find_axis(y, weights, scan.beam().angles)
-        error = axis.column - scan.column
-        rows[name] = {"column": scan.column, "error": error, "sigma": axis.uncertainty, "method": axis.method}
-        say_row(name, error=error, sigma=axis.uncertainty)
+def find_one_axis(name: str, size: PreparationSize) -> dict:
+    """Column of the axis of a scan, its error [column], and the error that the method tells."""
+    scan = AXIS_SCANS[name]
+    light = correct_transmission(*scan.readings())
+    air = find_air(light)
+    y, weights = to_line_integrals(air.normalise(light) if air and air.is_needed else light)
+    axis = find_axis(y, weights, scan.beam().angles)
+    error = axis.column - scan.column
+    say_row(name, error=error, sigma=axis.uncertainty)
+    return {"column": scan.column, "error": error, "sigma": axis.uncertainty, "method": axis.method}
+
+
+def join_axes(size: PreparationSize, rows: dict[str, dict]) -> dict:
+    """All scans, and the number of found axes."""
     found = sum(abs(row["error"]) < 0.2 for row in rows.values())
     told = sum(abs(row["error"]) < max(0.2, 2 * row["sigma"]) for row in rows.values())
     return {"scans": rows, "count": len(rows), "found": found, "found_or_told": told}
+
+
+measure_axis = SweptQuestion(
+    "How far is the rotation axis of twenty computed scans from its true column?",
+    lambda size: list(AXIS_SCANS),
+    find_one_axis,
+    join_axes,
+)
 
 
 # -- Rings ------------------------------------------------------------------------------------------------------------------
@@ -140,50 +151,65 @@ def measure_ring_errors(case: tuple[str, float, float], seed: int) -> dict[str, 
     return {label: value / unspoilt for label, value in found.items()}
 
 
-def measure_rings(size: PreparationSize) -> dict:
-    """What is the error of a slice with rings, over that of the same scan without rings?"""
+def join_rings(size: PreparationSize, found: dict[tuple[str, int], dict[str, float]]) -> dict:
+    """Means over the seeds, by case."""
     answer = {}
-    for label, case in RING_CASES.items():
-        errors = [measure_ring_errors(case, 100 + seed) for seed in range(size.seeds)]
+    for label in RING_CASES:
+        errors = [found[label, seed] for seed in range(size.seeds)]
         answer[label] = {step: float(np.mean([one[step] for one in errors])) for step in errors[0]}
         say_row(label, **answer[label])
     return answer
 
 
+measure_rings = SweptQuestion(
+    "What is the error of a slice with rings, over that of the same scan without rings?",
+    lambda size: list(itertools.product(RING_CASES, range(size.seeds))),
+    lambda piece, size: measure_ring_errors(RING_CASES[piece[0]], 100 + piece[1]),
+    join_rings,
+)
+
+
 # -- Motion -----------------------------------------------------------------------------------------------------------------
 
 
-def measure_motion(size: PreparationSize) -> dict:
-    """How near to the truth are fitted shifts and turns of the views?"""
+MOTION_CASES = {"10,000 quanta": (1e4, 1.0), "300 quanta": (300.0, 1.0), "no motion, 10,000 quanta": (1e4, 0.0)}
+"""Quanta of a pixel without object, and factor on the moves."""
+
+
+def measure_moves(label: str, size: PreparationSize) -> dict[str, float]:
+    """Errors of the fitted moves of a scan."""
     views, rows, columns = 90, 32, 96
     beam = ParallelBeam(np.arange(views) * np.pi / views, (rows, columns))
-    answer = {}
-    for label, photons, spread in (
-        ("10,000 quanta", 1e4, 1.0),
-        ("300 quanta", 300.0, 1.0),
-        ("no motion, 10,000 quanta", 1e4, 0.0),
-    ):
-        rng = np.random.default_rng(0)
-        moves = spread * rng.standard_normal((views, 3)) * [1.0, 1.0, np.radians(0.5)]
-        exact = random_ellipsoids(40, 3, 0.4 * columns).project(replace(beam, moves=moves))
-        counts = np.maximum(rng.poisson(photons * np.exp(-2 * exact / exact.max())), 1.0)
-        grid, y = VoxelGrid((rows, columns, columns)), -np.log(counts / photons)
-        found = align_views(beam, grid, y, counts, ["shift"], np.arange(0))
-        error = found.moves - moves
-        object_moves = np.stack([np.cos(beam.angles), np.sin(beam.angles)], 1)
-        error[:, 1] -= object_moves @ np.linalg.lstsq(object_moves, error[:, 1], rcond=None)[0]
-        error[:, 0] -= error[:, 0].mean()
-        along_rows, along_columns, turn = np.sqrt(np.mean(error**2, axis=0))
-        answer[label] = {
-            "rows [pixel]": float(along_rows),
-            "columns [pixel]": float(along_columns),
-            "turn [degree]": float(np.degrees(turn)),
-            "sigma of rows": float(found.sigma[0]),
-            "sigma of columns": float(found.sigma[1]),
-            "used": float(found.is_needed),
-        }
-        say_row(label, **answer[label])
+    photons, spread = MOTION_CASES[label]
+    rng = np.random.default_rng(0)
+    moves = spread * rng.standard_normal((views, 3)) * [1.0, 1.0, np.radians(0.5)]
+    exact = random_ellipsoids(40, 3, 0.4 * columns).project(replace(beam, moves=moves))
+    counts = np.maximum(rng.poisson(photons * np.exp(-2 * exact / exact.max())), 1.0)
+    grid, y = VoxelGrid((rows, columns, columns)), -np.log(counts / photons)
+    found = align_views(beam, grid, y, counts, ["shift"], np.arange(0))
+    error = found.moves - moves
+    object_moves = np.stack([np.cos(beam.angles), np.sin(beam.angles)], 1)
+    error[:, 1] -= object_moves @ np.linalg.lstsq(object_moves, error[:, 1], rcond=None)[0]
+    error[:, 0] -= error[:, 0].mean()
+    along_rows, along_columns, turn = np.sqrt(np.mean(error**2, axis=0))
+    answer = {
+        "rows [pixel]": float(along_rows),
+        "columns [pixel]": float(along_columns),
+        "turn [degree]": float(np.degrees(turn)),
+        "sigma of rows": float(found.sigma[0]),
+        "sigma of columns": float(found.sigma[1]),
+        "used": float(found.is_needed),
+    }
+    say_row(label, **answer)
     return answer
+
+
+measure_motion = SweptQuestion(
+    "How near to the truth are fitted shifts and turns of the views?",
+    lambda size: list(MOTION_CASES),
+    measure_moves,
+    lambda size, found: found,
+)
 
 
 # -- Tables -----------------------------------------------------------------------------------------------------------------

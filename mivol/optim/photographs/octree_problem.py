@@ -158,9 +158,12 @@ class OctreeProblem(SparseProblem, DividedProblem):
     def __post_init__(self) -> None:
         self.scale = SCALES[self.batches.space]
         if self.tree is None:
-            self.grid = RadianceProblem(self.batches, self.box, self.plan.grid, self.seed)
+            self._begin_grid()
         else:
             self._begin_tree(self.tree)
+
+    def _begin_grid(self) -> None:
+        self.tree, self.grid = None, RadianceProblem(self.batches, self.box, self.plan.grid, self.seed)
 
     def _begin_tree(self, tree: Octree) -> None:
         self.tree, self.grid = tree, None
@@ -260,6 +263,8 @@ class OctreeProblem(SparseProblem, DividedProblem):
                 )
             )
         else:
+            if self.grid is None:  # an earlier fit of the same photographs and plan ended as an octree
+                self._begin_grid()
             self.grid.take_step_state(state)
 
     def batch_loss_and_gradient(
