@@ -224,8 +224,8 @@ def reference(arguments: argparse.Namespace) -> None:
 def poses(arguments: argparse.Namespace) -> None:
     """Find the poses of a folder of photographs or of a video, and write them to FOLDER/sparse/0 for mivol optimize.
 
-    COLMAP searches (pip install "mivol[poses]"); nothing is downloaded, and no GPU is needed. Of a video, sharp frames between
-    which the camera moved become photographs in a folder of the video's name. The same command continues after Ctrl-C.
+    COLMAP searches (pip install "mivol[poses]"); nothing is downloaded, and no GPU is needed. From a video, poses takes sharp
+    frames, with a moved camera between them, into a folder of the video's name. The same command continues after Ctrl-C.
     """
     from mivol.photos import video
     from mivol.photos.poses import check_colmap, find_poses
@@ -285,7 +285,7 @@ def sweep(arguments: argparse.Namespace) -> int:
 
 
 def validate(arguments: argparse.Namespace) -> int:
-    """Compare mivol with Mitsuba's path tracer on a scene: bias, z-image, relMSE, gradients and a verdict.
+    """Compare mivol with Mitsuba's path tracer on a scene: bias, z-image (difference / error), relMSE, gradients, verdict.
 
     The exit code is 0 if both agree, 3 if they differ, and 4 if Mitsuba's image is not reliable.
     """
@@ -404,7 +404,7 @@ VERBS: dict[str, Verb] = {
         poses,
         lambda: [
             flag("folder", type=Path, help="folder of photographs, in images/ or in itself; or a video (.mp4, .mov, ...)"),
-            flag("--fps", type=float, help="frames of a video a second, at most (default: 2, and at most 300 in all)"),
+            flag("--fps", type=float, help="most frames per second of a video (default: 2, and at most 300 in all)"),
         ],
     ),
     "optimize": Verb(optimize, optimize_flags, describe_settings),

@@ -16,8 +16,8 @@ WRITTEN_AS = {".npz": "field", ".obj": "mesh"}
 def convert(arguments: argparse.Namespace) -> None:
     """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats; volumes too.
 
-    A field (.npz) is the mivol_sh of a scene, an octree, a hash grid or a NeRF; --to grid, octree, hash or nerf turns one into
-    another, hash and nerf also Gaussians, by a fit to views of the source.
+    A field (.npz) is the mivol_sh of a scene, an octree, a hash grid or a NeRF. --to grid, octree, hash or nerf converts fields
+    into each other. --to hash and --to nerf also take Gaussians; they fit a network to views of the source.
     Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     A scene of pbrt-v4 (.pbrt) becomes Mitsuba XML (.xml) with media of mivol.

@@ -32,10 +32,10 @@ def list_flag(name: str, metavar: str, text: str) -> tuple[tuple[str, ...], dict
     return flag(name, action="append", default=[], metavar=metavar, help=text)
 
 
-def scene_flags(text: str = "scene: Mitsuba XML") -> list[tuple[tuple[str, ...], dict[str, Any]]]:
+def scene_flags(text: str = "scene: Mitsuba XML", metavar: str = "scene") -> list[tuple[tuple[str, ...], dict[str, Any]]]:
     """The flags of the command ``mitsuba`` for a scene."""
     return [
-        flag("scene", type=Path, help=text),
+        flag("scene", type=Path, metavar=metavar, help=text),
         MODE,
         flag("-D", "--define", action="append", default=[], metavar="name=value", help="value of the scene's $name"),
         flag("-a", default="", metavar="path;path", help="more folders with files of the scene"),
@@ -65,10 +65,11 @@ def explain_flags() -> list:
     return [
         *scene_flags(
             "scene (.xml), experiment (.toml), points or Gaussians (.ply, .spz, ...), field (.npz), volume (.vdb, .nrrd, ...), "
-            "scan (HDF5, .xtekct, folder), or photographs (folder, file)"
+            "scan (HDF5, .xtekct, folder), or photographs (folder, file)",
+            "source",
         ),
         flag("-o", "--output", type=Path, help="image (.png, .svg) of the cameras of photographs, and of the boxes"),
-        *model_flags("explain the fit of mivol optimize with this --as"),
+        *model_flags("explain the fit of this model by mivol optimize"),
         list_flag("--set", "key=value", "override a setting of the experiment"),
         DATASET,
         SHAPE,
@@ -86,7 +87,9 @@ def render_flags() -> list:
     from mivol.experiments.render import DRAWN_AS
 
     return [
-        *scene_flags("scene (.xml), radiance field (.npz), points or Gaussians (.ply, .npy, .spz, ...) or volume (.vdb, ...)"),
+        *scene_flags(
+            "scene (.xml), radiance field (.npz), points or Gaussians (.ply, .npy, .spz, ...) or volume (.vdb, ...)", "source"
+        ),
         flag(
             "--look-at", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
             help="for a field, points or a volume: positions of camera and target [length] (default: the view that a fit keeps "
@@ -226,10 +229,11 @@ def view_flags() -> list:
     """Flags of ``mivol view``."""
     return [
         *scene_flags(
-            "run folder, posed photographs, field (.npz), points or Gaussians (.ply, ...), volume (.vdb, ...), or scene (.xml)"
+            "run folder, posed photographs, field (.npz), points or Gaussians (.ply, ...), volume (.vdb, ...), or scene (.xml)",
+            "source",
         ),
         flag("--photos", type=Path, metavar="FOLDER", help="show the cameras of these photographs too"),
         flag("--write", type=Path, metavar="FOLDER", help="write crops and films there (default: nothing is written)"),
-        flag("--port", type=int, default=8080, help="port; a taken one is passed over (default: %(default)s)"),
+        flag("--port", type=int, default=8080, help="port; if it is taken, the next free port (default: %(default)s)"),
         DATASET,
     ]
