@@ -175,6 +175,7 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
         MivolError: a camera for a scene.
     """
     from mivol.back_end import set_variant
+    from mivol.cli.inputs import check_dataset
     from mivol.experiments.render import Framing, PointLook, render_field, render_points, render_volume
     from mivol.files.formats import is_volume as is_volume_file
     from mivol.points.summary import SUFFIXES
@@ -184,6 +185,7 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
     is_volume = not (is_field or is_cloud) and arguments.scene.exists() and is_volume_file(arguments.scene)
     if not (is_cloud or is_field or is_volume) and arguments.look_at is not None:
         raise MivolError(f"{arguments.scene}: --look-at is for a field, points or a volume; a scene has its own cameras.")
+    check_dataset(arguments.scene, arguments.dataset)
     look = PointLook(arguments.points, arguments.radius, arguments.opacity)
     if not is_cloud and look != PointLook():
         raise MivolError(f"{arguments.scene}: --points, --radius and --opacity are for clouds of points: leave them out.")
@@ -192,7 +194,7 @@ def view_without_scene(arguments: argparse.Namespace) -> Callable | None:
     set_variant(arguments.mode)
     camera = Framing(arguments.look_at, arguments.up, arguments.fov, arguments.size and tuple(arguments.size))
     if is_volume:
-        return lambda: render_volume(arguments.scene, camera, arguments.spp, arguments.seed)
+        return lambda: render_volume(arguments.scene, camera, arguments.spp, arguments.seed, arguments.dataset)
     if is_cloud:
         return lambda: (render_points(arguments.scene, camera, look), ["R", "G", "B"])
     return lambda: (render_field(arguments.scene, camera), ["R", "G", "B"])

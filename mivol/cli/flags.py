@@ -104,6 +104,7 @@ def render_flags() -> list:
         flag("--radius", type=float,
              help="radius of discs, or standard deviation of splats [length] (default: half the median distance of points)"),
         flag("--opacity", type=float, default=1.0, help="opacity of points (default: %(default)s)"),
+        DATASET,
         SENSOR,
         flag("-o", "--output", type=Path, help="image, .exr or .png (default: the name of the input with .exr)"),
         flag("--integrator", help="integrator in place of the scene's, with the same max_depth: mivol, volpath, ..."),

@@ -226,7 +226,9 @@ VOLUME_DEPTH, VOLUME_SAMPLES = 100.0, 32
 """Optical depth [1] along the longest edge of a volume's box if all of it had the largest value, and samples per pixel."""
 
 
-def render_volume(path: Path, framing: Framing, spp: int | None = None, seed: int = 0) -> tuple[np.ndarray, list[str]]:
+def render_volume(
+    path: Path, framing: Framing, spp: int | None = None, seed: int = 0, dataset: str | None = None
+) -> tuple[np.ndarray, list[str]]:
     """Render a volume as a smoke of albedo 0.9 in its box, under a sky and a sun, with up to seven scatterings: linear light.
 
     Values are scaled to ``VOLUME_DEPTH``, since a file does not tell the unit of an extinction.
@@ -236,12 +238,14 @@ def render_volume(path: Path, framing: Framing, spp: int | None = None, seed: in
         framing: the camera; without a place, it sees the whole box.
         spp: samples per pixel; None means ``VOLUME_SAMPLES``.
         seed: seed of the random numbers.
+        dataset: name of the grid in a file of several.
 
     Raises:
         MivolError: as :func:`mivol.files.read_volume`, a volume without a positive value, or an invalid camera.
     """
     try:
-        grid = mi.load_dict({"type": "mivol_voxels", "filename": str(path), "use_grid_bbox": True, "signed": True})
+        named = {} if dataset is None else {"grid": dataset}
+        grid = mi.load_dict({"type": "mivol_voxels", "filename": str(path), "use_grid_bbox": True, "signed": True, **named})
     except RuntimeError as error:
         said = describe_error(error)
         raise MivolError(said.partition('"mivol_voxels": ')[2] or said) from None
@@ -254,6 +258,8 @@ def render_volume(path: Path, framing: Framing, spp: int | None = None, seed: in
     make_camera(place, up, fov, size)
     smoke = {"type": "mivol_medium", "sigma_t": grid, "albedo": 0.9, "scale": VOLUME_DEPTH / (top * float((high - low).max()))}
     box = mi.ScalarTransform4f().translate((low + high) / 2).scale((high - low) / 2)
+    # Mitsuba's camera sees from 0.01 to 10,000: neither a cloud in metres nor a cell in metres.
+    far = 2 * float(np.linalg.norm(np.subtract((low + high) / 2, place[:3])) + np.linalg.norm(high - low))
     sun = mi.ScalarVector3f(*(np.cross(np.subtract(place[3:], place[:3]), up) - np.array(up) * np.linalg.norm(high - low)))
     scene = mi.load_dict(
         {
@@ -264,6 +270,8 @@ def render_volume(path: Path, framing: Framing, spp: int | None = None, seed: in
             "sensor": {
                 "type": "perspective",
                 "fov": fov,
+                "near_clip": 1e-6 * far,
+                "far_clip": far,
                 "to_world": mi.ScalarTransform4f().look_at(origin=place[:3], target=place[3:], up=list(up)),
                 "film": {"type": "hdrfilm", "width": size[0], "height": size[1], "pixel_format": "rgb"},
                 "sampler": {"type": "independent", "sample_count": VOLUME_SAMPLES},

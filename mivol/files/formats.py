@@ -335,8 +335,14 @@ LARGEST_DENSE = 1 << 28
 """Size of a sparse volume as a dense array [bytes] up to which its voxels are described one by one."""
 
 
+GRID_NAMES = {".vdb": vdb.name_grids, ".nvdb": nvdb.name_grids}
+"""suffix -> names of the grids of a file."""
+
+
 def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> str:
     """Describe a volume in a few lines: size, values, place, and numbers that no medium takes.
+
+    Without a name, each grid of a file of several grids is described; a grid that is no volume is named with the reason.
 
     Args:
         path, dataset: as of :func:`read_volume`.
@@ -346,6 +352,11 @@ def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> st
         MivolError: as :func:`read_volume`.
     """
     is_sparse = is_sparse_file(path)
+    if is_sparse and not layout and dataset is None:
+        _find_format(path)
+        names = GRID_NAMES[_find_suffix(path, GRID_NAMES)](path)
+        if len(names) > 1:
+            return "\n".join(_describe_grid(path, name) for name in names)
     volume = read_sparse_volume(path, dataset) if is_sparse else read_volume(path, dataset, **layout)
     # Statistics of a large sparse volume count the voxels of its bricks, and 0 outside.
     is_whole = not is_sparse or volume.dense_bytes <= LARGEST_DENSE
@@ -379,6 +390,14 @@ def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> st
     if not finite.all():
         lines.append(f"{np.count_nonzero(~finite)} values are NaN or Inf: no medium takes them")
     return "\n".join([*lines, *(f"assumed: {note}" for note in volume.meta.get("notes", ()))])
+
+
+def _describe_grid(path: Path, name: str) -> str:
+    """Describe one of several grids, or say why it is no volume."""
+    try:
+        return describe_volume(path, name)
+    except MivolError as error:
+        return str(error)
 
 
 def convert_volume(source: Path, target: Path, dataset: str | None = None, **layout: Any) -> str:

@@ -319,7 +319,7 @@ def select_dataset(path: object, dataset: str | None, names: Sequence[str]) -> s
             path,
             f"{len(names)} arrays ({listed})",
             "a single array",
-            "name one by dataset= in Python, by --dataset in mivol explain, or by --set data.data= for a scan",
+            "name one by --dataset, by dataset= in Python, by grid in a scene, or by --set data.data= for a scan",
         )
     if dataset not in names:
         near = difflib.get_close_matches(dataset, names, 1)

@@ -125,6 +125,16 @@ def read_sparse_vdb(path: Path, dataset: str | None = None) -> SparseVolumeData:
     return SparseVolumeData(values, places, size[::-1], grid.place(size, low), offset, grid.describe(path, name, low, active))
 
 
+def name_grids(path: Path) -> list[str]:
+    """The names of the grids of a file, as :func:`read_vdb` takes them.
+
+    Raises:
+        MivolError: a damaged or truncated file.
+    """
+    with _open_file(path) as file:
+        return list(_name_all_grids(_Stream(file, path.stat().st_size, path)))
+
+
 def _open_file(path: Path) -> BinaryIO:
     try:
         return check_file(path).open("rb", buffering=BUFFER)

@@ -127,6 +127,30 @@ def warn_of_misplaced_grids(needs: Needs, survey: SceneSurvey) -> None:
             warnings.warn(f"{facts.misplacement} (this is said once).", RuntimeWarning, stacklevel=2)
 
 
+def find_clipped_view(needs: Needs, sensor: mi.Sensor) -> str:
+    """A sentence if every medium begins behind the sensor's ``far_clip`` (10,000 without it); else empty."""
+    boxes = [boundary.around for boundary in needs.boundaries]
+    if not isinstance(sensor, mi.ProjectiveCamera) or not boxes or None in boxes:
+        return ""
+    eye = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4, -1)[:3, 3, 0]
+    nearest = min(box.distance(eye) * box.longest_edge for box in boxes)
+    if nearest <= sensor.far_clip():
+        return ""
+    return (
+        f"the media begin {nearest:.4g} from the camera, whose far_clip is {sensor.far_clip():.4g}, so that no ray meets them: "
+        "enlarge the far_clip of the sensor"
+    )
+
+
+def warn_of_clipped_view(needs: Needs, sensor: mi.Sensor, survey: SceneSurvey) -> None:
+    """Warn once for each scene and sensor if no ray meets a medium."""
+    if ("clipped", sensor.ptr) in survey.warned or is_recording():
+        return
+    survey.warned.add(("clipped", sensor.ptr))
+    if said := find_clipped_view(needs, sensor):
+        warnings.warn(f"{said} (this is said once).", RuntimeWarning, stacklevel=2)
+
+
 def _is_placement(key: str, owner: object) -> bool:
     """Whether a parameter places a shape or a sensor; colours painted on a mesh do not count."""
     name = key.rsplit(".", 1)[-1]

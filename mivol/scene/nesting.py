@@ -70,6 +70,11 @@ class OrientedBox:
         size = max(np.abs(self.corners).max(), np.abs(other.corners).max())
         return bool((gap < margin * size).all())
 
+    @property
+    def longest_edge(self) -> float:
+        """Length of its longest edge [length]."""
+        return float(np.linalg.norm(self.corners[[4, 2, 1]] - self.corners[0], axis=1).max())
+
     def distance(self, point: np.ndarray) -> float:
         """Distance of a point, over the longest edge [1]; 0 inside. For a sheared box, at most the distance."""
         edges = self.corners[[4, 2, 1]] - self.corners[0]

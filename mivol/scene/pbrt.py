@@ -59,6 +59,10 @@ def convert_pbrt(source: Path | str, target: Path | str) -> str:
 # -- Scene ---------------------------------------------------------------------------------------------------------------
 
 
+PHOTOMETRIC = {"distant": ("illuminance", 1.0), "infinite": ("illuminance", np.pi), "point": ("power", 4 * np.pi)}
+"""Kind of light -> its photometric parameter, and the value for light of luminance (or intensity) 1."""
+
+
 class _Scene:
     """A scene that is written."""
 
@@ -113,8 +117,14 @@ class _Scene:
         """Add a light without a shape."""
         transform, scale = each.state.transform, each.number("scale", 1.0)
         self.counts["emitter"] += 1
-        if "power" in each.parameters or "illuminance" in each.parameters:
-            self.left_out.append(f"power and illuminance of the light {each.type!r}")
+        name, full = PHOTOMETRIC.get(each.type, ("", 1.0))
+        if each.type == "infinite" and "filename" in each.parameters:
+            name = ""  # of an image it is known only after an integral over its upper half
+        self.left_out += [
+            f"{n} of the light {each.type!r}" for n in ("power", "illuminance") if n in each.parameters and n != name
+        ]
+        if name and each.number(name, 0.0) > 0:
+            scale *= each.number(name, 0.0) / full
         if each.type == "infinite" and "filename" in each.parameters:
             sky = self.source.parent / each.text("filename")
             path = self.writer.path_beside(".exr")

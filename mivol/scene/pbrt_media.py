@@ -56,6 +56,10 @@ def to_rgb(value: object, default: float, is_light: bool = False) -> np.ndarray:
         rgb = np.maximum(XYZ_TO_SRGB @ xyz / XYZ_TO_SRGB.sum(axis=1), 0)
         return rgb / max(rgb @ LUMINANCE, 1e-300) if is_light else rgb
     if isinstance(value, str):
+        if value == "stdillum-D65":
+            return np.ones(3)  # the white of sRGB
+        if value == "stdillum-A":
+            return to_rgb({"blackbody": 2856.0}, default, is_light)
         raise refusal("convert_pbrt", f"the spectrum {value!r}", "numbers", "replace it in the scene by an rgb value")
     return np.broadcast_to(np.asarray(value, np.float64), 3)
 

@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, Recordings, is_recording, without_garbage_collection
-from mivol.scene.needs import find_needs, warn_of_misplaced_grids
+from mivol.scene.needs import find_needs, warn_of_clipped_view, warn_of_misplaced_grids
 from mivol.scene.plan import make_plan, read_parts
 from mivol.scene.previews import measure_lamp_noise, measure_media_light, measure_near_light, warn_of_last_order
 from mivol.scene.refusals import parse_aovs
@@ -184,6 +184,7 @@ class Session:
         survey = self._surveyed.survey
         needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
         warn_of_misplaced_grids(needs, survey)
+        warn_of_clipped_view(needs, sensor, survey)
         with dr.suspend_grad():
             needs = measure_media_light(scene, sensor, needs, survey, self.settings)
             needs = measure_near_light(scene, sensor, needs, survey, self.settings)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mivol.cli import main
-from mivol.files import FORMATS, read_volume, write_volume
+from mivol.files import FORMATS, VolumeData, read_volume, write_grids, write_volume
 
 PLACE = np.array([[4.0, 0, 0, -1], [0, 3, 0, 2], [0, 0, 2, 5], [0, 0, 0, 1]])
 VALUES = np.array([0, 0, 0.25, -1, 2, 4, np.nan, 8], np.float32).reshape(2, 2, 2, 1)
@@ -29,6 +29,25 @@ def test_explain_describes_a_volume(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "box: (-1, 2, 5) to (3, 5, 7); voxel (2, 1.5, 1)" in text
     assert "values: -1 to 8, mean 1.893, 28.6 % are 0" in text  # 13.25 / 7, 2 / 7
     assert "1 values are below 0" in text and "1 values are NaN or Inf" in text
+
+
+@pytest.mark.parametrize("suffix", [".vdb", ".nvdb"])
+def test_explain_and_render_take_a_file_of_several_grids(tmp_path: Path, capsys: pytest.CaptureFixture, suffix: str) -> None:
+    """Each grid is described; a picture needs the name of one."""
+    path, soot = tmp_path / f"a{suffix}", VolumeData(np.full((3, 3, 3, 1), 0.5, np.float32), PLACE)
+    write_grids(path, {"density": soot, "flame": VolumeData(np.full((5, 4, 3, 3), 2, np.float32), PLACE)})
+    assert run("explain", path) == 0
+    text = capsys.readouterr().out
+    assert "array 'density'\nvoxels (x, y, z): 3 x 3 x 3, 1 channel" in text
+    assert "array 'flame'\nvoxels (x, y, z): 3 x 4 x 5, 3 channels" in text
+    shown = ("-o", tmp_path / "a.exr", "--spp", 1, "--size", 8, 6)
+    assert run("render", path, *shown) == 1
+    assert "2 arrays ('density', 'flame'), expected a single array; name one by --dataset" in capsys.readouterr().err
+    assert run("render", path, "--dataset", "density", *shown) == 0
+    scene = tmp_path / "a.xml"
+    scene.write_text('<scene version="3.0.0"/>')
+    assert run("render", scene, "--dataset", "density") == 1
+    assert "--dataset names an array of a volume" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

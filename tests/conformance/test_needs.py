@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 
 import drjit as dr
@@ -484,3 +485,18 @@ def test_a_grid_in_another_shape_of_its_medium_is_not() -> None:
     fog = {**medium("mivol_medium", grid_volume("mivol_voxels", values(), PLACE), 0.0), "id": "fog"}
     scene = scene_of(box=box_of(fog, frame_at(10.0)), other=box_of({"type": "ref", "id": "fog"}, PLACE))
     assert "lies outside" not in explain(scene)
+
+
+@pytest.mark.parametrize("far", [28.9, 29.1])
+def test_a_camera_that_ends_before_the_media_is_told(far: float) -> None:
+    """The box begins at 29, in front of the camera."""
+    box = box_of(medium("homogeneous", 1.0), scenes.centred(2 * np.eye(3), (0, 0, 30)))
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    sensor = {"type": "perspective", "far_clip": far, "film": film}
+    scene = mi.load_dict({"type": "scene", "box": box, "sensor": sensor, "sky": {"type": "constant"}})
+    sentence = f"the media begin 29 from the camera, whose far_clip is {far:.4g}"
+    assert (f"warning   {sentence}" in explain(scene)) == (far < 29)
+    integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
+    with pytest.warns(RuntimeWarning, match=sentence) if far < 29 else contextlib.nullcontext():
+        mi.render(scene, integrator=integrator, spp=1)
+    mi.render(scene, integrator=integrator, spp=1)  # warnings are errors in tests: said once

@@ -6,6 +6,7 @@ of its bounds (fourth edition of the book, section 11.4); :func:`look_up` is tha
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -252,6 +253,23 @@ def test_a_sky_keeps_its_directions(tmp_path: Path, two_threads: None) -> None:
     expected = 2 * (np.stack([world[0], world[2], -world[1]]) + 1)
     assert np.abs(np.array(emitter.eval(si)) - expected).max() < 0.2  # a pixel is 0.06 wide, two of them are averaged
     assert unfold_sky(np.ones((8, 8, 3), np.float32)).shape == (16, 32, 3)
+
+
+def test_photometric_lights(tmp_path: Path) -> None:
+    """Illuminance pi of a sky of luminance 1, of a distant light 1; power 4 pi of the intensity 1; named illuminants."""
+    (tmp_path / "a.pbrt").write_text(
+        'WorldBegin LightSource "infinite" "float illuminance" 6 "spectrum L" "stdillum-D65" LightSource "distant" '
+        '"rgb L" [1 2 3] "float illuminance" 7 "float scale" 2 LightSource "point" "float power" 5 "spectrum I" "stdillum-A"'
+    )
+    assert "0 media, 3 lights" in mivol.convert_pbrt(tmp_path / "a.pbrt", tmp_path / "a.xml")
+    text = (tmp_path / "a.xml").read_text()
+    sky, sun, lamp = (np.array(re.search(f'name="{n}" value="([^"]*)"', text)[1].split(), float) for n in LIGHTS)
+    np.testing.assert_allclose(sky, 6 / np.pi, rtol=1e-8)
+    np.testing.assert_allclose(sun, [14, 28, 42], rtol=1e-8)
+    assert lamp @ [0.2126, 0.7152, 0.0722] == pytest.approx(5 / (4 * np.pi)) and lamp[0] > 2 * lamp[2]
+
+
+LIGHTS = ("radiance", "irradiance", "intensity")
 
 
 def test_what_is_left_out_is_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

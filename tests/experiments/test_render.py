@@ -28,12 +28,13 @@ def test_render_in_passes_is_the_mean(variant_rgb, folder: Path, monkeypatch: py
 # -- A volume alone ----------------------------------------------------------------------------------------------------
 
 
-def write_ball(path: Path, factor: float = 1.0) -> Path:
-    """A ball in a box of 2 x 2 x 4, far from the origin."""
+def write_ball(path: Path, factor: float = 1.0, length: float = 1.0) -> Path:
+    """A ball in a box of 2 x 2 x 4 times a length, far from the origin."""
     z, y, x = np.meshgrid(*(np.linspace(-1, 1, 16),) * 3, indexing="ij")
     values = factor * (x * x + y * y + z * z < 0.5).astype(np.float32)
     place = np.diag([2.0, 2.0, 4.0, 1.0])
     place[:3, 3] = 10, -5, 3
+    place[:3] *= length
     write_volume(path, values, place)
     return path
 
@@ -52,6 +53,14 @@ def test_a_volume_is_seen_whole_and_scaled(variant_rgb, tmp_path: Path) -> None:
     side = Framing([11, -20, 5, 11, 0, 5], (0.0, 0.0, 1.0), 30.0, (16, 12))
     moved, _ = render.render_volume(tmp_path / "a.vol", side, spp=16)
     assert moved[6, 8, 0] > 0.04 and not np.array_equal(moved, image)
+
+
+@pytest.mark.parametrize("length", [1e-4, 1e4])
+def test_a_volume_of_any_size_is_seen(variant_rgb, tmp_path: Path, length: float) -> None:
+    """Smaller than the near plane of Mitsuba's cameras (0.01), and behind their far plane (10,000)."""
+    image, _ = render.render_volume(write_ball(tmp_path / "a.vol", length=length), Framing(size=(16, 12)), spp=16)
+    np.testing.assert_allclose(image[0], np.broadcast_to([0.03, 0.05, 0.09], image[0].shape), rtol=1e-5)
+    assert image[6, 8, 0] > 0.1
 
 
 def test_a_volume_without_matter_is_refused(variant_rgb, tmp_path: Path) -> None:
