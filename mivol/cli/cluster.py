@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from mivol.config import Experiment
     from mivol.experiments.fit_kind import Distribution
     from mivol.experiments.render import Passes
-    from mivol.report.sweep_page import SweepRow
     from mivol.scene.load import LoadedScene
     from mivol.validate.reference import Complete
 
@@ -90,32 +89,12 @@ def complete_references(arguments: argparse.Namespace, loaded: LoadedScene) -> I
         yield complete_in_turn
         return
     from mivol.cluster.packages import SceneSource, share_scene
-    from mivol.cluster.reference import complete_on
+    from mivol.cluster.reference import ReferencePage, complete_on
 
     with open_workers(arguments.cluster, arguments.mode, arguments.threads) as pool, status_line() as show:
-        page = ReferencePage(pool, arguments) if arguments.sensor == "all" else lambda rows, is_running: None
+        page = ReferencePage(pool, arguments.output, f"References of {arguments.scene.name}", say)
+        page = page if arguments.sensor == "all" else lambda rows, is_running: None
         yield complete_on(pool, share_scene(pool, scene_source(arguments, SceneSource), loaded), show, page)
-
-
-class ReferencePage:
-    """The page of references under way: views, workers, and repeated work."""
-
-    def __init__(self, pool: Pool, arguments: argparse.Namespace) -> None:
-        self.pool, self.folder, self.written = pool, arguments.output, 0.0
-        self.title = f"References of {arguments.scene.name}"
-
-    def __call__(self, rows: list[SweepRow], is_running: bool) -> None:
-        """Write the page, every few seconds and at the end."""
-        from mivol.experiments.sweep import SECONDS_BETWEEN_PAGES
-        from mivol.report.sweep_page import SweepNews, write_sweep_page
-
-        if is_running and time.monotonic() - self.written < SECONDS_BETWEEN_PAGES:
-            return
-        self.written = time.monotonic()
-        news = SweepNews({}, tuple(self.pool.describe_losses()), self.pool.tabulate(), is_running)
-        page = write_sweep_page(self.folder, self.title, (), rows, news, "references.html")
-        if not is_running:
-            say(f"{page}")
 
 
 @contextmanager

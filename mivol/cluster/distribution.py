@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from mivol.cluster.packages import share_scene
 from mivol.cluster.pool import Pool
-from mivol.cluster.reference import complete_on
+from mivol.cluster.reference import ReferencePage, complete_on
 from mivol.cluster.scene_steps import make_source, share_scene_problem
 from mivol.cluster.steps import StepTimes, share_problem, share_projector
 from mivol.experiments.fit_kind import FitKind
@@ -52,10 +52,13 @@ class ClusterDistribution:
         return problem
 
     def complete_references(self, kind: SceneFit) -> Complete:
-        """The function that renders the references of a fit to images of a scene, which show the truth if it is known."""
+        """The function that renders the references of a fit to images of a scene, which show the truth if it is known; its page
+        stands in the folder of the references."""
         key = getattr(kind.settings.truth, "key", "")
         values = {} if kind.truth is None else {key: kind.truth}
-        return complete_on(self.pool, share_scene(self.pool, make_source(kind, values), kind.loaded), self.show)
+        scene = share_scene(self.pool, make_source(kind, values), kind.loaded)
+        page = ReferencePage(self.pool, kind.context.folder / "references", f"References of {kind.settings.title}")
+        return complete_on(self.pool, scene, self.show, page)
 
     def describe(self) -> str:
         """The workers and the time of a step, in a line; only the workers before the first step."""

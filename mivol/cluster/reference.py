@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -20,8 +21,9 @@ from mivol.cluster.packages import decode_sensor, encode_sensor, open_scene
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.workplace import Workplace
 from mivol.experiments.render import Passes, choose_integrator, render_in_turn
+from mivol.experiments.run_folder import SECONDS_BETWEEN_PAGES
 from mivol.optim.interrupt import InterruptGuard
-from mivol.report.sweep_page import SweepRow
+from mivol.report.sweep_page import SweepNews, SweepRow, write_sweep_page
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.validate.reference import PATHS_PER_PASS, Complete, PreparedReference, ReferenceResult, RenderSetup
@@ -183,6 +185,31 @@ class _Queue:
         """Progress in a line."""
         parts = [f"view {v.number}: {v.reference.run.moments.n} of {v.reference.count_batches()}" for v in self.views if v.sent]
         return f"{self.pool.describe()}, batches of {', '.join(parts[:4])}{', ...' * (len(parts) > 4)}"
+
+
+class ReferencePage:
+    """The page ``references.html`` of references under way: views, workers, and repeated work."""
+
+    def __init__(self, pool: Pool, folder: Path, title: str, say: Show = lambda line: None) -> None:
+        """Choose the place of the page.
+
+        Args:
+            pool: workers.
+            folder: of the page.
+            title: heading.
+            say: receives the path of the page at the end.
+        """
+        self.pool, self.folder, self.title, self.say, self.written = pool, folder, title, say, 0.0
+
+    def __call__(self, rows: list[SweepRow], is_running: bool) -> None:
+        """Write the page, every few seconds and at the end."""
+        if is_running and time.monotonic() - self.written < SECONDS_BETWEEN_PAGES:
+            return
+        self.written = time.monotonic()
+        news = SweepNews({}, tuple(self.pool.describe_losses()), self.pool.tabulate(), is_running)
+        page = write_sweep_page(self.folder, self.title, (), rows, news, "references.html")
+        if not is_running:
+            self.say(f"{page}")
 
 
 # -- Images ------------------------------------------------------------------------------------------------------------------

@@ -5,17 +5,24 @@ Conventions. ``explain`` begins a fit up to its first step. After that, only the
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import msgspec
 
 from mivol import config
 from mivol.back_end import choose_back_end
 from mivol.errors import MivolError
 from mivol.experiments.field_fit import FieldFit
-from mivol.experiments.fit_kind import FitKind, RunContext
+from mivol.experiments.fit_kind import Distribution, FitKind, RunContext
 from mivol.experiments.gaussian_fit import GaussianFit
 from mivol.experiments.octree_fit import OctreeFit
 from mivol.experiments.photo_fit import PhotoFit
-from mivol.experiments.run_folder import CHECKPOINT, BestIterate, RunFolder
+from mivol.experiments.run_folder import CHECKPOINT, SECONDS_BETWEEN_PAGES, BestIterate, RunFolder
 from mivol.experiments.sampled_fit import SampledFit
 from mivol.experiments.scan_fit import ScanFit
 from mivol.experiments.scene_fit import SceneFit
@@ -25,6 +32,7 @@ from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.problem import Problem
 from mivol.report.page import write_page
+from mivol.report.record import write_record
 from mivol.scene.explain import Explanation
 
 KINDS: dict[type, type[FitKind]] = {
@@ -60,7 +68,7 @@ def run_experiment(context: RunContext) -> Path:
     kind = KINDS[type(settings)](context)
     kind.record.notes += context.notes
     run = RunFolder(context.folder, kind.record, context.resume)
-    with run.at_work():
+    with LivePage(kind, run, context.distribution) as page, run.at_work():
         with run.stage(kind.stages.load):
             kind.load(lambda line: None)
             context.progress.say(kind.announcement())
@@ -70,19 +78,67 @@ def run_experiment(context: RunContext) -> Path:
             kind.problem = kind.make_problem() if workers is None else workers.make_problem(kind)
             best = BestIterate(run, kind.best_files())
             kind.prepare(run)
-            fit = complete_fit(kind, run, best)
+            fit = complete_fit(kind, run, best, page.show)
             run.record.notes += best.says() + ([] if workers is None else workers.notes())
         with run.stage(kind.stages.write):
             kind.write_outputs(fit, run, best)
             run.record.tables += [] if workers is None else workers.tables()
             run.remove_newest()
-    page = write_page(context.folder)
+    written = write_page(context.folder)
     context.progress.say([*best.says(), run.summary()])
-    return page
+    return written
 
 
-def complete_fit(kind: FitKind, run: RunFolder, best: BestIterate) -> Fit:
+MOST_SHARE_OF_PAGES = 0.02
+"""Largest share of the time of a fit that its pages take while it runs."""
+
+
+class LivePage:
+    """The page of a fit on a cluster while it runs: curves so far, progress, and a table of the workers. Without a cluster,
+    the page is written at the end only."""
+
+    def __init__(self, kind: FitKind, run: RunFolder, workers: Distribution | None) -> None:
+        self.kind, self.run, self.workers = kind, run, workers
+        self.has_page, self.due = False, time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, fault: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """The page of a stopped run says so, and a browser does not read it again."""
+        if fault is not None and self.has_page:
+            with suppress(MivolError, OSError):
+                write_page(self.run.path)
+
+    def show(self, fit: Fit, iterations: int) -> None:
+        """Write record and page, if they are due."""
+        start = time.monotonic()
+        if self.workers is None or start < self.due:
+            return
+        record = self.run.record
+        said = f"{fit.next_iteration} of {iterations} iterations, {self.workers.describe()}"
+        shown = msgspec.structs.replace(
+            record,
+            timings=record.timings | {self.kind.stages.fit: fit.seconds},
+            notes=[said, *record.notes],
+            tables=[*record.tables, *self.workers.tables()],
+        )
+        write_record(shown, self.run.path)
+        write_page(self.run.path)
+        self.has_page, end = True, time.monotonic()
+        self.due = end + max(SECONDS_BETWEEN_PAGES, (end - start) / MOST_SHARE_OF_PAGES)
+
+
+def complete_fit(
+    kind: FitKind, run: RunFolder, best: BestIterate, tell: Callable[[Fit, int], None] = lambda fit, iterations: None
+) -> Fit:
     """Take all steps of a fit, with metrics and checkpoints, and keep the best iterate.
+
+    Args:
+        kind: the fit, with its problem.
+        run: its folder.
+        best: keeps the best iterate.
+        tell: called after each step, with the number of iterations.
 
     Raises:
         MivolError: a checkpoint of another run, settings refused by the optimizer, or an infinite or NaN loss.
@@ -99,6 +155,7 @@ def complete_fit(kind: FitKind, run: RunFolder, best: BestIterate) -> Fit:
     def observe(fit: Fit) -> None:
         kind.after_step(fit, run, best)
         show(fit)
+        tell(fit, course.iterations)
 
     is_measured = kind.measure is not None
     fit = begin_fit(kind.problem, kind.optimizer(), course, measure=measure if is_measured else None, checkpoint=store)

@@ -42,6 +42,9 @@ EARLIER = "earlier"
 KEPT = (RECORD, METRICS, CHECKPOINT, BEST, "report.html")
 """Files moved to ``earlier/``."""
 
+SECONDS_BETWEEN_PAGES = 5.0
+"""Interval between two pages of a run under way on a cluster."""
+
 
 class RunFolder:
     """A folder, created if missing, with the record of a run.

@@ -27,7 +27,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, Progress, RunContext
 from mivol.experiments.kinds import run_experiment
-from mivol.experiments.run_folder import CHECKPOINT
+from mivol.experiments.run_folder import CHECKPOINT, SECONDS_BETWEEN_PAGES
 from mivol.files.atomic import disk_faults, lock_folder, write_whole_text
 from mivol.report.record import RECORD, find_quantity, read_record
 from mivol.report.sweep_page import SweepNews, SweepRow, write_sweep_page
@@ -201,9 +201,6 @@ Tell = Callable[[SweepNews], None]
 
 Execute = Callable[[Sweep, Iterator[SweepRun], Tell], Iterator[tuple[SweepRun, str]]]
 """Runs combinations, and yields each as it ends, with the reason of a refusal or ""."""
-
-SECONDS_BETWEEN_PAGES = 5.0
-"""Interval between two pages while no run ends."""
 
 
 def run_in_turn(progress: Progress) -> Execute:

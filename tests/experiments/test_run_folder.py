@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +15,10 @@ import pytest
 from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, RunContext
-from mivol.experiments.kinds import run_experiment
+from mivol.experiments.kinds import LivePage, run_experiment
 from mivol.experiments.run_folder import EARLIER, KEPT, BestFiles, BestIterate, RunFolder
 from mivol.files.atomic import whole_file
-from mivol.report.record import RunRecord, read_metrics, read_record
+from mivol.report.record import RunRecord, Table, read_metrics, read_record
 
 
 def folder(path: Path, title: str = "a run", is_resumed: bool = False) -> RunFolder:
@@ -46,6 +47,30 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
         raise KeyError
     with second.at_work():
         assert read_record(first.path).title == "another run"
+
+
+def test_the_page_of_a_fit_on_a_cluster_is_live(tmp_path: Path) -> None:
+    """While the fit runs, the page has the workers and is read again; a stopped run has the last page. Alone: no page."""
+    rows = Table(title="Workers", head=("host",), rows=(("node7",),))
+    workers = SimpleNamespace(describe=lambda: "2 workers, a step takes 9 ms", tables=lambda: [rows])
+    kind, fit = SimpleNamespace(stages=SimpleNamespace(fit="fit")), SimpleNamespace(next_iteration=3, seconds=2.0)
+    for distribution in (None, workers):
+        run = folder(tmp_path)
+        with pytest.raises(KeyError), LivePage(kind, run, distribution) as page, run.at_work():
+            run.begin(0)
+            page.show(fit, 40)
+            page.show(fit, 41)  # too early
+            if distribution is not None:
+                said = (run.path / "report.html").read_text()
+                assert all(words in said for words in ("3 of 40 iterations, 2 workers, a step takes 9", "node7", REFRESH))
+            raise KeyError
+        assert (run.path / "report.html").exists() == (distribution is not None)
+    said = (run.path / "report.html").read_text()
+    assert "Stopped" in said and REFRESH not in said
+    assert run.record.tables == []
+
+
+REFRESH = 'http-equiv="refresh"'
 
 
 def test_the_record_says_what_stopped_a_run(tmp_path: Path) -> None:
