@@ -9,8 +9,9 @@ failing, an import that breaks does not.
     scripts/mutate.py --only '*lattice*'     those whose file, test or list matches
     scripts/mutate.py --random 60 --seed 7   not these: 60 faults drawn from the whole package, and the share that the
                                              tests of their lines notice; from a part of it with --only 'mivol/scene/*';
-                                             without the first 40 with --from 41. The default suite is run once first, to
-                                             record which tests run which line; --lines FILE keeps the recording.
+                                             without the first 40 with --from 41. The default suite is run once first (with
+                                             --slow all tests), to record which tests run which line; --lines FILE
+                                             keeps the recording.
 """
 
 from __future__ import annotations
@@ -184,9 +185,9 @@ def judge_random(args: argparse.Namespace) -> None:
     with copies(args.jobs + 1) as (untouched, *broken):
         recording = args.lines or untouched.parent / "lines"
         if not recording.exists():
-            record_suite(untouched, args.jobs, recording)
-        guards = read_recording(recording, ROOT, group_entries((e.file, e.test) for e in load_entries()))
-        first = Checkout(broken[0], untouched, args.limit, args.rounds)
+            record_suite(untouched, args.jobs, recording, args.slow)
+        guards = read_recording(recording, group_entries((e.file, e.test) for e in load_entries()))
+        first = Checkout(broken[0], untouched, args.limit)
         checkouts = [first, *(replace(first, broken=copy) for copy in broken[1:])]
         report(judge_all(faults, guards, checkouts), len(faults), lambda line: print(line, flush=True))
 
@@ -200,7 +201,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the random choice")
     parser.add_argument("--from", dest="first", type=int, default=1, metavar="N", help="of --random: continue at the Nth fault")
     parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
-    parser.add_argument("--rounds", type=int, default=3, choices=(1, 2, 3), help="of --random: 2 leave out slow tests")
+    parser.add_argument("--slow", action="store_true", help="of --random: record and run slow tests, too")
     parser.add_argument("--lines", type=Path, metavar="FILE", help="of --random: recording to read, or to write if missing")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)

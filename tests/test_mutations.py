@@ -230,8 +230,7 @@ def index() -> guards.Guards:
     names = ("tests/test_b.py::t", "tests/test_b.py::u", "tests/test_b.py::p[1]", "tests/test_a.py::t", "tests/test_b.py::p[2]")
     tests = [guards.RunTest(name, 20.0, size) for name, size in zip(names, (10, 30, 40, 90, 20), strict=True)]
     runners = {("mivol/a.py", 13): [1, 2, 3, 4], ("mivol/a.py", 7): [0], ("mivol/b.py", 13): [0]}
-    texts = {"tests/test_a.py": "", "tests/test_b.py": "from mivol import other, a_b"}
-    return guards.Guards(tests, runners, {"mivol/a.py": ["tests/test_c.py::t"]}, texts)
+    return guards.Guards(tests, runners, {"mivol/a.py": ["tests/test_c.py::t"]})
 
 
 def fault_at(line: int, file: str = "mivol/a.py") -> object:
@@ -244,21 +243,14 @@ def test_the_most_specific_tests_of_a_line_come_first(index) -> None:
     assert found == ["tests/test_a.py::t", "tests/test_b.py::p[2]", "tests/test_b.py::u", "tests/test_b.py::p[1]"]
 
 
-def test_the_first_round_is_short_and_slow_tests_come_last(index, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rounds_have_a_time(index, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guards, "FIRST", 45.0)
     monkeypatch.setattr(guards, "SECOND", 25.0)
     assert index.rounds(fault_at(13), SMALL) == [
         ["tests/test_c.py::t", "tests/test_a.py::t", "tests/test_b.py::p[2]"],
         ["tests/test_b.py::u"],
-        ["-m", "slow", "tests/test_a.py", "tests/test_b.py", "tests/test_c.py"],
     ]
-
-
-def test_a_line_that_no_test_runs_is_left_to_slow_tests_of_its_module(index) -> None:
-    """The files called like it, or that name it."""
-    assert index.rounds(fault_at(13, "mivol/room/b.py"), SMALL) == [[], [], ["-m", "slow", "tests/test_b.py"]]
-    assert index.rounds(fault_at(13, "mivol/other/__init__.py"), SMALL) == [[], [], ["-m", "slow", "tests/test_b.py"]]
-    assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], [], []]
+    assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], []]
 
 
 @pytest.mark.slow
@@ -276,7 +268,7 @@ def test_a_recording_tells_which_tests_run_a_line(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     guards.record_suite(tmp_path, 1, tmp_path / "lines")
-    index = guards.read_recording(tmp_path / "lines", tmp_path, {})
+    index = guards.read_recording(tmp_path / "lines", {})
     source = (tmp_path / "mivol" / "a.py").read_text()
     names = {line: {t.function.rpartition("::")[2] for t in index.find_runners(fault_at(line), source)} for line in (2, 6)}
     assert names == {2: {"test_f", "test_h"}, 6: {"test_g", "test_h"}}
@@ -302,7 +294,7 @@ def checkout(tmp_path: Path, bare_pytest: None) -> object:
 def guards_of_halving(*names: str) -> guards.Guards:
     """Guards by which these tests run every line."""
     tests = [guards.RunTest(f"tests/test_halving.py::{name}", 1.0, 4) for name in names or ("test_red_anyway", "test_half")]
-    return guards.Guards(tests, {("halving.py", line): range(len(tests)) for line in range(1, 5)}, {}, {})
+    return guards.Guards(tests, {("halving.py", line): range(len(tests)) for line in range(1, 5)})
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Which tests guard a line: the tests that run it, the most specific first.
 
-A recording of the default suite (:mod:`mutation.recorder`) tells which lines each test runs, and how long the test takes.
+A recording of the suite (:mod:`mutation.recorder`) tells which lines each test runs, and how long the test takes.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import os
 import pickle
-import re
 import subprocess
 import sys
 import tempfile
@@ -26,9 +25,6 @@ __all__ = ["Guards", "RunTest", "group_entries", "lines_of", "read_recording", "
 FIRST, SECOND = 60.0, 300.0
 """Recorded time of the tests in the first round and in the second [s]."""
 
-MOST_FILES = 8
-"""Files of tests whose slow tests are run."""
-
 
 @dataclass(frozen=True)
 class RunTest:
@@ -45,11 +41,6 @@ class RunTest:
     size: int
 
     @property
-    def file(self) -> str:
-        """File of the test."""
-        return self.name.partition("::")[0]
-
-    @property
     def function(self) -> str:
         """Node id without the parameters."""
         return self.name.partition("[")[0]
@@ -63,13 +54,11 @@ class Guards:
         tests: the tests of the recording.
         runners: indices into ``tests`` by (file of the package, line).
         listed: the tests of the entries of tests/mutations, by file of the package.
-        texts: text of each file of tests.
     """
 
     tests: list[RunTest] = field(default_factory=list)
     runners: dict[tuple[str, int], Iterable[int]] = field(default_factory=dict)
     listed: dict[str, list[str]] = field(default_factory=dict)
-    texts: dict[str, str] = field(default_factory=dict)
 
     def find_runners(self, fault: Fault, source: str) -> list[RunTest]:
         """The tests that run the statement of a fault: tests in files called like the module first, then the most specific.
@@ -79,7 +68,7 @@ class Guards:
         lines = lines_of(source, fault.line)
         found = {k for line in lines for k in self.runners.get((fault.file, line), ())}
         chosen = sorted(
-            (self.tests[k] for k in found), key=lambda t: (not is_named_like(t.file, fault.file), t.size, t.seconds)
+            (self.tests[k] for k in found), key=lambda t: (not is_named_like(t.name, fault.file), t.size, t.seconds)
         )
         variants: Counter[str] = Counter()
         ranks = {}
@@ -89,24 +78,14 @@ class Guards:
         return sorted(chosen, key=lambda t: ranks[t.name] > 0)
 
     def rounds(self, fault: Fault, source: str) -> list[list[str]]:
-        """The arguments of pytest for a fault, round by round.
+        """Names of tests for a fault, round by round; a round may be empty.
 
         1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them;
-        2. more tests that run its line, ``SECOND`` seconds of them;
-        3. the slow tests of the files that are called like its module, that hold tests of its line, or that name its module.
-
-        A round may be empty.
+        2. more tests that run its line, ``SECOND`` seconds of them.
         """
-        runners = self.find_runners(fault, source)
-        first, rest = split_by_time(runners, FIRST)
-        second = split_by_time(rest, SECOND)[0]
-        listed = self.listed.get(fault.file, [])
-        named = [file for file in self.texts if is_named_like(file, fault.file)]
-        naming = [file for file, text in self.texts.items() if re.search(rf"\b{module_name(fault.file)}\b", text)]
-        around = [*named, *(test.file for test in runners), *(name.partition("::")[0] for name in listed), *naming]
-        files = unique(around)[:MOST_FILES]
-        one = unique([*listed, *(test.name for test in first)])
-        return [one, [test.name for test in second if test.name not in one], ["-m", "slow", *files] if files else []]
+        first, rest = split_by_time(self.find_runners(fault, source), FIRST)
+        one = list(dict.fromkeys([*self.listed.get(fault.file, []), *(test.name for test in first)]))
+        return [one, [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]]
 
 
 def split_by_time(tests: Sequence[RunTest], seconds: float) -> tuple[list[RunTest], list[RunTest]]:
@@ -119,20 +98,12 @@ def split_by_time(tests: Sequence[RunTest], seconds: float) -> tuple[list[RunTes
     return list(tests), []
 
 
-def unique(names: Iterable[str]) -> list[str]:
-    """The names without repetition, in their order."""
-    return list(dict.fromkeys(names))
-
-
 def is_named_like(test: str, file: str) -> bool:
-    """Whether a file of tests is called like a module; a package is called like its folder."""
-    return Path(test).stem.removeprefix("test_") == module_name(file)
-
-
-def module_name(file: str) -> str:
-    """The last part of a module's dotted name."""
+    """Whether the file of a test is called like a module; a package is called like its folder."""
     path = Path(file)
-    return path.parent.name if path.stem == "__init__" else path.stem
+    return Path(test.partition("::")[0]).stem.removeprefix("test_") == (
+        path.parent.name if path.stem == "__init__" else path.stem
+    )
 
 
 @cache
@@ -169,8 +140,8 @@ def statements_in(node: ast.AST) -> list[ast.stmt]:
     return [child for block in (*blocks, *handlers, *cases) if isinstance(block, list) for child in block]
 
 
-def record_suite(copy: Path, jobs: int, target: Path) -> None:
-    """Run the default suite of a checkout under the recorder, and write the recording.
+def record_suite(copy: Path, jobs: int, target: Path, slow: bool = False) -> None:
+    """Run the default suite of a checkout under the recorder, or the slow tests as well, and write the recording.
 
     Raises:
         RuntimeError: pytest wrote no recording.
@@ -181,6 +152,7 @@ def record_suite(copy: Path, jobs: int, target: Path) -> None:
         env.pop("PYTEST_XDIST_WORKER_COUNT", None)
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutation.recorder"]
         command += ["-n", str(jobs), "--dist", "worksteal"] if jobs > 1 else ["-p", "no:xdist"]
+        command += ["-m", "slow or not slow"] if slow else []
         done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
         parts = sorted(Path(folder).iterdir())
         if not parts:
@@ -196,11 +168,10 @@ def record_suite(copy: Path, jobs: int, target: Path) -> None:
         target.write_bytes(pickle.dumps((tests, runners)))
 
 
-def read_recording(path: Path, root: Path, listed: dict[str, list[str]]) -> Guards:
+def read_recording(path: Path, listed: dict[str, list[str]]) -> Guards:
     """The guards of a recording of :func:`record_suite`."""
     tests, runners = pickle.loads(path.read_bytes())
-    texts = {str(p.relative_to(root)): p.read_text() for p in sorted((root / "tests").rglob("test_*.py"))}
-    return Guards([RunTest(*test) for test in tests], runners, listed, texts)
+    return Guards([RunTest(*test) for test in tests], runners, listed)
 
 
 def group_entries(entries: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

@@ -47,7 +47,6 @@ class Checkout:
     Attributes:
         broken, untouched: their folders.
         limit: seconds that one test may take before it counts as one that does not end.
-        rounds: how many rounds of :meth:`guards.Guards.rounds` are run: 2 leave out the slow tests.
         green: what is known of tests of the untouched copy; shared by all who judge.
         lock: of ``green``.
     """
@@ -55,7 +54,6 @@ class Checkout:
     broken: Path
     untouched: Path
     limit: float
-    rounds: int = 3
     green: dict[str, bool] = field(default_factory=dict)
     lock: Lock = field(default_factory=Lock)
 
@@ -77,7 +75,7 @@ def run_pytest(copy: Path, arguments: Sequence[str], limit: float) -> tuple[int,
     # The clock runs for one test at a time and ends the process from a thread of its own, whatever a kernel does.
     command += ["-o", f"faulthandler_timeout={limit}", "-o", "faulthandler_exit_on_timeout=true"]
     if all("::" in argument for argument in arguments):
-        command += ["-m", "slow or not slow"]  # entries of tests/mutations name slow tests, too
+        command += ["-m", "slow or not slow"]  # named tests are run, slow or not
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:  # hundreds of tests are too long for a command line
         file.write("\n".join(arguments))
         file.flush()
@@ -92,7 +90,7 @@ def judge_fault(checkout: Checkout, fault: Fault, guards: Guards) -> Verdict:
     whole = file.read_text()
     file.write_text(fault.apply(whole))
     try:
-        for tests in guards.rounds(fault, whole)[: checkout.rounds]:
+        for tests in guards.rounds(fault, whole):
             killed, test = _red(checkout, tests) if tests else (False, "")
             if killed:
                 return Verdict(fault, True, test, time.perf_counter() - start)

@@ -466,6 +466,18 @@ def test_a_reader_of_values_and_place_alone_serves_every_verb(tmp_path: Path, mo
     assert_volume(files.read_volume(target), values, np.eye(4))
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".nrrd"])
+def test_files_are_compressed_unless_asked_otherwise(tmp_path: Path, suffix: str) -> None:
+    """A ramp of 32^3 values shrinks to less than a tenth; stored, it keeps the size of its values."""
+    values = np.broadcast_to(np.arange(32, dtype=np.float32), (32, 32, 32))[..., None]
+    sizes = {}
+    for compress in (True, False):
+        files.write_volume(tmp_path / f"a{suffix}", values, compress=compress)
+        sizes[compress] = (tmp_path / f"a{suffix}").stat().st_size
+    assert sizes[True] < values.nbytes / 10
+    assert suffix == ".nrrd" or sizes[False] >= values.nbytes
+
+
 def test_npy_round_trip_of_a_strided_array(tmp_path: Path) -> None:
     values = made.numbered(4, 4, 4, 3)[::2, :, ::-1]
     files.write_volume(tmp_path / "a.npy", values)

@@ -33,8 +33,8 @@ class RandomScene:
 
     parts: dict
     settings: dict
-    features: list[str] = field(default_factory=list)
-    is_rgb: bool = False
+    features: list[str]
+    is_rgb: bool
 
 
 @dataclass
