@@ -44,9 +44,7 @@ class Coefficients:
             MivolError: both pairs, half of a pair, a negative number, or a radiance field in another place than the emission.
         """
         if "velocity" in props:
-            raise MivolError(
-                "mivol_medium was given a velocity; motion blur is not there yet: leave it out for a still frame."
-            )
+            raise MivolError("mivol_medium was given a velocity; motion blur is not there yet: leave it out for a still frame.")
         given = [n for pair in COEFFICIENT_PAIRS for n in pair if n in props]
         if is_radiance_field(props.get("emission", 0.0)) or _is_made_of_gaussians(props, "emission"):
             return cls._of_field(props, given)
@@ -138,10 +136,12 @@ class Coefficients:
         all channels share a bound, as in stock ``heterogeneous``. A medium that emits stops every ray, see :meth:`eval`.
         """
         if self.lights:
-            return mi.Spectrum(OPAQUE_EXTINCTION)
+            return mi.Spectrum(dr.opaque(mi.Float, OPAQUE_EXTINCTION))
         if self.is_homogeneous:
             return sum((mi.Spectrum(dr.detach(_constant_value(v))) for v in self.extinction), mi.Spectrum(0))
-        return mi.Spectrum(sum(_maximum(v) for v in self.extinction))
+        bound = mi.Float(sum(_maximum(v) for v in self.extinction))
+        dr.make_opaque(bound)
+        return mi.Spectrum(bound)
 
     def reach(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether and where a ray can meet extinction: in the boxes of the grids, or anywhere with a constant part."""

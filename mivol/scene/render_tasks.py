@@ -11,13 +11,15 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mivol.kernel_recording import RecordedTask
+from mivol.kernel_recording import RecordedTask, copy_aligned, is_recording
 from mivol.scene.media_light import MediaLight
 from mivol.scene.needs import Needs
 from mivol.scene.plan import Plan, Readings, build_estimators
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.survey import SceneSurvey
+from mivol.space import lattice_from_world
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.media.medium_view import read_asymmetry
@@ -26,6 +28,7 @@ from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
 from mivol.transport.path.successive import paths_per_lane, walk_successively
 from mivol.transport.path.walk import has_one_segment, walk_path
+from mivol.transport.traversal.box import with_placements
 
 
 @dataclass
@@ -36,6 +39,7 @@ class PreparedArrays:
         readings: what transport reads of the values of media.
         light: table of the light of media (density, cumulative); None without a table.
         views: sensors of a ``batch``; None for another sensor.
+        placements: numbers of boxes, grids and the scene (:func:`prepare_placements`); None while ``dr.freeze`` records.
         asymmetries: the ``g`` of the stock ``hg`` of each medium, which Mitsuba hides from Dr.Jit; None for another phase
             function.
     """
@@ -43,6 +47,7 @@ class PreparedArrays:
     readings: Readings
     light: tuple[mi.Float, mi.Float] | None
     views: mi.SensorPtr | None
+    placements: mi.Float64 | None = None
     asymmetries: list[mi.Float | None] = field(default_factory=list)
 
 
@@ -57,6 +62,7 @@ class PlannedScene:
         needs: facts without arrays: a kept view of a medium would keep the derivatives of an earlier step.
         plan: choices for the scene.
         arrays: arrays made for the plan.
+        places: where groups of numbers are in ``arrays.placements`` (:func:`prepare_placements`).
         unrecorded: why renders are not recorded; None if they are.
     """
 
@@ -66,6 +72,7 @@ class PlannedScene:
     needs: Needs
     plan: Plan
     arrays: PreparedArrays
+    places: dict[bytes, int]
     unrecorded: str | None = None
 
     def read_arrays(self) -> PreparedArrays:
@@ -80,6 +87,26 @@ class PlannedScene:
     def key(self) -> tuple:
         """All that a recording depends on and does not follow."""
         return (*self.plan.decisions, self.needs.camera_inside, *self.state.key)
+
+
+def prepare_placements(needs: Needs, size: float) -> tuple[mi.Float64 | None, dict[bytes, int]]:
+    """The numbers of boxes and grids as one array, for :func:`mivol.transport.traversal.box.with_placements`.
+
+    Args:
+        needs: facts with the views of the media.
+        size: size of the scene [length].
+    """
+    if is_recording():
+        return None, {}
+    groups = [np.array([size], np.float64)]
+    for boundary, view in zip(needs.boundaries, needs.views, strict=True):
+        groups += [box.from_world for box in (boundary.box, boundary.hole) if box is not None]
+        groups += [np.array([boundary.box.edge])] if boundary.box is not None else []
+        lattices = (part.lattice for part in view.parts if part.lattice is not None)
+        groups += [lattice_from_world(lattice.to_world, lattice.res) for lattice in lattices if lattice.to_world is not None]
+    firsts = np.cumsum([0, *(group.size for group in groups)])
+    numbers = copy_aligned(np.concatenate([group.ravel() for group in groups]))
+    return mi.Float64(numbers), {group.tobytes(): int(k) for group, k in zip(groups[::-1], firsts[-2::-1], strict=True)}
 
 
 def find_unrecorded(scene: mi.Scene, sensor: mi.Sensor, spp: int, needs: Needs, plan: Plan, for_images: bool) -> str | None:
@@ -105,13 +132,15 @@ class RenderTask(RecordedTask):
         super().__init__()
         self.survey, self.needs, self.plan = opened.survey, opened.needs, opened.plan
         self.spp, self.settings, self.aovs, self.for_images = opened.spp, settings, aovs, for_images
+        self.places = opened.places
 
     def build_estimators(self, scene: mi.Scene, arrays: PreparedArrays) -> Estimators:
         """Build the planned estimators over the arrays of the scene."""
-        needs = self.needs.with_views(self.survey, arrays.asymmetries)
-        if arrays.light is not None:
-            needs = replace(needs, media_light=MediaLight(*arrays.light))
-        return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, arrays.readings)
+        with with_placements(arrays.placements, self.places):
+            needs = self.needs.with_views(self.survey, arrays.asymmetries)
+            if arrays.light is not None:
+                needs = replace(needs, media_light=MediaLight(*arrays.light))
+            return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, arrays.readings)
 
     def samples(self, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> RenderSamples:
         """The samples of the render."""

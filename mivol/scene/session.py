@@ -32,6 +32,7 @@ from mivol.scene.render_tasks import (
     PreparedArrays,
     RenderTask,
     find_unrecorded,
+    prepare_placements,
     render_tangent,
     zero_radiance,
 )
@@ -194,8 +195,9 @@ class Session:
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
-        arrays = PreparedArrays(read_parts(needs, plan, survey, for_images), light, find_batch_views(sensor))
-        opened = PlannedScene(state, spp, survey, replace(needs, views=(), media_light=None), plan, arrays)
+        placements, places = prepare_placements(needs, survey.size)
+        arrays = PreparedArrays(read_parts(needs, plan, survey, for_images), light, find_batch_views(sensor), placements)
+        opened = PlannedScene(state, spp, survey, replace(needs, views=(), media_light=None), plan, arrays, places)
         known = self._opened.get(for_images)
         if known is not None and (known.spp, known.key) == (spp, opened.key):
             opened.unrecorded = known.unrecorded

@@ -153,7 +153,7 @@ def follow(part: GaussianExtinction, there: RayInterval, t: mi.Float | None, wei
         part.vjp(gradient, [mi.Float(weight)], there)
     else:
         part.vjp_at(gradient, [mi.Float(weight)], there.ray, t, there.active)
-    dr.backward(part.deliver(scale, gradient))
+    dr.backward(dr.sum(dr.ravel(part.scaled(scale)) * part.fold_gradient(gradient)))
     by_name = {name: np.array(dr.grad(tensor)) for name, tensor in tensors.items()} | {"scale": np.array(dr.grad(scale))}
     change = {name: rng.normal(size=value.shape) for name, value in by_name.items()}
     for name, tensor in tensors.items():

@@ -95,7 +95,7 @@ def test_derivatives_are_transposes(name: str, where: str) -> None:
         else:
             jvp = numbers(part.jvp(tangent, RayInterval(ray, t0, t1, on)))
             part.vjp(gradient, weight, RayInterval(ray, t0, t1, on))
-    dr.backward(part.deliver(mi.Float(1), gradient))
+    dr.backward(dr.sum(dr.ravel(part.scaled(mi.Float(1))) * part.fold_gradient(gradient)))
     vjp = np.array(dr.grad(part.values), np.float64).reshape(shape)
     # Each of the terms is rounded a few times: 1e-6 of the sum of their sizes is 16 roundings of float32 each.
     terms = np.abs(jvp * w).sum() + np.abs(v * vjp).sum()
@@ -139,7 +139,7 @@ def test_a_point_has_the_value_times_the_scale():
 def test_a_gradient_is_delivered_to_the_value_and_to_the_scale():
     part, scale = coloured(), mi.Float(4)
     dr.enable_grad(part.constant, scale)
-    dr.backward(part.deliver(scale, mi.Float(1, 2, 4)))
+    dr.backward(dr.sum(dr.ravel(part.scaled(scale)) * part.fold_gradient(mi.Float(1, 2, 4))))
     np.testing.assert_array_equal(np.array(dr.grad(part.constant)).ravel(), [4, 8, 16])
     assert dr.grad(scale)[0] == 0.5 * 1 + 2.0 * 4
 
@@ -186,5 +186,5 @@ def test_a_gradient_reaches_the_scale_and_the_field():
         weight = [mi.Float(1, 1), mi.Float(2, 2), mi.Float(4, 4)]
         part.vjp_at(gradient, weight, upward(), mi.Float(2, 2), mi.Bool(True, False))
     np.testing.assert_array_equal(np.array(dr.grad(part.field.sigma)).ravel(), [2, 4, 8])
-    dr.backward(part.deliver(scale, gradient))
+    dr.backward(dr.sum(dr.ravel(part.scaled(scale)) * part.fold_gradient(gradient)))
     assert dr.grad(scale)[0] == 1.5 + 2 * 0.5 + 4 * 0.25

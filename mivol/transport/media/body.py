@@ -15,13 +15,14 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mivol.errors import MivolError
 from mivol.transport.media.channels import to_part_channels, to_scene_channels, to_spectrum
 from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval, Weight
 from mivol.transport.media.grid_extinction import SummedExtinction, add_to_cell, have_same_cells
 from mivol.transport.media.medium_view import MediumView
-from mivol.transport.traversal.box import UNIT_CUBE, Box, clip_to_ball, clip_to_box, is_in_box
+from mivol.transport.traversal.box import UNIT_CUBE, Box, clip_to_ball, clip_to_box, is_in_box, opaque_numbers
 from mivol.transport.traversal.rays import Ray, point_along
 
 __all__ = [
@@ -62,7 +63,7 @@ class Body:
         )
         self.rows = box.rows() if box is not None else None
         self.hole_rows = hole.rows() if hole is not None else None
-        self.edge = dr.opaque(mi.Float, box.edge) if box is not None else None
+        self.edge = mi.Float(opaque_numbers(np.array([box.edge]))[0]) if box is not None else None
         self.exact_parts = [p for p in view.parts if p.exact_line]
         self.flight_parts = flight_parts(view.parts)
         self.follows, self.follows_albedo = [True] * len(view.parts), True

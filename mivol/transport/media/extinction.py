@@ -79,8 +79,8 @@ class Extinction(Protocol):
     def start_gradient(self) -> Any:
         """A gradient of zero for the ``vjp`` methods to add to."""
 
-    def deliver(self, scale: mi.Float, gradient: Any) -> mi.Float:
-        """A scalar whose derivative by the scale and the parameters is the accumulated gradient."""
+    def fold_gradient(self, gradient: Any) -> mi.Float:
+        """The accumulated gradient of ``scaled(s)``, as a flat array."""
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """``scale`` times the coefficient [1/length] at a point of a ray; 0 outside the part."""
@@ -145,9 +145,8 @@ class ConstantExtinction:
     def start_gradient(self) -> mi.Float:
         return dr.zeros(mi.Float, self.channels)
 
-    def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
-        dr.eval(gradient)
-        return dr.sum(dr.ravel(self.scaled(scale)) * gradient)
+    def fold_gradient(self, gradient: mi.Float) -> mi.Float:
+        return gradient
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
         return self._along(dr.detach(self.constant), _length(interval))
@@ -225,9 +224,8 @@ class BoundedExtinction:
     def start_gradient(self) -> mi.Float:
         return dr.zeros(mi.Float, 1)
 
-    def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
-        dr.eval(gradient)
-        return dr.sum(scale * gradient)
+    def fold_gradient(self, gradient: mi.Float) -> mi.Float:
+        return gradient
 
     def clip(self, interval: RayInterval) -> tuple[mi.Float, mi.Float]:
         """The part [t0, t1] of an interval of a ray inside the box of the field; t1 <= t0 if the interval misses the box."""

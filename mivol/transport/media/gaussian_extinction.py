@@ -79,9 +79,8 @@ class GaussianExtinction:
     def start_gradient(self) -> mi.Float:
         return dr.zeros(mi.Float, ROW_SIZE * self.field.count * (1 + self.blocks))
 
-    def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
-        dr.eval(gradient)
-        return dr.sum(self.scaled(scale) * gradient)
+    def fold_gradient(self, gradient: mi.Float) -> mi.Float:
+        return gradient
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
         def add(tau: mi.Float, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.Float:

@@ -74,10 +74,8 @@ class NodeValues:
     def start_gradient(self) -> NodeGradient:
         return NodeGradient.zeros(self.lattice)
 
-    def deliver(self, scale: mi.Float, gradient: NodeGradient) -> mi.Float:
-        flat = gradient.fold()
-        dr.eval(flat)
-        return dr.sum(dr.ravel(self.scaled(scale)) * flat)
+    def fold_gradient(self, gradient: NodeGradient) -> mi.Float:
+        return gradient.fold()
 
     def add_at_point(self, gradient: NodeGradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d interpolated value of each channel) at a point of a ray to a gradient of the nodes."""
@@ -120,10 +118,8 @@ class GridExtinction(NodeValues):
         backproject_segment(self.lattice, gradient, weight, clip_interval(self.lattice, interval), interval.active)
 
     def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        if self.lattice.bricks is not None:
-            # No second array of scaled values: it would take the memory of the grid.
-            return [dr.detach(scale) * v for v in interpolate_at(self.lattice, dr.detach(self.values), ray, t, active)]
-        return interpolate_at(self.lattice, dr.detach(self.scaled(scale)), ray, t, active)
+        # No array of scaled values: it would take the memory of the grid, and a kernel at each point of a path.
+        return [dr.detach(scale) * v for v in interpolate_at(self.lattice, dr.detach(self.values), ray, t, active)]
 
     def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return interpolate_at(self.lattice, tangent, ray, t, active)

@@ -241,9 +241,8 @@ class OctreeExtinction:
     def start_gradient(self) -> mi.Float:
         return dr.zeros(mi.Float, self.field.leaves * self.channels)
 
-    def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
-        dr.eval(gradient)
-        return dr.sum(self.scaled(scale) * gradient)
+    def fold_gradient(self, gradient: mi.Float) -> mi.Float:
+        return gradient
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
         return self._sum_along(self.values, interval, enough)

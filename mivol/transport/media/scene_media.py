@@ -15,10 +15,12 @@ from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mivol.phase.closed_forms import INV_FOUR_PI, angle_between, eval_hg, sample_hg, scattered_direction
 from mivol.transport.media.body import Body, is_followed
 from mivol.transport.media.channels import to_scene_channels
+from mivol.transport.traversal.box import opaque_numbers
 from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["SceneMedia", "ScenePhases"]
@@ -57,7 +59,7 @@ class SceneMedia:
         self.traces = has_surfaces or bool(self.traced)
         self.channels = 1 if mi.is_monochromatic else max([b.view.channels for b in bodies], default=1)
         self.start, self.locates_camera = start, locates_camera
-        self.size = dr.opaque(mi.Float, size)
+        self.size = mi.Float(opaque_numbers(np.array([size], np.float64))[0])
         self.stops_rays = stops_rays
 
     @cached_property
@@ -151,17 +153,22 @@ class SceneMedia:
 
     def deliver_gradients(self) -> None:
         """End a reverse pass: deliver the gradients of the parts to their parameters."""
-        total = mi.Float(0)
+        pairs = []
         for body in self.bodies:
-            for part, gradient in zip(body.view.parts, body.gradients, strict=True):
-                # The derivative of what is delivered is the gradient, for the values and for the scale alike.
-                total += part.deliver(body.view.scale, gradient)
+            folded = (part.fold_gradient(g) for part, g in zip(body.view.parts, body.gradients, strict=True))
+            pairs += [(dr.ravel(p.scaled(body.view.scale)), g) for p, g in zip(body.view.parts, folded, strict=True)]
             if body.microflakes_gradient is not None:
                 slopes = (dr.gather(mi.Float, body.microflakes_gradient, mi.UInt32(k)) for k in range(6))
-                total += sum(s * g for s, g in zip(body.view.microflakes, slopes, strict=True))
+                pairs += zip(body.view.microflakes, slopes, strict=True)
             body.gradients, body.microflakes_gradient = [], None
-        if dr.grad_enabled(total):
-            dr.backward(total)
+        followed = [(values, gradient) for values, gradient in pairs if dr.grad_enabled(values)]
+        if followed:
+            dr.eval([gradient for _, gradient in followed])
+            # All at once: parts may share edges, which Dr.Jit follows only once.
+            for values, gradient in followed:
+                dr.accum_grad(values, gradient)
+                dr.enqueue(dr.ADMode.Backward, values)
+            dr.traverse(dr.ADMode.Backward)
 
     def start_tangent(self) -> None:
         """Begin a forward pass: take the tangent of each part from the parameters."""

@@ -88,21 +88,22 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
 
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
     stems, collision = walk_stem(replayed, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
-    dr.eval(first, stems.L, collision)
     baseline = estimators.segment.baseline
-    branches, share = _Branches.split(collision, first, USUAL_NOISE if baseline is None else baseline.noise)
+    dr.schedule(stems.L, dL)
+    branching = _Branching.of(collision, first, USUAL_NOISE if baseline is None else baseline.noise)
+    branches = branching.gather(dr.arange(mi.UInt32, n))
     primal, depth = branches.walk(replayed, Primal(dr.zeros(mi.Spectrum, n)))
-    dr.eval(primal.L, depth)
     for L_stem, L_branch in zip(stems.L, primal.L, strict=True):
-        dr.scatter_add(L_stem, L_branch * share, branches.stem, branches.collision.on)
+        dr.scatter_add(L_stem, L_branch * branching.share, branches.stem, branches.collision.on)
+    # One kernel walks the branches, adds their light to the stems, and counts them by length.
+    lengths = _Lengths.of(depth)
+    dr.eval(primal.L, lengths)
 
     # -- Their replays ---------------------------------------------------------------------------------------------------
-    dr.eval(stems.L, dL)
     replay_in_one_kernel(n, lambda: walk_stem(estimators, replayed_sampler, rays.ray, Replay(stems.L, dL)))
-    order = _order_by_length(depth)
-    branches = branches.reorder(order)
-    L, dL_branch = dr.gather(mi.Spectrum, primal.L, order), dr.gather(mi.Spectrum, dL, branches.stem) * share
-    dr.eval(L, dL_branch)
+    order = lengths.sort()
+    branches, L = branching.gather(order), dr.gather(mi.Spectrum, primal.L, order)
+    dL_branch = dr.gather(mi.Spectrum, dL, branches.stem) * branching.share
     replay_in_one_kernel(n, lambda: branches.walk(estimators, Replay(L, dL_branch)))
 
 
@@ -126,6 +127,54 @@ def replay_in_one_kernel(width: int, walk: Callable[[], object]) -> None:
 
 
 @dataclass
+class _Branching:
+    """The collisions at the ends of stems, each with as many branches.
+
+    Attributes:
+        collision: collisions of the stems.
+        sampler: random numbers of the stems.
+        collided: the stems with a collision; the other numbers are left over.
+        count: number of these stems (an array of one number).
+        each: branches of a stem (an array of one number).
+    """
+
+    collision: FirstCollision
+    sampler: SpreadSampler
+    collided: mi.UInt32
+    count: mi.UInt32
+    each: mi.UInt32
+
+    @classmethod
+    def of(cls, collision: FirstCollision, sampler: SpreadSampler, noise: mi.Float | float) -> _Branching:
+        """List the stems with a collision, and choose the number of branches.
+
+        Args:
+            collision, sampler: as in the class.
+            noise: as of :func:`count_branches`.
+        """
+        n = dr.width(collision.on)
+        count, collided = dr.opaque(mi.UInt32, 0), dr.zeros(mi.UInt32, n)
+        place = dr.scatter_inc(count, mi.UInt32(0), collision.on)
+        dr.scatter(collided, dr.arange(mi.UInt32, n), place, collision.on)
+        dr.eval(collision, sampler, collided, count)
+        return cls(collision, sampler, collided, count, count_branches(n, count, noise))
+
+    @property
+    def share(self) -> mi.Float:
+        """Share of each branch in the light of its stem [1]."""
+        return dr.rcp(mi.Float(self.each))
+
+    def gather(self, number: mi.UInt32) -> _Branches:
+        """The branches with these numbers: the branches of a stem have consecutive numbers."""
+        on = number < self.count * self.each
+        stem = dr.gather(mi.UInt32, self.collided, number // self.each, on)
+        sampler = self.sampler.gather(stem).branch(number % self.each, self.each)
+        branches = _Branches(stem, _gather_collisions(self.collision, stem), sampler)
+        branches.collision.on &= on
+        return branches
+
+
+@dataclass
 class _Branches:
     """Branches of paths: a lane for each stem, since a recording cannot depend on their number. The last lanes are off.
 
@@ -138,41 +187,6 @@ class _Branches:
     stem: mi.UInt32
     collision: FirstCollision
     sampler: SpreadSampler
-
-    @classmethod
-    def split(cls, collision: FirstCollision, sampler: SpreadSampler, noise: mi.Float | float) -> tuple[_Branches, mi.Float]:
-        """Split each stem with a collision into branches, side by side.
-
-        Args:
-            collision: the collisions of the stems.
-            sampler: random numbers of the stems.
-            noise: as of :func:`count_branches`.
-
-        Returns:
-            The branches, and the share of each in the light of its stem [1].
-        """
-        n = dr.width(collision.on)
-        rank = dr.cumsum(dr.select(collision.on, mi.UInt32(1), mi.UInt32(0))) - 1
-        count = dr.count(collision.on)
-        collided = dr.zeros(mi.UInt32, n)
-        dr.scatter(collided, dr.arange(mi.UInt32, n), rank, collision.on)
-        each = count_branches(n, count, noise)
-        dr.eval(collided, each, count)
-        number = dr.arange(mi.UInt32, n)
-        on = number < count * each
-        stem = dr.gather(mi.UInt32, collided, number // each, on)
-        sampler = sampler.gather(stem).branch(number % each, each)
-        branches = cls(stem, _gather_collisions(collision, stem), sampler)
-        branches.collision.on &= on
-        dr.eval(branches)
-        return branches, dr.rcp(mi.Float(each))
-
-    def reorder(self, order: mi.UInt32) -> _Branches:
-        """The branches in another order."""
-        stem = dr.gather(mi.UInt32, self.stem, order)
-        branches = _Branches(stem, _gather_collisions(self.collision, order), self.sampler.gather(order))
-        dr.eval(branches)
-        return branches
 
     def walk(self, estimators: Estimators, score: Primal | Replay) -> tuple[Primal | Replay, mi.UInt32]:
         """Walk the branches to their ends; return the score and the number of scattering events of each."""
@@ -187,17 +201,33 @@ def _gather_collisions(collision: FirstCollision, index: mi.UInt32) -> FirstColl
     return FirstCollision(FineRay(o, d, maxt, time, ray.wavelengths), *rest)
 
 
-def _order_by_length(depth: mi.UInt32) -> mi.UInt32:
-    """The indices of paths sorted by length, the longest first (a counting sort)."""
-    n = dr.width(depth)
-    key = MAX_SORTED_LENGTH - dr.minimum(depth, MAX_SORTED_LENGTH)
-    counts = dr.zeros(mi.UInt32, MAX_SORTED_LENGTH + 1)
-    place = dr.scatter_inc(counts, key)
-    dr.eval(place, counts)
-    start = dr.cumsum(counts) - counts
-    order = dr.zeros(mi.UInt32, n)
-    dr.scatter(order, dr.arange(mi.UInt32, n), dr.gather(mi.UInt32, start, key) + place)
-    return order
+@dataclass
+class _Lengths:
+    """The lengths of paths, counted for a sort.
+
+    Attributes:
+        key: 0 for the longest paths.
+        place: number of earlier paths of the same key.
+        counts: number of paths of each key.
+    """
+
+    key: mi.UInt32
+    place: mi.UInt32
+    counts: mi.UInt32
+
+    @classmethod
+    def of(cls, depth: mi.UInt32) -> _Lengths:
+        """Count the paths by their numbers of scattering events. Evaluate the result, with the paths, before :meth:`sort`."""
+        key = MAX_SORTED_LENGTH - dr.minimum(depth, MAX_SORTED_LENGTH)
+        counts = dr.zeros(mi.UInt32, MAX_SORTED_LENGTH + 1)
+        return cls(key, dr.scatter_inc(counts, key), counts)
+
+    def sort(self) -> mi.UInt32:
+        """The indices of the paths, the longest first (a counting sort)."""
+        n, start = dr.width(self.key), dr.prefix_sum(self.counts)
+        order = dr.empty(mi.UInt32, n)
+        dr.scatter(order, dr.arange(mi.UInt32, n), dr.gather(mi.UInt32, start, self.key) + self.place)
+        return order
 
 
 # -- The baseline --------------------------------------------------------------------------------------------------------
@@ -232,10 +262,10 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None
     chosen = clip_camera_ray(dr.gather(mi.Ray3f, rays, index))
 
     # -- Their light, and the light behind each of their collisions ------------------------------------------------------
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(BASELINE_SEED, count)
+    # Numbers of pixels outside of every film.
+    lane, one = dr.arange(mi.UInt32, count), mi.UInt32(1)
+    sampler = SpreadSampler.of_pixels(mi.Vector2i(lane, -1), mi.UInt32(BASELINE_SEED), dr.zeros(mi.UInt32, count), one)
     L = dr.detach(walk_path(estimators, sampler.clone(), chosen, Primal(dr.zeros(mi.Spectrum, count)))[0].L)
-    dr.eval(L)
     sums = BaselineSums(media)
 
     def collect(factor: Factor, light: mi.Spectrum) -> None:
@@ -243,5 +273,6 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None
             factor.shared.collect(sums, light)
 
     sums.add_path(L)
+    dr.eval(L)
     walk_path(estimators, sampler, chosen, Rest(L, collect))
     return sums.finish()

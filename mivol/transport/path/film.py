@@ -129,6 +129,7 @@ def _camera_rays(samples: RenderSamples, base: mi.Sampler, index: int, per_pass:
     film = sensor.film()
     width, height = _sampled_size(film)
     count = width * height * per_pass
+    # Opaque: as a literal, the number would make a kernel of its own for every count of samples.
     lane, each = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, per_pass)
     number = lane // each
     pixel = mi.Vector2i(number % width, number // width)
@@ -137,10 +138,12 @@ def _camera_rays(samples: RenderSamples, base: mi.Sampler, index: int, per_pass:
     pixel += mi.Vector2i(film.crop_offset())
     if base.class_name() == "IndependentSampler":
         # Opaque: with the seed as a literal, the kernel would be compiled anew in every render.
-        seed, first = mi.UInt32(samples.seed), dr.opaque(mi.UInt32, index * per_pass)
+        seed, sample, total = mi.UInt32(samples.seed), lane % each, each
         dr.make_opaque(seed)
-        total = dr.opaque(mi.UInt32, base.sample_count())
-        sampler = SpreadSampler.of_pixels(pixel, seed, first + lane % each, total)
+        if base.sample_count() > per_pass:
+            sample += dr.opaque(mi.UInt32, index * per_pass)
+            total = dr.opaque(mi.UInt32, base.sample_count())
+        sampler = SpreadSampler.of_pixels(pixel, seed, sample, total)
     else:
         # One permutation for all passes; ``advance`` moves on to the next pass.
         sampler = base.clone()

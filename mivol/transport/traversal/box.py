@@ -5,7 +5,9 @@ References: Kay & Kajiya 1986 (slab test).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import drjit as dr
@@ -14,7 +16,20 @@ import numpy as np
 
 from mivol.scene_graph import traverse
 
-__all__ = ["UNIT_CUBE", "Box", "clip_to_ball", "clip_to_box", "fit_ball", "fit_box", "is_in_box", "map_point", "map_vector"]
+__all__ = [
+    "UNIT_CUBE",
+    "Box",
+    "clip_to_ball",
+    "clip_to_box",
+    "fit_ball",
+    "fit_box",
+    "is_in_box",
+    "map_point",
+    "map_vector",
+    "opaque_numbers",
+    "opaque_rows",
+    "with_placements",
+]
 
 
 UNIT_CUBE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -34,12 +49,17 @@ class Box:
     is_round: bool = False
 
     def rows(self) -> list[list[mi.Float64]]:
-        """The (3, 4) map from the world to the unit cube, as opaque arrays, so that boxes in different places share a kernel.
+        """The (3, 4) map from the world to the unit cube (:func:`opaque_rows`).
 
         The arrays are made anew for each render: ``dr.freeze`` cannot record a function using arrays that were made before the
         recording and are not passed to the function.
         """
-        return [[dr.opaque(mi.Float64, float(v)) for v in row] for row in np.linalg.inv(self.to_world)[:3]]
+        return opaque_rows(self.from_world)
+
+    @property
+    def from_world(self) -> np.ndarray:
+        """The (3, 4) map from the world to the unit cube."""
+        return np.linalg.inv(self.to_world)[:3]
 
     @property
     def edge(self) -> float:
@@ -71,6 +91,41 @@ class Box:
         size = np.ptp(theirs, axis=0).max()
         apart = np.linalg.norm(self.corners()[:, None] - theirs[None], axis=-1).min(axis=1)
         return bool(apart.max() <= tolerance * size)
+
+
+_PLACEMENTS: ContextVar[tuple[mi.Float64, dict[bytes, int]] | None] = ContextVar("placements", default=None)
+
+
+@contextmanager
+def with_placements(numbers: mi.Float64 | None, places: dict[bytes, int]) -> Iterator[None]:
+    """Read numbers of :func:`opaque_numbers` from one array inside a ``with`` block.
+
+    A recording takes the array as a single input, in place of a fill for each number.
+
+    Args:
+        numbers: the numbers of all groups; None to make every number anew.
+        places: index of the first number of each group, by the bytes of the group.
+    """
+    token = _PLACEMENTS.set(None if numbers is None else (numbers, places))
+    try:
+        yield
+    finally:
+        _PLACEMENTS.reset(token)
+
+
+def opaque_numbers(values: np.ndarray) -> list[mi.Float64]:
+    """Numbers as arguments of a kernel, so that boxes and grids in different places share one compiled kernel."""
+    numbers, places = _PLACEMENTS.get() or (None, {})
+    first = places.get(values.tobytes())
+    if first is None:
+        return [dr.opaque(mi.Float64, float(v)) for v in values]
+    return [dr.gather(mi.Float64, numbers, mi.UInt32(first + k)) for k in range(len(values))]
+
+
+def opaque_rows(rows: np.ndarray) -> list[list[mi.Float64]]:
+    """A (3, 4) map by :func:`opaque_numbers`."""
+    flat = opaque_numbers(rows.ravel())
+    return [flat[k : k + 4] for k in (0, 4, 8)]
 
 
 def fit_box(shape: mi.Shape) -> Box:

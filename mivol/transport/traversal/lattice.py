@@ -19,7 +19,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.bricks import Bricks
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.traversal.box import clip_to_box, map_point
+from mivol.transport.traversal.box import clip_to_box, map_point, opaque_rows
 from mivol.transport.traversal.rays import Ray
 
 __all__ = ["Lattice", "Mask3", "Segment", "clip_to_grid", "locate_cell", "points_of_piece", "segment_between", "split_float64"]
@@ -59,9 +59,7 @@ class Lattice:
         if np.prod([n + 1 for n in shape[:3]]) * self.channels >= 2**31:
             raise MivolError(f"a grid of shape {shape} was given; at most 2^31 cells and channels are expected: split it.")
         self.to_world = check_affine(self.to_world)
-        # Opaque numbers are arguments of a kernel, so grids in different places share one compiled kernel.
-        rows = lattice_from_world(self.to_world, self.res)
-        self.from_world = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in rows]
+        self.from_world = opaque_rows(lattice_from_world(self.to_world, self.res))
 
     @property
     def res(self) -> tuple[int, int, int]:

@@ -114,15 +114,15 @@ class BaselineSums:
     def __init__(self, media: SceneMedia) -> None:
         self.media, self.blocks = media, MediumBlocks.of(media)
         self._count, self._colours = self.blocks[-1].first + self.blocks[-1].count, dr.size_v(mi.Spectrum)
-        # For each colour and block the sums of w, w L and w L^2, then the number of collisions in each block.
-        self.sums = dr.zeros(mi.Float, (3 * self._colours + 1) * self._count)
-        self.light = dr.zeros(mi.Float, self._colours)
-        dr.eval(self.sums, self.light)
+        # For each colour and block the sums of w, w L and w L^2, the number of collisions in each block, and the mean light of
+        # all paths.
+        self.sums = dr.zeros(mi.Float, (3 * self._colours + 1) * self._count + self._colours)
+        dr.eval(self.sums)
 
     def add_path(self, L: mi.Spectrum) -> None:
         """Add the light of paths, from which the baseline follows if none collides."""
         for c, light in enumerate(to_components(L)):
-            dr.scatter_add(self.light, light / dr.width(L), mi.UInt32(c))
+            dr.scatter_add(self.sums, light / dr.width(L), mi.UInt32((3 * self._colours + 1) * self._count + c))
 
     def add(self, ray: Ray, t: mi.Float64, body: mi.UInt32, weight: mi.Spectrum, L: mi.Spectrum, active: mi.Bool) -> None:
         """Add the collisions of a flight.
@@ -146,39 +146,37 @@ class BaselineSums:
         """The baseline: the mean light of the paths if none has collided."""
         n, colours = self._count, self._colours
         i = dr.arange(mi.UInt32, colours * n)
+        colour = i // n
         W, S, Q = (dr.gather(mi.Float, self.sums, i + k * colours * n) for k in range(3))
+        own = _ratio(S, W)
 
-        # -- The means of all blocks, and of each -----------------------------------------------------------------------------
-        each, totals = dr.arange(mi.UInt32, colours), dr.block_sum(self.sums, n)
-        total_W, total_S, total_Q = (dr.gather(mi.Float, totals, each + k * colours) for k in range(3))
-        total = dr.gather(mi.Float, totals, mi.UInt32(3 * colours))
-        mean = dr.select(total_W > 0, _ratio(total_S, total_W), self.light)
-        mean_i, own = dr.gather(mi.Float, mean, i // n), _ratio(S, W)
+        # -- The sums over all blocks -----------------------------------------------------------------------------------------
+        rows = [W, S, Q, S * own, dr.select(W > 0, mi.Float(1), 0)]
+        totals = dr.zeros(mi.Float, len(rows) * colours + 1)
+        for k, row in enumerate(rows):
+            dr.scatter_add(totals, row, colour + k * colours)
+        dr.scatter_add(totals, dr.gather(mi.Float, self.sums, i + 3 * colours * n, i < n), len(rows) * colours, i < n)
+        total_W, total_S, total_Q, explained, filled = (
+            dr.gather(mi.Float, totals, colour + k * colours) for k in range(len(rows))
+        )
+        total = dr.gather(mi.Float, totals, mi.UInt32(len(rows) * colours))
+        light = dr.gather(mi.Float, self.sums, colour + (3 * colours + 1) * n)
+        mean = dr.select(total_W > 0, _ratio(total_S, total_W), light)
 
         # -- The variance inside the blocks and between them ------------------------------------------------------------------
-        rows = [Q - S * own, W * dr.square(own - mean_i), dr.select(W > 0, mi.Float(1), 0)]
-        inside, spread, filled = _sum_blocks(rows, n)
-        inside, spread = (_ratio(dr.maximum(v, 0), total_W) for v in (inside, spread))
-        inside *= _ratio(total, dr.maximum(total - filled, 1))
+        inside = _ratio(dr.maximum(total_Q - explained, 0), total_W) * _ratio(total, dr.maximum(total - filled, 1))
+        spread = _ratio(dr.maximum(explained - total_S * mean, 0), total_W)
         between = dr.maximum(spread - DEPENDENCE * inside * _ratio(filled, total), 0)
-        informs = W * dr.gather(mi.Float, _ratio(total, total_W) * between, i // n)
-        share = _ratio(informs, informs + dr.gather(mi.Float, DEPENDENCE * inside, i // n))
-        values = mean_i + dr.select(W > 0, share * (own - mean_i), 0)
-        left = dr.sum(Q - 2 * values * S + dr.square(values) * W)
-        baseline = Baseline(self.blocks, values, n, mean, _ratio(dr.maximum(left, 0), dr.sum(total_Q)))
-        dr.eval(baseline.values, baseline.mean, baseline.noise)
-        return baseline
+        informs = W * _ratio(total, total_W) * between
+        share = _ratio(informs, informs + DEPENDENCE * inside)
+        values = mean + dr.select(W > 0, share * (own - mean), 0)
 
-
-def _sum_blocks(rows: list[mi.Float], size: int) -> list[mi.Float]:
-    """The sums over parts of a size, for several arrays of equal width, by one reduction."""
-    width = dr.width(rows[0])
-    parts = width // size
-    all_rows = dr.zeros(mi.Float, len(rows) * width)
-    for k, row in enumerate(rows):
-        dr.scatter(all_rows, row, dr.arange(mi.UInt32, width) + k * width)
-    sums = dr.block_sum(all_rows, size)
-    return [dr.gather(mi.Float, sums, dr.arange(mi.UInt32, parts) + k * parts) for k in range(len(rows))]
+        left, means = dr.opaque(mi.Float, 0), dr.zeros(mi.Float, colours)
+        dr.scatter_add(left, Q - 2 * values * S + dr.square(values) * W, mi.UInt32(0))
+        dr.scatter(means, mean, colour, i == colour * n)
+        dr.eval(values, left, means)
+        known = sum(dr.gather(mi.Float, totals, mi.UInt32(2 * colours + c)) for c in range(colours))
+        return Baseline(self.blocks, values, n, means, _ratio(dr.maximum(left, 0), known))
 
 
 def _ratio(a: mi.Float, b: mi.Float) -> mi.Float:
