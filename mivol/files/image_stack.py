@@ -49,7 +49,7 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None, rows: slice 
     if files[0].suffix.lower() in IMAGES:
         stack = read_images(files, rows)
     elif rows != ALL and (mapped := _map_array(files[0])) is not None:
-        stack = np.asarray(mapped[:, rows], np.float32)
+        stack = np.array(mapped[:, rows], np.float32)
     else:
         stack = read_volume(files[0], dataset).values[..., 0][:, rows]
     check_finite(path, stack)
@@ -120,7 +120,9 @@ def read_images(files: list[Path], rows: slice = ALL) -> np.ndarray:
             pages += list(_read_detector_images(file)[:, rows])
             continue
         if rows != ALL and (mapped := _map_pages(file)) is not None:
-            pages += list(np.asarray(mapped[:, rows], np.float32))
+            # A copy, so that the file is not mapped any more: the pages of many mapped files count as memory of the process.
+            pages += list(np.array(mapped[:, rows], np.float32))
+            del mapped
             continue
         with _opened(file) as image:
             pages += [np.asarray(page, np.float32)[rows] for page in ImageSequence.Iterator(image)]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from false_alarms import assert_same_mean, assert_same_variance, fresh
 
-from mivol.bench.studies.preparation import AXIS_SCANS
+from mivol.bench.studies.preparation import AXIS_SCANS, AxisScan
 from mivol.errors import MivolError
 from mivol.files import write_volume
 from mivol.tomography import cone_axis
@@ -464,3 +464,27 @@ def test_axes_of_twenty_scans(variant_rgb, capsys: pytest.CaptureFixture) -> Non
         assert air is None or abs(air.factor.mean() - scan.air) < 0.01
         assert (air is not None and air.is_needed) or scan.air == 1.0 or scan.radius > 60
     assert np.mean(np.square(z)) < 3.3
+
+
+def test_many_noisy_views_are_averaged(variant_rgb) -> None:
+    """An object wider than a detector of 40 columns, 900 views of 100 quanta: the noise of single views hides their mirror
+    images, the means of eleven show them."""
+    scan = AxisScan(1.4, radius=50, views=900, columns=40, depth=1, photons=100, rows=3, seed=2, head=False)
+    y, weights = to_line_integrals(correct_transmission(*scan.readings()))
+    with pytest.raises(MivolError, match="resemble no mirror images"):
+        axes.axis_from_mirrors(y, scan.beam().angles)
+    found = axes.find_axis(y, weights, scan.beam().angles)
+    assert abs(found.column - scan.column) < 3 * found.uncertainty < 0.3
+
+
+def test_means_of_views_weigh_their_noise() -> None:
+    """Views over 270 degrees that begin at 200: groups of three, by angle; 0 where no view is used."""
+    angles = np.radians(np.mod(200 + np.arange(0, 270, 0.5), 360))
+    y, weights = np.tile(np.arange(540.0)[:, None, None], (1, 1, 60)), np.ones((540, 1, 60))
+    weights[1], weights[3:6] = 4, 0
+    mixed = np.random.default_rng(0).permutation(540)
+    mean, total, at = axes._average_views(y[mixed], weights[mixed], angles[mixed])
+    assert mean.shape == (180, 1, 60) and np.all(total[0] == 6) and np.all(total[1] == 0)
+    assert np.allclose(mean[:3, 0, 0], [(0 + 4 + 2) / 6, 4, 7])
+    assert np.allclose(np.degrees(at[[0, -1]]), [200.5, 469])
+    assert axes._average_views(y[::3], weights[::3], angles[::3])[0].shape == (180, 1, 60)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.files import read_volume, write_volume
+from mivol.files import image_stack, read_volume, write_volume
 from mivol.files.image_stack import read_stack, stack_shape
 from mivol.files.mrc import read_tilt_angles
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
@@ -149,3 +150,22 @@ def test_angles_of_an_mdoc_without_angles_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mdoc").write_text("[ZValue = 0]\nStage = 3\n")
     with pytest.raises(MivolError, match="found 1 sections ZValue, expected a number TiltAngle in each"):
         read_tilt_angles(tmp_path / "a.mdoc")
+
+
+def test_a_file_is_unmapped_before_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows of a thousand float32 files: the pages of files that stay mapped would count as memory of the process."""
+    tifffile = pytest.importorskip("tifffile")
+    for view in range(3):
+        tifffile.imwrite(tmp_path / f"view_{view}.tif", np.full((8, 6), view, np.float32), photometric="minisblack")
+    maps: list[weakref.ref] = []
+    map_pages = image_stack._map_pages
+
+    def watch(file: Path) -> np.ndarray | None:
+        assert all(earlier() is None for earlier in maps)
+        mapped = map_pages(file)
+        maps.append(weakref.ref(mapped._mmap))
+        return mapped
+
+    monkeypatch.setattr(image_stack, "_map_pages", watch)
+    stack = image_stack.read_stack(tmp_path / "view_*.tif", rows=slice(1, 8, 4))
+    assert len(maps) == 3 and np.array_equal(stack, np.arange(3)[:, None, None] * np.ones((3, 2, 6)))
