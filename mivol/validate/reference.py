@@ -31,12 +31,13 @@ from mivol.photos.transforms import write_transforms
 from mivol.scene.description import content_hash
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
 from mivol.scene.sensors import check_film, find_sensor, to_camera
-from mivol.transport.media.medium_view import traverse_medium
 from mivol.validate.moments import Moments
 from mivol.validate.reference_file import (
     ReferenceResult,
     check_identity,
     checkpoint_path,
+    drop_damaged,
+    find_pass_spp,
     read_checkpoint,
     read_reference,
     reference_path,
@@ -44,7 +45,7 @@ from mivol.validate.reference_file import (
     write_checkpoint,
     write_reference,
 )
-from mivol.validate.trust import Doubt, find_doubts
+from mivol.validate.trust import Doubt, RgbExtinction, find_doubts, find_rgb_extinctions, use_channel
 
 # Mitsuba's forward integrators for media.
 INTEGRATORS = ("volpath", "volpathmis")
@@ -162,11 +163,11 @@ def prepare_reference(
     goal = _Goal(target_se, relative, max_spp)
 
     if path != Path(out):
-        _drop_damaged(path)
+        drop_damaged(path)
     finished = _read_finished(path, setup.identity, goal)
     if finished is not None:
         return PreparedReference(setup, goal, path, doubts, sensor, method, finished)
-    setup = setup.with_passes(pass_spp or _stored_pass_spp(path), max_spp)
+    setup = setup.with_passes(pass_spp or find_pass_spp(path), max_spp)
     prepared = PreparedReference(setup, goal, path, doubts, sensor, method)
     prepared.run = _load_state(path, setup)
     return prepared
@@ -443,17 +444,6 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_BatchRun], None]]:
 # -- What is on disk already ------------------------------------------------------------------------
 
 
-def _drop_damaged(path: Path) -> None:
-    """Remove damaged files from a folder whose files mivol names, with a warning."""
-    for file, read in ((path, read_reference), (checkpoint_path(path), read_checkpoint)):
-        try:
-            if file.exists():
-                read(file)
-        except MivolError as error:
-            warnings.warn(f"{file.name} is damaged and made anew: {error}", RuntimeWarning, stacklevel=4)
-            file.unlink()
-
-
 def _read_finished(path: Path, identity: dict[str, Any], goal: _Goal) -> ReferenceResult | None:
     """Read a sufficient reference from disk; None without such a reference."""
     if not path.exists():
@@ -461,14 +451,6 @@ def _read_finished(path: Path, identity: dict[str, Any], goal: _Goal) -> Referen
     found = read_reference(path)
     check_identity(path, found.identity, identity)
     return found if goal.reached(found.batches, found.spp, found.mean, found.variance) else None
-
-
-def _stored_pass_spp(path: Path) -> int | None:
-    """Samples per pass of a stored reference, for continuing to a higher accuracy."""
-    state = checkpoint_path(path)
-    if state.exists():
-        return int(read_checkpoint(state)[0]["identity"]["pass_spp"])
-    return int(read_reference(path).identity["pass_spp"]) if path.exists() else None
 
 
 def _load_state(path: Path, setup: RenderSetup) -> _BatchRun:
@@ -491,56 +473,6 @@ def _check_trust(scene: mi.Scene, sensor: mi.Sensor, accept: bool) -> tuple[Doub
     for doubt in doubts:
         warnings.warn(doubt.sentence, RuntimeWarning, stacklevel=4)
     return tuple(doubts)
-
-
-@dataclass(frozen=True)
-class RgbExtinction:
-    """The parameters of a medium whose extinction differs between channels, with their values."""
-
-    params: mi.SceneParameters
-    values: dict[str, np.ndarray]
-
-    def assign(self, values: dict[str, np.ndarray]) -> None:
-        """Assign other values to the medium, for each key of ``values``."""
-        for key, value in values.items():
-            kind = type(self.params[key])
-            self.params[key] = kind(*value.tolist()) if kind is mi.Color3f else kind(np.ascontiguousarray(value))
-        self.params.update()
-
-
-def find_rgb_extinctions(scene: mi.Scene) -> list[RgbExtinction]:
-    """Find the media whose extinction differs between channels."""
-    media = [m for s in scene.shapes() for m in (s.interior_medium(), s.exterior_medium()) if m is not None]
-    media += [m for s in scene.sensors() if (m := s.get_medium()) is not None]
-    found = []
-    for i, medium in enumerate(media):
-        if any(medium is other for other in media[:i]):
-            continue
-        params = traverse_medium(medium)
-        keys = [k for k in params.keys() if k.partition(".")[0] in ("sigma_t", "sigma_a", "sigma_s")]  # noqa: SIM118
-        values = {key: _copy_values(params[key]) for key in keys}
-        values = {k: v for k, v in values.items() if v.ndim and v.shape[-1] == 3 and np.any(v != v[..., :1])}
-        if values:
-            found.append(RgbExtinction(params, values))
-    return found
-
-
-def _copy_values(value: Any) -> np.ndarray:
-    """Copy the values, channels last."""
-    array = np.array(value)
-    return array.reshape(-1) if isinstance(value, mi.Color3f) else array
-
-
-@contextmanager
-def use_channel(media: list[RgbExtinction], channel: int) -> Iterator[None]:
-    """Give all channels the extinction of ``channel`` inside a ``with`` block."""
-    try:
-        for medium in media:
-            medium.assign({k: np.repeat(v[..., channel : channel + 1], 3, axis=-1) for k, v in medium.values.items()})
-        yield
-    finally:
-        for medium in media:
-            medium.assign(medium.values)
 
 
 def complete_in_turn(prepared: Iterator[PreparedReference]) -> Iterator[ReferenceResult]:

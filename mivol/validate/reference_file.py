@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -325,3 +326,22 @@ def compare(
         nrmse=np.inf if dark else nrmse(mean, reference.mean),
         alpha=alpha,
     )
+
+
+def drop_damaged(path: Path) -> None:
+    """Remove damaged files from a folder whose files mivol names, with a warning."""
+    for file, read in ((path, read_reference), (checkpoint_path(path), read_checkpoint)):
+        try:
+            if file.exists():
+                read(file)
+        except MivolError as error:
+            warnings.warn(f"{file.name} is damaged and made anew: {error}", RuntimeWarning, stacklevel=4)
+            file.unlink()
+
+
+def find_pass_spp(path: Path) -> int | None:
+    """Samples per pass of a stored reference, for continuing to a higher accuracy."""
+    state = checkpoint_path(path)
+    if state.exists():
+        return int(read_checkpoint(state)[0]["identity"]["pass_spp"])
+    return int(read_reference(path).identity["pass_spp"]) if path.exists() else None

@@ -2,16 +2,18 @@
 
 Conventions. A doubt is fatal if the image is wrong, and a remark if the image is right but surprising, or slightly off. All
 cases were reproduced with the 3.9.1 wheel. tests/conformance/test_reference.py checks that each case is still wrong, so a
-release with a correction is noticed. Extinction that differs between channels raises no doubt:
-:func:`mivol.validate.reference.render_reference` renders each channel alone.
+release with a correction is noticed. An extinction that differs between channels raises no doubt:
+:func:`mivol.validate.reference.render_reference` renders each channel alone, inside :func:`use_channel`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -425,3 +427,56 @@ def _crossings(p: np.ndarray, triangles: np.ndarray) -> int:
         v = q @ d * inverse
         t = np.einsum("ij,ij->i", q, e2) * inverse
         return int(np.count_nonzero((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)))
+
+
+# -- Extinctions that differ between channels ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RgbExtinction:
+    """The parameters of a medium whose extinction differs between channels, with their values."""
+
+    params: mi.SceneParameters
+    values: dict[str, np.ndarray]
+
+    def assign(self, values: dict[str, np.ndarray]) -> None:
+        """Assign other values to the medium, for each key of ``values``."""
+        for key, value in values.items():
+            kind = type(self.params[key])
+            self.params[key] = kind(*value.tolist()) if kind is mi.Color3f else kind(np.ascontiguousarray(value))
+        self.params.update()
+
+
+def find_rgb_extinctions(scene: mi.Scene) -> list[RgbExtinction]:
+    """Find the media whose extinction differs between channels."""
+    media = [m for s in scene.shapes() for m in (s.interior_medium(), s.exterior_medium()) if m is not None]
+    media += [m for s in scene.sensors() if (m := s.get_medium()) is not None]
+    found = []
+    for i, medium in enumerate(media):
+        if any(medium is other for other in media[:i]):
+            continue
+        params = traverse_medium(medium)
+        keys = [k for k in params.keys() if k.partition(".")[0] in ("sigma_t", "sigma_a", "sigma_s")]  # noqa: SIM118
+        values = {key: _copy_values(params[key]) for key in keys}
+        values = {k: v for k, v in values.items() if v.ndim and v.shape[-1] == 3 and np.any(v != v[..., :1])}
+        if values:
+            found.append(RgbExtinction(params, values))
+    return found
+
+
+def _copy_values(value: Any) -> np.ndarray:
+    """Copy the values, channels last."""
+    array = np.array(value)
+    return array.reshape(-1) if isinstance(value, mi.Color3f) else array
+
+
+@contextmanager
+def use_channel(media: list[RgbExtinction], channel: int) -> Iterator[None]:
+    """Give all channels the extinction of ``channel`` inside a ``with`` block."""
+    try:
+        for medium in media:
+            medium.assign({k: np.repeat(v[..., channel : channel + 1], 3, axis=-1) for k, v in medium.values.items()})
+        yield
+    finally:
+        for medium in media:
+            medium.assign(medium.values)
