@@ -352,11 +352,8 @@ def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> st
         MivolError: as :func:`read_volume`.
     """
     is_sparse = is_sparse_file(path)
-    if is_sparse and not layout and dataset is None:
-        _find_format(path)
-        names = GRID_NAMES[_find_suffix(path, GRID_NAMES)](path)
-        if len(names) > 1:
-            return "\n".join(_describe_grid(path, name) for name in names)
+    if is_sparse and not layout and dataset is None and len(names := _name_grids(path)) > 1:
+        return "\n".join(_describe_grid(path, name) for name in names)
     volume = read_sparse_volume(path, dataset) if is_sparse else read_volume(path, dataset, **layout)
     # Statistics of a large sparse volume count the voxels of its bricks, and 0 outside.
     is_whole = not is_sparse or volume.dense_bytes <= LARGEST_DENSE
@@ -392,6 +389,12 @@ def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> st
     return "\n".join([*lines, *(f"assumed: {note}" for note in volume.meta.get("notes", ()))])
 
 
+def _name_grids(path: Path) -> list[str]:
+    """The names of the grids of a sparse file."""
+    _find_format(path)
+    return GRID_NAMES[_find_suffix(path, GRID_NAMES)](path)
+
+
 def _describe_grid(path: Path, name: str) -> str:
     """Describe one of several grids, or say why it is no volume."""
     try:
@@ -405,7 +408,7 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
 
     Args:
         source, target: files; a folder may be the source.
-        dataset: as of :func:`read_volume`.
+        dataset: as of :func:`read_volume`; without a name, a ``.vdb`` or ``.nvdb`` keeps all grids in another one.
         layout: ``shape`` and ``dtype`` of raw bytes.
 
     Returns:
@@ -417,6 +420,8 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
     suffix = _find_suffix(target, WRITERS)
     # Between two formats that are sparse themselves, no dense array is made.
     is_sparse = not layout and suffix in SPARSE_READERS and is_sparse_file(source)
+    if is_sparse and dataset is None and len(names := _name_grids(source)) > 1:
+        return _convert_grids(source, target, names)
     volume = read_sparse_volume(source, dataset) if is_sparse else read_volume(source, dataset, **layout)
     place, lost = _keep_place(suffix, volume)
     facts = {"space": volume.meta["space"]} if volume.meta.get("space") else {}
@@ -434,6 +439,32 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
     size = " x ".join(str(n) for n in volume.size)
     line = f"{target}: {size} voxels" + (f"; {suffix} does not hold {' and '.join(lost)}" if lost else "")
     return "\n".join([line, *(f"assumed: {note}" for note in volume.meta.get("notes", ()))])
+
+
+def _convert_grids(source: Path, target: Path, names: Sequence[str]) -> str:
+    """Write all grids of a file; a line says what is lost, and a line for each grid that is no volume why it is left out."""
+    grids, left_out = {}, []
+    for name in names:
+        try:
+            grids[name] = read_sparse_volume(source, name)
+        except MivolError as error:
+            left_out.append(error)
+    if not grids:
+        raise left_out[0]
+    write_grids(target, grids)
+    lost = [f"{' and '.join(found)} of {name}" for name, grid in grids.items() if (found := _name_losses(grid))]
+    line = f"{target}: {', '.join(grids)}" + (f"; {target.suffix} does not hold {', '.join(lost)}" if lost else "")
+    return "\n".join([line, *(f"left out: {error}" for error in left_out)])
+
+
+def _name_losses(volume: VolumeData | SparseVolumeData) -> list[str]:
+    """Names of what reading a volume has changed."""
+    lost = []
+    if np.dtype(str(volume.meta["dtype"]).replace("text", "float32")).name in WIDE_TYPES:
+        lost.append(f"{volume.meta['dtype']} (numbers are rounded to float32)")
+    if volume.meta.get("class") == "level set":
+        lost.append("the distances of the level set (its fog is written)")
+    return lost
 
 
 WIDE_TYPES = ("float64", "int32", "uint32", "int64", "uint64")

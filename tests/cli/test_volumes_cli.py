@@ -13,6 +13,7 @@ import pytest
 from mivol.cli import main
 from mivol.files import FORMATS, VolumeData, read_volume, write_grids, write_volume
 
+CONFORMANCE = Path(__file__).parents[1] / "conformance"
 PLACE = np.array([[4.0, 0, 0, -1], [0, 3, 0, 2], [0, 0, 2, 5], [0, 0, 0, 1]])
 VALUES = np.array([0, 0, 0.25, -1, 2, 4, np.nan, 8], np.float32).reshape(2, 2, 2, 1)
 
@@ -32,14 +33,21 @@ def test_explain_describes_a_volume(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize("suffix", [".vdb", ".nvdb"])
-def test_explain_and_render_take_a_file_of_several_grids(tmp_path: Path, capsys: pytest.CaptureFixture, suffix: str) -> None:
-    """Each grid is described; a picture needs the name of one."""
+def test_verbs_take_a_file_of_several_grids(tmp_path: Path, capsys: pytest.CaptureFixture, suffix: str) -> None:
+    """Each grid is described, and kept in another file of grids; a picture needs the name of one."""
     path, soot = tmp_path / f"a{suffix}", VolumeData(np.full((3, 3, 3, 1), 0.5, np.float32), PLACE)
     write_grids(path, {"density": soot, "flame": VolumeData(np.full((5, 4, 3, 3), 2, np.float32), PLACE)})
     assert run("explain", path) == 0
     text = capsys.readouterr().out
     assert "array 'density'\nvoxels (x, y, z): 3 x 3 x 3, 1 channel" in text
     assert "array 'flame'\nvoxels (x, y, z): 3 x 4 x 5, 3 channels" in text
+    for target in ("b.vdb", "b.nvdb"):
+        assert run("convert", path, tmp_path / target) == 0
+        assert capsys.readouterr().out.strip().endswith(f"{target}: density, flame")
+        np.testing.assert_array_equal(read_volume(tmp_path / target, "flame").values, np.full((5, 4, 3, 3), 2))
+        np.testing.assert_allclose(read_volume(tmp_path / target, "density").to_world, PLACE, atol=1e-12)
+    assert run("convert", path, tmp_path / "b.vol") == 1
+    assert "2 arrays" in capsys.readouterr().err
     shown = ("-o", tmp_path / "a.exr", "--spp", 1, "--size", 8, 6)
     assert run("render", path, *shown) == 1
     assert "2 arrays ('density', 'flame'), expected a single array; name one by --dataset" in capsys.readouterr().err
@@ -87,13 +95,27 @@ def test_formats_convert_into_each_other(tmp_path: Path, capsys: pytest.CaptureF
         np.testing.assert_array_equal(read_volume(tmp_path / f"c{target}").values[..., 2], 3 * values[..., 0])
 
 
+def test_convert_leaves_out_grids_that_are_no_volumes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Of OpenVDB's own file: types of numbers, and masks, a frustum and points."""
+    file = tmp_path / "a.vdb"
+    file.write_bytes(gzip.decompress((CONFORMANCE / "openvdb_10_types.vdb.gz").read_bytes()))
+    assert run("convert", file, tmp_path / "b.nvdb") == 0
+    first, *left_out = capsys.readouterr().out.strip().splitlines()
+    assert "float64 (numbers are rounded to float32) of double" in first
+    assert len(left_out) == 3 and all(line.startswith("left out: ") for line in left_out)
+    assert "the grid 'mask'" in left_out[0] and "NonlinearFrustumMap" in left_out[1] and "the points 'points'" in left_out[2]
+    for name in ("double", "int32"):
+        values = [read_volume(path, name).values for path in (file, tmp_path / "b.nvdb")]
+        np.testing.assert_array_equal(*values)
+
+
 def test_convert_says_what_is_rounded_and_clipped(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Numbers wider than float32, and the distances of a level set (of OpenVDB's own file)."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["one"] = np.ones((2, 3, 4))
     assert run("convert", tmp_path / "a.h5", tmp_path / "a.vdb") == 0
     assert ".vdb does not hold float64 (numbers are rounded to float32)" in capsys.readouterr().out
-    packed = Path(__file__).parents[1] / "conformance" / "openvdb_10.vdb.gz"
+    packed = CONFORMANCE / "openvdb_10.vdb.gz"
     (tmp_path / "b.vdb").write_bytes(gzip.decompress(packed.read_bytes()))
     assert run("convert", tmp_path / "b.vdb", tmp_path / "b.nvdb", "--dataset", "ball") == 0
     assert ".nvdb does not hold the distances of the level set (its fog is written)" in capsys.readouterr().out
