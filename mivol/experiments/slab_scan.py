@@ -335,11 +335,8 @@ def run_slabs(context: RunContext) -> Path:
         context.progress.say([*plan.source.notes, *(f"{line.choice}, because {line.reason}" for line in plan.choices)])
         run.begin(0)
         run.make("volumes")
-        with run.stage("rows of the preview"):
-            rows = preview_rows(plan)
-            data = plan.source.read(rows)
         with run.stage("preview"):
-            caption = _write_preview(plan, data, rows.step, run.path)
+            caption = _write_preview(plan, preview_rows(plan), run.path)
             record.images.append(Image(path=PREVIEW, role="picture", caption=caption))
             context.progress.say([f"{run.path / PREVIEW}: {caption}"])
         with run.stage("slabs"):
@@ -395,19 +392,15 @@ def reconstruct_slab(plan: SlabPlan, layers: slice) -> np.ndarray:
         return np.zeros((layers.stop - layers.start, *slab.shape[1:]), np.float32)
     data, solve = plan.source.read(rows), plan.settings.solve
     if solve.name in DIRECT:
-        volume = _reconstruct_directly(data, slab, solve)
+        volume = _reconstruct_directly(Projector(data.geometry, slab), interpolate_gaps(data.y, data.weights), solve)
     else:
         volume = _iterate(plan.settings, data, slab)
     return volume[layers.start - wide.start :][: layers.stop - layers.start]
 
 
-def _reconstruct_directly(
-    data: Projections, slab: VoxelGrid, solve: config.SolveSettings, views: np.ndarray | None = None, cutoff: float = 1.0
-) -> np.ndarray:
-    method = filtered_backprojection if isinstance(data.geometry, ParallelBeam) else feldkamp
-    y = interpolate_gaps(data.y, data.weights)
-    y = y if views is None else y[views]
-    return method(Projector(data.geometry, slab, views), y, solve.window, solve.cutoff * cutoff)
+def _reconstruct_directly(projector: Projector, y: np.ndarray, solve: config.SolveSettings, cutoff: float = 1.0) -> np.ndarray:
+    method = filtered_backprojection if isinstance(projector.geometry, ParallelBeam) else feldkamp
+    return method(projector, y, solve.window, solve.cutoff * cutoff)
 
 
 def _iterate(settings: config.ScanExperiment, data: Projections, slab: VoxelGrid) -> np.ndarray:
@@ -431,9 +424,23 @@ def preview_rows(plan: SlabPlan) -> slice:
     return slice(step // 2, rows, step)
 
 
-def _write_preview(plan: SlabPlan, data: Projections, step: int, folder: Path) -> str:
+def _read_lines(plan: SlabPlan, rows: slice, views: np.ndarray) -> np.ndarray:
+    """Line integrals (views, rows, cols), float32, of some rows and views. Half of the memory limits the rows read at once."""
+    n_views, n_rows, columns = plan.source.beam.shape
+    chosen = range(n_rows)[rows]
+    budget = (plan.settings.slabs.memory * 2**30 - BASE_BYTES) / 2
+    at_once = max(1, int(budget / (RAY_BYTES["direct"] * n_views * columns)))
+    lines = np.empty((len(views), len(chosen), columns), np.float32)
+    for first in range(0, len(chosen), at_once):
+        part = chosen[first : first + at_once]
+        data = plan.source.read(slice(part.start, part.stop, part.step))
+        lines[:, first : first + len(part)] = interpolate_gaps(data.y, data.weights)[views]
+    return lines
+
+
+def _write_preview(plan: SlabPlan, rows: slice, folder: Path) -> str:
     """Write every eighth slice from some rows, coarse enough for half a minute; return a caption."""
-    beam, grid = plan.source.beam, plan.grid
+    beam, grid, step = plan.source.beam, plan.grid, rows.step
     layers = grid.select_layers(slice(step // 2, grid.shape[0], step))
     weight = 1 if isinstance(beam, ParallelBeam) else 8
     updates = weight * layers.size * beam.shape[0]
@@ -444,7 +451,9 @@ def _write_preview(plan: SlabPlan, data: Projections, step: int, folder: Path) -
     views = np.arange(0, beam.shape[0], coarse)
     solve = plan.settings.solve if plan.settings.solve.name in DIRECT else config.SolveSettings()
     try:
-        volume = _reconstruct_directly(data, small, solve, views, 1 / coarse)
+        projector = Projector(beam.select_rows(rows), small, views)
+        check_directions(projector)
+        volume = _reconstruct_directly(projector, _read_lines(plan, rows, views), solve, 1 / coarse)
     except MivolError as error:
         return f"no preview: {error}"
     write_volume(folder / "volumes/preview.npz", volume, small.to_world, compress=False)

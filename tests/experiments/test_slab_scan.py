@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments import slab_scan
+from mivol.experiments.projections import Projections
 from mivol.experiments.slab_scan import plan_slabs, reconstruct_slab, rows_of_slab
 from mivol.files import read_volume, write_volume
 from mivol.files.image_stack import read_stack, stack_shape
@@ -64,6 +66,25 @@ def test_a_slab_reads_the_rows_that_it_needs() -> None:
     rows = rows_of_slab(cone, VoxelGrid((1, 2, 2), 1.0, (0.0, 0.0, 6.0)))
     near, far = 6 * 12 / (6 - 0.5 * np.sqrt(2)), 6 * 12 / (6 + 0.5 * np.sqrt(2))
     assert rows.start - 20 <= far and rows.stop - 1 - 20 >= near - 0.3 and rows.stop - rows.start <= 5
+
+
+def test_the_preview_reads_a_few_rows_at_once(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of a memory of 12 rows beyond the base: six rows at once, the same line integrals as of all rows."""
+    (tmp_path / "fit.toml").write_text(SCAN + PARALLEL + ROWS)
+    plan = plan_slabs(config.load(tmp_path / "fit.toml", []), tmp_path)
+    row = slab_scan.RAY_BYTES["direct"] * 40 * 24
+    monkeypatch.setattr(slab_scan, "BASE_BYTES", 2**30 - 12 * row)
+    read, views, counts = plan.source.read, np.arange(0, 40, 3), []
+
+    def watch(rows: slice) -> Projections:
+        data = read(rows)
+        counts.append(data.y.shape[1])
+        return data
+
+    plan = replace(plan, source=replace(plan.source, read=watch))
+    lines = slab_scan._read_lines(plan, slice(1, 24, 2), views)
+    assert counts == [6, 6] and lines.dtype == np.float32
+    np.testing.assert_array_equal(lines, read(slice(1, 24, 2)).y[views].astype(np.float32))
 
 
 def test_rows_and_layers_are_where_they_were() -> None:
