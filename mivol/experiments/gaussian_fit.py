@@ -9,6 +9,7 @@ References: Kerbl et al. 2023, section 5.1 (first scales from the nearest neighb
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,13 +26,13 @@ from mivol.experiments.fit_kind import Stages
 from mivol.experiments.photo_fit import PhotoFit, describe_free_space
 from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.optim.gaussians.density_control import CloudArrays
-from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory
+from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory, scene_extent
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, project, rays, rectify
-from mivol.photos.region import FEWEST_POINTS, count_views, is_free_space, median_distance, points_in_box
+from mivol.photos.region import FEWEST_POINTS, count_views, is_free_space, points_in_box, viewing_distance
 from mivol.points import Gaussians, write_gaussians
 from mivol.points.gaussians import to_base_harmonics
 from mivol.report.record import PlanLine, Table
@@ -190,8 +191,13 @@ def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: Gaussian
     is_capture = settings.photos.background == "" and any(view.alpha is None for view in views)
     if is_capture:
         plan = adapt_to_few(plan, len(views)) if settings.gaussians.degree is None else plan
-        plan = replace(plan, reach=median_distance([view.camera for view in views], photos.box.mean(axis=0)))
+        plan = replace(plan, reach=viewing_distance([view.camera for view in views], photos.box))
     places, whence = find_start_points(photos, plan.start, settings.seed, is_capture)
+    cloud = make_start_cloud(places, views, plan.stages[0].degree)
+    if is_capture:
+        behind = make_background_cloud(views, plan.stages[0].degree)
+        cloud = {name: np.concatenate([array, behind[name]]) for name, array in cloud.items()}
+        whence += f", {len(behind['means'])} on a sphere far behind them for the background"
     largest = max(view.camera.size[0] * view.camera.size[1] for view in views)
     if settings.gaussians.minutes is not None:
         plan = plan.in_minutes(settings.gaussians.minutes, largest)
@@ -199,10 +205,9 @@ def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: Gaussian
     channels = 4 if all(view.alpha is not None for view in views) else 3
     sizes = {stage.shrink for stage in plan.stages}
     taken = sum(view.image.size // 3 * channels // shrink**2 for view in views for shrink in sizes)
-    memory = check_memory(replace(plan, start=len(places)), taken, pixels)
+    memory = check_memory(replace(plan, start=len(cloud["means"])), taken, pixels)
     batches = RayBatches.from_photos(views, [stage.shrink for stage in plan.stages])
-    cloud = make_start_cloud(places, views, plan.stages[0].degree)
-    lines = explain_plan(plan, photos, len(places), whence, memory, plan.minutes(largest))
+    lines = explain_plan(plan, photos, len(cloud["means"]), whence, memory, plan.minutes(largest))
     return GaussianStart(views, plan, batches, cloud, lines)
 
 
@@ -254,9 +259,9 @@ SHARE = 0.5
 def find_start_points(photos: Photos, count: int, seed: int, has_surroundings: bool = False) -> tuple[np.ndarray, str]:
     """Initial positions (N, 3) [length], and a description of their source.
 
-    The points of a reconstruction unchanged, if it has enough; otherwise ``count`` random points in the box. With alpha, the
-    random points avoid places that are transparent in some view. With surroundings, ``count`` more points stand along random
-    rays of the photographs, for what has no reconstructed points and for the background.
+    The points of a reconstruction in the box, if it has enough; otherwise ``count`` random points in the box. With alpha, the
+    random points avoid places that are transparent in some view. With surroundings, all points of the reconstruction are used,
+    and ``count`` more points stand along random rays of the photographs, for what has no reconstructed points.
 
     Raises:
         MivolError: alpha leaves no part of the box.
@@ -264,8 +269,8 @@ def find_start_points(photos: Photos, count: int, seed: int, has_surroundings: b
     rng = np.random.default_rng((seed, 1))
     points = photos.survey.points
     if points is not None and len(points) >= FEWEST_POINTS:
-        places = points_in_box(points, photos.box)
-        whence = f"{len(places)} points of the reconstruction in the box"
+        places = points if has_surroundings else points_in_box(points, photos.box)
+        whence = f"{len(places)} points of the reconstruction" + " in the box" * (not has_surroundings)
     elif any(view.alpha is None for view in photos.views):
         places, whence = rng.uniform(*photos.box, (count, 3)), f"{count} random points in the box"
     else:
@@ -297,7 +302,7 @@ SURROUNDINGS = 0.5, 8.0
 def draw_surroundings(photos: Photos, count: int, rng: np.random.Generator) -> np.ndarray:
     """Random points (N, 3) along rays of the photographs [length]; at most ``count``, outside free space."""
     cameras = [view.camera for view in photos.views]
-    reach = median_distance(cameras, photos.box.mean(axis=0))
+    reach = viewing_distance(cameras, photos.box)
     chosen = rng.integers(0, len(cameras), count)
     places, distances = rng.uniform(0, 1, (count, 2)), np.exp(rng.uniform(*np.log(SURROUNDINGS), count))
     drawn = []
@@ -306,6 +311,33 @@ def draw_surroundings(photos: Photos, count: int, rng: np.random.Generator) -> n
         drawn.append(o + reach * distances[chosen == number, None] * d)
     points = np.concatenate(drawn)
     return points[~is_free_space(cameras, points, reach)]
+
+
+BACKGROUND, DIRECTIONS, BACKGROUND_OPACITY = 9.0, 1600, 0.9
+"""Gaussians behind everything: their distance from the cameras [extent], their number for all directions,
+and their initial opacity."""
+
+
+def make_background_cloud(views: Sequence[Photo], degree: int) -> CloudArrays:
+    """Large Gaussians on a sphere around the cameras, in the directions that photographs see, with their mean colour.
+
+    They show what lies behind all points: sky, walls, windows. Their scale is 0.7 of their distance from each other, so that
+    they cover the sphere.
+
+    Args:
+        views: photographs.
+        degree: of the harmonics.
+    """
+    cameras = [view.camera for view in views]
+    # A spiral of equal steps along the axis has a point for each equal area of the sphere.
+    index = np.arange(DIRECTIONS) + 0.5
+    polar, turn = np.arccos(1 - 2 * index / DIRECTIONS), math.pi * (1 + math.sqrt(5)) * index
+    unit = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+    radius = BACKGROUND * scene_extent(cameras)
+    places = np.mean([camera.origin for camera in cameras], axis=0) + radius * unit
+    places = places[count_views(cameras, places) > 0]
+    apart = radius * math.sqrt(4 * math.pi / DIRECTIONS)
+    return _round_cloud(places, np.full(len(places), 0.7 * apart), BACKGROUND_OPACITY, views, degree)
 
 
 def make_start_cloud(places: np.ndarray, views: Sequence[Photo], degree: int) -> CloudArrays:
@@ -324,6 +356,11 @@ def make_start_cloud(places: np.ndarray, views: Sequence[Photo], degree: int) ->
     far = cKDTree(places).query(places, k=4)[0][:, 1:]
     # Coincident points would have no size, and no derivative of the size.
     scale = np.maximum(np.sqrt((far**2).mean(axis=1)), 1e-3 * np.median(far))
+    return _round_cloud(places, scale, OPACITY, views, degree)
+
+
+def _round_cloud(places: np.ndarray, scale: np.ndarray, opacity: float, views: Sequence[Photo], degree: int) -> CloudArrays:
+    """Round Gaussians at places (N, 3), of scales (N,) [length] and one opacity, with the mean colour of the views."""
     harmonics = np.zeros((len(places), (degree + 1) ** 2, 3), np.float32)
     harmonics[:, 0] = to_base_harmonics(_mean_colour(views, places))
     quaternions = np.zeros((len(places), 4), np.float32)
@@ -332,7 +369,7 @@ def make_start_cloud(places: np.ndarray, views: Sequence[Photo], degree: int) ->
         "means": places.astype(np.float32),
         "log_scales": np.repeat(np.log(scale)[:, None], 3, axis=1).astype(np.float32),
         "quaternions": quaternions,
-        "opacity_logits": np.full(len(places), logit(OPACITY), np.float32),
+        "opacity_logits": np.full(len(places), logit(opacity), np.float32),
         "harmonics": harmonics,
     }
 

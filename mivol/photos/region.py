@@ -65,10 +65,18 @@ def find_focus(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarra
     Raises:
         MivolError: parallel axes or a single view, for which no point is nearest.
     """
+    focus = _nearest_point(cameras)
+    if focus is None:
+        raise refusal(name, "cameras that all look in one direction", "views that cross", "give the box with box=")
+    return focus
+
+
+def _nearest_point(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """The point of :func:`find_focus`; None for parallel axes."""
     across = [np.eye(3) - (0 if isinstance(c.distortion, Panorama) else np.outer(c.forward, c.forward)) for c in cameras]
     total = np.sum(across, axis=0)
     if np.linalg.eigvalsh(total)[0] < PARALLEL * len(cameras):
-        raise refusal(name, "cameras that all look in one direction", "views that cross", "give the box with box=")
+        return None
     return np.linalg.solve(total, np.sum([a @ c.origin for a, c in zip(across, cameras, strict=True)], axis=0))
 
 
@@ -125,6 +133,16 @@ def middle_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarra
 def median_distance(cameras: Sequence[Camera], point: np.ndarray) -> float:
     """Return the median distance of the cameras from a point (3,) [length]."""
     return float(np.median([np.linalg.norm(camera.origin - point) for camera in cameras]))
+
+
+def viewing_distance(cameras: Sequence[Camera], box: np.ndarray) -> float:
+    """Return the median distance of the cameras from what they look at [length].
+
+    That is their focus (:func:`find_focus`), which a box (2, 3) of reconstructed points may miss by far: a room's points lie
+    all around. For parallel cameras the middle of the box takes its place.
+    """
+    focus = _nearest_point(cameras)
+    return median_distance(cameras, box.mean(axis=0) if focus is None else focus)
 
 
 def near_and_far(cameras: Sequence[Camera], box: np.ndarray) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from mivol.photos.region import (
     nested_boxes,
     points_in_box,
     shared_box,
+    viewing_distance,
 )
 from mivol.validate.metrics import fit_colours, score_image
 
@@ -49,6 +50,18 @@ def test_the_middle_box_of_a_tele_lens_is_what_its_frames_share() -> None:
     np.testing.assert_allclose(middle_box(around), MIDDLE * reach * np.array([[-1.0] * 3, [1.0] * 3]), atol=1e-9)
     with pytest.raises(MivolError, match='views without a shared region, .*; choose box = "middle"'):
         shared_box(around)
+
+
+def test_the_viewing_distance_does_not_follow_far_points() -> None:
+    """A box of points around a room has its middle elsewhere; parallel cameras have only the box."""
+    room = np.array([[-10.0, -10, -10], [90, 50, 30]])
+    assert viewing_distance(cameras(9), room) == pytest.approx(DISTANCE, rel=1e-9)
+    parallel = [
+        Camera(c.K, c.size, np.vstack([np.hstack([np.eye(3), [[k], [0], [0]]]), [0, 0, 0, 1]]), name=c.name)
+        for k, c in enumerate(cameras(3))
+    ]
+    middle = room.mean(axis=0)
+    assert viewing_distance(parallel, room) == pytest.approx(np.linalg.norm(middle - [1, 0, 0]), rel=1e-9)
 
 
 @pytest.mark.parametrize(("focal", "within"), [(96.0, 1.0), (48.0, 1.0), (19.2, 0.35 * 19.2 / 16), (6.4, 0.25)])

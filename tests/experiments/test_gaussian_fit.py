@@ -18,14 +18,20 @@ from tiny_experiment import assert_explained, resume_stopped_fit
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.gaussian_fit import adapt_to_few, find_start_points, make_gaussian_plan, make_start_cloud
+from mivol.experiments.gaussian_fit import (
+    adapt_to_few,
+    find_start_points,
+    make_background_cloud,
+    make_gaussian_plan,
+    make_start_cloud,
+)
 from mivol.experiments.photo_fit import PhotoFit
 from mivol.files import write_png
 from mivol.files.image_files import decode_srgb
-from mivol.optim.gaussians.gaussian_plan import PRESETS
+from mivol.optim.gaussians.gaussian_plan import PRESETS, scene_extent
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
-from mivol.photos import Camera, Photo, intrinsics, load_photos, project
-from mivol.photos.region import find_free_distances, is_free_space, median_distance
+from mivol.photos import Camera, Photo, intrinsics, load_photos, project, rays
+from mivol.photos.region import find_free_distances, is_free_space, viewing_distance
 from mivol.photos.transforms import write_transforms
 from mivol.points import read_gaussians
 from mivol.splatting import Splatter
@@ -258,17 +264,39 @@ def test_surroundings_stand_along_rays_of_the_photographs() -> None:
     found, says = find_start_points(photos(views, points), 300, 3, has_surroundings=True)
     around = found[120:]
     assert np.array_equal(found[:120], points) and 100 < len(around) < 300
-    assert says == f"120 points of the reconstruction in the box, {len(around)} along random rays of the photographs"
+    assert says == f"120 points of the reconstruction, {len(around)} along random rays of the photographs"
+    outside = np.concatenate([points, 100 * points])
+    assert np.array_equal(find_start_points(photos(views, outside), 300, 3, has_surroundings=True)[0][:240], outside)
     all_cameras = [view.camera for view in views]
-    reach = median_distance(all_cameras, BOX.mean(axis=0))
+    reach = viewing_distance(all_cameras, BOX)
     for point in around:
         distances = [np.linalg.norm(point - view.camera.origin) / reach for view in views if seen_pixel(view, point)]
         assert distances and max(distances) >= 0.5 and min(distances) <= 8
     assert np.linalg.norm(around - all_cameras[0].origin, axis=1).max() > 4 * reach
     assert not is_free_space(all_cameras, around, reach).any()
     few, _ = find_start_points(photos(views[:2], points), 300, 3, has_surroundings=True)
-    within = find_free_distances(all_cameras[:2], median_distance(all_cameras[:2], BOX.mean(axis=0)))[1]
+    within = find_free_distances(all_cameras[:2], viewing_distance(all_cameras[:2], BOX))[1]
     assert all(min(np.linalg.norm(p - c.origin) for c in all_cameras[:2]) >= within for p in few[120:])
+
+
+def test_the_background_covers_what_the_photographs_see() -> None:
+    """Behind each pixel stands a Gaussian within its scale; none stands where no photograph looks."""
+    views = [photo(k, k, alpha=False) for k in range(5)]
+    made = make_background_cloud(views, 1)
+    origins = np.array([view.camera.origin for view in views])
+    middle, extent = origins.mean(axis=0), scene_extent([view.camera for view in views])
+    places, scale = made["means"].astype(np.float64), float(np.exp(made["log_scales"][0, 0]))
+    np.testing.assert_allclose(np.linalg.norm(places - middle, axis=1), 9 * extent, rtol=1e-6)
+    assert all(any(seen_pixel(view, place) for view in views) for place in places)
+    for view in views:
+        o, d = rays(view.camera, np.stack(np.meshgrid([1.0, 20, 39], [1.0, 20, 39]), axis=-1).reshape(-1, 2))
+        b = (d * (o - middle)).sum(axis=-1)
+        t = -b + np.sqrt(b**2 - ((o - middle) ** 2).sum(axis=-1) + (9 * extent) ** 2)
+        hits = o + t[:, None] * d
+        # Points of the spiral are at most 1.05 root areas from any place; one more for the border of the frames.
+        assert np.linalg.norm(hits[:, None] - places, axis=-1).min(axis=1).max() < 2.1 * scale / 0.7
+    assert made["harmonics"].shape[1:] == (4, 3)
+    np.testing.assert_allclose(made["opacity_logits"], math.log(9), rtol=1e-6)
 
 
 def test_few_photographs_of_a_capture_get_a_lower_degree() -> None:
