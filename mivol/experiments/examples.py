@@ -152,7 +152,7 @@ EXAMPLES: dict[str, Example] = {
     ),
     "smoke": Example("an absorbing smoke from 16 pictures", _smoke("truth.file")),
     "white_smoke": Example("a smoke that scatters, under a white sky", _smoke("truth.file")),
-    "lamp": Example("where is the lamp, seen through a smoke that is known?", _smoke("scene.define.volume")),
+    "lamp": Example("where is the lamp behind a known smoke?", _smoke("scene.define.volume")),
     "tooth": Example("a tooth from synchrotron projections", _SLICES),
     "cloud": Example("a cloud under sun and sky", StandIn("cloud", "truth.file", (26, 37, 32), 0.12)),
 }

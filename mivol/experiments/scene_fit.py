@@ -217,7 +217,7 @@ class SceneFit(FitKind):
             set_parameter(params, start.parameter.name, start.value)
         if self.truth is not None:
             set_parameter(params, settings.truth.key, self.truth)
-        say(f"  holding   {'the truth' if self.truth is not None else 'the start'}, in the following lines")
+        say(f"  values    facts and plan are for {'the true volume' if self.truth is not None else 'the first values'}")
         return explain_scene(scene, settings.fit.max_depth, to_sensor(self.sensors[0]))
 
 

@@ -93,7 +93,7 @@ def test_an_experiment_is_explained_with_its_truth_in_the_scene(
     assert code == 0
     assert "3 of 8 x 8 pixels, 1 of them held out" in said
     assert "3 x 3 x 3 x 1, in [0, inf] 1/length, from 0.2" in said
-    assert "holding   the truth" in said
+    assert "facts and plan are for the true volume" in said
     depth = float(re.search(r"optical depth at most ([\d.]+)", said)[1])
     assert 2 < depth < 10.5  # 6 sqrt(3) = 10.39, told to three digits
     assert not (folder / "runs").exists()
