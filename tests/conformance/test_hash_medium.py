@@ -17,6 +17,7 @@ from mivol.fields.hash_grid import HashField
 from mivol.fields.nerf import NerfField, NerfSizes
 from mivol.optim.photographs.sampled_problem import find_region
 from mivol.validate.moments import Moments
+from scenes import box_of, camera, medium
 
 SIZES = {"levels": 3, "log2_table": 7, "coarsest": 2, "finest": 8, "width": 8}
 RUNS = 12
@@ -26,29 +27,13 @@ KEY = "box.interior_medium.sigma_t."
 def scene(max_depth: int = 2, albedo: float = 0.0, volume: dict | None = None, **more: object) -> mi.Scene:
     """The unit cube in white light: a pixel is the transmittance of the cube, if nothing scatters."""
     own = {"type": "mivol_hash", "majorant": 8.0, "seed": 4, **SIZES, **more}
-    place = mi.ScalarTransform4f()
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "mivol", "max_depth": max_depth},
-            "sensor": {
-                "type": "perspective",
-                "to_world": place.look_at([0.5, -2, 0.6], [0.5, 0.5, 0.5], [0, 0, 1]),
-                "fov": 16,
-                "film": {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb", "filter": {"type": "box"}},
-                "sampler": {"type": "independent"},
-            },
+            "sensor": camera((0.5, -2, 0.6), (0.5, 0.5, 0.5), 4, 16),
             "light": {"type": "constant"},
-            "box": {
-                "type": "cube",
-                "to_world": place.translate([0.5, 0.5, 0.5]).scale(0.5),
-                "bsdf": {"type": "null"},
-                "interior": {
-                    "type": "mivol_medium",
-                    "albedo": albedo,
-                    "sigma_t": volume or own,
-                },
-            },
+            "box": box_of(medium("mivol_medium", volume or own, albedo), np.eye(4)),
         }
     )
 
@@ -147,6 +132,22 @@ def test_a_step_along_the_gradient_of_scattered_light_lowers_the_loss(variant_rg
     assert errors[-1] < 0.5 * errors[0], errors
 
 
+def differentiate(box: mi.Scene, params: mi.SceneParameters, key: str, step: float) -> tuple[float, float]:
+    """Derivative of the mean of an image along its gradient by a parameter, and a central difference of ``step``."""
+    value = np.array(params[key])
+    dr.enable_grad(params[key])
+    params.update()
+    # Derivatives take the rays of the second seed, and so do the differences.
+    dr.backward(dr.mean(mi.render(box, params, spp=4, seed=1, seed_grad=2), axis=None))
+    along = np.array(dr.grad(params[key]), np.float64)
+    h, ends = step / np.linalg.norm(along), []
+    for move in (h, -h):
+        params[key] = mi.TensorXf(np.float32(value + move * along))
+        params.update()
+        ends.append(float(dr.mean(mi.render(box, spp=4, seed=2), axis=None).array[0]))
+    return float((along**2).sum()), (ends[0] - ends[1]) / (2 * h)
+
+
 def test_nodes_hold_the_values_of_the_network(variant_rgb: str) -> None:
     """With ``nodes``, the grid follows the tensors, and derivatives of an image reach them: against differences."""
     box = scene(nodes=5)
@@ -159,20 +160,9 @@ def test_nodes_hold_the_values_of_the_network(variant_rgb: str) -> None:
     nodes = np.array(params[KEY + "data"]).ravel()
     assert np.allclose(nodes, np.array(network.eval(p, None, mi.Bool(True))[0]), rtol=1e-5)
     assert nodes.std() > 0.5
-    key = KEY + "table"
-    value = np.array(params[key])
-    dr.enable_grad(params[key])
-    params.update()
-    # Derivatives take the rays of the second seed, and so do the differences.
-    dr.backward(dr.mean(mi.render(box, params, spp=4, seed=1, seed_grad=2), axis=None))
-    along = np.array(dr.grad(params[key]), np.float64)
-    h, ends = 0.01 / np.linalg.norm(along), []
-    for step in (h, -h):
-        params[key] = mi.TensorXf(np.float32(value + step * along))
-        params.update()
-        ends.append(float(dr.mean(mi.render(box, spp=4, seed=2), axis=None).array[0]))
     # Absorption is exact along fixed rays. float32 errs by 1e-7 of a difference of 4e-4, kinks of the network by less than 1 %.
-    assert (ends[0] - ends[1]) / (2 * h) == pytest.approx((along**2).sum(), rel=0.01)
+    steepest, difference = differentiate(box, params, KEY + "table", 0.01)
+    assert difference == pytest.approx(steepest, rel=0.01)
 
 
 @pytest.mark.parametrize("kind", ["hash", "nerf"])
@@ -190,18 +180,9 @@ def test_a_fitted_network_is_an_extinction_by_its_weights(variant_rgb: str, tmp_
     params, key = mi.traverse(box), KEY + name
     nodes = np.array(params[KEY + "data"])
     assert nodes.shape == (6, 6, 6, 1) and nodes.std() > 0.01 * nodes.mean() > 0
-    value = np.array(params[key])
-    dr.enable_grad(params[key])
-    params.update()
-    dr.backward(dr.mean(mi.render(box, params, spp=4, seed=1, seed_grad=2), axis=None))
-    along = np.array(dr.grad(params[key]), np.float64)
-    h, ends = 0.02 / np.linalg.norm(along), []
-    for step in (h, -h):
-        params[key] = mi.TensorXf(np.float32(value + step * along))
-        params.update()
-        ends.append(float(dr.mean(mi.render(box, spp=4, seed=2), axis=None).array[0]))
     # As above: float32 errs by 1e-7 of a difference of more than 1e-3.
-    assert (ends[0] - ends[1]) / (2 * h) == pytest.approx((along**2).sum(), rel=0.01)
+    steepest, difference = differentiate(box, params, key, 0.02)
+    assert difference == pytest.approx(steepest, rel=0.01)
 
 
 def test_a_network_needs_a_file_of_one(variant_rgb: str, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from false_alarms import assert_precise, assert_same_mean
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.octree_extinction import LeafField, OctreeExtinction, merge_voxels
 from mivol.validate.moments import Moments
+from scenes import box_of, camera, medium
 
 KEY = "box.interior_medium.sigma_t.data"
 
@@ -112,25 +113,13 @@ def test_derivatives_are_those_of_a_sum(variant_rgb: str) -> None:
 
 
 def scene(sigma_t: dict, albedo: object = 0.6, kind: str = "mivol_medium") -> mi.Scene:
-    place = mi.ScalarTransform4f()
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "mivol", "max_depth": 5},
-            "sensor": {
-                "type": "perspective",
-                "to_world": place.look_at([0.4, -2, 0.7], [0.5, 0.5, 0.5], [0, 0, 1]),
-                "fov": 30,
-                "film": {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb", "filter": {"type": "box"}},
-                "sampler": {"type": "independent"},
-            },
+            "sensor": camera((0.4, -2, 0.7), (0.5, 0.5, 0.5), 4, 30),
             "light": {"type": "constant"},
-            "box": {
-                "type": "cube",
-                "to_world": place.translate([0.5, 0.5, 0.5]).scale(0.5),
-                "bsdf": {"type": "null"},
-                "interior": {"type": kind, "albedo": albedo, "sigma_t": sigma_t},
-            },
+            "box": box_of(medium(kind, sigma_t, albedo), np.eye(4)),
         }
     )
 
