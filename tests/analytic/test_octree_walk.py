@@ -1,4 +1,4 @@
-"""The walk through the leaves of an octree: every leaf once, forwards and backwards, and few steps in vacuum."""
+"""The walk through the leaves of an octree: every leaf once, forwards and backwards."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import pytest
 from octrees import PLACE, hard_rays, random_octree
 
 from mivol.fields.octree import Octree, edges_of
-from mivol.transport.traversal.octree_walk import LeafIndex, clip_to_octree, find_octant, reverse_from, walk_leaves
+from mivol.transport.traversal.leaf_index import LeafIndex
+from mivol.transport.traversal.octree_walk import clip_to_octree, reverse_from, walk_leaves
 
 
 def sums(tree: Octree, o: np.ndarray, d: np.ndarray, there_and_back: bool) -> list[np.ndarray]:
@@ -54,26 +55,3 @@ def test_leaves_are_visited_once_in_both_directions(variant_rgb: str, depth: int
         found = sums(tree, o, d, there_and_back)
         np.testing.assert_allclose(found[0], [e[0] for e in expected], atol=2e-5)
         assert found[1].tolist() == [e[1] for e in expected] and found[2].tolist() == [e[2] for e in expected]
-
-
-def test_vacuum_is_crossed_in_few_steps(variant_rgb: str) -> None:
-    # Two leaves of one cell at opposite corners of 2^12 cells: the box of the leaves is the whole cube.
-    codes = np.array([0, 8**12 - 1], np.uint64)
-    tree = Octree.from_rows(12, PLACE, codes, np.zeros(2, np.uint8), np.ones(2), np.zeros((2, 1, 3)))
-    index = LeafIndex.find(tree)
-    rng = np.random.default_rng(0)
-    o, d = rng.uniform(-0.3, 0.3, (3, 64)), rng.uniform(-0.05, 0.05, (3, 64))
-    o[0], d[0] = o[0] - 2, d[0] + 1
-    segment = clip_to_octree(index, mi.Point3f(np.float32(o)), mi.Vector3f(np.float32(d / np.linalg.norm(d, axis=0))), np.inf)
-    cell, steps = mi.Vector3i(segment.cell), 0
-    while True:
-        _, is_leaf, edge, beyond = index.look_up(cell, find_octant(segment.d), mi.Bool(True))
-        steps += 1
-        assert not dr.any(is_leaf)
-        # The ray runs along x: the cells to cross along it are the most that a step can take.
-        cell.x = (cell.x & -edge) + edge + beyond
-        cell = dr.clip(cell, 0, 2**12 - 1)
-        if dr.all(cell.x == 2**12 - 1):
-            break
-    # 64 entries along an axis, at most 12 of them a step.
-    assert steps <= 7

@@ -27,7 +27,7 @@ from mivol.transport.line_integrals.radiance_field import (
 )
 from mivol.transport.line_integrals.radiance_source import bake
 from mivol.transport.line_integrals.sampled_rays import SampledModel, SampledRays, render_samples
-from mivol.transport.traversal.octree_walk import LeafIndex
+from mivol.transport.traversal.leaf_index import LeafIndex
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.photographs.radiance_plan import place_grid
 from mivol.transport.line_integrals.leaf_radiance import LeafColours, raise_leaf_weights
 from mivol.transport.line_integrals.radiance_field import RayBundle
-from mivol.transport.traversal.octree_walk import LeafIndex
+from mivol.transport.traversal.leaf_index import LeafIndex
 
 __all__ = ["OctreeRecipe", "ViewRays", "build_octree", "build_octree_of_points"]
 

@@ -44,7 +44,7 @@ from mivol.transport.line_integrals.leaf_radiance import (
     vjp_leaves,
 )
 from mivol.transport.line_integrals.radiance_field import RayBundle, RayGradient
-from mivol.transport.traversal.octree_walk import LeafIndex
+from mivol.transport.traversal.leaf_index import LeafIndex
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,8 @@ import numpy as np
 from mivol.fields.octree import Octree
 from mivol.numerics import fast_max, one_minus_exp, reciprocal
 from mivol.transport.line_integrals.radiance_field import MAX_DEPTH, RayBundle, RayGradient
-from mivol.transport.traversal.octree_walk import LeafIndex, VisitedLeaf, clip_to_octree, reverse_from, walk_leaves
+from mivol.transport.traversal.leaf_index import LeafIndex
+from mivol.transport.traversal.octree_walk import VisitedLeaf, clip_to_octree, reverse_from, walk_leaves
 
 __all__ = [
     "LeafColours",
@@ -262,24 +263,19 @@ def render_leaves(
     def visit(state: list, leaf: VisitedLeaf, on: mi.Bool) -> list:
         *light, T, tau, first = state
         sigma, colour = source.read(leaf.row, on)
-        own = dr.select(on, sigma * leaf.dt, 0)
-        # Weights and the transmittance sum to 1 up to rounding. The subtraction has an absolute error of 6e-8, as the light.
-        weight = T * _opacity(own)
+        own = sigma * leaf.dt  # 0 in lanes without a leaf, whose extinction is read as 0
+        # Weights and the transmittance sum to 1 up to rounding. A weight has an absolute error of 6e-8, as the light.
+        behind = T * dr.exp(-own)
+        weight = T - behind
         values = [*colour, *([segment.t0 + leaf.t + leaf.dt * _mean_place(own)] if distances else [])]
-        light = [dr.fma(weight, dr.select(on, c, 0), s) for s, c in zip(light, values, strict=True)]
-        return [*light, T - weight, tau + own, dr.select(on & (first < 0), leaf.t, first)]
+        light = [dr.fma(weight, c, s) for s, c in zip(light, values, strict=True)]
+        return [*light, behind, tau + own, dr.select(on & (first < 0), leaf.t, first)]
 
     state = [*(mi.Float(0) for _ in range(4 if distances else 3)), mi.Float(1), mi.Float(0), mi.Float(-1)]
     state, cell, last = walk_leaves(index, segment, visit, state, active, lambda s: s[-2] > depth)
-    *light, _, tau, first = state
+    *light, T, tau, first = state
     distance = light[3] if distances else mi.Float(0)
-    return LeafRays(mi.Color3f(*light[:3]), dr.exp(-tau), distance, tau, fast_max(first, 0), last, cell, rays)
-
-
-def _opacity(tau: mi.Float) -> mi.Float:
-    """1 - exp(-tau) with an absolute error of 6e-8: in half the operations of :func:`mivol.numerics.one_minus_exp`, whose error
-    is relative. Below 0.02 the series is off by tau^4 / 24 = 7e-9."""
-    return dr.select(tau < 0.02, tau * dr.fma(tau, dr.fma(tau, 1 / 6, -0.5), 1), 1 - dr.exp(-tau))
+    return LeafRays(mi.Color3f(*light[:3]), T, distance, tau, fast_max(first, 0), last, cell, rays)
 
 
 def _mean_place(tau: mi.Float) -> mi.Float:

@@ -27,7 +27,8 @@ from mivol.fields.protocol import EXACT_LINE, accumulate_tracked
 from mivol.files import check_volume, read_volume
 from mivol.kernel_recording import is_recording
 from mivol.transport.media.extinction import RayInterval
-from mivol.transport.traversal.octree_walk import LeafIndex, VisitedLeaf, clip_to_octree, walk_leaves
+from mivol.transport.traversal.leaf_index import LeafIndex
+from mivol.transport.traversal.octree_walk import VisitedLeaf, clip_to_octree, walk_leaves
 from mivol.transport.traversal.rays import Ray
 
 __all__ = ["LeafField", "OctreeExtinction", "merge_voxels"]
