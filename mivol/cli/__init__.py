@@ -312,7 +312,7 @@ def export(arguments: argparse.Namespace) -> None:
     convert --to grid makes grids of other resolutions.
     """
     from mivol.back_end import set_variant
-    from mivol.experiments.octree_conversion import GRID_NODES, sample_to_grid
+    from mivol.experiments.field_conversion import GRID_NODES, sample_to_grid
     from mivol.experiments.render import sky_beside
     from mivol.fields.field_archives import read_field_view
     from mivol.fields.field_files import read_field, write_field

@@ -66,15 +66,15 @@ def _convert_cloud(arguments: argparse.Namespace) -> str:
         check_contents(source)
     kind = _check_conversion(arguments)
     if kind in ("hash", "nerf"):
-        from mivol.experiments.network_conversion import convert_to_network
+        from mivol.experiments.field_conversion import convert_to_network
 
         return convert_to_network(source, target, kind, arguments.mode)
     if source.suffix.lower() == ".npz" and target.suffix.lower() == ".npz":
-        from mivol.experiments import octree_conversion
+        from mivol.experiments import field_conversion
 
         if kind == "grid":
-            return octree_conversion.convert_to_grid(source, target, resolution, arguments.mode)
-        return octree_conversion.convert_to_octree(source, target, resolution, arguments.mode)
+            return field_conversion.convert_to_grid(source, target, resolution, arguments.mode)
+        return field_conversion.convert_to_octree(source, target, resolution, arguments.mode)
     if source.suffix.lower() == ".npz":
         return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
     if kind not in ("field", "mesh"):

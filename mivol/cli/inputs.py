@@ -62,7 +62,7 @@ def explain_array(arguments: argparse.Namespace) -> int | None:
     if not layout and (draft := draft_scan_of(arguments.scene, arguments, is_array)):
         return explain_scan(draft)
     if not is_array and arguments.scene.suffix.lower() == ".npz":
-        from mivol.experiments.octree_conversion import describe_field
+        from mivol.experiments.field_conversion import describe_field
 
         print(describe_field(arguments.scene, arguments.mode).text)
         return 0

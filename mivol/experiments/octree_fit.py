@@ -16,8 +16,8 @@ import numpy as np
 
 from mivol.config import OctreeExperiment
 from mivol.errors import MivolError
+from mivol.experiments.field_conversion import describe_leaves, describe_speed
 from mivol.experiments.field_fit import FieldFit, adapt_plan, explain_plan, make_batches, set_background, write_result
-from mivol.experiments.octree_conversion import describe_leaves, describe_speed
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.sampled_fit import explain_sampled_plan, make_sampled_problem
 from mivol.fields.field_files import read_field, write_field

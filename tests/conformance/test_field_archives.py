@@ -11,7 +11,7 @@ import pytest
 
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import octree_conversion
+from mivol.experiments import field_conversion
 from mivol.fields.field_files import read_field, read_grid, write_field
 from mivol.fields.harmonics import harmonic_degree
 from mivol.fields.hash_encoding import HashSizes
@@ -86,8 +86,8 @@ def test_a_hash_grid_becomes_a_grid(
     variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By both verbs, which print the loss; the grid keeps the space of the colours."""
-    monkeypatch.setattr(octree_conversion, "GRID_NODES", 6)
-    monkeypatch.setattr(octree_conversion, "EDGE", 16)
+    monkeypatch.setattr(field_conversion, "GRID_NODES", 6)
+    monkeypatch.setattr(field_conversion, "EDGE", 16)
     write_field(tmp_path / "f.npz", hash_grid())
     assert main(["convert", str(tmp_path / "f.npz"), str(tmp_path / "grid.npz"), "--to", "grid", "--resolution", "8"]) == 0
     assert main(["export", str(tmp_path / "f.npz"), str(tmp_path / "f.vol")]) == 0
@@ -111,7 +111,7 @@ def test_a_nerf_is_read_as_it_was_saved(
     variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the bit; it becomes a grid, and explain names its kind."""
-    monkeypatch.setattr(octree_conversion, "EDGE", 16)
+    monkeypatch.setattr(field_conversion, "EDGE", 16)
     field = nerf()
     write_field(tmp_path / "f.npz", field)
     back = read_field(tmp_path / "f.npz")

@@ -10,8 +10,8 @@ import pytest
 from ball_photos import ball
 
 from mivol.cli import main
-from mivol.experiments import network_conversion
-from mivol.experiments.network_conversion import convert_to_network
+from mivol.experiments import field_conversion
+from mivol.experiments.field_conversion import convert_to_network
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.gaussian_grid import grid_to_gaussians
 from mivol.optim.photographs.sampled_problem import PRESETS
@@ -21,7 +21,7 @@ from mivol.points import write_gaussians
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"LOOKS": 12, "LOOK_EDGE": 24, "EDGE": 16}.items():
-        monkeypatch.setattr(network_conversion, name, value)
+        monkeypatch.setattr(field_conversion, name, value)
 
 
 @pytest.mark.slow
