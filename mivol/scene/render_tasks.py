@@ -192,6 +192,22 @@ class GradientTask(RenderTask):
                 media.deliver_gradients()
 
 
+class TangentTask(RenderTask):
+    """The derivative of an image along the gradients of the parameters."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given, for_images=False)
+
+    def __call__(self, scene: mi.Scene, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> mi.TensorXf:
+        with dr.suspend_grad():
+            with dr.resume_grad():
+                estimators = self.build_estimators(scene, arrays)
+                estimators.media.find_followed()
+                estimators.media.start_tangent()
+            samples = self.samples(sensor, arrays, seed)
+            return render_on_film(samples, self.aovs, lambda rays: _render_tangent(estimators, rays, self.aovs))
+
+
 def _render_primal(estimators: Estimators, rays: CameraRays, plan: Plan, aovs: list[str]) -> tuple:
     count = paths_per_lane(plan.successive_paths, dr.width(rays.ray))
     if count > 1:
@@ -207,7 +223,7 @@ def _walk_paths(estimators: Estimators, rays: CameraRays) -> tuple[mi.Spectrum, 
     return score.L, alpha
 
 
-def render_tangent(estimators: Estimators, rays: CameraRays, aovs: list[str]) -> tuple:
+def _render_tangent(estimators: Estimators, rays: CameraRays, aovs: list[str]) -> tuple:
     """The derivative of the radiance along camera rays, alpha and AOVs, for the film."""
     prepare_derivatives(estimators, rays.ray)
     black = zero_radiance(rays.ray)

@@ -31,9 +31,9 @@ from mivol.scene.render_tasks import (
     PlannedScene,
     PreparedArrays,
     RenderTask,
+    TangentTask,
     find_unrecorded,
     prepare_placements,
-    render_tangent,
     zero_radiance,
 )
 from mivol.scene.scene_state import SceneState, find_differentiated, find_gradient_array
@@ -44,7 +44,7 @@ from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
 from mivol.transport.media.medium_view import traverse_medium
 from mivol.transport.path.estimators import Settings
-from mivol.transport.path.film import find_batch_views, render_on_film
+from mivol.transport.path.film import find_batch_views
 from mivol.transport.path.walk import walk_path
 
 
@@ -116,15 +116,10 @@ class Session:
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients set on the parameters."""
         sensor = _find_renderable_sensor(scene, sensor)
-        with without_garbage_collection(), dr.suspend_grad(), carry_tangents(scene):
+        with without_garbage_collection(), carry_tangents(scene):
             with dr.resume_grad():
                 opened = self._open(scene, sensor, spp, SceneState.of(scene, sensor), for_images=False)
-                task = RenderTask(opened, self.settings, self.aovs, for_images=False)
-                estimators = task.build_estimators(scene, opened.read_arrays())
-                estimators.media.find_followed()
-                estimators.media.start_tangent()
-            samples = task.samples(sensor, opened.arrays, seed)
-            return render_on_film(samples, self.aovs, lambda rays: render_tangent(estimators, rays, self.aovs))
+            return self._run(TangentTask, opened, scene, sensor, _opaque_seed(seed))
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.

@@ -42,6 +42,8 @@ def test_a_step_renders_another_value_and_its_gradient() -> None:
 
 
 def test_a_study_counts_and_compares(tmp_path: Path) -> None:
+    size = study.StepsSize(scenes=("tutorial",), sides=(2,), spp=(1, 2), steps=1)
+    assert list(study.measure_steps(False, size)["rows"]) == ["tutorial, 2^2 x 1", "tutorial, 2^2 x 2"]
     size = study.StepsSize(scenes=("jade_null_sun",), sides=(4,), steps=2)
     answer = study.STUDY.questions["gradients"](size)
     (row,) = answer["rows"].values()

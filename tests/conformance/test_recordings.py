@@ -105,6 +105,20 @@ class Pair:
         self.params.update()
         return found
 
+    def tangents(self, key: str, seed: int) -> list[np.ndarray]:
+        return [self.tangent(integrator, key, seed) for integrator in (self.recorded, self.traced)]
+
+    def tangent(self, integrator: mi.Integrator, key: str, seed: int) -> np.ndarray:
+        value = type(self.params[key])(dr.detach(self.params[key]))
+        dr.enable_grad(value)
+        self.params[key] = value
+        self.params.update()
+        dr.set_grad(value, 0.1 * (seed + 1) + value)
+        found = np.array(integrator.render_forward(self.scene, self.params, seed=seed, spp=2))
+        self.params[key] = type(value)(dr.detach(value))
+        self.params.update()
+        return found
+
     def assert_same(self, seed: int, **more: object) -> None:
         found, truth = self.images(seed, **more)
         assert np.array_equal(found, truth) and truth.max() > 0
@@ -137,6 +151,22 @@ def test_gradients_follow_values(name: str) -> None:
             assert np.abs(found - truth).max() <= 200 * 2**-24 * np.abs(truth).max(), key
             assert np.abs(truth).max() > 0, key
     assert not any(pair.recordings.failures.values())
+
+
+@pytest.mark.parametrize("name", cases(SCENES, slow=[name for name in SCENES if name not in ("phase", "one scattering")]))
+def test_tangents_follow_values(name: str) -> None:
+    make, depth, keys = SCENES[name]
+    pair = Pair(make(), depth)
+    for key in keys:
+        for call in range(3):
+            pair.scale(key, 0.9)
+            found, truth = pair.tangents(key, call)
+            # Kernels of other inputs may round and sum in another order: at most some 200 terms along a path.
+            assert np.abs(found - truth).max() <= 200 * 2**-24 * np.abs(truth).max(), key
+            assert np.abs(truth).max() > 0, key
+    assert not any(pair.recordings.failures.values())
+    # The ``g`` of a stock ``hg`` is recorded anew in each step.
+    assert pair.recordings.count <= 2 * len(keys) + (name == "stock phase")
 
 
 def test_a_gradient_flows_on_to_what_a_parameter_was_made_from() -> None:
@@ -318,6 +348,23 @@ def test_derivatives_with_branches_are_recorded() -> None:
     found = [pair.gradient(pair.recorded, INSIDE + "sigma_t.data", seed) for seed in (1, 2)]
     assert not np.array_equal(*found)
     assert not any(pair.recordings.failures.values())
+
+
+def test_a_tangent_that_fails_is_traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tangents of the parameters outlive the failure."""
+    pair = Pair(smoke_under(), 1)
+    truth = pair.tangent(pair.traced, INSIDE + "sigma_t.data", 1)
+    work = render_tasks.TangentTask.__call__
+
+    def work_and_fail(self: RecordedTask, *inputs: object) -> mi.TensorXf:
+        image = work(self, *inputs)
+        if is_recording():
+            raise RuntimeError("as Dr.Jit says")
+        return image
+
+    monkeypatch.setattr(render_tasks.TangentTask, "__call__", work_and_fail)
+    assert np.array_equal(pair.tangent(pair.recorded, INSIDE + "sigma_t.data", 1), truth) and np.abs(truth).max() > 0
+    assert pair.recordings.failures[render_tasks.TangentTask] == ["as Dr.Jit says"]
 
 
 def test_a_task_that_fails_is_traced_and_adds_its_gradient_once(monkeypatch: pytest.MonkeyPatch) -> None:

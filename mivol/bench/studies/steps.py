@@ -2,11 +2,14 @@
 
     mivol bench steps                                        # half a minute on 2 idle cores
     mivol bench steps --quick                                # ten seconds, two scenes, few steps
-    mivol bench steps --scenes god_rays --sides 4 16 --spp 4
+    mivol bench steps --scenes tutorial god_rays --sides 16 64 --spp 1 16
 
 A step sets a parameter, calls ``params.update()``, and renders an image; with a gradient it also calls ``dr.backward`` on a
 loss of the image. The loop with ``mivol`` and the loop with ``prbvolpath`` differ in the name of the integrator only. They take
 turns. On the smallest film kernels take no time, so a step shows the work of the host: tracing, or the replay of a recording.
+
+The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth 6; the others are those of the study
+``everyday``.
 
 Milliseconds are wall times: medians over the steps after the first ``WARM`` ones, in which both integrators compile. A ratio is
 the time of ``prbvolpath`` over the time of mivol, without regard to their noise (``mivol bench everyday`` compares errors).
@@ -15,6 +18,7 @@ Launches are kernels, copies and fills of one step.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,14 +28,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.bench.extinctions import smoke
 from mivol.bench.harness.bars import AT_LEAST, Bar, judge, say_row
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Question, Size, Study, amount, ask
+from mivol.bench.scenes import box_scene
 from mivol.bench.studies.everyday import chosen_scenes
 from mivol.bench.studies.everyday.scenes import EverydayScene
 from mivol.report.figures import SERIES
 
 PEER = "prbvolpath"
+TUTORIAL = EverydayScene(
+    lambda side: box_scene(smoke().values, side, albedo=0.8), 6, 1.0, None, "box.interior_medium.sigma_t.data"
+)
+"""The scene ``tutorial``."""
+
 WARM = 3
 """Steps before the timing."""
 
@@ -43,10 +54,10 @@ class StepsSize(Size):
     scenes: tuple[str, ...] = amount(
         ("smoke_sun_map", "smoke_on_floor", "smoke_point_inside", "god_rays", "tissue", "jade_null_sun"),
         ("smoke_on_floor", "jade_null_sun"),
-        "scenes of the study everyday",
+        "tutorial, and scenes of the study everyday",
     )
     sides: tuple[int, ...] = amount((4, 16, 64), (4,), "edges of the image [pixels]")
-    spp: int = amount(1, doc="samples per pixel of a step")
+    spp: tuple[int, ...] = amount((1,), doc="samples per pixel of a step")
     steps: int = amount(15, 3, "steps of each integrator")
 
 
@@ -78,11 +89,14 @@ class _Loop:
 def measure_steps(differentiates: bool, size: StepsSize) -> dict:
     """Time steps of both integrators in each scene and for each film."""
     rows = {}
-    for name, scene in chosen_scenes(size.scenes).items():
-        for side in size.sides:
-            row = _contend({who: _Loop(scene, who, side, size.spp) for who in (PEER, "mivol")}, size, differentiates)
-            rows[f"{name}, {side}^2 x {size.spp}"] = row
-            say_row(f"{name}, {side}^2 x {size.spp}", ratio=row["ratio"], milliseconds=row["milliseconds"]["mivol"])
+    scenes = chosen_scenes([name for name in size.scenes if name != "tutorial"])
+    if "tutorial" in size.scenes:
+        scenes["tutorial"] = TUTORIAL
+    for name, scene in scenes.items():
+        for side, spp in itertools.product(size.sides, size.spp):
+            row = _contend({who: _Loop(scene, who, side, spp) for who in (PEER, "mivol")}, size, differentiates)
+            rows[f"{name}, {side}^2 x {spp}"] = row
+            say_row(f"{name}, {side}^2 x {spp}", ratio=row["ratio"], milliseconds=row["milliseconds"]["mivol"])
     return {"rows": rows, "least_ratio": min(row["ratio"] for row in rows.values())}
 
 

@@ -32,14 +32,14 @@ class RenderSamples:
 
     Attributes:
         sensor: sensor, with its film, filter, crop and sampler.
-        seed: seed of the sampler.
+        seed: seed of the sampler; opaque, since a literal would be compiled anew in every render.
         spp: samples per pixel; 0 for the sample count of the sensor's sampler.
         pass_rays: largest number of rays in a pass.
         views: sensors of a ``batch`` (:func:`find_batch_views`); None for another sensor.
     """
 
     sensor: mi.Sensor
-    seed: int
+    seed: mi.UInt32
     spp: int
     pass_rays: int
     views: mi.SensorPtr | None = None
@@ -137,9 +137,7 @@ def _camera_rays(samples: RenderSamples, base: mi.Sampler, index: int, per_pass:
         pixel -= film.rfilter().border_size()
     pixel += mi.Vector2i(film.crop_offset())
     if base.class_name() == "IndependentSampler":
-        # Opaque: with the seed as a literal, the kernel would be compiled anew in every render.
         seed, sample, total = mi.UInt32(samples.seed), lane % each, each
-        dr.make_opaque(seed)
         if base.sample_count() > per_pass:
             sample += dr.opaque(mi.UInt32, index * per_pass)
             total = dr.opaque(mi.UInt32, base.sample_count())
