@@ -4,7 +4,8 @@ Conventions. The model is ``FOLDER/sparse/0`` in COLMAP's binary format, beside 
 ``FOLDER`` itself. Photographs with equal size, camera, lens and focal length in EXIF share one camera. If one
 photograph has a quarter turn in EXIF, all are turned upright before the search, as :mod:`mivol.photos.survey` then reads them.
 
-Reference: Schönberger and Frahm 2016 (Structure-from-Motion Revisited, CVPR).
+References: Pan et al. 2024 (Global Structure-from-Motion Revisited, ECCV); Schönberger and Frahm 2016 (Structure-from-Motion
+Revisited, CVPR).
 """
 
 from __future__ import annotations

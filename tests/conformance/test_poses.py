@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -11,7 +16,7 @@ from PIL import Image, ImageOps
 
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.photos import poses, survey_photos
+from mivol.photos import colmap_process, poses, survey_photos
 from mivol.photos.listing import list_photographs
 from mivol.photos.photo_file import ORIENTATION, read_lens_facts
 from mivol.report import cameras
@@ -162,6 +167,42 @@ def test_pycolmap_is_asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MivolError, match=r'pip install "mivol\[poses\]"'):
         poses.find_poses(folder)
+
+
+@pytest.mark.parametrize(("together", "one_by_one", "kept"), [(5, None, 5), (3, 4, 4), (3, 2, 3), (0, 4, 4)])
+def test_poses_are_found_one_by_one_if_photographs_are_left_out(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    together: int,
+    one_by_one: int,
+    kept: int,
+) -> None:
+    """The larger model is kept; if all photographs have poses, the second search does not run."""
+
+    def make(count: int | None) -> Callable[..., dict]:
+        def search(database: Path, images: Path, models: Path, options: object) -> dict:
+            assert count is not None and options.random_seed == 0 and models.is_dir()
+            model = SimpleNamespace(
+                images={k: SimpleNamespace(name=f"{k}.png", has_pose=k < count) for k in range(5)},
+                write=lambda folder: (folder / "cameras.bin").write_text(str(count)),
+                compute_mean_reprojection_error=lambda: 0.5,
+                num_points3D=lambda: 7,
+                num_cameras=lambda: 1,
+            )
+            return {0: model} if count else {}
+
+        return search
+
+    library = MagicMock(global_mapping=make(together), incremental_mapping=make(one_by_one))
+    monkeypatch.setitem(sys.modules, "pycolmap", library)
+    (tmp_path / "models").mkdir()
+    job = {"images": "images", "names": [[f"{k}.png" for k in range(5)]], "masks": "", "sequential": False, "longest": 100}
+    colmap_process.run(job | {"database": str(tmp_path / "db"), "models": str(tmp_path / "models")})
+    said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (model,) = said[-1]["models"]
+    assert len(model["names"]) == kept and (Path(model["folder"]) / "cameras.bin").read_text() == str(kept)
+    assert any("one by one" in facts.get("stage", "") for facts in said) == (together < 5)
 
 
 PROGRAMS = {
