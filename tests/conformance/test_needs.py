@@ -182,6 +182,13 @@ def test_explain_gives_a_reason_for_each_choice():
     assert "A fast voxel traversal algorithm" in references
 
 
+def test_explain_names_a_medium_around_the_camera() -> None:
+    """A medium without a shape is called by its id, as any other."""
+    fog = {"type": "homogeneous", "id": "fog", "sigma_t": 0.2, "albedo": 0.5}
+    sensor = camera((0, 0, 5), (0, 0, 0)) | {"medium": {"type": "ref", "id": "fog"}}
+    assert "fog: " in explain(mi.load_dict({"type": "scene", "fog": fog, "sensor": sensor, "sky": sky()}))
+
+
 @pytest.mark.parametrize(
     ("integrator", "depth"),
     [
