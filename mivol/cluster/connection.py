@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import shutil
+import ssl
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,6 +98,10 @@ def _connect_address(distributed: Any, settings: ClusterSettings) -> Client:
         )
     try:
         return distributed.Client(settings.address, timeout=5, security=security, set_as_default=False)
+    except ssl.SSLError as error:
+        raise MivolError(
+            f"[security] names files without certificates and key of TLS ({error.reason}): give the PEM files of the scheduler."
+        ) from None
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise MivolError(

@@ -16,6 +16,7 @@ from tiny_experiment import refused, write_experiment
 
 from mivol import config
 from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
+from mivol.cluster.connection import _connect_address, import_distributed
 from mivol.cluster.packages import (
     decode_sensor,
     encode_sensor,
@@ -86,6 +87,15 @@ def test_wrong_files_are_refused(text: str, reason: str, tmp_path: Path) -> None
     (tmp_path / "cluster.toml").write_text(text)
     with pytest.raises(MivolError, match=reason):
         parse_cluster(str(tmp_path / "cluster.toml"))
+
+
+def test_files_without_certificates_are_refused(tmp_path: Path) -> None:
+    """TLS refuses them before the scheduler is asked, so the sentence is about the files."""
+    for name in ("a.pem", "b.pem", "c.pem"):
+        (tmp_path / name).write_text("no certificate")
+    (tmp_path / "tls.toml").write_text(TLS)
+    with pytest.raises(MivolError, match="without certificates and key of TLS"):
+        _connect_address(import_distributed(), parse_cluster(str(tmp_path / "tls.toml")))
 
 
 def test_loopback() -> None:
