@@ -110,4 +110,5 @@ FOG = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.7, "phase": {"type": "
 
 
 def floor() -> dict:
-    return {"floor": {"type": "rectangle", "to_world": turn().translate([0, 0, -1]).scale(5), "bsdf": RED}}
+    """Just below the box: volpath loses a part of the light of a surface in the plane of a boundary."""
+    return {"floor": {"type": "rectangle", "to_world": turn().translate([0, 0, -1.01]).scale(5), "bsdf": RED}}

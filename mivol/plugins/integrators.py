@@ -25,8 +25,8 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
         deterministic: scattered light by quadrature along the ray, without noise; at depth 2, for point, spot and directional
             lights. Derivatives are still sampled. The quadrature has a small error (docs/limits.md). Default false.
         shadows: exact; estimated: unbiased, from a few look-ups, in images (gradients walk every cell); grid: with
-            ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated for fine grids. Default
-            auto.
+            ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated for fine grids, and in images
+            of media that scatter several times from a table, corrected without bias by one shadow ray a path. Default auto.
         media_light: how light emitted by media finds scattering points. drawn: points in media are sampled, besides chance
             hits; met: by chance hits only; auto: the method with the smaller error in a small preview. Default auto.
         near_light: where emitters with a position (point, spot, area) light media that scatter several times. segments: every

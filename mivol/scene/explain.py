@@ -24,7 +24,7 @@ from mivol.scene.render_tasks import find_unrecorded
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
-from mivol.transport.estimators.single_scattering.shadow_tables import build_transmittance_grid, measure_transmittance_bias
+from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid, measure_transmittance_bias
 from mivol.transport.media.medium_view import traverse_medium
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.transport.traversal.box import Box
@@ -189,8 +189,9 @@ def _describe_light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Se
         return []
     with dr.suspend_grad():
         media, emitters = build_media(scene, needs, plan, survey_scene(scene)), SceneEmitters(scene)
-        grid = build_transmittance_grid(media, emitters)
-        bias, rms = measure_transmittance_bias(media, emitters, grid)
+        lattice = media.bodies[0].view.parts[0].lattice
+        grid = TransmittanceGrid.over_lattice(media, emitters, lattice)
+        bias, rms = measure_transmittance_bias(media, emitters, grid, lattice)
     nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
     rays = needs.film_samples * sum(needs.media[0].resolutions[0])
     pays = "pays" if nodes < rays else "does not pay"

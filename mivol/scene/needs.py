@@ -90,7 +90,8 @@ def find_needs(
         return needs
     bodies = [boundary.body(view) for boundary, view in zip(boundaries, views, strict=True)]
     scattering = [body for body, facts in zip(bodies, media, strict=True) if facts.is_scattering]
-    light = read_media_light(needs.make_media(scene, bodies, survey.size), boundaries, scattering, sensor, survey)
+    media = needs.make_media(scene, bodies, survey.size, survey.usable_tracer)
+    light = read_media_light(media, boundaries, scattering, sensor, survey)
     return replace(needs, media_light=light)
 
 
@@ -365,12 +366,13 @@ class Needs(ShapeFacts):
         views = (b.view(survey.places) for b in self.boundaries)
         return replace(self, views=tuple(replace(v, asymmetry=g) for v, g in zip(views, asymmetries, strict=True)))
 
-    def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
+    def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float, tracer: mi.Scene | None = None) -> SceneMedia:
         """Build the media of the scene among its surfaces.
 
         Args:
             bodies: a body for each of ``boundaries``, in the same order.
             size: diagonal of the scene [length].
+            tracer: scene of the surfaces alone; None to trace ``scene``.
         """
         return SceneMedia(
             scene,
@@ -381,6 +383,8 @@ class Needs(ShapeFacts):
             locates_camera=self.camera_inside and self.start is None,
             size=size,
             stops_rays=self.stops_rays,
+            surface_boxes=self.surface_boxes,
+            tracer=tracer,
         )
 
 

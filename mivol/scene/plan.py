@@ -27,6 +27,7 @@ from mivol.scene.choices import (
     choose_media_light,
     choose_near_light,
     choose_scattering_points,
+    choose_shadow_table,
     choose_shadows,
     choose_side_flights,
     choose_skipping,
@@ -54,13 +55,11 @@ from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.flights.flight_derivatives import MIN_ALBEDO
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
+from mivol.transport.estimators.lighting.emitters import find_lit_box
+from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
-from mivol.transport.estimators.single_scattering.shadow_tables import (
-    VisibilityCache,
-    build_transmittance_grid,
-    build_visibility_cache,
-)
 from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
+from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache, build_visibility_cache
 from mivol.transport.media.extinction import Extinction
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.media.scene_media import SceneMedia
@@ -114,6 +113,7 @@ class Plan:
         near_emitters: numbers of the emitters inside of media.
         are_thick: whether collisions alone find the derivatives of each medium's extinction.
         have_low_albedo: whether some albedo of each medium may be too low for derivatives to be found at collisions.
+        shadow_nodes: nodes along an edge of the table of shadows, in images; 0 for shadow rays.
         lamp_rays: own camera rays a sample for the light of lamps seen directly, in images; 0 for none.
         occupied: share of occupied blocks of the first medium's grid, in steps of ``OCCUPIED_STEP`` [1]; None if unknown.
     """
@@ -136,6 +136,7 @@ class Plan:
     have_low_albedo: tuple[bool, ...] = ()
     occupied: float | None = None
     lamp_rays: int = 0
+    shadow_nodes: int = 0
 
     @property
     def decisions(self) -> tuple:
@@ -196,6 +197,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     lamp_rays, why = choose_lamp_rays(needs, settings)
     choices += why
+    nodes, why = choose_shadow_table(needs, settings, segment)
+    choices += why
     return Plan(
         tuple(choices),
         skips,
@@ -215,6 +218,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         tuple(m.albedo_min < MIN_ALBEDO for m in needs.media),
         _round_occupied(needs),
         lamp_rays,
+        nodes,
     )
 
 
@@ -294,9 +298,15 @@ def _flies_through(part: Extinction, plan: Plan) -> bool:
 
 
 def build_media(
-    scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey, readings: Readings | None = None, for_images: bool = True
+    scene: mi.Scene,
+    needs: Needs,
+    plan: Plan,
+    survey: SceneSurvey,
+    readings: Readings | None = None,
+    for_images: bool = True,
+    tracer: mi.Scene | None = None,
 ) -> SceneMedia:
-    """Build the media for transport as planned; ``readings`` are read if they are not given."""
+    """Build the media for transport as planned; ``readings`` are read, and the ``tracer`` is the survey's, if not given."""
     if readings is None:
         readings = read_parts(needs, plan, survey, for_images)
     bodies = []
@@ -306,7 +316,7 @@ def build_media(
         body = boundary.body(view, plan.estimates_shadows[index])
         body.is_thick, body.has_low_albedo = plan.are_thick[index], plan.have_low_albedo[index]
         bodies.append(body)
-    return needs.make_media(scene, bodies, survey.size)
+    return needs.make_media(scene, bodies, survey.size, tracer or survey.usable_tracer)
 
 
 def build_estimators(
@@ -317,23 +327,28 @@ def build_estimators(
     survey: SceneSurvey,
     for_images: bool,
     readings: Readings | None = None,
+    tracer: mi.Scene | None = None,
 ) -> Estimators:
-    """Build the planned estimators, for images or for derivatives; ``readings`` are read if they are not given."""
+    """Build the planned estimators, for images or for derivatives; ``readings`` and ``tracer`` as for :func:`build_media`."""
     draws_near_light = plan.draws_near_light if for_images else plan.near_light_in_derivatives
-    media = build_media(scene, needs, plan, survey, readings, for_images)
+    media = build_media(scene, needs, plan, survey, readings, for_images, tracer)
     direct = DirectLighting(media)
     choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():
             choice.visibility_cache = _make_visibility_cache(direct, needs, plan, survey, for_images)
             if settings.shadows == "grid":
-                choice.transmittance_grid = build_transmittance_grid(media, direct.emitters)
+                lattice = next(p.lattice for p in media.bodies[0].view.parts if p.lattice is not None)
+                choice.transmittance_grid = TransmittanceGrid.over_lattice(media, direct.emitters, lattice)
     segment = SEGMENT_ESTIMATORS[plan.segment].make(choice)
     is_even = all(kind == "uniform" for kind in needs.emitter_kinds)
     lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1 and not is_even
     lights_media = segment.ends_in_media and not needs.is_sealed and not is_even
     if lights_surfaces or lights_media:
         direct.emitters  # noqa: B018  (made now, not in the loop of a path)
+    if for_images and plan.shadow_nodes:
+        with dr.suspend_grad():
+            direct.shadow_table = TransmittanceGrid.over_box(media, direct.emitters, find_lit_box(scene), plan.shadow_nodes)
     lobe = None if plan.side_flight_cosine is None else dr.opaque(mi.Float, plan.side_flight_cosine)
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)

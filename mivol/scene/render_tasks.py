@@ -40,6 +40,7 @@ class PreparedArrays:
         light: table of the light of media (density, cumulative); None without a table.
         views: sensors of a ``batch``; None for another sensor.
         placements: numbers of boxes, grids and the scene (:func:`prepare_placements`); None while ``dr.freeze`` records.
+        tracer: scene of the surfaces alone; None to trace the whole scene.
         asymmetries: the ``g`` of the stock ``hg`` of each medium, which Mitsuba hides from Dr.Jit; None for another phase
             function.
     """
@@ -48,6 +49,7 @@ class PreparedArrays:
     light: tuple[mi.Float, mi.Float] | None
     views: mi.SensorPtr | None
     placements: mi.Float64 | None = None
+    tracer: mi.Scene | None = None
     asymmetries: list[mi.Float | None] = field(default_factory=list)
 
 
@@ -90,7 +92,7 @@ class PlannedScene:
 
 
 def prepare_placements(needs: Needs, size: float) -> tuple[mi.Float64 | None, dict[bytes, int]]:
-    """The numbers of boxes and grids as one array, for :func:`mivol.transport.traversal.box.with_placements`.
+    """The numbers of boxes, grids and surfaces as one array, for :func:`mivol.transport.traversal.box.with_placements`.
 
     Args:
         needs: facts with the views of the media.
@@ -104,6 +106,7 @@ def prepare_placements(needs: Needs, size: float) -> tuple[mi.Float64 | None, di
         groups += [np.array([boundary.box.edge])] if boundary.box is not None else []
         lattices = (part.lattice for part in view.parts if part.lattice is not None)
         groups += [lattice_from_world(lattice.to_world, lattice.res) for lattice in lattices if lattice.to_world is not None]
+    groups += needs.surface_boxes or ()
     firsts = np.cumsum([0, *(group.size for group in groups)])
     numbers = copy_aligned(np.concatenate([group.ravel() for group in groups]))
     return mi.Float64(numbers), {group.tobytes(): int(k) for group, k in zip(groups[::-1], firsts[-2::-1], strict=True)}
@@ -140,7 +143,9 @@ class RenderTask(RecordedTask):
             needs = self.needs.with_views(self.survey, arrays.asymmetries)
             if arrays.light is not None:
                 needs = replace(needs, media_light=MediaLight(*arrays.light))
-            return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, arrays.readings)
+            return build_estimators(
+                scene, needs, self.plan, self.settings, self.survey, self.for_images, arrays.readings, arrays.tracer
+            )
 
     def samples(self, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> RenderSamples:
         """The samples of the render."""

@@ -191,7 +191,8 @@ class Session:
             warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
         placements, places = prepare_placements(needs, survey.size)
-        arrays = PreparedArrays(read_parts(needs, plan, survey, for_images), light, find_batch_views(sensor), placements)
+        readings = read_parts(needs, plan, survey, for_images)
+        arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer)
         opened = PlannedScene(state, spp, survey, replace(needs, views=(), media_light=None), plan, arrays, places)
         known = self._opened.get(for_images)
         if known is not None and (known.spp, known.key) == (spp, opened.key):

@@ -7,15 +7,29 @@ from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording
-from mivol.scene.nesting import OrientedBox, find_nesting_fault, oriented_box, scene_diagonal
+from mivol.scene.nesting import OrientedBox, find_nesting_fault, oriented_box, scene_diagonal, shape_bounds
 from mivol.scene_graph import traverse
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
 from mivol.transport.traversal.box import Box, fit_ball, fit_box
+
+MAX_FOLLOWED_SURFACES = 16
+"""Most surfaces whose placement is compared when a parameter has changed: 20 microseconds each."""
+
+MAX_FACES = 64
+"""Most faces of a mesh whose planes are looked for."""
+
+MAX_SURFACE_BOXES = 8
+"""Most boxes around surfaces: testing a ray against eight boxes takes a third of the time of tracing the ray."""
+
+BOX_MARGIN = 1e-5
+"""Width by which a box exceeds its surface, over its size and distance from the origin [1]: tracing in float32 is off by 1e-7
+of these, and a ray spawned at a surface begins 1e-4 of them away."""
 
 OUTSIDE_SHAPES = "space around shapes"
 """Class of shape of a medium that fills no shape."""
@@ -36,6 +50,8 @@ class ShapeFacts:
         is_sealed: whether every medium lies behind refracting boundaries without undeviated light, with all emitters outside
             and hittable by paths. Emitter sampling then finds no light from inside a medium.
         stops_rays: whether every traced boundary of a medium stops or turns all rays, so that a segment stays in one medium.
+        surface_boxes: (3, 4) maps from the world to cubes [-1, 1]^3 around the ``surfaces``; None for many surfaces, or with a
+            traced boundary of a medium.
     """
 
     surfaces: tuple[str, ...] = ()
@@ -46,6 +62,7 @@ class ShapeFacts:
     refractive: tuple[str, ...] = ()
     is_sealed: bool = False
     stops_rays: bool = False
+    surface_boxes: tuple[np.ndarray, ...] | None = None
 
 
 @dataclass
@@ -55,8 +72,9 @@ class SceneSurvey:
     Attributes:
         boundaries: the media with their boundaries.
         facts: the facts about shapes and emitters.
-        marks: placement of each boundary: the array of its vertices, or its box.
+        marks: placement of each boundary, and of each surface with a box: the array of its vertices, or its box.
         size: diagonal of the box around all shapes [length].
+        tracer: scene of the surfaces and traced boundaries alone; None to trace the whole scene.
         looked_up: stock grids whose interpolation agrees with mivol's, by pointer.
         scatters: whether each medium scattered at the last reading, by name.
         values, numbers: results of reading arrays and constants (:mod:`mivol.scene.readings`).
@@ -76,6 +94,7 @@ class SceneSurvey:
     facts: ShapeFacts
     marks: tuple[tuple[mi.Shape, object], ...] = ()
     size: float = 1.0
+    tracer: mi.Scene | None = None
     looked_up: set = field(default_factory=set)
     scatters: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
@@ -88,6 +107,11 @@ class SceneSurvey:
     gain_of_draws: float | None = None
     near_gain: float | None = None
     lamp_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def usable_tracer(self) -> mi.Scene | None:
+        """The tracer; None while ``dr.freeze`` records a function that has not been given it."""
+        return None if is_recording() else self.tracer
 
     @property
     def is_current(self) -> bool:
@@ -103,7 +127,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     Raises:
         MivolError: boundaries that disagree about the medium between them.
     """
-    boundaries, surfaces, refractive, has_null = [], [], [], False
+    boundaries, surfaces, solid, refractive, has_null = [], [], [], [], False
     shapes = scene.shapes()
     boxes = {s.ptr: oriented_box(s) for s in shapes if s.is_medium_transition()}
     named = {s.get_medium().ptr for s in scene.sensors() if s.get_medium() is not None}
@@ -116,6 +140,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
                 refractive.append(f"{name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
             surfaces.append(shape.class_name())
+            solid.append(shape)
             # The shapes of an instance have other BSDFs than the instance itself.
             has_null |= is_instance(shape) or mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
     # Mitsuba merges equal media into one object: if a boundary of a medium is traced, all its boundaries are.
@@ -131,7 +156,15 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     # A medium that also surrounds a shape has no known end.
     boundaries = [replace(b, around=None) if b.medium.ptr in exteriors else b for b in boundaries]
     boundaries = [part for boundary in boundaries for part in _split_levels(boundary)] + around
-    marks = tuple((s, _read_placement(s)) for s in shapes if s.is_medium_transition())
+    solid += [s for s in edges if _is_bare(s)]
+    # A GPU traces rays in hardware.
+    follows = mi.variant().startswith("llvm") and 0 < len(solid) <= MAX_FOLLOWED_SURFACES and not is_recording()
+    tracer = _make_tracer(solid) if follows and boxed else None
+    # Inside of a traced boundary, every ray meets its box.
+    has_boxes = follows and all(b.box or b.shape == OUTSIDE_SHAPES for b in boundaries)
+    pieces = tuple(rows for s in solid for rows in _surface_boxes(s)) if has_boxes else ()
+    marked = [s for s in shapes if s.is_medium_transition() or follows]
+    marks = tuple((s, _read_placement(s)) for s in marked)
     facts = ShapeFacts(
         surfaces=tuple(surfaces),
         has_null_transmission=bool(has_null),
@@ -141,8 +174,9 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
         refractive=tuple(refractive),
         is_sealed=_are_sealed(boundaries, shapes, scene.emitters()),
         stops_rays=not has_null and not any(_is_bare(edge) for edge in edges),
+        surface_boxes=pieces if 0 < len(pieces) <= MAX_SURFACE_BOXES else None,
     )
-    return SceneSurvey(tuple(boundaries), facts, marks, scene_diagonal(scene))
+    return SceneSurvey(tuple(boundaries), facts, marks, scene_diagonal(scene), tracer)
 
 
 def _read_placement(shape: mi.Shape) -> object:
@@ -152,6 +186,65 @@ def _read_placement(shape: mi.Shape) -> object:
     if "vertex_positions" in params:
         return dr.detach(params["vertex_positions"])
     return [*shape.bbox().min, *shape.bbox().max]
+
+
+def _make_tracer(shapes: list[mi.Shape]) -> mi.Scene:
+    """A scene of some shapes of another scene."""
+    names = [shape.id() for shape in shapes]
+    tracer = mi.load_dict({"type": "scene"} | {f"surface {k}": shape for k, shape in enumerate(shapes)}, optimize=False)
+    # Mitsuba has renamed the shapes by their new keys, and a user finds parameters by the old names.
+    for shape, name in zip(shapes, names, strict=True):
+        shape.set_id(name)
+    return tracer
+
+
+def _surface_boxes(shape: mi.Shape) -> list[np.ndarray]:
+    """(3, 4) maps from the world to cubes [-1, 1]^3 around the pieces of a shape.
+
+    The faces of a small mesh count as pieces by their planes, since Mitsuba merges the walls of a room into one mesh.
+    """
+    if shape.class_name() in ("Cube", "Sphere", "Instance"):
+        return [_map_to_cube(oriented_box(shape).corners)]
+    params = traverse(shape)
+    if shape.class_name() == "Rectangle":
+        placed = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        return [_map_to_cube((placed @ [[-1, 1, 1, -1], [-1, -1, 1, 1], [0] * 4, [1] * 4])[:3].T)]
+    if "faces" in params and len(params["faces"]) <= 3 * MAX_FACES:
+        points = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+        return [_map_to_cube(points[indices]) for indices in _find_planes(points, np.array(params["faces"]).reshape(-1, 3))]
+    return [_map_to_cube(np.stack(shape_bounds(shape)))]
+
+
+def _find_planes(points: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
+    """The indices of the vertices in each plane of a mesh."""
+    corners = points[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    size = np.ptp(points, axis=0).max()
+    away = np.abs(np.einsum("fa,gca->fgc", normals, corners) - np.einsum("fa,fa->f", normals, corners[:, 0])[:, None, None])
+    same, found = (away < BOX_MARGIN / 2 * size).all(axis=2), []
+    left = np.ones(len(faces), bool)
+    while left.any():
+        chosen = left & same[np.argmax(left)]
+        chosen[np.argmax(left)] = True
+        found.append(np.unique(faces[chosen]))
+        left &= ~chosen
+    return found
+
+
+def _map_to_cube(points: np.ndarray) -> np.ndarray:
+    """A (3, 4) map from the world to the cube [-1, 1]^3 around points: a box in the plane of flat ones, else along the axes."""
+    centred = points - points.mean(axis=0)
+    axes = np.eye(3)
+    if len(points) > 2:
+        _, widths, across = np.linalg.svd(centred, full_matrices=False)
+        is_tilted = np.abs(across[-1]).max() < 1 - BOX_MARGIN
+        if widths[-1] <= BOX_MARGIN / 2 * widths[0] and is_tilted:
+            axes = across
+    low, high = (points @ axes.T).min(axis=0), (points @ axes.T).max(axis=0)
+    margin = BOX_MARGIN * (np.abs(points).max() + (high - low).max())
+    half = np.maximum((high - low) / 2 + margin, 1e-30)
+    return np.c_[axes, -(low + high) / 2] / half[:, None]
 
 
 def _is_unmoved(shape: mi.Shape, mark: object) -> bool:

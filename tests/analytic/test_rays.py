@@ -78,6 +78,7 @@ def look_down(parts: dict, near: float, far: float) -> mi.Scene:
     return mi.load_dict({"type": "scene", **parts, "sky": sky(), "sensor": sensor | {"near_clip": near, "far_clip": far}})
 
 
+@pytest.mark.filterwarnings("ignore:the media begin 3 from the camera:RuntimeWarning")
 @pytest.mark.slow_for("grid", "traced")
 @pytest.mark.parametrize("kind", FOG)
 def test_fog_is_cut_at_both_planes(kind):

@@ -18,7 +18,7 @@ import scenes
 from mivol.bench.studies.steps import count_launches
 from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, RecordedTask, Recordings, is_recording, without_garbage_collection
-from mivol.scene import plan, render_tasks, scene_state, session
+from mivol.scene import plan, render_tasks, scene_state
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.threads import set_thread_count
 from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views
@@ -130,10 +130,10 @@ def test_images_follow_values(name: str) -> None:
     make, depth, keys = SCENES[name]
     pair = Pair(make(), depth)
     for key in keys:
-        for call in range(4):
+        for call in range(6):
             pair.scale(key, 0.9)
             pair.assert_same(call)
-            if call == 1:
+            if call == 3:
                 count = pair.recordings.count
         assert pair.recordings.count == count, key
     assert not any(pair.recordings.failures.values())
@@ -474,10 +474,9 @@ def test_collections_are_put_off_for_a_while() -> None:
 @pytest.mark.slow_for("forward", "reverse")
 @pytest.mark.parametrize("way", ["picture", "reverse", "forward"])
 def test_paths_are_recorded_without_them(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    seen, room = [], session if way == "forward" else render_tasks
-    name = {"picture": "walk_path", "reverse": "replay_branches", "forward": "render_tangent"}[way]
-    walk = getattr(room, name)
-    monkeypatch.setattr(room, name, lambda *a, **k: seen.append(gc.isenabled()) or walk(*a, **k))
+    seen, name = [], {"picture": "walk_path", "reverse": "replay_branches", "forward": "_render_tangent"}[way]
+    walk = getattr(render_tasks, name)
+    monkeypatch.setattr(render_tasks, name, lambda *a, **k: seen.append(gc.isenabled()) or walk(*a, **k))
     scene = close_up({"smoke": smoke(rough_grid(1), 0.5)[0], "sky": scenes.sky(1.0)}, res=2)
     params, integrator = mi.traverse(scene), mi.load_dict(mivol(max_depth=3))
     if way != "picture":

@@ -256,6 +256,7 @@ def trace_boundaries(
     si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
     if dr.hint(not media.traces, mode="scalar"):
         return SegmentEnd(si, mi.Float(ray.maxt), medium, 1.0), state
+    is_shadow_ray = passes_null
     passes_null &= media.has_null_transmission
 
     # -- State ------------------------------------------------------------------------------------------------------------
@@ -268,10 +269,19 @@ def trace_boundaries(
         maxt = dr.minimum(maxt, mi.Float(reach(state)))
         going &= maxt > 0
     onward.maxt = maxt
+    if dr.hint(media.surface_boxes is not None, mode="scalar"):
+        # A packet of lanes without a surface ahead leaves out the loop.
+        # A shadow ray ends at the surface of its emitter, which casts no shadow.
+        meets = media.may_meet_surface(onward, maxt * OWN_SURFACE if is_shadow_ray else maxt)
+        alone = going & ~meets
+        for body in media.traced:
+            state = visit(state, MediumInterval(ray, t, ray.maxt, alone & (medium == mi.MediumPtr(body.view.medium)), body))
+        t = dr.select(alone, ray.maxt, t)
+        going &= meets
     null_transmission = dr.full(mi.Spectrum, 1, dr.width(ray)) if passes_null else 1.0
 
     while dr.hint(going, label="to the next opaque surface"):
-        hit = media.scene.ray_intersect(onward, mi.RayFlags.All, False, going)
+        hit = media.tracer.ray_intersect(onward, mi.RayFlags.All, False, going)
         is_hit = going & hit.is_valid()
         t_hit = dr.select(is_hit, dr.maximum(t, hit_distance(ray, hit)), ray.maxt)
 

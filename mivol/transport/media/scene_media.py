@@ -11,6 +11,7 @@ follow ``g`` as any other argument.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import drjit as dr
@@ -20,7 +21,7 @@ import numpy as np
 from mivol.phase.closed_forms import INV_FOUR_PI, angle_between, eval_hg, sample_hg, scattered_direction
 from mivol.transport.media.body import Body, is_followed
 from mivol.transport.media.channels import to_scene_channels
-from mivol.transport.traversal.box import opaque_numbers
+from mivol.transport.traversal.box import opaque_numbers, opaque_rows
 from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["SceneMedia", "ScenePhases"]
@@ -38,6 +39,9 @@ class SceneMedia:
         locates_camera: whether the camera may be inside a traced boundary while the sensor names no medium.
         size: size of the scene [length], which scales the offset of spawned rays.
         stops_rays: whether every traced boundary stops or turns all rays, so that a segment stays in one medium.
+        surface_boxes: (3, 4) maps from the world to cubes [-1, 1]^3 that contain all surfaces and traced boundaries; None if
+            unknown.
+        tracer: a scene of the surfaces alone, without the boundaries of ``boxed`` media; None to trace ``scene``.
     """
 
     def __init__(
@@ -50,8 +54,10 @@ class SceneMedia:
         locates_camera: bool = False,
         size: float = 1.0,
         stops_rays: bool = False,
+        surface_boxes: Sequence[np.ndarray] | None = None,
+        tracer: mi.Scene | None = None,
     ) -> None:
-        self.scene = scene
+        self.scene, self.tracer = scene, tracer or scene
         self.boxed = [b for b in bodies if b.box is not None]
         # The tracer tells a segment by its medium, which several boundaries may share.
         self.traced = list({b.view.medium.ptr: b for b in bodies if b.box is None}.values())
@@ -61,6 +67,9 @@ class SceneMedia:
         self.start, self.locates_camera = start, locates_camera
         self.size = mi.Float(opaque_numbers(np.array([size], np.float64))[0])
         self.stops_rays = stops_rays
+        self.surface_boxes = surface_boxes and [
+            [[mi.Float(v) for v in row] for row in opaque_rows(rows)] for rows in surface_boxes
+        ]
 
     @cached_property
     def phases(self) -> ScenePhases:
@@ -139,6 +148,29 @@ class SceneMedia:
         if self.locates_camera:
             return _locate(self.scene, ray, self.size)
         return dr.zeros(mi.MediumPtr, n)
+
+    def may_meet_surface(self, ray: mi.Ray3f, maxt: mi.Float) -> mi.Bool:
+        """Whether a surface may lie on a ray up to the distance ``maxt`` [length]; never False if Mitsuba would find one."""
+        if self.surface_boxes is None:
+            return mi.Bool(True)
+        meets = mi.Bool(False)
+        for rows in self.surface_boxes:
+            near, far = mi.Float(0), mi.Float(maxt)
+            for row in rows:
+                o = dr.fma(row[0], ray.o.x, dr.fma(row[1], ray.o.y, dr.fma(row[2], ray.o.z, row[3])))
+                inverse = dr.rcp(dr.fma(row[0], ray.d.x, dr.fma(row[1], ray.d.y, row[2] * ray.d.z)))
+                a, b = (-1 - o) * inverse, (1 - o) * inverse
+                near, far = dr.maximum(near, dr.minimum(a, b)), dr.minimum(far, dr.maximum(a, b))
+            # A ray inside the plane of a face has a NaN, and counts as meeting the box.
+            meets |= ~(near > far)
+        return meets
+
+    def medium_around(self, p: mi.Point3f) -> mi.MediumPtr:
+        """The medium around points, by the first traced boundary above; null for media in boxes, which need none."""
+        n = dr.width(p)
+        if not self.traced:
+            return dr.zeros(mi.MediumPtr, n)
+        return _locate(self.scene, mi.Ray3f(p, mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f()), self.size)
 
     def find_followed(self) -> None:
         """Find what is differentiated in each medium."""

@@ -14,14 +14,12 @@ import mitsuba as mi
 from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling
+from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator, TrackedAbsorption
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.scattering_quadrature import ScatteringQuadrature
-from mivol.transport.estimators.single_scattering.shadow_tables import (
-    TransmittanceGrid,
-    VisibilityCache,
-)
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
+from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache
 from mivol.transport.line_integrals.emission import Emission
 from mivol.transport.media.scene_media import SceneMedia
 
@@ -264,6 +262,11 @@ class Estimators:
     def lights_media_at_vertices(self) -> bool:
         """Whether emitter samples light the collisions in media: not if segments draw the light of all sampled emitters."""
         return self.lights_media and (self.near is None or self.near.lights_vertices)
+
+    @property
+    def tabulates_shadows(self) -> bool:
+        """Whether a path keeps a shadow ray of its vertices."""
+        return self.segment.ends_in_media and self.direct.shadow_table is not None
 
     def is_shown(self, si: mi.SurfaceInteraction3f) -> mi.Bool | bool:
         """Whether the camera sees the emitter at the end of its ray."""

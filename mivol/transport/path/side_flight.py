@@ -24,6 +24,7 @@ import mitsuba as mi
 
 from mivol.phase.closed_forms import angle_between, eval_hg, sample_hg, scattered_direction
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantEmitterSample
+from mivol.transport.estimators.lighting.tabulated_shadows import TabulatedShadow
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.scores import IMAGE, Factor, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
@@ -93,11 +94,13 @@ class SideFlight:
         light: light at its end.
         shadow: shadow ray at its end.
         chance: uniform random number in [0, 1), by which a shadow ray of the path is kept for derivatives; None in images.
+        tabulated: the same shadow ray with its shadow read from a table; None without a table.
     """
 
     light: SideFlightLight
     shadow: DirectLight
     chance: mi.Float | None
+    tabulated: TabulatedShadow | None = None
 
 
 def estimate_side_flight(
@@ -149,11 +152,13 @@ def estimate_side_flight(
     with dr.resume_grad(when=attached):
         if attached:
             f = vertex.eval(wo, active)
-        value = weight * f * (flight.T * hit.albedo) * direct.value
+        flown = weight * f * (flight.T * hit.albedo)
+        value = flown * direct.value
     lit = on & direct.on
     light = SideFlightLight(value, flight.transmittance, lit)
     shadow = DirectLight(media, direct.ray_segment, value, lit)
-    return SideFlight(light, shadow, flight.chance)
+    tabulated = None if direct.shadow is None else direct.shadow.times(flown)
+    return SideFlight(light, shadow, flight.chance, tabulated)
 
 
 def weigh_emitter_sample(

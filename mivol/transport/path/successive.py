@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.walk import Path, advance_path, film_alpha, gather_lanes, leave_camera, start_path
@@ -73,13 +74,14 @@ def walk_successively(
     Returns:
         The radiance and the alpha (in [0, 1]) of each path.
 
-    Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`. Memory: 12 numbers a path.
+    Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`. Memory: 12 numbers a path, 30 with tabulated shadows.
     """
     n = dr.width(ray)
     lanes, per_lane = -(-n // count), dr.opaque(mi.UInt32, count)
     starts = _PathStarts(clip_camera_ray(ray), estimators.media.medium_at(ray), sampler.clone())
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
-    dr.eval(starts, L, alpha)
+    kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
+    dr.eval(starts, L, alpha, kept)
     index = dr.arange(mi.UInt32, lanes) * per_lane
     end = dr.minimum(index + per_lane, dr.opaque(mi.UInt32, n))
 
@@ -93,11 +95,16 @@ def walk_successively(
         ended = ~path.active
         dr.scatter(L, path.score.L, index, ended)
         dr.scatter(alpha, film_alpha(path), index, ended)
+        if kept is not None:
+            kept.scatter(path.tabulated, index, ended)
         index += dr.select(ended, mi.UInt32(1), mi.UInt32(0))
         return dr.select(ended, start(index, ended & (index < end)), path), index
 
     dr.while_loop(
         state=(start(index, index < end), index), cond=lambda path, _: path.active, body=advance, label="successive paths"
     )
-    dr.eval(L, alpha)
+    dr.eval(L, alpha, kept)
+    if kept is not None:
+        # Neighbouring lanes correct neighbouring paths, and none waits for the paths of another.
+        L += kept.correction(estimators.media, starts.ray)
     return L, alpha

@@ -31,6 +31,7 @@ from mivol.transport.estimators.lighting.direct_lighting import (
     EmitterSample,
     power_heuristic,
 )
+from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.body import medium_interaction
@@ -43,7 +44,7 @@ from mivol.transport.path.side_flight import (
     estimate_side_flight,
     weigh_emitter_sample,
 )
-from mivol.transport.traversal.random_numbers import SpreadSampler, draw_state
+from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state, fork_state
 from mivol.transport.traversal.rays import FineRay, Ray, clip_camera_ray, point_along
 
 __all__ = [
@@ -100,6 +101,7 @@ class Path:
         sampler: random numbers.
         probes: points kept from the flights so far, for derivatives; None in images.
         shadow: shadow ray kept for derivatives; None in images and for paths scattering at surfaces only.
+        tabulated: shadow ray kept to correct shadows from a table; None without a table.
         emitter_sample: emitter sample of the next vertex; None without side flights (each vertex then draws its own sample).
         emission_pdf: ``pdf`` in lanes where ``last`` has sampled the emission of media too, 0 in other lanes [1/sr]; None if
             media emission is never sampled.
@@ -121,6 +123,7 @@ class Path:
     sampler: mi.Sampler | SpreadSampler
     probes: Probes | None = None
     shadow: ShadowReservoir | None = None
+    tabulated: KeptShadow | None = None
     emitter_sample: WeightedEmitterSample | None = None
     emission_pdf: mi.Float | None = None
     left_medium: mi.Bool | None = None
@@ -192,6 +195,7 @@ def start_path(
         sampler=sampler,
         emission_pdf=None if estimators.emission is None else dr.zeros(mi.Float, n),
         left_medium=None if estimators.near is None else dr.full(mi.Bool, False, n),
+        tabulated=KeptShadow.empty(n) if estimators.tabulates_shadows else None,
     )
 
 
@@ -469,12 +473,16 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
     rng = draw_state(sampler, lit) if estimators.draws_shadows else None
     direct = estimators.direct.estimate_at_vertex(vertex, sample, attached, lit, rng)
     with dr.resume_grad(when=attached):
-        value = path.beta * direct.value
+        weight = mi.Spectrum(1)
         if event.collision is not None:
             weight = event.collision.albedo
             if path.emitter_sample is not None:
                 weight = weight * path.emitter_sample.weight
-            value = dr.select(event.in_medium, value * weight, value)
+            weight = dr.select(event.in_medium, weight, 1)
+        value = path.beta * direct.value * weight
+    if path.tabulated is not None:
+        (chance,) = draw_pcg32(fork_state(rng, 1), 1)[1]
+        path.tabulated = path.tabulated.offer(direct.shadow.times(path.beta * weight), chance, direct.on)
     light = DirectLight(media, direct.ray_segment, value, direct.on)
     if path.shadow is None:
         path.score = path.score.add(light)
@@ -502,6 +510,8 @@ def _add_near_light(estimators: Estimators, path: Path, segment: PathSegment, le
     samples = estimators.near.draw(path.sampler, path.active & segment.may_scatter)
     near = estimators.near.estimate(segment, length, samples, attached, path.active)
     path.score = path.score.add(near.light)
+    if path.tabulated is not None:
+        path.tabulated = path.tabulated.offer(near.tabulated, near.chance, near.shadow.active)
     return _keep_shadow_ray(estimators, path, near.shadow, near.chance)
 
 
@@ -563,6 +573,9 @@ def _add_side_flight(
     path.score = path.score.add(side.light)
     if path.shadow is not None:
         path.shadow = path.shadow.offer(side.shadow, side.chance)
+    if path.tabulated is not None:
+        (chance,) = draw_pcg32(fork_state(samples.shadow, 1), 1)[1]
+        path.tabulated = path.tabulated.offer(side.tabulated, chance, side.light.active)
     return path
 
 
@@ -585,7 +598,10 @@ def _start_reservoirs(estimators: Estimators, path: Path, *probes: str) -> Path:
 
 
 def _add_reservoirs(estimators: Estimators, path: Path) -> Path:
-    """Add the derivatives at the kept points and along the kept shadow ray, at the end of a path."""
+    """Add the derivatives at the kept points and along the kept shadow ray, and correct shadows, at the end of a path."""
+    if path.tabulated is not None:
+        light = path.tabulated.correction(estimators.media, path.ray)
+        path.score = path.score.add(TrackedTerm(light, mi.Bool(True)))
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(estimators.media, path.shadow))
     if path.probes is not None:

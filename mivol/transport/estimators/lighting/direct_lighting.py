@@ -32,6 +32,7 @@ from mivol.transport.estimators.lighting.emitters import (
 )
 from mivol.transport.estimators.lighting.moving_emitters import attach_position, moving_transmittance
 from mivol.transport.estimators.lighting.shadow_rays import find_transmittance, trace_shadow_ray
+from mivol.transport.estimators.lighting.tabulated_shadows import TabulatedShadow, TransmittanceGrid
 from mivol.transport.estimators.lighting.vertex import MediumVertex, Vertex
 from mivol.transport.estimators.scores import TrackedTerm
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
@@ -60,11 +61,13 @@ class DirectSample:
         ray_segment: the shadow ray.
         value: radiance, with derivatives on request; the optical depth along the ray is detached.
         on: lanes receiving light.
+        shadow: shadow read from a table, with the light that it dims, for vertices in media; None without a table.
     """
 
     ray_segment: RaySegment
     value: mi.Spectrum
     on: mi.Bool
+    shadow: TabulatedShadow | None = None
 
 
 @dataclass
@@ -159,10 +162,15 @@ class DirectLighting:
 
     Args:
         media: media and surfaces of the scene.
+
+    Attributes:
+        shadow_table: table of the shadows of vertices in media, in images; None for shadow rays.
     """
 
+    shadow_table: TransmittanceGrid | None
+
     def __init__(self, media: SceneMedia) -> None:
-        self.media = media
+        self.media, self.shadow_table = media, None
 
     @cached_property
     def emitters(self) -> SceneEmitters:
@@ -217,7 +225,12 @@ class DirectLighting:
         direct, it = sample.direct, vertex.interaction
         on = active & (direct.pdf > 0)
         start, medium = vertex.leave(direct.p)
-        ray_segment, clear, tau, light = trace_shadow_ray(self.media, start, medium, direct, on, rng)
+        shadow, traced = None, on
+        if self.shadow_table is not None:
+            inside = on & vertex.in_medium
+            number = self.emitters.number_of(sample.emitter)
+            shadow, traced = TabulatedShadow.look_up(self.shadow_table, start, medium, direct, number, inside), on & ~inside
+        ray_segment, clear, tau, light = trace_shadow_ray(self.media, start, medium, direct, traced, rng)
         on &= clear
         w_mis = mi.Float(1)
         if sample.has_alternative is not False:
@@ -240,7 +253,10 @@ class DirectLighting:
             # A density of 0 makes the source infinite. These lanes are not active, but 0 * inf in their derivative would be
             # NaN.
             value = dr.select(on, factor * vertex.eval(moved.d, on) * dr.select(direct.pdf > 0, source, 0), 0)
-        return DirectSample(ray_segment, value, on)
+        if shadow is None:
+            return DirectSample(ray_segment, value, on)
+        shadow = shadow.times(dr.select(traced, 0, value))
+        return DirectSample(ray_segment, dr.select(traced, value, value * shadow.T), on, shadow)
 
     def estimate_in_medium(
         self,

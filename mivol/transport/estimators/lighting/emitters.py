@@ -26,6 +26,7 @@ __all__ = [
     "ChosenEmitter",
     "SceneEmitters",
     "find_bounding_ball",
+    "find_lit_box",
     "fractional_part",
     "is_among",
     "join_arrays",
@@ -70,7 +71,11 @@ class SceneEmitters:
         self._from_camera = from_camera
         if self.sampled:
             self._table = _EmitterTable.of(scene, self.sampled, self._balls)
-            self._grid = tabulate_emitters(self._table.pointers, _find_lit_box(scene), self.is_near)
+            self._grid = tabulate_emitters(self._table.pointers, find_lit_box(scene), self.is_near)
+
+    def number_of(self, emitter: mi.EmitterPtr) -> mi.UInt32:
+        """The index of an emitter among those ``sampled``."""
+        return self._table.number(emitter)
 
     def bounding_ball(self, number: int) -> list[mi.Float] | None:
         """Centre and radius of a ``sampled`` emitter [length]; None if the emitter is at infinity."""
@@ -230,7 +235,7 @@ def join_arrays(values: list[mi.Float] | list[mi.UInt32], at_once: int = 16) -> 
     return values[0]
 
 
-def _find_lit_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
+def find_lit_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
     """The box around all boundaries of media; around the scene without boundaries; of zero size without shapes."""
     shapes = scene.shapes()
     boxes = [s.bbox() for s in shapes if s.is_medium_transition()] or [s.bbox() for s in shapes]

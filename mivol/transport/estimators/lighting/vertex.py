@@ -23,9 +23,11 @@ class Vertex(Protocol):
 
     Attributes:
         interaction: the point for Mitsuba's BSDFs, phase functions and emitters.
+        in_medium: lanes with a point of a medium.
     """
 
     interaction: mi.Interaction3f
+    in_medium: mi.Bool | bool
 
     def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
         """Origin of a ray from the vertex towards ``p``, and the medium around the origin."""
@@ -52,6 +54,7 @@ class SurfaceVertex:
     interaction: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
     medium: mi.MediumPtr
+    in_medium = False
 
     def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
         si = self.interaction
@@ -78,6 +81,7 @@ class MediumVertex:
     media: SceneMedia
     interaction: mi.MediumInteraction3f
     p: mi.Point3d
+    in_medium = True
 
     def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
         return self.p, self.interaction.medium

@@ -29,7 +29,7 @@ import mitsuba as mi
 from mivol.numerics import minimum, one_minus_exp
 from mivol.transport.estimators.lighting.emitters import ChosenEmitter, EquiangularSampler
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU
-from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
+from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, SegmentEnd, revisit_media, visit_media

@@ -32,6 +32,7 @@ import mitsuba as mi
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting
 from mivol.transport.estimators.lighting.emitters import join_arrays
 from mivol.transport.estimators.lighting.shadow_rays import segment_transmittance
+from mivol.transport.estimators.lighting.tabulated_shadows import TabulatedShadow
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.estimators.single_scattering.distance_sampling import (
@@ -145,12 +146,14 @@ class NearLight:
     Attributes:
         light: the light as a term.
         shadow: its shadow ray.
-        chance: uniform random number in [0, 1), by which a shadow ray of the path is kept for derivatives.
+        chance: uniform random number in [0, 1), by which a shadow ray of the path is kept.
+        tabulated: the same shadow ray with its shadow read from a table; None without a table.
     """
 
     light: ScatteredLight
     shadow: DirectLight
     chance: mi.Float
+    tabulated: TabulatedShadow | None = None
 
 
 class NearLighting:
@@ -244,6 +247,9 @@ class NearLighting:
         sample = self.direct.sample_near_emitter(mei, chosen, samples.emitter, event.on)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
         direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, candidate.rng)
-        coefficients = event_coefficients(media, ray, event, mei, proposal.is_exact)
-        light = ScatteredLight(media, segment, Scattering(event, mei, gain, [direct], *coefficients, chance))
-        return NearLight(light, DirectLight(media, direct.ray_segment, light.value, direct.on), chance)
+        sigma_t, sigma_s = event_coefficients(media, ray, event, mei, proposal.is_exact)
+        light = ScatteredLight(media, segment, Scattering(event, mei, gain, [direct], sigma_t, sigma_s, chance))
+        shadow = DirectLight(media, direct.ray_segment, light.value, direct.on)
+        if direct.shadow is None:
+            return NearLight(light, shadow, chance)
+        return NearLight(light, shadow, chance, direct.shadow.times(sigma_s * gain))

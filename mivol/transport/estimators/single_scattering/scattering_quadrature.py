@@ -32,10 +32,10 @@ import mitsuba as mi
 from mivol.numerics import maximum, minimum, phi1
 from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, make_ball_sampler
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
+from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid
 from mivol.transport.estimators.scores import IMAGE, TrackedTerm
 from mivol.transport.estimators.segment import Absorption, PathSegment, SegmentEstimate, Transmittance
 from mivol.transport.estimators.single_scattering.distance_sampling import lit_length
-from mivol.transport.estimators.single_scattering.shadow_tables import TransmittanceGrid
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
 from mivol.transport.media.channels import to_spectrum

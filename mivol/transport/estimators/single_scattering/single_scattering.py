@@ -49,7 +49,7 @@ from mivol.transport.estimators.single_scattering.scattering_derivatives import 
     event_coefficients,
     event_interaction,
 )
-from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
+from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache
 from mivol.transport.media.optical_depth import segment_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.traversal.random_numbers import SpreadSampler, fork_state
