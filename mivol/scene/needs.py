@@ -27,6 +27,7 @@ from mivol.scene.readings import (
     is_scattering,
     read_extinction,
     read_lowest_albedo,
+    read_number,
 )
 from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, ShapeFacts, find_outside_media, is_instance, survey_scene
 from mivol.scene_graph import list_values, traverse
@@ -207,7 +208,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
         **common,
         is_scattering=scatters,
         occupied=occupied,
-        tau_max=_bound_optical_depth(boundary, view, reads),
+        tau_max=_bound_optical_depth(boundary, view, reads, survey),
         tau_min=_find_thinnest(boundary, view),
         albedo_min=read_lowest_albedo(view, survey, boundary.name),
     )
@@ -226,14 +227,14 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
     return phase.class_name() if phase.class_name() != "PhaseFunction" else str(phase).partition("[")[0]
 
 
-def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridReading]) -> float | None:
+def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridReading], survey: SceneSurvey) -> float | None:
     """Bound the optical depth of a medium by its largest extinction times the diameter of its box or ball."""
     bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
     bounds += [max(p.field.bound()) for p in view.parts if isinstance(p, GaussianExtinction | OctreeExtinction)]
     constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.is_constant]
     if boundary.box is None:
         return None
-    scale = float(np.max(np.array(dr.detach(view.scale))))
+    scale = read_number(dr.detach(view.scale), survey)
     return scale * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * boundary.box.diameter
 
 

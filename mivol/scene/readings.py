@@ -279,6 +279,13 @@ def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:
     return any(high > 0 or dr.grad_enabled(a) for high, a in zip(highest, view.albedo_arrays, strict=True))
 
 
+def read_number(value: mi.Float, survey: SceneSurvey) -> float:
+    """The number of an array of one number, read once for each array: the host waits for all kernels before it reads."""
+    if value.state == dr.VarState.Literal:
+        return float(value[0])
+    return _read_once(survey, ("number",), value, lambda: float(value[0]))
+
+
 def read_lowest_albedo(view: MediumView, survey: SceneSurvey, name: str) -> float:
     """The lowest albedo of a medium [1]; 0 for a medium without an albedo. Each array is read once."""
     if view.albedo is None:
