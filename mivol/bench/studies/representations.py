@@ -247,7 +247,7 @@ class SmokeFit:
 
 
 def list_smoke_fits(majorant: float) -> dict[str, SmokeFit]:
-    """Voxels at three learning rates, and hash grids of no more numbers, at points of paths and at the nodes of a grid."""
+    """Voxels at four learning rates, and hash grids of no more numbers, at points of paths and at the nodes of a grid."""
     place = {"to_world": mi.ScalarTransform4f(np.float32(TO_WORLD))}
     start = mi.TensorXf(np.full((28, 28, 28, 1), 0.05 * majorant, np.float32))
     sizes = {"levels": 6, "log2_table": 11, "coarsest": 6, "finest": 40, "width": 16}
@@ -255,7 +255,7 @@ def list_smoke_fits(majorant: float) -> dict[str, SmokeFit]:
     rates = {"table": 0.05, "weights_0": 0.02, "weights_1": 0.02}
     voxels = {"type": "mivol_voxels", "data": start, **place}
     return {
-        **{f"voxels, rate {rate:g}": SmokeFit(voxels, {"data": rate}, (0, np.inf)) for rate in (0.2, 0.5, 2.0)},
+        **{f"voxels, rate {rate:g}": SmokeFit(voxels, {"data": rate}, (0, np.inf)) for rate in (0.05, 0.1, 0.2, 0.5)},
         "hash grid at nodes": SmokeFit(hashed | {"nodes": 28}, rates),
         "hash grid at points": SmokeFit(hashed, rates),
     }
