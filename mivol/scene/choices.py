@@ -66,7 +66,8 @@ Henyey-Greenstein with g = 0.8 under a sun: variance x time is 2 to 4 times smal
 MIN_TABLE_NODES, MAX_TABLE_NODES, TABLE_SHARE = 8, 24, 1 / 32
 """Fewest and most nodes along an edge of a table of shadows, and most nodes for each sample of an image. Measured variance x
 time over that of shadow rays, 48^2 x 64 samples, with 8, 12, 24 and 33 nodes: a cloud 0.60, 0.53, 0.53, 0.57; smoke of HG 0.8
-under a sun 0.72, 0.66, 0.60, 0.65. A table of 65 nodes costs as many rays as it saves there."""
+under a sun 0.72, 0.66, 0.60, 0.65 (with an additive correction of the table). A table of 65 nodes costs as many rays as it
+saves there."""
 
 SUCCESSIVE_PATHS, MIN_SUCCESSIVE_SCATTERINGS = 16, 16
 """Paths per lane walked one after the other, and the number of scatterings from which successive paths pay. Measured processor
@@ -303,8 +304,8 @@ def choose_shadow_table(needs: Needs, settings: Settings, segment: str) -> tuple
     nodes = int(min((TABLE_SHARE * needs.film_samples / emitters) ** (1 / 3), MAX_TABLE_NODES))
     if nodes < MIN_TABLE_NODES:
         return 0, []
-    method = f"from a table of {nodes}^3 nodes for {emitters} emitters, with one exact shadow ray a path"
-    return nodes, [Choice("shadows in media", method, "the shadow ray corrects the table: no bias, and few rays to walk")]
+    method = f"one exact shadow ray a path, chosen by a table of {nodes}^3 nodes for {emitters} emitters"
+    return nodes, [Choice("shadows in media", method, "no bias, and few rays to walk")]
 
 
 def choose_successive_paths(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:

@@ -239,8 +239,10 @@ def test_what_cannot_be_drawn_is_refused_or_met() -> None:
     for integrator in (auto, by_draws):
         _shoot(scene, integrator, mi.UInt32(1))  # a recording knows what was read before
     skip_recorded_grids_on_a_gpu()
-    image = np.array(dr.freeze(_shoot)(scene, auto, mi.UInt32(3)))
-    assert np.array_equal(image, np.array(_shoot(scene, by_chance, mi.UInt32(3))))
+    image, judge = np.array(dr.freeze(_shoot)(scene, auto, mi.UInt32(3))), np.array(_shoot(scene, by_chance, mi.UInt32(3)))
+    # In a recording of the user, a ray is spawned 1.8e-4 (1 + coordinate) beside the boundary of the medium, and the light of
+    # the floor changes by some times this; an ordinary render does not trace the boundary. Draws would change it altogether.
+    np.testing.assert_allclose(image, judge, rtol=0, atol=1e-3 * judge.max())
     with refused("media_light is 'drawn', and the emission cannot be read while dr.freeze records"):
         dr.freeze(_shoot)(scene, by_draws, mi.UInt32(1))
 

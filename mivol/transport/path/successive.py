@@ -105,6 +105,6 @@ def walk_successively(
     )
     dr.eval(L, alpha, kept)
     if kept is not None:
-        # Neighbouring lanes correct neighbouring paths, and none waits for the paths of another.
-        L += kept.correction(estimators.media, starts.ray)
+        # Here every lane has one shadow ray, and none waits for the longer path of another.
+        L += kept.light_at_camera(estimators.media, starts.ray)
     return L, alpha

@@ -101,7 +101,7 @@ class Path:
         sampler: random numbers.
         probes: points kept from the flights so far, for derivatives; None in images.
         shadow: shadow ray kept for derivatives; None in images and for paths scattering at surfaces only.
-        tabulated: shadow ray kept to correct shadows from a table; None without a table.
+        tabulated: shadow ray kept from those of vertices in media, by a table of shadows; None without a table.
         emitter_sample: emitter sample of the next vertex; None without side flights (each vertex then draws its own sample).
         emission_pdf: ``pdf`` in lanes where ``last`` has sampled the emission of media too, 0 in other lanes [1/sr]; None if
             media emission is never sampled.
@@ -598,9 +598,9 @@ def _start_reservoirs(estimators: Estimators, path: Path, *probes: str) -> Path:
 
 
 def _add_reservoirs(estimators: Estimators, path: Path) -> Path:
-    """Add the derivatives at the kept points and along the kept shadow ray, and correct shadows, at the end of a path."""
+    """Add the derivatives at the kept points and along the kept shadow ray, and its light in images, at the end of a path."""
     if path.tabulated is not None:
-        light = path.tabulated.correction(estimators.media, path.ray)
+        light = path.tabulated.light_at_camera(estimators.media, path.ray)
         path.score = path.score.add(TrackedTerm(light, mi.Bool(True)))
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(estimators.media, path.shadow))

@@ -256,7 +256,7 @@ class DirectLighting:
         if shadow is None:
             return DirectSample(ray_segment, value, on)
         shadow = shadow.times(dr.select(traced, 0, value))
-        return DirectSample(ray_segment, dr.select(traced, value, value * shadow.T), on, shadow)
+        return DirectSample(ray_segment, dr.select(traced, value, 0), on, shadow)
 
     def estimate_in_medium(
         self,

@@ -1,17 +1,17 @@
 r"""Shadows read from a table of optical depths, in place of shadow rays or with one exact shadow ray a path.
 
-.. math:: L = \sum_k f_k \hat T_k + \frac{w}{w_c}\, f_c\, (T_c - \hat T_c), \qquad w_k = f_k\, e_k, \quad w = \sum_k w_k
+.. math:: L = \frac{w}{w_c}\, f_c\, T_c, \qquad w_k = f_k \max(\hat T_k, T_0), \quad w = \sum_k w_k
 
 A :class:`TransmittanceGrid` holds the optical depth towards each emitter at the nodes of a lattice. The optical depth is
 interpolated: an interpolated transmittance would be too bright between nodes (by 54 % for a step of 2 in optical depth).
 Shadows from the table alone are biased.
 
-A path in media adds the light f T of many vertices, and walking a shadow ray takes most of the time of a vertex. So each vertex
-adds its light with the transmittance of the table, and the path keeps one vertex c of its vertices k, with probability w_c / w
-(weighted reservoir sampling). At the end of the path its exact shadow ray adds the error of the table, over that probability.
-The mean is that of exact shadow rays; the noise is that of the path, and of the errors of the table, which are small.
+The light of a path in media is the sum of f T over many vertices, and walking a shadow ray takes most of the time of a vertex.
+So a path keeps one vertex c of its vertices k, with a probability w_c / w in proportion to its light by the table (weighted
+reservoir sampling), and at its end follows the exact shadow ray of this vertex alone. The mean is that of all shadow rays. If
+the table is right, w is their sum, so the noise is that of the path. T_0 bounds the weight of light where the table is dark.
 
-References: Chao 1982 (weighted reservoir sampling).
+References: Chao 1982 (weighted reservoir sampling); Talbot et al. 2005 (resampling in proportion to approximate light).
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ SUN_RADIUS = 0.06
 SUN_DRAWS = 512
 """Number of directions among which the sun of an environment is found."""
 
-TABLE_ERROR, UNKNOWN_ERROR = 0.1, 1.0
-"""Expected errors e of a transmittance [1]: between the nodes of a table, and of light from other directions than the sun's.
-Any numbers above 0 are unbiased."""
+MIN_TABLE, UNKNOWN = 0.02, 0.3
+"""Least transmittance T_0 that a table may claim, and the transmittance that stands for light from other directions than the
+sun's [1]. Any numbers above 0 are unbiased."""
 
 
 def optical_depth_towards(
@@ -245,16 +245,14 @@ class TabulatedShadow:
         p: the vertex.
         target: point of the emitter.
         medium: medium around the vertex.
-        T: transmittance of the table [1]; 0 in directions without a table.
-        error: its expected error e [1].
+        T: largest transmittance of a channel by the table [1].
         light: light f of the vertex without its shadow [radiance].
     """
 
     p: mi.Point3d
     target: mi.Point3f
     medium: mi.MediumPtr
-    T: mi.Spectrum
-    error: mi.Float
+    T: mi.Float
     light: mi.Spectrum
 
     @classmethod
@@ -278,8 +276,8 @@ class TabulatedShadow:
             active: lanes to read.
         """
         known = grid.knows(number, direct.d)
-        T = dr.select(known, grid.transmittance(p, number, active), 0)
-        return cls(p, direct.p, medium, T, dr.select(known, TABLE_ERROR, UNKNOWN_ERROR), mi.Spectrum(1))
+        T = dr.maximum(dr.max(grid.transmittance(p, number, active)), MIN_TABLE)
+        return cls(p, direct.p, medium, dr.select(known, T, UNKNOWN), mi.Spectrum(1))
 
     def times(self, factor: mi.Spectrum) -> TabulatedShadow:
         """The shadow with its light multiplied by a factor."""
@@ -291,7 +289,7 @@ class KeptShadow:
     """The shadow ray that a path keeps of its vertices (weighted reservoir sampling).
 
     Attributes:
-        p, target, medium, T: as of :class:`TabulatedShadow`.
+        p, target, medium: as of :class:`TabulatedShadow`.
         light: light f of the vertex at the camera without its shadow [radiance].
         weight: reservoir weight of the vertex.
         total: total weight of the vertices so far.
@@ -300,7 +298,6 @@ class KeptShadow:
     p: mi.Point3d
     target: mi.Point3f
     medium: mi.MediumPtr
-    T: mi.Spectrum
     light: mi.Spectrum
     weight: mi.Float
     total: mi.Float
@@ -312,14 +309,13 @@ class KeptShadow:
 
     def offer(self, shadow: TabulatedShadow, chance: mi.Float, active: mi.Bool) -> KeptShadow:
         """Offer another vertex, with its light at the camera; ``chance`` is uniform in [0, 1)."""
-        weight = dr.select(active, dr.max(shadow.light) * shadow.error, 0)
+        weight = dr.select(active, dr.max(shadow.light) * shadow.T, 0)
         total = self.total + weight
         keep = chance * total < weight
         return KeptShadow(
             dr.select(keep, shadow.p, self.p),
             dr.select(keep, shadow.target, self.target),
             dr.select(keep, shadow.medium, self.medium),
-            dr.select(keep, shadow.T, self.T),
             dr.select(keep, shadow.light, self.light),
             dr.select(keep, weight, self.weight),
             total,
@@ -330,8 +326,8 @@ class KeptShadow:
         for field in fields(self):
             dr.scatter(getattr(self, field.name), getattr(values, field.name), index, active)
 
-    def correction(self, media: SceneMedia, ray: Ray) -> mi.Spectrum:
-        """The light missing at the camera [radiance].
+    def light_at_camera(self, media: SceneMedia, ray: Ray) -> mi.Spectrum:
+        """The light of all vertices at the camera, by the kept shadow ray [radiance].
 
         Args:
             media: media and surfaces.
@@ -343,11 +339,10 @@ class KeptShadow:
         direct = dr.zeros(mi.DirectionSample3f, dr.width(self.weight))
         direct.p, direct.time = self.target, ray.time
         _, clear, _, T = trace_shadow_ray(media, self.p, self.medium, direct, on)
-        T = dr.select(clear, T, 0)
-        return dr.select(on, self.light * (self.total / dr.select(on, self.weight, 1)) * (T - self.T), 0)
+        return dr.select(on & clear, self.light * (self.total / dr.select(on, self.weight, 1)) * T, 0)
 
 
 def _kinds() -> dict[str, type]:
     """The type of each field of :class:`KeptShadow` in the active variant."""
-    numbers = dict.fromkeys(("T", "light"), mi.Spectrum) | dict.fromkeys(("weight", "total"), mi.Float)
+    numbers = {"light": mi.Spectrum} | dict.fromkeys(("weight", "total"), mi.Float)
     return {"p": mi.Point3d, "target": mi.Point3f, "medium": mi.MediumPtr} | numbers
