@@ -23,9 +23,12 @@ CHANGES = {
     "hash": [],
     "gaussians": [],
     "scan": ["solve.iterations=5", "solve.tv=0.1"],
-    "stored": ['solve={name="os-sart", subsets=4, iterations=3, storage="matrix"}'],
+    "stored": [
+        'scan={beam="parallel", views=20, detector=[24, 24], pitch=0.09}',
+        'solve={name="os-sart", subsets=4, iterations=3, storage="matrix"}',
+    ],
 }
-"""Changes of an experiment of each kind; "stored" is the scan with stored rows."""
+"""Changes of an experiment of each kind; "stored" is a scan in parallel light with stored rows."""
 
 
 @pytest.fixture(scope="module")
