@@ -127,7 +127,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     Raises:
         MivolError: boundaries that disagree about the medium between them.
     """
-    boundaries, surfaces, solid, refractive, has_null = [], [], [], [], False
+    boundaries, surfaces, refractive, has_null = [], [], [], False
     shapes = scene.shapes()
     boxes = {s.ptr: oriented_box(s) for s in shapes if s.is_medium_transition()}
     named = {s.get_medium().ptr for s in scene.sensors() if s.get_medium() is not None}
@@ -139,8 +139,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
             if int(shape.bsdf().flags()) & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)):
                 refractive.append(f"{name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
-            surfaces.append(shape.class_name())
-            solid.append(shape)
+            surfaces.append(shape)
             # The shapes of an instance have other BSDFs than the instance itself.
             has_null |= is_instance(shape) or mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
     # Mitsuba merges equal media into one object: if a boundary of a medium is traced, all its boundaries are.
@@ -156,7 +155,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     # A medium that also surrounds a shape has no known end.
     boundaries = [replace(b, around=None) if b.medium.ptr in exteriors else b for b in boundaries]
     boundaries = [part for boundary in boundaries for part in _split_levels(boundary)] + around
-    solid += [s for s in edges if _is_bare(s)]
+    solid = [*surfaces, *(s for s in edges if _is_bare(s))]
     # A GPU traces rays in hardware.
     follows = mi.variant().startswith("llvm") and 0 < len(solid) <= MAX_FOLLOWED_SURFACES and not is_recording()
     tracer = _make_tracer(solid) if follows and boxed else None
@@ -166,7 +165,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     marked = [s for s in shapes if s.is_medium_transition() or follows]
     marks = tuple((s, _read_placement(s)) for s in marked)
     facts = ShapeFacts(
-        surfaces=tuple(surfaces),
+        surfaces=tuple(s.class_name() for s in surfaces),
         has_null_transmission=bool(has_null),
         emitters=tuple(e.class_name() for e in scene.emitters()),
         emitter_kinds=tuple(_emitter_kind(e) for e in scene.emitters()),
@@ -203,13 +202,11 @@ def _surface_boxes(shape: mi.Shape) -> list[np.ndarray]:
 
     The faces of a small mesh count as pieces by their planes, since Mitsuba merges the walls of a room into one mesh.
     """
-    if shape.class_name() in ("Cube", "Sphere", "Instance"):
-        return [_map_to_cube(oriented_box(shape).corners)]
     params = traverse(shape)
     if shape.class_name() == "Rectangle":
         placed = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)
         return [_map_to_cube((placed @ [[-1, 1, 1, -1], [-1, -1, 1, 1], [0] * 4, [1] * 4])[:3].T)]
-    if "faces" in params and len(params["faces"]) <= 3 * MAX_FACES:
+    if shape.class_name() != "Cube" and "faces" in params and len(params["faces"]) <= 3 * MAX_FACES:
         points = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
         return [_map_to_cube(points[indices]) for indices in _find_planes(points, np.array(params["faces"]).reshape(-1, 3))]
     return [_map_to_cube(np.stack(shape_bounds(shape)))]

@@ -139,34 +139,31 @@ def test_images_follow_values(name: str) -> None:
     assert not any(pair.recordings.failures.values())
 
 
-@pytest.mark.parametrize("name", cases(SCENES, slow=("stock grid", "phase", "fire", "one scattering")))
-def test_gradients_follow_values(name: str) -> None:
+def assert_same_derivatives(name: str, find: Callable[[Pair, str, int], list[np.ndarray]]) -> Pair:
+    """The derivatives by each parameter of a scene, in three calls with other values."""
     make, depth, keys = SCENES[name]
     pair = Pair(make(), depth)
     for key in keys:
         for call in range(3):
             pair.scale(key, 0.9)
-            found, truth = pair.gradients(key, call)
-            # Kernels of other inputs may round and sum in another order: at most some 200 terms in a voxel.
+            found, truth = find(pair, key, call)
+            # Kernels of other inputs may round and sum in another order: at most some 200 terms in a voxel or along a path.
             assert np.abs(found - truth).max() <= 200 * 2**-24 * np.abs(truth).max(), key
             assert np.abs(truth).max() > 0, key
     assert not any(pair.recordings.failures.values())
+    return pair
+
+
+@pytest.mark.parametrize("name", cases(SCENES, slow=("stock grid", "phase", "fire", "one scattering")))
+def test_gradients_follow_values(name: str) -> None:
+    assert_same_derivatives(name, Pair.gradients)
 
 
 @pytest.mark.parametrize("name", cases(SCENES, slow=[name for name in SCENES if name not in ("phase", "one scattering")]))
 def test_tangents_follow_values(name: str) -> None:
-    make, depth, keys = SCENES[name]
-    pair = Pair(make(), depth)
-    for key in keys:
-        for call in range(3):
-            pair.scale(key, 0.9)
-            found, truth = pair.tangents(key, call)
-            # Kernels of other inputs may round and sum in another order: at most some 200 terms along a path.
-            assert np.abs(found - truth).max() <= 200 * 2**-24 * np.abs(truth).max(), key
-            assert np.abs(truth).max() > 0, key
-    assert not any(pair.recordings.failures.values())
+    pair = assert_same_derivatives(name, Pair.tangents)
     # The ``g`` of a stock ``hg`` is recorded anew in each step.
-    assert pair.recordings.count <= 2 * len(keys) + (name == "stock phase")
+    assert pair.recordings.count <= 2 * len(SCENES[name][2]) + (name == "stock phase")
 
 
 def test_a_gradient_flows_on_to_what_a_parameter_was_made_from() -> None:

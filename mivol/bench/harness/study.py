@@ -78,7 +78,7 @@ class SweptQuestion:
     Attributes:
         split: size -> pieces, plain Python.
         compute: piece, size -> answer to the piece.
-        join: size, answers by piece in their order -> answer.
+        join: size, answers by piece in their order -> answer; by default these answers.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class SweptQuestion:
         text: str,
         split: Callable[[Any], Sequence[Any]],
         compute: Callable[[Any, Any], dict],
-        join: Callable[[Any, dict[Any, dict]], dict],
+        join: Callable[[Any, dict[Any, dict]], dict] = lambda size, answers: answers,
     ) -> None:
         """Make a question.
 

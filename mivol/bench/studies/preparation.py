@@ -208,7 +208,6 @@ measure_motion = SweptQuestion(
     "How near to the truth are fitted shifts and turns of the views?",
     lambda size: list(MOTION_CASES),
     measure_moves,
-    lambda size, found: found,
 )
 
 

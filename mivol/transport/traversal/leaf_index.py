@@ -390,7 +390,7 @@ def _mark_far_vacuum(table: np.ndarray, n: int) -> None:
         for reach in range(2, REACHES[-1] + 1):
             # A cube of the edge r is free if the eight cubes of the edge r - 1 at its corners are; outside all is free.
             for axis in range(3):
-                free = free & np.concatenate([np.take(free, range(1, n), axis), np.ones_like(np.take(free, [0], axis))], axis)
+                free = free & _next_along(free, axis, True)
             if reach in REACHES:
                 code[free] = CODES[REACHES.index(reach)]
         vacuum |= code[turn].reshape(-1) << np.uint32(3 * octant)

@@ -207,7 +207,6 @@ measure_hard = SweptQuestion(
     "Is the radiance of every path of hard scenes finite and not negative?",
     lambda size: list(HARD),
     try_hard,
-    lambda size, counts: counts,
 )
 
 

@@ -16,17 +16,17 @@ References: Chao 1982 (weighted reservoir sampling); Talbot et al. 2005 (resampl
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
 from mivol.transport.media.channels import to_spectrum
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.box import map_point
+from mivol.transport.traversal.box import Box, map_point, opaque_rows
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice
 from mivol.transport.traversal.rays import Ray
@@ -136,11 +136,7 @@ class TransmittanceGrid:
         Cost: one shadow ray for each node and emitter.
         """
         nodes = tuple(max(2, -(-n // cells) + 1) for n in lattice.res)
-        scales = [dr.rcp(mi.Float64(n)) for n in lattice.res[::-1]]
-        rows = [
-            [row[0] * s, row[1] * s, row[2] * s, (row[3] + 0.5) * s] for row, s in zip(lattice.from_world, scales, strict=True)
-        ]
-        return cls._integrate(media, emitters, nodes, rows, lattice.to_world_points)
+        return cls._integrate(media, emitters, nodes, Box(lattice.to_world))
 
     @classmethod
     def over_box(cls, media: SceneMedia, emitters: SceneEmitters, box: mi.ScalarBoundingBox3f, edge: int) -> TransmittanceGrid:
@@ -154,14 +150,12 @@ class TransmittanceGrid:
 
         Bias, cost: as of :meth:`over_lattice`.
         """
-        low, size = mi.ScalarPoint3f(box.min), mi.ScalarVector3f(box.extents())
-        mean = max(size[0] * size[1] * size[2], 1e-30) ** (1 / 3)
-        nodes = tuple(max(2, min(2 * edge, round(edge * size[a] / mean))) for a in (2, 1, 0))
-        low_d, size_d = [dr.opaque(mi.Float64, low[a]) for a in range(3)], [dr.opaque(mi.Float64, size[a]) for a in range(3)]
-        zero = mi.Float64(0)
-        rows = [[dr.rcp(size_d[a]) if b == a else zero for b in range(3)] + [-low_d[a] / size_d[a]] for a in range(3)]
-        place = lambda u: mi.Point3f(*(mi.Float(low_d[a]) + mi.Float(size_d[a]) * u[a] for a in range(3)))  # noqa: E731
-        return cls._integrate(media, emitters, nodes, rows, place)
+        size = np.array(box.extents(), np.float64)
+        # A flat box has no map from the world.
+        placed = Box(np.diag([*np.maximum(size, max(1e-6 * size.max(), 1e-30)), 1.0]))
+        placed.to_world[:3, 3] = box.min
+        nodes = tuple(max(2, min(2 * edge, round(edge * placed.to_world[a, a] / placed.edge))) for a in (2, 1, 0))
+        return cls._integrate(media, emitters, nodes, placed)
 
     @classmethod
     def _integrate(
@@ -169,15 +163,15 @@ class TransmittanceGrid:
         media: SceneMedia,
         emitters: SceneEmitters,
         nodes: tuple[int, int, int],
-        rows: list[list[mi.Float64]],
-        place: Callable[[mi.Vector3f], mi.Point3f],
+        box: Box,
     ) -> TransmittanceGrid:
-        """Integrate the optical depth from every node to every emitter; ``place`` maps the unit cube to the world."""
+        """Integrate the optical depth from every node in a box to every emitter."""
         z, y, x = nodes
         index = dr.arange(mi.UInt32, z * y * x)
         at = (index % x, (index // x) % y, index // (x * y))
         # Slightly inside, since a shadow ray in the plane of a face counts as outside the box.
-        p = place(mi.Vector3f(*(dr.clip(mi.Float(a) / (m - 1), INSET, 1 - INSET) for a, m in zip(at, (x, y, z), strict=True))))
+        u = [dr.clip(mi.Float(a) / (m - 1), INSET, 1 - INSET) for a, m in zip(at, (x, y, z), strict=True)]
+        p = mi.Point3f(*(map_point(row, u) for row in opaque_rows(box.to_world[:3])))
         count, k = len(emitters.sampled), media.channels
         suns = [find_sun(e)[0] if e.is_environment() else None for e in emitters.sampled]
         tau = dr.zeros(mi.Float, z * y * x * count * k)
@@ -185,7 +179,7 @@ class TransmittanceGrid:
             for c, row in enumerate(optical_depth_towards(media, p, emitter, mi.Bool(True), sun)):
                 dr.scatter(tau, row, (index * count + number) * k + c)
         dr.eval(tau, suns)
-        return cls(tau, nodes, rows, count, k, suns)
+        return cls(tau, nodes, box.rows(), count, k, suns)
 
     def transmittance(self, p: mi.Point3f | mi.Point3d, number: mi.UInt32 | int, active: mi.Bool) -> mi.Spectrum:
         """exp(-tau) towards one emitter, with tau interpolated trilinearly at a point [1]."""
