@@ -46,6 +46,7 @@ from mivol.transport.media.medium_view import traverse_medium
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.film import find_batch_views
 from mivol.transport.path.walk import walk_path
+from mivol.transport.traversal.box import with_placements
 
 
 @dataclass
@@ -178,7 +179,9 @@ class Session:
             self._opened = {}
             self.recordings.clear()
         survey = self._surveyed.survey
-        needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
+        known = next(iter(self._opened.values()), None)
+        with with_placements(None if known is None else known.arrays.placements, {} if known is None else known.places):
+            needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
         warn_of_misplaced_grids(needs, survey)
         warn_of_clipped_view(needs, sensor, survey)
         with dr.suspend_grad():

@@ -287,14 +287,18 @@ def test_negative_voxels_count_as_zero_in_a_recording() -> None:
 
 
 def test_a_replay_launches_few_kernels() -> None:
-    """At depth 6: kernels, copies and fills of an image, and of a gradient with its image and two updates."""
+    """At depth 6: kernels, copies and fills of an image, and of a gradient with its image and two updates.
+
+    With two threads, Dr.Jit fills, copies and sums an array of each thread for each scatter of sums.
+    """
     pair = Pair(smoke_under(), 6)
+    set_thread_count(2)
     key = INSIDE + "sigma_t.data"
     for _ in range(3):
         pair.images(1), pair.gradient(pair.recorded, key, 1)
     image = lambda: dr.eval(mi.render(pair.scene, integrator=pair.recorded, seed=2, spp=2))  # noqa: E731
-    assert count_launches(image) <= 9
-    assert count_launches(lambda: pair.gradient(pair.recorded, key, 2)) <= 64
+    assert count_launches(image) <= 10
+    assert count_launches(lambda: pair.gradient(pair.recorded, key, 2)) <= 71
 
 
 # -- What is traced ---------------------------------------------------------------------------------------------------------

@@ -89,22 +89,26 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
     stems, collision = walk_stem(replayed, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
     baseline = estimators.segment.baseline
-    dr.schedule(stems.L, dL)
+    light, lane = _PackedLight.of(stems.L), dr.arange(mi.UInt32, n)
+    dr.schedule(dL)
     branching = _Branching.of(collision, first, USUAL_NOISE if baseline is None else baseline.noise)
-    branches = branching.gather(dr.arange(mi.UInt32, n))
+    branches = branching.gather(lane)
     primal, depth = branches.walk(replayed, Primal(dr.zeros(mi.Spectrum, n)))
-    for L_stem, L_branch in zip(stems.L, primal.L, strict=True):
-        dr.scatter_add(L_stem, L_branch * branching.share, branches.stem, branches.collision.on)
+    light.add(primal.L * branching.share, branches.stem, branches.collision.on)
     # One kernel walks the branches, adds their light to the stems, and counts them by length.
     lengths = _Lengths.of(depth)
     dr.eval(primal.L, lengths)
 
     # -- Their replays ---------------------------------------------------------------------------------------------------
-    replay_in_one_kernel(n, lambda: walk_stem(estimators, replayed_sampler, rays.ray, Replay(stems.L, dL)))
     order = lengths.sort()
     branches, L = branching.gather(order), dr.gather(mi.Spectrum, primal.L, order)
     dL_branch = dr.gather(mi.Spectrum, dL, branches.stem) * branching.share
-    replay_in_one_kernel(n, lambda: branches.walk(estimators, Replay(L, dL_branch)))
+
+    def replay() -> None:
+        walk_stem(estimators, replayed_sampler, rays.ray, Replay(light.gather(lane), dL))
+        branches.walk(estimators, Replay(L, dL_branch))
+
+    replay_in_one_kernel(n, replay)
 
 
 def replay_in_one_kernel(width: int, walk: Callable[[], object]) -> None:
@@ -124,6 +128,40 @@ def replay_in_one_kernel(width: int, walk: Callable[[], object]) -> None:
         return (number + 1,)
 
     dr.while_loop(state=(dr.zeros(mi.UInt32, width),), cond=lambda number: number < 1, body=turn, label="replay")
+
+
+@dataclass
+class _PackedLight:
+    """Radiances as one array, to which Dr.Jit adds all colours of a lane at once.
+
+    Attributes:
+        values: colours fastest, with a zero after three colours: Dr.Jit writes 1, 2 or 4 numbers at once.
+        colours: number of colours.
+    """
+
+    values: mi.Float
+    colours: int
+
+    @classmethod
+    def of(cls, L: mi.Spectrum) -> _PackedLight:
+        """Pack the radiance of each lane."""
+        packed = cls(dr.empty(mi.Float, 0), len(L))
+        row = packed._pad(L)
+        packed.values = dr.empty(mi.Float, len(row) * dr.width(L))
+        dr.scatter(packed.values, row, dr.arange(mi.UInt32, dr.width(L)))
+        return packed
+
+    def add(self, L: mi.Spectrum, index: mi.UInt32, active: mi.Bool) -> None:
+        """Add radiances to the lanes with an index."""
+        dr.scatter_add(self.values, self._pad(L), index, active)
+
+    def gather(self, index: mi.UInt32) -> mi.Spectrum:
+        """The radiance of the lanes with an index."""
+        shape = (len(self._pad(dr.zeros(mi.Spectrum))), dr.width(index))
+        return mi.Spectrum(*dr.gather(mi.ArrayXf, self.values, index, shape=shape)[: self.colours])
+
+    def _pad(self, L: mi.Spectrum) -> mi.ArrayXf:
+        return mi.ArrayXf([*L, *[mi.Float(0)] * (self.colours == 3)])
 
 
 @dataclass
@@ -272,7 +310,8 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None
         if isinstance(factor, SegmentTransmittance):
             factor.shared.collect(sums, light)
 
-    sums.add_path(L)
+    # Evaluated before the light of paths is added: the second walk adds it with the collisions, in one kernel.
     dr.eval(L)
+    sums.add_path(L)
     walk_path(estimators, sampler, chosen, Rest(L, collect))
     return sums.finish()

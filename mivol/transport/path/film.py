@@ -295,7 +295,7 @@ def adjoint_rays(
             dr.traverse(dr.ADMode.Backward)
             dL, daovs = dr.grad(L), [dr.grad(a) for a in aovs]
         film.clear()
-        dr.eval(dL, daovs)
+        dr.schedule(dL, daovs)
         yield rays, dL, daovs
 
 

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.kernel_recording import is_recording
 from mivol.scene_graph import traverse
 
 __all__ = [
@@ -93,7 +94,7 @@ class Box:
         return bool(apart.max() <= tolerance * size)
 
 
-_PLACEMENTS: ContextVar[tuple[mi.Float64, dict[bytes, int]] | None] = ContextVar("placements", default=None)
+_PLACEMENTS: ContextVar[tuple[mi.Float64, dict[bytes, int], mi.UInt32] | None] = ContextVar("placements", default=None)
 
 
 @contextmanager
@@ -106,7 +107,9 @@ def with_placements(numbers: mi.Float64 | None, places: dict[bytes, int]) -> Ite
         numbers: the numbers of all groups; None to make every number anew.
         places: index of the first number of each group, by the bytes of the group.
     """
-    token = _PLACEMENTS.set(None if numbers is None else (numbers, places))
+    # Outside of recordings, Dr.Jit copies the number at a literal index at once.
+    start = mi.UInt32(0) if numbers is None or is_recording() else dr.opaque(mi.UInt32, 0)
+    token = _PLACEMENTS.set(None if numbers is None else (numbers, places, start))
     try:
         yield
     finally:
@@ -115,11 +118,11 @@ def with_placements(numbers: mi.Float64 | None, places: dict[bytes, int]) -> Ite
 
 def opaque_numbers(values: np.ndarray) -> list[mi.Float64]:
     """Numbers as arguments of a kernel, so that boxes and grids in different places share one compiled kernel."""
-    numbers, places = _PLACEMENTS.get() or (None, {})
+    numbers, places, start = _PLACEMENTS.get() or (None, {}, None)
     first = places.get(values.tobytes())
     if first is None:
         return [dr.opaque(mi.Float64, float(v)) for v in values]
-    return [dr.gather(mi.Float64, numbers, mi.UInt32(first + k)) for k in range(len(values))]
+    return [dr.gather(mi.Float64, numbers, start + (first + k)) for k in range(len(values))]
 
 
 def opaque_rows(rows: np.ndarray) -> list[list[mi.Float64]]:

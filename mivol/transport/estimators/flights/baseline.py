@@ -117,7 +117,6 @@ class BaselineSums:
         # For each colour and block the sums of w, w L and w L^2, the number of collisions in each block, and the mean light of
         # all paths.
         self.sums = dr.zeros(mi.Float, (3 * self._colours + 1) * self._count + self._colours)
-        dr.eval(self.sums)
 
     def add_path(self, L: mi.Spectrum) -> None:
         """Add the light of paths, from which the baseline follows if none collides."""
@@ -171,12 +170,11 @@ class BaselineSums:
         share = _ratio(informs, informs + DEPENDENCE * inside)
         values = mean + dr.select(W > 0, share * (own - mean), 0)
 
-        left, means = dr.opaque(mi.Float, 0), dr.zeros(mi.Float, colours)
+        left = dr.zeros(mi.Float, 1)
         dr.scatter_add(left, Q - 2 * values * S + dr.square(values) * W, mi.UInt32(0))
-        dr.scatter(means, mean, colour, i == colour * n)
-        dr.eval(values, left, means)
+        dr.eval(values, left, mean)
         known = sum(dr.gather(mi.Float, totals, mi.UInt32(2 * colours + c)) for c in range(colours))
-        return Baseline(self.blocks, values, n, means, _ratio(dr.maximum(left, 0), known))
+        return Baseline(self.blocks, values, n, mean, _ratio(dr.maximum(left, 0), known))
 
 
 def _ratio(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -192,7 +190,7 @@ class Baseline:
         blocks: blocks of each medium.
         values: radiance of each colour in each block, blocks fastest.
         count: number of blocks.
-        mean: mean of each colour.
+        mean: mean of each colour, repeated for each block as in ``values``.
         noise: second moment of the light about the baseline at collisions, over its second moment about 0 [1].
     """
 
@@ -216,7 +214,7 @@ class Baseline:
     @property
     def average(self) -> mi.Spectrum:
         """The mean over all collisions."""
-        return mi.Spectrum(*(dr.gather(mi.Float, self.mean, mi.UInt32(c)) for c in range(dr.size_v(mi.Spectrum))))
+        return mi.Spectrum(*(dr.gather(mi.Float, self.mean, mi.UInt32(c * self.count)) for c in range(dr.size_v(mi.Spectrum))))
 
     def _of(self, body: Body) -> MediumBlocks:
         return next(blocks for blocks in self.blocks if blocks.body is body)
