@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from mivol.errors import MivolError
 from mivol.files.source import refusal
@@ -82,6 +80,9 @@ def interpolate_cameras(cameras: Sequence[Camera], n: int) -> list[Camera]:
     """
     if len(cameras) < 2:
         raise refusal("a path between views", f"{len(cameras)} cameras", "at least 2", "give more views")
+    from scipy.interpolate import CubicSpline  # a second of import, which only paths need
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     keys, times = np.arange(len(cameras)), np.linspace(0, len(cameras) - 1, n)
     rotations = RotationSpline(keys, Rotation.from_matrix([c.to_world[:3, :3] for c in cameras]))(times).as_matrix()
     positions = CubicSpline(keys, [camera.origin for camera in cameras])(times)
@@ -105,6 +106,8 @@ def follow_keyframes(cameras: Sequence[Camera], keyframes: Sequence[Sequence[flo
     keys = np.array(keyframes, np.float64).reshape(-1, 6)
     if len(keys) < 2 or not np.isfinite(keys).all():
         raise refusal("keyframes", keys.tolist(), "at least two of six finite numbers", "give positions and targets")
+    from scipy.interpolate import CubicSpline
+
     up = _mean_up(cameras)
     rows = CubicSpline(np.arange(len(keys)), keys)(np.linspace(0, len(keys) - 1, n))
     return [aim_camera(cameras[0], row[:3], row[3:], up, f"step {i}") for i, row in enumerate(rows)]

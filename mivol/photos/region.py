@@ -12,8 +12,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter
-from scipy.spatial import cKDTree
 
 from mivol.files.source import refusal
 from mivol.photos.camera import FLIP, Camera, is_seen, project, rays
@@ -194,6 +192,8 @@ def is_free_space(cameras: Sequence[Camera], points: np.ndarray, reach: float) -
         reach: median distance of the cameras from what they look at [length].
     """
     clear, within = find_free_distances(cameras, reach)
+    from scipy.spatial import cKDTree  # imported late: a scan or a scene needs none of it
+
     distance = cKDTree(np.array([camera.origin for camera in cameras])).query(points)[0]
     free = distance < clear
     near = np.flatnonzero(~free & (distance < within))
@@ -330,6 +330,8 @@ def _opaque_cells(camera: Camera, alpha: np.ndarray, cells: np.ndarray, radius: 
     # more pixel allows for a lens, which magnifies towards the border.
     slope = np.hypot(*np.maximum(camera.K[:2, 2], camera.size - camera.K[:2, 2])) / camera.K[0, 0]
     pixels = int(np.ceil(camera.K[:2, :2].max() * radius * np.sqrt(1 + slope**2) / (nearest - radius))) + 1
+    from scipy.ndimage import maximum_filter
+
     near = maximum_filter(alpha > 0, size=2 * pixels + 1)
     inside = (depth > 0) & ((x >= 0) & (x < camera.size)).all(axis=1)
     column, row = np.where(inside[:, None], x, 0).astype(int).T

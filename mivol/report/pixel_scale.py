@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.image import imsave
 from numpy.typing import NDArray
+from PIL import Image
 
 from mivol.errors import MivolError
 from mivol.files import encode_srgb
@@ -115,7 +115,7 @@ def _channels(image: NDArray) -> int:
 def encode_png(rgb: NDArray[np.uint8]) -> bytes:
     """Encode pixels as PNG."""
     buffer = io.BytesIO()
-    imsave(buffer, rgb, format="png", metadata={"Software": None}, pil_kwargs={"optimize": True})
+    Image.fromarray(np.ascontiguousarray(rgb)).save(buffer, "png", compress_level=6)
     return buffer.getvalue()
 
 
@@ -216,8 +216,8 @@ def _over_white(colour: NDArray, finite: NDArray, opacity: NDArray | None) -> ND
 
 
 def is_preview_due(iteration: int, iterations: int) -> bool:
-    """Return whether a run writes a preview after an iteration: the first, the last, and about twenty between them."""
-    return iteration in (1, iterations) or iteration % max(1, iterations // 20) == 0
+    """Return whether a run writes a preview after an iteration: the first, the last, and about ten between them."""
+    return iteration in (1, iterations) or iteration % max(1, iterations // 10) == 0
 
 
 def write_preview(folder: Path, volume: NDArray, size: tuple[float, float, float]) -> Path:

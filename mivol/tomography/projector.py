@@ -176,6 +176,11 @@ class Projector:
         """``A.T @ 1``, (Z, Y, X): total length of all rays in each voxel [length]."""
         return self.T @ np.ones(self.projection_shape, np.float32)
 
+    @cached_property
+    def row_sums(self) -> np.ndarray:
+        """``A @ 1``, (views, rows, cols): length of each ray in the grid [length]."""
+        return self @ np.ones(self.grid.shape, np.float32)
+
     def as_linear_operator(self) -> scipy.sparse.linalg.LinearOperator:
         """The pair as a SciPy linear operator, for ``lsqr``, ``lsmr``, ``cg``, ``eigsh`` and others."""
         from scipy.sparse.linalg import LinearOperator

@@ -134,6 +134,26 @@ def test_pcg_with_prior_reaches_the_minimum_that_lbfgs_finds(scan):
     assert state.objective == pytest.approx(found.fun, rel=1e-6)
 
 
+def test_a_projected_step_costs_one_projection(scan):
+    """24 views, three of which give the length before the projection; each step of this scan leaves the domain."""
+    a, _, b = scan
+    views = []
+
+    class Counting(Views):
+        def __matmul__(self, x: np.ndarray) -> np.ndarray:
+            views.append(self.n_views)
+            return super().__matmul__(x)
+
+        def subset(self, some: np.ndarray) -> Counting:
+            return Counting(super().subset(some).matrix, len(some))
+
+    rng = np.random.default_rng(1)
+    problem = LeastSquares(Counting(a.matrix, a.n_views), b + 0.1 * rng.normal(size=b.shape), nonnegative=True)
+    run("pcg", problem, 10)
+    sums_and_start = 2 * a.n_views
+    assert sum(views) == sums_and_start + 10 * (a.n_views + 3)
+
+
 def test_preconditioner_helps_unequal_voxels(scan):
     """Voxels that rays feel 1 to 1000 times as strongly (as voxels of uneven size would be): Jacobi evens them out."""
     a, _, b = scan

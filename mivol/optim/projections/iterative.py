@@ -25,6 +25,7 @@ from mivol.optim.projections.linear_problems import (
     dot,
     flat_weights,
     flatten,
+    ray_lengths,
     reciprocal,
     start_field,
 )
@@ -112,7 +113,7 @@ class _Block:
 
 def _blocks(problem: LeastSquares, n_subsets: int) -> list[_Block]:
     a = problem.A
-    chord = a @ np.ones(a.shape[1], a.dtype)
+    chord = ray_lengths(a)
     views = [None] if n_subsets == 1 else [np.arange(s, a.n_views, n_subsets) for s in _golden_order(n_subsets)]
     return [_block(problem, v, chord) for v in views]
 
@@ -140,14 +141,16 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
     Without bounds and prior this is linear CG (CGLS if not preconditioned). Otherwise it is Polak-Ribiere CG on the free voxels
     (x > 0, or pushed up by the gradient). A step that would leave the domain is projected onto the domain, and followed to the
     minimum of the majoriser along the projected direction. If the projected direction does not descend, the diagonally scaled
-    gradient replaces the direction; its projection always descends. The objective therefore never rises.
+    gradient replaces the direction; its projection always descends. The objective therefore never rises. The length of the
+    step before its projection comes from every eighth view: it decides where the step meets the domain, not how far it goes.
 
     Preconditioner: ``diag(A^T W A 1 + separable majoriser of the prior)^-1`` (SQS). Voxels that no ray crosses keep ``x0``.
-    Cost per iteration: one A and one A^T, and one more A for a projected step.
+    Cost per iteration: one A and one A^T, and an eighth of an A for a projected step (one more A with fewer than 16 views).
     """
     a = problem.A
     weights = flat_weights(problem)
-    data_diagonal = a.T @ apply_weights(weights, a @ np.ones(a.shape[1], a.dtype)) if precondition else None
+    sample = _Sample.of(problem, weights)
+    data_diagonal = a.T @ apply_weights(weights, ray_lengths(a)) if precondition else None
     if state is None:
         x = start_field(a, problem.x0)
         if problem.nonnegative:
@@ -162,7 +165,8 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
             return
         direction, downhill, memory = directions
         g = memory["gradient"]
-        step = _descend(problem, weights, state.x, g, direction) or _descend(problem, weights, state.x, g, downhill)
+        ways = (_descend(problem, weights, sample, state.x, g, way) for way in (direction, downhill))
+        step = next((way for way in ways if way is not None), None)
         if step is None:
             return
         x, r = np.add(state.x, step[0], out=step[0]), state.memory["residual"] - step[1]
@@ -209,32 +213,83 @@ def _scaled_gradient(problem: LeastSquares, x: np.ndarray, g: np.ndarray, data_d
     return z
 
 
+SAMPLED, MIN_SAMPLES = 8, 2
+"""Every how many views give the length of a step before its projection, and the fewest of them."""
+
+
 def _descend(
-    problem: LeastSquares, weights: np.ndarray | None, x: np.ndarray, g: np.ndarray, direction: np.ndarray
+    problem: LeastSquares,
+    weights: np.ndarray | None,
+    sample: _Sample | None,
+    x: np.ndarray,
+    g: np.ndarray,
+    direction: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """(step, A step) to the minimum along ``direction``, projected onto the domain; None if the direction does not descend."""
-
-    def minimum(d: np.ndarray) -> tuple[float, np.ndarray] | None:
-        image = problem.A @ d
-        curvature = dot(image, apply_weights(weights, image)) + (problem.prior.curvature(x, d) if problem.prior else 0.0)
-        slope = dot(g, d)
-        return (-slope / curvature, image) if slope < 0 and curvature > 0 else None
-
-    lowest = minimum(direction)
-    if lowest is None:
-        return None
-    step = np.asarray(lowest[0], x.dtype) * direction
-    if not problem.nonnegative or all((x[part] + step[part]).min() >= 0 for part in blocks(len(x))):
-        return step, np.asarray(lowest[0], x.dtype) * lowest[1]
+    rough = sample and sample.length(problem, x, g, direction)
+    if rough is None:
+        lowest = _minimum(problem, weights, x, g, direction)
+        if lowest is None:
+            return None
+        rough, image = lowest
+        step = np.asarray(rough, x.dtype) * direction
+        if not problem.nonnegative or _stays_nonnegative(x, step):
+            return step, np.asarray(rough, x.dtype) * image
+    else:
+        step = np.asarray(rough, x.dtype) * direction
     for part in blocks(len(x)):
         step[part] = np.maximum(x[part] + step[part], 0) - x[part]
-    lowest = minimum(step)
+    lowest = _minimum(problem, weights, x, g, step)
     if lowest is None:
         return None
     # Beyond length 1 the projected step could leave the domain again.
     length = np.asarray(min(1.0, lowest[0]), x.dtype)
     step *= length
     return step, length * lowest[1]
+
+
+def _stays_nonnegative(x: np.ndarray, step: np.ndarray) -> bool:
+    return all((x[part] + step[part]).min() >= 0 for part in blocks(len(x)))
+
+
+def _minimum(
+    problem: LeastSquares, weights: np.ndarray | None, x: np.ndarray, g: np.ndarray, d: np.ndarray
+) -> tuple[float, np.ndarray] | None:
+    """Length to the majoriser's minimum along ``d``, and ``A d``; None if ``d`` does not descend."""
+    image = problem.A @ d
+    length = _length(problem, x, g, d, dot(image, apply_weights(weights, image)))
+    return None if length is None else (length, image)
+
+
+def _length(problem: LeastSquares, x: np.ndarray, g: np.ndarray, d: np.ndarray, data_curvature: float) -> float | None:
+    curvature = data_curvature + (problem.prior.curvature(x, d) if problem.prior else 0.0)
+    slope = dot(g, d)
+    return -slope / curvature if slope < 0 and curvature > 0 else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Every eighth view of a problem with a domain, for the length of steps that leave the domain."""
+
+    a: Any
+    weights: np.ndarray | None
+    all_over_some: float
+
+    @classmethod
+    def of(cls, problem: LeastSquares, weights: np.ndarray | None) -> _Sample | None:
+        """The sample; None without a domain, or with fewer than 16 views."""
+        views = getattr(problem.A, "n_views", 1)
+        if not problem.nonnegative or views < SAMPLED * MIN_SAMPLES:
+            return None
+        some = np.arange(SAMPLED // 2, views, SAMPLED)
+        used = None if weights is None else weights.reshape(views, -1)[some].reshape(-1)
+        return cls(problem.A.subset(some), used, views / len(some))
+
+    def length(self, problem: LeastSquares, x: np.ndarray, g: np.ndarray, d: np.ndarray) -> float | None:
+        """Length to the minimum along ``d`` by the sample's curvature; None if ``d`` ascends, or stays in the domain."""
+        image = self.a @ d
+        length = _length(problem, x, g, d, self.all_over_some * dot(image, apply_weights(self.weights, image)))
+        return None if length is None or _stays_nonnegative(x, np.asarray(length, x.dtype) * d) else length
 
 
 def cgls(problem: LeastSquares, state: SolverState | None = None) -> Iterator[SolverState]:
@@ -261,7 +316,7 @@ def transmission_likelihood(problem: PoissonCounts, state: SolverState | None = 
     """
     a, prior = problem.A, problem.prior
     counts = _Counts.of(problem)
-    chord = a @ np.ones(a.shape[1], a.dtype)
+    chord = ray_lengths(a)
     if state is None:
         x = np.maximum(start_field(a, problem.x0), 0)
         state = counts.state(x, 0, a @ x)

@@ -112,6 +112,11 @@ def start_field(a: Any, x0: np.ndarray | None) -> np.ndarray:
     return np.zeros(a.shape[1], a.dtype) if x0 is None else flatten(x0, a.dtype).copy()
 
 
+def ray_lengths(a: Any) -> np.ndarray:
+    """``A 1`` (m,), which a projector computes once."""
+    return flatten(a.row_sums if isinstance(a, Projector) else a @ np.ones(a.shape[1], a.dtype), a.dtype)
+
+
 def flat_weights(problem: LeastSquares) -> np.ndarray | None:
     """Weights of rays (m,); None: 1."""
     return None if problem.weights is None else flatten(problem.weights, problem.A.dtype)
@@ -360,7 +365,7 @@ def scale_tv_to_noise(a: Projector, y: np.ndarray, weights: np.ndarray, tv: floa
     w = np.asarray(weights, np.float64)
     sensitivity = np.asarray(a.T @ flatten(w, a.dtype), np.float64)
     pull = np.sqrt(CHORD * edge * np.median(sensitivity[sensitivity > 0])) if (sensitivity > 0).any() else 0.0
-    chord = np.asarray(a @ np.ones(a.shape[1], a.dtype), np.float64).reshape(w.shape)
+    chord = ray_lengths(a).astype(np.float64).reshape(w.shape)
     mean = abs(float(np.sum(w * y * chord))) / max(float(np.sum(w * chord**2)), np.finfo(float).tiny)
     slope = delta * mean / edge
     return SmoothedTV(a.grid.shape, tv * float(pull) / edge**2, slope or np.finfo(np.float32).tiny, a.grid.voxel_size)
