@@ -50,3 +50,19 @@ def lattice_from_world(to_world: np.ndarray, res: tuple[int, int, int]) -> np.nd
     q = inverse[:3] * n
     q[:, 3] -= 0.5
     return q
+
+
+def place_grid(box: np.ndarray, longest: int) -> tuple[tuple[int, int, int], np.ndarray]:
+    """Resolution (Z, Y, X) and ``to_world`` of a grid of cubic voxels that covers a box (2, 3)."""
+    edges = box[1] - box[0]
+    h = edges.max() / longest
+    counts = np.maximum(np.ceil(edges / h - 1e-9), 1).astype(int)
+    to_world = np.diag([*(counts * h), 1.0])
+    to_world[:3, 3] = box.mean(axis=0) - counts * h / 2
+    return (int(counts[2]), int(counts[1]), int(counts[0])), to_world
+
+
+def bounds_of(to_world: np.ndarray) -> np.ndarray:
+    """The upright box (2, 3) around the unit cube under a map (4, 4) to the world."""
+    corners = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ to_world.T
+    return np.stack([corners[:, :3].min(axis=0), corners[:, :3].max(axis=0)])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -49,6 +50,7 @@ __all__ = [
     "fit_photographs",
     "load_photographer",
     "prepare_fit",
+    "prepare_fit_in_time",
 ]
 
 SCRIPT = CHECKOUT / "scenes" / "still_life" / "photographs.py"
@@ -177,6 +179,29 @@ def prepare_fit(
         return PhotoProblem(problem, train, judged, problem.plan.steps)
     begun = start_gaussians(chosen, train, make_gaussian_plan(chosen))
     return PhotoProblem(begun.problem(seed), train, judged, begun.plan.steps)
+
+
+TIMED_STEPS = 20
+"""Steps that are timed before a fit in a given time; as many before them compile."""
+
+
+def prepare_fit_in_time(folder: Path, photos: dict, field: dict, seconds: float, clock: str = "processor") -> PhotoProblem:
+    """Prepare a fit of a field with as many steps as fit into a time, and with the whole course of its learning rates.
+
+    Args:
+        folder, photos: as of :func:`prepare_fit`.
+        field: the table ``field``, without an effort.
+        seconds: the time, without that of the timed steps.
+        clock: attribute of a :class:`Stopwatch`: "processor" or "seconds".
+    """
+    pilot, watch = prepare_fit(folder, photos, {"field": field}), Stopwatch()
+    begun = begin_fit(pilot.problem, pilot.problem.plan.optimizer, pilot.problem.plan.course())
+    for timed in (False, True):
+        with watch if timed else nullcontext():
+            for _ in range(TIMED_STEPS):
+                begun.advance()
+    effort = seconds * TIMED_STEPS / getattr(watch, clock) / pilot.steps
+    return prepare_fit(folder, photos, {"field": field | {"effort": effort}})
 
 
 @dataclass(frozen=True)

@@ -312,7 +312,7 @@ def export(arguments: argparse.Namespace) -> None:
     convert --to grid makes grids of other resolutions.
     """
     from mivol.back_end import set_variant
-    from mivol.experiments.field_conversion import GRID_NODES, sample_to_grid
+    from mivol.experiments.field_conversion import grid_of_network
     from mivol.experiments.render import sky_beside
     from mivol.fields.field_archives import read_field_view
     from mivol.fields.field_files import read_field, write_field
@@ -322,7 +322,7 @@ def export(arguments: argparse.Namespace) -> None:
     field, sky, view = read_field(arguments.field), sky_beside(arguments.field), read_field_view(arguments.field)
     is_copy = arguments.output.suffix == ".npz" and not arguments.output.name.endswith((".svox2.npz", ".svox.npz"))
     if isinstance(field, SampledField) and not is_copy:
-        field, lines = sample_to_grid(field, GRID_NODES)
+        field, lines = grid_of_network(field)
         print(lines)
     print("\n".join(str(path) for path in write_field(arguments.output, field, arguments.level, sky, view=view)))
 

@@ -16,9 +16,9 @@ WRITTEN_AS = {".npz": "field", ".obj": "mesh"}
 def convert(arguments: argparse.Namespace) -> None:
     """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats; volumes too.
 
-    A field (.npz) is the mivol_sh of a scene, an octree, a hash grid or a NeRF. --to grid, octree, hash or nerf converts fields
-    into each other. --to hash and --to nerf also take Gaussians; they fit a network to views of the source.
-    Conversions between kinds of fields and Gaussians (.ply) print their error in dB, from views of both. A mesh (.obj, or .ply
+    A field (.npz) is the mivol_sh of a scene, an octree, a hash grid or a NeRF. --to grid, octree, hash or nerf makes one of
+    another field or of Gaussians (.ply); hash and nerf fit a network to views of the source. Fields become Gaussians as well.
+    These conversions print their error in dB, from views of both. A mesh (.obj, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     A scene of pbrt-v4 (.pbrt) becomes Mitsuba XML (.xml) with media of mivol.
     """
@@ -58,7 +58,7 @@ def _convert_volume(arguments: argparse.Namespace) -> str:
 
 def _convert_cloud(arguments: argparse.Namespace) -> str:
     """Convert points, Gaussians or a field; return the lines to print."""
-    from mivol.experiments import gaussian_conversion
+    from mivol.experiments import field_conversion, gaussian_conversion
     from mivol.points.summary import convert_file, is_points_file
 
     source, target, resolution = arguments.source, arguments.output, arguments.resolution
@@ -66,17 +66,12 @@ def _convert_cloud(arguments: argparse.Namespace) -> str:
         check_contents(source)
     kind = _check_conversion(arguments)
     if kind in ("hash", "nerf"):
-        from mivol.experiments.field_conversion import convert_to_network
-
-        return convert_to_network(source, target, kind, arguments.mode)
-    if source.suffix.lower() == ".npz" and target.suffix.lower() == ".npz":
-        from mivol.experiments import field_conversion
-
-        if kind == "grid":
-            return field_conversion.convert_to_grid(source, target, resolution, arguments.mode)
-        return field_conversion.convert_to_octree(source, target, resolution, arguments.mode)
+        return field_conversion.convert_to_network(source, target, kind, arguments.mode)
+    if kind in ("grid", "octree"):
+        make = field_conversion.convert_to_grid if kind == "grid" else field_conversion.convert_to_octree
+        return make(source, target, resolution, arguments.mode)
     if source.suffix.lower() == ".npz":
-        return gaussian_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
+        return field_conversion.convert_to_gaussians(source, target, resolution, arguments.mode)
     if kind not in ("field", "mesh"):
         return convert_file(source, target, kind, arguments.box)
     make = gaussian_conversion.convert_to_field if kind == "field" else gaussian_conversion.convert_to_mesh
@@ -92,19 +87,28 @@ def _check_conversion(arguments: argparse.Namespace) -> str | None:
         if not is_field or arguments.resolution or arguments.box:
             raise MivolError(f"{target}: --to {kind} writes an .npz, fitted to views of the source: leave out other flags.")
         return kind
+    if kind == "nested":
+        raise MivolError(
+            f"{target}: no conversion makes a nested grid, whose outer boxes hold what lies around the cameras, since other "
+            "models hold nothing outside of their one box: make a grid (--to grid), which is a nested grid of one box."
+        )
     if from_field and is_field and arguments.to not in ("grid", "octree"):
         raise MivolError(
-            f"{target}: --to says what a field becomes: octree, hash or nerf; a field other than a grid also becomes a grid."
+            f"{target}: --to says what a field becomes: octree, hash or nerf, and grid for all but a grid of one box."
         )
-    if kind in ("octree", "grid") and not (from_field and is_field):
-        raise MivolError(f"{target}: --to {kind} makes an .npz from a radiance field (.npz); make a field first: --to field.")
+    if kind in ("octree", "grid") and not is_field:
+        raise MivolError(f"{target}: --to {kind} makes an .npz: give a file that ends so.")
+    if kind == "octree" and not from_field and arguments.box is not None:
+        raise MivolError(f"{target}: an octree is made of all Gaussians: crop them first, mivol convert a.ply b.ply --box.")
+    if kind == "grid" and not from_field:
+        kind = "field"
     if is_field != (kind in ("field", "octree", "grid")):
         raise MivolError(f"{target}: a radiance field is written as .npz, and nothing else is; leave out --to {arguments.to}.")
     if from_field and not is_field and kind not in (None, "gaussians"):
         raise MivolError(
             f"{source}: a radiance field becomes Gaussians (.ply) here; mivol export writes it as a mesh and more."
         )
-    is_gridded = kind in ("field", "mesh")
+    is_gridded = kind in ("field", "mesh", "octree")
     if arguments.box is not None and from_field:
         raise MivolError(f"{source}: --box crops Gaussians and points, not a radiance field: leave it out.")
     if arguments.resolution is not None and not (is_gridded or from_field):

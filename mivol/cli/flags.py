@@ -213,10 +213,10 @@ def convert_flags() -> list:
         DATASET,
         SHAPE,
         DTYPE,
-        flag("--to", choices=(*KINDS, "field", "mesh", "octree", "grid", "hash", "nerf"),
+        flag("--to", choices=(*KINDS, "field", "mesh", "octree", "grid", "nested", "hash", "nerf"),
              help="kind of the output (default: as the source, if possible)"),
         flag("--resolution", type=int,
-             help="for a field or a mesh: voxels along the longest edge (default: 128); for Gaussians from a field: Gaussians "
+             help="for a grid or a mesh: voxels along the longest edge (default: 128); for Gaussians from a field: Gaussians "
              "along that edge (default: one per two voxels); for an octree: leaves along the edge of its cube, a power of two "
              "(default: two per voxel)"),
         flag("--box", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),

@@ -1,14 +1,15 @@
-"""Conversions into grids, octrees, hash grids and NeRFs with their loss, and the description of a file.
+"""Conversions of radiance fields and Gaussians into each other, each with its loss, and the description of a file.
 
-A hash grid or a NeRF is fitted to views of the source, as to photographs with alpha. The views look at the source's box from
-evenly spread directions. Other views, from directions of their own, give the loss.
+An octree takes leaves where views of the source show matter. A hash grid or a NeRF is fitted to views of the source, as to
+photographs with alpha. These views look at the boxes of the source from evenly spread directions. Other views, from directions
+of their own, give the loss. Both look at the innermost box of a nested grid, through what lies around it; its sky is left out.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import drjit as dr
@@ -17,46 +18,135 @@ import numpy as np
 
 from mivol.back_end import set_variant
 from mivol.errors import MivolError
-from mivol.experiments.gaussian_conversion import EDGE, VIEWED, cameras_around, read_as_gaussians
+from mivol.experiments.gaussian_conversion import EDGE, VIEWED, box_to_world, cameras_around, read_as_gaussians
 from mivol.fields.field_archives import read_field_view
 from mivol.fields.field_files import read_field, write_field
-from mivol.fields.gaussian_grid import gaussian_box
+from mivol.fields.gaussian_grid import gaussian_box, gaussians_to_grid, grid_to_gaussians, nested_to_gaussians
 from mivol.fields.octree import Octree, check_depth
-from mivol.fields.resampling import sample_field
+from mivol.fields.resampling import GRID_NODES, sample_to_grid
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.files.source import check_file
+from mivol.files.source import check_file, select_by_suffix
 from mivol.optim.loop import begin_fit
 from mivol.optim.photographs.field_view import CameraRays, prepare_view, render_view
-from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree, build_octree_of_points
-from mivol.optim.photographs.radiance_plan import place_grid
+from mivol.optim.photographs.octree_building import (
+    OctreeRecipe,
+    ViewRays,
+    build_octree,
+    build_octree_of_levels,
+    build_octree_of_points,
+)
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.photographs.sampled_problem import PRESETS, SampledPlan, SampledProblem
 from mivol.photos import Camera, Photo
-from mivol.points.gaussian_files import read_gaussian_view
+from mivol.photos.camera_path import HomeView
+from mivol.points.gaussian_files import GAUSSIAN_WRITERS, read_gaussian_view, write_gaussians
+from mivol.points.gaussians import Gaussians
 from mivol.scene.explain import Explanation
+from mivol.space import bounds_of
 from mivol.splatting.splatter import Splatter, to_tensors
 from mivol.transport.line_integrals.radiance_field import RayBundle
 from mivol.validate.metrics import psnr
 
-GRID_NODES = 128
-"""Default number of nodes along the longest edge of the grid of a hash grid or a NeRF."""
+MOST_NODES = 256
+"""Default number of nodes along the longest edge of the grid of a nested grid, whose finest voxels may need more."""
 
-LOOKS = 48
-"""Number of views that decide which leaves are seen."""
+LEAF_VIEWS, LEAF_EDGE = 48, 512
+"""Number of views that decide which leaves are seen, and their largest edge [pixel]."""
 
-LOOK_EDGE = 512
-"""Largest edge of such a view [pixel]."""
+FITTED_VIEWS, FITTED_EDGE = 60, 160
+"""Number of views to which a network is fitted, and their edge [pixel]."""
+
+NETWORK_PRESETS = {"hash": "minute", "nerf": "minutes"}
+"""Presets of the fits, by the kind of the target."""
+
+Field = SphericalGrid | Octree | SampledField
 
 
-def convert_to_octree(source: Path, target: Path, resolution: int | None, variant: str) -> str:
-    """Write a radiance field as an octree.
+@dataclass(frozen=True)
+class Source:
+    """What is converted, or what it became.
+
+    Attributes:
+        model: field, or Gaussians.
+        boxes: (4, 4) unit cube to the world: the box, or those of a nested grid, the innermost first.
+        view: from which the file is shown.
+    """
+
+    model: Field | Gaussians
+    boxes: list[np.ndarray]
+    view: HomeView | None
+
+    @classmethod
+    def open(cls, path: Path) -> Source:
+        """Read a field (.npz), or Gaussians or points of another file.
+
+        Raises:
+            MivolError: as the readers.
+        """
+        if path.suffix.lower() != ".npz":
+            cloud = read_as_gaussians(path)
+            return cls(cloud, [box_to_world(*gaussian_box(cloud))], read_gaussian_view(path))
+        return cls.from_field(read_field(check_file(path)), read_field_view(path))
+
+    @classmethod
+    def from_field(cls, field: Field, view: HomeView | None = None) -> Source:
+        """A field as a source."""
+        boxes = [field.level_to_world(k) for k in range(field.levels)] if isinstance(field, SphericalGrid) else [field.to_world]
+        return cls(field, boxes, view)
+
+    @property
+    def is_nested(self) -> bool:
+        """Whether it is a grid of several boxes."""
+        return len(self.boxes) > 1
+
+    def show(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """A view: colours (H, W, 3) over black, and opacity (H, W)."""
+        if isinstance(self.model, Gaussians):
+            splatter = Splatter(*camera.size, self.model.degree)
+            rgba = np.array(splatter.forward(to_tensors(self.model), camera, derivatives=False)[0])
+            return rgba[..., :3], rgba[..., 3]
+        seen = render_view(self.model, camera, np.zeros(3))
+        return seen.image, seen.opacity
+
+    def cameras(self, edge: int, views: int) -> list[Camera]:
+        """Views of all boxes, as many of each, from all sides."""
+        return [camera for box in self.boxes for camera in cameras_around(box, edge, max(views // len(self.boxes), 1))]
+
+
+def describe_loss(path: Path, source: Source, target: Path) -> str:
+    """PSNR between views of a file and its source; colours of radiance are compared with colours of radiance only."""
+    written = Source.open(target)  # as it will be read: rounded values
+    if isinstance(written.model, Gaussians) and not isinstance(source.model, Gaussians) and source.model.space == "linear":
+        return "their colours are code values of the field's radiance, so views of the two do not compare"
+    loss = views_psnr(written, source)
+    return f"{loss:.1f} dB between views of {target.name} and {path.name}: {VIEWED}, over black, peak 1"
+
+
+def views_psnr(one: Source, other: Source) -> float:
+    """PSNR between views [dB], of the innermost box of ``other``, over black, peak 1."""
+    cameras = cameras_around(other.boxes[0], EDGE)
+    images, truth = (np.stack([source.show(camera)[0] for camera in cameras]) for source in (one, other))
+    return psnr(images, truth, 1.0)
+
+
+def describe_sizes(path: Path, target: Path) -> str:
+    """Bytes of a file, and over those of its source."""
+    sizes = [p.stat().st_size for p in (path, target)]
+    return f"{sizes[1]} bytes, {sizes[1] / sizes[0]:.2f} of {path.name}"
+
+
+# -- Octrees and grids ------------------------------------------------------------------------------------------------------
+
+
+def convert_to_octree(path: Path, target: Path, resolution: int | None, variant: str) -> str:
+    """Write a radiance field or Gaussians as an octree.
 
     Args:
-        source: grid with a single level, hash grid or NeRF (.npz), or an octree of svox, which is read as it is.
+        path: a field (.npz), or Gaussians, which become a grid of ``GRID_NODES`` first. An octree of svox is read as it is.
         target: file ending in .npz, or .svox.npz.
         resolution: leaves along the edge of the octree's cube, rounded up to a power of two; None means two leaves a voxel of
-            a grid, and 128 leaves for a hash grid or a NeRF.
+            a grid (of the innermost box of a nested grid), and 128 leaves for a hash grid or a NeRF.
         variant: Mitsuba variant of the views.
 
     Returns:
@@ -67,76 +157,175 @@ def convert_to_octree(source: Path, target: Path, resolution: int | None, varian
             :func:`mivol.optim.photographs.octree_building.build_octree` and the disk.
     """
     set_variant(variant)
-    field = read_field(source)
+    source = Source.open(path)
     if resolution is not None:
-        if isinstance(field, Octree):
-            raise MivolError(f"{source} is an octree, whose leaves stay as they are: leave out --resolution.")
+        if isinstance(source.model, Octree):
+            raise MivolError(f"{path} is an octree, whose leaves stay as they are: leave out --resolution.")
         check_depth((resolution - 1).bit_length())
     depth = 0 if resolution is None else max((resolution - 1).bit_length(), 1)
-    if isinstance(field, Octree):
-        tree = field
-    else:
-        build = build_octree_of_points if isinstance(field, SampledField) else build_octree
-        tree = build(field, LookAround(field), OctreeRecipe(depth))
-    write_field(target, tree, view=read_field_view(source))
-    written = read_field(target)  # as it will be read: rounded values
-    return "\n".join([f"{target}: {describe_leaves(tree)}", *_describe_loss(source, field, target, written)])
+    tree = make_octree(source, OctreeRecipe(depth))
+    write_field(target, tree, view=source.view)
+    lines = [f"{target}: {describe_leaves(tree)}", describe_loss(path, source, target), describe_sizes(path, target)]
+    if isinstance(source.model, SphericalGrid | Octree) and not source.is_nested:
+        lines.append(describe_speed(read_field(target), source.model, path.name))
+    return "\n".join(lines)
 
 
-def convert_to_grid(source: Path, target: Path, resolution: int | None, variant: str) -> str:
-    """Write an octree, a hash grid or a NeRF as a radiance field on a grid; result as :func:`convert_to_octree`.
+def make_octree(source: Source, recipe: OctreeRecipe) -> Octree:
+    """The octree of any source."""
+    model = source.model
+    if isinstance(model, Octree):
+        return model
+    if isinstance(model, Gaussians):
+        model = gaussians_to_grid(model, *gaussian_box(model), GRID_NODES)
+    if isinstance(model, SampledField):
+        return build_octree_of_points(model, look_around(source, LEAF_EDGE), recipe)
+    rays = look_around(source, min(LEAF_EDGE, 4 * max(model.res)))  # a pixel a half voxel
+    return (build_octree_of_levels if source.is_nested else build_octree)(model, rays, recipe)
+
+
+def look_around(source: Source, edge: int) -> ViewRays:
+    """Rays from all sides of the boxes of a source, view by view."""
+    cameras = source.cameras(edge, LEAF_VIEWS)
+
+    def rays() -> Iterator[RayBundle]:
+        for camera in cameras:
+            view = CameraRays.from_camera(camera)
+            yield view.make(0, view.count)[1]
+
+    return rays
+
+
+def convert_to_grid(path: Path, target: Path, resolution: int | None, variant: str) -> str:
+    """Write an octree, a nested grid, a hash grid or a NeRF as a grid of one box; result as :func:`convert_to_octree`.
 
     Args:
-        source: octree, hash grid or NeRF (.npz).
+        path: a field (.npz) other than a grid of one box.
         target: file ending in .npz.
-        resolution: nodes along the longest edge, for a hash grid or a NeRF; None means ``GRID_NODES``.
+        resolution: nodes along the longest edge, of the outermost box of a nested grid; not for an octree. None means
+            ``GRID_NODES`` for a hash grid or a NeRF, and for a nested grid its finest voxels, at most ``MOST_NODES``.
         variant: Mitsuba variant of the views.
 
     Raises:
         MivolError: a source that is a grid, a resolution for an octree, too many nodes, or as the readers and the disk.
     """
     set_variant(variant)
-    tree = read_field(source)
-    if isinstance(tree, SampledField):
-        grid, lines = sample_to_grid(tree, GRID_NODES if resolution is None else resolution)
-        write_field(target, grid, view=read_field_view(source))
-        return f"{target}: {lines}"
-    if not isinstance(tree, Octree):
-        raise MivolError(f"{source} is a grid: mivol convert --to grid makes a grid from an octree, a hash grid or a NeRF.")
-    if resolution is not None:
+    source = Source.open(path)
+    if isinstance(source.model, SphericalGrid) and not source.is_nested:
+        raise MivolError(f"{path} is a grid of one box already: use it as it is, or make it an octree, a hash grid or a NeRF.")
+    if resolution is not None and isinstance(source.model, Octree):
         raise MivolError(f"{target}: the grid of an octree has a node in each of its smallest cells: leave out --resolution.")
-    grid = tree.to_grid()
-    write_field(target, grid, view=read_field_view(source))
-    head = f"{target}: {' x '.join(map(str, grid.res[::-1]))} nodes, {grid.rows - 1} of them stored, degree {grid.degree}"
-    return "\n".join([head, *_describe_loss(source, tree, target, read_field(target))])
+    grid = make_grid(source, resolution)
+    write_field(target, grid, view=source.view)
+    lines = [f"{target}: {describe_nodes(grid)}", describe_loss(path, source, target), describe_sizes(path, target)]
+    if isinstance(source.model, Octree):
+        lines.append(describe_speed(read_field(target), source.model, path.name))
+    return "\n".join(lines)
 
 
-def sample_to_grid(field: SampledField, resolution: int) -> tuple[SphericalGrid, str]:
-    """The grid of a hash grid or a NeRF with ``resolution`` nodes along the longest edge, and lines with its size and its loss.
+def make_grid(source: Source, resolution: int | None = None) -> SphericalGrid:
+    """The grid of any source: that of one box as it is, others by :func:`convert_to_grid`.
 
     Raises:
-        MivolError: no matter in the box, or fewer than 2 nodes.
+        MivolError: no matter in the box, fewer than 2 nodes, or too many nodes.
     """
-    if resolution < 2:
-        raise MivolError(f"found a grid of {resolution} nodes along its longest edge, expected at least 2: raise --resolution.")
-    box = np.array([field.to_world[:3, 3], field.to_world[:3, 3] + field.edges])
-    grid = sample_field(field, *place_grid(box, resolution))
-    size = f"{' x '.join(map(str, grid.res[::-1]))} nodes, {grid.rows - 1} of them stored, degree {grid.degree}"
-    loss = f"{views_psnr(grid, field):.1f} dB between views of the grid and of the {field.noun}: {VIEWED}, over black, peak 1"
-    return grid, f"{size}\n{loss}"
+    model = source.model
+    if isinstance(model, Gaussians):
+        return gaussians_to_grid(model, *gaussian_box(model), resolution or GRID_NODES)
+    if isinstance(model, Octree):
+        return model.to_grid()
+    if isinstance(model, SampledField):
+        return sample_to_grid(model, GRID_NODES if resolution is None else resolution)
+    if not source.is_nested:
+        return model
+    finest = max(model.res) << (model.levels - 1)
+    return sample_to_grid(model, min(finest, MOST_NODES) if resolution is None else resolution)
 
 
-def _describe_loss(
-    source: Path, field: SphericalGrid | Octree | SampledField, target: Path, written: SphericalGrid | Octree
-) -> list[str]:
-    """Difference between views of two fields, and the sizes of their files, in lines."""
-    sizes = [path.stat().st_size for path in (source, target)]
-    speeds = [] if isinstance(field, SampledField) else [describe_speed(written, field, source.name)]
-    return [
-        f"{views_psnr(written, field):.1f} dB between views of {target.name} and {source.name}: {VIEWED}, over black, peak 1",
-        f"{sizes[1]} bytes, {sizes[1] / sizes[0]:.2f} of {source.name}",
-        *speeds,
-    ]
+def grid_of_network(field: SampledField) -> tuple[SphericalGrid, str]:
+    """The grid of a hash grid or a NeRF with ``GRID_NODES`` nodes along its longest edge, and lines with its size and loss.
+
+    Raises:
+        MivolError: no matter in the box.
+    """
+    grid = sample_to_grid(field, GRID_NODES)
+    loss = views_psnr(Source.from_field(grid), Source.from_field(field))
+    between = f"{loss:.1f} dB between views of the grid and of the {field.noun}: {VIEWED}, over black, peak 1"
+    return grid, f"{describe_nodes(grid)}\n{between}"
+
+
+def describe_nodes(grid: SphericalGrid) -> str:
+    """Nodes and degree of a grid."""
+    return f"{' x '.join(map(str, grid.res[::-1]))} nodes, {len(grid.stored_nodes())} of them stored, degree {grid.degree}"
+
+
+def convert_to_gaussians(path: Path, target: Path, resolution: int | None, variant: str) -> str:
+    """Write a radiance field as Gaussians; result as :func:`convert_to_octree`.
+
+    Args:
+        path: a field (.npz). An octree, a hash grid or a NeRF becomes a grid first; each level of a nested grid its Gaussians.
+        target: file of Gaussians.
+        resolution: blocks of voxels along the longest edge of the grid, with a Gaussian per block; None means blocks of 2
+            voxels (4 smallest leaves of an octree).
+        variant: Mitsuba variant of the compared views.
+
+    Raises:
+        MivolError: as :func:`mivol.fields.field_files.read_field`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians` and the
+            disk.
+    """
+    select_by_suffix(target, GAUSSIAN_WRITERS)
+    set_variant(variant)
+    source = Source.open(path)
+    if source.is_nested:
+        made = nested_to_gaussians(source.model, resolution)
+    else:
+        grid = make_grid(source)
+        if resolution is None and isinstance(source.model, Octree):
+            resolution = -(-max(grid.res) // 4)
+        made = grid_to_gaussians(grid, resolution)
+    write_gaussians(target, made, source.view)
+    return "\n".join([f"{target}: {made.count} Gaussians of degree {made.degree}", describe_loss(path, source, target)])
+
+
+# -- Networks ---------------------------------------------------------------------------------------------------------------
+
+
+def convert_to_network(path: Path, target: Path, kind: str, variant: str, plan: SampledPlan | None = None) -> str:
+    """Write a radiance field or Gaussians as a hash grid or a NeRF; result as :func:`convert_to_octree`.
+
+    Args:
+        path: a field (.npz), or Gaussians.
+        target: file ending in .npz.
+        kind: "hash" or "nerf".
+        variant: Mitsuba variant of the fit.
+        plan: of the fit; None takes the preset of ``NETWORK_PRESETS``.
+
+    Raises:
+        MivolError: colours of radiance, as the readers and the disk.
+    """
+    set_variant(variant)
+    plan = plan or PRESETS[kind][NETWORK_PRESETS[kind]]
+    source = Source.open(path)
+    if not isinstance(source.model, Gaussians) and source.model.space == "linear":
+        raise MivolError(f"{path} has colours of radiance, and views of code values are fitted: fit the photographs instead.")
+    cameras = source.cameras(FITTED_EDGE, FITTED_VIEWS)
+    photos = [take_view(source, camera, number) for number, camera in enumerate(cameras)]
+    problem = SampledProblem(RayBatches.from_photos(photos), bounds_of(source.boxes[-1]), plan)
+    begin_fit(problem, plan.optimizer, plan.course()).complete()
+    write_field(target, problem.field, view=source.view)
+    fitted = f"a {problem.field.noun} of {problem.field.numbers} numbers, fitted to {len(photos)} views of {path.name}"
+    return "\n".join([f"{target}: {fitted}", describe_loss(path, source, target), describe_sizes(path, target)])
+
+
+def take_view(source: Source, camera: Camera, number: int) -> Photo:
+    """A view as a photograph with alpha, in front of black."""
+    image, opacity = source.show(camera)
+    alpha = np.clip(opacity, 0, 1).astype(np.float32)
+    colour = np.clip(image, 0, alpha[..., None]).astype(np.float32)
+    return Photo(f"view {number}", colour, alpha, None, replace(camera), np.zeros(3, np.float32))
+
+
+# -- Speed and description --------------------------------------------------------------------------------------------------
 
 
 TIMED_EDGE, TURNS = 800, 7
@@ -160,26 +349,6 @@ def describe_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree,
     rates = TIMED_EDGE**2 / np.median(seconds[1:], axis=0) / 1e6  # the first turn compiles
     ratio = np.median(seconds[1:, 1] / seconds[1:, 0])
     return f"{rates[0]:.1f} M pixels a second of processor time, {other_name} {rates[1]:.1f}: {ratio:.2f} times as many"
-
-
-def views_psnr(field: SphericalGrid | Octree, other: SphericalGrid | Octree | SampledField) -> float:
-    """PSNR between views of two fields [dB], of the box of ``other``, over black, peak 1."""
-    cameras = cameras_around(other.to_world, EDGE)
-    images, truth = ([render_view(one, camera, np.zeros(3)).image for camera in cameras] for one in (field, other))
-    return psnr(np.stack(images), np.stack(truth), 1.0)
-
-
-class LookAround:
-    """Rays from all sides of the box of a field, view by view: a pixel a half voxel, at most ``LOOK_EDGE`` along an edge."""
-
-    def __init__(self, field: SphericalGrid | SampledField) -> None:
-        edge = min(LOOK_EDGE, 4 * max(field.res)) if isinstance(field, SphericalGrid) else LOOK_EDGE
-        self.cameras = cameras_around(field.to_world, edge, LOOKS)
-
-    def __call__(self) -> Iterator[RayBundle]:
-        for camera in self.cameras:
-            view = CameraRays.from_camera(camera)
-            yield view.make(0, view.count)[1]
 
 
 def describe_leaves(tree: Octree) -> str:
@@ -222,93 +391,3 @@ def describe_field(path: Path, variant: str) -> Explanation:
             "mivol render draws it; mivol convert and mivol export write it in other formats",
         )
     )
-
-
-# -- Networks ---------------------------------------------------------------------------------------------------------------
-
-
-NETWORK_PRESETS = {"hash": "minute", "nerf": "minutes"}
-"""Presets of the fits, by the kind of the target."""
-
-LOOKS, LOOK_EDGE = 60, 160
-"""Number of fitted views, and their edge [pixel]."""
-
-Show = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
-"""Renders a view: colours (H, W, 3) over black, and opacity (H, W)."""
-
-
-def convert_to_network(source: Path, target: Path, kind: str, variant: str, plan: SampledPlan | None = None) -> str:
-    """Write a radiance field or Gaussians as a hash grid or a NeRF.
-
-    Args:
-        source: a field (.npz: grid, nested grid, octree, hash grid or NeRF), or Gaussians.
-        target: file ending in .npz.
-        kind: "hash" or "nerf".
-        variant: Mitsuba variant of the fit.
-        plan: of the fit; None takes the preset of ``NETWORK_PRESETS``.
-
-    Returns:
-        A summary of file and error, in lines.
-
-    Raises:
-        MivolError: colours of radiance, as the readers and the disk.
-    """
-    set_variant(variant)
-    plan = plan or PRESETS[kind][NETWORK_PRESETS[kind]]
-    show, place, view = open_source(source)
-    photos = [take_view(show, camera, number) for number, camera in enumerate(cameras_around(place, LOOK_EDGE, LOOKS))]
-    box = bounds_of(place)
-    problem = SampledProblem(RayBatches.from_photos(photos), box, plan)
-    begin_fit(problem, plan.optimizer, plan.course()).complete()
-    write_field(target, problem.field, view=view)
-    written = read_field(target)  # as it will be read: rounded values
-    cameras = cameras_around(place, EDGE)
-    images = np.stack([render_view(written, camera, np.zeros(3)).image for camera in cameras])
-    loss = psnr(images, np.stack([show(camera)[0] for camera in cameras]), 1.0)
-    return "\n".join(
-        [
-            f"{target}: a {written.noun} of {written.numbers} numbers, fitted to {LOOKS} views of {source.name}",
-            f"{loss:.1f} dB between views of {target.name} and {source.name}: {VIEWED}, over black, peak 1",
-            f"{target.stat().st_size} bytes, {target.stat().st_size / source.stat().st_size:.2f} of {source.name}",
-        ]
-    )
-
-
-def open_source(source: Path) -> tuple[Show, np.ndarray, object]:
-    """The views of a field or of Gaussians, its box (4, 4), and the view in the file."""
-    if source.suffix.lower() != ".npz":
-        cloud = read_as_gaussians(source)
-        low, high = gaussian_box(cloud)
-        place = np.diag([*(high - low), 1.0])
-        place[:3, 3] = low
-        reals = to_tensors(cloud)
-
-        def splat(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-            rgba = np.array(Splatter(*camera.size, cloud.degree).forward(reals, camera, derivatives=False)[0])
-            return rgba[..., :3], rgba[..., 3]
-
-        return splat, place, read_gaussian_view(source)
-    field = read_field(source)
-    if field.space == "linear":
-        raise MivolError(f"{source} has colours of radiance, and views of code values are fitted: fit the photographs instead.")
-
-    def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        seen = render_view(field, camera, np.zeros(3))
-        return seen.image, seen.opacity
-
-    place = field.level_to_world(field.levels - 1) if isinstance(field, SphericalGrid) else field.to_world
-    return render, place, read_field_view(source)
-
-
-def take_view(show: Show, camera: Camera, number: int) -> Photo:
-    """A view as a photograph with alpha, in front of black."""
-    image, opacity = show(camera)
-    alpha = np.clip(opacity, 0, 1).astype(np.float32)
-    colour = np.clip(image, 0, alpha[..., None]).astype(np.float32)
-    return Photo(f"view {number}", colour, alpha, None, replace(camera), np.zeros(3, np.float32))
-
-
-def bounds_of(place: np.ndarray) -> np.ndarray:
-    """The upright box (2, 3) around the unit cube under a map to the world."""
-    corners = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ place.T
-    return np.array([corners[:, :3].min(axis=0), corners[:, :3].max(axis=0)])

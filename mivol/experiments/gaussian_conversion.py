@@ -1,4 +1,4 @@
-"""Conversions of Gaussians and points to radiance fields, to meshes and back, with the errors of the conversions."""
+"""Conversions of Gaussians and points to radiance fields and to meshes, with the errors of the conversions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.back_end import set_variant
-from mivol.fields.field_archives import read_field_view
 from mivol.fields.field_files import read_grid, write_field
 from mivol.fields.gaussian_field import MAX_OPACITY
-from mivol.fields.gaussian_grid import gaussian_box, gaussian_masses, gaussians_to_grid, grid_to_gaussians
+from mivol.fields.gaussian_grid import gaussian_box, gaussian_masses, gaussians_to_grid
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import DepthView, fuse_depths
 from mivol.files.mesh import MESH_WRITERS, Mesh, write_mesh
@@ -23,13 +22,7 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics, pixel_centres, rays
 from mivol.points.cloud import read_points
 from mivol.points.conversions import points_to_gaussians
-from mivol.points.gaussian_files import (
-    GAUSSIAN_WRITERS,
-    is_gaussian_file,
-    read_gaussian_view,
-    read_gaussians,
-    write_gaussians,
-)
+from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.scene_graph import traverse
 from mivol.splatting.splatter import Splatter, to_tensors
@@ -82,35 +75,6 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     if capped:
         lines.append(f"{capped} Gaussians of an opacity above {MAX_OPACITY} were made as opaque as that")
     return "\n".join(lines)
-
-
-def convert_to_gaussians(source: Path, target: Path, resolution: int | None, variant: str) -> str:
-    """Write a radiance field as Gaussians.
-
-    Args:
-        source: field (.npz) with a single level.
-        target: file ending in .ply.
-        resolution: blocks of voxels along the longest edge of the grid, with a Gaussian per block; None means blocks of 2
-            voxels.
-        variant: Mitsuba variant of the compared views.
-
-    Returns:
-        A summary of file and error, in lines.
-
-    Raises:
-        MivolError: as :func:`mivol.fields.field_files.read_grid`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians` and the
-            disk.
-    """
-    select_by_suffix(target, GAUSSIAN_WRITERS)
-    set_variant(variant)
-    field = read_grid(source)
-    made = grid_to_gaussians(field, resolution)
-    write_gaussians(target, made, read_field_view(source))
-    lines = [f"{target}: {made.count} Gaussians of degree {made.degree}"]
-    if field.space == "linear":
-        return "\n".join([*lines, "their colours are code values of the field's radiance, so views of the two do not compare"])
-    loss = f"{field_psnr(made, field):.1f} dB between splatted Gaussians and the field: {VIEWED}, over black, peak 1"
-    return "\n".join([*lines, loss])
 
 
 def corners_of_box(cloud: Gaussians, box: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:

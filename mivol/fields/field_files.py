@@ -41,6 +41,7 @@ from mivol.fields.field_archives import (
 )
 from mivol.fields.octree import Octree
 from mivol.fields.octree_files import is_octree, is_svox, parse_octree, parse_svox, write_octree, write_svox
+from mivol.fields.resampling import GRID_NODES, sample_to_grid
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
@@ -337,6 +338,7 @@ def write_scene(path: Path, field: SphericalGrid, sky: Sky | None = None, view: 
 def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, mi.TensorXf]:
     """Make a field from plugin parameters: ``filename``, or ``density`` and ``sh``; ``to_world`` and :data:`PLUGIN_SETTINGS`.
 
+    The file of an octree, a hash grid or a NeRF becomes a grid, of the latter two with ``nodes`` along its longest edge.
     Tensors hold linear radiance unless ``space`` says otherwise.
 
     Returns:
@@ -352,11 +354,22 @@ def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, 
         raise MivolError(f"mivol_sh was given {found}; give filename, or density and sh.")
     to_world = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
     if tensors:
+        if "nodes" in props:
+            raise MivolError(
+                "mivol_sh was given nodes beside density and sh; nodes are for a hash grid or a NeRF: leave them out."
+            )
         density, sh = (props[n] for n in tensors)
         settings = {"space": "linear"} | {n: props[n] for n in PLUGIN_SETTINGS if n in props}
         field = SphericalGrid.from_dense(np.array(dr.detach(density)), np.array(dr.detach(sh)), to_world, **settings)
         return field, density, sh
-    field = read_grid(str(mi.file_resolver().resolve(props["filename"])))
+    path = str(mi.file_resolver().resolve(props["filename"]))
+    field = read_field(path)
+    if isinstance(field, SampledField):
+        field = sample_to_grid(field, int(props.get("nodes", GRID_NODES)))
+    elif "nodes" in props:
+        raise refusal(Path(path), "nodes that are stored", "a hash grid or a NeRF, which has none", "leave nodes out")
+    elif isinstance(field, Octree):
+        field = field.to_grid()
     field = field.with_rows(*field.values(), field.nodes, **{n: props.get(n, getattr(field, n)) for n in PLUGIN_SETTINGS})
     if "to_world" in props:
         field = replace(field, to_world=to_world @ field.to_world)

@@ -48,7 +48,7 @@ from mivol.fields.gaussian_field import MAX_CHUNK_PAIRS, MAX_OPACITY, find_chunk
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
 from mivol.machine import check_memory
-from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, Gaussians
+from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, ROW_SHAPES, Gaussians
 
 DEPOSIT_REACH = 4.0
 """Standard deviations along each axis of the grid up to which a Gaussian is deposited; 2e-4 of its mass lies outside."""
@@ -205,6 +205,25 @@ def grid_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Ga
         (np.log(capped) - np.log1p(-capped))[drawn],
         colours.reshape(count, -1, 3)[drawn],
     )
+
+
+def nested_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Gaussians:
+    """Gaussians of a nested field: those of each level, outside of the box of the level before (:func:`grid_to_gaussians`).
+
+    Raises:
+        MivolError: as :func:`grid_to_gaussians`, if no level has a visible block.
+    """
+    z, y, x = (np.abs((np.arange(n) + 0.5) / n - 0.5) < 0.25 for n in field.res)
+    inner = z[:, None, None] & y[:, None] & x
+    parts = []
+    for number in range(field.levels):
+        level = field.extract_level(number)
+        outside = level if number == 0 else level.select_nodes(~inner)
+        if len(outside.stored_nodes()) and outside.values()[0].max() > 0:
+            parts.append(grid_to_gaussians(outside, resolution))
+    if not parts:
+        raise MivolError("the field holds nothing; matter is expected: there is nothing to make Gaussians of.")
+    return Gaussians(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in (*ROW_SHAPES, "harmonics")})
 
 
 def _collect_mass(field: SphericalGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

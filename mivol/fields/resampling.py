@@ -12,10 +12,12 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
+from mivol.space import bounds_of, lattice_from_world, place_grid
 
 
 def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray, keep: np.ndarray) -> SphericalGrid:
@@ -115,14 +117,16 @@ NODES = 1 << 13
 """Nodes sampled at a time."""
 
 
-def sample_field(field: SampledField, res: tuple[int, int, int], to_world: np.ndarray, degree: int = 2) -> SphericalGrid:
-    """A sparse grid of a field that is known at points.
+def sample_field(
+    field: SampledField | SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray, degree: int = 2
+) -> SphericalGrid:
+    """A sparse grid of a field that is known at points, as a nested grid is too.
 
     The density of a node is the mean over its voxel. Its colour is taken at the centre of mass of the voxel, in
     ``DIRECTIONS`` directions, and projected onto the harmonics by least squares.
 
     Args:
-        field: with a region.
+        field: with a region, or a grid of any levels.
         res, to_world: nodes (Z, Y, X) and box of the grid.
         degree: of the harmonics.
 
@@ -136,13 +140,29 @@ def sample_field(field: SampledField, res: tuple[int, int, int], to_world: np.nd
     return SphericalGrid.from_rows(res, to_world, np.minimum(density, OPAQUE / edge), sh, stored, space=field.space)
 
 
+GRID_NODES = 128
+"""Default number of nodes along the longest edge of such a grid."""
+
+
+def sample_to_grid(field: SampledField | SphericalGrid, resolution: int = GRID_NODES) -> SphericalGrid:
+    """The grid of a hash grid, a NeRF or a nested grid, with ``resolution`` nodes along the longest edge of its whole box.
+
+    Raises:
+        MivolError: no matter in the box, or fewer than 2 nodes.
+    """
+    if resolution < 2:
+        raise MivolError(f"found a grid of {resolution} nodes along its longest edge, expected at least 2: ask for more.")
+    place = field.level_to_world(field.levels - 1) if isinstance(field, SphericalGrid) else field.to_world
+    return sample_field(field, *place_grid(bounds_of(place), resolution))
+
+
 def voxel_edge(res: tuple[int, int, int], to_world: np.ndarray) -> float:
     """Cube root of the volume of a voxel [length]."""
     return float(np.abs(np.linalg.det(to_world[:3, :3])) / np.prod(res)) ** (1 / 3)
 
 
 def sample_voxels(
-    field: SampledField, res: tuple[int, int, int], to_world: np.ndarray
+    field: SampledField | SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The voxels of a grid that hold matter of a field: flat numbers (n,), mean densities (n,), centres of mass (n, 3).
 
@@ -152,8 +172,9 @@ def sample_voxels(
     z, y, x = res
     edge = voxel_edge(res, to_world)
     numbers, densities, centres = [], [], []
-    for start in range(0, x * y * z, NODES):
-        node = np.arange(start, min(start + NODES, x * y * z))
+    every = _nodes_near_matter(field, res, to_world) if isinstance(field, SphericalGrid) else np.arange(x * y * z)
+    for start in range(0, len(every), NODES):
+        node = every[start : start + NODES]
         sigma, places = _sample_voxels(field, node, res, to_world)
         mean = sigma.mean(axis=1)
         kept = mean * edge > EMPTY
@@ -161,19 +182,50 @@ def sample_voxels(
         numbers.append(node[kept])
         densities.append(mean[kept].astype(np.float32))
         centres.append((weight[..., None] * places[kept]).sum(axis=1))
-    nodes, density, places = map(np.concatenate, (numbers, densities, centres))
+    nodes, density, places = map(np.concatenate, (numbers, densities, centres)) if numbers else ([], [], [])
     if not len(nodes):
         raise MivolError("found no matter in the box of the grid, expected some: give another box.")
     return nodes, density, places
 
 
-def project_colours(field: SampledField, places: np.ndarray, degree: int = 2) -> np.ndarray:
+def _nodes_near_matter(field: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray) -> np.ndarray:
+    """Flat numbers of the voxels of a grid near nodes with matter of a nested grid."""
+    below, middle = field.activation_function.empty_below, 0.5 * (np.array(field.res[::-1]) - 1)
+    has_matter = np.zeros(field.node_count, bool)
+    has_matter[field.stored_nodes()] = True if below is None else field.values()[0] > below
+    voxel = np.abs(np.linalg.inv(field.to_world)[:3, :3] @ (to_world[:3, :3] / res[::-1])) * np.array(field.res[::-1])[:, None]
+    span = 0.5 * (PARTS - 1) / PARTS * voxel.sum(axis=1)  # of the points of a voxel from its middle [nodes]
+    near = []
+    for number, level in enumerate(has_matter.reshape(field.levels, *field.res)):
+        # Matter reaches less than a node beyond its own, and the middle lies up to half a node from the nearest one.
+        reach = math.ceil(1.5 + span.max() / 2.0**number) - 1
+        near.append(maximum_filter(level, 2 * reach + 1))
+    (z, y, x), found = res, []
+    # From the unit cube of the grid to nodes of the innermost level, counted from the middle.
+    turn = lattice_from_world(field.to_world, field.res) @ to_world
+    turn[:, 3] -= middle
+    unit_y, unit_x = np.meshgrid((np.arange(y) + 0.5) / y, (np.arange(x) + 0.5) / x, indexing="ij")
+    for k in range(z):
+        q = np.stack([unit_x, unit_y], axis=-1) @ turn[:, :2].T + (turn[:, 2] * (k + 0.5) / z + turn[:, 3])
+        held = np.zeros((y, x), bool)
+        for number, level in enumerate(near):
+            edge = (middle + 0.5) * 2.0**number
+            own = (np.abs(q) <= edge + span).all(axis=-1)
+            if number:
+                own &= (np.abs(q) > 0.5 * edge - span).any(axis=-1)
+            place = np.clip(np.rint(q / 2.0**number + middle), 0, 2 * middle).astype(int)
+            held |= own & level[place[..., 2], place[..., 1], place[..., 0]]
+        found.append(held)
+    return np.flatnonzero(np.stack(found))
+
+
+def project_colours(field: SampledField | SphericalGrid, places: np.ndarray, degree: int = 2) -> np.ndarray:
     """Harmonics (n, basis, 3) of a field's colours at places (n, 3), by least squares over ``DIRECTIONS`` directions."""
     return np.concatenate([_project_colours(field, places[k : k + NODES], degree) for k in range(0, len(places), NODES)])
 
 
 def _sample_voxels(
-    field: SampledField, node: np.ndarray, res: tuple[int, int, int], to_world: np.ndarray
+    field: SampledField | SphericalGrid, node: np.ndarray, res: tuple[int, int, int], to_world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Densities (N, points) at the points of voxels, and their places (N, points, 3)."""
     z, y, x = res
@@ -183,11 +235,14 @@ def _sample_voxels(
     places = unit @ to_world[:3, :3].T + to_world[:3, 3]
     p = mi.Point3f(np.ascontiguousarray(places.reshape(-1, 3).T, np.float32))
     dr.eval(p)
-    sigma = dr.select(field.region.holds(p), field.density(p), 0)
+    if isinstance(field, SphericalGrid):
+        sigma, _ = field.eval(p, mi.Vector3f(0, 0, 1))
+    else:
+        sigma = dr.select(field.region.holds(p), field.density(p), 0)
     return np.array(sigma, np.float64).reshape(len(node), -1), places
 
 
-def _project_colours(field: SampledField, places: np.ndarray, degree: int) -> np.ndarray:
+def _project_colours(field: SampledField | SphericalGrid, places: np.ndarray, degree: int) -> np.ndarray:
     """Harmonics (N, basis, 3) of the colours at places (N, 3), without the offset 1/2 of a grid."""
     k = np.arange(DIRECTIONS)
     height, turn = 1 - (2 * k + 1) / DIRECTIONS, np.pi * (3 - np.sqrt(5)) * k
@@ -198,5 +253,6 @@ def _project_colours(field: SampledField, places: np.ndarray, degree: int) -> np
     p = mi.Point3f(np.ascontiguousarray(np.repeat(places, DIRECTIONS, axis=0).T, np.float32))
     d = mi.Vector3f(np.tile(towards, len(places)))
     dr.eval(p, d)
-    colour = np.array(field.evaluate(p, d).colour, np.float64).T.reshape(len(places), DIRECTIONS, 3)
+    colour = field.eval(p, d)[1] if isinstance(field, SphericalGrid) else field.evaluate(p, d).colour
+    colour = np.array(colour, np.float64).T.reshape(len(places), DIRECTIONS, 3)
     return np.einsum("bk,nkc->nbc", np.linalg.pinv(basis), colour - 0.5).astype(np.float32)

@@ -136,6 +136,8 @@ class SphericalVolume(mi.Volume):
 
     Parameters:
         filename: a field written by ``mivol`` or svox2 (.npz), or
+        filename, nodes: a hash grid or a NeRF, whose density and colours are taken at the nodes of a grid with this number
+            along the longest edge (default 128); an octree becomes a grid with a node in each smallest cell, or
         density, sh: tensors (Z, Y, X, 1) and (Z, Y, X, basis, 3), 1 to 25 harmonics in the order of ``dr.sh_eval``.
         to_world: places the unit cube; moves a field of a file from the place given in the file. Densities are per world
             length: a field scaled by n is n times as opaque, unless its densities are divided by n.

@@ -58,9 +58,9 @@ def test_leaves_as_large_as_asked_for(field: Path, capsys: pytest.CaptureFixture
     "target, options, words",
     [
         ("tree.npz", [], "--to says what a field becomes: octree"),
-        ("tree.ply", ["--to", "octree"], "--to octree makes an .npz from"),
+        ("tree.ply", ["--to", "octree"], "--to octree makes an .npz: give"),
         ("tree.npz", ["--to", "octree", "--resolution", "8192"], "depth 13"),
-        ("tree.npz", ["--to", "grid"], "makes a grid from an octree, a hash grid or a NeRF"),
+        ("tree.npz", ["--to", "grid"], "is a grid of one box already"),
         ("tree.npz", ["--to", "octree", "--box", "0", "0", "0", "1", "1", "1"], "--box"),
     ],
 )

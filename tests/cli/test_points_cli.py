@@ -129,7 +129,7 @@ def test_convert_makes_gaussians_of_a_field_and_says_their_loss(tmp_path: Path, 
     for resolution in (12, 4):
         assert main(["convert", str(tmp_path / "b.npz"), str(tmp_path / "c.ply"), "--resolution", str(resolution)]) == 0
         written, lost = capsys.readouterr().out.splitlines()
-        assert "dB between splatted Gaussians and the field: 6 views, 128 x 128 pixels each" in lost
+        assert "dB between views of c.ply and b.npz: 6 views, 128 x 128 pixels each" in lost
         count[resolution], loss[resolution] = read_gaussians(tmp_path / "c.ply").count, float(lost.split()[0])
         assert f"c.ply: {count[resolution]} Gaussians of degree 0" in written
     assert count[12] > 4 * count[4] and loss[12] > loss[4] + 3

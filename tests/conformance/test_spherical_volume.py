@@ -9,14 +9,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from octrees import random_octree
 from scattering_scenes import cases
 
 from mivol.errors import MivolError
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.harmonics import decode_srgb_code
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
+from mivol.fields.resampling import sample_to_grid
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
 from mivol.files.image_files import decode_srgb
+from mivol.optim.photographs.sampled_problem import find_region
 from scenes import box_of, camera, centred, refused, render, rotation, sky, tensor, transform
 
 PLACE = centred(2 * np.eye(3))
@@ -321,3 +326,26 @@ def test_a_file_is_checked_for_the_activation_it_is_given(variant_rgb: None, tmp
     write_field(tmp_path / "field.npz", SphericalGrid.from_dense(density - 2 * density.max(), sh, np.eye(4)))
     with pytest.raises(RuntimeError, match="without an activation none may be negative"):
         mi.load_dict({"type": "mivol_sh", "filename": str(tmp_path / "field.npz"), "activation": "none"})
+
+
+def test_other_representations_are_shown_as_their_grids(variant_rgb: None, tmp_path: Path) -> None:
+    """A hash grid at the nodes that are asked for, an octree in its smallest cells; nodes of what is stored are refused."""
+    octree = random_octree(3)
+    hashed = HashField.random(HashSizes(levels=2, log2_table=6, coarsest=2, finest=5, width=4), PLACE, 3)
+    for name, one in {"hash": find_region(hashed, cells=4), "tree": octree, "grid": octree.to_grid()}.items():
+        write_field(tmp_path / f"{name}.npz", one)
+    stored = {name: read_field(tmp_path / f"{name}.npz") for name in ("hash", "tree")}
+    for name, more, grid in (
+        ("hash", {"nodes": 6}, sample_to_grid(stored["hash"], 6)),
+        ("tree", {}, stored["tree"].to_grid()),
+    ):
+        volume = mi.load_dict({"type": "mivol_sh", "filename": str(tmp_path / f"{name}.npz"), **more})
+        assert volume.mivol_field.res == grid.res and np.array_equal(volume.mivol_field.stored_nodes(), grid.stored_nodes())
+        for ours, theirs in zip(volume.mivol_field.values(), grid.values(), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        np.testing.assert_array_equal(volume.mivol_to_world, grid.to_world)
+    for name in ("tree", "grid"):
+        with pytest.raises(RuntimeError, match="found nodes that are stored, expected a hash grid or a NeRF"):
+            mi.load_dict({"type": "mivol_sh", "filename": str(tmp_path / f"{name}.npz"), "nodes": 6})
+    with pytest.raises(RuntimeError, match="nodes beside density and sh"):
+        mi.load_dict({"type": "scene", "box": field(nodes=6)})

@@ -21,10 +21,10 @@ from mivol.optim.photographs.radiance_plan import (
     allocated_bytes,
     check_memory,
     estimate_bytes,
-    place_grid,
 )
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Photo
+from mivol.space import place_grid
 
 
 def test_memory_is_checked_first(variant_rgb: str, photos: list[Photo]) -> None:

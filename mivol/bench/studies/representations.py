@@ -14,7 +14,7 @@ largest memory of Dr.Jit, without the photographs. Fields are rendered with one 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -29,7 +29,7 @@ from mivol.bench.harness.bars import AT_LEAST, Promise, say_row
 from mivol.bench.harness.figures import new_figure, show_images
 from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.harness.timing import Stopwatch, race, ratio_of
-from mivol.bench.photo_fits import FittedProblem, PhotoSize, find_photographs, fit_photographs, prepare_fit
+from mivol.bench.photo_fits import FittedProblem, PhotoSize, find_photographs, fit_photographs, prepare_fit, prepare_fit_in_time
 from mivol.bench.reference_walk import REFERENCE_RATE
 from mivol.bench.scenes import box_scene, constant_light, make_integrator
 from mivol.errors import MivolError
@@ -67,6 +67,8 @@ class RepresentationSize(PhotoSize):
     nerf_effort: float = amount(1.0, 0.02, "factor on the steps of the NeRF")
     samples: int = amount(1 << 17, 1 << 12, "samples of a hash grid")
     rounds: int = amount(7, 2, "timed calls with these samples")
+    rounds_edge: int = amount(64, 16, "longest edge of the photographs for coarse and fine networks [pixels]")
+    rounds_seconds: float = amount(300.0, 1.0, "processor time of each fit of these photographs [s]")
     smoke_side: int = amount(32, 8, "edge of the views of the smoke [pixels]")
     smoke_seconds: float = amount(30.0, 0.5, "processor time of each fit of the smoke [s]")
     smoke_spp: int = amount(2, 2, "samples per pixel of a step of the smoke")
@@ -150,6 +152,10 @@ def fit_and_judge(folder: Path, photos: dict, settings: dict, size: Representati
 
 def table(question: str, answer: dict) -> list[str]:
     """The table of the representations of a data set, for the docs."""
+    if question == "rounds":
+        rows = ((name, f"{row['psnr']:.2f} dB / {row['ssim']:.3f}", row["steps"]) for name, row in answer.items())
+        head = "| samples of a ray | PSNR / SSIM | steps |", "|---|---|---|"
+        return [*head, *(f"| {name} | {score} | {steps} |" for name, score, steps in rows)]
     if question in ("samples", "smoke") or not answer:
         return []
     head = "| model | PSNR / SSIM | time | memory | file | rays shown |", "|---|---|---|---|---|---|"
@@ -221,6 +227,31 @@ def measure_sample_rates(size: RepresentationSize) -> dict:
     for name, rate in rates.items():
         say_row(name, samples_per_processor_second=rate, on_2_cores=2 * rate)
     return {"rates": rates, "ratio": ratio_of(timings["drjit.hashgrid"], timings["mivol"], "processor")}
+
+
+ROUNDS = {
+    "one network, map of occupied cells": {},
+    "coarse + fine, 32 + 32 samples": {"coarse": 32, "fine": 32},
+    "coarse + fine, 64 + 128 samples": {"coarse": 64, "fine": 128},
+}
+"""Settings of NeRFs whose samples are placed in different ways; the last ones are the published numbers."""
+
+
+def measure_rounds(size: RepresentationSize) -> dict:
+    """How good is a NeRF with a coarse and a fine network, beside one network with a map of occupied cells, in equal time?
+
+    Each fit has as many steps as fit into the time, with the whole course of learning rates.
+    """
+    folder, answer = find_photographs("still_life", size), {}
+    photos = choose_photos("still_life", folder, "NeRF", replace(size, edge=size.rounds_edge))
+    for name, more in ROUNDS.items():
+        field = {"kind": "nerf", "preset": size.nerf, **more}
+        prepared = prepare_fit_in_time(folder, photos, field, size.rounds_seconds)
+        done = fit_photographs(prepared.problem, size.walk_side)
+        score = prepared.score(prepared.judged.views, ("psnr", "ssim"))
+        answer[name] = {**score, "steps": prepared.steps, "processor_seconds": done.processor}
+        say_row(name, **answer[name])
+    return answer
 
 
 SMOKE_KEY = "box.interior_medium.sigma_t."
@@ -310,7 +341,9 @@ def fit_smoke(fit: SmokeFit, views: list[View], light: dict, albedo: float, size
 
 def draw(answers: dict, path: Path) -> None:
     """Plot PSNR against minutes, and show a judged view of each fit beside its photograph."""
-    rows = [(question, answer) for question, answer in answers.items() if answer and question not in ("samples", "smoke")]
+    rows = [
+        (question, answer) for question, answer in answers.items() if answer and question not in ("samples", "smoke", "rounds")
+    ]
     if not rows:
         return
     columns = 2 + max(len(answer) for _, answer in rows)
@@ -330,6 +363,7 @@ def draw(answers: dict, path: Path) -> None:
 QUESTIONS = {
     "samples": measure_sample_rates,
     "smoke": measure_smoke,
+    "rounds": measure_rounds,
     "chair": ask("What are the photographs of the chair by each model, if its data is here?", measure, "chair"),
     "still_life": ask("What are the photographs of the still life by each model?", measure, "still_life"),
     "fox": ask("What are the photographs of the fox by each model, if its data is here?", measure, "fox"),

@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -28,18 +28,21 @@ from mivol.fields.octree import MAX_DEPTH, MAX_LEAVES, Octree, check_depth, inte
 from mivol.fields.resampling import project_colours, sample_voxels
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.optim.photographs.radiance_plan import place_grid
+from mivol.space import place_grid
 from mivol.transport.line_integrals.leaf_radiance import LeafColours, raise_leaf_weights
 from mivol.transport.line_integrals.radiance_field import RayBundle
 from mivol.transport.traversal.leaf_index import LeafIndex
 
-__all__ = ["OctreeRecipe", "ViewRays", "build_octree", "build_octree_of_points"]
+__all__ = ["OctreeRecipe", "ViewRays", "build_octree", "build_octree_of_levels", "build_octree_of_points"]
 
 ViewRays = Callable[[], Iterable[RayBundle]]
 """Returns the rays of all views, view by view."""
 
 GAUSS = 0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3)
 """The two Gauss points of an interval, as fractions."""
+
+
+NO_MATTER = "the grid holds no matter: an octree of it would have no leaf."
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,8 @@ def build_octree(grid: SphericalGrid, rays: ViewRays, recipe: OctreeRecipe = Oct
     base = _check_grid(grid, recipe)
     depth = max(recipe.depth or base + 1, base + 1)
     tree, cells = None, _half_voxels(grid)
+    if not len(cells):
+        raise MivolError(NO_MATTER)
     for level in range(base + 1, depth + 1):
         if level > base + 1:
             cells = (2 * cells[:, None] + np.array([*itertools.product((0, 1), repeat=3)])).reshape(-1, 3)
@@ -95,6 +100,53 @@ def build_octree(grid: SphericalGrid, rays: ViewRays, recipe: OctreeRecipe = Oct
     if recipe.depth and recipe.depth < depth:
         tree = _limit_depth(tree, recipe.depth)
     return tree
+
+
+def build_octree_of_levels(field: SphericalGrid, rays: ViewRays, recipe: OctreeRecipe = OctreeRecipe()) -> Octree:
+    """Make an octree from a nested grid: leaves of half a voxel of their level, and larger ones where views hardly differ.
+
+    Args:
+        field: nested grid. What a level holds in the box of the level before is left out, with the cells that its faces cut.
+        rays: rays of the views that decide which leaves are seen.
+        recipe: depth (at most that of half a voxel of the innermost box), threshold and tolerance.
+
+    Raises:
+        MivolError: as :func:`build_octree`, or too many levels for the largest depth.
+    """
+    n, levels = np.array(field.res[::-1]), field.levels
+    depth = int(n.max() * 2**levels - 1).bit_length()
+    if depth > MAX_DEPTH or recipe.depth > depth:
+        found = f"an octree of depth {max(depth, recipe.depth)} of {levels} levels of {n.max()} nodes"
+        raise MivolError(f"{found} was asked for; at most {min(depth, MAX_DEPTH)} is expected: give a smaller --resolution.")
+    parts = []
+    for number in range(levels):
+        level = field.extract_level(number)
+        _check_grid(level, replace(recipe, depth=0))
+        cells = _half_voxels(level)
+        if number:  # twice the places: the box of the level before is from n to 3 n along each axis
+            cells = cells[~((2 * cells + 2 > n) & (2 * cells < 3 * n)).all(axis=1)]
+        if not len(cells):
+            continue
+        density, sh = _means(level, 0.5, cells, with_colours=True)
+        # Cells of the innermost half voxels, counted from the corner of a cube around the middle of all boxes.
+        codes = interleave((cells - n) * 2**number + 2 ** (depth - 1), depth)
+        parts.append((codes, np.full(len(cells), number, np.uint8), density, sh))
+    if not parts:
+        raise MivolError(NO_MATTER)
+    codes, sizes, density, sh = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(codes)
+    order = order[density[order] > 0]
+    place = field.to_world.copy()
+    place[:3, :3] *= 2.0**depth / (2 * n)
+    place[:3, 3] = field.middle - place[:3, :3] @ [0.5, 0.5, 0.5]
+    rows = codes[order], sizes[order], density[order], sh[order]
+    tree = Octree.from_rows(depth, place, *rows, offset=field.offset, space=field.space)
+    weights = max_weights(tree, rays)
+    kept = weights >= recipe.keep_weight
+    if not kept.any():
+        raise MivolError("no view shows matter in the grid: check the box, the cameras and the threshold.")
+    tree = merge_siblings(tree.select(kept), weights[kept], recipe.tolerance)
+    return _limit_depth(tree, recipe.depth) if recipe.depth and recipe.depth < depth else tree
 
 
 POINTS_DEPTH = 7
@@ -145,7 +197,7 @@ def build_octree_of_points(
 def _check_grid(grid: SphericalGrid, recipe: OctreeRecipe) -> int:
     """The depth at which leaves are voxels."""
     if grid.levels > 1:
-        raise MivolError(f"a field of {grid.levels} nested levels was given; an octree is made from one of its levels.")
+        raise MivolError(f"a field of {grid.levels} nested levels was given; build_octree_of_levels makes one octree of all.")
     if not grid.clamp:
         raise MivolError("a field without clamp was given; an octree shows colours below 0 as 0: set clamp to True.")
     base = max(max(grid.res) - 1, 0).bit_length()
@@ -180,8 +232,6 @@ def _half_voxels(grid: SphericalGrid) -> np.ndarray:
     places = np.argwhere(cells)[:, None] * 2 + np.array([*itertools.product((-1, 0), repeat=3)])
     places = places.reshape(-1, 3)
     places = places[(places >= 0).all(axis=1) & (places < 2 * np.array(grid.res)).all(axis=1)]
-    if not len(places):
-        raise MivolError("the grid holds no matter: an octree of it would have no leaf.")
     return places[:, ::-1]
 
 
@@ -213,7 +263,7 @@ def _sample(grid: SphericalGrid, base: int, depth: int, cells: np.ndarray, with_
     density, sh = _means(grid, 2.0 ** (base - depth), cells, with_colours)
     filled = density > 0
     if not filled.any():
-        raise MivolError("the grid holds no matter: an octree of it would have no leaf.")
+        raise MivolError(NO_MATTER)
     sizes = np.zeros(int(filled.sum()), np.uint8)
     settings = {"offset": grid.offset, "space": grid.space}
     return Octree.from_rows(depth, _cube(grid, base), codes[filled], sizes, density[filled], sh[filled], **settings)

@@ -21,6 +21,7 @@ from mivol.optim.first_order import RMSprop
 from mivol.optim.loop import Course
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.optim.priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
+from mivol.space import place_grid
 
 FEW_PHOTOGRAPHS = 50
 """Number of photographs below which view-dependent colours overfit."""
@@ -266,16 +267,6 @@ measured).
 Rates and priors were chosen on views held out of training sets. The delay matters most with few views: a field that starts at
 the full rate is opaque before it has a shape. With the rates of ``cpu`` a voxel's optical depth changes equally in all stages,
 and colours move twice as far as by default, so half the steps suffice. Few views need lower rates, so these are no defaults."""
-
-
-def place_grid(box: np.ndarray, longest: int) -> tuple[tuple[int, int, int], np.ndarray]:
-    """Resolution (Z, Y, X) and ``to_world`` of a grid of cubic voxels that covers a box (2, 3)."""
-    edges = box[1] - box[0]
-    h = edges.max() / longest
-    counts = np.maximum(np.ceil(edges / h - 1e-9), 1).astype(int)
-    to_world = np.diag([*(counts * h), 1.0])
-    to_world[:3, 3] = box.mean(axis=0) - counts * h / 2
-    return (int(counts[2]), int(counts[1]), int(counts[0])), to_world
 
 
 def scale_longest(longest: int, box: np.ndarray) -> int:

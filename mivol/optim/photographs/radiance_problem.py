@@ -33,11 +33,12 @@ from mivol.fields.sky import TEXEL, Sky
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure, compare_rays
-from mivol.optim.photographs.radiance_plan import RadiancePlan, place_grid
+from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.ray_batches import DepthRays, RayBatch, RayBatches, depth_loss_gradient, sample_depth_rays
 from mivol.optim.priors import Neighbours, Rows
 from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, SparseProblem, to_tensors
 from mivol.photos.region import is_free_space, median_distance
+from mivol.space import place_grid
 from mivol.transport.line_integrals.radiance_field import (
     Model,
     RayGradient,

@@ -30,9 +30,10 @@ from mivol.optim.events import Event
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course
 from mivol.optim.photographs.photo_colours import SCALES, compare_rays
-from mivol.optim.photographs.radiance_plan import allocated_bytes, place_grid
+from mivol.optim.photographs.radiance_plan import allocated_bytes
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.optim.problem import Divide, DividedProblem, Reals, to_tensors
+from mivol.space import place_grid
 from mivol.transport.line_integrals.radiance_field import RayGradient
 from mivol.transport.line_integrals.sampled_rays import SampledModel, render_hierarchical, render_samples, vjp_samples
 from mivol.transport.traversal.occupancy import Occupancy, list_cells
