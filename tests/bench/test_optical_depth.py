@@ -128,6 +128,16 @@ def test_exact_optical_depths_are_those_of_the_oracle() -> None:
     np.testing.assert_allclose(exact_tau(values, o, d), tau_twin(values, TO_WORLD, o, d)[:, 0], rtol=1e-12, atol=1e-12)
 
 
+def test_a_pixel_sees_the_transmittance_of_its_rays(variant_rgb: str) -> None:
+    """In a grid of one value, rays that cross the same faces have the transmittance of their chord."""
+    values, pixels = np.full((2, 2, 2), 0.7, np.float32), np.array([27, 36])
+    means, doubt = study.pixel_means(values, 8, pixels, k=2)
+    rays = [np.array(x).T.astype(float) for x in camera_rays(8, pixels, 2)]
+    expected = np.exp(-tau_twin(values, TO_WORLD, *rays)[:, 0]).reshape(2, 4).mean(axis=1)
+    np.testing.assert_allclose(means, expected, rtol=1e-12)
+    assert 0 < doubt < 0.1 and (means < 1).all()
+
+
 def test_rays_of_a_pixel_go_through_its_parts(variant_rgb: str) -> None:
     """The mean direction of 2 x 2 rays of a pixel is that through its middle, to the square of the pixel's angle."""
     _, one = camera_rays(8, np.array([27]))

@@ -13,7 +13,7 @@ from ball_photos import BOX, PLAN, ball, camera, photo
 
 from mivol.back_end import set_threads
 from mivol.cluster.pool import Unit
-from mivol.cluster.steps import SharedProjector, make_view_blocks, share_problem, share_projector
+from mivol.cluster.steps import SharedProjector, StepTimes, make_view_blocks, share_problem, share_projector
 from mivol.cluster.workplace import Workplace
 from mivol.errors import MivolError
 from mivol.fields.hash_encoding import HashSizes
@@ -159,6 +159,13 @@ def test_several_photographs_a_step_are_their_mean(batches: RayBatches) -> None:
         np.testing.assert_allclose(np.array(value), mean, rtol=0, atol=1e-6 * np.abs(mean).max())
     assert np.array_equal(three._times, ones._times)
     assert three._times.max() == 3
+
+
+def test_times_of_steps_are_means() -> None:
+    times = StepTimes()
+    for wall, computing in ((0.3, 0.2), (0.5, 0.4)):
+        times.add(wall, computing)
+    assert times.describe() == "a step takes 400 ms, 300 of them on the slowest worker"
 
 
 def test_a_plan_with_several_photographs_a_step() -> None:

@@ -130,6 +130,17 @@ def test_the_arc_is_guessed_by_likeness(arc: float, blocks: str) -> None:
     assert found_scan.guess_arc(np.stack([views] * 3, axis=1))[0] == arc
 
 
+@pytest.mark.parametrize("files", [1, 5])
+def test_the_first_middle_and_last_view_tell_the_arc(tmp_path: Path, files: int) -> None:
+    """Of five views, in a file of five pages or in five files."""
+    views = [Image.fromarray(np.full((2, 3), k, "u2")) for k in range(5)]
+    step = 5 // files
+    paths = [tmp_path / f"{k}.tif" for k in range(files)]
+    for k, path in enumerate(paths):
+        views[k].save(path, save_all=True, append_images=views[k + 1 : k + step])
+    assert found_scan._three_views(paths, None, None)[:, 1, 2].tolist() == [0, 2, 4]
+
+
 def test_readings_without_flats(tmp_path: Path) -> None:
     """Air near 1 is a transmission, air near 0 a line integral, and readings of a camera are refused."""
     view = np.ones((2, 40))
