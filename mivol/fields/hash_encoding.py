@@ -95,6 +95,11 @@ class HashSizes:
         """The network from geometry and harmonics to colour."""
         return Network((self.geometry + basis_size(self.degree), *[self.width] * self.colour_layers, 3))
 
+    @property
+    def growth(self) -> float:
+        """Cells of a level along an edge over those of the level before."""
+        return (self.finest / self.coarsest) ** (1 / max(self.levels - 1, 1))
+
     def count_numbers(self, edges: np.ndarray) -> int:
         """Number of fitted numbers, in a box with the edges (x, y, z)."""
         rows = sum(level.rows for level in self.place_levels(edges))
@@ -111,10 +116,9 @@ class HashSizes:
 
     def place_levels(self, edges: np.ndarray) -> list[Level]:
         """The levels in a box with the edges (x, y, z)."""
-        growth = (self.finest / self.coarsest) ** (1 / max(self.levels - 1, 1))
         placed, first = [], 0
         for number in range(self.levels):
-            longest = self.coarsest * growth**number
+            longest = self.coarsest * self.growth**number
             cells = tuple(max(1, round(float(longest * edge / edges.max()))) for edge in edges)
             nodes = math.prod(n + 1 for n in cells)
             is_dense = nodes <= 1 << self.log2_table

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
 
-from mivol.experiments import field_fit, photo_fit
+from mivol.experiments import field_fit, photo_fit, sampled_fit
 from mivol.fields.field_files import write_field
+from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.hash_grid import HashField
+from mivol.fields.nerf import NerfField, NerfSizes
+from mivol.fields.sampled_field import Region
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
 from mivol.optim.photographs.field_view import FieldView
@@ -26,6 +32,16 @@ def field(keep: np.ndarray | None = None) -> SphericalGrid:
     """Densities of 1 to 60, colours of degree 1."""
     sigma = 1 + np.arange(60.0).reshape(RES)
     return SphericalGrid.from_dense(sigma, np.zeros((*RES, 4, 3)), np.diag([*EDGES, 1.0]), keep)
+
+
+@pytest.mark.parametrize(("model", "sizes"), [(HashField, HashSizes()), (NerfField, NerfSizes())])
+def test_the_table_of_a_sampled_field(model, sizes):
+    occupied = Region((1, 1, 1), np.eye(4), mi.UInt8([1, 1, 0, 0, 0, 0, 0, 0]), 0.1)
+    sampled = replace(model.random(sizes, np.eye(4)), region=occupied)
+    noun = {"hash": "Hash grid", "nerf": "NeRF"}[sampled.kind]
+    table = sampled_fit.tabulate_field(sampled, 3 << 19)
+    assert table.title == f"{noun}: {sampled.numbers} numbers, file 1.50 MiB, 25.0% of the cells occupied"
+    assert (table.head, table.rows) == sampled.tabulate()
 
 
 def camera(width: int = 4, height: int = 2) -> Camera:

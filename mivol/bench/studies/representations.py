@@ -197,7 +197,6 @@ def measure_sample_rates(size: RepresentationSize) -> dict:
     by_sigma, by_colour = mi.Float(rng.normal(size=count)), mi.Color3f(rng.normal(size=(3, count)))
     dr.eval(points, directions, by_sigma, by_colour)
     field = HashField.random(sizes, np.eye(4))
-    growth = (sizes.finest / sizes.coarsest) ** (1 / (sizes.levels - 1))
     peer = HashGridEncoding(
         mi.Float,
         3,
@@ -205,7 +204,7 @@ def measure_sample_rates(size: RepresentationSize) -> dict:
         n_features_per_level=sizes.features,
         hashmap_size=sizes.features << sizes.log2_table,
         base_resolution=sizes.coarsest,
-        per_level_scale=growth,
+        per_level_scale=sizes.growth,
     )
     density, colours = mi.Float(field.density_weights), mi.Float(field.colour_weights)
 
