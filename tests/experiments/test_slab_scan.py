@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,6 +86,14 @@ def test_the_preview_reads_a_few_rows_at_once(variant_rgb: str, tmp_path: Path, 
     lines = slab_scan._read_lines(plan, slice(1, 24, 2), views)
     assert counts == [6, 6] and lines.dtype == np.float32
     np.testing.assert_array_equal(lines, read(slice(1, 24, 2)).y[views].astype(np.float32))
+
+
+def test_coarse_voxels_lower_the_cutoff_of_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Voxels of twice the size show half of the frequencies."""
+    monkeypatch.setattr(slab_scan, "filtered_backprojection", lambda projector, y, window, cutoff: cutoff)
+    projector = SimpleNamespace(geometry=ParallelBeam(np.zeros(1), (1, 4), 1.0))
+    solve = config.SolveSettings(name="fbp", cutoff=0.8)
+    assert slab_scan._reconstruct_directly(projector, np.zeros(1), solve, 0.5) == 0.4
 
 
 def test_rows_and_layers_are_where_they_were() -> None:
