@@ -71,11 +71,12 @@ class _View:
 
     def next_numbers(self, most: int) -> range:
         """Numbers of the next batches to send; empty if enough are under way."""
-        done, wanted = self.reference.run.moments.n, self.reference.count_batches()
-        length = max(1, min(LONGEST_UNIT, PATHS_PER_PASS["llvm"] // self._paths()))
-        if self.reference.is_reached or self.sent >= done + most * length:
+        if self.reference.is_reached:
             return range(0)
-        return range(self.sent, min(self.sent + length, wanted))
+        length = max(1, min(LONGEST_UNIT, PATHS_PER_PASS["llvm"] // self._paths()))
+        if self.sent >= self.reference.run.moments.n + most * length:
+            return range(0)
+        return range(self.sent, min(self.sent + length, self.reference.count_batches()))
 
     def _paths(self) -> int:
         rows, columns, _ = self.reference.setup.shape
@@ -83,11 +84,13 @@ class _View:
 
     def row(self, status: str) -> SweepRow:
         """The view as a row of a page."""
-        reference = self.reference
-        done, wanted = reference.run.moments.n, reference.count_batches()
-        samples = {} if reference.finished is not None else {"samples a pixel": float(done * reference.setup.pass_spp)}
-        progress = f"{done} of {wanted} batches" if status != "finished" else ""
-        return SweepRow(reference.path.name, {}, status, progress, samples)
+        reference, kept = self.reference, self.reference.finished
+        done = reference.run.moments.n
+        samples = done * reference.setup.pass_spp if kept is None else kept.spp
+        is_under_way = status != "finished" and kept is None
+        progress = f"{done} of {reference.count_batches()} batches" if is_under_way else ""
+        shown = status if kept is None else "finished"
+        return SweepRow(reference.path.name, {}, shown, progress, {"samples a pixel": float(samples)})
 
     def take(self, numbers: range, images: list[np.ndarray], seconds: float) -> None:
         """Add images in the order of their numbers; those beyond the goal are dropped."""

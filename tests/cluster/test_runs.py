@@ -73,8 +73,8 @@ def no_leftovers() -> None:
 def test_references_do_not_depend_on_workers(client: object, tmp_path: Path, variant_rgb: str) -> None:
     """Rationale: seeds belong to batches, and the owner adds batches in their order.
 
-    Expected: mean and variance of each view equal to the bit alone, with 1, 2 and 3 workers, and with one killed; the first
-    view stops at its error, not at the largest number of samples.
+    Expected: mean and variance of each view equal to the bit alone, with 1, 2 and 3 workers, with one killed, and if some views
+    are on disk; the first view stops at its error, not at the largest number of samples.
     """
     path = write_scattering_scene(tmp_path)
     loaded = load_scene(path)
@@ -99,6 +99,10 @@ def test_references_do_not_depend_on_workers(client: object, tmp_path: Path, var
     for count in (1, 2, 3):
         with some_workers(client, count) as pool:
             compare(f"{count}", pool)
+    (tmp_path / "3" / "view_001.exr").unlink()
+    (tmp_path / "3" / "view_001.state.npz").unlink(missing_ok=True)
+    with some_workers(client, 1) as pool:
+        compare("3", pool)  # the first and the last view are on disk
     said: list[str] = []
     with some_workers(client, 2, said) as pool:
         compare("killed", pool, kill_once(pool))

@@ -35,6 +35,9 @@ from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
 from mivol.doctor import FAULT, Finding
 from mivol.errors import MivolError
 from mivol.optim.scenes.views import View
+from mivol.report.sweep_page import SweepRow
+from mivol.scene.load import load_scene
+from mivol.validate.reference import prepare_reference, render_reference
 
 TLS = 'scheduler = "address"\naddress = "tls://node1:8786"\n[security]\nca = "a.pem"\ncert = "b.pem"\nkey = "c.pem"\n'
 
@@ -287,6 +290,16 @@ def test_batches_are_cut_by_paths() -> None:
     assert make_view(0, 40, 16, 1).next_numbers(4) == range(0, LONGEST_UNIT)
     assert make_view(38, 40, 16, 1).next_numbers(4) == range(38, 40)
     assert not make_view(40, 40, 16, 1).next_numbers(4)
+
+
+def test_finished_views_need_no_batches(variant_rgb: str, tmp_path: Path) -> None:
+    """A run over several views continues behind those that are on disk; the page shows their samples."""
+    options = {"out": tmp_path / "r.exr", "max_depth": 2, "max_spp": 64, "pass_spp": 2}
+    scene = load_scene(write_experiment(tmp_path) / "scene.xml")
+    render_reference(scene, **options, progress=False)
+    view = _View(0, prepare_reference(scene, **options), 0)
+    assert not view.next_numbers(4)
+    assert view.row("running") == SweepRow("r.exr", {}, "finished", "", {"samples a pixel": 64.0})
 
 
 def test_units_wait_for_earlier_ones() -> None:
