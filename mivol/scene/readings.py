@@ -25,15 +25,17 @@ from mivol.transport.media.extinction import ExactExtinction, Extinction
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.grid_blocks import (
+    BlockExtremes,
     BlockRanges,
     CoarseGrid,
     block_shift,
-    bound_blocks,
     coarsen_grid,
     find_block_ranges,
     find_distances_of_bounds,
+    find_extremes,
     find_occupied_blocks,
     place_blocks,
+    tabulate_ranges,
 )
 from mivol.transport.traversal.grid_walk import NodeArray, corner_nodes, read_nodes
 from mivol.transport.traversal.interpolation import interpolate
@@ -46,6 +48,7 @@ class GridReading:
 
     Attributes:
         bounds: largest value of each block; of a sparse grid, whether the block is occupied.
+        extremes: smallest and largest values of each block; None of a sparse grid.
         occupied: share of blocks with a positive value [1].
         maximum: largest value of the grid.
         floored: values with 0 in place of negative values; None without negative values.
@@ -55,6 +58,7 @@ class GridReading:
     occupied: float
     maximum: float
     floored: mi.Float | None = None
+    extremes: BlockExtremes | None = None
 
 
 def _read_once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
@@ -85,24 +89,29 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
     array = dr.detach(part.lattice.values.array)
 
     def make() -> GridReading:
-        values, activation, floored = part.lattice.values, part.activation, None
+        values, activation, bricks, floored = part.lattice.values, part.activation, part.lattice.bricks, None
         if activation is not None:
             _check_stored_density(array, activation, name)
             # Values up to the empty value give no extinction; above, the extinction rises with the stored value.
             empty = activation.empty_below
             values = mi.TensorXf(dr.maximum(array, empty) if empty is not None else dr.abs(array) + 1, values.shape)
-        elif not dr.all((array >= 0) & dr.isfinite(array)):
+        elif bricks is not None and not dr.all((array >= 0) & dr.isfinite(array)):
             floored = _clip_negative(part, survey, name)
             values = mi.TensorXf(floored, values.shape)
-        _check_look_up(part, survey, name)
-        bricks = part.lattice.bricks
         if bricks is not None:
+            _check_look_up(part, survey, name)
             blocks = find_occupied_blocks(values, bricks)
             share = float(dr.count(blocks)[0]) / dr.width(blocks)
             return GridReading(blocks, share, float(dr.max(values.array)[0]), floored)
-        blocks = bound_blocks(values)
-        host = np.array(blocks)
-        return GridReading(blocks, float((host > 0).mean()), float(host.max(initial=0.0)), floored)
+        # All facts of a dense grid follow from the extremes of its blocks, which the host reads once.
+        extremes = find_extremes(values)
+        low, high = (np.array([np.array(end) for end in ends]) for ends in (extremes.low, extremes.high))
+        if activation is None and low.min() < 0:
+            floored = _clip_negative(part, survey, name)
+            extremes, low, high = extremes.floor(), np.maximum(low, 0), np.maximum(high, 0)
+        _check_look_up(part, survey, name)
+        bounds = np.maximum(-low, high).max(axis=0)
+        return GridReading(extremes.bounds, float((bounds > 0).mean()), float(bounds.max()), floored, extremes)
 
     reading = _read_once(survey, ("part",), array, make)
     if reading.floored is not None:
@@ -242,7 +251,7 @@ def read_part(
     reading.floored = part.floored
     # A grey variant averages an rgb extinction over the channels; the transmittance of the mean is not the mean transmittance.
     if tracks and not (mi.is_monochromatic and part.channels > 1):
-        reading.block_ranges = read_block_ranges(part, survey)
+        reading.block_ranges = read_block_ranges(part, survey, name)
     if draws_near_light:
         coarse = read_coarse_grid(survey, lattice, block_shift(lattice.res), False).lattice
         reading.rough, reading.rough_distances = coarse.values, coarse.empty_distances
@@ -257,10 +266,17 @@ def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) 
     )
 
 
-def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges:
+def read_block_ranges(part: ExactExtinction, survey: SceneSurvey, name: str) -> BlockRanges:
     """Read the range of values of each block of a grid, once for each state of the array."""
     values, bricks = part.lattice.values, part.lattice.bricks
-    return _read_once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values, None, bricks))
+
+    def make() -> BlockRanges:
+        if bricks is not None or is_recording():
+            return find_block_ranges(values, None, bricks)
+        extremes = read_extinction(part, survey, name).extremes
+        return tabulate_ranges(extremes if extremes.shift == block_shift(part.lattice.res) else extremes.join())
+
+    return _read_once(survey, ("blocks",), dr.detach(values.array), make)
 
 
 def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, finds_occupied: bool) -> CoarseGrid:

@@ -11,7 +11,13 @@ import pytest
 from hard_rays import BOUND, assert_tau, positive
 from oracle import tau_gradient_twin
 
-from mivol.transport.traversal.grid_blocks import coarsen_grid, find_block_ranges, find_empty_distances
+from mivol.transport.traversal.grid_blocks import (
+    coarsen_grid,
+    find_block_ranges,
+    find_empty_distances,
+    find_extremes,
+    tabulate_ranges,
+)
 from scenes import FRAMES, as_float32, centred, make_lattice, random_rays, tensor, to_lanes
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -91,6 +97,23 @@ def test_blocks_hold_all_nodes_of_their_cells(shape):
         own = values[np.ix_(*nodes)].reshape(-1, 3)
         assert np.array_equal(table[index][:3], own.min(axis=0))
         assert table[index][3] == pytest.approx(np.ptp(own, axis=0).max(), rel=2e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (7, 8, 9), (15, 16, 17), (23, 1, 24)])
+def test_blocks_of_twice_the_edge_are_joined(shape):
+    values = mi.TensorXf(np.random.default_rng(2).normal(size=(*shape, 3)).astype(np.float32))
+    joined, whole = tabulate_ranges(find_extremes(values, 1).join()), find_block_ranges(values, 2)
+    assert (joined.res, joined.shift) == (whole.res, whole.shift)
+    assert np.array_equal(np.array(joined.table), np.array(whole.table))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_blocks_with_a_bad_value_have_no_bounds(bad):
+    values = np.ones((9, 9, 9), np.float32)
+    values[8, 8, 8] = bad
+    extremes = find_extremes(tensor(values))
+    assert np.array_equal(np.array(extremes.low[0])[[0, -1]], [1, -np.inf])
+    assert np.array_equal(np.array(extremes.high[0])[[0, -1]], [1, np.inf])
 
 
 SIZE = (9, 14, 11)

@@ -300,6 +300,12 @@ def test_a_replay_launches_few_kernels() -> None:
     assert count_launches(image) <= 10
     assert count_launches(lambda: pair.gradient(pair.recorded, key, 2)) <= 71
 
+    def step() -> None:
+        pair.scale(key, 0.99), pair.gradient(pair.recorded, key, 2)
+
+    # A changed grid is read again: its update, one kernel for the extremes of its blocks, and their table.
+    assert count_launches(step) <= 86
+
 
 # -- What is traced ---------------------------------------------------------------------------------------------------------
 
