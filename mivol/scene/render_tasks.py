@@ -152,6 +152,13 @@ class RenderTask(RecordedTask):
         return RenderSamples(sensor, seed, self.spp, self.plan.pass_rays, arrays.views)
 
 
+class JoiningTask(RecordedTask):
+    """Nothing, with a scene and its tracer as inputs: a replay joins the arrays that map the same memory."""
+
+    def __call__(self, scene: mi.Scene, tracer: mi.Scene, number: mi.UInt32) -> mi.UInt32:
+        return number + 1
+
+
 class ImageTask(RenderTask):
     """An image."""
 

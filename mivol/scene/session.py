@@ -12,7 +12,7 @@ reads them. Extinction needs neither: transport reads extinction from the parame
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,6 +28,7 @@ from mivol.scene.refusals import parse_aovs
 from mivol.scene.render_tasks import (
     GradientTask,
     ImageTask,
+    JoiningTask,
     PlannedScene,
     PreparedArrays,
     RenderTask,
@@ -54,10 +55,12 @@ class _SurveyedScene:
     """The survey of a scene, and the shapes and emitters by which the scene is recognised.
 
     The scene itself is not kept: the scene may hold the integrator of this session, and then neither would ever be freed.
+    ``is_joined`` tells whether the scene and its tracer share their arrays.
     """
 
     parts: list[mi.Object]
     survey: SceneSurvey
+    is_joined: bool = False
 
     def is_of(self, parts: list[mi.Object]) -> bool:
         """Whether ``parts`` are the very same shapes and emitters."""
@@ -159,6 +162,7 @@ class Session:
         given = (scene, sensor, opened.read_arrays(), *inputs)
         if is_recording() or opened.unrecorded is not None:
             return make()(*given)
+        self._join_arrays(scene, opened.arrays.tracer)
         gradients = [(value, dr.grad(value)) for value in find_differentiated(scene)] if kind is GradientTask else []
         try:
             return self.recordings.call(kind, (opened.spp, *opened.key), make, *given)
@@ -167,6 +171,19 @@ class Session:
             for value, gradient in gradients:
                 dr.set_grad(value, gradient)
         return make()(*given)
+
+    def _join_arrays(self, scene: mi.Scene, tracer: mi.Scene | None) -> None:
+        """Let a scene and its tracer share their arrays before the first recording.
+
+        Both map the same memory of Mitsuba by arrays of their own. The first replay makes them one array. This would change the
+        inputs of the next call, which would be recorded anew.
+        """
+        if tracer is None or self._surveyed.is_joined:
+            return
+        self._surveyed.is_joined = True
+        with suppress(CannotRecordError):
+            for _ in range(3):
+                self.recordings.call(JoiningTask, (), JoiningTask, scene, tracer, dr.opaque(mi.UInt32, 0))
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
         """Survey a new scene, find the needs, plan, and read values; all of it is kept while the scene stays the same."""
