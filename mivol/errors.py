@@ -18,6 +18,10 @@ class MivolError(ValueError):
         return super().__str__().encode("utf-8", "backslashreplace").decode("utf-8")
 
 
+class WorkersLost(MivolError):
+    """The workers of a cluster cannot go on. A fit has not taken the step under way, and keeps its state in a checkpoint."""
+
+
 def reveal_refusals(render: Callable[..., Any]) -> Callable[..., Any]:
     """Make a render function raise the MivolError behind a RuntimeError.
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from mivol.cluster.address import BATCH_SYSTEMS, ClusterSettings
 from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
-from mivol.errors import MivolError
+from mivol.errors import MivolError, WorkersLost
 from mivol.report.record import Table
 
 if TYPE_CHECKING:
@@ -39,6 +39,9 @@ SECONDS_WITHOUT_WORKERS = 60.0
 
 SHARE_OF_MEMORY = 0.5
 """Largest share of a worker's memory that inputs may take."""
+
+AGAIN = "give the same command again (mivol optimize: with --resume); finished work is kept"
+"""Way out after the loss of all workers."""
 
 Say = Callable[[str], None]
 
@@ -174,16 +177,16 @@ class Pool:
         elif self._has_begun and self.settings.scheduler not in BATCH_SYSTEMS:
             waited = time.monotonic() - self._alone_since
             if waited > SECONDS_WITHOUT_WORKERS:
-                raise MivolError(
+                raise WorkersLost(
                     f"the last worker of {self.settings.describe()} was lost and none came for {waited:.0f} s: start workers, "
-                    "then the same command again; finished work is kept."
+                    f"then {AGAIN}."
                 )
 
-    def _scheduler_gone(self) -> MivolError:
-        return MivolError(
-            f"{self.settings.describe()}: its scheduler does not answer any more; finished work is kept, so start a scheduler "
-            "and then the same command again."
-        )
+    def _scheduler_gone(self) -> WorkersLost:
+        is_named = self.settings.scheduler == "address"
+        who = self.settings.describe() if is_named else f"the scheduler of {self.settings.describe()}"
+        start = "start a scheduler, then " if is_named else ""
+        return WorkersLost(f"{who} does not answer any more: {start}{AGAIN}.")
 
     def _join(self, address: str) -> None:
         """Begin the checks of a worker."""
@@ -245,7 +248,7 @@ class Pool:
         for number, unit in worker.units.items():
             self._losses[number] += 1
             if self._losses[number] >= MOST_LOSSES:
-                raise MivolError(
+                raise WorkersLost(
                     f"{describe_unit(unit)} ended {MOST_LOSSES} workers, the last on {worker.facts.host}: their memory may be "
                     "too small, or LLVM aborts; run mivol doctor there, and take fewer workers a machine."
                 )
@@ -305,7 +308,8 @@ class Pool:
             check: called while waiting; may raise, and the units under way are then given up.
 
         Raises:
-            MivolError: a refusal of the work, work that loses several workers, or a lost scheduler.
+            MivolError: a refusal of the work.
+            WorkersLost: work that loses several workers, no worker any more, or a lost scheduler.
         """
         source, again, is_empty = iter(units), [], False
         waiting: dict[int, Unit] = {}

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 
 from mivol.display import curve_html
-from mivol.errors import MivolError
+from mivol.errors import MivolError, WorkersLost
 from mivol.files.notebook import pairs_html
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Event, checkpoints_first
@@ -151,6 +151,7 @@ class Fit:
 
         Raises:
             MivolError: as :meth:`advance`.
+            WorkersLost: no worker of a cluster goes on; the checkpoint is written.
             Interrupted: Ctrl-C or SIGTERM; the checkpoint is written.
         """
         check_one_thread()
@@ -164,7 +165,7 @@ class Fit:
                         observer(self)
                     stop.check()
                 self.evaluate()
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, WorkersLost):
                 self.save()
                 raise
             finally:

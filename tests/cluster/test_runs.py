@@ -18,7 +18,6 @@ from local_workers import kill_once, kill_worker, some_workers
 from tiny_experiment import PHOTOS, run, write_experiment
 
 from mivol import config
-from mivol.cluster.connection import import_distributed
 from mivol.cluster.distribution import ClusterDistribution
 from mivol.cluster.packages import SceneSource, share_scene
 from mivol.cluster.pool import Pool, Unit
@@ -30,9 +29,11 @@ from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, RunContext
 from mivol.experiments.kinds import run_experiment
 from mivol.experiments.render import render_image
+from mivol.experiments.run_folder import CHECKPOINT
 from mivol.experiments.sweep import plan_sweep, run_in_turn, run_sweep
 from mivol.files import read_volume
-from mivol.report.record import read_record
+from mivol.optim import checkpoint
+from mivol.report.record import RECORD, read_record
 from mivol.report.sweep_page import SweepRow
 from mivol.scene.load import load_scene
 from mivol.scene.sensors import Ring
@@ -248,27 +249,61 @@ def test_jobs_of_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant_
     assert stat.S_IMODE((tmp_path / ".mivol").stat().st_mode) == stat.S_IRWXU
 
 
-def test_a_scheduler_that_dies_is_a_sentence(tmp_path: Path, variant_rgb: str) -> None:
-    """What was finished stays, and the same command goes on without a cluster."""
-    distributed = import_distributed()
-    path, out = write_scattering_scene(tmp_path), tmp_path / "r.exr"
-    cluster = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, memory_limit=0
-    )
-    command = [sys.executable, "-m", "mivol", "reference", str(path), "--max-depth", "4", "--spp", f"{1 << 24}", "-o", str(out)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    child = subprocess.Popen(
-        [*command, "--cluster", cluster.scheduler_address], stderr=subprocess.PIPE, text=True, env=environment
-    )
+LONG = {
+    "reference": (["scene.xml", "--max-depth", "4", "--spp", f"{1 << 24}"], "1 worker, batches of view 0: "),
+    "optimize": (["fit.toml", *PHOTOS, "--set", "fit.iterations=300"], "300 iterations, 1 worker"),
+    "sweep": (["fit.toml", *PHOTOS, "--over", "fit.iterations=2,100000"], "1 of 2 runs"),
+}
+"""Flags of a verb that takes long on the tiny experiment, and words once it works: of the error output, or of a record."""
+
+
+ONE_WORKER = """
+import sys
+from distributed import LocalCluster
+cluster = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0)
+print(cluster.scheduler_address, flush=True)
+sys.stdin.read()
+"""
+"""A scheduler and a worker in processes of their own."""
+
+
+@pytest.mark.parametrize("verb", LONG)
+def test_a_scheduler_that_dies_is_a_sentence(tmp_path: Path, variant_rgb: str, verb: str) -> None:
+    """Rationale: a fit without events writes no checkpoint before its end, so the loss itself must write one.
+
+    Expected: one sentence, exit code 1, and finished work on disk: batches, the iterations of a fit, ended runs of a sweep.
+    """
+    write_scattering_scene(tmp_path)
+    flags, at_work = LONG[verb]
+    here = {"text": True, "cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(ROOT)}}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    scheduler = subprocess.Popen([sys.executable, "-c", ONE_WORKER], **pipes, start_new_session=True, **here)
+    out = "r.exr" if verb == "reference" else "run"
+    command = [sys.executable, "-m", "mivol", verb, *flags, "-o", out, "--cluster", scheduler.stdout.readline().strip()]
+    child = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, **here)
     assert "1 worker on 1 host" in child.stderr.readline()
-    assert "1 worker, batches of view 0: " in child.stderr.readline()
-    cluster.close()
+    record = tmp_path / "run" / RECORD
+    while at_work not in ((record.read_text() if record.exists() else "") if verb == "optimize" else child.stderr.readline()):
+        assert child.poll() is None
+        time.sleep(0.1)
+    os.killpg(scheduler.pid, signal.SIGKILL)
+    scheduler.communicate()
     rest = child.stderr.read()
     child.stderr.close()
     assert child.wait(60) == 1
     assert rest.count("mivol: ") == 1
-    assert "its scheduler does not answer any more; finished work is kept" in rest
-    assert (tmp_path / "r.state.npz").is_file()
+    assert "does not answer any more: start a scheduler, then give the same command again" in rest
+    if verb == "reference":
+        assert (tmp_path / "r.state.npz").is_file()
+    elif verb == "optimize":
+        path = tmp_path / "run" / CHECKPOINT
+        assert 0 < checkpoint.read(path, checkpoint.read_settings(path))[1]["next_iteration"] < 300
+        assert run("optimize", tmp_path / "fit.toml", *flags[1:], "--resume", "-o", tmp_path / "run") == 0
+        assert read_record(tmp_path / "run").results["iterations"] == 300
+    else:
+        kept = (tmp_path / "run" / "iterations=2" / RECORD).stat().st_mtime_ns
+        assert run("sweep", tmp_path / "fit.toml", *PHOTOS, "--over", "fit.iterations=2,3", "-o", tmp_path / "run") == 0
+        assert (tmp_path / "run" / "iterations=2" / RECORD).stat().st_mtime_ns == kept
 
 
 def test_ctrl_c_ends_workers_and_keeps_batches(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from fit_scene import KEY, small_problem
 from scattering_scenes import cases
 
-from mivol.errors import MivolError
+from mivol.errors import MivolError, WorkersLost
 from mivol.files import atomic
 from mivol.optim import checkpoint
 from mivol.optim.checkpoint import CheckpointFile
@@ -77,9 +77,16 @@ def test_a_resumed_run_is_the_same_with_several_threads(two_threads, ctrl_c, tmp
 
 
 @pytest.mark.slow_for("after an event")
-@pytest.mark.parametrize("iteration", [2, 3], ids=["after an event", "plain"])
-def test_signal_within_an_iteration_loses_nothing(one_thread, ctrl_c, tmp_path: Path, iteration: int) -> None:
-    """The signal comes in the render of an iteration: that iteration is done again from where it began, its events not."""
+@pytest.mark.parametrize(
+    ("iteration", "end"),
+    [(2, Interrupted), (3, Interrupted), (3, WorkersLost)],
+    ids=["after an event", "plain", "workers lost"],
+)
+def test_an_end_within_an_iteration_loses_nothing(
+    one_thread, ctrl_c, tmp_path: Path, iteration: int, end: type[BaseException]
+) -> None:
+    """The signal, or the loss of all workers, comes in the render of an iteration: that iteration is done again from where it
+    began, its events not."""
     path, whole = tmp_path / "checkpoint.npz", fit(Adam())
     problem = small_problem()
     renders = 0
@@ -89,11 +96,13 @@ def test_signal_within_an_iteration_loses_nothing(one_thread, ctrl_c, tmp_path: 
         nonlocal renders
         renders += 1
         if renders == iteration + 1:
+            if end is WorkersLost:
+                raise WorkersLost("no scheduler.")
             os.kill(os.getpid(), signal.SIGINT)
         return kept(*args)
 
     problem.render = render
-    with pytest.raises(Interrupted):
+    with pytest.raises(end):
         reconstruct(problem, Adam(), Course(ITERATIONS, events=EVENTS), checkpoint=CheckpointFile(path, {"a": 1}))
     assert renders == iteration + 1
     resumed = fit(Adam(), path, resume=True)
