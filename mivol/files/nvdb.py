@@ -1,5 +1,7 @@
 """NanoVDB (``.nvdb``): the bricks of named sparse grids, uncompressed or compressed by zip or Blosc.
 
+Own reader: NanoVDB is a part of OpenVDB, which is not on PyPI.
+
 Conventions. A file is a row of segments: a header, the facts of its grids, and the grids. A grid is one block of memory: its
 head, the head of its tree, a root, two levels of inner nodes with 32^3 and 16^3 children, and leaves of 8^3 voxels, x slowest.
 The nodes of a level lie side by side. The box of the active voxels becomes the volume; a level set becomes a fog as in

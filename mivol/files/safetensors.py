@@ -1,5 +1,7 @@
 """Arrays by name in the format of safetensors: weights of networks, without pickled code.
 
+Own reader: the package safetensors 0.8 cannot read BF16 into NumPy.
+
 A file is the length of its header (8 bytes, little endian), the header (JSON: name -> dtype, shape, first and last byte), and
 the numbers.
 

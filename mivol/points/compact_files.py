@@ -53,9 +53,6 @@ HEADER_SIZE, SECTION_HEADER_SIZE = 4096, 1024
 NUMBER_TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}
 """Level -> types of positions, of scales and rotations, of harmonics."""
 
-CENTRE_SIZE = 12
-"""Size of the centre of a bucket [bytes]."""
-
 DEFAULT_MAX_HARMONIC = 1.5
 """Limit of harmonics in bytes if the header has none."""
 

@@ -179,50 +179,6 @@ def _log_axis(axis: Axis, values: NDArray) -> None:
     axis.set_major_formatter(LogFormatterSciNotation() if wide else (lambda value, _: f"{value:.3g}"))
 
 
-def plot_slices(
-    reconstruction: NDArray,
-    truth: NDArray | None = None,
-    *,
-    size: tuple[float, float, float] | None = None,
-    quantity: str = "sigma_t",
-    unit: str = "1/length",
-) -> Figure:
-    """Plot three orthogonal slices of a volume; with a truth, also the truth and the difference.
-
-    Args:
-        reconstruction: (Z, Y, X[, C]).
-        truth: array of the same shape, or None.
-        size: edges of the box along x, y, z [length].
-        quantity: name of the values.
-        unit: unit of the values.
-
-    Raises:
-        MivolError: different shapes.
-    """
-    rows = {"reconstruction": pixel_scale.middle_slices(reconstruction, size)}
-    if truth is not None:
-        if np.shape(truth) != np.shape(reconstruction):
-            raise MivolError(
-                f"truth {np.shape(truth)} and reconstruction {np.shape(reconstruction)} differ in shape; resample one of them."
-            )
-        rows = {"truth": pixel_scale.middle_slices(truth, size)} | rows
-        rows["difference"] = pixel_scale.middle_slices(np.asarray(reconstruction, float) - np.asarray(truth, float), size)
-    values = pixel_scale.shared_scale(*next(iter(rows.values())).images.values())
-    signed = pixel_scale.signed_scale(*rows["difference"].images.values()) if truth is not None else None
-    with mpl.rc_context(STYLE):
-        figure = empty_figure(7.2, 2.5 * len(rows) + 0.3)
-        grid = figure.subplots(len(rows), 3, squeeze=False)
-        for line, (name, cut) in zip(grid, rows.items(), strict=True):
-            scale = signed if name == "difference" else values
-            for axes, plane in zip(line, cut.images, strict=True):
-                _show_pixels(axes, pixel_scale.to_pixels(cut.images[plane], scale), cut.aspect[plane])
-                axes.set_xlabel(f"{plane[0]} →  at {cut.where[plane]}", labelpad=2)
-                axes.set_ylabel(f"{plane[1]} →", labelpad=2)
-            line[0].set_title(name)
-            _draw_colour_bar(figure, line, scale, f"{quantity} [{unit}]")
-    return figure
-
-
 def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None, *, unit: str = "") -> Figure:
     """Plot reference, render, signed difference and, if given, the z-image side by side.
 

@@ -283,20 +283,6 @@ def smallest_detectable_bias(
     return (z_bound(level, dof) + NormalDist().inv_cdf(power)) * s
 
 
-def required_batches(wanted_bias: float, variance: float, *, level: Significance = STRICT, power: float = 0.9) -> int:
-    """Batches (or samples) needed to find a bias: variance ((z_alpha + z_power)/bias)^2, rounded up.
-
-    Args:
-        wanted_bias: smallest bias to find, above 0.
-        variance: variance of a batch (or sample).
-        level, power: as in :func:`smallest_detectable_bias`.
-    """
-    if not wanted_bias > 0:
-        raise MivolError(f"found a wanted bias of {wanted_bias}, expected a number above 0.")
-    one = float(smallest_detectable_bias(variance, level=level, power=power))
-    return max(1, int(np.ceil((one / wanted_bias) ** 2)))
-
-
 @dataclass(frozen=True)
 class Bias:
     """Mean difference of two images, with its confidence interval.

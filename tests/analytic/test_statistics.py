@@ -21,7 +21,6 @@ from mivol.validate.statistics import (
     estimate_bias,
     p_value,
     pooled_dof,
-    required_batches,
     smallest_detectable_bias,
     z_bound,
     z_image,
@@ -98,7 +97,7 @@ def test_false_alarms_of_estimated_variance(seed, n):
 
 @pytest.mark.statistical
 def test_power_is_as_promised(seed):
-    """Of 2000 biases of the smallest detectable size, nine in ten are found; batches_for asks for as many as that."""
+    """Of 2000 biases of the smallest detectable size, nine in ten are found."""
     rng = np.random.default_rng(seed)
     level = Significance(1e-3, 100)
     size = float(smallest_detectable_bias(9.0, level=level))
@@ -111,9 +110,6 @@ def test_power_is_as_promised(seed):
         except AssertionError:
             hits += 1
     assert_rate(hits, runs, 0.9)
-    n = required_batches(size / 10, 9.0, level=level)
-    assert n == 100
-    assert required_batches(1e9, 1.0) == 1
 
 
 def test_message_names_pixel_and_power():
@@ -229,7 +225,6 @@ def test_refusals():
         (lambda: Significance(0, 3), "alpha = 0"),
         (lambda: Significance(0.1, 0), "over 0 comparisons"),
         (lambda: Significance(0.1, 3, "sidek"), "sidak"),
-        (lambda: required_batches(0, 1), "a wanted bias of 0"),
         (lambda: smallest_detectable_bias(1.0, power=1), "power = 1"),
     ]
     for call, words in cases:

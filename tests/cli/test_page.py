@@ -563,14 +563,9 @@ def test_error_figures_are_written_or_refused(tmp_path, artefacts):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_figures_of_slices_and_rows(artefacts):
-    rng = np.random.default_rng(5)
-    truth = rng.random((6, 8, 10))
-    figures.save_figure(figures.plot_slices(truth + 0.1, truth, size=(1, 0.8, 0.6)), artefacts / "slices.png")
-    image = rng.random((8, 8, 3))
+def test_figures_of_rows(artefacts):
+    image = np.random.default_rng(5).random((8, 8, 3))
     figures.save_figure(figures.plot_image_row(image, image + 0.1, np.full_like(image, 2.0)), artefacts / "row.png")
-    with pytest.raises(MivolError, match="differ in shape"):
-        figures.plot_slices(truth, truth[1:])
     with pytest.raises(MivolError, match='no row of the metrics has "psnr"'):
         figures.plot_curve([{"iteration": 1.0, "loss": 1.0}], "psnr")
 

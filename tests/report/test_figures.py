@@ -26,7 +26,6 @@ from mivol.report.figures import (
     plot_error_against_time,
     plot_image_row,
     plot_profile,
-    plot_slices,
     save_figure,
 )
 from mivol.report.pixel_scale import EDGE, GAP, depth_pixels, is_preview_due, normal_pixels, normals_from_depth, write_preview
@@ -65,15 +64,6 @@ def ramps() -> tuple[np.ndarray, np.ndarray]:
     return z + y / 4 + x / 20, (z + x) / 7
 
 
-def slices() -> Figure:
-    found, truth = ramps()
-    return plot_slices(found, truth, size=(5.0, 2.0, 3.0))
-
-
-def slices_alone() -> Figure:
-    return plot_slices(ramps()[0], quantity="albedo", unit="1")
-
-
 def row() -> Figure:
     reference = ramps()[0][0]
     return plot_image_row(reference, reference[:, ::-1], (reference[:, ::-1] - reference) / 0.1, unit="W")
@@ -100,7 +90,7 @@ def test_a_log_axis_has_two_labels_at_least(ends: tuple[float, float]) -> None:
     assert sum(low <= tick <= high for tick in axes.get_yticks()) >= 2
 
 
-DRAWN = [cameras, falling_curve, long_curve, reaching_the_noise, profile, methods, slices, slices_alone, row, row_in_colour]
+DRAWN = [cameras, falling_curve, long_curve, reaching_the_noise, profile, methods, row, row_in_colour]
 
 
 @pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
