@@ -64,13 +64,13 @@ class Finding:
 
 
 def _versions() -> list[Finding]:
-    python = sys.version_info[:2]
+    supported = (3, 11) <= sys.version_info[:2] <= (3, 13)
     found = [
         Finding(
             "Python",
-            OK if (3, 11) <= python <= (3, 13) else FAULT,
+            OK if supported else FAULT,
             f"{platform.python_version()}  {sys.executable}",
-            () if (3, 11) <= python <= (3, 13) else ("use Python 3.11, 3.12 or 3.13",),
+            () if supported else ("use Python 3.11, 3.12 or 3.13",),
         ),
         Finding("system", OK, f"{platform.system()} {platform.release()} {platform.machine()}"),
     ]

@@ -278,6 +278,7 @@ def test_every_call_has_its_own_seed(variant_rgb: str) -> None:
     calls.clear()
     compete(methods, 2, 1.0, 12, levels=(1, 4, 16), seed=3)
     assert {seed - 300_000 for _, seed, _ in calls} == seeds
+    assert compete(methods, 2, 1.0, 12).spp == {("a", 1): 12, ("b", 1): 12}
 
 
 def test_variances_and_ratios_of_times() -> None:

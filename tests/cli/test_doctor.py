@@ -53,6 +53,20 @@ def test_an_unsupported_mitsuba_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> N
     assert not doctor.render_works([*findings, doctor.Finding("llvm_ad_rgb", doctor.OK, "works")])
 
 
+@pytest.mark.parametrize(("version", "state"), [((3, 10), "FAULT"), ((3, 11), "ok"), ((3, 13), "ok"), ((3, 14), "FAULT")])
+def test_advice_for_an_unsupported_python(monkeypatch: pytest.MonkeyPatch, version: tuple[int, int], state: str) -> None:
+    monkeypatch.setattr(doctor.sys, "version_info", (*version, 0))
+    python = doctor._versions()[0]
+    assert (python.subject, python.state, bool(python.advice)) == ("Python", state, state == doctor.FAULT)
+
+
+@pytest.mark.parametrize(("major", "noted"), [(llvm.NEWEST_TESTED, False), (llvm.NEWEST_TESTED + 1, True)])
+def test_an_untested_llvm_is_noted(monkeypatch: pytest.MonkeyPatch, major: int, noted: bool) -> None:
+    monkeypatch.setattr(llvm, "loaded_version", lambda: (major, 99 * (not noted), 0))
+    found = doctor._llvm()[0]
+    assert (found.state, bool(found.advice)) == (doctor.OK, noted)
+
+
 def test_cores_and_memory_are_noted_where_there_is_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """More processors than the container grants, and less than 2 GiB."""
     monkeypatch.setattr(doctor.os, "cpu_count", lambda: 8)
