@@ -13,10 +13,14 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.files.sparse_volume import EDGE, VOXELS, count_bricks
+from mivol.numerics import fast_max, fast_min
 
 __all__ = ["ABSENT", "Bricks", "Nodes"]
 
 BITS = EDGE.bit_length() - 1
+
+ADDRESS_BITS = 3 * BITS
+"""Bits of the address of a node that hold its place in a brick."""
 
 ABSENT = 1 << 31
 """First slot of a brick that is not stored. Stored slots are smaller."""
@@ -48,14 +52,14 @@ class Bricks:
         offset: nodes of the first brick before the box (Z, Y, X).
         table: UInt32, the first slot of each brick of the box (z, y, x); ``ABSENT`` if the brick is not stored.
         stored: UInt32, ascending numbers of the stored bricks.
-        distances: UInt8, packed distance of each block of cells to the nearest one with a stored node, for a walk to skip.
+        distances: UInt32, packed distance of each block of cells to the nearest one with a stored node, for a walk to skip.
     """
 
     res: tuple[int, int, int]
     offset: tuple[int, int, int]
     table: mi.UInt32
     stored: mi.UInt32
-    distances: mi.UInt8 | None = None
+    distances: mi.UInt32 | None = None
 
     @classmethod
     def from_numbers(cls, res: tuple[int, int, int], offset: tuple[int, int, int], stored: mi.UInt32) -> Bricks:
@@ -89,10 +93,10 @@ class Bricks:
 
     def find_slot(self, node: mi.Vector3i, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """Find the slot of a node of the box, and whether it is stored."""
-        place = node + mi.Vector3i(*self.offset[::-1])
-        brick, inner = (place >> BITS) * _brick_strides(self.res, self.offset), (place & (EDGE - 1)) * _inner_strides()
-        first = dr.gather(mi.UInt32, self.table, mi.UInt32(brick.x + brick.y + brick.z), active)
-        return first + mi.UInt32(inner.x + inner.y + inner.z), active & (first < ABSENT)
+        shares = _address_shares(node + mi.Vector3i(*self.offset[::-1]), self.res, self.offset)
+        address = mi.UInt32(shares.x + shares.y + shares.z)
+        first = dr.gather(mi.UInt32, self.table, address >> ADDRESS_BITS, active)
+        return first + (address & (VOXELS - 1)), active & (first < ABSENT)
 
 
 def find_corners(
@@ -104,8 +108,8 @@ def find_corners(
     active: mi.Bool,
 ) -> Nodes:
     """Implement :meth:`Bricks.find_corners` for a loop, whose state holds the table alone."""
-    brick, inner = _split_planes(res, offset, cell, ahead)
-    return _find_nodes(table, brick[0], inner[0], list(zip(brick[1] - brick[0], inner[1] - inner[0], strict=True)), active)
+    near, far = _planes(res, offset, cell, ahead)
+    return _find_nodes(table, near.x + near.y + near.z, [f - n for n, f in zip(near, far, strict=True)], active)
 
 
 def find_face(
@@ -122,69 +126,65 @@ def find_face(
 
     The order is that of the two other axes, the lower axis fastest: (y, z), (x, z) or (x, y).
     """
-    brick, inner = _split_planes(res, offset, cell, ahead)
-    steps = [(far - near, move - place) for near, far, place, move in zip(brick[0], brick[1], inner[0], inner[1], strict=True)]
-    is_beyond = through & is_far
-    brick, inner = dr.select(is_beyond, brick[1], brick[0]), dr.select(is_beyond, inner[1], inner[0])
-    first = [dr.select(through.x, y, x) for x, y in zip(steps[0], steps[1], strict=True)]
-    second = [dr.select(through.z, y, z) for y, z in zip(steps[1], steps[2], strict=True)]
-    return _find_nodes(table, brick, inner, [tuple(first), tuple(second)], active)
+    near, far = _planes(res, offset, cell, ahead)
+    wide = far - near
+    base = dr.select(through & is_far, far, near)
+    steps = [dr.select(through.x, wide.y, wide.x), dr.select(through.z, wide.y, wide.z)]
+    return _find_nodes(table, base.x + base.y + base.z, steps, active)
 
 
-def _split_planes(
+def _planes(
     res: tuple[int, int, int], offset: tuple[int, int, int], cell: mi.Vector3i, ahead: object
-) -> tuple[tuple[mi.Vector3i, mi.Vector3i], tuple[mi.Vector3i, mi.Vector3i]]:
-    """The near and the far plane of a cell along each axis: their bricks, and their places in a brick."""
+) -> tuple[mi.Vector3i, mi.Vector3i]:
+    """The shares of the near and the far plane of a cell in the address of a node, along each axis."""
     z, y, x = res
-    top, shift = mi.Vector3i(x - 1, y - 1, z - 1), mi.Vector3i(*offset[::-1])
-    low, high = dr.clip(cell, 0, top) + shift, dr.clip(cell + 1, 0, top) + shift
-    planes = dr.select(ahead, low, high), dr.select(ahead, high, low)
-    strides, inner = _brick_strides(res, offset), _inner_strides()
-    return tuple((p >> BITS) * strides for p in planes), tuple((p & (EDGE - 1)) * inner for p in planes)
+    shift = mi.Vector3i(*offset[::-1])
+    low, high = fast_max(cell, 0), fast_min(cell + 1, mi.Vector3i(x - 1, y - 1, z - 1))
+    low, high = (_address_shares(p + shift, res, offset) for p in (low, high))
+    return dr.select(ahead, low, high), dr.select(ahead, high, low)
 
 
-def _find_nodes(
-    table: mi.UInt32,
-    brick: mi.Vector3i,
-    place: mi.Vector3i,
-    steps: list[tuple[mi.Int32, mi.Int32]],
-    active: mi.Bool,
-) -> Nodes:
+def _address_shares(place: mi.Vector3i, res: tuple[int, int, int], offset: tuple[int, int, int]) -> mi.Vector3i:
+    """The shares of the axes in the address of a node, from its place counted from the first brick.
+
+    The address is 512 times the number of the brick plus the place in the brick, and the sum of the three shares.
+    """
+    inner = mi.Vector3i(1, EDGE, EDGE * EDGE)
+    return place * inner + (place >> BITS) * (VOXELS * _brick_strides(res, offset) - EDGE * inner)
+
+
+def _find_nodes(table: mi.UInt32, first: mi.Int32, steps: list[mi.Int32], active: mi.Bool) -> Nodes:
     """Find a node and its neighbours by any of some steps; bit k of the number of a neighbour is step k.
 
     Args:
         table: first slots.
-        brick, place: brick and place of the node, an axis each.
-        steps: change of the brick and of the place in it.
+        first: address of the node.
+        steps: changes of the address.
         active: lanes to look up.
     """
-    number, place = brick.x + brick.y + brick.z, place.x + place.y + place.z
-    own = dr.gather(mi.UInt32, table, mi.UInt32(number), active)
-    numbers, places, leaves = [number], [place], [mi.Bool(False)]
-    for change, move in steps:
-        leaves += [other | (change != 0) for other in leaves]
-        numbers += [other + change for other in numbers]
-        places += [other + move for other in places]
+    addresses = [mi.UInt32(first)]
+    leaves = [mi.Bool(False)]
+    for step in steps:
+        moved = [a + mi.UInt32(step) for a in addresses]
+        crosses = (moved[0] ^ addresses[0]) >= VOXELS
+        addresses, leaves = addresses + moved, leaves + [on | crosses for on in leaves]
 
-    def look_up(own: mi.UInt32, numbers: list[mi.Int32], leaves: list[mi.Bool]) -> list[mi.UInt32]:
-        found = [dr.gather(mi.UInt32, table, mi.UInt32(n), on) for n, on in zip(numbers, leaves, strict=True)]
+    own = dr.gather(mi.UInt32, table, addresses[0] >> ADDRESS_BITS, active)
+    leaves = [active & on for on in leaves]
+
+    def look_up(own: mi.UInt32, addresses: list[mi.UInt32], leaves: list[mi.Bool]) -> list[mi.UInt32]:
+        found = [dr.gather(mi.UInt32, table, a >> ADDRESS_BITS, on) for a, on in zip(addresses, leaves, strict=True)]
         return [dr.select(on, first, own) for first, on in zip(found, leaves, strict=True)]
 
-    def repeat(own: mi.UInt32, numbers: list[mi.Int32], leaves: list[mi.Bool]) -> list[mi.UInt32]:
-        return [mi.UInt32(own) for _ in numbers]
+    def repeat(own: mi.UInt32, addresses: list[mi.UInt32], leaves: list[mi.Bool]) -> list[mi.UInt32]:
+        return [mi.UInt32(own) for _ in addresses]
 
     # A gather costs the same for any number of lanes; most cells lie in one brick, and a branch passes them by.
-    leaves = [active & other for other in leaves]
-    others = dr.if_stmt((own, numbers[1:], leaves[1:]), leaves[-1], look_up, repeat, label="other bricks")
-    firsts = [own, *others]
-    index = [first + mi.UInt32(p) for first, p in zip(firsts, places, strict=True)]
-    return Nodes(index, [first < ABSENT for first in firsts])
+    firsts = [own, *dr.if_stmt((own, addresses[1:], leaves[1:]), leaves[-1], look_up, repeat, label="other bricks")]
+    index = [f + (a & (VOXELS - 1)) for f, a in zip(firsts, addresses, strict=True)]
+    return Nodes(index, [f < ABSENT for f in firsts])
 
 
 def _brick_strides(res: tuple[int, int, int], offset: tuple[int, int, int]) -> mi.Vector3i:
     _, y, x = count_bricks(res, offset)
     return mi.Vector3i(1, x, x * y)
-
-
-def _inner_strides() -> mi.Vector3i:
-    return mi.Vector3i(1, EDGE, EDGE * EDGE)

@@ -20,7 +20,10 @@ from mivol.kernel_recording import copy_aligned, is_recording
 from mivol.space import check_affine
 
 MOST_SLOTS = 1 << 31
-"""Largest number of stored values, and of bricks in the box."""
+"""Stored values are fewer than this."""
+
+MOST_BRICKS = 1 << 23
+"""Bricks of the box are at most this many: the address of a node has 32 bits."""
 
 
 class SparseVoxels(GridValues):
@@ -69,9 +72,10 @@ class SparseVoxels(GridValues):
         self.to_local = mi.ScalarAffineTransform4f(mi.ScalarMatrix4f(to_local), mi.ScalarMatrix4f(self.to_world.T))
 
     def _check_size(self, values: int) -> None:
-        most = max(values, int(np.prod(count_bricks(self.res, self.offset), dtype=np.int64)))
-        if most >= MOST_SLOTS:
-            raise refusal(self.name, f"{most} values or bricks", "fewer than 2^31", "coarsen or crop it")
+        bricks = int(np.prod(count_bricks(self.res, self.offset), dtype=np.int64))
+        if values >= MOST_SLOTS or bricks > MOST_BRICKS:
+            found, expected = f"{values} values in a box of {bricks} bricks", "fewer than 2^31 values and at most 2^23 bricks"
+            raise refusal(self.name, found, expected, "coarsen or crop it")
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f | None = None, active: mi.Bool = True) -> list[mi.Float]:
         """Values at world points, a list of channels; 0 outside the box. The direction ``w`` has no effect."""

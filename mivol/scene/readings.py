@@ -211,10 +211,10 @@ class PartReading:
     """
 
     floored: mi.Float | None = None
-    empty_distances: mi.UInt8 | None = None
+    empty_distances: mi.UInt32 | None = None
     block_ranges: BlockRanges | None = None
     rough: mi.TensorXf | None = None
-    rough_distances: mi.UInt8 | None = None
+    rough_distances: mi.UInt32 | None = None
 
     def apply(self, part: ExactExtinction) -> None:
         """Give the reading to a part."""
@@ -258,7 +258,7 @@ def read_part(
     return reading
 
 
-def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt8:
+def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt32:
     """Measure the distance of each block to the nearest occupied block, once for each state of the array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
     return _read_once(

@@ -458,7 +458,7 @@ class RecordedKernels:
         if self._threads != dr.thread_count():
             self._record()
 
-    def integrate(self, values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+    def integrate(self, values: mi.Float, empty: mi.UInt32 | None, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
         """Line integrals of ``values`` along rays; ``empty`` blocks are skipped."""
         return self._integrate(values, empty, o, d, self._from_world)
 
@@ -492,7 +492,7 @@ class RecordedKernels:
 
 
 def _trace_integral(
-    shape: tuple[int, int, int], values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f, rows: Rows
+    shape: tuple[int, int, int], values: mi.Float, empty: mi.UInt32 | None, o: mi.Point3f, d: mi.Vector3f, rows: Rows
 ) -> mi.Float:
     lattice = Lattice(mi.TensorXf(values, (*shape, 1)), None, empty, from_world=rows)
     return integrate_segment(lattice, values, clip_to_grid(lattice, o, d, 0, dr.inf))[0]

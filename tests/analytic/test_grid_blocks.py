@@ -65,7 +65,7 @@ def test_gaps_are_the_distances_between_blocks():
     away = np.abs(np.indices(empty_distances.shape).reshape(3, -1).T[:, None] - held).max(axis=2).min(axis=1)
     assert away.max() > 2
     np.testing.assert_array_equal(empty_distances.ravel(), np.minimum(away, REACH))
-    assert dr.width(packed) == -(-empty_distances.size // 2)  # two blocks in a byte
+    assert dr.width(packed) == -(-empty_distances.size // 8)  # eight blocks in a word
     assert np.all(np.array(read_distances(find_empty_distances(tensor(np.zeros((9, 9, 9)))), (9, 9, 9))) == REACH)
 
 

@@ -312,6 +312,7 @@ def test_explain_says_what_is_stored() -> None:
         ({"storage": "vdb"}, "expected one of auto, dense, sparse"),
         ({"bricks": [0, 1]}, "places of shape"),
         ({"resolution": [0, 9, 9]}, "expected voxels of at least 1 and offsets of 0 to 7"),
+        ({"resolution": [1, 23200, 23200]}, "at most 2^23 bricks"),
         ({"offset": [8, 0, 0]}, "expected voxels of at least 1 and offsets of 0 to 7"),
         ({"bricks": [0, 1, 2, 3, 4, 5, 6, 8]}, "numbers below 8 in a box of (2, 2, 2) bricks"),
         ({"bricks": [0, 1, 2, 3, 4, 5, 7, 6]}, "bricks out of order or twice"),
@@ -343,10 +344,10 @@ def test_data_and_bricks_change_together() -> None:
 
 
 def test_memory_is_that_of_the_bricks() -> None:
-    """The tables of a grid of 512^3: 4 bytes a brick of the box, and a byte for two of 129^3 blocks."""
+    """The tables of a grid of 512^3: 4 bytes a brick of the box, and a word for eight of 129^3 blocks."""
     volume = SparseVolumeData(np.ones((2, 8, 8, 8, 1), np.float32), np.array([[0, 0, 0], [63, 63, 63]]), (512,) * 3, np.eye(4))
     scene = smoke_scene(plugin(volume), 1)
     voxels_of = find_children(scene.shapes()[0].interior_medium())["sigma_t"]
     arrays = [voxels_of.data.array, voxels_of.table, voxels_of.distances, voxels_of.bricks]
     held = sum(dr.width(a) * dr.itemsize_v(type(a)) for a in arrays)
-    assert held == 2 * 512 * 4 + 64**3 * 4 + (129**3 + 1) // 2 + 2 * 4
+    assert held == 2 * 512 * 4 + 64**3 * 4 + (129**3 + 7) // 8 * 4 + 2 * 4

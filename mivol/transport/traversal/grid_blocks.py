@@ -2,8 +2,8 @@
 
 Conventions. Block b of an axis holds the cells b 2^shift - 1 to (b + 1) 2^shift - 2, and all nodes touching these cells.
 Distances are Chebyshev distances (the largest of the distances along the three axes), counted in blocks. From a block at
-distance k a ray may cross k - 1 blocks in a step. A walk reads *packed* distances: two blocks share a byte, the first one has
-its lower four bits.
+distance k a ray may cross k - 1 blocks in a step. A walk reads *packed* distances: eight blocks share a word, the first one has
+its lowest four bits. (A processor gathers words, not bytes: a gather of bytes is a loop over the lanes.)
 
 References: Cohen & Sheffer 1994 (proximity clouds); Szirmay-Kalos et al. 2011 (super-grids).
 """
@@ -162,12 +162,12 @@ def count_blocks(n: int, shift: int = SHIFT) -> int:
     return -(-(n + 1) >> shift)
 
 
-def find_empty_distances(values: mi.TensorXf) -> mi.UInt8:
+def find_empty_distances(values: mi.TensorXf) -> mi.UInt32:
     """Find the packed distances of :func:`find_distances_of_bounds` for a grid (Z, Y, X, C)."""
     return find_distances_of_bounds(bound_blocks(values), values.shape[:3])
 
 
-def find_distances_of_bounds(bounds: mi.Float | mi.Bool, res: tuple[int, int, int]) -> mi.UInt8:
+def find_distances_of_bounds(bounds: mi.Float | mi.Bool, res: tuple[int, int, int]) -> mi.UInt32:
     """Find the packed distance of each block to the nearest non-empty block.
 
     Args:
@@ -175,7 +175,7 @@ def find_distances_of_bounds(bounds: mi.Float | mi.Bool, res: tuple[int, int, in
         res: resolution of the grid (Z, Y, X).
 
     Returns:
-        Chebyshev distances [blocks], 0 for a non-empty block, at most ``REACH``; a byte for two blocks (z, y, x).
+        Chebyshev distances [blocks], 0 for a non-empty block, at most ``REACH``; a word for eight blocks (z, y, x).
 
     Cost: at most 6 ``REACH`` look-ups a block.
     """
@@ -183,29 +183,28 @@ def find_distances_of_bounds(bounds: mi.Float | mi.Bool, res: tuple[int, int, in
     return _pack(find_distances(occupied, tuple(count_blocks(n) for n in res)))
 
 
-def find_stored_distances(bricks: Bricks) -> mi.UInt8:
+def find_stored_distances(bricks: Bricks) -> mi.UInt32:
     """Find the packed distance of each block to the nearest block with a stored node of a sparse grid."""
     counts = tuple(count_blocks(n) for n in bricks.res)
     return _pack(find_distances(occupied_blocks(None, bricks, SHIFT, counts), counts))
 
 
-def _pack(distances: mi.UInt8) -> mi.UInt8:
-    """Pack the distances of two blocks into a byte."""
+def _pack(distances: mi.UInt8) -> mi.UInt32:
+    """Pack the distances of eight blocks into a word."""
     count = dr.width(distances)
-    first = dr.arange(mi.UInt32, (count + 1) // 2) * 2
-    low, high = (dr.gather(mi.UInt8, distances, block, block < count) for block in (first, first + 1))
-    packed = mi.UInt8(mi.UInt32(low) | (mi.UInt32(high) << 4))
+    first, packed = dr.arange(mi.UInt32, -(-count // 8)) * 8, mi.UInt32(0)
+    for k in range(8):
+        packed |= mi.UInt32(dr.gather(mi.UInt8, distances, first + k, first + k < count)) << (4 * k)
     dr.eval(packed)
     return packed
 
 
-def read_distance(packed: mi.UInt8, block: mi.UInt32, active: mi.Bool = True) -> mi.Int32:
+def read_distance(packed: mi.UInt32, block: mi.UInt32, active: mi.Bool = True) -> mi.Int32:
     """Read the distance of a block."""
-    pair = mi.UInt32(dr.gather(mi.UInt8, packed, block >> 1, active))
-    return mi.Int32((pair >> ((block & 1) << 2)) & 15)
+    return mi.Int32((dr.gather(mi.UInt32, packed, block >> 3, active) >> ((block & 7) << 2)) & 15)
 
 
-def read_distances(packed: mi.UInt8, res: tuple[int, int, int]) -> mi.Int32:
+def read_distances(packed: mi.UInt32, res: tuple[int, int, int]) -> mi.Int32:
     """Read the distances of all blocks (z, y, x) of a grid (Z, Y, X)."""
     return read_distance(packed, dr.arange(mi.UInt32, math.prod(count_blocks(n) for n in res)))
 
@@ -351,7 +350,7 @@ def coarsen_grid(lattice: Lattice, shift: int, finds_occupied: bool) -> CoarseGr
     return CoarseGrid(place_blocks(lattice, values, shift, empty_distances), is_occupied)
 
 
-def place_blocks(lattice: Lattice, means: mi.TensorXf, shift: int, empty_distances: mi.UInt8 | None = None) -> Lattice:
+def place_blocks(lattice: Lattice, means: mi.TensorXf, shift: int, empty_distances: mi.UInt32 | None = None) -> Lattice:
     """Place the means of blocks of 2^shift voxels of a lattice as a grid of their own."""
     ratios = [(m << shift) / n for m, n in zip(means.shape[2::-1], lattice.res[::-1], strict=True)]
     return Lattice(means, lattice.to_world @ np.diag([*ratios, 1.0]), empty_distances)

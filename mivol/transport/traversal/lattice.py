@@ -45,7 +45,7 @@ class Lattice:
 
     values: mi.TensorXf
     to_world: np.ndarray
-    empty_distances: mi.UInt8 | None = None
+    empty_distances: mi.UInt32 | None = None
     block_ranges: Any = None
     from_world: list[list[mi.Float64]] | None = None
     bricks: Bricks | None = None
