@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import logging
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from tiny_experiment import refused, write_experiment
 
 from mivol import config
 from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
-from mivol.cluster.connection import _connect_address, import_distributed
+from mivol.cluster.connection import _collect_failures, _connect_address, import_distributed
 from mivol.cluster.packages import (
     decode_sensor,
     encode_sensor,
@@ -54,6 +55,15 @@ def test_forms_of_cluster(tmp_path: Path) -> None:
         (tmp_path / name).write_text("")
     (tmp_path / "tls.toml").write_text(TLS)
     assert parse_cluster(str(tmp_path / "tls.toml")).security.ca == str(tmp_path / "a.pem")
+
+
+def test_jobs_that_could_not_be_submitted_are_collected(capsys: pytest.CaptureFixture[str]) -> None:
+    """Dask logs them as exceptions; lines are joined, and nothing is printed."""
+    with _collect_failures() as found:
+        for error in (OSError("sbatch:\n  not found"), None):
+            logging.getLogger("asyncio").error("a task failed", exc_info=(type(error), error, None))
+    assert found == ["sbatch: not found"]
+    assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(

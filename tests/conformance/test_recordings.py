@@ -336,6 +336,16 @@ def test_what_cannot_be_recorded_is_named() -> None:
     assert find_hidden_arrays(lamp, lamp.sensors()[0]) == "a recording does not follow the derivative by lamp.position"
 
 
+def test_a_python_plugin_of_another_package_is_not_recorded() -> None:
+    class Foreign(mi.BSDF):
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+
+    mi.register_bsdf("test_foreign", Foreign)
+    scene = smoke_under(ball={"type": "sphere", "bsdf": {"type": "test_foreign"}})
+    assert find_hidden_arrays(scene, scene.sensors()[0]) == "Foreign is a Python plugin, whose arrays may be hidden"
+
+
 def test_only_back_ends_that_were_tried_record(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = smoke_under()
     monkeypatch.setattr(scene_state, "RECORDED_BACK_ENDS", ("none",))
