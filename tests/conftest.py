@@ -172,6 +172,15 @@ def whole_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Baseline, "_read", lambda self, block, active: self.average)
 
 
+@pytest.fixture
+def flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plan uses free flights at depth 2 too, instead of the estimator of single scattering."""
+    from mivol.scene import plan
+
+    choose = plan.choose_segment_estimator
+    monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
+
+
 @pytest.fixture(autouse=True)
 def _same_threads() -> Iterator[None]:
     """Forget how many threads a test asked for."""

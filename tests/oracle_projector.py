@@ -11,6 +11,9 @@ import scipy.sparse
 
 from mivol.tomography.geometry import Geometry, VoxelGrid
 
+GRID = VoxelGrid((5, 7, 6), (0.5, 0.4, 0.6), centre=(0.2, -0.3, 0.1))
+ANGLES = np.array([0.0, 0.4, np.pi / 2, 2.5, 4.0])
+
 GAUSS = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3) / 6
 
 

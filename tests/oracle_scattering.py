@@ -148,8 +148,16 @@ class Grid:
             np.add.at(row, node, self.scale * (weight[:, None] * length).ravel() * corner)
 
 
+class Constant:
+    """A constant extinction (C,) between two ``edges`` of each ray."""
+
+    def tau(self, o: np.ndarray, d: np.ndarray, t_max: np.ndarray) -> np.ndarray:
+        t = np.clip(self.edges(o, d), 0, np.asarray(t_max)[:, None])
+        return (t[:, 1:] - t[:, :1]) * np.atleast_1d(self.constant)
+
+
 @dataclass
-class Box:
+class Box(Constant):
     """A constant extinction (C,) in the unit cube under `to_world`."""
 
     constant: np.ndarray
@@ -162,13 +170,9 @@ class Box:
         u, _ = into(self.to_world, x, np.zeros_like(x))
         return np.all((u >= 0) & (u <= 1), axis=1)[:, None] * np.atleast_1d(self.constant)
 
-    def tau(self, o: np.ndarray, d: np.ndarray, t_max: np.ndarray) -> np.ndarray:
-        t = np.clip(self.edges(o, d), 0, np.asarray(t_max)[:, None])
-        return (t[:, 1:] - t[:, :1]) * np.atleast_1d(self.constant)
-
 
 @dataclass
-class Ball:
+class Ball(Constant):
     """A constant extinction (C,) in a sphere."""
 
     constant: np.ndarray
@@ -185,10 +189,6 @@ class Ball:
     def sigma(self, x: np.ndarray) -> np.ndarray:
         inside = np.sum((x - np.asarray(self.centre)) ** 2, axis=1) <= self.radius**2
         return inside[:, None] * np.atleast_1d(self.constant)
-
-    def tau(self, o: np.ndarray, d: np.ndarray, t_max: np.ndarray) -> np.ndarray:
-        t = np.clip(self.edges(o, d), 0, np.asarray(t_max)[:, None])
-        return (t[:, 1:] - t[:, :1]) * np.atleast_1d(self.constant)
 
 
 def box_edges(to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -46,6 +46,18 @@ class Cloud(Slab):
         return values
 
 
+OBLONG = np.array([[2.0, 0, 0, -1], [0, 1.5, 0, -0.5], [0, 0, 3.0, 0], [0, 0, 0, 1]])
+
+
+def random_points(count: int) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Points in the box ``OBLONG``, and directions."""
+    rng = np.random.default_rng(2)
+    p = OBLONG[:3, :3] @ rng.random((3, count)) + OBLONG[:3, 3:]
+    d = rng.normal(size=(3, count))
+    d /= np.linalg.norm(d, axis=0)
+    return mi.Point3f(np.float32(p)), mi.Vector3f(np.float32(d))
+
+
 def random_rays(count: int, seed: int = 0) -> RayBundle:
     """Rays from a sphere of radius 3 towards points of the cube."""
     rng = np.random.default_rng(seed)

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from sampled_fields import OBLONG, random_points
 
 from mivol.errors import MivolError
 from mivol.fields import hash_grid, networks
@@ -14,31 +15,22 @@ from mivol.fields.hash_grid import HashField
 from mivol.fields.networks import Network
 from mivol.threads import map_arrays
 
-PLACE = np.array([[2.0, 0, 0, -1], [0, 1.5, 0, -0.5], [0, 0, 3.0, 0], [0, 0, 0, 1]])
 SIZES = HashSizes(levels=4, features=2, log2_table=8, coarsest=3, finest=20, width=8, geometry=5, degree=1)
 PRIMES = 1, 2654435761, 805459861
 
 
 def make(sizes: HashSizes = SIZES, space: str = "srgb") -> HashField:
     """A field with values of order 1."""
-    field = HashField.random(sizes, PLACE, 3, space)
+    field = HashField.random(sizes, OBLONG, 3, space)
     rng = np.random.default_rng(1)
     table = rng.normal(size=dr.width(field.table)).astype(np.float32)
     return field.with_parameters(field.parameters() | {"table": mi.TensorXf(table, field.shapes()["table"])})
 
 
-def points(count: int) -> tuple[mi.Point3f, mi.Vector3f]:
-    rng = np.random.default_rng(2)
-    p = PLACE[:3, :3] @ rng.random((3, count)) + PLACE[:3, 3:]
-    d = rng.normal(size=(3, count))
-    d /= np.linalg.norm(d, axis=0)
-    return mi.Point3f(np.float32(p)), mi.Vector3f(np.float32(d))
-
-
 def twin(field: HashField, values: dict[str, np.ndarray], p: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Density (N,) and colour (N, 3), written for reading."""
     sizes, table = field.sizes, values["table"].reshape(-1, field.sizes.features)
-    unit = (p - PLACE[:3, 3]) / np.diag(PLACE)[:3]
+    unit = (p - OBLONG[:3, 3]) / np.diag(OBLONG)[:3]
     features = []
     for level in field.encoding.levels:
         total = np.zeros((len(p), sizes.features))
@@ -85,7 +77,7 @@ def test_levels_are_dense_while_their_nodes_fit() -> None:
 def test_values_and_derivatives_equal_a_twin_in_float64(variant_rgb: str, which: str, space: str) -> None:
     """By matrices in memory and in the lanes of a kernel: table entries, weights, with the cut of no exponent near."""
     field, n = make(space=space), 40
-    p, d = points(n)
+    p, d = random_points(n)
     dr.eval(p, d)
     found = (field._evaluate_rows if which == "rows" else field._evaluate_lanes)(p, d)
     values, at = values_of(field), (np.array(p, np.float64).T, np.array(d, np.float64).T)
@@ -117,7 +109,7 @@ def test_values_and_derivatives_equal_a_twin_in_float64(variant_rgb: str, which:
 @pytest.mark.parametrize("space", ["srgb", "linear"])
 def test_both_evaluations_agree_beyond_the_cut_of_exponents(variant_rgb: str, space: str) -> None:
     """The value stays at exp(15), and the derivative is that at the cut."""
-    field, (p, d) = make(space=space), points(40)
+    field, (p, d) = make(space=space), random_points(40)
     values = field.parameters()
     large = {name: mi.TensorXf(30 * np.array(values[name])) for name in ("density_weights", "colour_weights")}
     field = field.with_parameters(values | large)
@@ -135,7 +127,7 @@ def test_both_evaluations_agree_beyond_the_cut_of_exponents(variant_rgb: str, sp
 
 def test_blocks_in_threads_give_the_same_bits(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Results keep the order of the blocks; a fault in a thread reaches the caller."""
-    field, (p, d) = make(), points(100)
+    field, (p, d) = make(), random_points(100)
     dr.eval(p, d)
     monkeypatch.setattr(networks, "BLOCK", 16)
 
@@ -156,7 +148,7 @@ def test_blocks_in_threads_give_the_same_bits(variant_rgb: str, monkeypatch: pyt
 def test_rows_of_any_width_are_read_and_added_to(variant_rgb: str, features: int) -> None:
     """The transpose: sum of slopes times features equals the sum of gradient times table, since features are linear in it."""
     field = make(HashSizes(levels=3, features=features, log2_table=7, coarsest=2, finest=9))
-    p, _ = points(50)
+    p, _ = random_points(50)
     unit = field.encoding.to_unit(p)
     found = field.encoding.encode(field.table, unit)
     rng = np.random.default_rng(0)

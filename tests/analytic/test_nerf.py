@@ -9,13 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from sampled_fields import OBLONG, random_points
 
 from mivol.errors import MivolError
 from mivol.fields.nerf import NerfField, NerfSizes
 from mivol.files.safetensors import read_safetensors, write_safetensors
 from mivol.optim.photographs.sampled_problem import find_region
 
-PLACE = np.array([[2.0, 0, 0, -1], [0, 1.5, 0, -0.5], [0, 0, 3.0, 0], [0, 0, 0, 1]])
 FRAME = 0.0, 0.25, 1.5, 1.5
 SIZES = NerfSizes(depth=4, width=8, skip=2, place=3, direction=2, branch=6)
 SPHERICAL = NerfSizes(depth=4, width=8, skip=2, place=3, direction=0, branch=1, harmonics=1)
@@ -31,14 +31,6 @@ def published(sizes: NerfSizes = SIZES) -> Weights:
         arrays[f"{name}.bias"] = rng.normal(size=out).astype(np.float32) / 4
     arrays["alpha_linear.bias"] += 0.5
     return arrays
-
-
-def points(count: int) -> tuple[mi.Point3f, mi.Vector3f]:
-    rng = np.random.default_rng(2)
-    p = PLACE[:3, :3] @ rng.random((3, count)) + PLACE[:3, 3:]
-    d = rng.normal(size=(3, count))
-    d /= np.linalg.norm(d, axis=0)
-    return mi.Point3f(np.float32(p)), mi.Vector3f(np.float32(d))
 
 
 def twin(arrays: Weights, p: np.ndarray, d: np.ndarray, relu: bool, linear: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -79,9 +71,9 @@ def test_values_and_derivatives_equal_a_twin_in_float64(
     from dataclasses import replace
 
     arrays, n, linear = published(SIZES if head == "branch" else SPHERICAL), 40, space == "linear"
-    p, d = points(n)
+    p, d = random_points(n)
     dr.eval(p, d)
-    field = replace(NerfField.from_published(arrays, PLACE, FRAME), space=space)
+    field = replace(NerfField.from_published(arrays, OBLONG, FRAME), space=space)
     field = replace(field, sizes=replace(field.sizes, relu=int(relu)))
     found = (field._evaluate_rows if which == "rows" else field._evaluate_lanes)(p, d)
     at = np.array(p, np.float64).T, np.array(d, np.float64).T
@@ -115,7 +107,7 @@ def test_values_and_derivatives_equal_a_twin_in_float64(
 def test_a_published_network_is_read_from_an_npz(variant_rgb: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "network.npz", **published())
     with np.load(tmp_path / "network.npz") as arrays:
-        field = NerfField.from_published(arrays, PLACE)
+        field = NerfField.from_published(arrays, OBLONG)
     assert field.frame == (0, 0, 0, 1)
     assert (field.sizes.depth, field.sizes.width, field.sizes.skip, field.sizes.branch) == (4, 8, 2, 6)
     assert (field.sizes.place, field.sizes.direction, field.sizes.relu) == (3, 2, 1)
@@ -124,11 +116,11 @@ def test_a_published_network_is_read_from_an_npz(variant_rgb: str, tmp_path: Pat
 @pytest.mark.parametrize("sizes", [SIZES, SPHERICAL])
 def test_weights_survive_a_safetensors_file(variant_rgb: str, tmp_path: Path, sizes: NerfSizes) -> None:
     arrays = published(sizes)
-    field = NerfField.from_published(arrays, PLACE, FRAME)
+    field = NerfField.from_published(arrays, OBLONG, FRAME)
     write_safetensors(tmp_path / "weights.safetensors", field.to_published())
     read = read_safetensors(tmp_path / "weights.safetensors")
     assert set(read) == set(arrays) and all(np.array_equal(read[name], value) for name, value in arrays.items())
-    again = NerfField.from_published(read, PLACE, FRAME)
+    again = NerfField.from_published(read, OBLONG, FRAME)
     assert again.sizes.harmonics == sizes.harmonics and np.array_equal(again.weights, field.weights)
 
 
@@ -198,7 +190,7 @@ def test_weights_that_contradict_are_refused(variant_rgb: str, change: Callable[
     arrays = published()
     change(arrays)
     with pytest.raises(MivolError, match=said):
-        NerfField.from_published(arrays, PLACE)
+        NerfField.from_published(arrays, OBLONG)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from emission_scenes import (
 )
 from false_alarms import Estimate, assert_precise, assert_same_mean
 from oracle import box_interval, sphere_interval
-from scattering_scenes import moments
+from scattering_scenes import Pencils, moments
 
 from scenes import (
     FRAMES,
@@ -67,6 +67,16 @@ def test_grids_in_any_frame(kind, frame):
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= (2e-5 if kind == "mivol_voxels" else 1e-4)
 
 
+def assert_differentiated(seen: Pencils, ends: tuple[str, ...]) -> None:
+    """Tangents are finite differences, and gradients are their transpose."""
+    along, w = directions(seen.scene, ends), np.random.default_rng(2).uniform(size=(len(seen.o), 3))
+    jv, found = changes(seen, along), gradients(seen, list(ends), w)
+    fd = moved(seen.scene, along, lambda: light(seen))
+    assert np.abs(jv - fd).max() <= 2e-4 * np.abs(fd).max()
+    total = [np.sum(g * v) for g, v in zip(found, along.values(), strict=True)]
+    assert abs(sum(total) - (jv * w).sum()) <= 1e-5 * sum(np.abs(total))
+
+
 FINE = {
     "coarser, inside of cells": ((3, 2, 4), centred(1.7 * np.eye(3)), 4),
     "finer": ((9, 12, 17), PLACE, 3),
@@ -84,13 +94,7 @@ def test_light_on_other_cells_than_the_extinction(name):
     m = twins.Medium((rough(1, 0.1, 3), PLACE), (rough(2, 0.1, 1, 3, shape), as_float32(place)), parts=parts)
     seen = emitting(m)
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= 4e-6
-    ends = ("sigma_t.data", "emission.data")
-    along, w = directions(seen.scene, ends), np.random.default_rng(2).uniform(size=(len(seen.o), 3))
-    jv, found = changes(seen, along), gradients(seen, list(ends), w)
-    fd = moved(seen.scene, along, lambda: light(seen))
-    assert np.abs(jv - fd).max() <= 2e-4 * np.abs(fd).max()
-    total = [np.sum(g * v) for g, v in zip(found, along.values(), strict=True)]
-    assert abs(sum(total) - (jv * w).sum()) <= 1e-5 * sum(np.abs(total))
+    assert_differentiated(seen, ("sigma_t.data", "emission.data"))
 
 
 @pytest.mark.slow_for("gridvolume")
@@ -187,13 +191,7 @@ def test_several_media(kinds):
     # Ends of traced intervals are Mitsuba's, 4e-6 of an extinction or emission density of 1.5 at coordinates of 6.
     assert np.abs(light(seen) - truth).max() <= 1e-4
     ends = [k for k, _ in mi.traverse(seen.scene) if "interior_medium" in k and k.endswith(("data", "value.value"))]
-    ends = tuple(k for k in ends if "albedo" not in k)
-    along, w = directions(seen.scene, ends), np.random.default_rng(2).uniform(size=(8, 3))
-    jv, found = changes(seen, along), gradients(seen, list(ends), w)
-    fd = moved(seen.scene, along, lambda: light(seen))
-    assert np.abs(jv - fd).max() <= 2e-4 * np.abs(fd).max()
-    total = [np.sum(g * v) for g, v in zip(found, along.values(), strict=True)]
-    assert abs(sum(total) - (jv * w).sum()) <= 1e-5 * sum(np.abs(total))
+    assert_differentiated(seen, tuple(k for k in ends if "albedo" not in k))
 
 
 @pytest.mark.slow

@@ -11,19 +11,11 @@ from false_alarms import assert_precise, assert_same_mean, difference, fresh, ov
 from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, phase, point, rough_grid, smoke
 
 import scenes
-from mivol.scene import plan
 from mivol.transport.estimators.flights import free_flight
 from mivol.validate.moments import Moments
 from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
-
-
-@pytest.fixture
-def flies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plan uses free flights at depth 2 too, instead of the estimator of single scattering."""
-    choose = plan.choose_segment_estimator
-    monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
 
 
 def volpath(**more: object) -> dict:

@@ -31,7 +31,6 @@ from scattering_scenes import (
 
 import scenes
 from mivol.errors import MivolError
-from mivol.scene import plan
 from mivol.scene.explain import explain_scene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, build_media, make_plan
@@ -57,13 +56,6 @@ def lamp(at: list[float] = (0, 0.4, 1.5), size: float = 0.6, radiance: float = 6
 def floor() -> dict:
     place = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)
     return {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": 0.6}}
-
-
-@pytest.fixture
-def flies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plan uses free flights at depth 2 too, instead of the estimator of single scattering."""
-    choose = plan.choose_segment_estimator
-    monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
 
 
 # -- One scattering, against the twin ------------------------------------------------------------------------------------

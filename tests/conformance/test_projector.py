@@ -8,7 +8,7 @@ import numpy as np
 import oracle_projector
 import pytest
 import scipy.sparse.linalg
-from oracle_projector import assert_pair_is_adjoint, assert_pair_is_its_twin, numbers
+from oracle_projector import ANGLES, GRID, assert_pair_is_adjoint, assert_pair_is_its_twin, numbers
 
 from mivol.errors import MivolError
 from mivol.threads import set_thread_count
@@ -19,8 +19,6 @@ from mivol.tomography.projector import Projector, order_rays
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
-GRID = VoxelGrid((5, 7, 6), (0.5, 0.4, 0.6), centre=(0.2, -0.3, 0.1))
-ANGLES = np.array([0.0, 0.4, np.pi / 2, 2.5, 4.0])
 BEAMS = {
     "parallel": ParallelBeam(ANGLES, (7, 9), (0.5, 0.45), axis_offset=0.13, detector_offset=(0.07, -0.2)),
     "cone": ConeBeam(ANGLES, (7, 9), 8.0, 13.0, (0.7, 0.8), axis_offset=-0.2, detector_offset=(0.3, 0.1)),

@@ -5,8 +5,9 @@ Kernels are recorded while Python's collector is paused.
 
 from __future__ import annotations
 
+import contextlib
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import drjit as dr
 import mitsuba as mi
@@ -94,30 +95,29 @@ class Pair:
     def gradients(self, key: str, seed: int) -> list[np.ndarray]:
         return [self.gradient(integrator, key, seed) for integrator in (self.recorded, self.traced)]
 
-    def gradient(self, integrator: mi.Integrator, key: str, seed: int) -> np.ndarray:
+    @contextlib.contextmanager
+    def differentiated(self, key: str) -> Iterator[object]:
+        """The value of a parameter, whose gradients are enabled inside of the block."""
         value = type(self.params[key])(dr.detach(self.params[key]))
         dr.enable_grad(value)
         self.params[key] = value
         self.params.update()
-        dr.backward(dr.mean(mi.render(self.scene, self.params, integrator=integrator, seed=seed, spp=2), axis=None))
-        found = np.array(dr.ravel(dr.grad(self.params[key])))
+        yield value
         self.params[key] = type(value)(dr.detach(value))
         self.params.update()
-        return found
+
+    def gradient(self, integrator: mi.Integrator, key: str, seed: int) -> np.ndarray:
+        with self.differentiated(key):
+            dr.backward(dr.mean(mi.render(self.scene, self.params, integrator=integrator, seed=seed, spp=2), axis=None))
+            return np.array(dr.ravel(dr.grad(self.params[key])))
 
     def tangents(self, key: str, seed: int) -> list[np.ndarray]:
         return [self.tangent(integrator, key, seed) for integrator in (self.recorded, self.traced)]
 
     def tangent(self, integrator: mi.Integrator, key: str, seed: int) -> np.ndarray:
-        value = type(self.params[key])(dr.detach(self.params[key]))
-        dr.enable_grad(value)
-        self.params[key] = value
-        self.params.update()
-        dr.set_grad(value, 0.1 * (seed + 1) + value)
-        found = np.array(integrator.render_forward(self.scene, self.params, seed=seed, spp=2))
-        self.params[key] = type(value)(dr.detach(value))
-        self.params.update()
-        return found
+        with self.differentiated(key) as value:
+            dr.set_grad(value, 0.1 * (seed + 1) + value)
+            return np.array(integrator.render_forward(self.scene, self.params, seed=seed, spp=2))
 
     def assert_same(self, seed: int, **more: object) -> None:
         found, truth = self.images(seed, **more)

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import oracle_projector
 import pytest
-from oracle_projector import assert_pair_is_adjoint, assert_pair_is_its_twin, numbers
+from oracle_projector import ANGLES, GRID, assert_pair_is_adjoint, assert_pair_is_its_twin, numbers
 
 from mivol.errors import MivolError
 from mivol.optim.projections.linear_problems import LeastSquares
@@ -19,8 +19,6 @@ from mivol.tomography.stored import is_worth_storing, matrix_bytes, store_matrix
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
-GRID = VoxelGrid((5, 7, 6), (0.5, 0.4, 0.6), centre=(0.2, -0.3, 0.1))
-ANGLES = np.array([0.0, 0.4, np.pi / 2, 2.5, 4.0])
 BEAMS = {
     "parallel, rows between layers": ParallelBeam(ANGLES, (7, 9), (0.5, 0.45), axis_offset=0.13, detector_offset=(0.07, -0.2)),
     "parallel, rows are layers": ParallelBeam(ANGLES, (5, 9), (0.6, 0.45), detector_offset=(0.1, 0.01)),

@@ -46,13 +46,6 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 MEDIUM = "smoke.interior_medium."
 
 
-@pytest.fixture
-def flies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plan uses free flights at depth 2 too, instead of the estimator of single scattering."""
-    choose = plan.choose_segment_estimator
-    monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
-
-
 # -- One scattering, against the twin -----------------------------------------------------------------------------------
 
 

@@ -49,6 +49,11 @@ def stack(opacity_logits: list[float], depths: list[float], scale: float = 0.2) 
     return arrays
 
 
+def assert_drawn(picture: mi.TensorXf, arrays: dict[str, np.ndarray], camera: Camera, rounding: float = ROUNDING) -> None:
+    truth, _ = oracle_splats.draw(arrays, camera)
+    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + rounding)
+
+
 def test_the_median_depth_is_that_of_the_splat_at_which_half_of_the_light_is_lost(variant_rgb: str) -> None:
     """Three splats of opacity 0.4 on the axis leave 0.6, 0.36 and 0.216 of the light, so half of it is lost at the second.
 
@@ -166,8 +171,7 @@ def test_tiny_and_huge_scales(splatter: Splatter, camera: Camera, scale: float) 
     changes by 1e-9 across the image."""
     arrays = cloud(20, 2, scale, seed=4)
     picture, kept = splatter.forward(tensors(arrays), camera)
-    truth, _ = oracle_splats.draw(arrays, camera)
-    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + ROUNDING)
+    assert_drawn(picture, arrays, camera)
     gradient, _ = splatter.backward(kept, picture)
     assert all(np.isfinite(np.array(g)).all() for g in gradient.values())
 
@@ -178,8 +182,7 @@ def test_needles(splatter: Splatter, camera: Camera) -> None:
     arrays = cloud(20, 2, 1.0, seed=6)
     arrays["log_scales"] = np.log(np.full((20, 3), [300.0, 3e-4, 3e-4], np.float32))
     picture, kept = splatter.forward(tensors(arrays), camera)
-    truth, _ = oracle_splats.draw(arrays, camera)
-    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + 1e-3)
+    assert_drawn(picture, arrays, camera, 1e-3)
     assert all(np.isfinite(np.array(g)).all() for g in splatter.backward(kept, picture)[0].values())
 
 
@@ -218,7 +221,6 @@ def test_the_unit_of_length_is_free(variant_rgb: str, unit: float) -> None:
     """Scaling everything by a length, near plane included, gives the same image and divides the derivative by places.
     Logarithms of scales up to 12 are rounded by 12 * 2^-24 = 7e-7, and alpha by at most 11 times this error (q <= 2 ln 255)."""
     arrays, camera = cloud(50, 2, 0.15, seed=4), looking(SIDE, SIDE)
-    truth, _ = oracle_splats.draw(arrays, camera)
     pose = camera.to_world.copy()
     pose[:3, 3] *= unit
     splatter = Splatter(SIDE, SIDE, 2, near=0.01 * unit)
@@ -227,7 +229,7 @@ def test_the_unit_of_length_is_free(variant_rgb: str, unit: float) -> None:
         "log_scales": arrays["log_scales"] + np.float32(np.log(unit)),
     }
     picture, kept = splatter.forward(tensors(scaled), Camera(camera.K, camera.size, pose))
-    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + ROUNDING)
+    assert_drawn(picture, arrays, camera)
     found = np.array(splatter.backward(kept, picture)[0]["means"]).astype(float) * unit
     splatter = Splatter(SIDE, SIDE, 2)
     picture, kept = splatter.forward(tensors(arrays), camera)
@@ -316,9 +318,8 @@ def test_quaternions_of_any_length(splatter: Splatter, camera: Camera, length: f
     arrays = cloud(20, 2, 0.1, seed=4)
     arrays["quaternions"] /= np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True)
     scaled = arrays | {"quaternions": arrays["quaternions"] * np.float32(length)}
-    truth, _ = oracle_splats.draw(arrays, camera)
     picture, kept = splatter.forward(tensors(scaled), camera)
-    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + ROUNDING)
+    assert_drawn(picture, arrays, camera)
     found = np.array(splatter.backward(kept, picture)[0]["quaternions"]).astype(float) * length
     picture, kept = splatter.forward(tensors(arrays), camera)
     unit = np.array(splatter.backward(kept, picture)[0]["quaternions"])
