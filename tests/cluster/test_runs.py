@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import signal
 import stat
 import subprocess
@@ -249,6 +250,40 @@ def test_jobs_of_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant_
     assert stat.S_IMODE((tmp_path / ".mivol").stat().st_mode) == stat.S_IRWXU
 
 
+MANY = {
+    "sweep": (["fit.toml", *PHOTOS, "--over", "fit.spp=1,2,4", "--over", "seed=0..3"], "2 of 12 runs", "sweep.html", 12),
+    "reference": (["many.xml", "--sensor", "all", "--max-depth", "4", "--spp", "16384"], "batches of", "references.html", 16),
+}
+"""Flags of a verb, words on the error output once it works, its page, and the rows of the page."""
+
+
+@pytest.mark.parametrize("verb", MANY)
+def test_a_command_ends_without_one_of_two_workers(tmp_path: Path, verb: str) -> None:
+    """Expected: exit code 0; the page has 12 fits, or 16 views, all finished, and tells of the loss and of repeated work."""
+    scene = write_scattering_scene(tmp_path).read_text()
+    first, end = scene.index("    <sensor"), scene.index("    <shape")
+    (tmp_path / "many.xml").write_text(scene[:first] + 16 * scene[first:end] + scene[end:])
+    flags, at_work, page, rows = MANY[verb]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "mivol", verb, *flags, "-o", "out", "--cluster", "local:2"], cwd=tmp_path, text=True,
+        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert "2 workers on 1 host" in child.stderr.readline()
+    workers = find_workers(child.pid)
+    assert len(workers) == 2
+    while at_work not in child.stderr.readline():
+        assert child.poll() is None
+    os.kill(workers[0], signal.SIGKILL)
+    rest = child.stderr.read()
+    child.stderr.close()
+    assert child.wait(60) == 0
+    assert "lost a worker" in rest
+    text = (tmp_path / "out" / page).read_text()
+    assert text.count("<td>finished</td>") == rows
+    assert re.search(r"1 worker\(s\) of the cluster were lost, and [1-9] piece\(s\) of work were done again", text)
+    assert "<td>lost</td>" in text
+
+
 LONG = {
     "reference": (["scene.xml", "--max-depth", "4", "--spp", f"{1 << 24}"], "1 worker, batches of view 0: "),
     "optimize": (["fit.toml", *PHOTOS, "--set", "fit.iterations=300"], "300 iterations, 1 worker"),
@@ -337,6 +372,11 @@ def is_alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def find_workers(owner: int) -> list[int]:
+    """Processes of the workers that a process has started."""
+    return [pid for pid in find_children(owner) if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
 def find_children(parent: int) -> list[int]:
