@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import shutil
 import ssl
 from collections.abc import Callable, Iterator, Sequence
@@ -129,19 +130,29 @@ answer it with an unfinished image, and call it finished."""
 
 @contextlib.contextmanager
 def _start_local(distributed: Any, settings: ClusterSettings) -> Iterator[Client]:
-    """Processes of this machine; their memory is not limited by Dask, since Dr.Jit's cache of memory looks like a leak."""
+    """Processes of this machine; their memory is not limited by Dask, since Dr.Jit's cache of memory looks like a leak.
+
+    Raises:
+        MivolError: no worker starts, as for a script that opens workers where each worker imports it.
+    """
     import dask
 
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(1)  # a script opens workers where each worker imports it; the process of the script says so
     security = distributed.Security.temporary()
-    with (
-        dask.config.set(DASK),
-        distributed.LocalCluster(
-            n_workers=settings.workers, threads_per_worker=1, processes=True, memory_limit=0, host="127.0.0.1",
-            dashboard_address="127.0.0.1:0", security=security, silence_logs=logging.CRITICAL + 1, preload=[OWN_GROUP],
-        ) as cluster,
-        distributed.Client(cluster, security=security, set_as_default=False, direct_to_workers=True) as client,
-    ):  # fmt: skip
-        yield client
+    with dask.config.set(DASK):
+        try:
+            cluster = distributed.LocalCluster(
+                n_workers=settings.workers, threads_per_worker=1, processes=True, memory_limit=0, host="127.0.0.1",
+                dashboard_address="127.0.0.1:0", security=security, silence_logs=logging.CRITICAL + 1, preload=[OWN_GROUP],
+            )  # fmt: skip
+        except RuntimeError as error:
+            raise MivolError(
+                f"no worker started on this machine ({str(error).rstrip('.')}): in a script, write "
+                'if __name__ == "__main__": before the lines that open workers, because each worker imports the script.'
+            ) from None
+        with cluster, distributed.Client(cluster, security=security, set_as_default=False, direct_to_workers=True) as client:
+            yield client
 
 
 @contextlib.contextmanager

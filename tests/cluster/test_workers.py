@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import asyncio
 import logging
+import multiprocessing
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from tiny_experiment import refused, write_experiment
 
 from mivol import config
 from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
-from mivol.cluster.connection import _collect_failures, _connect_address, import_distributed
+from mivol.cluster.connection import _collect_failures, _connect, _connect_address, import_distributed
 from mivol.cluster.packages import (
     decode_sensor,
     encode_sensor,
@@ -114,6 +115,24 @@ def test_files_without_certificates_are_refused(tmp_path: Path) -> None:
 def test_loopback() -> None:
     assert all(map(is_loopback, ("localhost", "127.0.0.1", "127.8.0.1", "::1")))
     assert not any(map(is_loopback, ("", "0.0.0.0", "10.0.0.1", "node1", "localhost.example.org")))
+
+
+def test_a_script_that_workers_import_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker imports the script: it ends there in silence, and the process of the script gives the sentence."""
+
+    def fail(**options: object) -> None:
+        raise RuntimeError("Nanny failed to start.")
+
+    fake = SimpleNamespace(Security=SimpleNamespace(temporary=lambda: None), LocalCluster=fail)
+    settings = ClusterSettings(scheduler="local", workers=1, threads=1)
+    with (
+        pytest.raises(MivolError, match=r"\(Nanny failed to start\): in a script, write if __name__ == "),
+        _connect(fake, settings),
+    ):
+        pass
+    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(SystemExit), _connect(fake, settings):
+        pass
 
 
 # -- Which workers are refused -----------------------------------------------------------------------------------------------
