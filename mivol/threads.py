@@ -10,6 +10,7 @@ or processes; ``mivol.cluster`` lets Dask start workers, each a fresh process wi
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -49,6 +50,11 @@ def check_one_thread() -> None:
             f"threads lose gradients silently: hand the work to {_owner.name!r} (by a queue of NumPy arrays), or to a process "
             "of its own."
         )
+
+
+def is_script_import() -> bool:
+    """Whether this process is a child that still imports the script of its parent, and so can start no process."""
+    return getattr(multiprocessing.current_process(), "_inheriting", False)
 
 
 @contextmanager

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import multiprocessing
 import shutil
 import ssl
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +20,7 @@ from mivol import machine
 from mivol.cluster.address import BATCH_SYSTEMS, ClusterSettings, parse_cluster
 from mivol.cluster.pool import Pool, Say
 from mivol.errors import MivolError
+from mivol.threads import is_script_import
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -137,7 +137,7 @@ def _start_local(distributed: Any, settings: ClusterSettings) -> Iterator[Client
     """
     import dask
 
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
+    if is_script_import():
         raise SystemExit(1)  # a script opens workers where each worker imports it; the process of the script says so
     security = distributed.Security.temporary()
     with dask.config.set(DASK):
