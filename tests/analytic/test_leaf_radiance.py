@@ -13,6 +13,8 @@ from octrees import PLACE, hard_rays, random_octree, twin
 from mivol.errors import MivolError
 from mivol.fields.octree import MAX_DEPTH, Octree, interleave, separate
 from mivol.transport.line_integrals.leaf_radiance import (
+    HALF_MAX,
+    HalfColours,
     LeafPlaces,
     make_leaf_colours,
     make_leaf_harmonics,
@@ -53,6 +55,24 @@ def test_agrees_with_the_twin(variant_rgb: str, depth: int, split: float, colour
     if colours == "sigmoid":
         total = np.array(rendered.colour) + np.array(rendered.T)
         assert total.min() >= 0 and total.max() <= 1 + 1e-6
+
+
+def test_half_floats_keep_leaves_to_their_rounding(variant_rgb: str) -> None:
+    """2^-11 of a number, or half a step of the smallest halves; more than a half float holds stays opaque and finite."""
+    tree = random_octree(4)
+    density, sh = tree.values()
+    density[3] = 1e9
+    tree = tree.with_leaves(tree.codes, tree.sizes, density, sh)
+    exact = make_leaf_colours(tree, LeafPlaces.find(tree), np.array([[2.0, 3, 1]]), mi.UInt32(0))
+    row, on = dr.arange(mi.UInt32, tree.leaves), mi.Bool(True)
+    for ours, theirs in zip(*(source.read(row, on) for source in (HalfColours.round(exact, tree.cell), exact)), strict=True):
+        ours, theirs, unit = np.array(ours), np.array(theirs), 1.0
+        if ours.ndim == 1:
+            unit = 1 / tree.cell
+            assert ours[3] * tree.cell == pytest.approx(HALF_MAX, rel=1e-6)
+            ours, theirs = np.delete(ours, 3), np.delete(theirs, 3)
+        assert (np.abs(ours - theirs) <= (2.0**-11 + 2.0**-22) * np.abs(theirs) + 2.0**-25 * unit).all()
+        assert (ours != theirs).any()
 
 
 def uniform(n: int, depth: int) -> tuple[Octree, np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.photographs.ray_batches import TILE
 from mivol.photos import Camera, pixel_centres, rays
-from mivol.transport.line_integrals.leaf_radiance import LeafPlaces, LeafRays, make_leaf_colours, render_leaves
+from mivol.transport.line_integrals.leaf_radiance import HalfColours, LeafPlaces, LeafRays, make_leaf_colours, render_leaves
 from mivol.transport.line_integrals.radiance_field import (
     MAX_DEPTH,
     RayBundle,
@@ -134,7 +134,7 @@ def prepare_view(
     if isinstance(field, Octree):
         depth = MAX_DEPTH if stop == 0 else -math.log(stop)
         index, places = INDEXED.find(field)
-        leaves = make_leaf_colours(field, places, camera.origin[None], mi.UInt32(0))
+        leaves = HalfColours.round(make_leaf_colours(field, places, camera.origin[None], mi.UInt32(0)), field.cell)
         return lambda bundle: render_leaves(index, leaves, bundle, depth, distances=True)
     if isinstance(field, SampledField):
         sampled = SampledModel.from_field(field, stop)

@@ -282,6 +282,7 @@ class OctreeExtinction:
 
         def visit(state: list, leaf: VisitedLeaf, on: mi.Bool) -> list:
             remaining, t, collides = state
+            on &= ~collides  # the walk ends a leaf later
             rows = read_leaf(self.values, self.channels, leaf.row, on)
             sigma = scale * rows[0]
             for c, row in enumerate(rows[1:], 1):

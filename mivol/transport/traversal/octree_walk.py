@@ -75,7 +75,8 @@ def walk_leaves(
         visit: ``visit(state, leaf, active) -> state``, called once, while Dr.Jit traces the loop.
         state: any PyTree of Dr.Jit arrays.
         active: lanes to walk.
-        until: ``until(state) -> mask`` of lanes to stop, evaluated after each leaf; None to walk to the end.
+        until: ``until(state) -> mask`` of lanes that stop after one more leaf, evaluated before each leaf; None to walk to the
+            end.
 
     Returns:
         The last state, the first visited cell of the last visited leaf, and the distance of its exit from the start of the
@@ -130,14 +131,11 @@ def walk_leaves(
         row, is_leaf, edge, beyond = index.look_up(cell ^ turn, towards, active)
         exit, following = cross(cell, edge, beyond)
         stop = fast_max(fast_min(exit, length), t)
-        on, visited = active & is_leaf, visit(state, VisitedLeaf(row, t, stop - t), active & is_leaf)
+        on = active & is_leaf
         active &= (exit < length) & dr.all(following < end)
         if until is not None:
-            done = until(state)
-            visited = dr.select(done, state, visited)
-            on &= ~done
-            active &= ~done
-        state = visited
+            active &= ~until(state)  # before the visit, so that the next look-up does not wait for the values of the leaf
+        state = visit(state, VisitedLeaf(row, t, stop - t), on)
         last = dr.select(on, cell, last)
         left = dr.select(on, stop, left)
         cell, t = following, stop
