@@ -312,6 +312,7 @@ def test_derivatives_of_a_lit_scan() -> None:
     [
         ({"shade": True}, "was given no eye; give the place of the camera"),
         (shaded(specular=-1.0), "was given specular -1; finite numbers"),
+        (shaded(diffuse=np.inf), "was given diffuse inf; finite numbers"),
         ({"gradient_opacity": "1"}, "the gradient_opacity of mivol_transfer has the shape"),
         ({"gradient_opacity": "0 0 0, 1 1 1"}, "at least two entries of 1 finite numbers"),
         ({"gradient_opacity": "0, 1", "gradient_domain": "2, 1"}, "the gradient_domain of mivol_transfer is 2, 1"),

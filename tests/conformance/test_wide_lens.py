@@ -72,7 +72,8 @@ def test_a_fisheye_ends_at_the_fold_of_its_image() -> None:
     lens = Fisheye(k1=-1 / 12)
     assert lens.widest == pytest.approx(2)
     assert Fisheye().widest == np.pi
-    np.testing.assert_array_equal(lens.sees(np.array([[1.33, 0], [0, -1.34]])), [True, False])
+    rim = float(lens.radius(np.float64(lens.widest)))
+    np.testing.assert_array_equal(lens.sees(np.array([[1.33, 0], [0, -1.34], [rim, 0]])), [True, False, True])
     np.testing.assert_allclose(lens.direction(np.array([0, -5.0])), [0, -np.sin(2), np.cos(2)], atol=1e-7)
     beyond = np.array([np.sin(2.01), 0, np.cos(2.01)])
     assert np.isnan(lens.point(beyond)).all()
