@@ -7,9 +7,13 @@ aborts the process. Seen with CUDA 13.0. Therefore spills go to local memory.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import drjit as dr  # loads LLVM, so mivol.llvm chooses the library first
 import mitsuba as mi
 
+from mivol import machine
 from mivol.errors import MivolError
 from mivol.threads import check_one_thread, set_thread_count
 
@@ -77,3 +81,31 @@ def spill_to_local_memory(variant: str | None = None) -> None:
     variant = variant or mi.variant()
     if variant is not None and variant.startswith("cuda"):
         dr.set_flag(dr.JitFlag.SpillToSharedMemory, False)
+
+
+def free_memory() -> int | None:
+    """Memory for the arrays of the active variant [bytes]: of this process, or of the GPU at first; None if unknown."""
+    return _free_gpu_memory() if is_on_gpu() else machine.available_memory()
+
+
+def is_on_gpu() -> bool:
+    """Whether the active variant computes on an NVIDIA GPU."""
+    return (mi.variant() or "").startswith("cuda")
+
+
+@functools.cache
+def _free_gpu_memory() -> int | None:
+    # Asked once: Dr.Jit keeps freed memory, which would count as used later.
+    gpu = machine.find_used_gpu(machine.list_gpus())
+    return gpu.free if gpu is not None and gpu.total else None
+
+
+def check_memory(needed: float, what: str, way_out: str | Callable[[float], str], limit: float | None = None) -> None:
+    """Refuse a task whose arrays need more than :func:`free_memory`; arguments as of :func:`mivol.machine.check_memory`.
+
+    Raises:
+        MivolError: the task needs more than the free memory.
+    """
+    free = free_memory() if limit is None else limit
+    if free is not None:
+        machine.check_memory(needed, f"{what} on the GPU" if is_on_gpu() else what, way_out, free)

@@ -113,15 +113,43 @@ def _cuda() -> list[Finding]:
     import drjit as dr
 
     if not dr.has_backend(dr.JitBackend.CUDA):
-        return [Finding("CUDA", NOTE, "no usable NVIDIA GPU or driver; only the cuda_ad_* variants need one")]
+        return [Finding("CUDA", NOTE, "no usable NVIDIA GPU or driver; only the cuda_ad_* variants need one"), *_gpus()]
     version = ".".join(map(str, dr.detail.cuda_version()))
     value = f"driver for CUDA {version}, compute capability {dr.detail.cuda_compute_capability()}"
-    findings = [Finding("CUDA", OK, value)]
+    findings = [Finding("CUDA", OK, value), *_gpus()]
     optix = run_child("import ctypes; ctypes.CDLL('libnvoptix.so.1')", isolated=True)
     if optix.returncode == 0:
         return [*findings, Finding("OptiX", OK, "libnvoptix.so.1 loads")]
     advice = "install the whole NVIDIA driver (in a container: NVIDIA_DRIVER_CAPABILITIES=all); shapes are traced by it"
     return [*findings, Finding("OptiX", FAULT, "libnvoptix.so.1 does not load", (advice,))]
+
+
+OLDEST_DRIVER = 535
+"""Oldest NVIDIA driver that Mitsuba 3.9 supports."""
+
+BUSY_LOAD, BUSY_MEMORY = 0.2, 0.25
+"""Share of time with kernels, and share of the memory in use [1], from which a GPU counts as busy."""
+
+
+def _gpus() -> list[Finding]:
+    """A line for each NVIDIA GPU: an old driver, a busy card, and which of several is used."""
+    gpus = machine.list_gpus()
+    used, findings = machine.find_used_gpu(gpus), []
+    for number, gpu in enumerate(gpus):
+        advice = []
+        is_old = gpu.driver.partition(".")[0].isdecimal() and int(gpu.driver.partition(".")[0]) < OLDEST_DRIVER
+        if is_old:
+            advice.append(f"the driver is too old: Mitsuba needs {OLDEST_DRIVER} or newer; install a newer NVIDIA driver")
+        is_busy = gpu.load > BUSY_LOAD or gpu.used > BUSY_MEMORY * gpu.total
+        if is_busy:
+            advice.append("another process uses it (nvidia-smi lists them): wait, or choose another by CUDA_VISIBLE_DEVICES")
+        if len(gpus) > 1:
+            choice = "mivol uses this one" if gpu is used else f"not used; CUDA_VISIBLE_DEVICES={number} chooses it"
+            advice.append(choice)
+        room = f"{gpu.free / 2**30:.1f} of {gpu.total / 2**30:.1f} GiB free" if gpu.total else "memory not told"
+        value = f"{gpu.name}, driver {gpu.driver}, {room}, load {gpu.load:.0%}"
+        findings.append(Finding(f"GPU {number}", FAULT if is_old else NOTE if is_busy else OK, value, tuple(advice)))
+    return findings
 
 
 def _variants_to_try() -> list[str]:

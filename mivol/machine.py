@@ -11,9 +11,11 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from mivol.errors import MivolError
+from mivol.threads import run_program
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -57,6 +59,54 @@ def available_memory() -> int | None:
     second = _group_memory("memory.max", "memory.current", "memory.stat")
     first = _group_memory("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat")
     return int(min(system, second, first))
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """An NVIDIA GPU.
+
+    Attributes:
+        name: name of the card.
+        driver: version of the driver.
+        total, used: memory of the card, and memory in use by all processes [bytes].
+        load: share of time in which kernels ran, over the last second or less [1].
+    """
+
+    name: str
+    driver: str
+    total: int
+    used: int
+    load: float
+
+    @property
+    def free(self) -> int:
+        """Memory that no process uses [bytes]."""
+        return self.total - self.used
+
+
+GPU_FIELDS = "name,driver_version,memory.total,memory.used,utilization.gpu"
+"""Columns asked of ``nvidia-smi``; memory in MiB, the load in percent."""
+
+
+def list_gpus() -> list[Gpu]:
+    """The NVIDIA GPUs in the order of ``nvidia-smi``, also those hidden by ``CUDA_VISIBLE_DEVICES``.
+
+    Empty without ``nvidia-smi``. A number that the driver does not tell counts as 0.
+    """
+    told = run_program("nvidia-smi", f"--query-gpu={GPU_FIELDS}", "--format=csv,noheader,nounits", timeout=20)
+    rows = [[field.strip() for field in line.split(",")] for line in told.splitlines() if line.strip()]
+    return [_read_gpu(row) for row in rows if len(row) == len(GPU_FIELDS.split(","))]
+
+
+def _read_gpu(row: list[str]) -> Gpu:
+    total, used, load = (float(field) if re.fullmatch(r"[0-9.]+", field) else 0.0 for field in row[2:])
+    return Gpu(row[0], row[1], int(total * 2**20), int(used * 2**20), load / 100)
+
+
+def find_used_gpu(gpus: list[Gpu]) -> Gpu | None:
+    """The GPU that Dr.Jit uses: the first that ``CUDA_VISIBLE_DEVICES`` shows; None if it cannot be told."""
+    first = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0].strip()
+    return gpus[int(first)] if first.isdecimal() and int(first) < len(gpus) else None
 
 
 def peak_memory() -> int | None:

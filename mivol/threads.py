@@ -101,6 +101,15 @@ def map_arrays(work: Callable[[Item], Result], items: Sequence[Item], count: int
         return list(pool.map(work, items))
 
 
+def run_program(*command: str, timeout: float) -> str:
+    """What a program prints; empty without the program, after a failure, or after ``timeout`` [s]."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout
+
+
 def run_child(
     code: str, *args: str, timeout: float = 120.0, env: Mapping[str, str] | None = None, isolated: bool = False
 ) -> subprocess.CompletedProcess[str]:

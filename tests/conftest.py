@@ -28,6 +28,27 @@ from mivol.threads import set_thread_count
 ROOT = Path(__file__).resolve().parents[1]
 
 
+ON_A_GPU = (
+    "analytic/test_direct_lighting.py",
+    "analytic/test_grid_blocks.py",
+    "analytic/test_interpolation.py",
+    "analytic/test_tracking.py",
+    "conformance/test_emission.py",
+    "conformance/test_film.py",
+    "conformance/test_free_flight.py",
+    "conformance/test_projector.py",
+    "conformance/test_session.py",
+    "conformance/test_surfaces.py",
+    "gradient/test_derivatives.py",
+    "gradient/test_flight_derivatives.py",
+    "gradient/test_grid_integral.py",
+    "gradient/test_splatter.py",
+    "hard/test_optical_depth.py",
+    "optim/test_radiance_problem.py",
+)
+"""Modules with the marker ``gpu``: one for each kind of kernel that a GPU compiles."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Options of the suite."""
     parser.addoption("--variant", default="llvm_ad_rgb", help="the Mitsuba variant of the fixture variant_rgb")
@@ -59,13 +80,15 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the variants of ``slow_for`` as slow.
+    """Mark the variants of ``slow_for`` as slow, and the modules for a GPU.
 
     Raises:
         pytest.UsageError: a test has no such variant. One that was renamed would run in every suite without a word.
     """
     unmatched: dict[str, set[str]] = {}
     for item in items:
+        if item.path.is_relative_to(ROOT / "tests") and item.path.relative_to(ROOT / "tests").as_posix() in ON_A_GPU:
+            item.add_marker(pytest.mark.gpu)
         if marker := item.get_closest_marker("slow_for"):
             test, _, variant = item.nodeid.partition("[")
             left = unmatched.setdefault(test, set(marker.args))

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mivol.back_end import free_memory
 from mivol.errors import MivolError
 from mivol.files.sparse_volume import VOXELS
-from mivol.machine import available_memory
 from mivol.scene.choices import (
     MAX_SKIPPED_SHARE,
     Choice,
@@ -266,12 +266,13 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
             memory += (packed if fits else 0) + 8 * z * y * x * channels
             ways.add("packed corners, one copy per thread" if fits else "added to the nodes")
     # Asking for the free memory takes as long as all other choices: a small step is not asked about.
-    asks = needs.parameters and needs.variant.startswith("llvm") and memory > SMALL_STEP
-    free = available_memory() if asks else None
+    asks = needs.parameters and memory > SMALL_STEP
+    free = free_memory() if asks else None
     if free is not None and memory > free:
+        edge = math.floor(100 * (free / memory) ** (1 / 3))
         raise MivolError(
             f"a gradient step would take {memory / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free; lower the resolution "
-            "of the grids."
+            f"of the grids: {edge} % of their nodes along each axis fit."
         )
     parameters = ", ".join(needs.parameters) or "none with gradients yet"
     size = f"{memory / 2**20:.1f} MiB besides the rays ({'; '.join(sorted(ways)) or 'no grid'})"

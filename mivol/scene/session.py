@@ -19,6 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.back_end import is_on_gpu
 from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, Recordings, is_recording, without_garbage_collection
 from mivol.scene.needs import find_needs, warn_of_clipped_view, warn_of_misplaced_grids
@@ -66,6 +67,9 @@ class _SurveyedScene:
         """Whether ``parts`` are the very same shapes and emitters."""
         return len(parts) == len(self.parts) and all(a is b for a, b in zip(parts, self.parts, strict=True))
 
+
+OUT_OF_MEMORY = "out of memory"
+"""Words of Dr.Jit's error when the system or the GPU has no more memory."""
 
 MAX_RECORDINGS = 64
 """Largest number of recordings: an image and a gradient from each of 32 cameras."""
@@ -170,7 +174,17 @@ class Session:
             # The task has run up to the fault.
             for value, gradient in gradients:
                 dr.set_grad(value, gradient)
-        return make()(*given)
+        try:
+            return make()(*given)
+        except RuntimeError as error:
+            if OUT_OF_MEMORY not in f"{error} {error.__cause__}":
+                raise
+        width, height = sensor.film().crop_size()
+        where = "the GPU" if is_on_gpu() else "this machine"
+        raise MivolError(
+            f"a render of {width} x {height} pixels ran out of memory on {where}: render crops of half the pixels, or give"
+            "  the grids 80 % of their nodes along each axis (half the memory)."
+        )
 
     def _join_arrays(self, scene: mi.Scene, tracer: mi.Scene | None) -> None:
         """Let a scene and its tracer share their arrays before the first recording.

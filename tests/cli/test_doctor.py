@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mivol import doctor, llvm
+from mivol import doctor, llvm, machine
 
 OLD = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
 
@@ -82,3 +82,29 @@ def test_cores_and_memory_are_noted_where_there_is_little(monkeypatch: pytest.Mo
     assert second.advice == ("the examples need 2 GiB",)
     monkeypatch.setattr(doctor.machine, "available_memory", lambda: None)
     assert [finding.subject for finding in doctor._resources()] == ["cores"]
+
+
+NVIDIA_SMI = """#!/bin/sh
+echo "NVIDIA A100, 470.82.01, 40960, 300, 0"
+echo "NVIDIA H200, 580.65.06, 143771, 90000, 97"
+echo "NVIDIA Thor, 580.65.06, [N/A], [N/A], [N/A]"
+"""
+
+
+def test_gpus_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An old driver, a busy card, several cards, and a card that does not tell its memory."""
+    program = tmp_path / "nvidia-smi"
+    program.write_text(NVIDIA_SMI)
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
+    old, busy, silent = doctor._gpus()
+    assert (old.state, busy.state, silent.state) == (doctor.FAULT, doctor.NOTE, doctor.OK)
+    assert "too old: Mitsuba needs 535" in old.advice[0] and old.advice[1] == "not used; CUDA_VISIBLE_DEVICES=0 chooses it"
+    assert busy.value == "NVIDIA H200, driver 580.65.06, 52.5 of 140.4 GiB free, load 97%"
+    assert "another process uses it" in busy.advice[0] and busy.advice[1] == "mivol uses this one"
+    assert machine.find_used_gpu(machine.list_gpus()).free == (143771 - 90000) << 20
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-1a2b")
+    assert machine.find_used_gpu(machine.list_gpus()) is None
+    monkeypatch.setenv("PATH", str(tmp_path / "nowhere"))
+    assert machine.list_gpus() == []

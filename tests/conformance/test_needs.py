@@ -236,7 +236,7 @@ def test_gradient_step_that_cannot_fit_is_refused(monkeypatch):
     needs = find_needs(scene, scene.sensors()[0])
     assert "box.interior_medium.sigma_t.data" in needs.parameters
     make_plan(needs, Settings(max_depth=1))
-    monkeypatch.setattr(plan, "available_memory", lambda: 1000)
+    monkeypatch.setattr(plan, "free_memory", lambda: 1000)
     make_plan(needs, Settings(max_depth=1))  # so small a step is not compared with the free memory
     monkeypatch.setattr(plan, "SMALL_STEP", 0)
     if mi.variant().startswith("llvm"):

@@ -23,7 +23,7 @@ from mivol.scene import plan, render_tasks, scene_state
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.threads import set_thread_count
 from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views
-from scenes import ball_of, box_of, camera, grid_volume, medium, pencil, sky
+from scenes import ball_of, box_of, camera, grid_volume, medium, pencil, refused, sky
 
 pytestmark = pytest.mark.usefixtures("cpu_back_end")
 
@@ -507,3 +507,14 @@ def test_paths_are_recorded_without_them(variant_rgb: str, monkeypatch: pytest.M
         mi.render(scene, integrator=integrator, spp=1)
     assert seen and not any(seen)
     assert gc.isenabled()
+
+
+def test_out_of_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, integrator = smoke_under(), mi.load_dict(mivol(max_depth=2))
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("jit_malloc(): out of memory! Could not allocate 12884901888 bytes (backend=1, shared=0).")
+
+    monkeypatch.setattr(render_tasks.ImageTask, "__call__", fail)
+    with refused("a render of 6 x 6 pixels ran out of memory on this machine: render crops"):
+        mi.render(scene, integrator=integrator, spp=1)

@@ -13,11 +13,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from mivol import machine
+from mivol import back_end
 from mivol.optim.events import CoarseToFine, ControlDensity, Event
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course
@@ -277,7 +275,7 @@ def check_memory(plan: GaussianPlan, photographs: int, pixels: int, limit: int |
         plan: plan of the fit.
         photographs: bytes of the photographs.
         pixels: pixels of the largest photograph.
-        limit: [bytes]; None takes the machine's available memory (unchecked on a GPU).
+        limit: [bytes]; None takes the free memory of the machine, or of the GPU.
 
     Raises:
         MivolError: the fit needs more memory; the message names a possible number of Gaussians.
@@ -289,6 +287,5 @@ def check_memory(plan: GaussianPlan, photographs: int, pixels: int, limit: int |
         each, rest = estimate_bytes(plan, 1, 0), free - photographs - estimate_bytes(plan, 0, pixels)
         return f"gaussians.most = {rest // each:.0f} fits" if rest > each else "read the photographs smaller (photos.scale)"
 
-    if limit is not None or dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
-        machine.check_memory(needed, f"a fit of {most} Gaussians", advise, limit)
+    back_end.check_memory(needed, f"a fit of {most} Gaussians", advise, limit)
     return f"about {needed / 2**20:.0f} MiB: photographs {photographs / 2**20:.0f}, Gaussians and an image the rest"

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol import machine
+from mivol import back_end
 from mivol.fields.harmonics import basis_size, row_width
 from mivol.optim.events import CoarseToFine, DropUnseen, Event, UpdateOccupancy
 from mivol.optim.first_order import RMSprop
@@ -327,7 +327,7 @@ def check_memory(plan: RadiancePlan, box: np.ndarray, batches: RayBatches, limit
 
     Args:
         plan, box, batches: plan, box and photographs of the fit.
-        limit: [bytes]; None takes the machine's available memory (unchecked on a GPU).
+        limit: [bytes]; None takes the free memory of the machine, or of the GPU.
 
     Raises:
         MivolError: the fit needs more memory; the message names the largest resolution that fits.
@@ -343,8 +343,7 @@ def check_memory(plan: RadiancePlan, box: np.ndarray, batches: RayBatches, limit
         fitting = 7 + bisect.bisect_right(range(8, last.longest), free, key=lambda n: needed(plan.with_longest(n)))
         return f"longest = {fitting} fits" if fitting > 7 else "no resolution fits: read the photographs smaller"
 
-    if limit is not None or dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
-        machine.check_memory(most, f"a fit with {last.longest} nodes along an edge", advise, limit)
+    back_end.check_memory(most, f"a fit with {last.longest} nodes along an edge", advise, limit)
     first = estimate_bytes(plan, plan.stages[0], box)
     return (
         f"about {most / 2**20:.0f} MiB: photographs {batches.bytes / 2**20:.0f}, the first grid {first / 2**20:.0f}, "

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol import machine
+from mivol import back_end
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
 from mivol.fields.nerf import NerfField, NerfSizes
@@ -345,13 +345,12 @@ def check_memory(plan: SampledPlan, box: np.ndarray, batches: RayBatches, limit:
 
     Args:
         plan, box, batches: plan, box and photographs of the fit.
-        limit: [bytes]; None takes the machine's available memory (unchecked on a GPU).
+        limit: [bytes]; None takes the free memory of the machine, or of the GPU.
 
     Raises:
         MivolError: the fit needs more memory.
     """
     own = estimate_bytes(plan, box)
     advice = "give field.log2_table or field.samples less" if plan.model is HashField else "give field.samples less"
-    if limit is not None or dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
-        machine.check_memory(batches.bytes + own, f"a fit of a {plan.model.noun}", advice, limit)
+    back_end.check_memory(batches.bytes + own, f"a fit of a {plan.model.noun}", advice, limit)
     return f"about {(batches.bytes + own) / 2**20:.0f} MiB: photographs {batches.bytes / 2**20:.0f}, the fit {own / 2**20:.0f}"

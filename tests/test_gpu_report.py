@@ -1,0 +1,47 @@
+"""The report of a GPU: parts that pass, fail, wait and lack their data, in one JSON file and one table."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from conftest import ON_A_GPU
+from script_modules import load
+
+report = load("gpu_report")
+
+
+def part(name: str, code: str, limit: float = 60, needs: str = "") -> report.Part:
+    return report.Part(name, limit, lambda variant, out: ["-c", code], needs)
+
+
+def test_parts_are_run_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = (
+        part("table", "print('hello'); print('| a | 1 |')"),
+        part("broken", "import os; print('last words', flush=True); os.abort()"),
+        part("waiting", "import time; time.sleep(600)", limit=1),
+        part("fit", "raise SystemExit", needs="nowhere"),
+    )
+    monkeypatch.setattr(report, "PARTS", parts)
+    monkeypatch.setattr(report, "list_gpus", list)
+    assert report.main(["--variant", "llvm_ad_rgb", "--out", str(tmp_path)]) == 1
+    told = json.loads((tmp_path / "report.json").read_text())
+    states = {found["name"]: found["state"] for found in told["parts"]}
+    assert states == {"table": "ok", "broken": "failed", "waiting": "out of time", "fit": "left out"}
+    assert told["parts"][0]["lines"] == ["| a | 1 |"] and told["parts"][1]["lines"] == ["last words"]
+    assert "MIVOL_DATA" in told["parts"][3]["lines"][0]
+    assert "| waiting | out of time | 1 |" in capsys.readouterr().out
+    assert report.main(["--variant", "llvm_ad_rgb", "--out", str(tmp_path), "--only", "table"]) == 0
+
+
+def test_a_machine_without_a_gpu(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(report, "list_gpus", list)
+    with pytest.raises(SystemExit):
+        report.main([])
+    assert "nvidia-smi finds no NVIDIA GPU here" in capsys.readouterr().err
+
+
+def test_the_parts_take_twelve_minutes_and_their_tests_exist() -> None:
+    assert sum(part.limit for part in report.PARTS) == 12 * 60
+    assert all((report.ROOT / "tests" / module).is_file() for module in ON_A_GPU)
