@@ -9,6 +9,7 @@ from radiance_rays import CUBE
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells
+from mivol.transport.traversal.occupied_cells import _numbered
 from mivol.transport.traversal.occupied_walk import count_pieces, find_piece
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -43,3 +44,10 @@ def test_pieces_of_a_ray_through_the_middle_and_of_one_that_misses() -> None:
             if wanted is not None:
                 # Powers of two and their sums: nothing is rounded.
                 assert (start[ray], start[ray] + length[ray]) == wanted
+
+
+def test_rows_are_numbered_in_their_order(variant_rgb: str) -> None:
+    """The last possible row among them."""
+    different, place = _numbered([mi.UInt32([3, 0]), mi.UInt32([5, 3])], 5)
+    assert np.array(different).tolist() == [0, 3, 5]
+    assert np.array(place)[[0, 3, 5]].tolist() == [0, 1, 2]

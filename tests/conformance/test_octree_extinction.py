@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean
+from octrees import random_octree
 
+from mivol.fields.field_files import write_field
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.octree_extinction import LeafField, OctreeExtinction, merge_voxels
 from mivol.validate.moments import Moments
@@ -184,3 +187,14 @@ def test_a_step_below_zero_is_refused(variant_rgb: str) -> None:
     params["data"] = mi.TensorXf(np.full(params["data"].shape, -0.5, np.float32))
     with pytest.raises((RuntimeError, ValueError), match=r"leaf 0 of a mivol_octree has the value \[-0.5\]"):
         params.update()
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_an_octree_file_stands_where_it_was_fitted_unless_it_is_moved(variant_rgb: str, tmp_path: Path, moved: bool) -> None:
+    tree, elsewhere = random_octree(3), np.diag([3.0, 3.0, 3.0, 1.0])
+    write_field(tmp_path / "tree.npz", tree, half=False)
+    props = mi.Properties("mivol_octree")
+    props["filename"] = str(tmp_path / "tree.npz")
+    if moved:
+        props["to_world"] = mi.ScalarTransform4f(elsewhere)
+    np.testing.assert_allclose(LeafField.from_props(props).to_world, elsewhere if moved else tree.to_world, atol=1e-6)
