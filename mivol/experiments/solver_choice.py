@@ -99,7 +99,8 @@ def resolve_supersampling(settings: config.SolveSettings, walk: Projector) -> tu
     if unknowns > MOST_UNKNOWNS:
         reason = f"twice as many along each edge were {unknowns / 2**20:.4g} Mi, of at most {MOST_UNKNOWNS >> 20} Mi"
         return 1, [PlanLine(choice="unknowns: the voxels", reason=f"{reason} (solve.supersampling = 2 takes them)")]
-    return 2, [PlanLine(choice="unknowns: two along each edge of a voxel, which is their mean", reason="edges cut voxels")]
+    choice = "unknowns: two along each edge of a voxel; the voxel is their mean"
+    return 2, [PlanLine(choice=choice, reason="surfaces pass through voxels")]
 
 
 FIELDS, FIELDS_OF_ONE_STEP = 10, 3
@@ -221,7 +222,7 @@ def explain_prior(prior: SmoothedTV | None, state: SolverState) -> list[PlanLine
     return [
         PlanLine(
             choice=f"total variation: strength {prior.strength:.4g} / length, smooth below {prior.delta:.4g} / length^2",
-            reason=f"{share:.2%} of the final objective; {edges:.2%} of the slopes are kept as edges",
+            reason=f"{share:.2%} of the final objective; {edges:.2%} of the differences between neighbours count as edges",
         )
     ]
 

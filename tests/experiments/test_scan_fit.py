@@ -265,7 +265,7 @@ def test_a_prior_in_units_of_the_noise_says_what_it_did(variant_rgb, folder: Pat
     assert run(folder, *changes) == 0
     (line,) = [line for line in json.loads((folder / "run/run.json").read_text())["plan"] if "variation" in line["choice"]]
     assert "strength" in line["choice"]
-    assert "% of the slopes are kept as edges" in line["reason"]
+    assert "% of the differences between neighbours count as edges" in line["reason"]
 
 
 @pytest.mark.slow
@@ -288,7 +288,7 @@ def test_what_is_left_open_is_chosen_and_said(variant_rgb, folder: Path, capsys:
     capsys.readouterr()
     assert main(["explain", str(folder / "fit.toml")]) == 0
     said = capsys.readouterr().out
-    assert "unknowns: two along each edge of a voxel, which is their mean, because edges cut voxels" in said
+    assert "unknowns: two along each edge of a voxel; the voxel is their mean, because surfaces pass through voxels" in said
     assert "total variation: 1 in units of the noise" in said
     assert "pcg, at most 6 iterations" in said
 

@@ -36,7 +36,7 @@ def test_what_is_left_open_is_the_best_of_the_table(variant_rgb: str, geometry: 
     assert "the table of docs/benchmarks.md" in said["solver: pcg"]
     assert list(said)[1:] == [
         "start: filtered back-projection",
-        "unknowns: two along each edge of a voxel, which is their mean",
+        "unknowns: two along each edge of a voxel; the voxel is their mean",
     ]
 
 
