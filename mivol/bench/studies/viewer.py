@@ -1,15 +1,21 @@
-"""How long does a page of the live view wait for its first picture?
+"""How long does a page of the live view wait for its first picture, and how much slower is a fit that is looked at?
 
     mivol bench viewer [--edge 400] [--rounds 9]
+    mivol bench viewer --only cost [--fits 5]
 
 A request is a camera that a page has not asked for before. The coarse picture answers it; the full picture follows when the
 camera rests. Subjects are made on the spot: random Gaussians in a ball, a grid with harmonics of degree 2 around the surface of
 a ball, and a volume of values. Kernels are warm, as after the start of ``mivol view``. Times are medians over rounds, in
 processor time of all threads and in time of the clock; on two idle cores the first is about twice the second.
+
+``cost`` repeats a fit of the example demo, alone and with a viewer in turn. The viewer is a process that asks for a new camera
+after each picture, more often than a person does. Its times are the clock during the steps of the fit, which needs a machine
+without other work, and the processor time of the fit's process.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,12 +25,18 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from mivol.back_end import choose_back_end
+from mivol.bench.harness.bars import AT_MOST, Promise
 from mivol.bench.harness.study import Size, Study, amount, ask
 from mivol.bench.studies.storage import make_field
+from mivol.errors import MivolError
+from mivol.experiments.examples import copy_example
 from mivol.experiments.render import make_camera
 from mivol.fields.field_files import write_field
 from mivol.files import write_volume
 from mivol.points import Gaussians, write_gaussians
+from mivol.report.record import RECORD, read_record
+from mivol.threads import follow_program, run_child
 from mivol.view.painter import Painter
 from mivol.view.runs import open_subject
 
@@ -39,6 +51,8 @@ class ViewerSize(Size):
     rounds: int = amount(9, 1, doc="cameras asked for")
     gaussians: int = amount(50_000, 500, doc="number of Gaussians")
     nodes: int = amount(96, 16, doc="nodes along an edge of the grid, and voxels of the volume")
+    fits: int = amount(5, 1, doc="fits alone, and as many with a viewer")
+    iterations: int = amount(24, 2, doc="iterations of a fit")
 
 
 def write_subject(path: Path, size: ViewerSize) -> Path:
@@ -83,8 +97,73 @@ def measure_pictures(name: str, size: ViewerSize) -> dict:
             "processor": float(np.median(processor[1:]))}  # fmt: skip
 
 
+# -- Cost of a viewer ----------------------------------------------------------------------------------------------------------
+
+FIT = "import sys, time; from mivol.cli import main; main(sys.argv[1:]); print(time.process_time())"
+"""Program of a fit; its last line is its processor time [s]."""
+
+QUIET = "threads=2", 'event=[{name="evaluate", every=4}]', "reference.spp=64"
+"""Changes of the example demo."""
+
+
+def run_fit(folder: Path, size: ViewerSize) -> dict[str, float]:
+    """Run the fit in a process of its own; return the time of its steps, and the processor time of the process [s]."""
+    changes = [*QUIET, f"fit.iterations={size.iterations}"]
+    flags = [word for change in changes for word in ("--set", change)]
+    ended = run_child(FIT, "optimize", str(folder / "demo" / "fit.toml"), "-o", str(folder / "run"), *flags, timeout=600)
+    if ended.returncode:
+        raise MivolError(f"the fit failed: {ended.stderr}")
+    seconds = read_record(folder / "run").results["fit_seconds"]
+    return {"clock": float(seconds), "processor": float(ended.stdout.split()[-1])}
+
+
+def look_at_run(run: Path, edge: int) -> None:
+    """Be the viewer of a run from its start to its end: one new camera after another; prints the number of pictures."""
+    while not (run / RECORD).exists() or read_record(run).status != "running":
+        time.sleep(0.05)
+    choose_back_end("llvm_ad_rgb", 0)
+    subject, count = open_subject(run, say=lambda line: None), 0
+    painter = Painter(subject, lambda page, picture, is_full: None, subject.first_look())
+    middle, extent = subject.box.mean(axis=0), float(np.ptp(subject.box, axis=0).max())
+    while read_record(run).status == "running":
+        turn = 0.1 * count
+        origin = middle + 1.6 * extent * np.array([np.cos(turn), np.sin(turn), 0.4])
+        if subject.refresh():
+            painter.change()
+        painter.see("page", make_camera([*origin, *middle], (0, 0, 1), 40.0, (edge, edge * ASPECT[1] // ASPECT[0])))
+        painter.step()
+        count += 1
+    print(count)
+
+
+def measure_cost(size: ViewerSize) -> dict:
+    """How much slower is a fit while a viewer asks for one picture after another?"""
+    rows: dict[str, list[dict[str, float]]] = {"alone": [], "with a viewer": []}
+    pictures = 0
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        copy_example("demo", folder / "demo")
+        run_fit(folder, size)  # renders the references, compiles kernels
+        for _ in range(size.fits):
+            rows["alone"].append(run_fit(folder, size))
+            viewer = follow_program(Path(__file__), str(folder / "run"), str(size.edge), errors=folder / "viewer.txt")
+            next(viewer)
+            rows["with a viewer"].append(run_fit(folder, size))
+            pictures += int(next(viewer))
+    ratio = {
+        kind: float(np.median([row[kind] for row in rows["with a viewer"]]) / np.median([row[kind] for row in rows["alone"]]))
+        for kind in ("clock", "processor")
+    }
+    return {**ratio, "rows": rows, "pictures": pictures}
+
+
 def table(question: str, answer: dict) -> list[str]:
     """A line of Markdown."""
+    if question == "cost":
+        return [
+            f"a fit with a viewer takes {answer['clock']:.3f} of the time of one alone, {answer['processor']:.3f} of its "
+            f"processor time; {answer['pictures']} pictures in {len(answer['rows']['alone'])} fits"
+        ]
     times = f"{1000 * answer['clock']:.0f} ms of the clock, {1000 * answer['processor']:.0f} ms of the processor"
     return [f"{answer['name']}: {answer['width']} x {answer['height']} pixels in {times}"]
 
@@ -97,6 +176,12 @@ STUDY = Study(
     __name__,
     __doc__,
     ViewerSize,
-    {"gaussians": _question("balls.ply"), "grid": _question("field.npz"), "volume": _question("volume.nrrd")},
+    {"gaussians": _question("balls.ply"), "grid": _question("field.npz"), "volume": _question("volume.nrrd"),
+     "cost": measure_cost},
     table=table,
-)
+    promises={"cost": [Promise("time of a fit with a viewer, over one alone", ("clock",), AT_MOST, 1.05)]},
+)  # fmt: skip
+
+if __name__ == "__main__":
+    print("looking", flush=True)
+    look_at_run(Path(sys.argv[1]), int(sys.argv[2]))
