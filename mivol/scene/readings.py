@@ -62,7 +62,8 @@ class GridReading:
 
 
 def _read_once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
-    """Compute something once for each state of an array. The array is kept, so Dr.Jit cannot give its index to another array.
+    """Compute something once for each state of an array. The array is kept, so Dr.Jit cannot give its index to another array,
+    until :func:`release_unread`.
 
     While ``dr.freeze`` records, the result is computed anew: a recording cannot use arrays made before the recording.
     """
@@ -73,7 +74,14 @@ def _read_once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable
         made = make()
         survey.values = dict(list(survey.values.items())[-15:])
         survey.values[key] = (array, made)
+    survey.reads[-1].add(key)
     return survey.values[key][1]
+
+
+def release_unread(survey: SceneSurvey) -> None:
+    """Release the arrays that neither the present nor the previous render has read: those of earlier steps of a fit."""
+    survey.values = {key: kept for key, kept in survey.values.items() if any(key in reads for reads in survey.reads)}
+    survey.reads = [survey.reads[-1], set()]
 
 
 def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> GridReading:

@@ -25,6 +25,7 @@ from mivol.kernel_recording import CannotRecordError, Recordings, is_recording, 
 from mivol.scene.needs import find_needs, warn_of_clipped_view, warn_of_misplaced_grids
 from mivol.scene.plan import make_plan, read_parts
 from mivol.scene.previews import measure_lamp_noise, measure_media_light, measure_near_light, warn_of_last_order
+from mivol.scene.readings import release_unread
 from mivol.scene.refusals import parse_aovs
 from mivol.scene.render_tasks import (
     GradientTask,
@@ -235,6 +236,7 @@ class Session:
             opened.unrecorded = find_unrecorded(scene, sensor, spp, needs, plan, for_images)
         if not is_recording():
             self._opened[for_images] = opened
+            release_unread(survey)
         return opened
 
 

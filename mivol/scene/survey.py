@@ -78,6 +78,7 @@ class SceneSurvey:
         looked_up: stock grids whose interpolation agrees with mivol's, by pointer.
         scatters: whether each medium scattered at the last reading, by name.
         values, numbers: results of reading arrays and constants (:mod:`mivol.scene.readings`).
+        reads: keys of the values that the previous render and the present one have read.
         places: placements of grids (:func:`mivol.transport.media.medium_view.view_medium`).
         cosines: mean cosines of phase functions, by the name of the medium.
         warned: media and grids with a warning already given.
@@ -98,6 +99,7 @@ class SceneSurvey:
     looked_up: set = field(default_factory=set)
     scatters: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
+    reads: list[set] = field(default_factory=lambda: [set(), set()])
     places: dict = field(default_factory=dict)
     numbers: dict = field(default_factory=dict)
     cosines: dict = field(default_factory=dict)

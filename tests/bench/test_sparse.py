@@ -27,6 +27,7 @@ def test_bars_and_table() -> None:
         "memory": {
             "held_bytes": {"all": 219e6},
             "peak_bytes": {"gradient": 950e6},
+            "fit_over_medium": {"fit": 5.1, "fit by Adam": 7},
             "held_over_bricks": 1.03,
             "first_picture": {"both": 2.0},
         },
@@ -34,7 +35,7 @@ def test_bars_and_table() -> None:
         "fit": {"time": 0.4, "memory": 0.2},
     }
     met = [bar["met"] for name, a in answers.items() for bar in sparse.STUDY.bars(name, a)]
-    assert met == [False, False, True, False, False, True, True, True, True, True]
+    assert met == [False, False, True, False, False, False, True, True, True, True, True]
     assert sparse.tabulate("walk", walk)[2:] == [
         "| threads | 4.00 / 2.00 | 6.00 / 1.00 | 1.50 / 0.50 |",
         f"| smoke | skipped: {sparse.MISSING} | | |",

@@ -351,3 +351,20 @@ def test_memory_is_that_of_the_bricks() -> None:
     arrays = [voxels_of.data.array, voxels_of.table, voxels_of.distances, voxels_of.bricks]
     held = sum(dr.width(a) * dr.itemsize_v(type(a)) for a in arrays)
     assert held == 2 * 512 * 4 + 64**3 * 4 + (129**3 + 7) // 8 * 4 + 2 * 4
+
+
+def test_a_fit_keeps_no_values_of_earlier_steps() -> None:
+    """A reading keeps its array, so readings of earlier steps would hold their values."""
+    scene, integrator = (
+        smoke_scene(plugin(cut(patches(np.random.default_rng(0), (9, 9, 9)))), 2),
+        mi.load_dict({"type": "mivol"}),
+    )
+    params, key = mi.traverse(scene), INSIDE + "sigma_t.data"
+    for _ in range(4):
+        params[key] = dr.detach(params[key]) * 0.9
+        dr.make_opaque(params[key])
+        dr.enable_grad(params[key])
+        params.update()
+        dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=1), axis=None))
+    kept = integrator.session._surveyed.survey.values
+    assert {array.index for (kind, _), (array, _) in kept.items() if kind == "part"} == {dr.detach(params[key]).array.index}
