@@ -140,6 +140,9 @@ def sample_field(
     return SphericalGrid.from_rows(res, to_world, np.minimum(density, OPAQUE / edge), sh, stored, space=field.space)
 
 
+MOST_VOXELS = 1 << 30
+"""Largest number of voxels whose points are sampled."""
+
 GRID_NODES = 128
 """Default number of nodes along the longest edge of such a grid."""
 
@@ -167,9 +170,13 @@ def sample_voxels(
     """The voxels of a grid that hold matter of a field: flat numbers (n,), mean densities (n,), centres of mass (n, 3).
 
     Raises:
-        MivolError: no matter in the box.
+        MivolError: no matter in the box, or more than ``MOST_VOXELS``.
     """
     z, y, x = res
+    if x * y * z > MOST_VOXELS:
+        raise MivolError(
+            f"found {x} x {y} x {z} voxels to sample, expected at most {MOST_VOXELS}: give a smaller --resolution."
+        )
     edge = voxel_edge(res, to_world)
     numbers, densities, centres = [], [], []
     every = _nodes_near_matter(field, res, to_world) if isinstance(field, SphericalGrid) else np.arange(x * y * z)

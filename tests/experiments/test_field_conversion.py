@@ -132,6 +132,8 @@ def test_an_octree_has_leaves_that_many_fine_views_see(variant_rgb: str) -> None
         ("cloud.ply", "a.ply", ["--to", "octree"], "--to octree makes an .npz"),
         ("nested.npz", "a.npz", ["--to", "octree", "--resolution", "4096"], "at most 7 is expected"),
         ("nested.npz", "a.npz", ["--to", "grid", "--resolution", "1"], "expected at least 2"),
+        ("nested.npz", "a.npz", ["--to", "grid", "--resolution", "2048"], "expected at most 1073741824"),
+        ("grid.npz", "a.npz", ["--to", "octree", "--resolution", "-3"], "give 1 to 4096"),
         ("grid.npz", "a.npz", ["--to", "grid"], "is a grid of one box already"),
     ],
 )

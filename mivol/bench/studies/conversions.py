@@ -50,6 +50,7 @@ class ConversionSize(PhotoSize):
 
     edge: int = amount(200, 24, "longest edge of photographs and views [pixels]")
     models: tuple[str, ...] = amount(("grid", "nested grid", "octree", "hash grid", "NeRF", "Gaussians"), doc="sources")
+    targets: tuple[str, ...] = amount(tuple(KINDS), doc="targets")
     effort: float = amount(1.0, 0.02, "factor on the steps of all fits")
     longest: int = amount(0, 16, "nodes along the longest edge of the grids; 0: the presets'")
 
@@ -83,7 +84,7 @@ def measure_conversions(size: ConversionSize) -> dict:
             answer[name] = {"psnr": own, "targets": {}}
             say_row(name, psnr=own)
             for kind in KINDS:
-                if kind != name:
+                if kind != name and kind in size.targets:
                     row = convert_and_judge(source, kind, prepared.judged, size)
                     answer[name]["targets"][kind] = row
                     say_row(f"{name} to {kind}", **row)
