@@ -17,9 +17,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.back_end import free_memory
 from mivol.errors import MivolError
 from mivol.kernel_recording import copy_aligned, ensure_aligned, record_kernels
-from mivol.machine import available_memory
 from mivol.photos.camera import Camera
 from mivol.points import Gaussians
 from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
@@ -32,6 +32,9 @@ NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
 
 ENTRY_BYTES = 4 * (4 + LANES * PIXELS // CHUNK)
 """Memory of an entry of a list: the entry, its sorting, and T of the tile once in ``CHUNK`` entries."""
+
+SMALL_LISTS = 1 << 26
+"""Memory of lists [byte] up to which it is not compared with the free memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +237,10 @@ class Splatter:
 
     def _check_room(self, counts: np.ndarray) -> None:
         total = int(counts.sum(dtype=np.int64))
-        check_memory(total * ENTRY_BYTES, available_memory(), total, f"{int((counts > 0).sum()):,} Gaussians are visible")
+        needed = total * ENTRY_BYTES
+        # Asking for the free memory takes a tenth of the host's time of a small step.
+        free = free_memory() if needed > SMALL_LISTS else None
+        check_memory(needed, free, total, f"{int((counts > 0).sum()):,} Gaussians are visible")
 
     def _frame(self, lists: Lists, derivatives: bool) -> Frame:
         width, height = self.size

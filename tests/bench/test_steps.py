@@ -60,3 +60,12 @@ def test_a_study_counts_and_compares(tmp_path: Path) -> None:
 def test_a_scene_that_is_misspelt_is_named() -> None:
     with pytest.raises(MivolError, match='there is no scene "jade_null_sum": .*jade_null_sun'):
         study.measure_steps(False, study.StepsSize(scenes=("jade_null_sum",)))
+
+
+@pytest.mark.slow
+def test_steps_of_fits_have_a_peer_where_there_is_one() -> None:
+    answer = study.measure_fits(study.StepsSize(steps=1))
+    assert list(answer["rows"]) == ["a scene with Adam", "a grid", "Gaussians"]
+    assert answer["least_ratio"] == answer["rows"]["a scene with Adam"]["ratio"] > 0
+    assert all(row["milliseconds"]["mivol"] > 0 and row["launches"]["mivol"] > 10 for row in answer["rows"].values())
+    assert len(study.table("fits", answer)) == 5

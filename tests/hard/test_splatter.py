@@ -329,7 +329,8 @@ def test_quaternions_of_any_length(splatter: Splatter, camera: Camera, length: f
 def test_lists_that_do_not_fit_are_refused_with_their_size(splatter: Splatter, monkeypatch: pytest.MonkeyPatch) -> None:
     """The refusal comes before the lists are made. A Gaussian in a tile takes 80 bytes: an entry, its sorting, and T of 64
     pixels / 4."""
-    monkeypatch.setattr(module, "available_memory", lambda: 15 << 20)
+    monkeypatch.setattr(module, "free_memory", lambda: 15 << 20)
+    monkeypatch.setattr(module, "SMALL_LISTS", 7 << 20)
     made = []
     monkeypatch.setattr(splatter, "_write", lambda *args: made.append(args))
     arrays = {name: np.repeat(value, 10**5, axis=0) for name, value in stack([0.0], [0.0], 1e-4).items()}

@@ -1,6 +1,7 @@
 """How long does a step of an optimisation take beside its kernels, in a loop that a user writes?
 
     mivol bench steps                                        # half a minute on 2 idle cores
+    mivol bench steps --only fits                            # ten seconds: steps of mivol's own fits
     mivol bench steps --quick                                # ten seconds, two scenes, few steps
     mivol bench steps --scenes tutorial god_rays --sides 16 64 --spp 1 16
 
@@ -10,6 +11,9 @@ turns. On the smallest film kernels take no time, so a step shows the work of th
 
 The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth 6; the others are those of the study
 ``everyday``.
+
+fits: a step of the fit loop with its optimizer, schedule, priors and record, on tiny models: the density of ``tutorial`` with
+Adam (also through ``prbvolpath``), a radiance field of 24^3 nodes and 256 Gaussians, both from photographs of 24^2 pixels.
 
 Milliseconds are wall times: medians over the steps after the first ``WARM`` ones, in which both integrators compile. A ratio is
 the time of ``prbvolpath`` over the time of mivol, without regard to their noise (``mivol bench everyday`` compares errors).
@@ -22,6 +26,7 @@ import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -35,7 +40,21 @@ from mivol.bench.harness.study import Question, Size, Study, amount, ask
 from mivol.bench.scenes import box_scene
 from mivol.bench.studies.everyday import chosen_scenes
 from mivol.bench.studies.everyday.scenes import EverydayScene
+from mivol.experiments.gaussian_fit import make_start_cloud
+from mivol.optim.first_order import Adam
+from mivol.optim.gaussians.gaussian_plan import GaussianPlan, GaussianStage
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.parameters import Parameter
+from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import View
+from mivol.photos import Camera, Photo
+from mivol.photos.camera import intrinsics
 from mivol.report.figures import SERIES
+from mivol.splatting import Splatter
 
 PEER = "prbvolpath"
 TUTORIAL = EverydayScene(
@@ -101,25 +120,78 @@ def measure_steps(differentiates: bool, size: StepsSize) -> dict:
 
 
 def _contend(loops: dict[str, _Loop], size: StepsSize, differentiates: bool) -> dict:
-    seconds: dict[str, list[float]] = {name: [] for name in loops}
-    for loop in loops.values():
+    return race_steps({name: partial(loop.step, differentiates) for name, loop in loops.items()}, size.steps)
+
+
+def race_steps(steps: dict[str, Callable[[], object]], count: int) -> dict:
+    """Times, launches, and the ratio of times of steps that take turns; the ratio only if the peer takes part."""
+    seconds: dict[str, list[float]] = {name: [] for name in steps}
+    for step in steps.values():
         for _ in range(WARM):
-            loop.step(differentiates)
-    for _ in range(size.steps):
-        for name, loop in loops.items():
-            seconds[name].append(_time(loop.step, differentiates))
-    ratios = np.divide(seconds[PEER], seconds["mivol"])
-    return {
+            step()
+    for _ in range(count):
+        for name, step in steps.items():
+            seconds[name].append(_time(step))
+    row = {
         "milliseconds": {name: 1e3 * float(np.median(s)) for name, s in seconds.items()},
-        "ratio": float(np.median(ratios)),
-        "launches": {name: count_launches(lambda loop=loop: loop.step(differentiates)) for name, loop in loops.items()},
+        "launches": {name: count_launches(step) for name, step in steps.items()},
     }
+    return row | {"ratio": float(np.median(np.divide(seconds[PEER], seconds["mivol"])))} if PEER in steps else row
 
 
-def _time(step: Callable[[bool], None], differentiates: bool) -> float:
+def _time(step: Callable[[], object]) -> float:
     start = time.perf_counter()
-    step(differentiates)
+    step()
     return time.perf_counter() - start
+
+
+PHOTO_SIDE, PHOTOS = 24, 6
+"""Edge [pixels] and number of the photographs of tiny fits."""
+
+
+def measure_fits(size: StepsSize) -> dict:
+    """Time steps of fits of tiny models."""
+    scenes = {name: _begin_scene_fit(name) for name in (PEER, "mivol")}
+    photos = _photograph_cloud()
+    grid = RadiancePlan((RadianceStage(24, 1000, 1, 4),), degree=1)
+    field = RadianceProblem(RayBatches.from_photos(photos, (1,)), np.array([[-1.0] * 3, [1.0] * 3]), grid)
+    plan = GaussianPlan((GaussianStage(PHOTO_SIDE, 1000, 1, 1),), start=256, most=256)
+    cloud = make_start_cloud(_draw_places(256, 1), photos, plan.degree)
+    gaussians = GaussianProblem(RayBatches.from_photos(photos, (1,)), [photo.camera for photo in photos], cloud, plan)
+    rows = {"a scene with Adam": race_steps({name: fit.advance for name, fit in scenes.items()}, size.steps)}
+    for name, problem, optimizer in (("a grid", field, grid.optimizer), ("Gaussians", gaussians, plan.optimizer)):
+        rows[name] = race_steps({"mivol": begin_fit(problem, optimizer, 1000).advance}, size.steps)
+    return {"rows": rows, "least_ratio": rows["a scene with Adam"]["ratio"]}
+
+
+def _begin_scene_fit(name: str) -> Fit:
+    scene = TUTORIAL.load(4)
+    view = View("view", scene.sensors()[0], mi.TensorXf(np.ones((4, 4, 3), np.float32)))
+    parameter = Parameter(TUTORIAL.parameter, domain=(0.0, np.inf), lr=1e-3)
+    return begin_fit(SceneProblem(scene, [view], [parameter], TUTORIAL.integrator(name), spp=1), Adam(), 1000)
+
+
+def _draw_places(count: int, seed: int) -> np.ndarray:
+    """Points on a sphere of radius 0.6."""
+    drawn = np.random.default_rng(seed).normal(size=(count, 3))
+    return 0.6 * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def _photograph_cloud() -> list[Photo]:
+    """Photographs of opaque Gaussians on a sphere, over white."""
+    cloud, white = make_start_cloud(_draw_places(120, 5), [], 0), np.ones(3, np.float32)
+    cloud["opacity_logits"][:] = 3
+    cloud["harmonics"][:, 0] = 1.5 * np.sin(5 * cloud["means"])
+    tensors = {name: mi.TensorXf(array) for name, array in cloud.items()}
+    found = []
+    for k in range(PHOTOS):
+        pose = np.array(mi.ScalarTransform4f().look_at([3 * np.cos(k), 3 * np.sin(k), 1], [0, 0, 0], [0, 0, 1]).matrix)
+        # Photographs look along -z of their pose, Mitsuba's sensors along +z.
+        pose[:3, [0, 2]] *= -1
+        camera = Camera(intrinsics(30, 30, PHOTO_SIDE / 2, PHOTO_SIDE / 2), (PHOTO_SIDE, PHOTO_SIDE), pose)
+        seen = np.clip(np.array(Splatter(PHOTO_SIDE, PHOTO_SIDE, 0).forward(tensors, camera, derivatives=False)[0]), 0, 1)
+        found.append(Photo(f"view {k}", seen[..., :3] + 1 - seen[..., 3:], seen[..., 3], None, camera, white))
+    return found
 
 
 def count_launches(call: Callable[[], None]) -> int:
@@ -142,8 +214,11 @@ def table(question: str, answer: dict) -> list[str]:
     lines = [f"| scene, film | {PEER} [ms] | mivol [ms] | ratio | launches |", "|---|---|---|---|---|"]
     for name, row in answer["rows"].items():
         ms, launches = row["milliseconds"], row["launches"]
-        counts = f"{launches[PEER]} / {launches['mivol']}"
-        lines.append(f"| {name} | {ms[PEER]:.3g} | {ms['mivol']:.3g} | {row['ratio']:.3g} | {counts} |")
+        if PEER in ms:
+            counts = f"{launches[PEER]} / {launches['mivol']}"
+            lines.append(f"| {name} | {ms[PEER]:.3g} | {ms['mivol']:.3g} | {row['ratio']:.3g} | {counts} |")
+        else:
+            lines.append(f"| {name} | | {ms['mivol']:.3g} | | {launches['mivol']} |")
     return lines
 
 
@@ -153,7 +228,7 @@ def draw(answers: dict, path: Path) -> None:
         panels = np.atleast_1d(figure.subplots(1, len(answers)))
         for axes, (question, answer) in zip(panels, answers.items(), strict=True):
             for who, colour in zip((PEER, "mivol"), SERIES, strict=False):
-                values = [row["milliseconds"][who] for row in answer["rows"].values()]
+                values = [row["milliseconds"].get(who, np.nan) for row in answer["rows"].values()]
                 axes.plot(values, np.arange(len(values)), "o", color=colour, label=who)
             axes.set_yticks(np.arange(len(answer["rows"])), list(answer["rows"]), fontsize=7)
             axes.set(xscale="log", xlabel="wall time of a step [ms]", title=question)
@@ -164,6 +239,7 @@ def draw(answers: dict, path: Path) -> None:
 QUESTIONS: dict[str, Question] = {
     "images": ask("How long does a step with an image take?", measure_steps, False),
     "gradients": ask("How long does a step with an image and its gradient take?", measure_steps, True),
+    "fits": ask("How long does a step of a fit take?", measure_fits),
 }
 
 STUDY = Study(__name__, __doc__, StepsSize, QUESTIONS, compare, draw, table)
