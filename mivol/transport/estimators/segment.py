@@ -16,9 +16,10 @@ References: Novak et al. 2014 (ratio tracking).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.lighting.shadow_rays import estimate_transmittance
@@ -39,6 +40,7 @@ __all__ = [
     "Absorption",
     "Collision",
     "FlightPoint",
+    "KnownFlight",
     "PathSegment",
     "SegmentEstimate",
     "SegmentEstimator",
@@ -64,6 +66,7 @@ class PathSegment:
         is_side_flight: a flight beside the path (:mod:`mivol.transport.path.side_flight`).
         emission_weight: weight of the emission of media along the segment, if the origin has sampled their emission too [1];
             None means a weight of 1.
+        known: flights found before, for estimators whose segments end in media; None without such flights.
     """
 
     ray: Ray
@@ -74,6 +77,30 @@ class PathSegment:
     depth: mi.UInt32
     is_side_flight: bool = False
     emission_weight: mi.Float | None = None
+    known: KnownFlight | None = None
+
+
+@dataclass
+class KnownFlight:
+    """The first collision along a segment, found before the path follows the segment.
+
+    Attributes:
+        t: distance of the collision on the ray [length]; infinite without a collision.
+        body: index of its medium.
+        on: lanes in which the collision is known.
+    """
+
+    t: mi.Float64
+    body: mi.UInt32
+    on: mi.Bool
+
+    def at(self, index: mi.UInt32, active: mi.Bool) -> KnownFlight:
+        """The flights of other lanes, known where ``active``."""
+        return KnownFlight(dr.gather(mi.Float64, self.t, index, active), dr.gather(mi.UInt32, self.body, index, active), active)
+
+    def forget(self) -> KnownFlight:
+        """The same in no lane."""
+        return replace(self, on=dr.full(mi.Bool, False, dr.width(self.on)))
 
 
 @dataclass

@@ -18,6 +18,7 @@ import mitsuba as mi
 
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import Primal
+from mivol.transport.estimators.segment import KnownFlight
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.walk import Path, advance_path, film_alpha, gather_lanes, leave_camera, start_path
 from mivol.transport.traversal.random_numbers import SpreadSampler
@@ -39,19 +40,22 @@ class _PathStarts:
         ray: camera rays, ended at the sensor's ``far_clip``.
         medium: media around their origins.
         sampler: random numbers of each path.
+        known: flights of the camera rays; None if they are drawn with the segment.
     """
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
     sampler: SpreadSampler
+    known: KnownFlight | None
 
-    def gather(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, SpreadSampler]:
-        """Gather ray, medium and sampler of paths by their numbers."""
+    def gather(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, SpreadSampler, KnownFlight | None]:
+        """Gather ray, medium, sampler and flight of paths by their numbers."""
         ray = self.ray
         o, d, maxt, time = (gather_lanes(values, index, active) for values in (ray.o, ray.d, ray.maxt, ray.time))
         sampler = self.sampler.gather(index, active)
         ray = mi.Ray3f(o, d, maxt, time, ray.wavelengths)
-        return ray, gather_lanes(self.medium, index, active), sampler
+        known = None if self.known is None else self.known.at(index, active)
+        return ray, gather_lanes(self.medium, index, active), sampler, known
 
 
 def paths_per_lane(limit: int, paths: int) -> int:
@@ -74,11 +78,13 @@ def walk_successively(
     Returns:
         The radiance and the alpha (in [0, 1]) of each path.
 
-    Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`. Memory: 12 numbers a path, 30 with tabulated shadows.
+    Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`. Memory: 16 numbers a path, 34 with tabulated shadows.
     """
     n = dr.width(ray)
     lanes, per_lane = -(-n // count), dr.opaque(mi.UInt32, count)
-    starts = _PathStarts(clip_camera_ray(ray), estimators.media.medium_at(ray), sampler.clone())
+    clipped, medium, sampler = clip_camera_ray(ray), estimators.media.medium_at(ray), sampler.clone()
+    known = estimators.segment.find_first_collision(clipped, medium, sampler, dr.full(mi.Bool, True, n))
+    starts = _PathStarts(clipped, medium, sampler, known)
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
     kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
     dr.eval(starts, L, alpha, kept)
@@ -86,8 +92,9 @@ def walk_successively(
     end = dr.minimum(index + per_lane, dr.opaque(mi.UInt32, n))
 
     def start(index: mi.UInt32, active: mi.Bool) -> Path:
-        ray, medium, sampler = starts.gather(index, active)
+        ray, medium, sampler, known = starts.gather(index, active)
         path = start_path(estimators, ray, Primal(dr.zeros(mi.Spectrum, lanes)), sampler, active)
+        path.known = known
         return leave_camera(estimators, path, medium)
 
     def advance(path: Path, index: mi.UInt32) -> tuple[Path, mi.UInt32]:

@@ -33,7 +33,7 @@ from mivol.transport.estimators.lighting.direct_lighting import (
 )
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
-from mivol.transport.estimators.segment import Collision, PathSegment
+from mivol.transport.estimators.segment import Collision, KnownFlight, PathSegment
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import to_components
 from mivol.transport.path.estimators import Estimators
@@ -106,6 +106,7 @@ class Path:
         emission_pdf: ``pdf`` in lanes where ``last`` has sampled the emission of media too, 0 in other lanes [1/sr]; None if
             media emission is never sampled.
         left_medium: lanes in which ``last`` is a point of a medium; None if vertices draw the light of near emitters.
+        known: flights of camera rays, for the first segment of the path; None if they are drawn with the segment.
     """
 
     ray: FineRay
@@ -127,6 +128,7 @@ class Path:
     emitter_sample: WeightedEmitterSample | None = None
     emission_pdf: mi.Float | None = None
     left_medium: mi.Bool | None = None
+    known: KnownFlight | None = None
 
 
 @dataclass
@@ -206,6 +208,13 @@ def leave_camera(estimators: Estimators, path: Path, medium: mi.MediumPtr) -> Pa
     return _sample_first_emitter(estimators, path)
 
 
+def find_first_collision(estimators: Estimators, path: Path) -> Path:
+    """Find the collisions of paths leaving the camera before their first segments, where that lowers the noise."""
+    if estimators.segment.ends_in_media:
+        path.known = estimators.segment.find_first_collision(path.ray, path.medium, path.sampler, path.active)
+    return path
+
+
 def has_one_segment(estimators: Estimators) -> bool:
     """Whether every path has one segment: no surfaces, or depth 1 and no surface transmitting light without deviation."""
     media = estimators.media
@@ -262,7 +271,7 @@ def walk_path(
         path = _add_emitted_light(estimators, path, event)
         path.is_opaque |= event.at_surface
         return path.score, film_alpha(path)
-    path = _start_reservoirs(estimators, path, "first", "later")
+    path = find_first_collision(estimators, _start_reservoirs(estimators, path, "first", "later"))
     path = _add_reservoirs(estimators, _walk_to_end(estimators, path))
     return path.score, film_alpha(path)
 
@@ -279,7 +288,7 @@ def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: S
     """
     media, n = estimators.media, dr.width(ray)
     path = start_path(estimators, clip_camera_ray(ray), score, sampler, dr.full(mi.Bool, True, n))
-    path = leave_camera(estimators, path, media.medium_at(ray))
+    path = find_first_collision(estimators, leave_camera(estimators, path, media.medium_at(ray)))
     path = _start_reservoirs(estimators, path, *(("first", "later") if media.has_surfaces else ("first",)))
 
     def advance(path: Path, first: FirstCollision) -> tuple[Path, FirstCollision]:
@@ -345,6 +354,8 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
     samples = estimators.segment.draw(path.sampler, may_scatter)
     # Copies: throughput and depth change in place below, and derivatives read the values at the start of the segment later.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples, mi.UInt32(path.depth))
+    if path.known is not None:
+        segment.known, path.known = path.known, path.known.forget()
     if estimators.emission is not None:
         segment.emission_weight = estimators.emission.weigh_path(path.last, path.emission_pdf, path.ray.d, path.active)
     estimate = estimators.segment.estimate(segment, path.score.purpose, path.active)
