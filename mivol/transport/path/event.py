@@ -115,7 +115,7 @@ class DirectionSamples:
     Attributes:
         component: uniform random number in [0, 1) for the component of the BSDF or phase function.
         direction: two uniform random numbers in [0, 1) for the direction.
-        aimed: directions around a near emitter, drawn for a share of the samples; None for no such directions.
+        aimed: directions around emitters, drawn for a share of the samples (lobes in media only); None for no such directions.
     """
 
     component: mi.Float
@@ -156,7 +156,7 @@ def _sample_bsdf(
     media, si = estimators.media, event.si
     bsdf = si.bsdf()
     sample, weight = bsdf.sample(mi.BSDFContext(), si, samples.component, samples.direction, event.at_surface)
-    if samples.aimed is not None:
+    if samples.aimed is not None and samples.aimed.cosine is None:
         sample, weight = _mix_bsdf(si, sample, weight, samples, event.at_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
     # A sampled direction of density 0 has weight 0; its path ends at the roulette, where beta is 0.

@@ -8,6 +8,11 @@ direct light at x' has the weight p / (p + q), and the light at the end of the s
 
 All emitters are at infinity, so w has the same density at x' and at x.
 
+Light scattered three times and more comes from many directions, most of them near w. So a share of the path's own directions
+is drawn from a lobe about w too, and p is the density of the mixture. This lobe is wider: the mean cosine after two
+scatterings is the product of both. The throughput grows by at most 1 / (1 - ``AIMED_SHARE``) at a vertex, and paths with a
+throughput above 1 draw from the phase function alone.
+
 For derivatives, a side flight is walked back like the path's own flights, and its shadow ray is offered to the path's
 reservoir. Only the probes of the path estimate derivatives in regions without extinction
 (:mod:`mivol.transport.estimators.flights.flight_derivatives`), since the points of probes are drawn without these weights.
@@ -28,6 +33,7 @@ from mivol.transport.estimators.lighting.tabulated_shadows import TabulatedShado
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.scores import IMAGE, Factor, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
+from mivol.transport.estimators.single_scattering.near_light import AimedDirections
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay
 
@@ -36,9 +42,16 @@ __all__ = [
     "SideFlightLight",
     "SideFlightSamples",
     "WeightedEmitterSample",
+    "aim_at_emitter",
     "estimate_side_flight",
     "weigh_emitter_sample",
 ]
+
+
+AIMED_SHARE = 0.1
+"""Share of the directions at a vertex that are drawn about the emitter sample [1]. (Variance over the variance without them, at
+0.07, 0.1, 0.15 and 0.25: 0.53, 0.50, 0.49 and 0.76 in a smoke of optical depth 20 with a mean cosine of 0.8 under a sun, and
+0.99, 1.02, 1.07 and 1.22 in a cloud of albedo 0.999.)"""
 
 
 @dataclass
@@ -109,6 +122,7 @@ def estimate_side_flight(
     beta: mi.Spectrum,
     depth: mi.UInt32,
     sample: DistantEmitterSample,
+    aimed: AimedDirections,
     numbers: SideFlightSamples,
     purpose: str,
     active: mi.Bool,
@@ -121,6 +135,7 @@ def estimate_side_flight(
         beta: throughput up to the vertex [1].
         depth: number of scattering events before the vertex.
         sample: emitter sample, used by the next vertex of the path too.
+        aimed: share of the path's own directions drawn about the emitter.
         numbers: random numbers.
         purpose: IMAGE, REVERSE or FORWARD; values stay attached for derivatives.
         active: lanes whose path may scatter at the vertex and once more.
@@ -137,7 +152,7 @@ def estimate_side_flight(
     vertex = MediumVertex(media, mei, collision.p)
     f, p = vertex.eval_and_pdf(wo, active)
     # beta albedo f / q, times the weight q / (p + q): q cancels.
-    weight = beta * collision.albedo * dr.rcp(p + eval_hg(angle_between(-w, wo), estimators.lobe))
+    weight = beta * collision.albedo * dr.rcp(aimed.mix(p, wo) + eval_hg(angle_between(-w, wo), estimators.lobe))
 
     # -- The flight ------------------------------------------------------------------------------------------------------
     ray = FineRay.from_point(collision.p, wo, mei)
@@ -159,6 +174,22 @@ def estimate_side_flight(
     shadow = DirectLight(media, direct.ray_segment, value, lit)
     tabulated = None if direct.shadow is None else direct.shadow.times(flown)
     return SideFlight(light, shadow, flight.chance, tabulated)
+
+
+def aim_at_emitter(
+    estimators: Estimators, sample: DistantEmitterSample, beta: mi.Spectrum, u: mi.Float, active: mi.Bool
+) -> AimedDirections:
+    """Draw a share of the path's directions about an emitter sample.
+
+    Args:
+        estimators: estimators of the render.
+        sample: emitter sample.
+        beta: throughput up to the vertex [1].
+        u: uniform random number in [0, 1) that chooses such a direction.
+        active: lanes with a side flight at the vertex; the share is 0 in other lanes.
+    """
+    share = dr.select(active & (dr.max(beta) <= 1), mi.Float(AIMED_SHARE), 0)
+    return AimedDirections([_direction_to_emitter(sample)], [share], u, dr.square(estimators.lobe))
 
 
 def weigh_emitter_sample(

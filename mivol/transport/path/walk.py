@@ -34,6 +34,7 @@ from mivol.transport.estimators.lighting.direct_lighting import (
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, KnownFlight, PathSegment
+from mivol.transport.estimators.single_scattering.near_light import AimedDirections
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import to_components
 from mivol.transport.path.estimators import Estimators
@@ -41,6 +42,7 @@ from mivol.transport.path.event import DirectionSamples, PathEvent, sample_next_
 from mivol.transport.path.side_flight import (
     SideFlightSamples,
     WeightedEmitterSample,
+    aim_at_emitter,
     estimate_side_flight,
     weigh_emitter_sample,
 )
@@ -414,11 +416,14 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     if path.emitter_sample is not None:
         flies_aside = event.in_medium & (path.depth + 2 < limit)
         emitter_sample = _sample_distant_emitter(estimators, path.ray, sampler, arrives)
-        path = _add_side_flight(estimators, path, event, emitter_sample, flies_aside)
+        aimed = aim_at_emitter(estimators, emitter_sample, path.beta, sampler.next_1d(arrives), flies_aside)
+        path = _add_side_flight(estimators, path, event, emitter_sample, aimed, flies_aside)
 
     # -- The next direction --------------------------------------------------------------------------------------------
     samples = DirectionSamples(sampler.next_1d(arrives), sampler.next_2d(arrives))
-    if estimators.near is not None and estimators.near.aims:
+    if path.emitter_sample is not None:
+        samples.aimed = aimed
+    elif estimators.near is not None and estimators.near.aims:
         # The last segment of a path finds emitters by chance only.
         aims = may_scatter & (path.depth + 2 < limit)
         p = mi.Point3f(event.vertex(estimators.media).interaction.p)
@@ -428,9 +433,8 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     for factor in onward.factors:
         path.score = path.score.scale(factor)
     if path.emitter_sample is not None:
-        path.emitter_sample = weigh_emitter_sample(
-            estimators, emitter_sample, onward.ray.d, onward.pdf, flies_aside & onward.on
-        )
+        pdf = aimed.mix(onward.pdf, onward.ray.d)
+        path.emitter_sample = weigh_emitter_sample(estimators, emitter_sample, onward.ray.d, pdf, flies_aside & onward.on)
     path.beta *= dr.select(onward.on, onward.weight, 0)
     path.eta *= dr.select(onward.on, onward.eta, 1)
     path.ray, path.medium = onward.ray, dr.select(onward.on, onward.medium, path.medium)
@@ -574,13 +578,20 @@ def _sample_distant_emitter(
 
 
 def _add_side_flight(
-    estimators: Estimators, path: Path, event: PathEvent, sample: DistantEmitterSample, active: mi.Bool
+    estimators: Estimators,
+    path: Path,
+    event: PathEvent,
+    sample: DistantEmitterSample,
+    aimed: AimedDirections,
+    active: mi.Bool,
 ) -> Path:
     """Add the light of an emitter sample that reaches the path through the end of a side flight."""
     sampler = path.sampler
     lobe, flight = sampler.next_2d(active), estimators.segment.draw(sampler, active)
     samples = SideFlightSamples(lobe, flight, draw_state(sampler, active) if estimators.draws_shadows else None)
-    side = estimate_side_flight(estimators, event.collision, path.beta, path.depth, sample, samples, path.score.purpose, active)
+    side = estimate_side_flight(
+        estimators, event.collision, path.beta, path.depth, sample, aimed, samples, path.score.purpose, active
+    )
     path.score = path.score.add(side.light)
     if path.shadow is not None:
         path.shadow = path.shadow.offer(side.shadow, side.chance)

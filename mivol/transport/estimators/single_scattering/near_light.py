@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mivol.phase.closed_forms import angle_between, eval_hg, sample_hg, scattered_direction
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting
 from mivol.transport.estimators.lighting.emitters import join_arrays
 from mivol.transport.estimators.lighting.shadow_rays import segment_transmittance
@@ -77,11 +78,13 @@ class AimedDirections:
         axes: direction towards each emitter.
         shares: probability of a direction around each emitter [1].
         u: uniform random number in [0, 1) that chooses one of them, or none.
+        cosine: mean cosine of a Henyey-Greenstein lobe around each axis; None for the density of near emitters.
     """
 
     axes: list[mi.Vector3f]
     shares: list[mi.Float]
     u: mi.Float
+    cosine: mi.Float | None = None
 
     @property
     def share(self) -> mi.Float:
@@ -99,13 +102,16 @@ class AimedDirections:
         for other, share in zip(self.axes[1:], self.shares[1:], strict=True):
             axis = dr.select(self.u >= below, other, axis)
             below = below + share  # a copy: += would change the share
+        if self.cosine is not None:
+            return scattered_direction(-axis, sample_hg(u.x, self.cosine), u.y)
         sin_theta, cos_theta = dr.sincos(dr.pi * (1 - dr.sqrt(1 - u.x)))
         sin_phi, cos_phi = dr.sincos(dr.two_pi * u.y)
         return mi.Frame3f(axis).to_world(mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta))
 
-    @staticmethod
-    def pdf(axis: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
+    def pdf(self, axis: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
         """Density of a direction drawn around an axis [1/sr]."""
+        if self.cosine is not None:
+            return eval_hg(angle_between(-axis, d), self.cosine)
         sine = dr.norm(dr.cross(d, axis))
         return (dr.pi - dr.atan2(sine, dr.dot(d, axis))) / (dr.pi**3 * dr.maximum(sine, MIN_SINE))
 
