@@ -3,7 +3,9 @@ r"""Side flights from the middle of a ball of fog under a sun, against quadratur
 Everything depends on the cosine c of the angle to the sun: with the densities p of the phase function and q of the lobe, and
 the length s(t, c) of the shadow ray from the distance t,
 
-.. math:: L = \alpha^2 E\, 2\pi \int_{-1}^1 \frac{q}{p + q}\, p\, p \int_0^R \sigma e^{-\sigma (t + s)}\,dt\,dc
+.. math:: L = \alpha^2 E\, 2\pi \int_{-1}^1 \frac{q}{m + q}\, p\, p \int_0^R \sigma e^{-\sigma (t + s)}\,dt\,dc
+
+The path itself draws its directions with the density m: p mixed with a wider lobe about the sun.
 """
 
 from __future__ import annotations
@@ -20,8 +22,15 @@ from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, 
 from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import Collision
 from mivol.transport.media.body import medium_interaction
+from mivol.transport.path import side_flight
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.side_flight import SideFlightSamples, estimate_side_flight, weigh_emitter_sample
+from mivol.transport.path.side_flight import (
+    AIMED_SHARE,
+    SideFlightSamples,
+    aim_at_emitter,
+    estimate_side_flight,
+    weigh_emitter_sample,
+)
 from mivol.transport.traversal.random_numbers import draw_state
 from mivol.validate.moments import Moments
 from scenes import ball_of, camera, media_of, medium
@@ -52,26 +61,28 @@ def of_cosine(c: np.ndarray, g: float) -> np.ndarray:
 
 
 @pytest.mark.statistical
-def test_light_at_the_end_of_a_side_flight():
+def test_light_at_the_end_of_a_side_flight(monkeypatch):
+    monkeypatch.setattr(side_flight, "AIMED_SHARE", 0.8)  # a larger share, to be seen in the mean
     estimators, hit = middle()
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(fresh(1), N)
     samples = SideFlightSamples(sampler.next_2d(), (sampler.next_1d(), draw_state(sampler)), None)
     with dr.suspend_grad():
         aim = DistantEmitterSample.from_sample(estimators.direct.sample_emitter(hit.mei, mi.Point2f(0.5), hit.on))
-        found = estimate_side_flight(
-            estimators, hit, mi.Spectrum(0.5, 1, 2), mi.UInt32(0), aim, samples, IMAGE, dr.arange(mi.UInt32, N) > 0
-        )
+        beta, on = mi.Spectrum(0.5, 1, 1), dr.arange(mi.UInt32, N) > 0
+        aimed = aim_at_emitter(estimators, aim, beta, mi.Float(0), on)
+        found = estimate_side_flight(estimators, hit, beta, mi.UInt32(0), aim, aimed, samples, IMAGE, on)
     value = np.array(found.light.value, np.float64)
     (c, wc), (t, wt) = gauss(64), gauss(64)
     t, wt = 0.5 * (t + 1), 0.5 * wt
     s = -t * c[:, None] + np.sqrt(1 - t**2 * (1 - c[:, None] ** 2))
     inner = (SIGMA * np.exp(-SIGMA * (t + s))) @ wt
     p, q = of_cosine(c, G), of_cosine(c, LOBE)
-    exact = ALBEDO**2 * SUN * 2 * np.pi * np.sum(wc * q / (p + q) * p * p * inner)
+    mixed = 0.2 * p + 0.8 * of_cosine(c, LOBE**2)
+    exact = ALBEDO**2 * SUN * 2 * np.pi * np.sum(wc * q / (mixed + q) * p * p * inner)
     # The ball is traced: its surface is known to 1e-5, and one lane of all is off.
     assert_same_mean(
-        Moments.from_values(value.T), exact * np.array([0.5, 1, 2]), rounding=(1e-5 + 1 / N) * exact, what="the light"
+        Moments.from_values(value.T), exact * np.array([0.5, 1, 1]), rounding=(1e-5 + 1 / N) * exact, what="the light"
     )
     assert not value[:, 0].any()
 
@@ -87,3 +98,24 @@ def test_the_next_vertex_counts_by_the_balance_heuristic():
     # The cosine is rounded to 2^-24 twice, and the relative slope of HG by it is 3 g / (1 - g)^2 = 60 at most.
     np.testing.assert_allclose(np.array(aim.weight)[10:], expected[10:], rtol=60 * 2.0**-23)
     assert np.all(np.array(aim.weight)[:10] == 1) and aim.sample is sample
+
+
+@pytest.mark.parametrize(("beta", "share"), [(0.5, AIMED_SHARE), (1.0, AIMED_SHARE), (1.01, 0.0)])
+def test_directions_are_aimed_while_the_throughput_is_low(beta, share):
+    """A share of the directions lies in a lobe about the sun; a path whose throughput has grown draws none."""
+    estimators, hit = middle()
+    sample = DistantEmitterSample.from_sample(estimators.direct.sample_emitter(hit.mei, mi.Point2f(0.5), hit.on))
+    u = (np.arange(N) + 0.5) / N
+    aimed = aim_at_emitter(estimators, sample, mi.Spectrum(0.1, beta, 0.2), mi.Float(u), dr.arange(mi.UInt32, N) > 9)
+    np.testing.assert_array_equal(np.array(aimed.is_drawn)[10:], u[10:] < np.float32(share))
+    assert not np.array(aimed.is_drawn)[:10].any()
+    d = aimed.draw(mi.Point2f(mi.Float(u), 0.3))
+    c = np.array(d.z, np.float64)
+    # The share of directions with a cosine below c is u. Its slope by c is at most (1 - g^2) / (2 (1 - g)^3) < 7, and c
+    # has some roundings of 2^-24.
+    g = LOBE**2
+    below = (1 - g * g) / (2 * g) * (1 / np.sqrt(1 + g * g - 2 * g * c) - 1 / (1 + g))
+    np.testing.assert_allclose(below, u, atol=7 * 8 * 2.0**-24)
+    p = of_cosine(c, G)
+    mixed = np.array(aimed.mix(mi.Float(p), d), np.float64)
+    np.testing.assert_allclose(mixed[10:], ((1 - share) * p + share * of_cosine(c, LOBE**2))[10:], rtol=1e-4)

@@ -19,6 +19,7 @@ from scattering_scenes import PLACE, aimed, assert_same_images, cases, close_up,
 import scenes
 from mivol.experiments.script import explain
 from mivol.transport.estimators.flights import tracking
+from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.flights.tracking import (
     LOOKUP_RATE,
     delta_tracking,
@@ -26,14 +27,17 @@ from mivol.transport.estimators.flights.tracking import (
     ratio_tracking,
     residual_ratio_tracking,
 )
+from mivol.transport.estimators.scores import IMAGE
+from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.grid_integral import integrate_segment
 from mivol.transport.traversal.grid_blocks import find_block_ranges
 from mivol.transport.traversal.lattice import Lattice, clip_to_grid
-from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, seed_pcg32
+from mivol.transport.traversal.rays import FineRay
 from mivol.validate.moments import Moments
-from scenes import as_float32, make_lattice, refused
+from scenes import as_float32, make_lattice, media_of, refused
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -289,6 +293,40 @@ def test_every_collision_is_real_where_blocks_have_one_value():
     expected[expected > end] = np.inf
     # The lengths of 15 blocks, and as many optical depths, are subtracted from numbers of up to 16.
     np.testing.assert_allclose(np.array(t), expected, atol=15 * 16 * 2.0**-24 / 0.8)
+
+
+def test_camera_rays_spread_their_collisions():
+    """Of 64 samples of a pixel, each has the collision of a stratum of [0, 1) of its own: as many collide as the opacity says.
+
+    The estimate of the first segment then takes the collision as it is, and the next segment draws its own.
+    """
+    values, count = rough_grid(1, 2.0, (9, 12, 17)), 64
+    scene = close_up({"smoke": smoke(values, 0.5)[0], "lamp": point([0, 0, 9.0])[0]}, res=2)
+    flights = FreeFlight(media_of(scene))
+    (part,) = flights.bodies[0].view.parts
+    part.lattice.block_ranges = find_block_ranges(part.lattice.values, 2)
+    lane = dr.arange(mi.UInt32, count)
+    sampler = SpreadSampler.of_pixels(mi.Vector2i(3, 5), mi.UInt32(1), lane, mi.UInt32(count))
+    one = mi.Ray3f(ray().o, ray().d, mi.Float(dr.inf), mi.Float(0), mi.Color0f())
+    many = dr.gather(mi.Ray3f, one, dr.zeros(mi.UInt32, count))
+    on, outside = dr.full(mi.Bool, True, count), dr.zeros(mi.MediumPtr, count)
+    with dr.suspend_grad():
+        known = flights.find_first_collision(many, outside, sampler, on)
+        segment = PathSegment(FineRay.from_ray(many), outside, dr.full(mi.Spectrum, 1, count), on, flights.draw(sampler, on),
+                              dr.zeros(mi.UInt32, count), known=known)  # fmt: skip
+        first = flights.estimate(segment, IMAGE, on).collision
+        segment.known = known.forget()
+        again = flights.estimate(segment, IMAGE, on).collision
+    t, tau = np.array(known.t), depths(values, known.t, 0.0) / SCALE
+    u = np.where(np.isfinite(t), -np.expm1(-tau), np.nan)
+    opacity = -np.expm1(-tau_twin(values, PLACE, START, D)[0])
+    # Optical depths of about 1 are known to 1e-5.
+    hit = np.flatnonzero(np.isfinite(u))
+    assert np.all(hit / count - 1e-5 < u[hit]) and np.all(u[hit] < (hit + 1) / count + 1e-5)
+    assert np.all(np.diff(hit) == 1) and abs(len(hit) - opacity * count) <= 1 and 20 < len(hit) < 60
+    np.testing.assert_array_equal(np.array(first.on), np.isfinite(t))
+    np.testing.assert_array_equal(np.array(first.t)[hit], t[hit])
+    assert np.mean(np.array(again.t)[hit] == t[hit]) < 0.1
 
 
 def test_lanes_that_are_off_and_vacuum_have_no_collision():
