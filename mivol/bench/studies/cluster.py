@@ -97,8 +97,14 @@ def measure_reference(size: ClusterSize) -> dict:
             alone = measure(pool, lambda n=number: render_photographs(loaded, folder / f"one{n}", progress=False, **options))
             both = measure(pool, lambda n=number: render_photographs(loaded, folder / f"two{n}", complete=complete, **options))
             slowest = max(max(both["workers"]), (sum(both["workers"]) + both["owner"]) / 2)
-            found.append({"one": alone["owner"], "two": slowest, "wall": [alone["wall"], both["wall"]]})
-    return {"rounds": found[1:], "ratio": float(np.median([row["two"] / row["one"] for row in found[1:]]))}
+            share = {"owner": both["owner"] / alone["owner"], "workers": sum(both["workers"]) / alone["owner"]}
+            uneven = max(both["workers"]) / (sum(both["workers"]) / 2)
+            row = {"one": alone["owner"], "two": slowest, "wall": [alone["wall"], both["wall"]]}
+            found.append(row | share | {"ratio": slowest / alone["owner"], "uneven": uneven})
+    found = found[1:]
+    return {"rounds": found} | {
+        name: float(np.median([row[name] for row in found])) for name in ("ratio", "owner", "workers", "uneven")
+    }
 
 
 def measure_gradient(size: ClusterSize) -> dict:
@@ -257,6 +263,11 @@ def table(question: str, answer: dict) -> list[str]:
         ]
     names = "reference", "gradient"
     lines = [f"{name}: two workers take {answer[name]['ratio']:.3f} of the time of one process" for name in names]
+    split = answer["reference"]
+    lines.append(
+        f"reference: the workers take {split['workers']:.3f} of the time of one process together, the slower one "
+        f"{split['uneven']:.3f} of their mean, and the owner {split['owner']:.3f}"
+    )
     for size, taken in answer["messages"]["seconds"].items():
         median, fastest = 1e3 * taken["median"], 1e3 * taken["fastest"]
         lines.append(f"{size} bytes to two workers and back: median {median:.2g} ms, fastest {fastest:.2g} ms")
