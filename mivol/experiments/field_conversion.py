@@ -226,7 +226,7 @@ def convert_to_grid(path: Path, target: Path, resolution: int | None, variant: s
 
 
 def make_grid(source: Source, resolution: int | None = None) -> SphericalGrid:
-    """The grid of any source: that of one box as it is, others by :func:`convert_to_grid`.
+    """The grid of any source: a grid of one box unchanged, other sources by :func:`convert_to_grid`.
 
     Raises:
         MivolError: no matter in the box, fewer than 2 nodes, or too many nodes.

@@ -26,7 +26,7 @@ METHODS = {"hash": "a hash grid with small networks", "nerf": "a coordinate netw
 """The model of a fit, by the kind of the field."""
 
 CITATIONS = {"hash": ["mueller_2022"], "nerf": ["nerf_2020", "mueller_2022"]}
-"""Sources by the kind of the field; the map of occupied cells is that of Müller et al."""
+"""Sources by the kind of the field; the map of occupied cells follows Müller et al."""
 
 
 class SampledFit(FieldFit):

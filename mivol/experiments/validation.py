@@ -230,7 +230,7 @@ def validate_scene(
 
 
 def render_batches(passes: Passes, settings: Validation) -> tuple[Moments, float]:
-    """Render the colour channels in independent batches; returns the time of all renders [s] too."""
+    """Render the colour channels in independent batches; also returns their time [s]."""
     spp = math.ceil(settings.spp / BATCHES)
     found = list(passes([(derive_seed(settings.seed, IMAGE, batch), spp) for batch in range(BATCHES)]))
     return Moments.from_batches(image for image, _ in found), math.fsum(seconds for _, seconds in found)

@@ -487,7 +487,7 @@ def _keep_place(suffix: str, volume: VolumeData | SparseVolumeData) -> tuple[np.
 
 
 def is_unread(path: Path) -> bool:
-    """Whether a file holds binary data, and its suffix is neither in :data:`FORMATS` nor that of a scene or an experiment."""
+    """Whether a file holds binary data, and its suffix is neither in :data:`FORMATS` nor a suffix of scenes or experiments."""
     if path.name.lower().endswith((*FORMATS, ".xml", ".toml")) or not path.is_file():
         return False
     return _find_unread(path) is not None

@@ -94,7 +94,7 @@ def split_frame(size: Sequence[int], to_world: np.ndarray) -> tuple[np.ndarray, 
 
 
 def is_upright(steps: np.ndarray) -> bool:
-    """Whether the axes of a grid are those of the world, to 1e-9 of the largest step."""
+    """Whether the axes of a grid equal the axes of the world, to 1e-9 of the largest step."""
     return bool(np.allclose(steps, np.diag(np.abs(np.diag(steps))), rtol=0, atol=1e-9 * np.abs(steps).max()))
 
 

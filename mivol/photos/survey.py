@@ -1,6 +1,6 @@
 """The content of a data set of photographs before reading pixels: cameras, splits and box.
 
-Conventions. Cameras are those of :mod:`mivol.photos.camera`. A data set has the splits train, val and test. ``held_out`` moves
+Conventions. Cameras follow :mod:`mivol.photos.camera`. A data set has the splits train, val and test. ``held_out`` moves
 every n-th or named photographs from the training split to the held-out split. Missing photographs are skipped and listed.
 The box is found from the training cameras (or from the points of a reconstruction) for every split, so all splits share it.
 """

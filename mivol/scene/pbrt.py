@@ -248,7 +248,7 @@ def _holds(each: Directive, bounds: np.ndarray) -> bool:
 # -- Skies ---------------------------------------------------------------------------------------------------------------
 
 SKY_TO_PBRT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""From the axes of Mitsuba's sky (pole along y) to those of pbrt's (pole along z)."""
+"""From the axes of Mitsuba's sky (pole along y) to the axes of pbrt's sky (pole along z)."""
 
 
 def _rigid(transform: np.ndarray) -> np.ndarray:

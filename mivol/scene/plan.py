@@ -104,7 +104,7 @@ class Plan:
         scattering_points: scattering points per camera ray in images.
         pass_rays: most rays of a pass.
         gradient_bytes: memory of a gradient step besides the rays [byte].
-        side_flight_cosine: mean cosine of the lobe for side flights; None for no side flights.
+        side_flight_cosine: mean cosine of the lobe for side flights; None without side flights.
         draws_emission: whether scattering points sample the light emitted by media.
         successive_paths: most paths per lane, walked one after the other.
         branches: whether paths branch at their first collision for derivatives.

@@ -128,7 +128,7 @@ class RenderTask(RecordedTask):
     Args:
         opened: facts and plan of the scene, and the samples per pixel.
         settings, aovs: as in :class:`mivol.scene.session.Session`.
-        for_images: whether the estimators are those of images or of derivatives.
+        for_images: True for estimators of images, False for estimators of derivatives.
     """
 
     def __init__(self, opened: PlannedScene, settings: Settings, aovs: list[str], for_images: bool) -> None:

@@ -9,7 +9,7 @@ A step sets a parameter, calls ``params.update()``, and renders an image; with a
 loss of the image. The loop with ``mivol`` and the loop with ``prbvolpath`` differ in the name of the integrator only. They take
 turns. On the smallest film kernels take no time, so a step shows the work of the host: tracing, or the replay of a recording.
 
-The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth 6; the others are those of the study
+The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth 6; the other scenes are scenes of the study
 ``everyday``.
 
 fits: a step of the fit loop with its optimizer, schedule, priors and record, on tiny models: the density of ``tutorial`` with

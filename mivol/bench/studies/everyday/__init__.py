@@ -97,7 +97,7 @@ def measure_images(size: EverydaySize) -> dict:
 
 
 def measure_gradients(size: EverydaySize) -> dict:
-    """How much sooner has a gradient of mivol the same error as one of prbvolpath?"""
+    """How much sooner does a gradient of mivol reach the error of prbvolpath?"""
     return _measure_scenes(_contend_gradients, size)
 
 
