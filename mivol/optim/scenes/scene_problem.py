@@ -141,7 +141,9 @@ class SceneProblem(LinearizableProblem):
         # Mitsuba's envmap puts another array into the parameters: restore the attached array.
         for name, value in values.items():
             self.params[name] = value
-        self.noisy = self._has_noise()
+        # An extinction alone does not make a medium scatter.
+        if any("sigma_t" not in p.name.split(".") for p in self.parameters):
+            self.noisy = self._has_noise()
 
     # -- Sparse grids ---------------------------------------------------------------------------------------------
 
@@ -334,7 +336,12 @@ class SceneProblem(LinearizableProblem):
             value = p.from_reals(u)
             energy = p.energy(value)
             total += float(dr.detach(energy)[0])
-            dr.backward(energy + dr.sum(value.array * gradients[p.name].array))
+            dr.set_grad(value, gradients[p.name])
+            dr.enqueue(dr.ADMode.Backward, value)
+            if dr.grad_enabled(energy):
+                dr.set_grad(energy, 1)
+                dr.enqueue(dr.ADMode.Backward, energy)
+            dr.traverse(dr.ADMode.Backward)
             by_reals[p.name] = dr.grad(u)
         dr.eval(by_reals)
         return total, by_reals
