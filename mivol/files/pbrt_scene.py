@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mivol.files.source import read_bytes, refusal
+from mivol.files.source import decompress, read_bytes, refusal
 
 TOKEN = re.compile(r'\s*(?:"([^"]*)"|(\[)|(\])|([A-Za-z_][\w]*)|([^\s"\[\]]+))')
 END = re.compile(r"\s*\Z")
@@ -24,12 +24,15 @@ COMMENT = re.compile(r'("[^"\n]*")|#[^\n]*')
 DEEPEST = 16
 """Files that include each other."""
 
+LONGEST = 1 << 30
+"""Largest text in a compressed file [bytes]."""
+
 #: directive -> numbers that follow it, in brackets or not.
 NUMBERS = {"Translate": 3, "Scale": 3, "Rotate": 4, "LookAt": 9, "Transform": 16, "ConcatTransform": 16}
 
 #: directives with a type in quotes and parameters.
 TYPED = (
-    *("Camera", "Film", "Sampler", "Integrator", "PixelFilter", "Accelerator", "ColorSpace", "Option"),
+    *("Camera", "Film", "Sampler", "Integrator", "PixelFilter", "Accelerator", "ColorSpace"),
     *("Shape", "Material", "MakeNamedMaterial", "NamedMaterial", "MakeNamedMedium", "LightSource", "AreaLightSource"),
     *("Attribute", "CoordinateSystem", "CoordSysTransform", "ObjectBegin", "ObjectInstance", "Include", "Import"),
 )
@@ -107,7 +110,10 @@ class _Reader:
         self.depth += 1
         if self.depth > DEEPEST:
             raise refusal(path, f"more than {DEEPEST} files within each other", "fewer", "correct the Include directives")
-        tokens = _Tokens(COMMENT.sub(lambda m: m[1] or "", read_bytes(path).decode("utf-8", "replace")), path)
+        data = read_bytes(path)
+        if data[:2] == b"\x1f\x8b":
+            data = decompress(data, "gzip", LONGEST, path)
+        tokens = _Tokens(COMMENT.sub(lambda m: m[1] or "", data.decode("utf-8", "replace")), path)
         while (name := tokens.word()) is not None:
             self.take(name, tokens, path)
         self.depth -= 1
@@ -139,8 +145,11 @@ class _Reader:
             tokens.quoted(name), tokens.quoted(name), tokens.parameters()
         elif name in TYPED:
             self.take_typed(name, tokens.quoted(name), tokens, path)
-        elif name == "ObjectEnd":
+        elif name == "ObjectEnd" and self.objects:
             self.objects -= 1
+            self.state = self.saved.pop()
+        elif name == "Option":
+            self.left_out += [f"the option {option!r}" for option in tokens.parameters()]
         elif name != "ReverseOrientation":
             raise refusal(
                 path, f"the directive {name!r}", f"one of {', '.join((*NUMBERS, *TYPED))}", "is this a scene of pbrt-v4?"
@@ -165,9 +174,11 @@ class _Reader:
         elif name == "CoordSysTransform":
             self.state = dataclasses.replace(state, transform=self.systems.get(kind, state.transform))
         elif name in ("ObjectBegin", "ObjectInstance"):
-            self.objects += name == "ObjectBegin"
+            if name == "ObjectBegin":
+                self.objects += 1
+                self.saved.append(state)
             self.left_out.append("instances of objects")
-        elif name in ("PixelFilter", "Accelerator", "ColorSpace", "Option", "Attribute"):
+        elif name in ("PixelFilter", "Accelerator", "ColorSpace", "Attribute"):
             self.left_out.append(f"{name} {kind!r}")
         elif not self.objects:
             self.directives.append(Directive(name, kind, parameters, state))

@@ -6,6 +6,7 @@ of its bounds (fourth edition of the book, section 11.4); :func:`look_up` is tha
 
 from __future__ import annotations
 
+import gzip
 import re
 from pathlib import Path
 
@@ -273,14 +274,15 @@ LIGHTS = ("radiance", "irradiance", "intensity")
 
 
 def test_what_is_left_out_is_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    (tmp_path / "b.pbrt").write_text('Shape "curve" Material "hair" Shape "disk"')
+    (tmp_path / "b.pbrt.gz").write_bytes(gzip.compress(b'Shape "curve" Material "hair" Shape "disk"'))
     (tmp_path / "a.pbrt").write_text(
-        'Camera "realistic" Film "rgb" "string sensor" "nikon" WorldBegin Include "b.pbrt" LightSource "goniometric" '
-        'Texture "t" "spectrum" "imagemap" "string filename" "a.png" ObjectBegin "o" Shape "disk" ObjectEnd ObjectInstance "o"'
+        'Camera "realistic" Film "rgb" "string sensor" "nikon" WorldBegin Include "b.pbrt.gz" LightSource "goniometric" '
+        'Texture "t" "spectrum" "imagemap" "string filename" "a.png" Option "string rendercoordsys" "world" '
+        'ObjectBegin "o" Material "conductor" Shape "disk" ObjectEnd ObjectInstance "o" Shape "disk"'
     )
     assert main(["convert", str(tmp_path / "a.pbrt"), str(tmp_path / "a.xml")]) == 0
     said = capsys.readouterr().out
-    assert "a.xml: 1 shapes, 0 media, 0 lights" in said
+    assert "a.xml: 2 shapes, 0 media, 0 lights" in said
     for words in (
         "camera 'realistic'",
         "shape 'curve'",
@@ -288,8 +290,10 @@ def test_what_is_left_out_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
         "light 'goniometric'",
         "texture 't'",
         "instances of objects",
+        "the option 'rendercoordsys'",
     ):
         assert words in said
+    assert "conductor" not in said  # the material of an object ends with it
 
 
 @pytest.mark.parametrize(
@@ -298,6 +302,7 @@ def test_what_is_left_out_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
         ("Shapes", "the directive 'Shapes'"),
         ("Scale 1 2", "3 numbers after Scale"),
         ("AttributeEnd", "AttributeEnd without a beginning"),
+        ("ObjectEnd", "the directive 'ObjectEnd'"),
         ('Shape "sphere" "float radius" [ 1', "a closing bracket"),
         ('Shape "sphere" "float" 1', "a type and a name in quotes"),
         ('Shape "sphere" "float radius" [ a ]', "in line 1, expected numbers"),
