@@ -22,6 +22,7 @@ __all__ = [
     "choose_lighting",
     "choose_media_light",
     "choose_near_light",
+    "describe_orders",
     "is_lamp_noise_open",
     "is_near_light_open",
     "choose_shadow_table",
@@ -433,6 +434,29 @@ def _explain_missing_light(needs: Needs) -> str:
     if any(m.has_own_walk for m in needs.media):
         return "a medium consists of Gaussians or is an octree, which the table of light does not hold"
     return "an emitting medium fills no shape of its own, or shapes are instances"
+
+
+def describe_orders(needs: Needs, settings: Settings, segment: str, draws_near_light: bool, flies_aside: bool) -> Choice | None:
+    """Say which estimator finds which order of scattering in images, and why; None without scattered light."""
+    if not is_scattering_visible(needs, settings):
+        return None
+    subject = "orders of light"
+    if segment != "free_flight":
+        return Choice(
+            subject, "one scattering, at points of each camera ray", "no light scatters twice, and none is left to chance"
+        )
+    if needs.is_sealed:
+        return Choice(subject, "all by paths that leave the media by chance", "no straight ray leads from inside to an emitter")
+    if all(kind == "uniform" for kind in needs.emitter_kinds):
+        return Choice(subject, "all by paths that escape", "every direction out of the media ends in the same light")
+    if draws_near_light:
+        others = "" if min(needs.emitter_distances) == max(needs.emitter_distances) else ", the light of others at collisions"
+        method = f"each by a distance of its own on each segment for near emitters{others}"
+        return Choice(subject, method, "collisions seldom lie where light of near emitters is strong")
+    if flies_aside:
+        method = "the first at collisions, the second and later ones also by side flights and directions about the emitter"
+        return Choice(subject, method, "a peaked phase function turns light towards the path near the emitter's direction only")
+    return Choice(subject, "each at the collisions of a path", "the light of emitters is even along a flight")
 
 
 def choose_scattering_points(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:

@@ -14,12 +14,18 @@ import numpy as np
 
 from mivol.cite import list_citations
 from mivol.errors import MivolError
-from mivol.scene.choices import Choice, is_scattering_visible, shares_cells
+from mivol.scene.choices import Choice, describe_orders, is_scattering_visible, shares_cells
 from mivol.scene.depth_two import depth_two_error, mean_albedo, scattering_depth
 from mivol.scene.needs import MediumFacts, Needs, find_clipped_view, find_needs, mean_cosine
 from mivol.scene.nesting import shape_bounds
 from mivol.scene.plan import Plan, build_media, make_plan
-from mivol.scene.previews import find_sufficient_depth, measure_lamp_noise, measure_media_light, measure_near_light
+from mivol.scene.previews import (
+    find_sufficient_depth,
+    measure_emitter_noise,
+    measure_lamp_noise,
+    measure_media_light,
+    measure_near_light,
+)
 from mivol.scene.render_tasks import find_unrecorded
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
@@ -87,7 +93,8 @@ def explain_scene(
         needs = measure_media_light(scene, eye, needs, survey, settings)
         needs = measure_near_light(scene, eye, needs, survey, settings)
         needs = measure_lamp_noise(scene, eye, needs, survey, settings)
-        return Explanation((*facts, *_describe_plan(scene, eye, needs, settings, noise)))
+        shares = measure_emitter_noise(scene, eye, needs, survey, settings)
+        return Explanation((*facts, *_describe_plan(scene, eye, needs, settings, noise, shares)))
     except MivolError as error:
         return Explanation(facts, str(error))
 
@@ -157,9 +164,18 @@ def _flags(bsdf: mi.BSDF) -> int:
     return int(flags[0]) if dr.is_array_v(flags) else int(flags)
 
 
-def _describe_plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Settings, noise: float | None) -> list[str]:
+def _describe_plan(
+    scene: mi.Scene,
+    eye: mi.Sensor,
+    needs: Needs,
+    settings: Settings,
+    noise: float | None,
+    shares: list[tuple[str, float]],
+) -> list[str]:
     plan = make_plan(needs, settings)
-    choices = [*plan.choices, *(choose_recording(scene, eye, needs, plan, for_images) for for_images in (True, False))]
+    orders = describe_orders(needs, settings, plan.segment, plan.draws_near_light, plan.side_flight_cosine is not None)
+    choices = [*plan.choices, *([orders] if orders else []), *([_describe_noise(shares)] if shares else [])]
+    choices += [choose_recording(scene, eye, needs, plan, for_images) for for_images in (True, False)]
     width = max(len(c.subject) for c in choices)
     lines = ["plan", *(f"  {c.subject:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in choices)]
     lines += [f"  table     {text}" for text in _describe_transfer_tables(needs)]
@@ -171,6 +187,14 @@ def _describe_plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Sett
         depth = "without a limit (-1)" if answer.depth < 0 else answer.depth
         lines += [f"  depth     {depth} is enough\n              because {answer.reason}"]
     return [*lines, "references", *(f"  {source}" for source in list_citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
+
+
+def _describe_noise(shares: list[tuple[str, float]]) -> Choice:
+    """Name the lights that make most of the noise."""
+    most = [f"{name} makes {share:.0%}" for name, share in shares[:2] if share >= 0.01]
+    if sum(share for _, share in shares) < 0.9:
+        most.append("several lights together make the rest")
+    return Choice("noise", ", ".join(most), "without a light, the variance of a small preview falls by its share")
 
 
 def choose_recording(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, plan: Plan, for_images: bool) -> Choice:

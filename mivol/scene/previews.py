@@ -25,6 +25,8 @@ path hits a light found by sampling, the difference of the means stands for the 
 **Light of near emitters.** :func:`measure_near_light` renders the same cells with direct light at collisions and at distances
 drawn on each segment. The gain is the sum of the variances of all cells with collisions, over c times their sum with distances:
 the noise of collisions near an emitter is large in few cells.
+
+**Noise of lights.** :func:`measure_emitter_noise` renders single pixels with and without each emitter, for ``mivol explain``.
 """
 
 from __future__ import annotations
@@ -314,6 +316,56 @@ def measure_lamp_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey:
             rest = _measure_pixel_variance(sensor, estimators.without_lamps()) if edge > 0 else 0.0
         survey.lamp_noise[sensor.ptr] = (edge, rest)
     return replace(needs, lamp_noise=survey.lamp_noise[sensor.ptr])
+
+
+SWITCHES = ("radiance.value", "intensity.value", "irradiance.value", "scale")
+"""Parameters of an emitter that are 0 without its light; the first that it has counts."""
+
+MAX_SWITCHED = 8
+"""Largest number of emitters whose noise is measured: each takes a preview."""
+
+
+def measure_emitter_noise(
+    scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings
+) -> list[tuple[str, float]]:
+    """Measure how much of the noise each emitter makes: by how much the variance in a pixel falls without its light.
+
+    Arguments as for :func:`measure_media_light`. Lights are switched off one after the other, and on again.
+
+    Returns:
+        Name and share [1] of each emitter, the largest share first; empty for one emitter, for more than ``MAX_SWITCHED``,
+        and for images without noise. Shares need not add up to 1: choosing among lights makes noise too, and lights behind and
+        inside a medium make up for each other. Emitters without one of ``SWITCHES`` are left out.
+
+    Cost: 16384 paths for each emitter, and 16384 more.
+    """
+    if not 2 <= len(scene.emitters()) <= MAX_SWITCHED or is_recording():
+        return []
+
+    def variance() -> float:
+        plan = make_plan(needs, settings)
+        return _measure_pixel_variance(sensor, build_estimators(scene, needs, plan, settings, survey, for_images=True))
+
+    shares = []
+    with without_garbage_collection(), dr.suspend_grad():
+        whole = variance()
+        for emitter in scene.emitters() if whole > 0 else []:
+            values = mi.traverse(emitter)
+            switch = next((key for key in SWITCHES if key in values), None)
+            if switch is None:
+                continue
+            lit = values[switch]
+            kept = type(lit)(lit)
+            try:
+                values[switch] = kept * 0
+                values.update()
+                rest = variance()
+            finally:
+                values[switch] = kept
+                values.update()
+            shape = emitter.shape() if emitter.class_name() == "AreaLight" else None
+            shares.append(((shape or emitter).id(), max(0.0, 1 - rest / whole)))
+    return sorted(shares, key=lambda share: -share[1])
 
 
 def _measure_pixel_variance(sensor: mi.Sensor, estimators: Estimators) -> float:
