@@ -7,6 +7,7 @@ names inside of scenes and data sets stay valid. The scene of a worker must have
 from __future__ import annotations
 
 import hashlib
+import pickle
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -133,14 +134,14 @@ def share_scene(pool: Pool, source: SceneSource, loaded: LoadedScene) -> str:
         )
     bundle = pack_files(loaded.files)
     digest = hashlib.sha256(bundle.digest.encode())
-    for key, value in sorted(source.values.items()):
-        digest.update(key.encode() + b"\0" + str(value.shape).encode() + np.ascontiguousarray(value).tobytes())
+    values = zlib.compress(pickle.dumps(dict(sorted(source.values.items())), protocol=5), 1)
+    digest.update(values)
     content = {
         "files": bundle.files,
         "path": str(source.path.absolute()),
         "defines": {key: _absolute_file(value, bundle) for key, value in source.defines.items()},
         "folders": [str(folder.absolute()) for folder in source.folders],
-        "values": dict(source.values),
+        "values": values,
         "hash": loaded.content_hash,
     }
     digest.update(msgspec.json.encode([content["path"], sorted(content["defines"].items()), content["folders"]]))
@@ -178,7 +179,7 @@ def _load(place: Workplace, digest: str) -> LoadedScene:
             "XML names a file by an absolute path, so name files relative to the XML."
         )
     params = traverse(loaded.scene)
-    for key, value in content["values"].items():
+    for key, value in pickle.loads(zlib.decompress(content["values"])).items():
         set_parameter(params, key, value)
     return loaded
 

@@ -273,7 +273,19 @@ class Pool:
             MivolError: inputs larger than half of the memory of a worker.
         """
         self._inputs[digest] = (value, size)
-        total = sum(size for _, size in self._inputs.values())
+        self.check_room()
+        return digest
+
+    def check_room(self, size: int = 0) -> None:
+        """Refuse arrays that would fill a worker.
+
+        Args:
+            size: bytes of arrays that go to each worker beside the registered inputs.
+
+        Raises:
+            MivolError: together they are larger than half of the memory of a worker.
+        """
+        total = size + sum(size for _, size in self._inputs.values())
         beside = Counter(worker.facts.host for worker in self.workers.values())
         for worker in self.workers.values():
             room = SHARE_OF_MEMORY * worker.facts.memory / beside[worker.facts.host]
@@ -282,7 +294,6 @@ class Pool:
                     f"the inputs take {total / 2**30:,.1f} GiB in each worker, and half of the memory of a worker on "
                     f"{worker.facts.host} is {room / 2**30:,.1f} GiB: start fewer workers a machine, or give smaller inputs."
                 )
-        return digest
 
     def forget(self, digest: str) -> None:
         """Remove an input here and in the workers; no unit under way may need it."""

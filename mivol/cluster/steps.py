@@ -90,7 +90,7 @@ def compute_parts(
     used = place.made(f"twin {twin}", lambda: _make_twin(place, twin))
     start = time.monotonic()
     if state and place.kept.get(f"state {twin}") != state:
-        used.take_state(pickle.loads(place.kept[state]))
+        used.take_state(pickle.loads(zlib.decompress(place.kept[state])))
         place.kept[f"state {twin}"] = state
     return used.compute(what, arrays, parts), time.monotonic() - start
 
@@ -175,8 +175,9 @@ class Steps:
             check: called while waiting; may raise.
 
         Raises:
-            MivolError: a refusal of a worker, or as :meth:`mivol.cluster.pool.Pool.run`.
+            MivolError: arrays that would fill a worker, a refusal of a worker, or as :meth:`mivol.cluster.pool.Pool.run`.
         """
+        self.pool.check_room(sum(value.nbytes for group in arrays for value in group.values()))
         start, count = time.monotonic(), min(len(parts), max(1, len(self.pool.workers)))
         needs = (*self.needs, self.state) if self.state else self.needs
         units = [
@@ -199,7 +200,7 @@ class Steps:
         """Register the state of the problem as an input, if it is another one than before."""
         if _is_same(state, self._known):
             return
-        data, self._known = to_bytes(state), state
+        data, self._known = zlib.compress(to_bytes(state), 1), state
         digest = hashlib.sha256(self.twin.encode() + data).hexdigest()
         if self.state and self.state != digest:
             self.pool.forget(self.state)

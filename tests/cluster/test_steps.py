@@ -72,6 +72,10 @@ class PoolHere:
         self.workers = {number: Workplace() for number in range(count)}
         self.inputs: dict[str, bytes] = {}
         self.counts: list[int] = []
+        self.counted: list[int] = []
+
+    def check_room(self, size: int) -> None:
+        self.counted.append(size)
 
     def share(self, digest: str, value: bytes, size: int) -> str:
         assert size == len(value)
@@ -121,6 +125,7 @@ def test_a_step_is_the_sum_of_its_parts(kind: str, batches: RayBatches) -> None:
                     np.testing.assert_allclose(np.array(divided[name]), expected, **close)
             change_state(kind, problem, gradient)
         assert len(pool.inputs) == 2
+        assert pool.counted[-1] == sum(np.array(value).nbytes for value in reals.values())
         found.append({name: np.array(value) for name, value in divided.items()})
     assert any(np.abs(value).max() > 0 for value in found[0].values())
     for other in found[1:]:

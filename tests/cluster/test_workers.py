@@ -195,6 +195,10 @@ def test_inputs_are_counted_before_they_are_sent() -> None:
     pool.share("a", None, 60)  # the same content again
     with pytest.raises(MivolError, match="half of the memory of a worker on node1"):
         pool.share("b", None, 41)
+    pool.forget("b")
+    pool.check_room(40)
+    with pytest.raises(MivolError, match="half of the memory of a worker on node1"):
+        pool.check_room(41)
 
 
 def test_work_that_kills_its_workers_ends() -> None:
