@@ -129,6 +129,17 @@ def read_lens_facts(path: Path) -> tuple:
         return (size, *(str(tables[table].get(tag)) for tag, table in LENS_TAGS.items()))
 
 
+def check_pixels(path: Path) -> None:
+    """Decode a photograph, a JPEG at an eighth of its size, which takes a fraction of the time.
+
+    Raises:
+        MivolError: a damaged photograph, such as half of a JPEG.
+    """
+    with _opened(path) as image:
+        image.draft(None, (1, 1))
+        _loaded(image, path)
+
+
 def write_upright(path: Path, copy: Path, orientation: int) -> None:
     """Write sRGB codes of a photograph, turned by an orientation of ``TURNS``, as JPEG for a name of JPEG and else as PNG.
 

@@ -10,6 +10,7 @@ Revisited, CVPR).
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import shutil
@@ -24,7 +25,7 @@ from typing import Any
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos.listing import list_photographs
-from mivol.photos.photo_file import read_lens_facts, read_photo_header, write_upright
+from mivol.photos.photo_file import check_pixels, read_lens_facts, read_photo_header, write_upright
 from mivol.photos.survey import find_format
 from mivol.threads import follow_program
 
@@ -102,6 +103,7 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None) -> 
             continues with them.
     """
     images, names = _check_folder(folder)
+    names = _leave_out_copies(folder, images, names, say)
     work = folder / WORK
     _begin_work(work, images, names)
     try:
@@ -161,10 +163,30 @@ def _check_folder(folder: Path) -> tuple[Path, list[str]]:
         way_out = f"mivol optimize {folder}, or remove them first"
         raise refusal(folder, f"poses in it already ({kind})", "photographs without poses", way_out)
     images, names = list_photographs(folder)
-    if len(names) < FEWEST:
-        found = f"{len(names)} photograph{'s' * (len(names) != 1)} in {images}"
-        raise refusal(folder, found, f"at least {FEWEST}, and 20 or more for a fit", "photograph the subject from more sides")
+    _check_count(folder, len(names), f"in {images}")
     return images, names
+
+
+def _check_count(folder: Path, count: int, words: str) -> None:
+    if count < FEWEST:
+        found = f"{count} photograph{'s' * (count != 1)} {words}"
+        raise refusal(folder, found, f"at least {FEWEST}, and 20 or more for a fit", "photograph the subject from more sides")
+
+
+def _leave_out_copies(folder: Path, images: Path, names: list[str], say: Callable[[str], None]) -> list[str]:
+    """The names without files equal to an earlier one: a pair of equal photographs has no parallax.
+
+    Raises:
+        MivolError: too few different photographs.
+    """
+    first: dict[bytes, str] = {}
+    for name in names:
+        first.setdefault(hashlib.sha256((images / name).read_bytes()).digest(), name)
+    kept = [name for name in names if name in set(first.values())]
+    if len(kept) < len(names):
+        say(f"{len(names) - len(kept)} of {len(names)} photographs are copies of others and left out")
+        _check_count(folder, len(kept), "without copies of others")
+    return kept
 
 
 def _prepare(images: Path, names: list[str], copies: Path) -> Path:
@@ -180,6 +202,7 @@ def _prepare(images: Path, names: list[str], copies: Path) -> Path:
         copy.parent.mkdir(parents=True, exist_ok=True)
         orientation = headers[name].orientation if turns else 1
         if orientation == 1 and Path(name).suffix.lower() in DIRECT:
+            check_pixels(images / name)
             _link((images / name).absolute(), copy)
         else:
             write_upright(images / name, copy, orientation)

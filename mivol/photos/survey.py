@@ -171,7 +171,7 @@ def _read(path: Path) -> tuple[str, Listing]:
     if name is None:
         known = ", ".join(DATA_SET_FORMATS)
         if names := list_photographs(path)[1]:
-            found = f"{len(names)} photographs without cameras"
+            found = f"{len(names)} photograph{'s' * (len(names) != 1)} without cameras"
             raise refusal(path, found, f"cameras of {known}", f"mivol poses {path} finds them")
         raise refusal(path, "no cameras", f"one of {known}", "name the folder of the file of cameras")
     return name, DATA_SET_FORMATS[name].read(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -25,10 +26,10 @@ from mivol.report import cameras
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Five photographs of 64 x 48 pixels, three of them in a folder below."""
-    for name in ("a.jpg", "b.png", "near/c.webp", "near/d.jpg", "near/e.jpg"):
+    for number, name in enumerate(("a.jpg", "b.png", "near/c.webp", "near/d.jpg", "near/e.jpg")):
         path = tmp_path / "walk" / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels(64, 48, len(name), alpha=False)).save(path)
+        Image.fromarray(pixels(64, 48, number, alpha=False)).save(path)
     return tmp_path / "walk"
 
 
@@ -122,8 +123,25 @@ def test_what_cannot_have_poses_is_refused(folder: Path, job: dict, tmp_path: Pa
         poses.find_poses(tmp_path / "few")
     with pytest.raises(MivolError, match="found no folder"):
         poses.find_poses(tmp_path / "none")
-    (folder / "images" / "a.jpg").write_bytes(b"no image")
-    with pytest.raises(MivolError, match=r"a.jpg: found a damaged or foreign file"):
+    whole = (folder / "images" / "a.jpg").read_bytes()
+    for content in (b"no image", whole[: len(whole) // 2]):
+        (folder / "images" / "a.jpg").write_bytes(content)
+        with pytest.raises(MivolError, match=r"a.jpg: found a damaged or foreign file"):
+            poses.find_poses(folder)
+
+
+def test_copies_are_left_out(folder: Path, job: dict) -> None:
+    """Of equal files the first counts; with too few others the search is refused before it begins."""
+    images, said = folder / "images", []
+    (images / "near" / "f.jpg").write_bytes((images / "a.jpg").read_bytes())
+    found = poses.find_poses(folder, said.append)
+    assert "1 of 6 photographs are copies of others and left out" in said
+    assert sorted([*found.posed, *found.unposed]) == ["a.jpg", "b.png", "near/c.webp", "near/d.jpg", "near/e.jpg"]
+    shutil.rmtree(folder / "sparse")
+    for name in ("b.png", "near/c.webp", "near/d.jpg", "near/e.jpg"):
+        (images / name).unlink()
+    (images / "g.jpg").write_bytes((images / "a.jpg").read_bytes())
+    with pytest.raises(MivolError, match="found 1 photograph without copies of others, expected at least 3"):
         poses.find_poses(folder)
 
 
