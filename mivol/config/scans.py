@@ -246,7 +246,7 @@ class SolveSettings(Section):
         setting("1", "first volume; absent: auto takes filtered if the views allow it, others empty"),
     ] = None
     iterations: (
-        Annotated[int, setting("iteration", 'largest number of iterations; absent: 20, with data.rings = "fit" 80', ge=1)]
+        Annotated[int, setting("iteration", 'largest number of iterations; absent: 20, with data.rings = "fit" 40', ge=1)]
         | None
     ) = None
     nonnegative: Annotated[bool, setting("1", "keep every voxel at or above 0")] = True
@@ -329,9 +329,10 @@ class ScanExperiment(Section):
     def __post_init__(self) -> None:
         if isinstance(self.scan, OfData) != isinstance(self.data, Nikon):
             raise ValueError('scan.beam = "data" and data.source = "nikon" go together: give both, or neither')
-        if getattr(self.data, "rings", "none") == "fit" and (self.data.drift or self.solve.solver in ("fbp", "fdk", "ml-tr")):
+        if getattr(self.data, "rings", "none") == "fit" and (self.data.drift or self.solve.solver not in ("pcg", "cgls")):
             other = f"data.drift = {self.data.drift}" if self.data.drift else f"{self.solve.solver}"
-            raise ValueError(f'data.rings = "fit" needs least squares with constant gains, found {other}: use rings = "gain"')
+            way = 'choose pcg, or use rings = "gain"'
+            raise ValueError(f'data.rings = "fit" needs conjugate gradients and constant gains, found {other}: {way}')
         if getattr(self.data, "rows", None) and not isinstance(self.scan, Parallel):
             raise ValueError('data.rows cuts the detector of a beam = "parallel": leave it out')
         if isinstance(self.scan, Cone) and not is_circle(self.scan) and getattr(self.data, "find_axis", None):

@@ -47,7 +47,7 @@ from mivol.experiments.solver_choice import (
 from mivol.files import read_volume, write_exr, write_volume
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Course, Fit
-from mivol.optim.projections.inversion import DriftFit, GainFit, LightFit, LinearSolve, ProjectionProblem, update_light
+from mivol.optim.projections.inversion import DriftFit, LinearSolve, ProjectionProblem, update_light
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.cameras import draw_scanner
@@ -59,13 +59,11 @@ from mivol.tomography.filtered import check_directions, feldkamp, filtered_backp
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
 from mivol.tomography.preprocess import LightDrift, interpolate_gaps
 from mivol.tomography.projector import Projector
+from mivol.tomography.rings import PixelGains
 from mivol.validate.metrics import nrmse
 
 RING_CITATIONS = {"gain": ("vo_2018", "eilers_2003"), "fit": ("vo_2018", "eilers_2003"), "sort": ("vo_2018",)}
 """Citations by ``data.rings``."""
-
-GAIN_TURN = 4
-"""Iterations of the solver between two fits of the gains."""
 
 
 class ScanFit(FitKind):
@@ -171,7 +169,7 @@ class ScanFit(FitKind):
         if self.data.is_noise_known:
             record.results["discrepancy"] = state.residual_norm / expected_residual_norm(problem, self.settings.solve.name)
         self.data = subtract_light(self.problem, self.data, state)
-        if isinstance(self.problem.light, GainFit):
+        if isinstance(problem, LeastSquares) and problem.gains is not None:
             size = float(np.std(self.data.removed_rings[0]))
             record.notes.append(f'rings: the gains of the columns scatter by {size:.2%} in the middle row (data.rings = "fit")')
 
@@ -251,19 +249,15 @@ def make_problem(settings: config.ScanExperiment, a: Projector, data: Projection
     x0 = start_volume(solve, a, data, kept)
     dr.flush_malloc_cache()
     if ALL_SOLVERS[solve.name].problem is LeastSquares:
-        least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, solve.nonnegative, prior)
-        return ProjectionProblem(least_squares, light=choose_light(settings, view_times(data)[kept]))
+        weights = data.weights[kept]
+        gains = PixelGains(weights) if getattr(settings.data, "rings", "none") == "fit" else None
+        least_squares = LeastSquares(a, data.y[kept], weights, x0, solve.nonnegative, prior, gains)
+        drift = DriftFit(view_times(data)[kept]) if getattr(settings.data, "drift", 0) else None
+        return ProjectionProblem(least_squares, light=drift)
     if data.quanta is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
     quanta = data.quanta.select_views(kept)
     return ProjectionProblem(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
-
-
-def choose_light(settings: config.ScanExperiment, times: np.ndarray) -> LightFit | None:
-    """Return the unknowns of the light that the settings ask for, at the times of the fitted views."""
-    if getattr(settings.data, "drift", 0):
-        return DriftFit(times)
-    return GainFit(times) if getattr(settings.data, "rings", "none") == "fit" else None
 
 
 def view_times(data: Projections) -> np.ndarray:
@@ -272,12 +266,15 @@ def view_times(data: Projections) -> np.ndarray:
 
 
 def subtract_light(problem: ProjectionProblem, data: Projections, state: SolverState) -> Projections:
-    """Subtract the fitted light from the line integrals of all views; the fitted views determine it."""
-    if problem.light is None:
+    """Subtract the fitted drift or gains from the line integrals of all views; the fitted views determine them."""
+    task = problem.linear_problem
+    if problem.light is not None:
+        last = LightDrift(*(state.memory[name] for name in ("offset", "slope")))
+        change = update_light(task, problem.light, last, state.x).eval(view_times(data))
+    elif isinstance(task, LeastSquares) and task.gains is not None:
+        change = task.gains.fit(task.b - (task.A @ state.x).reshape(task.b.shape))[None]
+    else:
         return data
-    last = LightDrift(*(state.memory[name] for name in ("offset", "slope")))
-    drift = update_light(problem.linear_problem, problem.light, last, state.x)
-    change = drift.eval(view_times(data))
     removed = data.removed_rings
     if removed is not None:
         removed = removed + change[:, change.shape[1] // 2]
@@ -314,8 +311,7 @@ def make_solver(settings: config.ScanExperiment, noise: float | None) -> LinearS
     shared = {name: getattr(solve, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     if solve.discrepancy:
         shared["stop_norm"] = solve.discrepancy * noise
-    turn = getattr(settings.data, "drift", 0) or (GAIN_TURN if getattr(settings.data, "rings", "none") == "fit" else 0)
-    return LinearSolve(solver=solve.name, drift=turn, **shared)
+    return LinearSolve(solver=solve.name, drift=getattr(settings.data, "drift", 0), **shared)
 
 
 def data_norm(task: LeastSquares | PoissonCounts) -> float:

@@ -1,6 +1,6 @@
 """Faults of pixels: rings, steps between the columns of a sinogram by gains that the flats do not have; and zingers.
 
-:func:`remove_rings` removes them from line integrals alone. :func:`fit_gains` finds what is left as the residual of a volume.
+:func:`remove_rings` removes them from line integrals alone. :class:`PixelGains` makes what is left an unknown of the fit.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.sparse import diags_array, eye_array
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu, spsolve
 
 from mivol.errors import MivolError
 from mivol.tomography.preprocess import Transmission, interpolate_gaps
@@ -17,8 +17,9 @@ RING_WIDTHS = {"gain": 14, "sort": 7}
 """Default width [column] by method, chosen by a head and forty ellipsoids in 129 columns with gains of 2 %: 6 and 10 leave more
 rings of the head, 20 and 30 take more of the ellipsoids for gains; 7 has the least error of the head among 3 to 21."""
 
-GAIN_PERIOD = 40
-"""Period along the detector [column] of which half is fitted in one turn; with 60, the head loses more of its skull."""
+GAIN_PERIOD = 60
+"""Period along the detector [column] of which half is found; 40 leaves more rings of ellipsoids, with 90 the head loses more of
+its skull."""
 
 EDGE_BEND = 5.0
 """Bend of an edge of the object, over the robust standard deviation of all bends."""
@@ -115,33 +116,49 @@ HOT_SHARE = 0.75
 """Share of the views in which a hot pixel differs from its neighbours: a detail of the object moves on."""
 
 
-def fit_gains(residual: np.ndarray, weights: np.ndarray, period: float = GAIN_PERIOD) -> np.ndarray:
-    r"""Offset of each pixel, the line integral :math:`-\log g` of a constant gain g, from the residual of a volume.
+class PixelGains:
+    r"""Constant gains g of the pixels as unknowns of a weighted least-squares problem, which eliminates them.
 
-    The weighted mean m over the views, without what varies slowly along the detector:
+    The offsets :math:`o = -\log g` minimise, for the residual r of a volume and with T the sum of a pixel's weights,
 
-    .. math:: o = m - \arg\min_s \; |m - s|^2 + (p / 2 \pi)^4 \sum_c (s_{c-1} - 2 s_c + s_{c+1})^2
+    .. math:: \sum_v w_v (r_v - o)^2 + \bar T \, o^T K^{-1} o, \qquad K = (p / 2 \pi)^4 D^T D
 
-    A round object about the axis can explain every m, and total variation prefers the flattest. This bias is smooth along the
-    detector; half of a period p is left out.
+    row by row, with second differences D along the detector and the median :math:`\bar T` of T. So offsets that vary slowly
+    are dear: half of one with the period p is found, less of a longer one, and no straight line. What is left is
+    quadratic in r: ``r . weigh(r)``, with the derivative ``2 weigh(r)`` (variable projection).
+
+    Bias: a detail that all views see at the same column, such as a tube about the axis, can count as gains, and total variation
+    prefers it flat. This bias is smooth along the detector, which p limits.
 
     Args:
-        residual: (views, rows, cols), ``y - A x``.
-        weights: inverse variances; a pixel of weight 0 in all views gets no offset.
+        weights: inverse variances (views, rows, cols); a pixel of weight 0 in all views gets no offset.
         period: p [column].
 
-    Returns:
-        (rows, cols).
-
-    References: Eilers 2003, Anal. Chem. 75, 3631 (penalised second differences).
+    References: Golub & Pereyra 1973, SIAM J. Numer. Anal. 10, 413 (variable projection); Eilers 2003, Anal. Chem. 75, 3631
+    (penalised second differences).
     """
-    total, columns = weights.sum(0), weights.shape[2]
-    mean = (weights * residual).sum(0) / np.where(total > 0, total, 1.0)
-    if columns < 3:
-        return np.zeros_like(mean)
-    second = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(columns - 2, columns)).tocsr()
-    normal = eye_array(columns) + (period / (2 * np.pi)) ** 4 * second.T @ second
-    return np.where(total > 0, mean - spsolve(normal.tocsc(), mean.T).reshape(columns, -1).T, 0.0)
+
+    def __init__(self, weights: np.ndarray, period: float = GAIN_PERIOD) -> None:
+        self._weights = weights
+        self._total, columns = weights.sum(0, dtype=np.float64), weights.shape[2]
+        second = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(max(columns - 2, 0), columns)).tocsr()
+        self._stiffness = ((period / (2 * np.pi)) ** 4 * second.T @ second).tocsr()
+        middle = np.median(self._total[self._total > 0]) if self._total.any() else 1.0
+        # With o = K q, the minimum has (T K + middle) q = T m, with the weighted mean m of the residual.
+        self._solvers = [splu((diags_array(t) @ self._stiffness + middle * eye_array(columns)).tocsc()) for t in self._total]
+
+    def fit(self, residual: np.ndarray) -> np.ndarray:
+        """The offsets (rows, cols) for a residual (views, rows, cols)."""
+        sums = (self._weights * residual).sum(0, dtype=np.float64)
+        found = np.stack([self._stiffness @ solver.solve(row) for solver, row in zip(self._solvers, sums, strict=True)])
+        return np.where(self._total > 0, found, 0.0)
+
+    def weigh(self, residual: np.ndarray) -> np.ndarray:
+        """The weighted residual without its offsets, in the shape of ``residual``."""
+        seen = residual.reshape(self._weights.shape)
+        left = seen - self.fit(seen).astype(residual.dtype)
+        left *= self._weights
+        return left.reshape(residual.shape)
 
 
 def _smooth_ranks(y: np.ndarray, width: int) -> np.ndarray:

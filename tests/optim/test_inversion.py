@@ -12,7 +12,6 @@ from mivol.errors import MivolError
 from mivol.optim.loop import Course, reconstruct
 from mivol.optim.projections.inversion import (
     DriftFit,
-    GainFit,
     LinearSolve,
     ProjectionProblem,
     solve_with_light,
@@ -21,6 +20,7 @@ from mivol.optim.projections.inversion import (
 from mivol.optim.projections.linear_problems import LeastSquares, SolverState
 from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.preprocess import LightDrift
+from mivol.tomography.rings import PixelGains
 
 
 def inversion(scan: tuple[Views, np.ndarray, np.ndarray], **more: object) -> ProjectionProblem:
@@ -138,15 +138,27 @@ def test_saved_drift_state_continues_bit_for_bit(drifting, cut):
         np.testing.assert_array_equal(a.x, b.x)
 
 
-def test_gains_become_unknowns_step_by_step():
-    """Gains of three columns' period: a turn overshoots by .9, as block descent may below 2; what is found is a fixed point."""
-    rng = np.random.default_rng(3)
-    # A period of three columns loses 1 - 1 / (1 + (40 / 3)^4) = 1 - 3e-5 to what varies slowly; edges take part of the rest.
-    offset = 0.02 * np.cos(2 * np.pi * np.arange(400) / 3)[None]
-    object_part = rng.normal(size=(400, 1, 400)) * 1e-3
-    residual = np.broadcast_to(offset, object_part.shape) + object_part - object_part.mean(0)
-    light = GainFit(np.zeros(400)).update(LightDrift(np.zeros((1, 400)), np.zeros((1, 400))), residual, np.ones(residual.shape))
-    np.testing.assert_allclose(light.offset[:, 80:-80], 1.9 * offset[:, 80:-80], atol=2e-5)
-    again = GainFit(np.zeros(400)).update(LightDrift(offset, light.slope), residual, np.ones(residual.shape))
-    np.testing.assert_allclose(again.offset, offset, atol=1e-12)
-    assert not light.slope.any()
+def test_eliminated_gains_are_those_of_the_joint_minimum(scan):
+    """Expected: the volume of dense least squares with the offsets as further unknowns, whose penalty is o^T pinv(K) o and
+    infinite for straight lines. Volumes are compared by the residual that the offsets leave, which both minimise.
+    """
+    a, _, b = scan
+    columns, rng = a.shape[0] // VIEWS, np.random.default_rng(5)
+    weights = rng.uniform(0.5, 2.0, (VIEWS, 1, columns))
+    y = b.reshape(weights.shape) + 0.02 * rng.normal(size=columns) + 0.01 * rng.normal(size=weights.shape)
+    gains = PixelGains(weights, 9.0)
+    state = run("pcg", LeastSquares(a, y, weights, gains=gains), 2000)[-1]
+    second = np.diff(np.eye(columns), 2, axis=0)
+    # o = D^T q meets no straight line, and o^T K^-1 o = q^T q / stiffness.
+    middle, stiffness = np.median(weights.sum((0, 1))), (9 / (2 * np.pi)) ** 4
+    offsets = np.tile(second.T, (VIEWS, 1))
+    root = np.sqrt(weights.reshape(-1))[:, None]
+    joint = np.block([
+        [root * a.matrix.toarray(), root * offsets],
+        [np.zeros((columns - 2, a.shape[1])), np.sqrt(middle / stiffness) * np.eye(columns - 2)],
+    ])  # fmt: skip
+    wanted = np.linalg.lstsq(joint, np.append(root[:, 0] * y.reshape(-1), np.zeros(columns - 2)), rcond=None)[0]
+    left = joint @ wanted - np.append(root[:, 0] * y.reshape(-1), np.zeros(columns - 2))
+    assert state.residual_norm == pytest.approx(np.linalg.norm(left), rel=1e-6)
+    found = gains.fit(y - (a @ state.x).reshape(y.shape))[0]
+    np.testing.assert_allclose(found, second.T @ wanted[a.shape[1] :], atol=1e-4)

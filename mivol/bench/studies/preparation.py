@@ -28,7 +28,7 @@ from mivol import config
 from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.study import Size, Study, SweptQuestion, amount
 from mivol.experiments.projections import Projections
-from mivol.experiments.scan_fit import GAIN_TURN, start_volume
+from mivol.experiments.scan_fit import start_volume
 from mivol.experiments.solver_choice import (
     GAIN_ITERATIONS,
     ITERATIONS,
@@ -38,13 +38,13 @@ from mivol.experiments.solver_choice import (
     resolve_solver,
 )
 from mivol.optim.projections.alignment import align_views
-from mivol.optim.projections.inversion import GainFit, LinearSolve, ProjectionProblem
+from mivol.optim.projections.inversion import LinearSolve, ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
 from mivol.tomography.phantoms import random_ellipsoids, shepp_logan
 from mivol.tomography.preprocess import correct_transmission, find_air, to_line_integrals
 from mivol.tomography.projector import Projector
-from mivol.tomography.rings import RING_WIDTHS, remove_rings
+from mivol.tomography.rings import RING_WIDTHS, PixelGains, remove_rings
 from mivol.tomography.rotation_axis import find_axis
 from mivol.validate.metrics import nrmse
 
@@ -117,10 +117,10 @@ def solve_by_default(y: np.ndarray, weights: np.ndarray, is_noise_known: bool, w
     walk = choose_storage(solve, walk).apply(walk)
     data, views = Projections(BEAM, y, weights, is_noise_known=is_noise_known), np.arange(VIEWS)
     start, prior = start_volume(solve, walk, data, views), make_prior(solve, walk, data, views)
-    light = GainFit(np.zeros(VIEWS)) if with_gains else None
-    problem = ProjectionProblem(LeastSquares(walk, y, weights, start, solve.nonnegative, prior), light=light)
+    gains = PixelGains(weights) if with_gains else None
+    problem = ProjectionProblem(LeastSquares(walk, y, weights, start, solve.nonnegative, prior, gains))
     estimate_noise(problem, solve, data)
-    run = LinearSolve(drift=GAIN_TURN if with_gains else 0).begin(problem)
+    run = LinearSolve().begin(problem)
     for iteration in range(iterations):
         run.step(iteration, 1.0)
     return voxel_means(run.state.x.reshape(walk.grid.shape), GRID.shape)

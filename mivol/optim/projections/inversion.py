@@ -2,10 +2,10 @@
 
 Conventions. A solver needs products with the operator beyond a gradient, and therefore runs separate iterations.
 :func:`solve_with_light` alternates between object and light (block descent): a few iterations of the solver explain ``b -
-light``, then the light (a drift, or gains of pixels) is fitted to the remaining part of ``b``. Each turn lowers the joint
+light``, then the light is fitted to the remaining part of ``b``. Each turn lowers the joint
 weighted least squares.
 
-References: :func:`mivol.tomography.preprocess.fit_light_drift`, :func:`mivol.tomography.rings.fit_gains`.
+References: :func:`mivol.tomography.preprocess.fit_light_drift`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts,
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.optim.strategy import setting
 from mivol.tomography.preprocess import LightDrift, fit_light_drift
-from mivol.tomography.rings import fit_gains
 
 KEY = "x"
 """Name of the volume among the values."""
@@ -52,21 +51,6 @@ class DriftFit:
 
     def update(self, light: LightDrift, residual: np.ndarray, weights: np.ndarray) -> LightDrift:
         return fit_light_drift(residual, weights, self.times)
-
-
-OVER_RELAXATION = 1.9
-"""Step of the gains over the step that fits the residual: block descent converges below 2, and most quickly near it."""
-
-
-@dataclass(frozen=True, eq=False)
-class GainFit:
-    """A constant gain of each pixel, as an offset."""
-
-    times: np.ndarray
-
-    def update(self, light: LightDrift, residual: np.ndarray, weights: np.ndarray) -> LightDrift:
-        step = fit_gains(residual - light.offset, weights)
-        return LightDrift(light.offset + OVER_RELAXATION * step, light.slope)
 
 
 @dataclass

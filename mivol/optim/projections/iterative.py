@@ -8,7 +8,7 @@ curvature).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +28,11 @@ from mivol.optim.projections.linear_problems import (
     ray_lengths,
     reciprocal,
     start_field,
+    weighting,
 )
+
+Weighting = Callable[[np.ndarray], np.ndarray]
+"""From a residual (m,) to the weighted residual."""
 
 
 def ordered_subsets_sart(
@@ -144,12 +148,15 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
     gradient replaces the direction; its projection always descends. The objective therefore never rises. The length of the
     step before its projection comes from every eighth view: it decides where the step meets the domain, not how far it goes.
 
+    Unknown gains are eliminated (:class:`mivol.tomography.rings.PixelGains`): the objective is that of the best gains.
+
     Preconditioner: ``diag(A^T W A 1 + separable majoriser of the prior)^-1`` (SQS). Voxels that no ray crosses keep ``x0``.
     Cost per iteration: one A and one A^T, and an eighth of an A for a projected step (one more A with fewer than 16 views).
     """
     a = problem.A
-    weights = flat_weights(problem)
+    weights, weigh = flat_weights(problem), weighting(problem)
     sample = _Sample.of(problem, weights)
+    # Unknown gains only lower the curvature: the diagonal still majorises.
     data_diagonal = a.T @ apply_weights(weights, ray_lengths(a)) if precondition else None
     if state is None:
         x = start_field(a, problem.x0)
@@ -160,12 +167,12 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
     elif "residual" not in state.memory:
         state = replace(state, memory={"residual": flatten(problem.b, a.dtype) - a @ state.x})
     while True:
-        directions = _direction(problem, state, data_diagonal, weights)
+        directions = _direction(problem, state, data_diagonal, weigh)
         if directions is None:
             return
         direction, downhill, memory = directions
         g = memory["gradient"]
-        ways = (_descend(problem, weights, sample, state.x, g, way) for way in (direction, downhill))
+        ways = (_descend(problem, weigh, sample, state.x, g, way) for way in (direction, downhill))
         step = next((way for way in ways if way is not None), None)
         if step is None:
             return
@@ -177,11 +184,11 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
 
 
 def _direction(
-    problem: LeastSquares, state: SolverState, data_diagonal: np.ndarray | None, weights: np.ndarray | None
+    problem: LeastSquares, state: SolverState, data_diagonal: np.ndarray | None, weigh: Weighting
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
     """The conjugate direction, the scaled descent direction, and memory for the next direction; None at the minimum."""
     x, memory, prior = state.x, state.memory, problem.prior
-    g = problem.A.T @ apply_weights(weights, memory["residual"])
+    g = problem.A.T @ weigh(memory["residual"])
     np.negative(g, out=g)
     if prior:
         g += prior.gradient(x)
@@ -219,7 +226,7 @@ SAMPLED, MIN_SAMPLES = 8, 2
 
 def _descend(
     problem: LeastSquares,
-    weights: np.ndarray | None,
+    weigh: Weighting,
     sample: _Sample | None,
     x: np.ndarray,
     g: np.ndarray,
@@ -228,7 +235,7 @@ def _descend(
     """(step, A step) to the minimum along ``direction``, projected onto the domain; None if the direction does not descend."""
     rough = sample and sample.length(problem, x, g, direction)
     if rough is None:
-        lowest = _minimum(problem, weights, x, g, direction)
+        lowest = _minimum(problem, weigh, x, g, direction)
         if lowest is None:
             return None
         rough, image = lowest
@@ -239,7 +246,7 @@ def _descend(
         step = np.asarray(rough, x.dtype) * direction
     for part in blocks(len(x)):
         step[part] = np.maximum(x[part] + step[part], 0) - x[part]
-    lowest = _minimum(problem, weights, x, g, step)
+    lowest = _minimum(problem, weigh, x, g, step)
     if lowest is None:
         return None
     # Beyond length 1 the projected step could leave the domain again.
@@ -253,11 +260,11 @@ def _stays_nonnegative(x: np.ndarray, step: np.ndarray) -> bool:
 
 
 def _minimum(
-    problem: LeastSquares, weights: np.ndarray | None, x: np.ndarray, g: np.ndarray, d: np.ndarray
+    problem: LeastSquares, weigh: Weighting, x: np.ndarray, g: np.ndarray, d: np.ndarray
 ) -> tuple[float, np.ndarray] | None:
     """Length to the majoriser's minimum along ``d``, and ``A d``; None if ``d`` does not descend."""
     image = problem.A @ d
-    length = _length(problem, x, g, d, dot(image, apply_weights(weights, image)))
+    length = _length(problem, x, g, d, dot(image, weigh(image)))
     return None if length is None else (length, image)
 
 
@@ -298,7 +305,7 @@ def cgls(problem: LeastSquares, state: SolverState | None = None) -> Iterator[So
 
 
 def _ls_state(problem: LeastSquares, x: np.ndarray, iteration: int, r: np.ndarray, memory: dict) -> SolverState:
-    norm2 = dot(r, apply_weights(flat_weights(problem), r))
+    norm2 = dot(r, weighting(problem)(r))
     penalty = problem.prior.value(x) if problem.prior else 0.0
     return SolverState(x, iteration, norm2 / 2 + penalty, float(np.sqrt(norm2)), memory)
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.tomography.projector import Projector
+from mivol.tomography.rings import PixelGains
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,7 @@ class LeastSquares:
         x0: start; None: 0.
         nonnegative: keep every voxel at or above 0.
         prior: optional penalty.
+        gains: unknown gains of the pixels, which conjugate gradients eliminate; ``b`` is then explained up to their offsets.
     """
 
     A: Any
@@ -44,6 +46,7 @@ class LeastSquares:
     x0: np.ndarray | None = None
     nonnegative: bool = False
     prior: SmoothedTV | None = None
+    gains: PixelGains | None = None
 
     def __post_init__(self) -> None:
         check_sizes(self.A, self.x0, b=self.b, weights=self.weights)
@@ -125,6 +128,14 @@ def flat_weights(problem: LeastSquares) -> np.ndarray | None:
 def apply_weights(weights: np.ndarray | None, v: np.ndarray) -> np.ndarray:
     """Weighted vector; None stands for weights of 1."""
     return v if weights is None else weights * v
+
+
+def weighting(problem: LeastSquares) -> Callable[[np.ndarray], np.ndarray]:
+    """The function from a residual (m,) to the weighted residual, without the offsets of unknown gains."""
+    if problem.gains is not None:
+        return problem.gains.weigh
+    weights = flat_weights(problem)
+    return lambda v: apply_weights(weights, v)
 
 
 BLOCK = 1 << 18
