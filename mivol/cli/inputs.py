@@ -54,7 +54,7 @@ def _explain_file(arguments: argparse.Namespace) -> Explanation | FileSummary:
 
 def explain_array(arguments: argparse.Namespace) -> int | None:
     """Explain a scan, or describe a volume or a field, and return the exit code; None for other inputs."""
-    from mivol.experiments.found_scan import TIFF_FOLDER, find_scan
+    from mivol.experiments.found_scan import SINOGRAM, TIFF_FOLDER, find_scan
     from mivol.files.formats import describe_volume
 
     layout = raw_layout(arguments)
@@ -69,7 +69,7 @@ def explain_array(arguments: argparse.Namespace) -> int | None:
     if not is_array:
         return None
     print(describe_volume(arguments.scene, arguments.dataset, **layout))
-    if arguments.dataset is None and arguments.scene.is_dir() and find_scan(arguments.scene) == TIFF_FOLDER:
+    if arguments.dataset is None and find_scan(arguments.scene) in (TIFF_FOLDER, SINOGRAM):
         print(
             "a volume, for want of flats, darks and angles: mivol optimize takes it as a scan, mivol explain does so with --set"
         )
@@ -91,12 +91,12 @@ def draft_scan_of(path: Path, arguments: argparse.Namespace, is_array: bool = Fa
 
     An HDF5 file without the layout of a scan counts as a scan if its suffix is no volume suffix, or with ``--set``;
     ``--dataset`` makes it a volume. A folder of TIFF files that ``is_array`` counts as a scan if it has flats, darks or angles,
-    or with ``--set``.
+    or with ``--set``; a single image that ``is_array`` counts as a sinogram with ``--set``.
 
     Raises:
         MivolError: as :func:`mivol.experiments.found_scan.draft_scan`.
     """
-    from mivol.experiments.found_scan import TIFF_FOLDER, draft_scan, find_scan, has_scan_files
+    from mivol.experiments.found_scan import SINOGRAM, TIFF_FOLDER, draft_scan, find_scan, has_scan_files
     from mivol.files.hdf5 import is_hdf5
 
     is_photographs = arguments.preset is not None or arguments.model is not None
@@ -104,7 +104,8 @@ def draft_scan_of(path: Path, arguments: argparse.Namespace, is_array: bool = Fa
         return None
     is_named = path.is_file() and is_hdf5(path) and (arguments.set or not is_array)
     kind = find_scan(path)
-    if kind == TIFF_FOLDER and is_array and not arguments.set and not has_scan_files(path):
+    has_files = kind == TIFF_FOLDER and has_scan_files(path)
+    if kind in (TIFF_FOLDER, SINOGRAM) and is_array and not arguments.set and not has_files:
         return None
     return draft_scan(path, arguments.set) if is_named or kind else None
 

@@ -168,7 +168,7 @@ class Readings(Section):
             setting(
                 "pixel",
                 "gain, fit: period along the detector of which half is removed, more of a shorter one; sort: columns of the "
-                "median, an odd number; absent: 14 and 7",
+                "median, an odd number; absent: gain 14, fit 5, sort 7",
                 ge=3,
             ),
         ]
@@ -208,6 +208,10 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
         Literal["intensity", "transmission", "line_integral"],
         setting("1", "quantity of a pixel; an intensity needs flats"),
     ]
+    images: Annotated[
+        Literal["views", "sinograms"],
+        setting("1", "axes of the file: views (view, row, column), or sinograms of corrected values (row, view, column)"),
+    ] = "views"
     dataset: Annotated[str, setting("1", "name of the array in an .npz or HDF5 file")] = ""
     flats: Annotated[str, setting("path", "readings of light without object, as file")] = ""
     darks: Annotated[str, setting("path", "readings without light, as file; empty: 0")] = ""
@@ -218,6 +222,8 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
     def __post_init__(self) -> None:
         if (self.reading == "intensity") != bool(self.flats) or (self.darks and not self.flats):
             raise ValueError("an intensity needs flats, and nothing else takes flats and darks: give flats, or change reading")
+        if self.reading == "intensity" and self.images == "sinograms":
+            raise ValueError('sinograms hold corrected values: give reading = "transmission" or "line_integral"')
         if self.reading != "intensity" and self.saturation < INFINITY:
             raise ValueError("only readings of an intensity saturate: leave saturation out, or change reading")
 
@@ -246,7 +252,7 @@ class SolveSettings(Section):
         setting("1", "first volume; absent: auto takes filtered if the views allow it, others empty"),
     ] = None
     iterations: (
-        Annotated[int, setting("iteration", 'largest number of iterations; absent: 20, with data.rings = "fit" 40', ge=1)]
+        Annotated[int, setting("iteration", 'largest number of iterations; absent: 20, with data.rings = "fit" 60', ge=1)]
         | None
     ) = None
     nonnegative: Annotated[bool, setting("1", "keep every voxel at or above 0")] = True

@@ -22,7 +22,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.files.formats import HEAD, read_volume
 from mivol.files.hdf5 import is_hdf5
-from mivol.files.image_stack import IMAGES, read_images
+from mivol.files.image_stack import IMAGES, read_images, stack_shape
 from mivol.files.mrc import find_tilt_angles, is_mrc, read_tilt_angles
 from mivol.files.nikon import SECTION, read_nikon
 from mivol.files.scan_hdf5 import half_turns_in_radians, is_scan, survey_projections
@@ -85,7 +85,8 @@ def draft_scan(path: Path, changes: Sequence[str] = ()) -> ScanDraft:
         config.apply_change(given, change)
     kind = find_scan(path)
     if kind is None and not (path.is_file() and is_hdf5(path)):
-        expected = "a scan in HDF5, an .xtekct file, a tilt series (MRC with .rawtlt, .tlt or .mdoc), or a folder of images"
+        kinds = "an .xtekct file, a tilt series (MRC with .rawtlt, .tlt or .mdoc), a sinogram (TIFF)"
+        expected = f"a scan in HDF5, {kinds}, or a folder of images"
         raise refusal(path, "no scan", expected, "name one of them, or write a TOML file")
     draft = SCAN_KINDS[kind or HDF5][1](path, given)
     name = path.resolve().stem
@@ -380,9 +381,12 @@ def guess_arc(views: np.ndarray) -> tuple[float, str]:
     """Guess the arc [degree] by three views (first, middle and last; rows; columns), corrected by flats.
 
     After a turn the last view resembles the first, and the middle one the first's mirror image. After half a turn the last view
-    resembles the mirror image. Mirror images are compared at their best shift along the columns.
+    resembles the mirror image. Mirror images are compared at their best shift along the columns. Slopes are compared, of views
+    smoothed by a 100th of the detector: noise dominates the slopes of single rows.
     """
-    slopes = np.gradient(views, axis=-1)
+    from scipy.ndimage import gaussian_filter1d
+
+    slopes = np.gradient(gaussian_filter1d(views, views.shape[-1] / 100, axis=-1), axis=-1)
     first, middle, last = slopes
     mirrored = -first[:, ::-1]
     turn = min(_correlation(first, last)[0], _correlation(mirrored, middle).max())
@@ -412,11 +416,41 @@ def _three_views(files: list[Path], flat: np.ndarray | None, dark: np.ndarray | 
     return (three - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
 
 
-HDF5, TIFF_FOLDER = "hdf5", "tiff"
+# -- Sinogram ------------------------------------------------------------------------------------------------------------
+
+
+def _is_sinogram(path: Path) -> bool:
+    """Whether a file is a single grey image of a format of detectors."""
+    if not path.is_file() or path.suffix.lower() not in IMAGES:
+        return False
+    with suppress(MivolError):
+        return stack_shape(path)[0] == 1
+    return False
+
+
+def _draft_sinogram(path: Path, given: dict[str, Any]) -> ScanDraft:
+    image = read_images([path])[0]
+    views, columns = image.shape
+    data: dict[str, Any] = {"source": "stack", "file": str(path), "images": "sinograms"}
+    data["reading"], why = guess_reading(path, image)
+    lines = [
+        f"found: a single image of {views} x {columns} pixels",
+        f"assumed: a sinogram, {_count(views, 'view')} of {columns} columns; turn the image if its columns are views",
+        f"assumed: no flats, and {why}: the pixels are taken as {data['reading']}s; data.reading sets it",
+    ]
+    scan: dict[str, Any] = {"beam": "parallel"}
+    lines += _draft_angles(path.parent, scan, data, views, image[[0, views // 2, -1], None])
+    lines += _draft_beam(scan, None, (None, None), (1, columns))
+    raw = {"scan": scan, "data": data}
+    return _finish(raw, [*lines, *_put_grid(raw, 1, columns)], views)
+
+
+HDF5, TIFF_FOLDER, SINOGRAM = "hdf5", "tiff", "sinogram"
 SCAN_KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, dict[str, Any]], ScanDraft]]] = {
     "nikon": (lambda path: any(map(_is_nikon, path.iterdir() if path.is_dir() else [path])), _draft_nikon),
     HDF5: (lambda path: any(map(is_scan, path.iterdir() if path.is_dir() else [path])), _draft_hdf5),
     "mrc": (_is_tilt_series, _draft_tilt_series),
     TIFF_FOLDER: (lambda path: path.is_dir() and bool(group_images(path, IMAGES)), _draft_tiff),
+    SINOGRAM: (_is_sinogram, _draft_sinogram),
 }
 """Recognition and draft of each kind of scan, in this order."""

@@ -75,7 +75,8 @@ def detector_size(settings: config.ScanExperiment, base: Path) -> tuple[int, int
         rows = data.rows[1] - data.rows[0] if data.rows else scan.pixels[0]
         return scan.frames[0], rows, scan.pixels[1]
     if isinstance(data, Stack):
-        return stack_shape(base / data.file, data.dataset or None)
+        first, second, columns = stack_shape(base / data.file, data.dataset or None)
+        return (second, first, columns) if data.images == "sinograms" else (first, second, columns)
     scan = read_nikon(base / data.file)
     return len(scan.images), *scan.detector
 
@@ -118,11 +119,14 @@ def read_stack_scan(settings: config.ScanExperiment, base: Path, rows: slice) ->
     is_flipped = data.first_row == "highest"
     if is_flipped and rows != ALL:
         # The same rows counted downwards: ``rows`` of the flipped rows.
-        last = range(stack_shape(base / data.file, data.dataset or None)[1])[::-1][rows]
+        last = range(detector_size(settings, base)[1])[::-1][rows]
         rows = slice(last[-1], last[0] + 1, -last.step)
 
     def stack(name: str) -> np.ndarray:
-        values = read_stack(base / name, data.dataset or None, rows)
+        if data.images == "sinograms":
+            values = read_stack(base / name, data.dataset or None)[rows].swapaxes(0, 1)
+        else:
+            values = read_stack(base / name, data.dataset or None, rows)
         return values[:, ::-1] if is_flipped else values
 
     readings = stack(data.file)

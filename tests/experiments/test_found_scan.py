@@ -15,7 +15,7 @@ from PIL import Image
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import found_scan, kinds
+from mivol.experiments import found_scan, kinds, readings
 from mivol.experiments.found_scan import draft_scan, find_scan
 from mivol.files import read_volume
 from mivol.scene.explain import Explanation
@@ -117,6 +117,34 @@ def test_names_that_no_pattern_tells_apart(tmp_path: Path) -> None:
 
 
 BLOCKS = {"unlike": ((1, 12, 0), (2, 9, 2)), "even at first": ((1, 12, np.pi / 2), (1, 12, -np.pi / 2), (1, 6, np.pi / 2))}
+
+
+def test_a_single_image_is_a_sinogram(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """For mivol optimize; mivol explain takes it for a slice, and for a sinogram with --set. Values are those of the image."""
+    angle = np.pi * np.arange(24)[:, None] / 24
+    lines = np.maximum(0, 1 - ((np.arange(48) - 23.5 - 6 * np.cos(angle)) / 12) ** 2).astype(np.float32)
+    path = tmp_path / "slice.tif"
+    Image.fromarray(lines).save(path)
+    draft = draft_scan(path)
+    assert draft.raw["scan"] == {"beam": "parallel", "arc": 180.0}
+    assert draft.raw["data"] == {"source": "stack", "file": str(path), "images": "sinograms", "reading": "line_integral"}
+    settings = config.from_dict(draft.raw)
+    assert readings.detector_size(settings, Path()) == (24, 1, 48)
+    found = readings.read_stack_scan(settings, Path(), readings.ALL).transmission.value
+    np.testing.assert_allclose(found, np.exp(-lines[:, None]), rtol=1e-6)
+    assert main(["explain", str(path)]) == 0
+    assert "voxels (x, y, z): 48 x 24 x 1" in (said := capsys.readouterr().out) and "mivol optimize takes it as a scan" in said
+    with pytest.raises(MivolError, match="sinograms hold corrected values"):
+        config.from_dict({**draft.raw, "data": draft.raw["data"] | {"reading": "intensity", "flats": "f.tif"}})
+
+
+def test_the_arc_of_a_noisy_row_is_guessed() -> None:
+    """One row of 800 columns with noise of a tenth, over a whole turn: slopes of single pixels are noise. Without smoothing,
+    each of 40 seeds gives 180 degrees; with it, none."""
+    rng, angle = np.random.default_rng(2), 2 * np.pi * np.array([0, 60, 119])[:, None] / 120
+    blocks = ((1.0, 200, 0.3), (0.5, 150, 2.0))
+    views = sum(h * np.exp(-(((np.arange(800) - 420 - r * np.cos(angle + p)) / 40) ** 2)) for h, r, p in blocks)
+    assert found_scan.guess_arc((views + 0.1 * rng.normal(size=views.shape))[:, None])[0] == 360.0
 
 
 @pytest.mark.parametrize(("arc", "blocks"), [(180.0, "unlike"), (360.0, "unlike"), (180.0, "even at first")])
