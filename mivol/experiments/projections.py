@@ -37,7 +37,7 @@ from mivol.tomography.preprocess import (
     to_line_integrals,
 )
 from mivol.tomography.projector import Projector
-from mivol.tomography.rings import RING_WIDTHS, find_zingers, remove_rings
+from mivol.tomography.rings import FIRST_WIDTH, RING_WIDTHS, find_zingers, remove_rings
 from mivol.tomography.rotation_axis import find_axis
 from mivol.tomography.single_material import filter_phase
 
@@ -335,8 +335,8 @@ def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> 
     if data.rings == "none":
         return y, []
     # The gains that the solver fits are counted from what the filter leaves.
-    method = "gain" if data.rings == "fit" else data.rings
-    width = RING_WIDTHS[method] if data.ring_width is None else data.ring_width
+    method, width = ("gain", FIRST_WIDTH) if data.rings == "fit" else (data.rings, RING_WIDTHS[data.rings])
+    width = width if data.ring_width is None else data.ring_width
     found = remove_rings(y, weights, method, width)
     size = float(np.sqrt(np.mean((y - found) ** 2)))
     said = f'ring removal (data.rings = "{data.rings}", {width} columns) changed the line integrals by {size:.2g} (RMS)'

@@ -47,7 +47,7 @@ def tv_strength(settings: config.SolveSettings) -> float:
     return 1.0 if settings.name == AUTO and settings.tv_unit == "noise" else 0.0
 
 
-ITERATIONS, GAIN_ITERATIONS = 20, 40
+ITERATIONS, GAIN_ITERATIONS = 20, 60
 """Iterations if the settings leave them open, without and with unknown gains of the pixels."""
 
 

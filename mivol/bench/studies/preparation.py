@@ -44,7 +44,7 @@ from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, v
 from mivol.tomography.phantoms import random_ellipsoids, shepp_logan
 from mivol.tomography.preprocess import correct_transmission, find_air, to_line_integrals
 from mivol.tomography.projector import Projector
-from mivol.tomography.rings import RING_WIDTHS, PixelGains, remove_rings
+from mivol.tomography.rings import FIRST_WIDTH, RING_WIDTHS, PixelGains, remove_rings
 from mivol.tomography.rotation_axis import find_axis
 from mivol.validate.metrics import nrmse
 
@@ -102,6 +102,10 @@ RING_CASES = {
 """Object, largest line integral, quanta of a pixel without object."""
 
 
+STEPS = {"gain": RING_WIDTHS["gain"], "fit": FIRST_WIDTH}
+"""What is done, with the width of the removal from line integrals [column]."""
+
+
 def make_ring_scan(name: str, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """Exact line integrals (views, 1, columns) up to ``depth``, and the object averaged over voxels."""
     phantom = shepp_logan() if name == "head" else random_ellipsoids(40, 3, 0.92)
@@ -138,16 +142,14 @@ def measure_ring_errors(case: tuple[str, float, float], seed: int) -> dict[str, 
 
     clean, rings = measure(np.exp(-exact)), measure(gains * np.exp(-exact))
     weights = photons * np.exp(-clean) if photons else np.ones(exact.shape)
-    width = RING_WIDTHS["gain"]
 
     def error(y: np.ndarray, with_gains: bool) -> float:
         return nrmse(solve_by_default(y, weights, photons > 0, with_gains), truth)
 
     unspoilt = error(clean, False)
-    removed = {label: remove_rings(y, weights, "gain", width) for label, y in (("", rings), (", no rings", clean))}
     found = {"none": error(rings, False)}
-    for (label, y), with_gains in itertools.product(removed.items(), (False, True)):
-        found[("fit" if with_gains else "gain") + label] = error(y, with_gains)
+    for (label, y), (step, width) in itertools.product((("", rings), (", no rings", clean)), STEPS.items()):
+        found[step + label] = error(remove_rings(y, weights, "gain", width), step == "fit")
     return {label: value / unspoilt for label, value in found.items()}
 
 
