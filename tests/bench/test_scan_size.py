@@ -22,3 +22,11 @@ def test_a_whole_volume_is_stopped_and_resumed(variant_rgb: str) -> None:
     assert (answer["slabs"], answer["stopped_after"]) == (2, 1)
     assert answer["nrmse"] < 0.5
     assert scan_size.table("whole", answer)[0].startswith("| slabs |")
+
+
+@pytest.mark.slow
+def test_the_default_is_measured_in_its_own_process() -> None:
+    """Memory and time are those of the command: more than of a process that does nothing, and a folder with its files."""
+    answer = scan_size.measure_default(scan_size.ScanSize.quick())
+    assert answer["processor_seconds"] > 0 and 0.1 < answer["peak_gib"] < 1 and 0.01 < answer["folder_mb"] < 40
+    assert scan_size.table("default", answer)[0].startswith("| seconds |")

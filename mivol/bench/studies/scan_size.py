@@ -2,12 +2,16 @@
 
     mivol bench scan_size [--n 512] [--views 512] [--slices 32]
     mivol bench scan_size --only whole [--edge 1024] [--memory 4] [--solver fbp]
+    mivol bench scan_size --only default [--default-edge 160]
 
 Exact views of the Shepp-Logan head are written as TIFF, one file a view, with as many rows as slices. Each contestant reads
 them, reconstructs all slices by filtered back-projection (ramp without a window), and writes a TIFF file a slice. mivol takes
 slabs within 2 GiB. algotom (``fbp_reconstruction`` on the processor, compiled by numba) and astra-toolbox (FBP, ``linear``) are
 left out where they are not installed. Times are processor times of the whole path, the shorter of two runs; the first may
 compile.
+
+default: ``mivol optimize`` in a process of its own, with the settings that a scan gets: a head with noise in a cone beam,
+as transmissions; by default 82 views of 135 x 160 pixels, and as many voxels as the detector sees.
 
 whole: a head of ``edge`` voxels along each edge, from as many views, rows and columns, by slabs in a run folder. The
 run is stopped after half of its slabs and resumed. The peak is that of the process; slabs are planned for ``memory``. It needs
@@ -19,6 +23,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
+import resource
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -36,7 +43,7 @@ from mivol.experiments.slab_scan import STATE, plan_slabs, reconstruct_slab, run
 from mivol.files.image_stack import read_images
 from mivol.files.tiff import TiffSlices
 from mivol.machine import peak_memory
-from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
 from mivol.validate.metrics import nrmse
 
@@ -57,6 +64,7 @@ class ScanSize(Size):
     edge: int = amount(1024, quick=32, doc="voxels along each edge of the whole volume, and views, rows and columns")
     memory: float = amount(4.0, quick=0.343, doc="memory of its slabs [GiB]")
     solver: str = amount("fbp", doc="its solver")
+    default_edge: int = amount(160, quick=16, doc="columns of the detector of a scan with all defaults")
 
 
 def write_views(folder: Path, n: int, views: int, slices: int) -> ParallelBeam:
@@ -122,6 +130,38 @@ def _mivol(settings: config.ScanExperiment) -> Contestant:
             writer.write(layers.start, reconstruct_slab(plan, layers))
 
     return run
+
+
+# -- All defaults ----------------------------------------------------------------------------------------------------------
+
+
+def measure_default(size: ScanSize) -> dict[str, float]:
+    """What do the defaults take: time, memory and the size of the run folder?"""
+    n, rows, views = size.default_edge, max(8, size.default_edge * 135 // 160), max(12, size.default_edge * 82 // 160)
+    beam = ConeBeam(2 * np.pi * np.arange(views) / views, (rows, n), 6.0, 8.0, 2.66 / n)
+    y = shepp_logan().integrate_lines(*beam.rays(), whole_lines=True)
+    counts = np.maximum(np.random.default_rng(0).poisson(1e4 * np.exp(-y)), 1)
+    with TemporaryDirectory() as folder:
+        np.save(Path(folder) / "views.npy", (counts / 1e4).astype(np.float32))
+        lines = [
+            'title = "default"', "held_out_every = 20", "[scan]", 'beam = "cone"', "arc = 360", f"pitch = {2.66 / n}",
+            "source_to_axis = 6", "source_to_detector = 8", "[data]", 'source = "stack"', 'file = "views.npy"',
+            'reading = "transmission"',
+        ]  # fmt: skip
+        (Path(folder) / "fit.toml").write_text("\n".join(lines))
+        run = Path(folder) / "run"
+        command = [sys.executable, "-m", "mivol", "optimize", str(Path(folder) / "fit.toml"), "--out", str(run)]
+        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        subprocess.run(command, check=True, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        answer = {
+            "seconds": time.perf_counter() - start,
+            "processor_seconds": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+            "peak_gib": after.ru_maxrss / 2**20,
+            "folder_mb": sum(file.stat().st_size for file in run.rglob("*") if file.is_file()) / 1e6,
+        }
+    say_row("default", **answer)
+    return answer
 
 
 # -- A whole volume --------------------------------------------------------------------------------------------------------
@@ -222,7 +262,7 @@ PEERS: dict[str, tuple[str, Callable[[ParallelBeam], Contestant]]] = {
 
 def table(question: str, answer: dict[str, Any]) -> list[str]:
     """Markdown table."""
-    if question == "whole":
+    if question != "slices":
         return [
             "| " + " | ".join(answer) + " |",
             "|---:" * len(answer) + "|",
@@ -235,5 +275,5 @@ def table(question: str, answer: dict[str, Any]) -> list[str]:
     ]
 
 
-QUESTIONS = {"slices": measure_slices, "whole": measure_whole}
-STUDY = Study(__name__, __doc__, ScanSize, QUESTIONS, table=table, on_request=("whole",))
+QUESTIONS = {"slices": measure_slices, "default": measure_default, "whole": measure_whole}
+STUDY = Study(__name__, __doc__, ScanSize, QUESTIONS, table=table, on_request=("default", "whole"))
