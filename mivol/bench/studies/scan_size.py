@@ -24,8 +24,6 @@ import importlib
 import importlib.util
 import json
 import resource
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -38,11 +36,13 @@ import numpy as np
 from mivol import config
 from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.study import Size, Study, amount
+from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, RunContext
 from mivol.experiments.slab_scan import STATE, plan_slabs, reconstruct_slab, run_slabs
 from mivol.files.image_stack import read_images
 from mivol.files.tiff import TiffSlices
 from mivol.machine import peak_memory
+from mivol.threads import run_child
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
 from mivol.validate.metrics import nrmse
@@ -150,9 +150,11 @@ def measure_default(size: ScanSize) -> dict[str, float]:
         ]  # fmt: skip
         (Path(folder) / "fit.toml").write_text("\n".join(lines))
         run = Path(folder) / "run"
-        command = [sys.executable, "-m", "mivol", "optimize", str(Path(folder) / "fit.toml"), "--out", str(run)]
+        command = "import sys; from mivol.cli import main; sys.exit(main(sys.argv[1:]))"
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        subprocess.run(command, check=True, capture_output=True)
+        done = run_child(command, "optimize", str(Path(folder) / "fit.toml"), "--out", str(run), timeout=3600.0)
+        if done.returncode:
+            raise MivolError(f"found the exit code {done.returncode} of mivol optimize, expected 0: {done.stderr[-200:]}")
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         answer = {
             "seconds": time.perf_counter() - start,
