@@ -35,6 +35,9 @@ class Photographs(Section):
         ),
     ] = ""
     held_out: Annotated[int, setting("view", "step between training views that are not fitted; 0: none", ge=0)] = 8
+    fold: Annotated[
+        int, setting("view", "first of the views that are not fitted, below held_out: one fold of a cross-validation", ge=0)
+    ] = 0
     box: Annotated[
         str | tuple[Vector, Vector],
         setting(
@@ -54,6 +57,8 @@ class Photographs(Section):
     ] = None
 
     def __post_init__(self) -> None:
+        if self.fold and self.fold >= self.held_out:
+            raise ValueError(f"fold is {self.fold}: a number below held_out = {self.held_out} is expected")
         colour = self.background
         if not isinstance(colour, str) and not all(0 <= c <= 1 for c in colour):  # NaN fails every comparison
             raise ValueError(f"background is {list(colour)}: three numbers from 0 to 1 are expected, codes of 8 bits over 255")

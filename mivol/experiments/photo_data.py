@@ -37,6 +37,7 @@ def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos |
         "scale": photo_settings.scale,
         "largest": photo_settings.largest,
         "held_out": photo_settings.held_out,
+        "fold": photo_settings.fold,
         "space": photo_settings.space,
         "stored": photo_settings.stored,
         "box": SEARCHED.get(box) if isinstance(box, str) else np.array(box, np.float64),
@@ -46,7 +47,7 @@ def read_photos(settings: PhotoExperiment, base: Path) -> tuple[Photos, Photos |
             raise MivolError('photos.space = "linear" is not for Gaussians, which are fitted to code values: choose "srgb".')
         options["space"] = "srgb"
     path = base / photo_settings.path
-    surveyed = {"held_out": photo_settings.held_out, "box": options["box"]}
+    surveyed = {"held_out": photo_settings.held_out, "fold": photo_settings.fold, "box": options["box"]}
     fitted = survey_photos(path, split="train", **surveyed)
     is_judged = photo_settings.judged != "held_out" or photo_settings.held_out > 0
     others = survey_photos(path, split=photo_settings.judged, **surveyed).frames if is_judged else ()

@@ -134,6 +134,7 @@ def load_photos(
     space: str | None = None,
     stored: str | None = None,
     held_out: int | Sequence[str] = 0,
+    fold: int = 0,
     box: np.ndarray | str | None = None,
     seed: int = 0,
     largest: int | None = None,
@@ -149,7 +150,7 @@ def load_photos(
             blends over other colours) or (r, g, b). None is "white", as in NeRF's protocol. Only for images with alpha.
         space: colour space of the values, "srgb" or "linear"; by default the space of the files.
         stored: colour space of PNG and JPEG files, "srgb" or "linear"; by default srgb, or linear for a PNG with a gAMA of 1.
-        held_out: n for every n-th training photograph, or file names (:func:`survey_photos`).
+        held_out, fold: n for every n-th training photograph and the number of the first, or file names (:func:`survey_photos`).
         box: (2, 3) [length]; None or "middle" to find the box from the cameras or points.
         seed: seed of random backgrounds.
         largest: longest edge of a photograph [pixel]; larger photographs shrink below ``scale``.
@@ -163,7 +164,7 @@ def load_photos(
         >>> photos = load_photos("chair", scale=0.25, background="white")
         >>> o, d = rays(photos.views[0].camera, pixel_centres(photos.views[0].camera.size))
     """
-    survey = survey_photos(path, split=split, held_out=held_out, box=box)
+    survey = survey_photos(path, split=split, held_out=held_out, fold=fold, box=box)
     stored_spaces = _find_stored_spaces(survey.frames, stored)
     space = _choose_space(space, stored_spaces)
     if not 0 < scale <= 1:

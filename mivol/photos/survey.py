@@ -120,14 +120,20 @@ class PhotoSurvey:
 
 
 def survey_photos(
-    path: str | os.PathLike, *, split: str = "all", held_out: int | Sequence[str] = 0, box: np.ndarray | str | None = None
+    path: str | os.PathLike,
+    *,
+    split: str = "all",
+    held_out: int | Sequence[str] = 0,
+    fold: int = 0,
+    box: np.ndarray | str | None = None,
 ) -> PhotoSurvey:
     """Read cameras, sizes and box of a data set, without pixels.
 
     Args:
         path: folder, or file of cameras.
         split: one of ``SPLITS``; "train" excludes the held-out photographs.
-        held_out: n for every n-th existing training photograph from the first on (0 for no held-out view), or file names.
+        held_out: n for every n-th existing training photograph (0 for no held-out view), or file names.
+        fold: number of the first of every n-th photograph, from 0 to n - 1: the n folds hold out each photograph once.
         box: (2, 3) [length]; by default from points or cameras (:mod:`mivol.photos.region`); "middle" for the innermost of
             nested boxes, which some cameras may miss.
 
@@ -138,7 +144,7 @@ def survey_photos(
     name, listing = _read(path)
     if split not in SPLITS:
         raise refusal("split", f'"{split}"', f"one of {', '.join(SPLITS)}", "choose one")
-    entries = _assign_held_out(listing.entries, held_out, path)
+    entries = _assign_held_out(listing.entries, held_out, fold, path)
     present = [entry for entry in entries if entry.file.is_file()]
     chosen = [entry for entry in present if split in ("all", entry.split)]
     absent = [entry.name for entry in entries if not entry.file.is_file() and split in ("all", entry.split)]
@@ -177,13 +183,15 @@ def _read(path: Path) -> tuple[str, Listing]:
     return name, DATA_SET_FORMATS[name].read(path)
 
 
-def _assign_held_out(entries: list[Entry], held_out: int | Sequence[str], path: Path) -> list[Entry]:
+def _assign_held_out(entries: list[Entry], held_out: int | Sequence[str], fold: int, path: Path) -> list[Entry]:
     """Set the split of held-out entries to "held_out"."""
     train = [entry for entry in entries if entry.split == "train" and entry.file.is_file()]
     if isinstance(held_out, int):
         if held_out < 0 or held_out == 1:
             raise refusal("held_out", f"{held_out}", "0, or 2 and more", "1 would hold out every view")
-        chosen = {id(entry) for entry in train[::held_out]} if held_out else set()
+        if not 0 <= fold < max(held_out, 1):
+            raise refusal("fold", f"{fold}", f"0 to {max(held_out, 1) - 1}", "count folds from 0, below held_out")
+        chosen = {id(entry) for entry in train[fold::held_out]} if held_out else set()
     else:
         names = {name for entry in train for name in (entry.name, entry.file.name)}
         unknown = next((name for name in held_out if name not in names), None)

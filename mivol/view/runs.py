@@ -172,4 +172,4 @@ def find_photographs(folder: Path) -> PhotoSurvey | None:
     path = settings.get("photos.path")
     if not path or find_format(Path(path)) is None:
         return None
-    return survey_views(Path(path), int(settings.get("photos.held_out") or 0))
+    return survey_views(Path(path), int(settings.get("photos.held_out") or 0), int(settings.get("photos.fold") or 0))

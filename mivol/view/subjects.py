@@ -289,12 +289,12 @@ HELD_OUT = 8
 """Step between photographs that do not take part in a fit, unless the data set or a run says which."""
 
 
-def survey_views(path: Path, held_out: int = HELD_OUT) -> PhotoSurvey:
-    """The photographs of a data set; without a split of its own, every ``held_out``-th is held out, as in a fit."""
+def survey_views(path: Path, held_out: int = HELD_OUT, fold: int = 0) -> PhotoSurvey:
+    """The photographs of a data set; without a split of its own, every ``held_out``-th from ``fold`` on is held out."""
     survey = survey_photos(path)
     if not held_out or any(frame.split != "train" for frame in survey.frames) or len(survey.frames) < 2:
         return survey
-    return survey_photos(path, held_out=held_out)
+    return survey_photos(path, held_out=held_out, fold=fold)
 
 
 def _box_of(to_world: np.ndarray) -> np.ndarray:

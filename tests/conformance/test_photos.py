@@ -176,6 +176,10 @@ def test_held_out_photographs_leave_the_training_split(blender: Path) -> None:
         for split in ("train", "held_out")
     }
     assert names == {"train": ["r_1.png", "r_3.png"], "held_out": ["r_0.png", "r_2.png"]}
+    folds = [load_photos(blender, split="held_out", held_out=3, fold=k, background="white").views for k in range(3)]
+    assert [[view.name for view in views] for views in folds] == [["r_0.png", "r_3.png"], ["r_1.png"], ["r_2.png"]]
+    with pytest.raises(MivolError, match="count folds from 0"):
+        load_photos(blender, held_out=3, fold=3)
     named = load_photos(blender, split="held_out", held_out=["r_3.png"], background="white")
     assert [view.name for view in named.views] == ["r_3.png"]
 
