@@ -31,7 +31,7 @@ def copy(tmp_path: Path) -> Path:
     """A folder with a copy of the package whose shells say their name."""
     package = tmp_path / "mivol"
     (package / "plugins").mkdir(parents=True)
-    for name in ("__init__.py", "back_end.py", "errors.py", "llvm.py", "threads.py"):
+    for name in ("__init__.py", "back_end.py", "errors.py", "llvm.py", "machine.py", "threads.py"):
         shutil.copy(PACKAGE / name, package)
     shutil.copy(PACKAGE / "plugins" / "__init__.py", package / "plugins")
     for name in plugins.MODULES:

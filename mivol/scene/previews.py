@@ -46,6 +46,7 @@ from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import Needs, find_needs
 from mivol.scene.plan import Plan, build_estimators, choose_segment, make_plan
 from mivol.scene.survey import SceneSurvey, survey_scene
+from mivol.scene_graph import traverse
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.walk import has_one_segment, walk_path
@@ -350,7 +351,7 @@ def measure_emitter_noise(
     with without_garbage_collection(), dr.suspend_grad():
         whole = variance()
         for emitter in scene.emitters() if whole > 0 else []:
-            values = mi.traverse(emitter)
+            values = traverse(emitter)
             switch = next((key for key in SWITCHES if key in values), None)
             if switch is None:
                 continue
