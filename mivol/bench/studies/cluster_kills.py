@@ -24,7 +24,9 @@ import numpy as np
 from mivol import config
 from mivol.back_end import choose_back_end
 from mivol.bench.harness.bars import AT_MOST, Promise, say
+from mivol.bench.harness.catalogue import answer_on
 from mivol.bench.harness.study import Size, Study, amount, ask
+from mivol.bench.studies.preparation import PreparationSize, measure_axis
 from mivol.cluster.connection import open_pool
 from mivol.cluster.distribution import ClusterDistribution
 from mivol.cluster.packages import SceneSource, share_scene
@@ -120,6 +122,12 @@ def run_sweep_of_fits(pool: Pool, folder: Path, name: str) -> np.ndarray:
     return np.concatenate([np.ravel(read_volume(volume).values) for volume in volumes])
 
 
+def run_bench(pool: Pool, folder: Path, name: str) -> np.ndarray:
+    """A swept question of the bench: the rotation axes of twenty scans."""
+    answer = answer_on(pool, "preparation", "axis", measure_axis, PreparationSize())
+    return np.ravel([[row["column"], row["error"], row["sigma"]] for row in answer["scans"].values()])
+
+
 BALL = """title = "a ball"
 threads = 1
 [photos]
@@ -153,6 +161,7 @@ VERBS: dict[str, Verb] = {
     "validate": run_validate,
     "optimize_scene": run_fit("demo/fit.toml", [*SCENE, "fit.iterations=6"]),
     "sweep": run_sweep_of_fits,
+    "bench": run_bench,
 } | {f"optimize_{name}": run_fit(f"{name}.toml", []) for name in EXPERIMENTS}
 
 
