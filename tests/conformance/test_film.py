@@ -255,14 +255,14 @@ def test_a_new_seed_compiles_nothing(monkeypatch):
     monkeypatch.setattr(session, "find_unrecorded", lambda *_: "every call is traced")
     smoke = medium("heterogeneous", grid_volume("gridvolume", np.ones((4, 5, 6, 1), np.float32), PLACE), 0.5)
     scene = mi.load_dict({"type": "scene", "box": box_of(smoke, PLACE), "sky": sky(0.5), "sensor": sensor_of()})
-    integrator, compiled = mi.load_dict({"type": "mivol", "max_depth": 2}), []
+    integrator, seen = mi.load_dict({"type": "mivol", "max_depth": 2}), []
     for seed in (7, 1234, 99):
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.eval(mi.render(scene, integrator=integrator, spp=8, seed=seed))
-            kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-        compiled.append(sum(not k["cache_hit"] for k in kernels))
-    assert compiled[1:] == [0, 0]
+            # Not by cache hits: a cache on disk holds the kernels of earlier runs.
+            seen.append({k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT})
+    assert seen[0] and seen[1] | seen[2] <= seen[0]
 
 
 def test_batch_sensor():
