@@ -343,8 +343,9 @@ def measure_emitter_noise(
     if not 2 <= len(scene.emitters()) <= MAX_SWITCHED or is_recording():
         return []
 
+    plan = make_plan(needs, settings)
+
     def variance() -> float:
-        plan = make_plan(needs, settings)
         return _measure_pixel_variance(sensor, build_estimators(scene, needs, plan, settings, survey, for_images=True))
 
     shares = []

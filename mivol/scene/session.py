@@ -184,7 +184,7 @@ class Session:
         where = "the GPU" if is_on_gpu() else "this machine"
         raise MivolError(
             f"a render of {width} x {height} pixels ran out of memory on {where}: render crops of half the pixels, or give"
-            "  the grids 80 % of their nodes along each axis (half the memory)."
+            " the grids 80 % of their nodes along each axis (half the memory)."
         )
 
     def _join_arrays(self, scene: mi.Scene, tracer: mi.Scene | None) -> None:

@@ -24,6 +24,7 @@ import numpy as np
 from mivol.fields.octree import Octree
 from mivol.numerics import fast_max, one_minus_exp, reciprocal
 from mivol.transport.line_integrals.radiance_field import MAX_DEPTH, RayBundle, RayGradient
+from mivol.transport.line_integrals.radiance_source import add_packet, sum_harmonics
 from mivol.transport.traversal.leaf_index import LeafIndex
 from mivol.transport.traversal.octree_walk import VisitedLeaf, clip_to_octree, reverse_from, walk_leaves
 
@@ -63,7 +64,7 @@ class LeafColours:
 
     def add(self, row: mi.UInt32, by_sigma: mi.Float, by_colour: list[mi.Float], on: mi.Bool) -> None:
         """Add derivatives by the values of :meth:`read`."""
-        _add_packet(self.slope, [by_sigma, *by_colour], self.first + row, on)
+        add_packet(self.slope, [by_sigma, *by_colour], self.first + row, on)
 
 
 HALF_MAX = 65504.0
@@ -122,14 +123,14 @@ class LeafHarmonics:
     def read(self, row: mi.UInt32, on: mi.Bool) -> tuple[mi.Float, list[mi.Float]]:
         """Extinction and colour of leaves."""
         values = dr.gather(mi.ArrayXf, self.table, row, on, shape=(self.width, 1))
-        return values[3 * self.tree.basis], self.tree.map_colours(_sum_harmonics(values, self.basis, self.tree.offset))
+        return values[3 * self.tree.basis], self.tree.map_colours(sum_harmonics(values, self.basis, self.tree.offset))
 
     def add(self, row: mi.UInt32, by_sigma: mi.Float, by_colour: list[mi.Float], on: mi.Bool) -> None:
         """Add derivatives by the values of the leaves."""
         _, colour = self.read(row, on)
         by_sum = [d * s for d, s in zip(by_colour, self.tree.colour_slopes(colour), strict=True)]
         values = [*(c * y for y in self.basis for c in by_sum), by_sigma]
-        _add_packet(self.slope, [*values, *(mi.Float(0) for _ in range(self.width - len(values)))], row, on)
+        add_packet(self.slope, [*values, *(mi.Float(0) for _ in range(self.width - len(values)))], row, on)
 
     def slopes(self) -> tuple[mi.Float, mi.Float]:
         """Derivatives by ``density`` and ``harmonics`` of the octree."""
@@ -147,19 +148,6 @@ LeafSource = LeafColours | HalfColours | LeafHarmonics
 def _packed_width(tree: Octree) -> int:
     """Size of a row of harmonics and extinction, padded to whole packets."""
     return -(-(3 * tree.basis + 1) // 4) * 4
-
-
-def _sum_harmonics(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> list[mi.Float]:
-    colour = [mi.Float(offset)] * 3
-    for b, y in enumerate(basis):
-        colour = [dr.fma(row[3 * b + k], y, c) for k, c in enumerate(colour)]
-    return colour
-
-
-def _add_packet(target: mi.Float, values: list[mi.Float], row: mi.UInt32, on: mi.Bool) -> None:
-    """Add numbers that lie side by side in memory. On the CPU each thread adds to its own copy, without atomics."""
-    mode = dr.ReduceMode.Expand if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else dr.ReduceMode.Auto
-    dr.scatter_add(target, mi.ArrayXf(values), row, on, mode=mode)
 
 
 # -- Sources ---------------------------------------------------------------------------------------------------------------
@@ -214,7 +202,7 @@ def make_leaf_colours(
     values = dr.gather(mi.ArrayXf, tree.harmonics, every, shape=(tree.width, 1))
     for number, point in enumerate(points):
         basis = _basis_from(tree, places, point)
-        colour = tree.map_colours(_sum_harmonics(values, basis, tree.offset))
+        colour = tree.map_colours(sum_harmonics(values, basis, tree.offset))
         dr.scatter(table, mi.ArrayXf([raw, *colour]), every + dr.opaque(mi.UInt32, number) * count)
     return LeafColours(table, view * count, dr.zeros(mi.Float, dr.width(table)) if slope else None)
 

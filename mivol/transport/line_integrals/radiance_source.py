@@ -25,7 +25,7 @@ from mivol.transport.line_integrals.carried_face import CellCorners, Face, Pendi
 from mivol.transport.traversal.occupied_cells import OccupiedCells
 from mivol.transport.traversal.occupied_walk import OccupiedCell
 
-__all__ = ["Baked", "CellValues", "Colours", "Exact", "Source", "bake", "make_exact", "vjp_bake"]
+__all__ = ["Baked", "CellValues", "Colours", "Exact", "Source", "add_packet", "bake", "make_exact", "sum_harmonics", "vjp_bake"]
 
 
 Colours = list
@@ -129,7 +129,7 @@ class Baked:
         on: mi.Bool,
     ) -> list:
         for node, values in zip(self._nodes(cells, visited.number, on), zip(raw, *colours, strict=True), strict=True):
-            _add_packet(self.slope, values, node, on)
+            add_packet(self.slope, values, node, on)
         return carried
 
     def finish(self, carried: list) -> None:
@@ -202,13 +202,13 @@ class Exact:
     def _value(self, row: mi.UInt32, on: mi.Bool) -> list[mi.Float]:
         """Raw density and rgb of a row."""
         values = dr.gather(mi.ArrayXf, self.table, row, on, shape=(packed_width(self.field.basis), 1))
-        return [values[3 * self.field.basis], *_sum_harmonics(values, self.basis, self.field.offset)]
+        return [values[3 * self.field.basis], *sum_harmonics(values, self.basis, self.field.offset)]
 
     def _write(self, row: mi.UInt32, slopes: list[mi.Float], on: mi.Bool) -> None:
         """Add the derivatives by the values of :meth:`_value`."""
         raw, *colour = slopes
         values = [*(c * y for y in self.basis for c in colour), raw]
-        _add_packet(self.slope, _pad_row(values, packed_width(self.field.basis)), row, on)
+        add_packet(self.slope, _pad_row(values, packed_width(self.field.basis)), row, on)
 
 
 def packed_width(basis: int) -> int:
@@ -221,7 +221,7 @@ def _pad_row(values: list[mi.Float], width: int) -> mi.ArrayXf:
     return mi.ArrayXf([*values, *(mi.Float(0) for _ in range(width - len(values)))])
 
 
-def _sum_harmonics(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> list[mi.Float]:
+def sum_harmonics(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> list[mi.Float]:
     """The colour of a row of harmonics, before the clamp."""
     colour = [mi.Float(offset)] * 3
     for b, y in enumerate(basis):
@@ -229,7 +229,7 @@ def _sum_harmonics(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> lis
     return colour
 
 
-def _add_packet(target: mi.Float, values: Sequence[mi.Float], row: mi.UInt32, on: mi.Bool) -> None:
+def add_packet(target: mi.Float, values: Sequence[mi.Float], row: mi.UInt32, on: mi.Bool) -> None:
     """Add numbers that lie side by side in memory. On the CPU each thread adds to its own copy, without atomics."""
     mode = dr.ReduceMode.Expand if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else dr.ReduceMode.Auto
     dr.scatter_add(target, mi.ArrayXf(list(values)), row, on, mode=mode)
@@ -264,7 +264,7 @@ def _fill_table(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: 
     values = dr.gather(mi.ArrayXf, field.harmonics, rows, shape=(field.width, 1))
     v = mi.UInt32(0)
     while dr.hint(v < pinholes, exclude=[table]):
-        dr.scatter(table, mi.ArrayXf([raw, *_sum_harmonics(values, view_basis(node, v), field.offset)]), number + v * count)
+        dr.scatter(table, mi.ArrayXf([raw, *sum_harmonics(values, view_basis(node, v), field.offset)]), number + v * count)
         v += 1
 
 
