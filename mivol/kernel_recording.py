@@ -8,10 +8,13 @@ aborts: callables of several targets and of one target have different keys (``Gl
 
 from __future__ import annotations
 
+import copy
 import gc
 import itertools
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -76,17 +79,19 @@ class Recordings:
 
     Args:
         most: largest number of recordings; the least recently used is dropped.
+        keeps_literals: whether a recording holds the values of inputs that Dr.Jit knows as numbers, which makes faster kernels;
+            an input that changes is recorded anew, once, as an array. False: all inputs are arrays.
 
     Attributes:
         failures: why Dr.Jit could not record tasks, by the class of the task.
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, keeps_literals: bool = True) -> None:
         self.most = most
         self.failures: dict[type[RecordedTask], list[str]] = {}
         self._tasks: dict[Hashable, RecordedTask] = {}
         # dr.freeze defines a class in each call, which only Python's collector can free.
-        self._frozen = dr.detail.FrozenFunction(_run_task, most, 1 << 30, dr.JitBackend.Invalid, True)
+        self._frozen = dr.detail.FrozenFunction(_run_task, most, 1 << 30, dr.JitBackend.Invalid, keeps_literals)
 
     @property
     def count(self) -> int:
@@ -127,6 +132,96 @@ class Recordings:
                 raise KeyboardInterrupt from None
             failures.append(task.failure or str(error.__cause__ or error))
         raise CannotRecordError(failures[-1])
+
+
+class RecordedFunctions:
+    """Functions of structures of arrays, whose kernels are recorded in the first call and replayed in later calls.
+
+    A call is recorded anew for another function, for other values in the structures that are no arrays, and for other sizes of
+    arrays, since a recording holds sizes as numbers. A function that Dr.Jit cannot record is run.
+
+    Args:
+        most: largest number of recordings; the least recently used is dropped.
+    """
+
+    def __init__(self, most: int = 8) -> None:
+        self._recordings = Recordings(most, keeps_literals=False)
+
+    @property
+    def count(self) -> int:
+        """Number of recordings made so far."""
+        return self._recordings.count
+
+    def call(self, function: Callable, *arguments: Any) -> Any:
+        """The result of ``function(*arguments)``.
+
+        Args:
+            function: function of a module. It changes no array of its arguments, and reads arrays of its arguments only.
+            arguments: arrays, hashable values, and dataclasses, lists, tuples and dicts of these. Values may be small NumPy
+                arrays. What differs from call to call must be in a Dr.Jit array.
+        """
+        arrays: list[Any] = []
+        key = _list_arrays(arguments, arrays)
+        make = partial(_FunctionTask, function, arguments)
+        try:
+            return self._recordings.call(_FunctionTask, (function, key), make, arrays)
+        except CannotRecordError:
+            return function(*arguments)
+
+
+class _FunctionTask(RecordedTask):
+    """A function with the parts of its arguments that are no arrays."""
+
+    def __init__(self, function: Callable, arguments: tuple[Any, ...]) -> None:
+        super().__init__()
+        self._function, self._arguments = function, _replace_arrays(arguments, itertools.repeat(_Place()))
+
+    def __call__(self, arrays: list[Any]) -> Any:
+        return self._function(*_replace_arrays(self._arguments, iter(arrays)))
+
+
+class _Place:
+    """The place of an array in a structure."""
+
+
+PLAIN = frozenset({int, float, bool, str, type(None)})
+
+
+def _list_arrays(value: Any, arrays: list[Any]) -> Hashable:
+    """Append the arrays of a structure to a list; returns all else as a key."""
+    kind = type(value)
+    if kind in PLAIN:
+        return value
+    if dr.is_array_v(kind):
+        arrays.append(value)
+        return kind, value.shape
+    if kind is dict:
+        return tuple([(name, _list_arrays(part, arrays)) for name, part in value.items()])
+    if isinstance(value, (list, tuple)):
+        return kind, tuple([_list_arrays(part, arrays) for part in value])
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype.str, value.tobytes()
+    if is_dataclass(kind):
+        return kind, tuple([(name, _list_arrays(part, arrays)) for name, part in vars(value).items()])
+    return value
+
+
+def _replace_arrays(value: Any, others: Iterator[Any]) -> Any:
+    """A structure with other arrays, or with places, in the order of :func:`_list_arrays`: of its arrays or its places."""
+    kind = type(value)
+    if kind is _Place or dr.is_array_v(kind):
+        return next(others)
+    if kind is dict:
+        return {name: _replace_arrays(part, others) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        parts = [_replace_arrays(part, others) for part in value]
+        return kind(*parts) if hasattr(kind, "_fields") else kind(parts)
+    if is_dataclass(kind):
+        whole = copy.copy(value)  # the parts are checked
+        for name, part in vars(value).items():
+            object.__setattr__(whole, name, _replace_arrays(part, others))
+        return whole
+    return value
 
 
 def _run_task(given: dict[str, Any]) -> Any:

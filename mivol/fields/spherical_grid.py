@@ -29,6 +29,7 @@ References: Sloan 2008, 2013 (harmonics); Yu et al. 2021, Fridovich-Keil, Yu et 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -116,6 +117,9 @@ class SphericalGrid:
         select_activation(self.activation)
         if self.space not in SPACES:
             raise MivolError(f"the space of a field's colours is {self.space!r}; {' or '.join(SPACES)} is expected.")
+        self._check_rows()
+
+    def _check_rows(self) -> None:
         expected = self.rows
         if dr.width(self.density) != expected or dr.width(self.harmonics) != expected * self.width:
             raise MivolError(
@@ -325,8 +329,15 @@ class SphericalGrid:
         return replace(self, harmonics=self.harmonics * factor, offset=self.offset * factor)
 
     def with_values(self, density: mi.Float, harmonics: mi.Float) -> SphericalGrid:
-        """The field with other rows at the same nodes."""
-        return replace(self, density=density, harmonics=harmonics)
+        """The field with other rows at the same nodes.
+
+        Raises:
+            MivolError: values for another number of rows.
+        """
+        other = copy.copy(self)  # the place and the settings are checked
+        other.density, other.harmonics = density, harmonics
+        other._check_rows()
+        return other
 
     def with_tensors(self, density: mi.TensorXf, sh: mi.TensorXf) -> SphericalGrid:
         """The field with the values of two tensors, as a scene's parameters hold them; derivatives pass through.
@@ -417,18 +428,21 @@ class SphericalGrid:
         """Harmonics of unit directions of travel in the world."""
         return dr.sh_eval(rotate_direction(local_frame(self.to_world), d), self.degree)
 
-    def make_view_basis(self, points: np.ndarray) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
+    def offsets_from(self, points: np.ndarray) -> mi.Float:
+        """Offsets of the middle of the boxes from world points (V, 3), in the grid's frame, and a 0: 3 V + 1 numbers."""
+        # A difference in float64.
+        offsets = (local_frame(self.to_world) @ (self.middle - np.asarray(points, np.float64)).T).T
+        return mi.Float(copy_aligned(np.append(np.float32(offsets).reshape(-1), np.float32(0))))
+
+    def make_view_basis(self, offsets: mi.Float) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
         """A function of node numbers and point numbers that returns the harmonics of the directions from points to nodes.
 
         Args:
-            points: (V, 3) world.
+            offsets: of the points, from :meth:`offsets_from`.
         """
         z, y, x = self.res
         frame, per_level = local_frame(self.to_world), math.prod(self.res)
         linear = frame @ self.to_world[:3, :3] / np.array([x, y, z], np.float64)
-        # Middle of the boxes minus the point, in the grid's frame: a difference in float64.
-        start = (frame @ (self.middle - np.asarray(points, np.float64)).T).T
-        starts = mi.Float(np.append(np.float32(start).reshape(-1), np.float32(0)))
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in linear]
 
         def basis(node: mi.UInt32, view: mi.UInt32) -> list[mi.Float]:
@@ -436,7 +450,7 @@ class SphericalGrid:
             scale = mi.Float(mi.UInt32(1) << (node // per_level))
             indices = (inner % x, x), (inner // x % y, y), (inner // (x * y), z)
             q = [scale * (mi.Float(index) + (0.5 - 0.5 * n)) for index, n in indices]
-            from_point = [dr.gather(mi.Float, starts, view * 3 + a) for a in range(3)]
+            from_point = [dr.gather(mi.Float, offsets, view * 3 + a) for a in range(3)]
             d = mi.Vector3f(*(_affine(row, q, s) for row, s in zip(rows, from_point, strict=True)))
             length = dr.norm(d)
             return dr.sh_eval(dr.select(length > 0, d / length, mi.Vector3f(0, 0, 1)), self.degree)

@@ -8,13 +8,15 @@ References: Kingma and Ba 2015 (Adam); Hinton 2012 (RMSprop; Coursera, lecture 6
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.kernel_recording import RecordedFunctions
 from mivol.optim.optimizer import FirstOrder, OptimizerRun
 from mivol.optim.problem import DifferentiableProblem, Reals, Refinement
 from mivol.optim.strategy import setting
@@ -142,34 +144,28 @@ class RMSpropRun(OptimizerRun):
         super().__init__(problem)
         self.settings = settings
         self.squares = {name: self._store(dr.zeros(mi.TensorXf, value.shape)) for name, value in self.reals.items()}
+        self._recorded = RecordedFunctions()
 
     def step(self, iteration: int, factor: float) -> float | mi.Float:
         loss, slopes = self.problem.loss_and_gradient(self.reals, iteration, self.settings.views)
-        rates = self.problem.learning_rates(iteration)
-        reals, squares = self._step(slopes, {name: rate * factor for name, rate in rates.items()})
-        del slopes  # as large as the reals
-        # Squares and reals share terms: scheduled here, both are evaluated in the same kernels.
-        dr.schedule(squares)
-        reals = self.problem.after_step(reals, iteration)
-        dr.eval(reals, squares)
+        rates = {name: dr.opaque(mi.Float, rate * factor) for name, rate in self.problem.learning_rates(iteration).items()}
+        moves = getattr(self.problem, "moves_after_step", lambda iteration: [])(iteration)
+        given = self.settings.memory, self.settings.half, self.reals, self.squares, slopes, rates
+        reals, squares = self._recorded.call(descend_and_move, *given, *(moves[0] if moves else (_stay, ())))
+        del slopes, given  # as large as the reals
+        for function, arguments in moves[1:]:
+            reals = self._recorded.call(function, reals, *arguments)
+        if not moves:
+            reals = self.problem.after_step(reals, iteration)
+            dr.eval(reals)
         self.reals, self.squares = reals, squares
         return loss
 
-    def _step(self, slopes: Reals, rates: dict[str, float]) -> tuple[Reals, Reals]:
-        """Reals and squares after a step."""
-        reals, squares = {}, {}
-        for name, value in self.reals.items():
-            known, slope = self._load(self.squares[name]).array, slopes[name].array
-            moved = descend(value.array, known, slope, rates[name], self.settings.memory)
-            reals[name], means = (mi.TensorXf(array, value.shape) for array in moved)
-            squares[name] = self._store(means)
-        return reals, squares
-
     def _store(self, means: mi.TensorXf) -> mi.TensorXf | mi.TensorXf16:
-        return to_halves(means) if self.settings.half else means
+        return store_means(means, self.settings.half)
 
     def _load(self, held: mi.TensorXf | mi.TensorXf16) -> mi.TensorXf:
-        return from_halves(held) if self.settings.half else held
+        return load_means(held)
 
     def pack(self) -> dict[str, np.ndarray]:
         return super().pack() | {f"{self._key}/{name}": np.array(value) for name, value in self.squares.items()}
@@ -200,6 +196,43 @@ class RMSpropRun(OptimizerRun):
         dr.eval(self.squares)
 
 
+def descend_and_move(
+    memory: float,
+    half: bool,
+    reals: Reals,
+    squares: Reals,
+    slopes: Reals,
+    rates: dict[str, mi.Float],
+    move: Callable[..., Reals],
+    arguments: tuple[Any, ...],
+) -> tuple[Reals, Reals]:
+    """Reals and running means after a step and a move (``move(reals, *arguments)``), in the same kernels."""
+    moved, means = {}, {}
+    for name, value in reals.items():
+        found = descend(value.array, load_means(squares[name]).array, slopes[name].array, rates[name], memory)
+        moved[name], mean = (mi.TensorXf(array, value.shape) for array in found)
+        means[name] = store_means(mean, half)
+    # Squares and reals share terms: scheduled here, both are evaluated in the same kernels.
+    dr.schedule(means)
+    moved = move(moved, *arguments)
+    dr.eval(moved, means)
+    return moved, means
+
+
+def _stay(reals: Reals) -> Reals:
+    return reals
+
+
+def store_means(means: mi.TensorXf, half: bool) -> mi.TensorXf | mi.TensorXf16:
+    """Running means in the precision of a fit."""
+    return to_halves(means) if half else means
+
+
+def load_means(held: mi.TensorXf | mi.TensorXf16) -> mi.TensorXf:
+    """Running means from :func:`store_means`."""
+    return from_halves(held) if isinstance(held, mi.TensorXf16) else held
+
+
 def to_halves(means: mi.TensorXf) -> mi.TensorXf16:
     """Running means as fourth roots in half precision, scaled by ``UNIT``."""
     roots = dr.minimum(UNIT * dr.sqrt(dr.sqrt(means.array)), LARGEST)
@@ -211,10 +244,12 @@ def from_halves(roots: mi.TensorXf16) -> mi.TensorXf:
     return mi.TensorXf(dr.square(dr.square(mi.Float(roots.array) * (1 / UNIT))), roots.shape)
 
 
-def descend(values: mi.Float, squares: mi.Float, slope: mi.Float, rate: float, memory: float) -> tuple[mi.Float, mi.Float]:
+def descend(
+    values: mi.Float, squares: mi.Float, slope: mi.Float, rate: mi.Float | float, memory: float
+) -> tuple[mi.Float, mi.Float]:
     """Values and running means of squared derivatives after a step of ``rate``, where the derivative is not 0."""
     square = dr.square(slope)
     mean = dr.select(squares == 0, square, dr.fma(memory, squares - square, square))
     touched = mean > 0
-    step = dr.opaque(mi.Float, rate) * slope * dr.rsqrt(dr.select(touched, mean, 1))
+    step = rate * slope * dr.rsqrt(dr.select(touched, mean, 1))
     return dr.select(touched, values - step, values), dr.select(slope == 0, squares, mean)

@@ -20,8 +20,9 @@ Loshchilov & Hutter 2019 (decoupling).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -204,6 +205,11 @@ class Neighbours:
     after: list[mi.UInt32]
     before: list[mi.UInt32]
 
+    @property
+    def count(self) -> int:
+        """Number of rows with neighbours."""
+        return dr.width(self.after[0])
+
     @classmethod
     def from_field(cls, field: SphericalGrid) -> Neighbours:
         """Find the neighbours of each row of a field."""
@@ -243,6 +249,18 @@ class Rows:
     step: int = 0
 
 
+class Move(NamedTuple):
+    """A change of a parameter's values, as a function that can be recorded.
+
+    Attributes:
+        function: ``function(values, *arguments) -> values``, a function of a module. It reads arrays of its arguments only.
+        arguments: numbers that differ from step to step are arrays.
+    """
+
+    function: Callable[..., mi.Float]
+    arguments: tuple[Any, ...]
+
+
 class DecoupledPrior(Strategy, tag="decoupled prior"):
     """A move of a parameter's values after each step; ``is_spatial`` marks priors that compare neighbours."""
 
@@ -250,9 +268,18 @@ class DecoupledPrior(Strategy, tag="decoupled prior"):
 
     weight: Annotated[float, setting("photograph", "number of agreeing photographs that balance the prior", ge=0)] = 1.0
 
-    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
-        """Values after the move; a spatial prior takes evaluated values."""
+    def make_move(self, rows: Rows) -> Move | None:
+        """The move; None leaves all values. A spatial prior takes evaluated values."""
         raise NotImplementedError
+
+    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
+        """Values after the move."""
+        return move_values(values, self.make_move(rows))
+
+
+def move_values(values: mi.Float, move: Move | None) -> mi.Float:
+    """Values after a move, if there is one."""
+    return values if move is None else move.function(values, *move.arguments)
 
 
 class Smoothness(DecoupledPrior, tag="smoothness"):
@@ -267,57 +294,60 @@ class Smoothness(DecoupledPrior, tag="smoothness"):
     share: Annotated[float, setting("1", "share of the rows per step", gt=0, le=1)] = 1 / 8
     every: Annotated[int, setting("step", "steps between applications, each to the shares of all these steps", ge=1)] = 1
 
-    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
+    def make_move(self, rows: Rows) -> Move | None:
         if rows.step % self.every:
-            return values
-        moved = mi.Float(values)
-        smooth(moved, rows, self.every * self.weight, min(self.every * self.share, 1))
-        return moved
+            return None
+        share, amount = min(self.every * self.share, 1), rows.rate * (self.every * self.weight) / rows.unit
+        if amount == 0:
+            return None
+        run = max(int(rows.neighbours.count * share), 1)
+        first, length = dr.opaque(mi.UInt32, rows.first), dr.opaque(mi.Float, amount / share)
+        return Move(smooth, (rows.width, rows.neighbours, run, first, length))
 
 
 class Sparsity(DecoupledPrior, tag="sparsity"):
     """The Cauchy prior on a density. Source: Hedman et al. 2021."""
 
-    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
-        return sparsify(values, rows.rate * self.weight, rows.unit)
+    def make_move(self, rows: Rows) -> Move | None:
+        amount = rows.rate * self.weight
+        return Move(sparsify, (dr.opaque(mi.Float, 4 * amount), rows.unit)) if amount else None
 
 
 class ViewDependence(DecoupledPrior, tag="view_dependence"):
     """Weight decay on the view-dependent coefficients. These overfit with few photographs."""
 
-    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
-        return decay_view_dependence(values, rows.width, rows.rate * self.weight)
+    def make_move(self, rows: Rows) -> Move | None:
+        share = rows.rate * self.weight
+        return Move(decay_view_dependence, (rows.width, dr.opaque(mi.Float, 1 - min(share, 1)))) if share else None
 
 
-def smooth(values: mi.Float, rows: Rows, weight: float, share: float) -> None:
-    """Move a run of rows down the slope of the total variation.
+def smooth(values: mi.Float, width: int, neighbours: Neighbours, run: int, first: mi.UInt32, length: mi.Float) -> mi.Float:
+    """Values after a run of rows moved down the slope of the total variation.
 
-    A step down a slope of 1 has the length amount = rate * weight / unit. A row appears in four terms, its own and the terms of
-    the three previous nodes. With delta = 6 amount / share no term moves the row by more than a sixth of a difference, so
-    values stay between their former minimum and maximum.
+    A row appears in four terms, its own and the terms of the three previous nodes. Differences below 6 times the length of a
+    step count as noise, so no term moves the row by more than a sixth of a difference, and values stay between their former
+    minimum and maximum.
 
     Args:
-        values: moved in place.
-        rows: width, neighbours and rate of the rows.
-        weight: weight of the prior; 0 moves nothing.
-        share: share of the rows to move; these rows stand for all rows.
+        values: evaluated; they stay.
+        width: numbers per row.
+        neighbours: rows beside each row.
+        run: number of rows to move.
+        first: number of the first row to move.
+        length: of a step down a slope of 1: the amount of the prior over the share of the rows, which stand for all rows.
 
-    Cost: 13 rows read and 1 row written per moved row. A row is written by a single lane, without atomic addition.
+    Cost: all values are copied; 13 rows read and 1 row written per moved row. A row is written by a single lane, without
+    atomic addition.
     """
-    amount = rows.rate * weight / rows.unit
-    if amount == 0:
-        return
-    next_rows, width = rows.neighbours.after, rows.width
-    count = dr.width(next_rows[0])
-    row = (dr.arange(mi.UInt32, max(int(count * share), 1)) + dr.opaque(mi.UInt32, rows.first)) % count
-    length = dr.opaque(mi.Float, amount / share)
+    moved_values, next_rows = mi.Float(values), neighbours.after
+    row = (dr.arange(mi.UInt32, run) + first) % neighbours.count
 
     def numbers(row: mi.UInt32) -> mi.ArrayXf:
         return dr.gather(mi.ArrayXf, values, row, shape=(width, 1))
 
     own_values = numbers(row)
     terms = [(own_values, [numbers(dr.gather(mi.UInt32, after, row)) for after in next_rows])]
-    for axis, before in enumerate(rows.neighbours.before):
+    for axis, before in enumerate(neighbours.before):
         # Without a previous node, `node` is the row itself, and its difference to the row is 0.
         node = dr.gather(mi.UInt32, before, row)
         after = [own_values if a == axis else numbers(dr.gather(mi.UInt32, next_, node)) for a, next_ in enumerate(next_rows)]
@@ -326,7 +356,8 @@ def smooth(values: mi.Float, rows: Rows, weight: float, share: float) -> None:
     for c in range(width):
         own, *others = (_slopes([end[c] - at[c] for end in ends], 6 * length) for at, ends in terms)
         moved.append(dr.fma(length, sum(own) - sum(slopes[axis] for axis, slopes in enumerate(others)), own_values[c]))
-    dr.scatter(values, mi.ArrayXf(moved), row)
+    dr.scatter(moved_values, mi.ArrayXf(moved), row)
+    return moved_values
 
 
 def _slopes(steps: list[mi.Float], delta: mi.Float) -> list[mi.Float]:
@@ -334,20 +365,15 @@ def _slopes(steps: list[mi.Float], delta: mi.Float) -> list[mi.Float]:
     return [s * dr.rsqrt(dr.square(delta) + sum(dr.square(s) for s in steps)) for s in steps]
 
 
-def sparsify(density: mi.Float, amount: float, unit: float) -> mi.Float:
-    """Density after a step of ``amount`` [1] down the Cauchy prior's slope, in units of 1 / ``unit``, and at least 0."""
-    if amount == 0:
-        return density
+def sparsify(density: mi.Float, step: mi.Float, unit: float) -> mi.Float:
+    """Density after the slope of the Cauchy prior times ``step`` / 4 [1], in units of 1 / ``unit``, and at least 0."""
     sigma = dr.maximum(density * unit, 0)
-    step = dr.opaque(mi.Float, 4 * amount) * sigma / (1 + 2 * dr.square(sigma))
-    return density - dr.minimum(step, sigma) * (1 / unit)
+    fall = step * sigma / (1 + 2 * dr.square(sigma))
+    return density - dr.minimum(fall, sigma) * (1 / unit)
 
 
-def decay_view_dependence(harmonics: mi.Float, width: int, share: float) -> mi.Float:
-    """Coefficients, ``width`` per row, after all but the three constant ones lost the share ``share``."""
-    if share == 0:
-        return harmonics
-    factor = dr.opaque(mi.Float, 1 - min(share, 1))
+def decay_view_dependence(harmonics: mi.Float, width: int, factor: mi.Float) -> mi.Float:
+    """Coefficients, ``width`` per row, of which all but the three constant ones are multiplied by a factor."""
     return dr.select(dr.arange(mi.UInt32, dr.width(harmonics)) % width < 3, harmonics, harmonics * factor)
 
 

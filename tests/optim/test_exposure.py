@@ -20,7 +20,7 @@ from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import begin_fit
 from mivol.optim.photographs import radiance_problem
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.photo_colours import AGREE, GAIN_PULL, GAIN_RATE, Exposure
+from mivol.optim.photographs.photo_colours import AGREE, GAIN_PULL, GAIN_RATE, Exposure, pull_at
 from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
@@ -50,7 +50,7 @@ def problem_of(plan: RadiancePlan = SMALL, count: int = 5, uneven: float = 0.0) 
 
 def test_regularized_gains_move_towards_1_with_mean_1(variant_rgb: str) -> None:
     logs = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
-    found = Exposure(mi.Float(logs.ravel())).regularized(0.3)
+    found = Exposure(mi.Float(logs.ravel())).regularized(pull_at(0.3))
     wanted = (logs - logs.mean(axis=0)) * (1 - 0.3 * GAIN_PULL)
     # float32: a mean of seven numbers of up to 3, and two products: a few times 3 x 6e-8.
     np.testing.assert_allclose(np.array(found.tensor), wanted, atol=1e-6)
@@ -115,7 +115,7 @@ def test_gains_of_equal_exposures_are_removed(variant_rgb: str, spread: float, s
     assert slopes.shape == (15,) and slopes.any() != bool(said)
     reals = problem.values() | {"exposure": mi.TensorXf(logs)}
     pulled = np.array(problem.after_step(reals, 0)["exposure"])
-    wanted = logs if said else np.array(Exposure(mi.Float(logs.ravel())).regularized(GAIN_RATE).tensor)
+    wanted = logs if said else np.array(Exposure(mi.Float(logs.ravel())).regularized(pull_at(GAIN_RATE)).tensor)
     np.testing.assert_allclose(pulled, wanted, atol=1e-8)
     problem.exposure = Exposure(mi.Float(logs.ravel()))
     assert "exposure" not in problem.refine(2).message and problem.has_gains != bool(said)

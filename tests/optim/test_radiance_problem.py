@@ -14,6 +14,7 @@ from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
 from mivol.fields.sky import Sky
+from mivol.kernel_recording import RecordedFunctions
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import Fit, begin_fit, reconstruct
 from mivol.optim.photographs.field_view import render_view
@@ -312,3 +313,19 @@ def test_current_field_follows_the_latest_step(variant_rgb: str, photos: list[Ph
         assert np.array_equal(found.density, fit.run.reals["density"].array)
         assert not np.array_equal(found.density, before)
         before = np.array(found.density)
+
+
+def test_steps_are_recorded_once_and_equal_traced_steps(
+    one_thread: None, photos: list[Photo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps differ in views, tiles, background, rates and the rows that the prior moves: each as an array."""
+    plan = replace(PLAN, stages=PLAN.stages[:1], random_background=True, tv_density=0.1, sparsity=0.1, beta=0.01)
+    batches = RayBatches.from_photos(photos[:4], (2,))
+    recorded = fitted(batches, plan, 6)
+    assert (recorded.problem._recorded.count, recorded.run._recorded.count) == (1, 2)
+    monkeypatch.setattr(RecordedFunctions, "call", lambda self, function, *arguments: function(*arguments))
+    traced = fitted(batches, plan, 6)
+    assert traced.problem._recorded.count == 0
+    assert [row["loss"] for row in recorded.history] == [row["loss"] for row in traced.history]
+    for name, value in traced.run.reals.items():
+        np.testing.assert_array_equal(np.array(recorded.run.reals[name]), np.array(value))

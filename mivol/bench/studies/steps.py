@@ -13,7 +13,8 @@ The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth
 ``everyday``.
 
 fits: a step of the fit loop with its optimizer, schedule, priors and record, on tiny models: the density of ``tutorial`` with
-Adam (also through ``prbvolpath``), a radiance field of 24^3 nodes and 256 Gaussians, both from photographs of 24^2 pixels.
+Adam (also through ``prbvolpath``), a radiance field of 24^3 nodes (256 rays a step) and 256 Gaussians, both from photographs
+of 24^2 pixels.
 
 Milliseconds are wall times: medians over the steps after the first ``WARM`` ones, in which both integrators compile. A ratio is
 the time of ``prbvolpath`` over the time of mivol, without regard to their noise (``mivol bench everyday`` compares errors).
@@ -153,7 +154,7 @@ def measure_fits(size: StepsSize) -> dict:
     """Time steps of fits of tiny models."""
     scenes = {name: _begin_scene_fit(name) for name in (PEER, "mivol")}
     photos = _photograph_cloud()
-    grid = RadiancePlan((RadianceStage(24, 1000, 1, 4),), degree=1)
+    grid = RadiancePlan((RadianceStage(24, 1000, tiles=4),), degree=1)
     field = RadianceProblem(RayBatches.from_photos(photos, (1,)), np.array([[-1.0] * 3, [1.0] * 3]), grid)
     plan = GaussianPlan((GaussianStage(PHOTO_SIDE, 1000, 1, 1),), start=256, most=256)
     cloud = make_start_cloud(_draw_places(256, 1), photos, plan.degree)

@@ -32,7 +32,7 @@ from mivol.optim.gaussians.density_control import (
 )
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, scene_extent
 from mivol.optim.losses import ImageShape, image_loss
-from mivol.optim.photographs.photo_colours import Exposure
+from mivol.optim.photographs.photo_colours import Exposure, pull_at
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, StagedProblem, add_parts, to_arrays, to_tensors
 from mivol.optim.strategy import suggest_name
@@ -312,7 +312,7 @@ class GaussianProblem(StagedProblem, DividedProblem):
     def after_step(self, reals: Reals, iteration: int) -> Reals:
         """Pull gains towards 1; for relocation, move transparent Gaussians at random (Kheradmand et al. 2024, eq. 8)."""
         if self.exposure is not None:
-            pulled = Exposure(reals["exposure"].array).regularized(self._gain_step(iteration) / len(self.cameras))
+            pulled = Exposure(reals["exposure"].array).regularized(pull_at(self._gain_step(iteration) / len(self.cameras)))
             dr.eval(pulled.logs)
             reals = reals | {"exposure": pulled.tensor}
         if self.plan.control != "relocation" or iteration >= self.plan.growth[1] * self.plan.steps:

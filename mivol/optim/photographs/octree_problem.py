@@ -312,7 +312,9 @@ class OctreeProblem(SparseProblem, DividedProblem):
         share = self.plan.leaves.matte * self.learning_rates(iteration)["harmonics"] / len(self.batches.origins)
         return {
             "density": mi.TensorXf(dr.maximum(density.array, 0), density.shape),
-            "harmonics": mi.TensorXf(decay_view_dependence(harmonics.array, self.tree.width, share), harmonics.shape),
+            "harmonics": mi.TensorXf(
+                decay_view_dependence(harmonics.array, self.tree.width, dr.opaque(mi.Float, 1 - min(share, 1))), harmonics.shape
+            ),
         }
 
     # -- Stages -------------------------------------------------------------------------------------------------------

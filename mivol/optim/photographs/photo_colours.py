@@ -148,6 +148,11 @@ def compare_rays(
     return RayErrors(colour, dr.squared_norm(error) * (1 / 3), by_colour, by_radiance, dr.dot(by_radiance, backdrop))
 
 
+def mean_of(values: mi.Float) -> mi.Float:
+    """The mean, equal to the bit in a recording and without: ``dr.mean`` divides by a width that it hides from a recording."""
+    return dr.sum(values) * (1 / dr.width(values))
+
+
 CHANNELS = 3
 
 GAIN_RATE = 0.01
@@ -201,9 +206,14 @@ class Exposure:
             dr.scatter_add(total, by[k], view * CHANNELS + k)
         return total
 
-    def regularized(self, rate: float) -> Exposure:
-        """Gains after a step's prior: pulled towards 1, with a mean logarithm of 0 in each channel."""
+    def regularized(self, pull: mi.Float) -> Exposure:
+        """Gains after a step's prior: pulled towards 1 by a share, with a mean logarithm of 0 in each channel."""
         entry, photographs = dr.arange(mi.UInt32, dr.width(self.logs)), dr.arange(mi.UInt32, dr.width(self.logs) // CHANNELS)
-        means = [dr.mean(dr.gather(mi.Float, self.logs, photographs * CHANNELS + k)) for k in range(CHANNELS)]
+        means = [mean_of(dr.gather(mi.Float, self.logs, photographs * CHANNELS + k)) for k in range(CHANNELS)]
         mean = dr.select(entry % CHANNELS == 0, means[0], dr.select(entry % CHANNELS == 1, means[1], means[2]))
-        return Exposure((self.logs - mean) * (1 - dr.opaque(mi.Float, GAIN_PULL * rate)))
+        return Exposure((self.logs - mean) * (1 - pull))
+
+
+def pull_at(rate: float) -> mi.Float:
+    """Share by which :meth:`Exposure.regularized` pulls gains with a learning rate."""
+    return dr.opaque(mi.Float, GAIN_PULL * rate)

@@ -31,24 +31,26 @@ from mivol.fields.harmonics import basis_size, row_width
 from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
+from mivol.kernel_recording import RecordedFunctions
 from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure, compare_rays
+from mivol.optim.photographs.batch_gradient import (
+    FieldModel,
+    GradientSettings,
+    differentiate_batch,
+    differentiate_tiles,
+    keep_free,
+    move_numbers,
+    move_rows,
+)
+from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure, pull_at
 from mivol.optim.photographs.radiance_plan import RadiancePlan
-from mivol.optim.photographs.ray_batches import DepthRays, RayBatch, RayBatches, depth_loss_gradient, sample_depth_rays
+from mivol.optim.photographs.ray_batches import POINTS_PER_VIEW, DepthRays, RayBatch, RayBatches, sample_depth_rays
 from mivol.optim.priors import Neighbours, Rows
 from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, SparseProblem, to_tensors
 from mivol.photos.region import is_free_space, median_distance
 from mivol.space import place_grid
-from mivol.transport.line_integrals.radiance_field import (
-    Model,
-    RayGradient,
-    find_occupied_cells,
-    make_model,
-    raise_to_max_weights,
-    render_rays,
-    vjp_rays,
-)
-from mivol.transport.line_integrals.radiance_source import Baked, bake, vjp_bake
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, raise_to_max_weights
+from mivol.transport.line_integrals.radiance_source import bake
 from mivol.transport.traversal.occupied_cells import OccupiedCells
 
 
@@ -59,13 +61,13 @@ class StepRays(NamedTuple):
         views: numbers of the chosen views.
         corner: (views, tiles, 2) first pixels of the tiles.
         background: put behind all photographs (3,); None keeps their own.
-        rng: the generator after these draws.
+        first_row: first row that a prior moves, if it moves a share of the rows.
     """
 
     views: np.ndarray
     corner: np.ndarray
     background: np.ndarray | None
-    rng: np.random.Generator
+    first_row: int
 
 
 @dataclasses.dataclass
@@ -126,6 +128,8 @@ class RadianceProblem(SparseProblem, DividedProblem):
         fog = _fog(*grid, degree, self.plan.start / self.unit, self.plan.levels, self.batches.space)
         self.field = _coloured(fog, self.scale.fog_colour(self.batches.pixels))
         self._first_row = 0
+        self._drawn: tuple[Any, StepRays] | None = None
+        self._recorded = RecordedFunctions()
         self._update_neighbours()
 
     # -- Values -------------------------------------------------------------------------------------------------------
@@ -169,8 +173,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
             self.set_reals(reals)
             count = len(self._draw_step(iteration, views).views)
             found = to_tensors(self.divide(self, reals, [(iteration, views, (number,)) for number in range(count)]))
-        rng = self._draw_step(iteration, views).rng
-        self._first_row = int(rng.integers(dr.width(self._neighbours.after[0])))
+        self._first_row = self._draw_step(iteration, views).first_row
         return found.pop("loss").array, found
 
     def compute_part(self, reals: Reals, iteration: int, views: int, only: Sequence[int] | None = None) -> Reals:
@@ -184,20 +187,40 @@ class RadianceProblem(SparseProblem, DividedProblem):
         self.set_reals(reals)
         step = self._draw_step(iteration, views)
         numbers = list(range(len(step.views)) if only is None else only)
-        share = len(numbers) / len(step.views)
-        batch = self.batches.make_tiles(self.plan.stages[self.stage].shrink, step.views[numbers], step.corner[numbers])
+        chosen = step.views[numbers]
+        pixels = self.batches.tabulate(self.plan.stages[self.stage].shrink, chosen, step.corner[numbers])
         depth_rays = self._draw_depth_rays(step.views, iteration) if 0 in numbers else None
-        loss, slopes = self.batch_loss_and_gradient(batch, step.background, depth_rays, share)
-        slopes |= {name: self.scale.gradient_by_reals(slopes[name], reals[name].array) for name in self._colours(reals)}
-        found = {name: mi.TensorXf(slopes[name], value.shape) for name, value in reals.items()}
-        return found | {"loss": mi.TensorXf(dr.mean(loss) * share, (1,))}
+        if depth_rays is not None:
+            depth_rays = dataclasses.replace(depth_rays, count=dr.opaque(mi.UInt32, depth_rays.count))
+        return self._recorded.call(
+            differentiate_tiles,
+            self._gradient_settings(len(numbers) / len(step.views)),
+            self._field_model(),
+            reals,
+            pixels,
+            self.field.offsets_from(self.batches.origins[chosen]),
+            _opaque_colour(step.background),
+            depth_rays,
+        )
+
+    def _gradient_settings(self, share: float) -> GradientSettings:
+        plan = self.plan
+        return GradientSettings(self.scale, plan.stop, plan.beta, plan.depth, self.near, self.has_gains, share)
+
+    def _field_model(self) -> FieldModel:
+        return FieldModel(self.field, self._cells, self.sky, self.exposure)
 
     def _draw_step(self, iteration: int, views: int) -> StepRays:
-        """The random numbers of a step."""
-        stage, rng = self.plan.stages[self.stage], np.random.default_rng((self.seed, iteration))
-        chosen = self.batches.choose_views(views or stage.views, rng)
-        corner = self.batches.draw_corners(stage.shrink, chosen, stage.tiles, rng)
-        return StepRays(chosen, corner, self._background(rng), rng)
+        """The random numbers of a step; the latest step is kept."""
+        stage, key = self.plan.stages[self.stage], (self.seed, self.stage, iteration, views)
+        if self._drawn is None or self._drawn[0] != key:
+            rng = np.random.default_rng((self.seed, iteration))
+            chosen = self.batches.choose_views(views or stage.views, rng)
+            corner = self.batches.draw_corners(stage.shrink, chosen, stage.tiles, rng)
+            background = self._background(rng)
+            first_row = int(rng.integers(self._neighbours.count))
+            self._drawn = key, StepRays(chosen, corner, background, first_row)
+        return self._drawn[1]
 
     def step_state(self) -> dict[str, Any]:
         """The nodes and the listed cells."""
@@ -222,7 +245,8 @@ class RadianceProblem(SparseProblem, DividedProblem):
             return None
         voxel, rng = 2 * self.unit / self.plan.stages[self.stage].longest, np.random.default_rng((self.seed, iteration, 1))
         points = [self.batches.points[view] for view in chosen]
-        return sample_depth_rays(points, self.batches.origins[chosen], self.box, self.plan.levels, voxel, rng)
+        least = len(points) * POINTS_PER_VIEW
+        return sample_depth_rays(points, self.batches.origins[chosen], self.box, self.plan.levels, voxel, rng, least)
 
     def batch_loss_and_gradient(
         self,
@@ -239,47 +263,8 @@ class RadianceProblem(SparseProblem, DividedProblem):
             depth_rays: points of the same views; only the derivatives contain the plan's weight times their energy.
             share: of the batch in a step, a factor on the derivatives of rays.
         """
-        source = bake(self.field, self._cells, batch.origins, batch.slot, slope=True)
-        model, count = make_model(self.field, self.plan.stop), dr.width(batch.slot)
-        rendered = render_rays(self._cells, source, model, batch.rays)
-        backdrop = batch.background
-        if background is not None:
-            backdrop = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
-        backdrop = backdrop if self.sky is None else self.sky.eval(batch.rays.d)
-        gain = self.exposure.gains(batch.view) if self.has_gains else None
-        errors = compare_rays(batch, rendered.colour, rendered.T, backdrop, self.scale, gain)
-        by_radiance, by_T, loss = errors.by_radiance * share, errors.by_T * share, errors.loss
-        if self.plan.beta > 0:
-            # Bounded: at 0 and 1 the prior is satisfied, and its derivative is infinite.
-            T = dr.clip(rendered.T, 0.01, 0.99)
-            by_T += self.plan.beta * share / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
-        dr.eval(rendered, by_radiance, by_T, loss)
-        vjp_rays(self._cells, source, model, rendered, RayGradient(by_radiance, by_T), near=self.near)
-        if depth_rays is not None:
-            self._add_depth_gradient(source, model, depth_rays)
-        dr.eval(source.slope)
-        density, harmonics = vjp_bake(self.field, self._cells, source, batch.origins)
-        gradient = {"density": self._stored(density), "harmonics": self._stored(harmonics)}
-        if self.sky is not None:
-            gradient["sky"] = self.sky.texel_gradient(batch.rays.d, by_radiance * rendered.T)
-        if self.exposure is not None:
-            by_log_gain = errors.by_colour * errors.colour * share if self.has_gains else mi.Color3f(0)
-            gradient["exposure"] = self.exposure.gradient(batch.view, by_log_gain)
-        return loss, gradient
-
-    def _add_depth_gradient(self, source: Baked, model: Model, depth_rays: DepthRays) -> None:
-        """Add the derivatives of the points' energy to the field's derivatives."""
-        # The tables of all pinholes hold the same densities.
-        source = dataclasses.replace(source, first=mi.UInt32(0))
-        rendered = render_rays(self._cells, source, model, depth_rays.rays)
-        by_radiance = RayGradient(mi.Color3f(0), self.plan.depth * depth_loss_gradient(rendered.T, depth_rays.count))
-        dr.eval(rendered, by_radiance)
-        vjp_rays(self._cells, source, model, rendered, by_radiance, near=self.near)
-
-    def _stored(self, slope: mi.Float) -> mi.Float:
-        """Derivatives of stored nodes: the last row of a sparse field is the surrounding vacuum and stays constant."""
-        own = self.field.rows if self.field.nodes is None else self.field.rows - 1
-        return dr.select(dr.arange(mi.UInt32, dr.width(slope)) < own * (dr.width(slope) // self.field.rows), slope, 0)
+        settings, colour = self._gradient_settings(share), _opaque_colour(background)
+        return differentiate_batch(settings, self._field_model(), batch, colour, depth_rays)
 
     # -- Steps --------------------------------------------------------------------------------------------------------
 
@@ -293,24 +278,24 @@ class RadianceProblem(SparseProblem, DividedProblem):
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
         """Apply the priors: move values by shares of the learning rate, smaller with more photographs."""
-        shapes = {name: value.shape for name, value in reals.items()}
-        # Pop: a step that is not evaluated yet holds the gradient, which is as large as the reals.
-        arrays = {name: reals.pop(name).array for name in shapes}
+        for function, arguments in self.moves_after_step(iteration):
+            # Evaluate: the moves of rows read neighbours, which would compute the step twice.
+            dr.eval(reals)
+            reals = function(reals, *arguments)
+        return reals
+
+    def moves_after_step(self, iteration: int) -> list[tuple[Callable[..., Reals], tuple[Any, ...]]]:
+        """:meth:`after_step` as functions: the moves of single numbers, and the moves that compare rows."""
         rows = self._rows(iteration)
-        for name, prior in self.plan.priors:
-            if not prior.is_spatial:
-                arrays[name] = prior.apply(arrays[name], rows[name])
-        if self.has_gains:
-            arrays["exposure"] = Exposure(arrays["exposure"]).regularized(self.learning_rates(iteration)["exposure"]).logs
-        # Evaluate here: the spatial priors read neighbours, which would compute the step twice.
-        if self.sky is not None and self.plan.sky_smooth:
-            arrays["sky"] = self.sky.with_texels(arrays["sky"]).smooth(self.plan.sky_smooth).texels
-        dr.eval(arrays)
-        for name, prior in self.plan.priors:
-            if prior.is_spatial:
-                arrays[name] = prior.apply(arrays[name], rows[name])
-        arrays["density"] = self._without_free_space(arrays["density"])
-        return {name: mi.TensorXf(array, shapes[name]) for name, array in arrays.items()}
+        moves = [(name, prior.is_spatial, prior.make_move(rows[name])) for name, prior in self.plan.priors]
+        single, spatial = (
+            [(name, move) for name, is_spatial, move in moves if move is not None and is_spatial == wanted]
+            for wanted in (False, True)
+        )
+        pull = pull_at(self.learning_rates(iteration)["exposure"]) if self.has_gains else None
+        sky = self.sky if self.plan.sky_smooth else None
+        found: list[tuple[Callable[..., Reals], tuple[Any, ...]]] = [(move_numbers, (single, pull, sky, self.plan.sky_smooth))]
+        return [*found, (move_rows, (spatial, self._free))] if spatial or self._free is not None else found
 
     def _rows(self, iteration: int) -> dict[str, Rows]:
         """Rows for the priors of an iteration, by parameter."""
@@ -371,10 +356,6 @@ class RadianceProblem(SparseProblem, DividedProblem):
         self._cells = None  # frees memory for the new list of the same size
         self._cells = find_occupied_cells(self.field)
 
-    def _without_free_space(self, density: mi.Float) -> mi.Float:
-        """The densities of the rows, 0 at nodes in free space."""
-        return density if self._free is None else dr.select(self._free, 0, density)
-
     def _find_free_space(self) -> mi.Bool | None:
         """Whether each row is a node in free space; None if the plan has no free space."""
         if not self.plan.free_space:
@@ -385,7 +366,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
 
     def _update_neighbours(self) -> None:
         self._free = self._find_free_space()
-        self.field = self.field.with_values(self._without_free_space(self.field.density), self.field.harmonics)
+        self.field = self.field.with_values(keep_free(self.field.density, self._free), self.field.harmonics)
         self._neighbours = Neighbours.from_field(self.field)
         self.update_occupancy()
 
@@ -419,6 +400,10 @@ class RadianceProblem(SparseProblem, DividedProblem):
         self.field = SphericalGrid(*grid, degree, *values, nodes, levels=self.plan.levels, space=self.batches.space)
         self.set_reals(reals)
         self._update_neighbours()
+
+
+def _opaque_colour(colour: np.ndarray | None) -> mi.Color3f | None:
+    return None if colour is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in colour))
 
 
 def _tensors(grid: SphericalGrid) -> Reals:

@@ -33,6 +33,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.kernel_recording import copy_aligned
 from mivol.photos import Camera, Photo, directions, pixel_centres
 from mivol.transport.line_integrals.radiance_field import RayBundle
 
@@ -56,8 +57,12 @@ class Level:
 
     def values(self, at: mi.UInt32) -> mi.Float:
         """Values of pixels; codes are scaled to 0..1."""
-        value = mi.Float(dr.gather(type(self.codes), self.codes, at))
-        return value if dr.is_float_v(self.codes) else value * (1 / 255)
+        return _read_values(self.codes, at)
+
+
+def _read_values(codes: mi.UInt8 | mi.Float, at: mi.UInt32) -> mi.Float:
+    value = mi.Float(dr.gather(type(codes), codes, at))
+    return value if dr.is_float_v(codes) else value * (1 / 255)
 
 
 @dataclass
@@ -88,28 +93,14 @@ class WideRays:
             starts.append(known[lens])
         return cls(mi.Float(np.concatenate(tables)), np.array(starts, np.int32)) if tables else None
 
-    def replace_directions(self, d: mi.Vector3f, slot: mi.UInt32, views: np.ndarray, pixel: mi.UInt32) -> mi.Vector3f:
-        """Directions ``d`` in the cameras' frames, replaced for views with a wide lens.
-
-        Args:
-            d: directions of pinholes.
-            slot: index of each ray's view in ``views``.
-            views: numbers of views.
-            pixel: number of each ray's pixel in its image.
-        """
-        start = dr.gather(mi.Int32, mi.Int32(self.starts[views]), slot)
-        is_wide = start >= 0
-        at = 3 * (mi.UInt32(dr.maximum(start, 0)) + pixel)
-        traced = mi.Vector3f(*(dr.gather(mi.Float, self.directions, at + k, is_wide) for k in range(3)))
-        return dr.select(is_wide, traced, d)
-
 
 @dataclass
 class RayBatch:
     """Rays of pixels of some views, and the colours of the photographs.
 
     Attributes:
-        origins: (V, 3) pinholes of the chosen views.
+        origins: (V, 3) pinholes of the chosen views, or their offsets from the field of a fit
+            (:meth:`mivol.fields.spherical_grid.SphericalGrid.offsets_from`).
         rays: in world space.
         slot: index of each ray's view among the chosen views.
         view: number of each ray's view among all views.
@@ -119,7 +110,7 @@ class RayBatch:
         counted: 1, or 0 for a masked pixel.
     """
 
-    origins: np.ndarray
+    origins: np.ndarray | mi.Float
     rays: RayBundle
     slot: mi.UInt32
     view: mi.UInt32
@@ -127,6 +118,66 @@ class RayBatch:
     alpha: mi.Float
     background: mi.Color3f
     counted: mi.Float
+
+
+@dataclass
+class PixelTable:
+    """The pixels of some views as arrays, from which a recorded step makes its rays.
+
+    Attributes:
+        lenses, codes, counted, directions: arrays of all photographs (:class:`RayBatches`, :class:`Level`, :class:`WideRays`).
+        numbers: UInt32: of each chosen view its number, its first pixel, its width [pixel] and the first pixel of its wide lens
+            (2^32 - 1: none); then the first column and the first row of each tile.
+        views, tiles: number of chosen views, and of tiles a view.
+        channels: as :class:`RayBatches`.
+        shrink: as :class:`Level`.
+    """
+
+    lenses: mi.Float
+    codes: mi.UInt8 | mi.Float
+    counted: mi.UInt8 | None
+    directions: mi.Float | None
+    numbers: mi.UInt32
+    views: int
+    tiles: int
+    channels: int
+    shrink: int
+
+    def make_tiles(self, origins: np.ndarray | mi.Float) -> RayBatch:
+        """Rays of the tiles; ``origins`` as :class:`RayBatch`."""
+        count = self.views * self.tiles
+        lane = dr.arange(mi.UInt32, count * TILE * TILE)
+        tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
+        first = [dr.gather(mi.UInt32, self.numbers, 4 * self.views + a * count + tile) for a in range(2)]
+        return self.make_batch(tile // self.tiles, first[0] + within % TILE, first[1] + within // TILE, origins)
+
+    def make_batch(self, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32, origins: np.ndarray | mi.Float) -> RayBatch:
+        """Rays through pixel centres, with the values of the pixels; ``slot`` is the index of each ray's view."""
+        view, start, width = (dr.gather(mi.UInt32, self.numbers, k * self.views + slot) for k in range(3))
+        within = row * width + column
+        pixel = start + within
+        values = [_read_values(self.codes, pixel * self.channels + k) for k in range(self.channels)]
+        counted = mi.Float(1) if self.counted is None else mi.Float(dr.gather(mi.UInt8, self.counted, pixel))
+        lens = [dr.gather(mi.Float, self.lenses, view * LENS + k) for k in range(LENS)]
+        x = ((mi.Float(column) + 0.5) * self.shrink - lens[2]) * lens[0]
+        y = (lens[3] - (mi.Float(row) + 0.5) * self.shrink) * lens[1]
+        if self.directions is None:
+            d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
+        else:
+            local = self._replace_directions(mi.Vector3f(x, y, -1), slot, within)
+            d = mi.Vector3f(*(dr.dot(mi.Vector3f(*lens[4 + 3 * a : 7 + 3 * a]), local) for a in range(3)))
+        o = mi.Point3f(lens[13], lens[14], lens[15])
+        alpha = values[3] if self.channels == 4 else mi.Float(1)
+        target, background = mi.Color3f(*values[:3]), mi.Color3f(*lens[16:])
+        return RayBatch(origins, RayBundle(o, dr.normalize(d)), slot, view, target, alpha, background, counted)
+
+    def _replace_directions(self, d: mi.Vector3f, slot: mi.UInt32, pixel: mi.UInt32) -> mi.Vector3f:
+        """Directions ``d`` of pinholes in the cameras' frames, replaced for pixels of views with a wide lens."""
+        start = dr.gather(mi.UInt32, self.numbers, 3 * self.views + slot)
+        is_wide = start != NO_LENS
+        at = 3 * (dr.select(is_wide, start, 0) + pixel)
+        traced = mi.Vector3f(*(dr.gather(mi.Float, self.directions, at + k, is_wide) for k in range(3)))
+        return dr.select(is_wide, traced, d)
 
 
 @dataclass
@@ -228,11 +279,17 @@ class RayBatches:
 
     def make_tiles(self, shrink: int, views: np.ndarray, corner: np.ndarray) -> RayBatch:
         """Rays of the tiles of :meth:`draw_corners`."""
-        tiles = corner.shape[1]
-        lane = dr.arange(mi.UInt32, len(views) * tiles * TILE * TILE)
-        tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
-        first = [dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(corner[..., a]).reshape(-1)), tile) for a in range(2)]
-        return self.make_batch(shrink, views, tile // tiles, first[0] + within % TILE, first[1] + within // TILE)
+        return self.tabulate(shrink, views, corner).make_tiles(self.origins[views])
+
+    def tabulate(self, shrink: int, views: np.ndarray, corner: np.ndarray) -> PixelTable:
+        """The pixels of some views as arrays, with the tiles of :meth:`draw_corners`."""
+        level, wide = self.levels[shrink], self.levels[shrink].wide
+        lens = np.full(len(views), NO_LENS) if wide is None else np.int64(wide.starts[views]) % (NO_LENS + 1)
+        parts = [views, level.starts[views], level.sizes[views][:, 0], lens, corner[..., 0].ravel(), corner[..., 1].ravel()]
+        numbers = mi.UInt32(copy_aligned(np.concatenate(parts).astype(np.uint32)))
+        directions = None if wide is None else wide.directions
+        arrays = self.lenses, level.codes, level.counted, directions, numbers
+        return PixelTable(*arrays, len(views), corner.shape[1], self.channels, shrink)
 
     def all_pixels(self, shrink: int, view: int) -> RayBatch:
         """All pixels of a view, tile by tile; tiles that cross the border repeat border pixels."""
@@ -242,7 +299,9 @@ class RayBatches:
         tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
         column = dr.minimum(tile % across * TILE + within % TILE, width - 1)
         row = dr.minimum(tile // across * TILE + within // TILE, height - 1)
-        return self.make_batch(shrink, np.array([view]), lane * 0, column, row)
+        views = np.array([view])
+        table = self.tabulate(shrink, views, np.zeros((1, 0, 2), np.uint32))
+        return table.make_batch(lane * 0, column, row, self.origins[views])
 
     def image(self, shrink: int, view: int) -> tuple[list[mi.Float], mi.Float]:
         """A whole view, pixel by pixel: its channels (rgb and, if kept, alpha), and the weights (1 or 0)."""
@@ -265,31 +324,12 @@ class RayBatches:
             digest.update(points.tobytes())
         return digest.hexdigest()[:16]
 
-    def make_batch(self, shrink: int, views: np.ndarray, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32) -> RayBatch:
-        """Rays through pixel centres, with the values of the pixels."""
-        level = self.levels[shrink]
-        table = np.stack([views, level.starts[views], level.sizes[views][:, 0]], axis=1).astype(np.uint32)
-        view, start, width = (dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(table[:, k])), slot) for k in range(3))
-        within = row * width + column
-        pixel = start + within
-        values = [level.values(pixel * self.channels + k) for k in range(self.channels)]
-        counted = mi.Float(1) if level.counted is None else mi.Float(dr.gather(mi.UInt8, level.counted, pixel))
-        lens = [dr.gather(mi.Float, self.lenses, view * LENS + k) for k in range(LENS)]
-        x = ((mi.Float(column) + 0.5) * level.shrink - lens[2]) * lens[0]
-        y = (lens[3] - (mi.Float(row) + 0.5) * level.shrink) * lens[1]
-        if level.wide is None:
-            d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
-        else:
-            local = level.wide.replace_directions(mi.Vector3f(x, y, -1), slot, views, within)
-            d = mi.Vector3f(*(dr.dot(mi.Vector3f(*lens[4 + 3 * a : 7 + 3 * a]), local) for a in range(3)))
-        o = mi.Point3f(lens[13], lens[14], lens[15])
-        alpha = values[3] if self.channels == 4 else mi.Float(1)
-        target, background = mi.Color3f(*values[:3]), mi.Color3f(*lens[16:])
-        return RayBatch(self.origins[views], RayBundle(o, dr.normalize(d)), slot, view, target, alpha, background, counted)
-
 
 LENS = 19
 """Numbers a view: 1/fx, 1/fy, cx, cy, rotation by rows, origin, background."""
+
+NO_LENS = 2**32 - 1
+"""First pixel of the wide lens of a pinhole."""
 
 
 def _lens(photo: Photo) -> list[float]:
@@ -347,16 +387,23 @@ class DepthRays:
     """Points as rays.
 
     Attributes:
-        rays: rays that end before the points; then, in the same order, rays that end behind them.
-        count: number of points.
+        rays: rays that end before the points; then, in the same order, rays that end behind them. Each half may end in rays of
+            length 0, which belong to no point.
+        count: number of points; in a recorded step an array.
     """
 
     rays: RayBundle
-    count: int
+    count: int | mi.UInt32
 
 
 def sample_depth_rays(
-    points: Sequence[np.ndarray], origins: np.ndarray, box: np.ndarray, levels: int, voxel: float, rng: np.random.Generator
+    points: Sequence[np.ndarray],
+    origins: np.ndarray,
+    box: np.ndarray,
+    levels: int,
+    voxel: float,
+    rng: np.random.Generator,
+    least: int = 0,
 ) -> DepthRays | None:
     """Draw points of each of some photographs; None if no drawn point lies in the boxes.
 
@@ -367,6 +414,7 @@ def sample_depth_rays(
         levels: number of nested boxes.
         voxel: edge of a voxel of the innermost box [length].
         rng: draws the points.
+        least: number of rays of each half; rays of length 0 fill the rest.
     """
     drawn = [own[rng.integers(0, len(own), POINTS_PER_VIEW)] if len(own) else np.zeros((0, 3)) for own in points]
     slot = np.repeat(np.arange(len(drawn)), [len(own) for own in drawn])
@@ -380,24 +428,22 @@ def sample_depth_rays(
         return None
     offset, d, o = offset[inside], d[inside], origins[slot[inside]]
     margin = voxel * 2 ** np.ceil(np.log2(np.maximum(extent[inside], 1))) + UNCERTAINTY * d
-    twice = np.tile(np.arange(len(d)), 2)
-    o, towards = mi.Point3f(*_columns(o[twice])), mi.Vector3f(*_columns((offset / d[:, None])[twice]))
-    ends = _real(np.concatenate([np.maximum(d - margin, 0), d + margin]))
-    return DepthRays(RayBundle(o, towards, ends), len(d))
+    halves = [np.zeros((max(least, len(d)), 7)) for _ in range(2)]
+    for half, ends in zip(halves, (np.maximum(d - margin, 0), d + margin), strict=True):
+        half[:, 5] = 1  # a direction for rays of length 0
+        half[: len(d)] = np.column_stack([o, offset / d[:, None], ends])
+    columns = [_real(column) for column in np.concatenate(halves).T]
+    return DepthRays(RayBundle(mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:6]), columns[6]), len(d))
 
 
-def depth_loss_gradient(T: mi.Float, count: int) -> mi.Float:
-    """Derivatives of the mean of E over points by the transmittances of their rays (2 count), in the order of the rays."""
-    number, n = dr.arange(mi.UInt32, 2 * count), dr.opaque(mi.UInt32, count)
-    point = number % n
-    ends = dr.gather(mi.Float, T, point) - dr.gather(mi.Float, T, point + n)
+def depth_loss_gradient(T: mi.Float, count: int | mi.UInt32) -> mi.Float:
+    """Derivatives of the mean of E over points by the transmittances of their rays, in the order of :class:`DepthRays`."""
+    number, half = dr.arange(mi.UInt32, dr.width(T)), dr.opaque(mi.UInt32, dr.width(T) // 2)
+    point, n = number % half, dr.opaque(mi.UInt32, count) if isinstance(count, int) else count
+    ends = dr.gather(mi.Float, T, point) - dr.gather(mi.Float, T, point + half)
     slope = (1 - OUTLIERS) / ((1 - OUTLIERS) * ends + OUTLIERS) / mi.Float(n)
-    return dr.select(number < n, -slope, slope)
-
-
-def _columns(rows: np.ndarray) -> list[mi.Float]:
-    return [_real(column) for column in rows.T]
+    return dr.select(point < n, dr.select(number < half, -slope, slope), 0)
 
 
 def _real(values: np.ndarray) -> mi.Float:
-    return mi.Float(np.ascontiguousarray(values, np.float32))
+    return mi.Float(copy_aligned(np.ascontiguousarray(values, np.float32)))

@@ -235,13 +235,15 @@ def add_packet(target: mi.Float, values: Sequence[mi.Float], row: mi.UInt32, on:
     dr.scatter_add(target, mi.ArrayXf(list(values)), row, on, mode=mode)
 
 
-def bake(field: SphericalGrid, cells: OccupiedCells, points: np.ndarray, view: mi.UInt32, slope: bool = False) -> Baked:
+def bake(
+    field: SphericalGrid, cells: OccupiedCells, points: np.ndarray | mi.Float, view: mi.UInt32, slope: bool = False
+) -> Baked:
     """Sum the harmonics of each node in the directions from pinholes.
 
     Args:
         field: radiance field.
         cells: occupied cells; other nodes are left out.
-        points: (V, 3) world, the pinholes.
+        points: (V, 3) world, the pinholes, or their offsets from :meth:`SphericalGrid.offsets_from`.
         view: number of each ray's pinhole.
         slope: whether derivatives will be computed.
 
@@ -249,17 +251,26 @@ def bake(field: SphericalGrid, cells: OccupiedCells, points: np.ndarray, view: m
         with trilinear weights, equals the direction of the ray to first order.
     Cost: the field is read once, and 4 numbers a node and pinhole are written.
     """
-    table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
-    _fill_table(field, cells.rows, table, points)
+    offsets = _to_offsets(field, points)
+    table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * _count_pinholes(offsets))
+    _fill_table(field, cells.rows, table, offsets)
     first = view * _opaque_count(cells.rows)
     return Baked(table, first, dr.zeros(mi.Float, _round_up_size(dr.width(table))) if slope else None)
 
 
+def _to_offsets(field: SphericalGrid, points: np.ndarray | mi.Float) -> mi.Float:
+    return field.offsets_from(points) if isinstance(points, np.ndarray) else points
+
+
+def _count_pinholes(offsets: mi.Float) -> int:
+    return dr.width(offsets) // 3
+
+
 @dr.syntax
-def _fill_table(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
+def _fill_table(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, offsets: mi.Float) -> None:
     """Fill the blocks of a table in a loop, which reads the field once; a single kernel serves any number of pinholes."""
-    number, node, view_basis = dr.arange(mi.UInt32, dr.width(rows)), _look_up_node(field, rows), field.make_view_basis(points)
-    pinholes, count = dr.opaque(mi.UInt32, len(points)), _opaque_count(rows)
+    number, node, view_basis = dr.arange(mi.UInt32, dr.width(rows)), _look_up_node(field, rows), field.make_view_basis(offsets)
+    pinholes, count = dr.opaque(mi.UInt32, _count_pinholes(offsets)), _opaque_count(rows)
     raw = dr.gather(mi.Float, field.density, rows)
     values = dr.gather(mi.ArrayXf, field.harmonics, rows, shape=(field.width, 1))
     v = mi.UInt32(0)
@@ -287,20 +298,22 @@ def _look_up_node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
     return row if field.nodes is None else dr.gather(mi.UInt32, field.nodes, row, row < field.rows - 1)
 
 
-def vjp_bake(field: SphericalGrid, cells: OccupiedCells, baked: Baked, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
+def vjp_bake(
+    field: SphericalGrid, cells: OccupiedCells, baked: Baked, points: np.ndarray | mi.Float
+) -> tuple[mi.Float, mi.Float]:
     """Derivatives by the rows of a field, density and harmonics, from the derivatives by its baked table: the transpose of
     bake.
     """
-    return _sum_over_pinholes(field, cells.rows, baked.slope, points)
+    return _sum_over_pinholes(field, cells.rows, baked.slope, _to_offsets(field, points))
 
 
 @dr.syntax
-def _sum_over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
+def _sum_over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, offsets: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Sum the derivatives of all pinholes in a loop; a single kernel serves any number of pinholes."""
     number = dr.arange(mi.UInt32, dr.width(rows))
     node = _look_up_node(field, rows)
-    view_basis = field.make_view_basis(points)
-    pinholes, count, width = dr.opaque(mi.UInt32, len(points)), _opaque_count(rows), field.width
+    view_basis = field.make_view_basis(offsets)
+    pinholes, count, width = dr.opaque(mi.UInt32, _count_pinholes(offsets)), _opaque_count(rows), field.width
     packet = mi.ArrayXf([mi.Float(0)] * 4)
     raw = dr.zeros(mi.Float, dr.width(rows))
     harmonics = [dr.zeros(mi.Float, dr.width(rows)) for _ in range(width)]
