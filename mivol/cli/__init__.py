@@ -243,7 +243,7 @@ def poses(arguments: argparse.Namespace) -> None:
     if arguments.fps is not None and not is_video:
         raise MivolError(f"--fps is for videos, and {place} is none: leave it out.")
     place = video.extract_frames(place, arguments.fps, say) if is_video else place
-    found = find_poses(place, say)
+    found = find_poses(place, say, is_video)
     print(found.describe())
     print(write_poses_page(place, found))
     folder = shlex.quote(str(place))

@@ -181,7 +181,7 @@ MODELS: dict[str, dict[str, dict[str, str]]] = {
 def of_photographs(
     path: Path, model: str = "gaussians", preset: str | None = None, changes: Sequence[str] = ()
 ) -> PhotoExperiment:
-    """Make the experiment of photographs without a TOML file.
+    """Make the experiment of photographs without a TOML file; the run folder has the name of their folder.
 
     Args:
         path: folder of photographs, or file of cameras.
@@ -194,7 +194,8 @@ def of_photographs(
     """
     chosen = {} if preset is None else {"preset": preset}
     tables = {table: settings | chosen for table, settings in MODELS[model].items()}
-    raw = {"title": path.resolve().name, "photos": {"path": str(path)}, **tables}
+    name = (path if path.is_dir() else path.parent).resolve().name
+    raw = {"title": name, "output": f"runs/{name}", "photos": {"path": str(path)}, **tables}
     for change in changes:
         apply_change(raw, change)
     return from_dict(raw, str(path))

@@ -1,11 +1,13 @@
 """Camera paths for films of a photographed subject (around it, from view to view, through keyframes), and its first view.
 
-Conventions. Every camera of a path is a pinhole with the size and focal length of the first given camera (a field of view of
-``WIDE`` degrees for a wide lens), without distortion, and with the optical axis through the image centre.
+Conventions. Every camera of a path is a pinhole with the size and focal length of the first given camera (for a turntable, the
+first of the most common size; a field of view of ``WIDE`` degrees for a wide lens), without distortion, and with the optical
+axis through the image centre.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +17,7 @@ from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos.camera import Camera, field_of_view, intrinsics
 from mivol.photos.lens import Lens
+from mivol.photos.region import find_subject
 
 ALL_ROUND = np.radians(90)
 """Largest azimuth gap [radian] between cameras of a full circle; a larger gap makes the path swing between its ends."""
@@ -48,7 +51,7 @@ def aim_camera(like: Camera, origin: np.ndarray, target: np.ndarray, up: np.ndar
 
 
 def turntable(cameras: Sequence[Camera], box: np.ndarray, n: int) -> list[Camera]:
-    """Return n cameras around the centre of a box, in equal steps on a closed path.
+    """Return n cameras around what a box holds (:func:`mivol.photos.region.find_subject`), in equal steps on a closed path.
 
     The circle is centred on the upward direction of the photographs, at their mean distance and elevation. If the photographs
     leave an azimuth gap of more than 90 degrees, the path swings sinusoidally between the ends of the gap instead.
@@ -56,7 +59,7 @@ def turntable(cameras: Sequence[Camera], box: np.ndarray, n: int) -> list[Camera
     Raises:
         MivolError: cameras without a common upward direction.
     """
-    middle = np.mean(box, axis=0)
+    middle = find_subject(cameras, box)
     up = _mean_up(cameras)
     side = np.linalg.qr(np.column_stack([up, np.eye(3)[np.argmin(np.abs(up))]]))[0][:, 1]
     front = np.cross(up, side)
@@ -64,10 +67,10 @@ def turntable(cameras: Sequence[Camera], box: np.ndarray, n: int) -> list[Camera
     height, across = offsets @ up, np.stack([offsets @ side, offsets @ front])
     radius = float(np.linalg.norm(across, axis=0).mean())
     azimuths = _azimuths(np.arctan2(across[1], across[0]), n)
+    sizes = Counter(camera.size for camera in cameras)
+    like = next(camera for camera in cameras if camera.size == sizes.most_common(1)[0][0])
     return [
-        aim_camera(
-            cameras[0], middle + radius * (np.cos(a) * side + np.sin(a) * front) + height.mean() * up, middle, up, f"turn {i}"
-        )
+        aim_camera(like, middle + radius * (np.cos(a) * side + np.sin(a) * front) + height.mean() * up, middle, up, f"turn {i}")
         for i, a in enumerate(azimuths)
     ]
 
@@ -195,11 +198,11 @@ class HomeView:
 
 
 def find_home_view(cameras: Sequence[Camera], box: np.ndarray) -> HomeView:
-    """Return the view of the photograph that aims best at the middle of a box (2, 3) [length].
+    """Return the view of the photograph that aims best at what a box (2, 3) holds [length], as :func:`turntable` does.
 
     Up is the common upward direction of the photographs, or the photograph's own without a common direction.
     """
-    middle = np.mean(box, axis=0)
+    middle = find_subject(cameras, box)
     aims = [float((middle - c.origin) @ c.forward / max(np.linalg.norm(middle - c.origin), 1e-30)) for c in cameras]
     best = cameras[int(np.argmax(aims))]
     try:

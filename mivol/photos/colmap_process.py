@@ -2,20 +2,50 @@
 
 pycolmap brings its own zlib, which breaks Pillow's PNG in the same process. So nothing of mivol imports this file.
 
+Pairs. Of a short list of photographs all pairs are matched. Of a long one or a video (``sequential``), photographs are matched
+with neighbours in the order of names and with those that look alike (:func:`find_alike`), which close a walk around it.
+
 Global structure from motion (Pan et al. 2024) comes first. It averages the rotations of all photographs and finds all positions
 together, so errors do not add up along a chain of photographs. If it leaves out photographs, poses are also found one by one
 (Schönberger and Frahm 2016), and the larger model is kept.
 
-The job names ``images`` (folder), ``names`` (groups of photographs, one camera for each group), ``masks`` (folder, or ""),
-``database`` and ``models`` (where to write), ``sequential`` (match neighbours in the order of names only) and ``longest`` (edge
-of a photograph in the search for features [pixel]). Lines of JSON on the standard output are stages, then the models.
+The job names ``images`` (folder), ``names`` (groups of photographs, one camera for each group), ``order`` (all photographs),
+``masks`` (folder, or ""), ``database`` and ``models`` (where to write), ``sequential``, ``longest`` (edge of a photograph in
+the search for features [pixel]), and ``aliases`` (names in the model for those in ``names``, which have no blanks). Lines of
+JSON on the standard output are stages, facts about the matches, then the models.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from itertools import combinations
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+OVERLAP = 10
+"""Neighbours on each side that are matched in a sequence; farther ones at 16, 32, ... steps are matched too."""
+
+ALIKE = 10
+"""Photographs that look most alike, matched with each photograph of a sequence."""
+
+WORDS, SAMPLE, ROUNDS = 64, 200, 8
+"""Visual words of an image signature, features of a photograph for finding words, and rounds of k-means."""
+
+PARTS = 10
+"""Parts in which features and matches are reported."""
+
+STILL = 0.002
+"""Median shift of a pair's common points, over the width, below which nothing moved between two photographs."""
+
+TURN, FOCAL, EQUAL = 0.1, (0.4, 1.6), 1.03
+"""Least median shift of a turn of the camera, over the width; focal lengths that are tried, over the width; and the largest
+ratio of singular values that counts as equal."""
+
+FEWEST = 15
+"""Common points of a pair with an overlap (COLMAP's ``min_num_inliers``)."""
 
 
 def say(**facts: object) -> None:
@@ -28,41 +58,158 @@ def run(job: dict) -> None:
     import pycolmap  # the extra ``poses``, in this process alone
 
     pycolmap.logging.minloglevel = 3
-    database, images, device = Path(job["database"]), Path(job["images"]), pycolmap.Device.cpu
-    reader, features = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
-    reader.mask_path, features.max_image_size = job["masks"], job["longest"]
-    single = pycolmap.CameraMode.SINGLE
+    database, images = Path(job["database"]), Path(job["images"])
     for names in job["names"]:
-        say(stage=f"features of {len(names)} photographs")
-        pycolmap.extract_features(database, images, names, single, reader, features, device)
-    say(stage="matches")
-    if job["sequential"]:
-        pycolmap.match_sequential(database, device=device)
-    else:
-        pycolmap.match_exhaustive(database, device=device)
+        find_features(pycolmap, job, names)
+    with pycolmap.Database.open(database) as opened:
+        pairs = list_pairs(job["order"], find_alike(opened) if job["sequential"] else None)
+    match_pairs(pycolmap, database, pairs)
+    say(matches=describe_matches(pycolmap, database, job["aliases"]))
     say(stage="poses of all photographs at once")
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     together = Path(job["models"]) / "together"
     together.mkdir()
-    found = write_models(pycolmap.global_mapping(database, images, together, options), together)
+    found = write_models(pycolmap.global_mapping(database, images, together, options), together, job["aliases"])
     if count_posed(found) < sum(map(len, job["names"])):
         say(stage=f"{count_posed(found)} photographs have poses; poses one by one")
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = 0
         apart = Path(job["models"]) / "one-by-one"
         apart.mkdir()
-        others = write_models(pycolmap.incremental_mapping(database, images, apart, options), apart)
+        others = write_models(pycolmap.incremental_mapping(database, images, apart, options), apart, job["aliases"])
         found = max(found, others, key=count_posed)
     say(models=found)
 
 
-def write_models(models: dict, place: Path) -> list[dict]:
+def find_features(pycolmap: Any, job: dict, names: list[str]) -> None:
+    """Find the features of photographs of one camera, in parts; photographs with features stay as they are."""
+    reader, features = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reader.mask_path, features.max_image_size = job["masks"], job["longest"]
+    size = max(8, -(-len(names) // PARTS))
+    for start in range(0, len(names), size):
+        say(stage=f"features: {start} of {len(names)} photographs of a camera")
+        part, mode = names[start : start + size], pycolmap.CameraMode.SINGLE
+        pycolmap.extract_features(job["database"], job["images"], part, mode, reader, features, pycolmap.Device.cpu)
+        if start == 0:
+            with pycolmap.Database.open(job["database"]) as opened:
+                reader.existing_camera_id = opened.read_image_with_name(names[0]).camera_id
+
+
+def list_pairs(order: list[str], alike: dict[str, list[str]] | None) -> list[tuple[str, str]]:
+    """The pairs to match: all, or (``alike`` given) those of neighbours and of photographs that look alike."""
+    if alike is None:
+        return list(combinations(order, 2))
+    steps = [*range(1, OVERLAP + 1), *(2**n for n in range(4, 31) if 2**n < len(order))]
+    pairs = {(order[at], order[at + step]): None for step in steps for at in range(len(order) - step)}
+    for name, others in alike.items():
+        for other in others:
+            if (other, name) not in pairs:
+                pairs[name, other] = None
+    return list(pairs)
+
+
+def find_alike(database: Any) -> dict[str, list[str]]:
+    """The ``ALIKE`` photographs most like each photograph.
+
+    Each photograph is summed up by the residuals of its features about visual words, which are found in these photographs alone
+    (vectors of locally aggregated descriptors: Jégou et al. 2010, with square roots of SIFT: Arandjelović and Zisserman 2012).
+    """
+    features = {}
+    for image in database.read_all_images():
+        rows = np.sqrt(np.asarray(database.read_descriptors(image.image_id).data, np.float32).reshape(-1, 128))
+        features[image.name] = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-6)
+    rng = np.random.default_rng(0)
+    sample = np.concatenate([rows[rng.permutation(len(rows))[:SAMPLE]] for rows in features.values()])
+    if len(sample) < WORDS:
+        return {}
+    words = sample[rng.permutation(len(sample))[:WORDS]]
+    for _ in range(ROUNDS):
+        nearest = find_words(sample, words)
+        counts = np.bincount(nearest, minlength=WORDS)
+        sums = np.zeros_like(words)
+        np.add.at(sums, nearest, sample)
+        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
+    names, signatures = list(features), []
+    for rows in features.values():
+        nearest, sums = find_words(rows, words), np.zeros_like(words)
+        np.add.at(sums, nearest, rows - words[nearest])
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-6)
+        signatures.append(sums.ravel() / max(float(np.linalg.norm(sums)), 1e-6))
+    likeness = np.array(signatures) @ np.array(signatures).T
+    np.fill_diagonal(likeness, -np.inf)
+    best = np.argsort(-likeness, axis=1, kind="stable")[:, : min(ALIKE, len(names) - 1)]
+    return {name: [names[other] for other in row] for name, row in zip(names, best, strict=True)}
+
+
+def find_words(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """Index (N,) of the word nearest to each feature."""
+    return np.argmin((words**2).sum(axis=1) - 2 * rows @ words.T, axis=1)
+
+
+def match_pairs(pycolmap: Any, database: Path, pairs: list[tuple[str, str]]) -> None:
+    """Match the features of pairs, in parts; pairs with matches stay as they are."""
+    options, size = pycolmap.ImportedPairingOptions(), max(100, -(-len(pairs) // PARTS))
+    options.match_list_path = database.with_name("pairs.txt")
+    for start in range(0, len(pairs), size):
+        say(stage=f"matches: {start} of {len(pairs)} pairs")
+        text = "".join(f"{one} {other}\n" for one, other in pairs[start : start + size])
+        options.match_list_path.write_text(text, encoding="utf-8")
+        pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu)
+
+
+def describe_matches(pycolmap: Any, database: Path, aliases: dict[str, str]) -> dict:
+    """Facts on the pairs with an overlap.
+
+    Returns:
+        ``pairs``: their number; ``still``: pairs between which nothing moved; ``turned``: pairs between which the camera turned
+        on the spot; ``best``: for each photograph the one with the most common points, and their number.
+    """
+    flat = {getattr(pycolmap.TwoViewGeometryConfiguration, name) for name in ("PANORAMIC", "PLANAR_OR_PANORAMIC")}
+    facts = {"pairs": 0, "still": 0, "turned": 0, "best": {}}
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image for image in opened.read_all_images()}
+        places = {number: opened.read_keypoints(number)[:, :2] for number in images}
+        sizes = {number: opened.read_camera(image.camera_id) for number, image in images.items()}
+        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            one, other = pycolmap.pair_id_to_image_pair(pair)
+            matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+            for a, b in ((one, other), (other, one)):
+                name, partner = (aliases.get(images[number].name, images[number].name) for number in (a, b))
+                if len(matches) > facts["best"].get(name, ("", -1))[1]:
+                    facts["best"][name] = partner, len(matches)
+            if len(matches) < FEWEST:
+                continue
+            shifts = np.linalg.norm(places[one][matches[:, 0]] - places[other][matches[:, 1]], axis=1)
+            shift, size = np.median(shifts) / sizes[one].width, (sizes[one].width, sizes[one].height)
+            facts["pairs"] += 1
+            facts["still"] += bool(shift < STILL)
+            facts["turned"] += bool(shift > TURN and geometry.config in flat and is_turn(np.asarray(geometry.H), size))
+    return facts
+
+
+def is_turn(homography: np.ndarray, size: tuple[int, int]) -> bool:
+    """Whether a homography of pixels (3, 3) is the one of a turn on the spot, for a common focal length.
+
+    It is K R K^-1 then, and K^-1 H K has three equal singular values (Hartley 1997, self-calibration of rotating cameras). A
+    plane seen from two places has others.
+    """
+    ratios = []
+    for focal in np.linspace(*FOCAL, 49) * size[0]:
+        K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
+        values = np.linalg.svd(np.linalg.inv(K) @ homography @ K, compute_uv=False)
+        ratios.append(values[0] / max(float(values[2]), 1e-12))
+    return min(ratios) < EQUAL
+
+
+def write_models(models: dict, place: Path, aliases: dict[str, str]) -> list[dict]:
     """Write models to folders of ``place``; return the facts of each."""
     found = []
     for number, model in models.items():
         folder = place / str(number)
         folder.mkdir(exist_ok=True)
+        for image in model.images.values():
+            image.name = aliases.get(image.name, image.name)
         model.write(folder)
         named = sorted(image.name for image in model.images.values() if image.has_pose)
         error, points = model.compute_mean_reprojection_error(), model.num_points3D()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,6 +115,11 @@ def check_points(rows: np.ndarray, file: Path, way_out: str) -> None:
     if not np.isfinite(rows).all():
         number = int(np.argmin(np.isfinite(rows).all(axis=1)))
         raise refusal(file, f"point {number} at {rows[number, :3].tolist()}", "finite numbers", way_out)
+
+
+def split_numbers(name: str) -> list[tuple[int, str]]:
+    """Key that sorts 2.jpg before 10.jpg."""
+    return [(int(part), part) if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]{1,18})", name)]
 
 
 def list_photographs(folder: Path) -> tuple[Path, list[str]]:

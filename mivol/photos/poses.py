@@ -16,15 +16,15 @@ import json
 import shutil
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mivol.errors import MivolError
 from mivol.files.source import refusal
-from mivol.photos.listing import list_photographs
+from mivol.photos.listing import find_mask, list_photographs, split_numbers
 from mivol.photos.photo_file import check_pixels, read_lens_facts, read_photo_header, write_upright
 from mivol.photos.survey import find_format
 from mivol.threads import follow_program
@@ -33,7 +33,13 @@ FEWEST = 3
 """Fewest photographs of which poses are searched."""
 
 EXHAUSTIVE = 150
-"""Largest number of photographs of which all pairs are matched; of more, neighbours in the order of names."""
+"""Largest number of photographs of which all pairs are matched; of more, neighbours by name and those that look alike."""
+
+ODD = 0.3
+"""Share of the pairs with an overlap from which a warning speaks of pairs without parallax."""
+
+FEW = 50
+"""Common points below which a pair of photographs is said to have few."""
 
 LONGEST = 2000
 """Longest edge of a photograph in the search for features [pixel]."""
@@ -59,6 +65,7 @@ class Poses:
         points: number of points.
         cameras: number of cameras.
         others: photographs of each further model, which has no part in common with the first.
+        best: photograph without a pose -> the photograph with the most points in common with it, and their number.
     """
 
     folder: Path
@@ -68,6 +75,7 @@ class Poses:
     points: int
     cameras: int
     others: tuple[tuple[str, ...], ...] = ()
+    best: Mapping[str, tuple[str, int]] = field(default_factory=dict)
 
     def describe(self) -> str:
         """Describe the result in a paragraph."""
@@ -84,17 +92,25 @@ class Poses:
                 f"photograph what lies between {first} and {self.posed[-1]}"
             )
         if self.unposed:
-            named = ", ".join(self.unposed[:5]) + (" ..." if len(self.unposed) > 5 else "")
+            named = ", ".join(map(self._name_unposed, self.unposed[:5])) + (" ..." if len(self.unposed) > 5 else "")
             lines.append(f"without a pose: {named}; {AGAIN}")
         return "\n".join(lines)
 
+    def _name_unposed(self, name: str) -> str:
+        """A photograph without a pose, with the reason that its matches show."""
+        partner, points = self.best.get(name, ("", 0))
+        if points == 0:
+            return f"{name} (shows no part of another photograph)"
+        return f"{name} (few matches: {points} points in common with {partner})" if points < FEW else name
 
-def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None) -> Poses:
+
+def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_video: bool = False) -> Poses:
     """Find the poses of the photographs of a folder, and write them to ``sparse/0``, whole or not at all.
 
     Args:
         folder: folder with photographs, in ``images/`` or in itself; masks may lie in ``masks/NAME.png``.
-        say: receives the stages.
+        say: receives the stages, and warnings about what has no parallax.
+        is_video: whether the photographs are frames of a video, in the order of their names.
 
     Raises:
         MivolError: a missing pycolmap, poses that exist already, too few photographs, a damaged photograph, or photographs
@@ -103,25 +119,33 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None) -> 
             continues with them.
     """
     images, names = _check_folder(folder)
-    names = _leave_out_copies(folder, images, names, say)
+    names = sorted(_leave_out_copies(folder, images, names, say), key=split_numbers)
     work = folder / WORK
     _begin_work(work, images, names)
     try:
+        aliases = {name: f"blank-{number:05d}{Path(name).suffix}" for number, name in enumerate(names) if " " in name}
+        masks = _prepare(images, names, work, aliases)
+        groups = _group_by_lens(images, names).values()
         job = {
-            "images": str(_prepare(images, names, work / "images")),
-            "names": list(_group_by_lens(images, names).values()),
-            "masks": str(folder / "masks") if (folder / "masks").is_dir() else "",
+            "images": str(work / "images"),
+            "names": [[aliases.get(name, name) for name in group] for group in groups],
+            "order": [aliases.get(name, name) for name in names],
+            "aliases": {alias: name for name, alias in aliases.items()},
+            "masks": str(work / "masks") if masks else "",
             "database": str(work / "database.db"),
             "models": str(work / "models"),
-            "sequential": len(names) > EXHAUSTIVE,
+            "sequential": is_video or len(names) > EXHAUSTIVE,
             "longest": LONGEST,
         }
         (work / "models").mkdir()
-        models = sorted(_run(job, work, say), key=lambda model: -len(model["names"]))
+        models, matches = _run(job, work, say)
+        faults = _list_faults(matches)
         if not models:
             found = f"{len(names)} photographs without enough overlap"
-            raise refusal(folder, found, "photographs that show the same parts from several places", AGAIN)
-        poses = _keep(folder, models, names)
+            raise refusal(folder, found, "photographs that show the same parts from several places", "; ".join(faults) or AGAIN)
+        for line in faults:
+            say(line)
+        poses = _keep(folder, sorted(models, key=lambda model: -len(model["names"])), names, matches)
     except MivolError:
         shutil.rmtree(work, ignore_errors=True)
         raise
@@ -145,7 +169,7 @@ def _begin_work(work: Path, images: Path, names: list[str]) -> None:
     listed = work / "photographs.json"
     with suppress(OSError, ValueError):
         if json.loads(listed.read_text(encoding="utf-8")) == facts:
-            for part in ("images", "models"):
+            for part in ("images", "masks", "models"):
                 shutil.rmtree(work / part, ignore_errors=True)
             return
     shutil.rmtree(work, ignore_errors=True)
@@ -189,24 +213,35 @@ def _leave_out_copies(folder: Path, images: Path, names: list[str], say: Callabl
     return kept
 
 
-def _prepare(images: Path, names: list[str], copies: Path) -> Path:
-    """Make a folder of the photographs as COLMAP is to read them: links, and copies of what is turned or in another format.
+def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, str]) -> int:
+    """Make folders of the photographs and masks as COLMAP is to read them: links, and copies of what is turned or converted.
+
+    Returns:
+        Number of masks.
 
     Raises:
-        MivolError: a damaged photograph.
+        MivolError: a damaged photograph or mask.
     """
-    headers = {name: read_photo_header(images / name) for name in names}
+    headers, masks = {name: read_photo_header(images / name) for name in names}, 0
     turns = any(header.orientation > 4 for header in headers.values())
     for name in names:
-        copy = copies / name
-        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy = work / "images" / aliases.get(name, name)
         orientation = headers[name].orientation if turns else 1
-        if orientation == 1 and Path(name).suffix.lower() in DIRECT:
-            check_pixels(images / name)
-            _link((images / name).absolute(), copy)
-        else:
-            write_upright(images / name, copy, orientation)
-    return copies
+        _prepare_file(images / name, copy, orientation)
+        if (mask := find_mask(images / name)) is not None:
+            masks += 1
+            _prepare_file(mask, work / "masks" / f"{aliases.get(name, name)}.png", orientation)
+    return masks
+
+
+def _prepare_file(file: Path, copy: Path, orientation: int) -> None:
+    """Link an image, or convert it if COLMAP reads no such file, or not upright."""
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    if orientation == 1 and file.suffix.lower() in DIRECT:
+        check_pixels(file)
+        _link(file.absolute(), copy)
+    else:
+        write_upright(file, copy, orientation)
 
 
 def _link(file: Path, copy: Path) -> None:
@@ -225,22 +260,39 @@ def _group_by_lens(images: Path, names: list[str]) -> dict[Any, list[str]]:
     return groups
 
 
-def _run(job: dict[str, Any], work: Path, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Run COLMAP in a process of its own; return its models."""
+def _run(job: dict[str, Any], work: Path, say: Callable[[str], None]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Run COLMAP in a process of its own; return its models, and facts about the matches."""
     (work / "job.json").write_text(json.dumps(job), encoding="utf-8")
-    models, program, errors = None, Path(__file__).with_name("colmap_process.py"), work / "errors.txt"
+    models, matches, program, errors = None, {}, Path(__file__).with_name("colmap_process.py"), work / "errors.txt"
     for line in follow_program(program, str(work / "job.json"), errors=errors):
         facts = json.loads(line) if line.startswith("{") else {}
-        models = facts.get("models", models)
+        models, matches = facts.get("models", models), facts.get("matches", matches)
         if "stage" in facts:
             say(facts["stage"])
     last = (errors.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no message"])[-1]
     if models is None:
         raise MivolError(f"COLMAP ended early ({last}): check that the photographs open, and the free disk and memory.")
-    return models
+    return models, matches
 
 
-def _keep(folder: Path, models: list[dict[str, Any]], names: list[str]) -> Poses:
+def _list_faults(matches: Mapping[str, Any]) -> list[str]:
+    """Sentences on pairs of photographs without parallax, with what to photograph instead."""
+    count, still, turned = (matches.get(key, 0) for key in ("pairs", "still", "turned"))
+    lines = []
+    if count and still >= ODD * count:
+        lines.append(
+            f"{still} of {count} pairs of photographs show a background that does not move: walk around the subject instead of "
+            "turning it before the camera, or mask the background (masks/NAME.png, black)"
+        )
+    if count and turned >= ODD * count:
+        lines.append(
+            f"between {turned} of {count} pairs of photographs the camera turned on the spot, which shows no depth: step to "
+            "the side between photographs"
+        )
+    return lines
+
+
+def _keep(folder: Path, models: list[dict[str, Any]], names: list[str], matches: Mapping[str, Any]) -> Poses:
     """Move the largest model to ``sparse/0``."""
     best, *others = models
     target = folder / "sparse" / "0"
@@ -251,4 +303,5 @@ def _keep(folder: Path, models: list[dict[str, Any]], names: list[str]) -> Poses
     posed = tuple(best["names"])
     rest = tuple(name for name in names if name not in set(posed))
     apart = tuple(tuple(model["names"]) for model in others)
-    return Poses(target, posed, rest, best["error"], best["points"], best["cameras"], apart)
+    partners = {name: tuple(matches.get("best", {}).get(name, ("", 0))) for name in rest}
+    return Poses(target, posed, rest, best["error"], best["points"], best["cameras"], apart, partners)

@@ -143,6 +143,19 @@ def viewing_distance(cameras: Sequence[Camera], box: np.ndarray) -> float:
     return median_distance(cameras, box.mean(axis=0) if focus is None else focus)
 
 
+def find_subject(cameras: Sequence[Camera], box: np.ndarray) -> np.ndarray:
+    """Return the point (3,) at which pictures of the whole should aim [length].
+
+    That is the middle of the box (2, 3). If half of the cameras stand inside, as in a room, it is their focus, as long as half
+    of them see it.
+    """
+    middle, focus = np.mean(box, axis=0), _nearest_point(cameras)
+    inside = np.array([(box[0] <= camera.origin).all() and (camera.origin <= box[1]).all() for camera in cameras])
+    if focus is None or inside.mean() < 0.5 or count_views(cameras, focus[None])[0] < 0.5 * len(cameras):
+        return middle
+    return focus
+
+
 def near_and_far(cameras: Sequence[Camera], box: np.ndarray) -> tuple[float, float]:
     """Return the smallest and the largest distance between a camera and a point of the box [length]; 0 from inside."""
     origins = np.array([c.origin for c in cameras])

@@ -24,6 +24,7 @@ from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import UNLISTED, Entry, Listing, find_mask, find_shrink, list_photographs
 from mivol.photos.llff import read_llff
+from mivol.photos.phone_exports import is_arkit, is_polycam, is_record3d, read_arkit, read_polycam, read_record3d
 from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
 
@@ -46,6 +47,9 @@ DATA_SET_FORMATS: dict[str, DataSetFormat] = {
     ),
     "COLMAP": DataSetFormat(lambda path: find_model(path) is not None, read_colmap),
     "LLFF": DataSetFormat(lambda path: (path / "poses_bounds.npy").is_file() or path.name == "poses_bounds.npy", read_llff),
+    "Polycam": DataSetFormat(is_polycam, read_polycam),
+    "Record3D": DataSetFormat(is_record3d, read_record3d),
+    "ARKit (3D Scanner App)": DataSetFormat(is_arkit, read_arkit),
 }
 
 

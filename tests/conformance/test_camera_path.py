@@ -45,6 +45,24 @@ def test_turntable_around_a_ring_is_the_ring(middle: tuple[float, ...]) -> None:
         np.testing.assert_allclose(project(camera, np.array(middle, float))[0], (32, 24), atol=1e-12)
 
 
+def test_in_a_room_films_and_first_views_aim_at_the_focus() -> None:
+    """A room's box holds the cameras, and its middle may lie anywhere; a box that cameras stand around is looked at itself."""
+    cameras, room = cameras_of(ring(12)), np.array([[-9.0, -5, -3], [5, 9, 20]])
+    for camera in turntable(cameras, room, 5):
+        np.testing.assert_allclose(project(camera, np.zeros(3))[0], (32, 24), atol=1e-12)
+    np.testing.assert_allclose(find_home_view(cameras, room).target, 0, atol=1e-12)
+    small = np.array([[0.0, 0, 0], [2, 1, 1]])
+    np.testing.assert_allclose(project(turntable(cameras, small, 5)[0], small.mean(axis=0))[0], (32, 24), atol=1e-12)
+    outwards = cameras_of([pose @ np.diag([-1.0, 1, -1, 1]) for pose in ring(12)])
+    np.testing.assert_allclose(project(turntable(outwards, room, 5)[0], room.mean(axis=0))[0], (32, 24), atol=1e-12)
+
+
+def test_films_have_the_most_common_size() -> None:
+    cameras = cameras_of(ring(4))
+    cameras[0] = cameras[0].resized((8, 6))
+    assert {camera.size for camera in turntable(cameras, BOX, 3)} == {LIKE.size}
+
+
 def test_turntable_of_an_arc_swings_between_its_ends() -> None:
     """Photographs between azimuth 20 and 120: the path reaches both ends and stays between them."""
     azimuths = np.radians(np.linspace(20, 120, 6))

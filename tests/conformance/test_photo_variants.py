@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from photo_sets import edit, pixels, png_of_16_bits, ring, write_colmap, write_transforms
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from mivol.cli import main
 from mivol.errors import MivolError
@@ -155,6 +157,77 @@ def test_wrong_poses_of_llff_are_refused(tmp_path: Path, case: str) -> None:
     np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
     with pytest.raises(MivolError, match=message):
         load_photos(folder)
+
+
+ROLL = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)
+"""Rotation of the world of :func:`ring`, with z up, to one with y up, as ARKit's."""
+
+
+def write_export(folder: Path, kind: str, n: int = 3) -> Path:
+    """Raw data of an app with numbers past 9: photographs of 24 x 16 pixels, focal lengths 20 and 21, middle at (11, 9)."""
+    for k, pose in enumerate(ring(n)):
+        pose, number = np.block([[ROLL.T @ pose[:3]], [np.array([[0.0, 0, 0, 1]])]]), 8 + k
+        image = {
+            "polycam": folder / "keyframes" / "corrected_images" / f"{number}.jpg",
+            "record3d": folder / "rgb" / f"{k}.jpg",
+            "arkit": folder / f"frame_{number}.jpg",
+        }[kind]
+        image.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels(24, 16, k, alpha=False)).save(image)
+        lens = {"fx": 20, "fy": 21, "cx": 11, "cy": 9}
+        if kind == "polycam":
+            rows = {f"t_{i}{j}": pose[i, j] for i in range(3) for j in range(4)}
+            file = folder / "keyframes" / "corrected_cameras" / f"{number}.json"
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(json.dumps({**lens, "width": 24, "height": 16, **rows}))
+        elif kind == "record3d":
+            file = folder / "metadata.json"
+            table = json.loads(file.read_text()) if file.exists() else {"w": 24, "h": 16, "poses": []}
+            row = [*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]]
+            table |= {"K": [20, 0, 0, 0, 21, 0, 11, 9, 1], "poses": [*table["poses"], row]}
+            file.write_text(json.dumps(table))
+        else:
+            table = {"intrinsics": [20, 0, 11, 0, 21, 9, 0, 0, 1], "cameraPoseARFrame": pose.ravel().tolist()}
+            (folder / f"frame_{number}.json").write_text(json.dumps(table))
+            (folder / "frame_90.json").write_text(json.dumps(table))  # a pose without a photograph
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("polycam", "Polycam"), ("record3d", "Record3D"), ("arkit", "ARKit (3D Scanner App)")]
+)
+def test_exports_of_phones(tmp_path: Path, kind: str, name: str) -> None:
+    survey = survey_photos(write_export(tmp_path / "scan", kind))
+    assert survey.format == name and len(survey.frames) == 3 and not survey.skipped
+    for k, (frame, pose) in enumerate(zip(survey.frames, ring(3), strict=True)):
+        assert frame.file.stem.endswith(str(k if kind == "record3d" else 8 + k))
+        np.testing.assert_allclose(frame.camera.to_world[:3], ROLL.T @ pose[:3], atol=1e-12)
+        np.testing.assert_allclose(frame.camera.K, [[20, 0, 11], [0, 21, 9], [0, 0, 1]])
+
+
+def test_record3d_may_have_a_lens_for_each_frame(tmp_path: Path) -> None:
+    folder = write_export(tmp_path / "scan", "record3d")
+    edit(folder / "metadata.json", lambda table: table.update(perFrameIntrinsicCoeffs=[[30 + k, 31, 12, 8] for k in range(3)]))
+    assert [frame.camera.K[0, 0] for frame in survey_photos(folder).frames] == [30, 31, 32]
+
+
+BAD_EXPORTS = {
+    "no JSON": ("polycam", "keyframes/corrected_cameras/9.json", None, "text that is not JSON"),
+    "a missing number": ("polycam", "keyframes/corrected_cameras/9.json", lambda t: t.pop("t_13"), "found no t_13"),
+    "half a pixel": ("polycam", "keyframes/corrected_cameras/9.json", lambda t: t.update(width=2.5), "2.5 x 16 pixels"),
+    "too few numbers": ("arkit", "frame_9.json", lambda t: t.update(intrinsics=[1, 2]), "intrinsics of 2 .* 9 finite numbers"),
+    "words": ("record3d", "metadata.json", lambda t: t.update(poses=[["a"] * 7]), "poses of 1 .* any x 7 finite numbers"),
+    "no rotation": ("record3d", "metadata.json", lambda t: t["poses"].__setitem__(1, [0] * 7), "pose 1 with the quaternion"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_EXPORTS)
+def test_wrong_exports_of_phones_are_refused(tmp_path: Path, case: str) -> None:
+    kind, name, change, message = BAD_EXPORTS[case]
+    file = write_export(tmp_path / "scan", kind) / name
+    file.write_text("{") if change is None else edit(file, change)
+    with pytest.raises(MivolError, match=message):
+        survey_photos(tmp_path / "scan")
 
 
 @pytest.mark.parametrize("suffix", ["webp", "png"])

@@ -19,7 +19,7 @@ from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos import colmap_process, poses, survey_photos
 from mivol.photos.listing import list_photographs
-from mivol.photos.photo_file import ORIENTATION, read_lens_facts
+from mivol.photos.photo_file import ORIENTATION, read_lens_facts, read_photo_header
 from mivol.report import cameras
 
 
@@ -47,7 +47,7 @@ def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict:
     """What COLMAP is asked, in the place of COLMAP: two models, of three photographs and of one."""
     asked = {}
 
-    def run(given: dict, work: Path, say: object) -> list[dict]:
+    def run(given: dict, work: Path, say: object) -> tuple[list[dict], dict]:
         asked.update(given)
         for name in (name for group in given["names"] for name in group):
             with Image.open(Path(given["images"]) / name) as image:
@@ -56,7 +56,7 @@ def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict:
         for k, names in enumerate((["near/e.jpg"], ["a.jpg", "b.png", "near/d.jpg"])):
             model = write_colmap(tmp_path / f"model{k}") / "sparse" / "0"
             models.append({"folder": str(model), "names": names, "error": 0.5, "points": 7, "cameras": 1})
-        return models
+        return models, asked.get("matches", {})
 
     monkeypatch.setattr(poses, "_run", run)
     monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: object())
@@ -67,13 +67,15 @@ def test_the_largest_model_is_kept_and_the_rest_is_named(
     folder: Path, job: dict, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cameras, "write_poses_page", lambda folder, found: folder / "poses.html")
+    job["matches"] = {"pairs": 3, "best": {"near/e.jpg": ["a.jpg", 21], "near/c.webp": ["a.jpg", 0]}}
     assert main(["poses", str(folder)]) == 0
     said = capsys.readouterr().out
     for fact in (
         f"{folder / 'sparse' / '0'}: 3 of 5 photographs have poses, 7 points, 1 camera, reprojection error 0.50 pixels",
         "1 photographs (near/e.jpg, ...) have poses in models of their own",
         "photograph what lies between near/e.jpg and near/d.jpg",
-        "without a pose: near/c.webp, near/e.jpg",
+        "without a pose: near/c.webp (shows no part of another photograph), "
+        "near/e.jpg (few matches: 21 points in common with a.jpg)",
         f"mivol optimize {folder} fits Gaussians",
     ):
         assert fact in said
@@ -143,6 +145,86 @@ def test_copies_are_left_out(folder: Path, job: dict) -> None:
     (images / "g.jpg").write_bytes((images / "a.jpg").read_bytes())
     with pytest.raises(MivolError, match="found 1 photograph without copies of others, expected at least 3"):
         poses.find_poses(folder)
+
+
+def test_names_with_blanks_have_aliases_and_masks_go_along(folder: Path, job: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP's lists of pairs know no blanks. A mask turns with its photograph."""
+    (folder / "images" / "b.png").rename(folder / "images" / "b 2.png")
+    Image.fromarray(pixels(64, 48, 3)).save(folder / "images" / "b 10.png")
+    set_exif(folder / "images" / "b 2.png", {ORIENTATION: 6})
+    (folder / "masks").mkdir()
+    Image.fromarray(np.arange(64 * 48, dtype=np.uint8).reshape(48, 64)).save(folder / "masks" / "b 2.png")
+    masks = []
+
+    def look(given: dict, work: Path, say: object) -> tuple[list, dict]:
+        masks.extend((file.name, read_photo_header(file).size) for file in Path(given["masks"]).iterdir())
+        job.update(given)
+        return [], {}
+
+    monkeypatch.setattr(poses, "_run", look)
+    with pytest.raises(MivolError, match="without enough overlap"):
+        poses.find_poses(folder)
+    assert [job["aliases"].get(name, name) for name in job["order"]][:3] == ["a.jpg", "b 2.png", "b 10.png"]
+    assert all(" " not in name for name in job["order"])
+    ((name, size),) = masks
+    assert job["aliases"][name.removesuffix(".png")] == "b 2.png" and size == (48, 64)
+
+
+FAULTS = {
+    "still": ({"pairs": 10, "still": 3, "turned": 0}, "3 of 10 pairs .* background that does not move: walk around"),
+    "turned": ({"pairs": 10, "still": 0, "turned": 3}, "between 3 of 10 pairs .* turned on the spot.*step to the side"),
+    "neither": ({"pairs": 10, "still": 2, "turned": 2}, "photograph again in small steps"),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_pairs_without_parallax_are_the_reason(folder: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+    """Without a model the refusal says what the pairs show, and what to photograph."""
+    facts, message = FAULTS[case]
+    monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(poses, "_run", lambda job, work, say: ([], facts))
+    with pytest.raises(MivolError, match=message):
+        poses.find_poses(folder)
+
+
+class Features:
+    """A database of COLMAP with descriptors alone."""
+
+    def __init__(self, descriptors: list[np.ndarray]) -> None:
+        self._descriptors = descriptors
+
+    def read_all_images(self) -> list[SimpleNamespace]:
+        return [SimpleNamespace(image_id=k, name=f"{k}.jpg") for k in range(len(self._descriptors))]
+
+    def read_descriptors(self, number: int) -> SimpleNamespace:
+        return SimpleNamespace(data=self._descriptors[number])
+
+
+def test_photographs_of_the_same_place_look_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 24 photographs of 12 places, seen twice with half of the features, the twin is the most alike."""
+    rng = np.random.default_rng(1)
+    places = rng.integers(0, 128, (12, 200, 128))
+    seen = [places[k % 12][rng.permutation(200)[:100]] + rng.integers(0, 9, (100, 128)) for k in range(24)]
+    alike = colmap_process.find_alike(Features([rows.astype(np.uint8) for rows in seen]))
+    assert [alike[f"{k}.jpg"][0] for k in range(24)] == [f"{(k + 12) % 24}.jpg" for k in range(24)]
+    assert colmap_process.find_alike(Features([np.zeros((0, 128), np.uint8)] * 3)) == {}
+
+
+@pytest.mark.parametrize(("offset", "is_turn"), [(0.0, True), (0.3, False)])
+def test_a_turn_on_the_spot_is_told_from_a_plane(offset: float, is_turn: bool) -> None:
+    """R + t n^T, seen with a focal length of 0.9 widths, by 25 degrees: t = 0, or a plane seen from the side."""
+    K, angle = np.array([[576.0, 0, 320], [0, 576, 240], [0, 0, 1]]), np.radians(25)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turn += np.outer([offset, 0.1 * offset, 0], [0, 0, 1])
+    assert colmap_process.is_turn(3.7 * K @ turn @ np.linalg.inv(K), (640, 480)) == is_turn
+
+
+def test_a_sequence_is_matched_with_neighbours_and_with_what_looks_alike() -> None:
+    names = [f"{k}" for k in range(40)]
+    pairs = colmap_process.list_pairs(names, {"0": ["1", "39"], "39": ["0"]})
+    steps = {int(b) - int(a) for a, b in pairs}
+    assert steps == {*range(1, 11), 16, 32, 39} and len(pairs) == len({frozenset(pair) for pair in pairs})
+    assert len(colmap_process.list_pairs(names, None)) == 40 * 39 // 2
 
 
 def test_a_page_shows_cameras_and_errors(tmp_path: Path) -> None:
@@ -215,7 +297,16 @@ def test_poses_are_found_one_by_one_if_photographs_are_left_out(
     library = MagicMock(global_mapping=make(together), incremental_mapping=make(one_by_one))
     monkeypatch.setitem(sys.modules, "pycolmap", library)
     (tmp_path / "models").mkdir()
-    job = {"images": "images", "names": [[f"{k}.png" for k in range(5)]], "masks": "", "sequential": False, "longest": 100}
+    names = [f"{k}.png" for k in range(5)]
+    job = {
+        "images": "images",
+        "names": [names],
+        "order": names,
+        "masks": "",
+        "sequential": False,
+        "longest": 100,
+        "aliases": {},
+    }
     colmap_process.run(job | {"database": str(tmp_path / "db"), "models": str(tmp_path / "models")})
     said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     (model,) = said[-1]["models"]

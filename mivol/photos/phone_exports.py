@@ -1,0 +1,162 @@
+"""Poses that phones export: raw data of Polycam and Record3D, and frames of ARKit by 3D Scanner App.
+
+Conventions. All three write ARKit's poses: camera to world with the axes of :mod:`mivol.photos.camera`, y up in the world, in
+metres, of the pixels as they are stored.
+
+Sources, looked up in programs that read them (nerfstudio, polyform, usa):
+
+* Polycam: ``keyframes/corrected_cameras/ID.json`` for ``keyframes/corrected_images/ID.jpg``, without them ``cameras`` and
+  ``images``; focal lengths, principal point, size, and the rows ``t_00`` to ``t_23`` of the pose.
+* Record3D: ``metadata.json`` (``metadata`` in an unpacked .r3d) with ``K`` column by column, the size ``w`` and ``h``, and
+  ``poses`` (x, y, z, w of the quaternion, position), for ``rgb/N.jpg`` or ``rgbd/N.jpg``. ``perFrameIntrinsicCoeffs`` (fx, fy,
+  cx, cy) of newer versions take precedence.
+* 3D Scanner App: ``frame_N.json`` for ``frame_N.jpg``, with ``intrinsics`` and ``cameraPoseARFrame`` row by row.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mivol.files.source import read_bytes, refusal
+from mivol.photos.camera import Camera, intrinsics
+from mivol.photos.listing import Entry, Listing, find_image, split_numbers
+
+CORRECTED, PLAIN = ("corrected_cameras", "corrected_images"), ("cameras", "images")
+"""Folders of cameras and images of Polycam: after and before its bundle adjustment."""
+
+
+def is_polycam(path: Path) -> bool:
+    """Whether a folder holds raw data of Polycam."""
+    return _polycam_folders(path) is not None
+
+
+def is_record3d(path: Path) -> bool:
+    """Whether a folder holds an export of Record3D."""
+    return _record3d_files(path) is not None
+
+
+def is_arkit(path: Path) -> bool:
+    """Whether a folder holds frames of 3D Scanner App."""
+    return path.is_dir() and next(path.glob("frame_*.json"), None) is not None
+
+
+def read_polycam(path: Path) -> Listing:
+    """Read the raw data of Polycam.
+
+    Raises:
+        MivolError: a file that is no JSON, or lacks a number.
+    """
+    cameras, images = _polycam_folders(path)
+    entries = []
+    for file in sorted(cameras.glob("*.json"), key=lambda file: split_numbers(file.name)):
+        table = _read_table(file)
+        fx, fy, cx, cy, width, height = (_numbers(file, table, key, 0) for key in ("fx", "fy", "cx", "cy", "width", "height"))
+        pose = [[_numbers(file, table, f"t_{row}{column}", 0) for column in range(4)] for row in range(3)]
+        size = _whole_size(file, width, height)
+        entries.append(_entry(images / file.stem, intrinsics(fx, fy, cx, cy), _to_world(pose), size))
+    return Listing(entries)
+
+
+def read_record3d(path: Path) -> Listing:
+    """Read an export of Record3D.
+
+    Raises:
+        MivolError: a file that is no JSON, or numbers that are missing or too few.
+    """
+    file, images = _record3d_files(path)
+    table = _read_table(file)
+    K = _numbers(file, table, "K", 9).reshape(3, 3).T
+    size = _whole_size(file, *(_numbers(file, table, key, 0) for key in ("w", "h")))
+    poses = _numbers(file, table, "poses", (-1, 7))
+    lenses = None
+    if "perFrameIntrinsicCoeffs" in table:
+        lenses = _numbers(file, table, "perFrameIntrinsicCoeffs", (len(poses), 4))
+    entries = []
+    for number, row in enumerate(poses):
+        if not np.linalg.norm(row[:4]) > 0:
+            raise refusal(file, f"pose {number} with the quaternion {row[:4].tolist()}", "a rotation", "export it again")
+        pose = np.column_stack([Rotation.from_quat(row[:4]).as_matrix(), row[4:]])
+        lens = (K[0, 0], K[1, 1], K[0, 2], K[1, 2]) if lenses is None else lenses[number]
+        entries.append(_entry(images / str(number), intrinsics(*lens), _to_world(pose), size))
+    return Listing(entries)
+
+
+def read_arkit(path: Path) -> Listing:
+    """Read the frames of 3D Scanner App.
+
+    Raises:
+        MivolError: a file that is no JSON, or numbers that are missing or too few.
+    """
+    entries = []
+    for file in sorted(path.glob("frame_*.json"), key=lambda file: split_numbers(file.name)):
+        table = _read_table(file)
+        K = _numbers(file, table, "intrinsics", 9).reshape(3, 3)
+        pose = _numbers(file, table, "cameraPoseARFrame", 16).reshape(4, 4)
+        entries.append(_entry(path / file.stem, intrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2]), pose))
+    # Most frames of a scan have a pose and no photograph.
+    kept = [entry for entry in entries if entry.file.is_file()]
+    return Listing(kept or entries)
+
+
+def _polycam_folders(path: Path) -> tuple[Path, Path] | None:
+    for cameras, images in (CORRECTED, PLAIN):
+        if (path / "keyframes" / cameras).is_dir() and (path / "keyframes" / images).is_dir():
+            return path / "keyframes" / cameras, path / "keyframes" / images
+    return None
+
+
+def _record3d_files(path: Path) -> tuple[Path, Path] | None:
+    file = next((path / name for name in ("metadata.json", "metadata") if (path / name).is_file()), None)
+    images = next((path / name for name in ("rgb", "rgbd") if (path / name).is_dir()), None)
+    return None if file is None or images is None else (file, images)
+
+
+def _read_table(file: Path) -> dict[str, Any]:
+    try:
+        table = json.loads(read_bytes(file))
+    except (ValueError, RecursionError) as error:
+        raise refusal(file, f"text that is not JSON ({error})", "a camera in JSON", "export it again") from error
+    if not isinstance(table, dict):
+        raise refusal(file, "no table of numbers", "a camera in JSON", "export it again")
+    return table
+
+
+def _numbers(file: Path, table: dict[str, Any], key: str, count: int | tuple[int, int]) -> Any:
+    """The finite number (``count`` 0), list of numbers or table of numbers under a key."""
+    shape = () if count == 0 else (count,) if isinstance(count, int) else count
+    try:
+        found = np.asarray(table[key], np.float64)
+    except KeyError:
+        raise refusal(file, f"no {key}", "the numbers of a camera", "export it again") from None
+    except (TypeError, ValueError):
+        found = np.full(1, np.nan)
+    fits = found.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, found.shape, strict=True)) and found.size
+    if not fits or not np.isfinite(found).all():
+        expected = " x ".join("any" if n < 0 else str(n) for n in shape) + " finite numbers" if shape else "a finite number"
+        raise refusal(file, f"{key} of {found.size} values, or not of numbers", expected, "export it again")
+    return found if shape else float(found)
+
+
+def _whole_size(file: Path, width: float, height: float) -> tuple[int, int]:
+    if not all(n >= 1 and n == int(n) for n in (width, height)):
+        raise refusal(file, f"an image of {width:g} x {height:g} pixels", "whole numbers of pixels", "export it again")
+    return int(width), int(height)
+
+
+def _to_world(rows: Sequence | np.ndarray) -> np.ndarray:
+    return np.vstack([np.asarray(rows, np.float64), [0, 0, 0, 1]])
+
+
+def _entry(image: Path, K: np.ndarray, to_world: np.ndarray, size: tuple[int, int] | None = None) -> Entry:
+    file = find_image(image)
+
+    def camera(pixels: tuple[int, int]) -> Camera:
+        return Camera(K, pixels, to_world, name=file.name)
+
+    return Entry(file.name, file, camera, size=size, is_stored=True)
