@@ -41,7 +41,12 @@ from mivol.transport.traversal.box import Box
 
 
 def find_needs(
-    scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = None, spp: int = 0, reads_emission: bool = True
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    survey: SceneSurvey | None = None,
+    spp: int = 0,
+    reads_emission: bool = True,
+    differentiated: Sequence[tuple[str, mi.Object]] | None = None,
 ) -> Needs:
     """Find the facts of a scene.
 
@@ -51,6 +56,7 @@ def find_needs(
         survey: an earlier survey of the same scene; by default a new survey.
         spp: samples per pixel; 0 for the sampler's own count.
         reads_emission: whether to locate the light of media, so that a plan may sample the light.
+        differentiated: keys of the parameters with gradients enabled, and their owners; by default found in the scene.
 
     Raises:
         MivolError: a variant or a medium that mivol does not render.
@@ -61,8 +67,9 @@ def find_needs(
     start = [] if sensor.get_medium() is None else [sensor.get_medium()]
     boundaries = (*survey.boundaries, *find_outside_media(start, survey.boundaries))
     views = tuple(b.view(survey.places) for b in boundaries)
-    params = traverse(scene)
-    differentiated = tuple(k for k, v in list_values(params) if dr.grad_enabled(v))
+    if differentiated is None:
+        params = traverse(scene)
+        differentiated = [(k, params.properties[k][2]) for k, v in list_values(params) if dr.grad_enabled(v)]
     media = tuple(
         replace(_read_medium_facts(b, view, survey, recording), misplaced=_find_misplaced(b, view, boundaries, survey))
         for b, view in zip(boundaries, views, strict=True)
@@ -75,8 +82,7 @@ def find_needs(
         media=media,
         start=sensor.get_medium(),
         camera_inside=_may_camera_be_inside(scene, sensor, survey),
-        parameters=differentiated,
-        places=tuple(k for k in differentiated if _is_placement(k, params.properties[k][2])),
+        **_sort_parameters(differentiated),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
         spp=spp or sensor.sampler().sample_count(),
         is_colour_film=not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special),
@@ -94,6 +100,14 @@ def find_needs(
     media = needs.make_media(scene, bodies, survey.size, survey.usable_tracer)
     light = read_media_light(media, boundaries, scattering, sensor, survey)
     return replace(needs, media_light=light)
+
+
+def _sort_parameters(differentiated: Sequence[tuple[str, mi.Object]]) -> dict[str, tuple[str, ...]]:
+    """``Needs.parameters`` and ``Needs.places``."""
+    return {
+        "parameters": tuple(key for key, _ in differentiated),
+        "places": tuple(key for key, owner in differentiated if _is_placement(key, owner)),
+    }
 
 
 def _find_emitter_distances(scene: mi.Scene, boundaries: Sequence[Boundary]) -> tuple[float, ...]:
@@ -361,6 +375,16 @@ class Needs(ShapeFacts):
     def has_lamps(self) -> bool:
         """Whether a shape emits light."""
         return "AreaLight" in self.emitters
+
+    def with_parameters(self, differentiated: Sequence[tuple[str, mi.Object]]) -> Needs | None:
+        """The facts of the same values with gradients enabled on other parameters, for derivatives; None to find them anew.
+
+        A medium without scattering scatters if its albedo has gradients; the table of the light of media is not kept.
+        """
+        may_scatter = any("sigma_t" not in key.split(".") for key, _ in differentiated)
+        if any(m.emits or (may_scatter and not m.is_scattering) for m in self.media):
+            return None
+        return replace(self, lamp_noise=None, **_sort_parameters(differentiated))
 
     def with_views(self, survey: SceneSurvey, asymmetries: list[mi.Float | None]) -> Needs:
         """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``asymmetries``."""

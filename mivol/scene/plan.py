@@ -60,7 +60,6 @@ from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceG
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
 from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache, build_visibility_cache
-from mivol.transport.media.extinction import Extinction
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import (
@@ -143,6 +142,11 @@ class Plan:
         """All that a kernel depends on, without the reasons: equal plans give the same kernels."""
         skipped = {"choices", "gradient_bytes"}
         return tuple(value for name, value in vars(self).items() if name not in skipped)
+
+    def readings(self, for_images: bool) -> tuple:
+        """All that decides what is read of the values of media (:func:`read_parts`)."""
+        near = self.draws_near_light if for_images else self.near_light_in_derivatives
+        return self.skips_empty, self.estimates_shadows, self.segment == "free_flight", near
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -285,17 +289,11 @@ Readings = list[list[PartReading]]
 
 def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) -> Readings:
     """Read the values that the planned estimators need besides the values themselves."""
-    near = plan.draws_near_light if for_images else plan.near_light_in_derivatives
+    skips_empty, estimates_shadows, flies, near = plan.readings(for_images)
     return [
-        [read_part(part, survey, boundary.name, skip, tracks or _flies_through(part, plan), near) for part in view.parts]
-        for boundary, view, skip, tracks in zip(
-            needs.boundaries, needs.views, plan.skips_empty, plan.estimates_shadows, strict=True
-        )
+        [read_part(p, survey, boundary.name, skip, tracks or (flies and p.channels == 1), near) for p in view.parts]
+        for boundary, view, skip, tracks in zip(needs.boundaries, needs.views, skips_empty, estimates_shadows, strict=True)
     ]
-
-
-def _flies_through(part: Extinction, plan: Plan) -> bool:
-    return plan.segment == "free_flight" and part.channels == 1
 
 
 def build_media(

@@ -45,19 +45,21 @@ class SceneState:
         values: the arrays that a recording follows, by their indices in Dr.Jit and with their shapes.
         others: all other arrays and numbers.
         held: the arrays. Dr.Jit would give the index of a freed array to another array.
+        differentiated: keys of the scene's parameters with gradients enabled, with their owners.
     """
 
     sensor: mi.Sensor
     values: list = field(default_factory=list)
     others: list = field(default_factory=list)
     held: list = field(default_factory=list)
+    differentiated: list[tuple[str, mi.Object]] = field(default_factory=list)
 
     @classmethod
     def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> SceneState:
         """Read the state of a scene and of the sensor to render, which may lie outside of the scene."""
         state = cls(sensor)
         params = traverse(scene)
-        state._add(params)
+        state.differentiated = state._add(params)
         if sensor not in params.hierarchy:
             state._add(traverse(sensor))
         state.others.append(_describe_sensor(sensor))
@@ -74,7 +76,14 @@ class SceneState:
         """Whether no parameter differs, and the sensor is the same."""
         return self.sensor is other.sensor and self.values == other.values and self.others == other.others
 
-    def _add(self, params: mi.SceneParameters) -> None:
+    def has_same_numbers(self, other: SceneState) -> bool:
+        """Whether no parameter differs except by gradients that a recording follows, and the sensor is the same."""
+        numbers, others = ([value[:2] for value in state.values] for state in (self, other))
+        return self.sensor is other.sensor and numbers == others and self.others == other.others
+
+    def _add(self, params: mi.SceneParameters) -> list[tuple[str, mi.Object]]:
+        """Add parameters; returns the keys with gradients enabled, and their owners."""
+        differentiated = []
         for key in params.properties:
             _, _, owner, _ = params.properties[key]
             value = params[key]
@@ -86,6 +95,9 @@ class SceneState:
             self.held.append(kept)
             state = (tuple(dr.detail.collect_indices(kept)), dr.shape(kept), dr.grad_enabled(numbers))
             (self.values if _is_followed(owner, key) else self.others).append(state)
+            if state[2]:
+                differentiated.append((key, owner))
+        return differentiated
 
 
 def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:

@@ -45,7 +45,7 @@ from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.scene_graph import list_values, traverse
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
-from mivol.transport.media.medium_view import traverse_medium
+from mivol.transport.media.medium_view import MediumView, traverse_medium
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.film import find_batch_views
 from mivol.transport.path.walk import walk_path
@@ -99,6 +99,8 @@ class Session:
         self.recordings = Recordings(MAX_RECORDINGS)
         self._surveyed: _SurveyedScene | None = None
         self._opened: dict[bool, PlannedScene] = {}
+        # Of the last image, for its derivatives; kept longer, they would keep the derivatives of an earlier step.
+        self._views: tuple[MediumView, ...] = ()
 
     def __repr__(self) -> str:
         s = self.settings
@@ -210,10 +212,15 @@ class Session:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
             self._opened = {}
             self.recordings.clear()
-        survey = self._surveyed.survey
+        survey, views = self._surveyed.survey, self._views
+        self._views = ()
+        if not for_images and views and not is_recording():
+            opened = self._open_like_image(scene, sensor, spp, state, views)
+            if opened is not None:
+                return opened
         known = next(iter(self._opened.values()), None)
         with with_placements(None if known is None else known.arrays.placements, {} if known is None else known.places):
-            needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
+            needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission, state.differentiated)
         warn_of_misplaced_grids(needs, survey)
         warn_of_clipped_view(needs, sensor, survey)
         with dr.suspend_grad():
@@ -225,19 +232,49 @@ class Session:
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
-        placements, places = prepare_placements(needs, survey.size)
+        if known is not None and known.state.others == state.others:
+            placements, places = known.arrays.placements, known.places
+        else:
+            placements, places = prepare_placements(needs, survey.size)
         readings = read_parts(needs, plan, survey, for_images)
         arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer)
         opened = PlannedScene(state, spp, survey, replace(needs, views=(), media_light=None), plan, arrays, places)
-        known = self._opened.get(for_images)
+        self._keep(opened, scene, for_images)
+        if not is_recording():
+            release_unread(survey)
+            self._views = needs.views if for_images else ()
+        return opened
+
+    def _open_like_image(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, views: tuple[MediumView, ...]
+    ) -> PlannedScene | None:
+        """Plan derivatives by the facts and readings of an image of the same values; None if there are none.
+
+        Args:
+            views: of the media, from the image.
+        """
+        image = self._opened.get(True)
+        if image is None or image.spp != spp or not image.state.has_same_numbers(state):
+            return None
+        needs = image.needs.with_parameters(state.differentiated)
+        if needs is None:
+            return None
+        plan = make_plan(replace(needs, views=views), self.settings, self.aovs)
+        if plan.readings(for_images=False) != image.plan.readings(for_images=True):
+            return None
+        opened = PlannedScene(state, spp, image.survey, needs, plan, image.arrays, image.places)
+        self._keep(opened, scene, for_images=False)
+        return opened
+
+    def _keep(self, opened: PlannedScene, scene: mi.Scene, for_images: bool) -> None:
+        """Find whether renders are recorded, and keep what was opened."""
+        known, spp = self._opened.get(for_images), opened.spp
         if known is not None and (known.spp, known.key) == (spp, opened.key):
             opened.unrecorded = known.unrecorded
         else:
-            opened.unrecorded = find_unrecorded(scene, sensor, spp, needs, plan, for_images)
+            opened.unrecorded = find_unrecorded(scene, opened.state.sensor, spp, opened.needs, opened.plan, for_images)
         if not is_recording():
             self._opened[for_images] = opened
-            release_unread(survey)
-        return opened
 
 
 def _find_renderable_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

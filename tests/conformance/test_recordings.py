@@ -19,7 +19,7 @@ import scenes
 from mivol.bench.studies.steps import count_launches
 from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, RecordedTask, Recordings, is_recording, without_garbage_collection
-from mivol.scene import plan, render_tasks, scene_state
+from mivol.scene import plan, render_tasks, scene_state, session
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.threads import set_thread_count
 from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views
@@ -308,6 +308,36 @@ def test_a_replay_launches_few_kernels() -> None:
 
 
 # -- What is traced ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("albedo", "between", "readings"), [(0.8, False, 1), (0.8, True, 2), (0.0, False, 2)])
+def test_derivatives_take_the_facts_of_their_image(
+    monkeypatch: pytest.MonkeyPatch, albedo: float, between: bool, readings: int
+) -> None:
+    """Not if a value changed in between; and a medium without scattering may scatter, for a derivative by its albedo."""
+    scene, found, count = smoke_under(), [], []
+    params, key = mi.traverse(scene), INSIDE + "albedo.value.value"
+    find_needs = session.find_needs
+    monkeypatch.setattr(session, "find_needs", lambda *given: [count.append(1), find_needs(*given)][1])
+    for renders in (True, False):
+        integrator = mi.load_dict(mivol(max_depth=4))
+        params[key] = mi.Float(albedo)
+        params.update()
+        dr.enable_grad(params[key])
+        if renders:
+            integrator.render(scene, seed=3, spp=2)
+        if between:
+            params[key] = mi.Float(albedo / 2)
+            params.update()
+            dr.enable_grad(params[key])
+        adjoint = mi.TensorXf(np.linspace(0, 1, 108, dtype=np.float32).reshape(6, 6, 3))
+        integrator.render_backward(scene, params, adjoint, seed=4, spp=2)
+        found.append(float(dr.grad(params[key])[0]))
+        if renders:
+            assert len(count) == readings
+    assert found[0] != 0
+    # Sums of some hundred float32 numbers of one sign, in another order.
+    assert found[0] == pytest.approx(found[1], rel=1e-5)
 
 
 def test_what_cannot_be_recorded_is_named() -> None:
