@@ -170,6 +170,7 @@ class Session:
         if is_recording() or opened.unrecorded is not None:
             return make()(*given)
         self._join_arrays(scene, opened.arrays.tracer)
+        self._reset(sensor)
         gradients = [(value, dr.grad(value)) for value in find_differentiated(scene)] if kind is GradientTask else []
         try:
             return self.recordings.call(kind, (opened.spp, *opened.key), make, *given)
@@ -188,6 +189,16 @@ class Session:
             f"a render of {width} x {height} pixels ran out of memory on {where}: render crops of half the pixels, or give"
             " the grids 80 % of their nodes along each axis (half the memory)."
         )
+
+    def _reset(self, sensor: mi.Sensor) -> None:
+        """Bring the film and the sampler into a state that does not depend on what was rendered before.
+
+        Both are inputs of a recording, and no task reads their state. But Dr.Jit records anew for an image of zeros in the place
+        of none, and for arrays in the place of the numbers of a sampler that was never seeded.
+        """
+        sensor.film().prepare(self.aovs)
+        if sensor.sampler().wavefront_size() != 1:
+            sensor.sampler().seed(dr.opaque(mi.UInt32, 0), 1)
 
     def _join_arrays(self, scene: mi.Scene, tracer: mi.Scene | None) -> None:
         """Let a scene and its tracer share their arrays before the first recording.
