@@ -306,19 +306,26 @@ def validate(arguments: argparse.Namespace) -> int:
 
 
 def export(arguments: argparse.Namespace) -> None:
-    """Write a radiance field as a mesh, volumes, a scene with its sky, or a file of another program.
+    """Write a radiance field as a mesh, volumes, a scene with its sky, or a file of another program; Gaussians as a scene.
 
     A hash grid or a NeRF becomes a grid of 128 nodes along its longest edge first, and export prints the loss in dB; mivol
     convert --to grid makes grids of other resolutions.
     """
     from mivol.back_end import set_variant
     from mivol.experiments.field_conversion import grid_of_network
+    from mivol.experiments.gaussian_conversion import convert_to_scene
     from mivol.experiments.render import sky_beside
     from mivol.fields.field_archives import read_field_view
     from mivol.fields.field_files import read_field, write_field
     from mivol.fields.sampled_field import SampledField
+    from mivol.points.summary import SUFFIXES
 
     set_variant(arguments.mode)
+    if arguments.field.suffix.lower() in SUFFIXES:
+        if arguments.level is not None:
+            raise MivolError(f"{arguments.field}: --level is for the mesh of a field: leave it out.")
+        print("\n".join(str(path) for path in convert_to_scene(arguments.field, arguments.output)))
+        return
     field, sky, view = read_field(arguments.field), sky_beside(arguments.field), read_field_view(arguments.field)
     is_copy = arguments.output.suffix == ".npz" and not arguments.output.name.endswith((".svox2.npz", ".svox.npz"))
     if isinstance(field, SampledField) and not is_copy:

@@ -189,7 +189,7 @@ def export_flags() -> list:
 
     formats = ", ".join(f"{suffix} ({kind.name})" for suffix, kind in FIELD_FORMATS.items())
     return [
-        flag("field", type=Path, help="radiance field (.npz) of mivol, or a checkpoint of svox2"),
+        flag("field", type=Path, help="radiance field (.npz) of mivol, a checkpoint of svox2, or Gaussians (.ply, ...)"),
         flag("output", type=Path, help=f"file to write; its suffix chooses the format: {formats}"),
         flag("--level", type=float,
              help="extinction at a mesh's surface [1/length] (default: a voxel of opacity 0.5, or half the maximum if lower)"),

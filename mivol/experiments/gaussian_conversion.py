@@ -11,18 +11,19 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.back_end import set_variant
-from mivol.fields.field_files import read_grid, write_field
+from mivol.fields.field_files import LONGEST_EDGE, read_grid, write_emission_scene, write_field
 from mivol.fields.gaussian_field import MAX_OPACITY
 from mivol.fields.gaussian_grid import gaussian_box, gaussian_masses, gaussians_to_grid
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import DepthView, fuse_depths
 from mivol.files.mesh import MESH_WRITERS, Mesh, write_mesh
-from mivol.files.source import check_file, select_by_suffix
+from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics, pixel_centres, rays
+from mivol.photos.camera_path import HomeView
 from mivol.points.cloud import read_points
 from mivol.points.conversions import points_to_gaussians
-from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians
+from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.scene_graph import traverse
 from mivol.splatting.splatter import Splatter, to_tensors
@@ -75,6 +76,49 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     if capped:
         lines.append(f"{capped} Gaussians of an opacity above {MAX_OPACITY} were made as opaque as that")
     return "\n".join(lines)
+
+
+FILTER = 0.3
+"""Variance of the low-pass filter of splats [pixel^2]."""
+
+SAMPLES = 4
+"""Samples a pixel of a scene of Gaussians: rays do not filter, and a ray among thousands of Gaussians is slow."""
+
+
+def convert_to_scene(source: Path, target: Path) -> list[Path]:
+    """Write Gaussians, or points as Gaussians, and a scene of Mitsuba that traces rays through them (``mivol_gaussians``).
+
+    The camera is the first view of the file, else one before the middle half of the Gaussians, with up along z. Gaussians are
+    widened as splats are at the distance of what the camera looks at.
+
+    Args:
+        source: file of Gaussians or points in a known format.
+        target: ends in .xml; the Gaussians lie beside it.
+
+    Returns:
+        Paths of the files written, the scene first.
+
+    Raises:
+        MivolError: as the readers, another suffix, or a full disk.
+    """
+    if target.suffix.lower() != ".xml":
+        found, way_out = f"a file {target.suffix or 'without a suffix'}", f"mivol convert {source} writes other formats"
+        raise refusal(target, found, "a scene (.xml) of Gaussians", way_out)
+    cloud, view = read_as_gaussians(source), read_gaussian_view(source)
+    low, high = gaussian_box(cloud)
+    if view is None:
+        inner = np.quantile(cloud.means, [0.25, 0.75], axis=0)
+        middle, reach = inner.mean(axis=0), 2 * float((inner[1] - inner[0]).max())
+        eye = middle + reach * np.array([0.5, -0.8, 0.35])
+        view = HomeView((0.0, 0.0, 1.0), tuple(eye.tolist()), tuple(middle.tolist()), 60.0, (4, 3))
+    focal = view.scaled(LONGEST_EDGE)[0] / 2 / math.tan(math.radians(view.fov) / 2)
+    blur = math.sqrt(FILTER) * math.dist(view.origin, view.target) / focal
+    file = target.with_name(f"{target.stem}-gaussians.ply")
+    write_gaussians(file, cloud, view)
+    more = f'\n                <float name="blur" value="{blur:.6g}"/>'
+    given = {"kind": "Gaussians", "volume": "mivol_gaussians", "file": file.name, "more": more, "sky": "", "samples": SAMPLES}
+    write_emission_scene(target, box_to_world(low, high), view, **given)
+    return [target, file]
 
 
 def corners_of_box(cloud: Gaussians, box: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:

@@ -249,7 +249,7 @@ EYE = 0.5, -0.7, 0.8
 """Position of the camera in the unit cube of the innermost box: before the box, a little above its middle."""
 
 SCENE = """<scene version="3.0.0">
-    <!-- The field that mivol wrote to {field}. Put surfaces and lights into it, and move the camera. -->
+    <!-- The {kind} that mivol wrote to {file}. Put surfaces and lights into it, and move the camera. -->
     <integrator type="mivol">
         <integer name="max_depth" value="2"/>
     </integrator>
@@ -263,7 +263,7 @@ SCENE = """<scene version="3.0.0">
             <integer name="height" value="{height}"/>
         </film>
         <sampler type="independent">
-            <integer name="sample_count" value="16"/>
+            <integer name="sample_count" value="{samples}"/>
         </sampler>
     </sensor>
     <shape type="cube" id="field">
@@ -272,8 +272,8 @@ SCENE = """<scene version="3.0.0">
         </transform>
         <bsdf type="null"/>
         <medium name="interior" type="mivol_medium">
-            <volume name="emission" type="mivol_sh">
-                <string name="filename" value="{field}"/>
+            <volume name="emission" type="{volume}">
+                <string name="filename" value="{file}"/>{more}
             </volume>
         </medium>
     </shape>
@@ -316,20 +316,28 @@ def write_scene(path: Path, field: SphericalGrid, sky: Sky | None = None, view: 
     if view is None:
         eye = place[:3, :3] @ EYE + place[:3, 3]
         view = HomeView(tuple(place[:3, 2]), tuple(eye), tuple(field.middle), 60.0, (4, 3))
+    environment = "" if sky is None else ENVIRONMENT.format(name=sky_path.name)
+    given = {"kind": "field", "volume": "mivol_sh", "file": field_path.name, "more": "", "sky": environment, "samples": 16}
+    write_emission_scene(path, field.level_to_world(field.levels - 1), view, **given)
+    return written
+
+
+def write_emission_scene(path: Path, to_world: np.ndarray, view: HomeView, **given: object) -> None:
+    """Write a scene of a medium that only emits, in a cube, and a camera.
+
+    Args:
+        path: ends in .xml.
+        to_world: (4, 4), unit cube to the box of the medium.
+        view: the camera.
+        given: the other values of ``SCENE``.
+    """
     width, height = view.scaled(LONGEST_EDGE)
-    numbers = {
-        "eye": view.origin,
-        "target": view.target,
-        "up": view.up,
-        "fov": view.fov,
-        "place": field.level_to_world(field.levels - 1) @ CUBE_TO_UNIT,
-    }
+    place = to_world @ CUBE_TO_UNIT
+    numbers = {"eye": view.origin, "target": view.target, "up": view.up, "fov": view.fov, "place": place}
     texts = {name: " ".join(f"{value:.9g}" for value in np.ravel(values)) for name, values in numbers.items()}
     commas = {name: text.replace(" ", ", ") for name, text in texts.items() if name != "place"}
-    environment = "" if sky is None else ENVIRONMENT.format(name=sky_path.name)
-    text = SCENE.format(field=field_path.name, sky=environment, place=texts["place"], width=width, height=height, **commas)
+    text = SCENE.format(place=texts["place"], width=width, height=height, **commas, **given)
     write_whole(path, lambda file: file.write(text.encode()))
-    return written
 
 
 # -- Parameters of a scene ---------------------------------------------------------------------------------------------

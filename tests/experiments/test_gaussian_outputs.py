@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
+from mivol.cli import main
 from mivol.experiments import gaussian_fit as outputs
 from mivol.experiments import photo_fit
 from mivol.experiments.film import Film
 from mivol.experiments.fit_kind import NullProgress
-from mivol.points import Gaussians
+from mivol.photos.camera import project
+from mivol.photos.camera_path import HomeView
+from mivol.points import Gaussians, write_gaussians
+from mivol.scene.sensors import to_camera
 from mivol.validate.metrics import ImageScore
 
 
@@ -40,6 +46,31 @@ def test_what_the_gaussians_take() -> None:
         ("longest axis: median [length]", "4"),
         ("longest over shortest axis: median", "3"),
     )
+
+
+@pytest.mark.parametrize("has_view", [True, False])
+def test_gaussians_become_a_scene(variant_rgb: str, tmp_path: Path, has_view: bool, capsys: pytest.CaptureFixture) -> None:
+    """The camera is the first view of the file. The blur is that of splats in an image of 480 pixels, 60 degrees wide, at 5."""
+    place, means = tmp_path / "place.xml", np.float32([[0, 0, 0], [3, -1, 2], [5, 1, -4]])
+    view = HomeView((0.0, -1.0, 0.0), (5.0, 0.0, -5.0), (5.0, 0.0, 0.0), 60.0, (960, 540)) if has_view else None
+    write_gaussians(tmp_path / "a.ply", replace(cloud(), means=means), view)
+    assert main(["export", str(tmp_path / "a.ply"), str(place)]) == 0
+    assert capsys.readouterr().out.split() == [str(place), str(tmp_path / "place-gaussians.ply")]
+    scene = mi.load_file(str(place))
+    camera = to_camera(scene.sensors()[0])
+    if has_view:
+        assert camera.size == (480, 270)
+        np.testing.assert_allclose(camera.to_world[:3, 3], [5, 0, -5], atol=1e-6)
+        np.testing.assert_allclose(camera.to_world[:3, 1], [0, -1, 0], atol=1e-6)
+        blur = np.sqrt(0.3) * 5 / (240 / np.tan(np.radians(30)))
+        assert f'name="blur" value="{blur:.6g}"' in place.read_text()
+    pixels, depth = project(camera, np.median(means, axis=0))
+    assert depth > 0 and (pixels > 0).all() and (pixels < camera.size).all()
+    box = scene.shapes()[0].bbox()
+    assert (np.array(box.min) < means.min(axis=0)).all() and (np.array(box.max) > means.max(axis=0)).all()
+    for target, fault in ((tmp_path / "place.obj", "expected a scene"), (place, "--level is for the mesh of a field")):
+        assert main(["export", str(tmp_path / "a.ply"), str(target), *(["--level", "1"] if target == place else [])]) == 1
+        assert fault in capsys.readouterr().err
 
 
 def test_a_picture_stands_before_a_colour() -> None:
