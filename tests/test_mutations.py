@@ -249,8 +249,35 @@ def test_rounds_have_a_time(index, monkeypatch: pytest.MonkeyPatch) -> None:
     assert index.rounds(fault_at(13), SMALL) == [
         ["tests/test_c.py::t", "tests/test_a.py::t", "tests/test_b.py::p[2]"],
         ["tests/test_b.py::u"],
+        [],
     ]
-    assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], []]
+    assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], [], []]
+
+
+@pytest.mark.parametrize(("line", "expected"), [(3, True), (6, True), (17, True), (13, False)])
+def test_lines_of_an_import_are_judged_by_the_reference(index, line: int, expected: bool) -> None:
+    """A constant, a default value and an attribute of a class; a line of a function is not of an import."""
+    assert (guards.OF_IMPORTS[0] in index.rounds(fault_at(line), SMALL)[0]) == expected
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "expected"),
+    [
+        ("mivol/a.py", 13, ["tests/x/test_a.py"]),  # called like the module
+        ("mivol/c.py", 13, ["tests/test_two.py"]),  # no recorded test runs it: files that import it
+        ("mivol/b.py", 13, []),  # a recorded test runs it
+    ],
+)
+def test_slow_tests_of_a_module_come_last(index, file: str, line: int, expected: list[str]) -> None:
+    slow = "import pytest\nfrom mivol import b\nfrom mivol.c import f\n@pytest.mark.slow\ndef test(): pass\n"
+    index.test_files = {"tests/x/test_a.py": "@pytest.mark.slow", "tests/test_a.py": "", "tests/test_two.py": slow}
+    assert index.rounds(fault_at(line, file), SMALL)[2] == (["-m", "slow", *expected] if expected else [])
+
+
+def test_a_study_may_measure_something_else():
+    """Constants of studies are no faults; operators are."""
+    found = {f.kind for f in faults.find_faults("mivol/bench/studies/a.py", "def f(n=3):\n    return 2 * n\n")}
+    assert found == {"operator"}
 
 
 @pytest.mark.slow
@@ -272,14 +299,16 @@ def test_a_recording_tells_which_tests_run_a_line(tmp_path: Path) -> None:
     source = (tmp_path / "mivol" / "a.py").read_text()
     names = {line: {t.function.rpartition("::")[2] for t in index.find_runners(fault_at(line), source)} for line in (2, 6)}
     assert names == {2: {"test_f", "test_h"}, 6: {"test_g", "test_h"}}
+    assert {t.name.rpartition("::")[2]: t.passed for t in index.tests} == {"test_f": False, "test_g": True, "test_h": True}
 
 
 HALVING = "def half(x):\n    return x / 2\ndef least(x):\n    return x if x < 9 else 9\n"
 
 
 @pytest.fixture
-def checkout(tmp_path: Path, bare_pytest: None) -> object:
+def checkout(tmp_path: Path, bare_pytest: None, monkeypatch: pytest.MonkeyPatch) -> object:
     """Two copies of a checkout with a test that sees half of the module, and one that is red anyway."""
+    monkeypatch.setattr(guards, "OF_IMPORTS", ())
     for name in ("broken", "untouched"):
         (tmp_path / name / "tests").mkdir(parents=True)
         (tmp_path / name / "halving.py").write_text(HALVING)

@@ -1,5 +1,7 @@
 """glTF 2.0 in one binary file (``.glb``): the container, its arrays, and triangle meshes.
 
+Own reader: pygltflib 1.16 accepts a file that is cut in half, and decodes no arrays.
+
 Conventions. A ``.glb`` has a JSON document and one buffer. Arrays are little-endian and start at multiples of 4 bytes. glTF has
 y up, in a right-handed frame; meshes keep their coordinates, and the node turns their up to y. Vertex colours of glTF are
 linear reflectances, those of :class:`mivol.files.mesh.Mesh` are code values. The colours of a capture are its light, so the

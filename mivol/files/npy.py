@@ -1,10 +1,11 @@
 """NumPy's files: ``.npy`` (one array without placement) and ``.npz`` (arrays by name, placement and metadata).
 
+Own checks before NumPy's reader, which allocates whatever an archive claims.
+
 Conventions. Grids are (Z, Y, X) or (Z, Y, X, C). A ``.npz`` of mivol holds ``values`` (float32), ``to_world`` (float64, 4x4)
 and ``metadata`` (a 0-d string of JSON). Any other ``.npz`` is read by the name of an array and placed on the unit cube. Only
-numbers, truth values and text are read, never Python objects. NumPy's own ``load`` would allocate whatever an archive claims.
-:func:`read_archive` compares the size of each array in its header with the size of the member, and the sum of the sizes with
-the free memory.
+numbers, truth values and text are read, never Python objects. :func:`read_archive` compares the
+size of each array in its header with the size of the member, and the sum of the sizes with the free memory.
 """
 
 from __future__ import annotations

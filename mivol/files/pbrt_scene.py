@@ -1,5 +1,7 @@
 """Scenes of pbrt-v4 (``.pbrt``): directives with their parameters and the current graphics state.
 
+Own reader: no package on PyPI reads scenes of pbrt-v4.
+
 Conventions. A transform maps from the space of an object to the world, as columns; before ``WorldBegin`` it maps from the world
 to the camera. Lists of numbers are float64 arrays. Included files are read from the folder of the file that names them.
 

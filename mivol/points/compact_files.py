@@ -1,5 +1,7 @@
 """Compact files of Gaussians, read and written: ``.splat`` (antimatter15), ``.ksplat`` (GaussianSplats3D), Niantic's ``.spz``.
 
+Own readers: gaussforge 0.6 refuses sound ``.splat`` files, and accepts bytes after the end of a ``.ksplat``.
+
 ``.splat``. 32 bytes a Gaussian, no header, colours without harmonics: position and scale in float32, colour and opacity in a
 byte each, the unit quaternion (w, x, y, z) as 128 + 128 q in a byte each.
 

@@ -1,5 +1,7 @@
 """Gaussians in glTF: the extension ``KHR_gaussian_splatting`` in a ``.glb``, read and written.
 
+Own reader, by :mod:`mivol.files.gltf`: pygltflib 1.16 leaves the arrays of the extension to the caller.
+
 Conventions. A primitive of points holds centres, rotations (x, y, z, w), standard deviations, opacities, and a coefficient of
 the harmonics (rgb) in each attribute. The basis is that of published files, and so are the colours: sRGB code values, as
 displayed. glTF has y up and published files have y down, so both reader and writer turn half a turn about z: x and y change

@@ -1,5 +1,7 @@
 """Gaussians in ``.ply``: the format of 3D Gaussian splatting, read and written, and PlayCanvas' compressed format, read.
 
+Own reader, by :mod:`mivol.files.ply`: plyfile is under the GPL.
+
 The format of 3D Gaussian splatting holds the pre-images of the activations, one property each. Properties are written in the
 order of the authors' program: ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3``, float32, with normals of 0,
 ``f_rest`` by colour (all of red, all of green, all of blue), and quaternions (w, x, y, z). Files are read with any order and

@@ -1,5 +1,7 @@
 """Gaussians in SOG, PlayCanvas' delivery format: images in a ZIP archive, read (version 2) and written.
 
+Own reader: gaussforge 0.6 ends Python with a segmentation fault if ``count`` is larger than the images.
+
 Layout. ``meta.json`` names lossless WebP images of the same size, a pixel for each Gaussian, row by row. Positions are 16 bits
 over the range of each axis of ``sign(x) log(1 + |x|)``, low and high bytes in two images. Logarithms of scales and coefficients
 of degree 0 are numbers of entries of a table of 256 values each; alpha of the latter is the opacity. Of the unit quaternion

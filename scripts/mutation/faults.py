@@ -2,7 +2,8 @@
 
 A fault replaces one piece of a file's text: an operator, a sign, a constant, an index or a whole condition. They are
 found in the syntax tree, so that docstrings, other strings, annotations, imports, decorators and ``__all__`` are never
-touched, nor what only a type checker or a direct call of the file runs.
+touched, nor what only a type checker or a direct call of the file runs. Constants of the studies of the bench are left alone,
+too: sizes, seeds and scenes choose what is measured, so another value is another measurement and no fault.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ BUILT_IN = ("bool", "bytes", "complex", "dict", "float", "int", "list", "object"
 
 DECLARATIONS = ("annotation", "returns", "decorator_list", "type_params", "bases")
 """Fields of nodes that say what something is, not what it does; the keywords of a class are such, too."""
+
+STUDIES = "bench/studies/"
+"""Folder of the modules whose constants choose a measurement."""
 
 SMALL, LARGE = 1e-6, 1e6
 """Outside of them a constant stands for zero or for infinity: twice as much of it is the same."""
@@ -138,6 +142,8 @@ def find_faults(file: str, source: str) -> tuple[Fault, ...]:
         if id(node) in indices:
             continue
         for start, end, new, kind in _faults_of(node, text):
+            if kind == "constant" and STUDIES in file:
+                continue
             line = source.count("\n", 0, start) + 1
             found.add(Fault(file, line, start, source[start:end], new, kind))
     return tuple(sorted(found, key=lambda f: (f.start, f.old, f.new)))

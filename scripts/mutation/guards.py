@@ -1,6 +1,7 @@
 """Which tests guard a line: the tests that run it, the most specific first.
 
-A recording of the suite (:mod:`mutation.recorder`) tells which lines each test runs, and how long the test takes.
+A recording of the suite (:mod:`mutation.recorder`) tells which lines each test runs, and how long the test takes. Lines that
+only an import runs, and slow tests, are not in it: :data:`OF_IMPORTS` and the names of test files stand for them.
 """
 
 from __future__ import annotations
@@ -8,22 +9,26 @@ from __future__ import annotations
 import ast
 import os
 import pickle
+import re
 import subprocess
 import sys
 import tempfile
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
 from mutation.faults import Fault
 
-__all__ = ["Guards", "RunTest", "group_entries", "lines_of", "read_recording", "record_suite"]
+__all__ = ["Guards", "RunTest", "group_entries", "is_of_import", "lines_of", "read_recording", "record_suite"]
 
 FIRST, SECOND = 60.0, 300.0
 """Recorded time of the tests in the first round and in the second [s]."""
+
+OF_IMPORTS = ("tests/test_docs.py::test_reference_is_what_the_code_says",)
+"""Tests of what imports compute: default arguments, settings and tables stand on the pages of the reference."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +39,13 @@ class RunTest:
         name: its node id.
         seconds: its time.
         size: lines of the package that it runs.
+        passed: whether it was green.
     """
 
     name: str
     seconds: float
     size: int
+    passed: bool = True
 
     @property
     def function(self) -> str:
@@ -54,11 +61,13 @@ class Guards:
         tests: the tests of the recording.
         runners: indices into ``tests`` by (file of the package, line).
         listed: the tests of the entries of tests/mutations, by file of the package.
+        test_files: text of each test file.
     """
 
     tests: list[RunTest] = field(default_factory=list)
     runners: dict[tuple[str, int], Iterable[int]] = field(default_factory=dict)
     listed: dict[str, list[str]] = field(default_factory=dict)
+    test_files: Mapping[str, str] = field(default_factory=dict)
 
     def find_runners(self, fault: Fault, source: str) -> list[RunTest]:
         """The tests that run the statement of a fault: tests in files called like the module first, then the most specific.
@@ -80,12 +89,27 @@ class Guards:
     def rounds(self, fault: Fault, source: str) -> list[list[str]]:
         """Names of tests for a fault, round by round; a round may be empty.
 
-        1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them;
-        2. more tests that run its line, ``SECOND`` seconds of them.
+        1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them; ``OF_IMPORTS`` for a
+           line that an import runs;
+        2. more tests that run its line, ``SECOND`` seconds of them;
+        3. the slow tests of its module, by the names of their files.
         """
-        first, rest = split_by_time(self.find_runners(fault, source), FIRST)
-        one = list(dict.fromkeys([*self.listed.get(fault.file, []), *(test.name for test in first)]))
-        return [one, [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]]
+        runners = self.find_runners(fault, source)
+        first, rest = split_by_time(runners, FIRST)
+        of_import = OF_IMPORTS if is_of_import(source, fault.line) else ()
+        one = list(dict.fromkeys([*self.listed.get(fault.file, []), *of_import, *(test.name for test in first)]))
+        two = [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]
+        slow = self.find_slow_files(fault.file, also_by_import=not runners)
+        return [one, two, ["-m", "slow", *slow] if slow else []]
+
+    def find_slow_files(self, file: str, also_by_import: bool) -> list[str]:
+        """Test files with slow tests that are called like a module; if there are none, perhaps those that import it."""
+        slow = {name: text for name, text in self.test_files.items() if "mark.slow" in text}
+        module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        parent, _, name = module.rpartition(".")
+        imported = re.compile(rf"(from {re.escape(module)} import|from {re.escape(parent)} import .*\b{name}\b)")
+        called = [test for test in slow if is_named_like(test, file)]
+        return called or [test for test, text in slow.items() if also_by_import and imported.search(text)]
 
 
 def split_by_time(tests: Sequence[RunTest], seconds: float) -> tuple[list[RunTest], list[RunTest]]:
@@ -132,6 +156,12 @@ def lines_of(source: str, line: int) -> range:
     return found
 
 
+def is_of_import(source: str, line: int) -> bool:
+    """Whether an import runs this line: it is outside functions, or in the head of one."""
+    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+    return not any(f.body[0].lineno <= line <= f.end_lineno for f in functions)
+
+
 def statements_in(node: ast.AST) -> list[ast.stmt]:
     """The statements of the blocks of a node."""
     blocks = [getattr(node, name, []) for name in ("body", "orelse", "finalbody")]
@@ -168,10 +198,10 @@ def record_suite(copy: Path, jobs: int, target: Path, slow: bool = False) -> Non
         target.write_bytes(pickle.dumps((tests, runners)))
 
 
-def read_recording(path: Path, listed: dict[str, list[str]]) -> Guards:
-    """The guards of a recording of :func:`record_suite`."""
+def read_recording(path: Path, listed: dict[str, list[str]], test_files: Mapping[str, str] | None = None) -> Guards:
+    """The guards of a recording of :func:`record_suite`; ``test_files`` are the texts of all test files."""
     tests, runners = pickle.loads(path.read_bytes())
-    return Guards([RunTest(*test) for test in tests], runners, listed)
+    return Guards([RunTest(*test) for test in tests], runners, listed, test_files or {})
 
 
 def group_entries(entries: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

@@ -1,4 +1,4 @@
-"""A plugin of pytest that records which lines of the package each test runs, and how long the test takes.
+"""A plugin of pytest that records which lines of the package each test runs, how long it takes, and whether it passes.
 
 Run it as ``pytest -p mutation.recorder`` with the folder ``scripts`` on the path of Python; the environment variable
 ``MIVOL_LINES`` names the file for the recording.
@@ -27,15 +27,16 @@ class Recorder:
     """Traces the functions of one folder.
 
     Attributes:
-        tests: (node id, seconds, number of lines) of each test, in the order of the run.
+        tests: (node id, seconds, number of lines, whether it passed) of each test, in the order of the run.
         runners: indices into ``tests`` by (file, line); files are relative to the checkout.
     """
 
     def __init__(self, root: str, package: str) -> None:
         self.root, self.folder = root, f"{root}{os.sep}{package}{os.sep}"
-        self.tests: list[tuple[str, float, int]] = []
+        self.tests: list[tuple[str, float, int, bool]] = []
         self.runners: dict[tuple[str, int], array] = {}
         self._lines: Lines = set()
+        self._passed = True
         self._of_fixtures: dict[str, Lines] = {}
 
     def start(self) -> None:
@@ -65,7 +66,7 @@ class Recorder:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
         """Record one test."""
-        self._lines = set()
+        self._lines, self._passed = set(), True
         start = time.perf_counter()
         self.start()
         try:
@@ -75,7 +76,11 @@ class Recorder:
             lines = self._lines.union(*(self._of_fixtures.get(name, ()) for name in getattr(item, "fixturenames", ())))
             for file, line in lines:
                 self.runners.setdefault((file[len(self.root) + 1 :], line), array("H")).append(len(self.tests))
-            self.tests.append((item.nodeid, time.perf_counter() - start, len(lines)))
+            self.tests.append((item.nodeid, time.perf_counter() - start, len(lines), self._passed))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note whether a part of a test is red."""
+        self._passed &= not report.failed
 
     def pytest_sessionfinish(self) -> None:
         """Write the recording, each worker of pytest-xdist a part of it."""
