@@ -194,7 +194,7 @@ class Session:
         """Bring the film and the sampler into a state that does not depend on what was rendered before.
 
         Both are inputs of a recording, and no task reads their state. But Dr.Jit records anew for an image of zeros in place of
-        none, and for arrays in place of the numbers of a sampler that was never seeded.
+        no image, and for arrays in place of the numbers of a sampler that was never seeded.
         """
         sensor.film().prepare(self.aovs)
         if sensor.sampler().wavefront_size() != 1:

@@ -324,7 +324,7 @@ def test_an_image_and_a_gradient_are_recorded_once_in_any_order(order: str) -> N
             if task == "image":
                 integrator.render(scene, seed=step, spp=2)
             else:
-                integrator.render_backward(scene, params, mi.TensorXf(np.ones((6, 6, 3), np.float32)), seed=step, spp=2)
+                integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (6, 6, 3)), seed=step, spp=2)
         assert integrator.session.recordings.count == 2
 
 
