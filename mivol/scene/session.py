@@ -72,8 +72,8 @@ class _SurveyedScene:
 OUT_OF_MEMORY = "out of memory"
 """Words of Dr.Jit's error when the system or the GPU has no more memory."""
 
-MAX_RECORDINGS = 64
-"""Largest number of recordings: an image and a gradient from each of 32 cameras."""
+MAX_RECORDINGS = 256
+"""Largest number of recordings: an image and a gradient from each of 128 cameras."""
 
 
 class Session:

@@ -10,7 +10,7 @@ Kernels are recorded once (``dr.freeze``) and launched without tracing for any n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import drjit as dr
@@ -132,6 +132,8 @@ class Splatter:
         self._project = record_kernels(_trace_projection, degree, compensated)
         self._write, self._composite = dr.freeze(write_tiles), dr.freeze(composite)
         self._project_adjoint = record_kernels(_trace_adjoint, degree, compensated)
+        # A recording holds the size of the target and of the copies of it that each thread adds to.
+        self._composite_adjoints: dict[tuple[int, int], Callable[..., Adjoint]] = {}
 
     def __repr__(self) -> str:
         return f"Splatter({self.size[0]} x {self.size[1]}, degree {self.degree})"
@@ -174,17 +176,20 @@ class Splatter:
         )
         return self._tensor(image), cache
 
-    def backward(self, cache: SplatterCache, d_image: mi.TensorXf) -> tuple[dict[str, mi.TensorXf], ScreenStatistics]:
+    def backward(
+        self, cache: SplatterCache, d_image: mi.TensorXf, pose: bool = True
+    ) -> tuple[dict[str, mi.TensorXf], ScreenStatistics]:
         """The derivatives of a number L by every input of an image.
 
         Args:
             cache: from :meth:`forward`.
             d_image: derivative of L by each number of the image, of the shape of the image.
+            pose: whether to return the derivatives by the camera.
 
         Returns:
-            The derivatives by name, of the shapes of the tensors of the cloud, with "pose" (6,): derivatives by a small motion
-            of the camera, a rotation vector about its place in the axes of the world [1/rad] and a translation in the world
-            [1/length]. The second result is the statistics of the screen.
+            The derivatives by name, of the shapes of the tensors of the cloud. On request also "pose" (6,): derivatives by a
+            small motion of the camera, a rotation vector about its place in the axes of the world [1/rad] and a translation in
+            the world [1/length]. The second result is the statistics of the screen.
 
         Raises:
             MivolError: a derivative of another shape, or an image drawn without derivatives, with a median depth or of discs.
@@ -203,14 +208,18 @@ class Splatter:
         if n == 0:
             gradient = {name: dr.zeros(mi.TensorXf, shape) for name, shape in cache.shapes.items()}
             nothing = np.zeros(0, np.float32)
-            return gradient | {"pose": dr.zeros(mi.TensorXf, (6,))}, ScreenStatistics(np.zeros(0, bool), nothing, nothing)
+            gradient |= {"pose": dr.zeros(mi.TensorXf, (6,))} if pose else {}
+            return gradient, ScreenStatistics(np.zeros(0, bool), nothing, nothing)
         adjoint = Adjoint(dr.detach(d_image.array), cache.chunks, _blank(8 * _capacity(n)), _blank(2 * _capacity(n)))
-        # Not recorded: the copies of the target that each thread adds to are of a size that a recording would hold fast.
-        adjoint = composite_adjoint((cache.shape, cache.rest), cache.lists, self._grid, cache.frame, adjoint)
+        size = _capacity(n), dr.thread_count()
+        if size not in self._composite_adjoints:
+            self._composite_adjoints[size] = dr.freeze(composite_adjoint)
+        adjoint = self._composite_adjoints[size]((cache.shape, cache.rest), cache.lists, self._grid, cache.frame, adjoint)
         target = Cloud(*[_blank(int(np.prod(cache.shapes[name]))) for name in NAMES])
-        d_cloud, pose, d_mean2d = self._project_adjoint(cache.cloud, cache.view, self._filter, adjoint, target)
+        d_cloud, by_pose, d_mean2d = self._project_adjoint(cache.cloud, cache.view, self._filter, adjoint, target)
         gradient = {name: mi.TensorXf(getattr(d_cloud, name), cache.shapes[name]) for name in NAMES}
-        gradient["pose"] = mi.TensorXf(np.array([np.array(d).sum(dtype=np.float64) for d in pose], np.float32))
+        if pose:
+            gradient["pose"] = mi.TensorXf(np.array([np.array(d).sum(dtype=np.float64) for d in by_pose], np.float32))
         return gradient, ScreenStatistics(cache.visible, np.array(d_mean2d), cache.radius)
 
     # -- Lists ---------------------------------------------------------------------------------------------------------------

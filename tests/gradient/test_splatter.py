@@ -158,7 +158,17 @@ def test_kernels_are_recorded_once(splatter: Splatter) -> None:
             dr.eval(splatter.backward(kept, picture)[0])
             compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
             assert n == 60 or len(compiled) == 0, n
-    assert [f.n_recordings for f in recorded] == [1, 1, 1, 1]
+    assert [f.n_recordings for f in (*recorded, *splatter._composite_adjoints.values())] == [1, 1, 1, 1, 1]
+
+
+def test_derivatives_without_the_camera(splatter: Splatter) -> None:
+    image, saved = splatter.forward(tensors(cloud(20, 2, 0.05, seed=1)), looking(WIDTH, HEIGHT))
+    with_pose, without = (splatter.backward(saved, dr.ones(mi.TensorXf, image.shape), pose)[0] for pose in (True, False))
+    assert with_pose.keys() - without.keys() == {"pose"}
+    for name, value in without.items():
+        # Sums over at most some hundred pixels, by threads in another order.
+        most = np.abs(np.array(with_pose[name])).max()
+        np.testing.assert_allclose(np.array(value), np.array(with_pose[name]), rtol=0, atol=WIDTH * HEIGHT * 2**-24 * most)
 
 
 def test_room_for_gaussians_is_a_power_of_two() -> None:

@@ -22,6 +22,7 @@ from mivol.optim.losses import Huber, Log
 from mivol.optim.optimizers import OPTIMIZERS
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import Laplacian, TotalVariation
+from mivol.optim.scenes import scene_problem
 from mivol.optim.scenes.scene_problem import SceneProblem, draw_views
 from mivol.optim.scenes.views import View, derive_seed, make_batches
 from mivol.optim.schedules import Cosine
@@ -109,6 +110,17 @@ def test_gradient_of_a_sky(variant_rgb) -> None:
     ends = [problem.loss_value({key: x + sign * h * v}, 0) for sign in (1, -1)]
     gradient = problem.loss_and_gradient({key: x}, 0)[1][key]
     assert dr.sum(gradient * v, axis=None).array[0] == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=0.02)
+
+
+def test_the_host_waits_for_large_passes_only(variant_rgb, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a small pass is computed, it prepares the next one."""
+    waits, problem = [], small_problem()
+    monkeypatch.setattr(scene_problem.dr, "sync_thread", lambda: waits.append(1))
+    problem.loss_and_gradient(problem.initial_reals(), 0)
+    assert not waits
+    monkeypatch.setattr(scene_problem, "LARGE_PASS", 1)
+    problem.loss_and_gradient(problem.initial_reals(), 0)
+    assert len(waits) >= 2
 
 
 def test_parameter_without_derivative_is_refused(variant_rgb) -> None:

@@ -99,6 +99,7 @@ class GaussianProblem(StagedProblem, DividedProblem):
         self._splatters: dict[tuple[int, int, float, float, int], Splatter] = {}
         self._shapes: dict[tuple[int, int], ImageShape] = {}
         self._cameras: dict[tuple[int, int], Camera] = {}
+        self._order: tuple[int, np.ndarray] | None = None
         self._image_loss = dr.freeze(image_loss)
         self.cloud = _with_degree(self.cloud, self.plan.stages[0].degree)
         self._reset_statistics()
@@ -173,7 +174,9 @@ class GaussianProblem(StagedProblem, DividedProblem):
             count: views of the step.
         """
         epoch, index = divmod(number, len(self.cameras))
-        view = int(np.random.default_rng((self.seed, 2, epoch)).permutation(len(self.cameras))[index])
+        if self._order is None or self._order[0] != epoch:
+            self._order = epoch, np.random.default_rng((self.seed, 2, epoch)).permutation(len(self.cameras))
+        view = int(self._order[1][index])
         loss, gradient, statistics = self.view_loss_and_gradient(reals, view, self._background(number))
         found = {name: mi.TensorXf(value.array / count, value.shape) for name, value in gradient.items()}
         visible = np.asarray(statistics.visible)
@@ -210,8 +213,7 @@ class GaussianProblem(StagedProblem, DividedProblem):
         gains = self._gains_of(reals, view)
         colour, target, backdrop, counted = self._compare_with_photograph(image, view, shrink, background, gains)
         loss, slope = self._image_loss(colour, target, self._shape(camera.size), self.plan.ssim)
-        gradient, statistics = splatter.backward(saved, _gradient_of_image(slope, backdrop, counted, gains, image.shape))
-        gradient.pop("pose")
+        gradient, statistics = splatter.backward(saved, _gradient_of_image(slope, backdrop, counted, gains, image.shape), False)
         if self.exposure is not None:
             pixel, by_log = dr.arange(mi.UInt32, dr.width(colour) // 3), colour * slope
             by_log = mi.Color3f(*(dr.sum(dr.gather(mi.Float, by_log, 3 * pixel + c)) for c in range(3)))

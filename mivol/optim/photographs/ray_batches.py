@@ -27,6 +27,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -238,7 +239,7 @@ class RayBatches:
         wide = sum(4 * dr.width(level.wide.directions) for level in self.levels.values() if level.wide is not None)
         return sum(dr.itemsize_v(pixels) * dr.width(pixels) for pixels in self._pixels()) + wide
 
-    @property
+    @cached_property
     def backgrounds(self) -> np.ndarray:
         """(V, 3) background colour of each photograph."""
         return np.array(self.lenses).reshape(-1, LENS)[:, 16:]

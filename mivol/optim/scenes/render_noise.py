@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -38,15 +39,29 @@ NOTABLE = 0.05
 class Comparison:
     """The difference between a render and its reference.
 
+    The host reads loss and noise at the first access, which waits for the render.
+
     Attributes:
-        loss: mean penalty; without the render's noise if the loss takes pairs.
-        noise: estimated contribution of the noise to the mean penalty of the mean image; 0 for a single render.
+        value: Float, ``loss`` on the device.
+        bias: Float, the noise on the device without the weight; None for a single render.
+        weight: factor on the noise.
         adjoint: derivative of ``loss`` by the mean image.
     """
 
-    loss: float
-    noise: float
+    value: mi.Float
+    bias: mi.Float | None
+    weight: float
     adjoint: mi.TensorXf
+
+    @cached_property
+    def loss(self) -> float:
+        """Mean penalty; without the render's noise if the loss takes pairs."""
+        return float(self.value[0])
+
+    @cached_property
+    def noise(self) -> float:
+        """Estimated contribution of the noise to the mean penalty of the mean image; 0 for a single render."""
+        return 0.0 if self.bias is None else float(self.bias[0]) * self.weight
 
 
 def compare_with_reference(
@@ -76,15 +91,17 @@ def compare_with_reference(
     image = mi.TensorXf(mean)
     dr.enable_grad(image)
     value = loss(image, reference)
-    noise = 0.0
+    bias = None
     if len(renders) > 1:
         halves = (share * loss(image + dr.detach(part - mean), reference) for share, part in zip(shares, renders, strict=True))
         bias = sum(halves) - value
-        noise = float(bias[0]) * weight
         value = value - bias if loss.pairs else value
     value = value * weight
     dr.backward(value)
-    return Comparison(float(value[0]), noise, dr.detach(dr.grad(image)))
+    value, adjoint = dr.detach(value), dr.detach(dr.grad(image))
+    bias = None if bias is None else dr.detach(bias)
+    dr.eval(value, bias, adjoint)
+    return Comparison(value, bias, weight, adjoint)
 
 
 def split_samples(spp: int, loss: Loss) -> tuple[int, ...]:

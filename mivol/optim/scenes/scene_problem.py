@@ -41,6 +41,9 @@ from mivol.optim.scenes.views import (
 )
 from mivol.scene_graph import traverse
 
+LARGE_PASS = 1 << 16
+"""Samples of a pass for which the host waits. It prepares what follows a smaller pass while the pass is computed."""
+
 
 @dataclass(repr=False)
 class SceneProblem(LinearizableProblem):
@@ -190,7 +193,7 @@ class SceneProblem(LinearizableProblem):
             with dr.suspend_grad():
                 image = self.integrator.render(self.scene, sensor, seed=derive_seed(seed, number), spp=share)
                 total = image * share if total is None else total + image * share
-            self._finish(total)
+            self._finish(total, share * count_pixels(sensor))
         return total / spp
 
     def images(self, count: int = 3) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -205,7 +208,7 @@ class SceneProblem(LinearizableProblem):
                 self.integrator.render_backward(
                     self.scene, self.params, adjoint * (spp / self.spp), sensor, derive_seed(seed, number), spp
                 )
-            self._finish(self.gradients())
+            self._finish(self.gradients(), spp * count_pixels(sensor))
 
     def jvp(self, sensor: mi.Sensor, tangents: Reals, seed: int) -> mi.TensorXf:
         """J v of a sensor's image, for a direction v of the scene's parameters."""
@@ -214,7 +217,7 @@ class SceneProblem(LinearizableProblem):
             self._set_tangents(tangents)
             image = self.integrator.render_forward(self.scene, self.params, sensor, derive_seed(seed, number), spp)
             total = dr.detach(image) * spp if total is None else total + dr.detach(image) * spp
-            self._finish(total)
+            self._finish(total, spp * count_pixels(sensor))
         return total / self.spp
 
     def _set_tangents(self, tangents: Reals) -> None:
@@ -223,9 +226,11 @@ class SceneProblem(LinearizableProblem):
             value = self.params[p.name]
             dr.set_grad(value, like(tangents[p.name], value))
 
-    def _finish(self, arrays: object) -> None:
+    def _finish(self, arrays: object, samples: int) -> None:
+        """Launch the kernels of a pass; wait for a large pass, since an interrupt acts between passes."""
         dr.eval(arrays)
-        dr.sync_thread()
+        if samples >= LARGE_PASS:
+            dr.sync_thread()
         self.safe_point()
 
     # -- Loss and gradient ----------------------------------------------------------------------------------------
