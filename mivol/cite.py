@@ -264,6 +264,13 @@ CITATIONS: dict[str, Citation] = {
         "NDT & E International 41(4), 242-251",
         "https://doi.org/10.1016/j.ndteint.2007.12.001",
     ),
+    "golub_1973": Citation(
+        "G. H. Golub, V. Pereyra",
+        1973,
+        "The differentiation of pseudo-inverses and nonlinear least squares problems whose variables separate",
+        "SIAM Journal on Numerical Analysis 10(2), 413-432",
+        "https://doi.org/10.1137/0710036",
+    ),
     "eilers_2003": Citation(
         "P. H. C. Eilers",
         2003,

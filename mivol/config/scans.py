@@ -150,9 +150,14 @@ class Readings(Section):
     hardening: Annotated[
         int, setting("1", "degree of a polynomial that straightens line integrals of a single material; 0: off", ge=0, le=5)
     ] = 0
-    scatter: Annotated[bool, setting("1", "with data.hardening: also fit a constant scattered light, of a single material")] = (
-        False
-    )
+    scatter: Annotated[
+        bool,
+        setting(
+            "1",
+            "subtract scattered light: a smooth term of the light that makes all views agree; with data.hardening a constant "
+            "behind a single material",
+        ),
+    ] = False
     rings: Annotated[
         Literal["none", "gain", "sort", "fit"],
         setting(

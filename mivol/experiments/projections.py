@@ -241,10 +241,13 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
     notes, angles = [*readings.notes, *readings.transmission.notes], readings.angles
     if angles is not None:
         notes += note_order(angles)
-    transmission, light, air_notes = correct_air(readings.transmission, data.air, air)
+    # Scattered light brightens the air: it is not looked for before the scatter is known.
+    columns = 0 if data.air is None and data.scatter and not data.hardening else data.air
+    transmission, light, air_notes = correct_air(readings.transmission, columns, air)
+    pictures = [] if light is None else [show_step("air", readings.transmission.value, transmission.value)]
     if readings.intensity is not None:
         check_light(transmission)
-    transmission, corrections, pictures = correct_pixels(data, transmission)
+    transmission, corrections, shown = correct_pixels(data, transmission)
     notes += [*air_notes, *corrections]
     measured, weights = to_line_integrals(transmission)
     y, ring_notes = correct_rings(measured, weights, data)
@@ -254,6 +257,7 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
     if is_circle(settings.scan):
         offset, axis_notes = resolve_axis(settings, base, y, weights, angles)
         notes += axis_notes
+    pictures += [*shown, *show_axis(settings, y, angles, offset)]
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
@@ -309,14 +313,47 @@ def correct_pixels(
         found = find_zingers(transmission, data.zingers)
         before = transmission.value[:, middle]
         transmission = replace(transmission, value=np.where(found, np.nan, transmission.value))
-        pictures.append(("zingers", before, interpolate_gaps(before[None], ~found[None, :, middle])[0]))
+        after = interpolate_gaps(before[None], ~found[None, :, middle])[0]
+        pictures.append(show_step("zingers", before[:, None], after[:, None]))
         notes.append(f"{found.sum()} of {found.size} pixels are zingers or hot (data.zingers = {data.zingers:g}): not used")
     if data.phase is not None:
-        before, chosen = transmission.value[:, middle], data.phase
+        before, chosen = transmission.value, data.phase
         transmission, length = filter_phase(transmission, chosen.delta_beta, chosen.distance, chosen.energy, chosen.pixel)
-        pictures.append(("phase", before, transmission.value[:, middle]))
+        pictures.append(show_step("phase", before, transmission.value))
         notes.append(f"Paganin's filter of a single material has a length of {length:.3g} pixels (data.phase)")
     return transmission, notes, pictures
+
+
+def show_step(name: str, before: np.ndarray, after: np.ndarray) -> tuple[str, np.ndarray, np.ndarray]:
+    """A picture of a step for the report: line integrals of the middle row of transmissions (views, rows, cols)."""
+    middle = before.shape[1] // 2
+
+    def lines(transmission: np.ndarray) -> np.ndarray:
+        row = transmission[:, middle]
+        seen = np.isfinite(row) & (row > 0)
+        return np.where(seen, -np.log(np.where(seen, row, 1.0)), 0.0)
+
+    return name, lines(before), lines(after)
+
+
+def show_axis(
+    settings: config.ScanExperiment, y: np.ndarray, angles: np.ndarray | None, offset: float | None
+) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """A picture of a found axis of a parallel beam: half a turn of the middle row, then its mirror images about the axis.
+
+    They continue the views if the axis is right. The picture before has the axis in the middle of the detector.
+    """
+    if offset is None or angles is None or not isinstance(settings.scan, Parallel):
+        return []
+    row = y[np.abs(angles - angles[0]) < np.pi, y.shape[1] // 2]
+    columns = np.arange(y.shape[2])
+    middle = (y.shape[2] - 1) / 2
+    found = middle + offset / float(np.broadcast_to(settings.scan.pitch, (2,))[1])
+
+    def mirror(column: float) -> np.ndarray:
+        return np.stack([np.interp(2 * column - columns, columns, view, 0.0, 0.0) for view in row])
+
+    return [("axis", *(np.concatenate([row, mirror(column)]) for column in (middle, found)))]
 
 
 def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> tuple[np.ndarray, list[str]]:

@@ -1,4 +1,4 @@
-"""Corrections of a scan that need its geometry: beam hardening and scattered light, and a fitted geometry.
+"""Corrections of a scan that need its geometry: scattered light, beam hardening, and a fitted geometry.
 
 Each returns the projections with a line that says what was done. Without the setting the same projections return.
 """
@@ -13,6 +13,9 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.projections import Projections, grid_of_detector
 from mivol.optim.projections.alignment import Alignment, align_views
+from mivol.optim.projections.linear_problems import PoissonCounts
+from mivol.optim.projections.scatter import fit_scatter
+from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 from mivol.tomography.single_material import fit_hardening
@@ -26,27 +29,52 @@ def correction_citations(settings: config.ScanExperiment) -> list[str]:
     asked = {
         "paganin_2002": getattr(settings.data, "phase", None),
         "krumm_2008": getattr(settings.data, "hardening", 0),
+        "golub_1973": getattr(settings.data, "scatter", False) and not getattr(settings.data, "hardening", 0),
         "penczek_1994": getattr(settings.scan, "refine", ()),
     }
     return [key for key, is_set in asked.items() if is_set]
 
 
 def straighten_lines(settings: config.ScanExperiment, data: Projections) -> Projections:
-    """Straighten line integrals against beam hardening and scattered light, if the settings ask for it.
+    """Correct line integrals for scattered light and beam hardening, if the settings ask for it.
+
+    Scatter alone is a smooth term that makes the views consistent; with hardening it is a constant behind one material.
 
     Raises:
-        MivolError: a degree of 1, scatter alone, another beam than a circle, or as :func:`fit_hardening`.
+        MivolError: a degree of 1, ml-tr, another beam than a circle, or as :func:`fit_hardening` and :func:`fit_scatter`.
     """
     degree, with_scatter = getattr(settings.data, "hardening", 0), getattr(settings.data, "scatter", False)
-    if not degree:
-        if with_scatter:
-            raise MivolError("found data.scatter without data.hardening, expected both: set data.hardening = 2 or more.")
+    if not degree and not with_scatter:
         return data
+    name = "data.hardening" if degree else "data.scatter"
     if degree == 1:
         raise MivolError("found data.hardening = 1, which changes nothing, expected a degree of 2 to 5, or 0.")
+    if ALL_SOLVERS[settings.solve.solver].problem is PoissonCounts:
+        raise MivolError(f"found {name} with {settings.solve.name}, which takes counts, not line integrals: choose pcg.")
     beam = data.geometry
     if not isinstance(beam, ParallelBeam | ConeBeam):
-        raise MivolError("found data.hardening with a table of views, expected a beam on a circle: leave it out.")
+        raise MivolError(f"found {name} with a table of views, expected a beam on a circle: leave it out.")
+    return _straighten(data, beam, degree, with_scatter) if degree else _subtract_scatter(data, beam, settings.data.air or 0)
+
+
+def _subtract_scatter(data: Projections, beam: ParallelBeam | ConeBeam, air_columns: int) -> Projections:
+    """Subtract a smooth term of scattered light, if there is one."""
+    found = fit_scatter(beam, data.y, data.weights, air_columns)
+    size = f"{found.light.min():.3g} to {found.light.max():.3g} +- {np.median(found.sigma):.1g} of the light"
+    if not found.is_needed:
+        return replace(data, notes=(*data.notes, f"scattered light of {size} is not above its noise: none is subtracted"))
+    y, weights = found.subtract(data.y, data.weights)
+    note = f"scattered light of {size}, smooth along the detector, is subtracted (data.scatter)"
+    return _with_picture(data, "scatter", y, weights, note)
+
+
+def _with_picture(data: Projections, name: str, y: np.ndarray, weights: np.ndarray, note: str) -> Projections:
+    middle = y.shape[1] // 2
+    picture = (name, data.y[:, middle], y[:, middle])
+    return replace(data, y=y, weights=weights, notes=(*data.notes, note), pictures=(*data.pictures, picture))
+
+
+def _straighten(data: Projections, beam: ParallelBeam | ConeBeam, degree: int, with_scatter: bool) -> Projections:
     part = slice(None)
     if isinstance(beam, ParallelBeam) and beam.is_upright and data.y.shape[1] > MOST_ROWS:
         first = (data.y.shape[1] - MOST_ROWS) // 2
@@ -60,9 +88,7 @@ def straighten_lines(settings: config.ScanExperiment, data: Projections) -> Proj
         f"line integrals y are straightened to y {terms}{light} (data.hardening = {degree}): their misfit to one material "
         f"falls to {found.misfit:.2f} of what it was"
     )
-    middle = y.shape[1] // 2
-    picture = ("hardening", data.y[:, middle], y[:, middle])
-    return replace(data, y=y, weights=weights, notes=(*data.notes, note), pictures=(*data.pictures, picture))
+    return _with_picture(data, "hardening", y, weights, note)
 
 
 def refine_geometry(

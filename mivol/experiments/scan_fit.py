@@ -271,6 +271,9 @@ def subtract_light(problem: ProjectionProblem, data: Projections, state: SolverS
     if problem.light is not None:
         last = LightDrift(*(state.memory[name] for name in ("offset", "slope")))
         change = update_light(task, problem.light, last, state.x).eval(view_times(data))
+        middle = change.shape[1] // 2
+        shown = ("drift", data.y[:, middle], (data.y - change)[:, middle])
+        data = replace(data, pictures=(*data.pictures, shown))
     elif isinstance(task, LeastSquares) and task.gains is not None:
         change = task.gains.fit(task.b - (task.A @ state.x).reshape(task.b.shape))[None]
     else:
@@ -351,13 +354,7 @@ def write_outputs(
             pair = Pair(*(part[view, ::-1] for part in (data.y, predicted, noise)))
             record.images += write_pair(run.path, f"view {view}", pair, held_out=True)
     record.images += draw_scanner(run.path, data.geometry, grid, held_out)
-    if data.removed_rings is not None:
-        before, after = data.y[:, middle] + data.removed_rings, data.y[:, middle]
-        save_figure(plot_ring_removal(before, after), run.path / "rings.png")
-        record.images.append(Image(path="rings.png", role="picture", caption=f"ring removal in {caption}, each line one view"))
-    for name, before, after in data.pictures:
-        save_figure(plot_ring_removal(before, after), run.path / f"{name}.png")
-        record.images.append(Image(path=f"{name}.png", role="picture", caption=f"{name} in {caption}, each line one view"))
+    draw_steps(run, data, caption)
     run.write_curves()
     record.results["views"] = float(projector.n_views - len(held_out))
     if data.truth is not None:
@@ -365,6 +362,24 @@ def write_outputs(
     if len(held_out):
         z = (data.y - predicted)[held_out] * np.sqrt(data.weights[held_out])
         record.results["held_out_rms_of_residual_over_noise"] = float(np.sqrt(np.mean(z**2)))
+
+
+STEPS = {
+    "axis": "half a turn, then its mirror images about the middle of the detector (before) and about the found axis (after)",
+    "rings": "ring removal",
+}
+"""Captions of the pictures of steps whose name does not say enough."""
+
+
+def draw_steps(run: RunFolder, data: Projections, caption: str) -> None:
+    """Draw what each step of the preparation changed in the middle row, and record the pictures."""
+    steps, row = list(data.pictures), data.y[:, data.y.shape[1] // 2]
+    if data.removed_rings is not None:
+        steps.append(("rings", row + data.removed_rings, row))
+    for name, before, after in steps:
+        save_figure(plot_ring_removal(before, after), run.path / f"{name}.png")
+        said = f"{STEPS.get(name, name)} in {caption}, each line one view"
+        run.record.images.append(Image(path=f"{name}.png", role="picture", caption=said))
 
 
 FINISHED = "volumes/reconstruction.npz"

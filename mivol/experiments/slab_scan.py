@@ -38,7 +38,7 @@ from mivol.experiments.projections import (
 )
 from mivol.experiments.readings import detector_size, read_scan
 from mivol.experiments.run_folder import RunFolder
-from mivol.experiments.scan_fit import make_problem, make_solver
+from mivol.experiments.scan_fit import draw_steps, make_problem, make_solver
 from mivol.experiments.solver_choice import choose_storage, estimate_noise, resolve_solver
 from mivol.files import write_volume
 from mivol.files.atomic import write_whole_text
@@ -90,12 +90,14 @@ class RowSource:
         read: function from rows to their line integrals.
         truth: function from a grid to the true volume; None if unknown.
         notes: notes for the report.
+        sample: some rows in the middle, whose steps of preparation the report shows; None if computed.
     """
 
     beam: ParallelBeam | ConeBeam
     read: Callable[[slice], Projections]
     truth: Callable[[VoxelGrid], np.ndarray] | None = None
     notes: tuple[str, ...] = ()
+    sample: Projections | None = None
 
 
 def open_source(settings: config.ScanExperiment, base: Path) -> RowSource:
@@ -123,7 +125,7 @@ def open_source(settings: config.ScanExperiment, base: Path) -> RowSource:
         data = read_measured(fixed, base, part, air)
         return replace(data, geometry=beam.select_rows(part))
 
-    return RowSource(beam, read, notes=sample.notes)
+    return RowSource(beam, read, notes=sample.notes, sample=sample)
 
 
 def _check_settings(settings: config.ScanExperiment) -> None:
@@ -134,6 +136,7 @@ def _check_settings(settings: config.ScanExperiment) -> None:
     whole = {
         'data.rings = "fit"': getattr(settings.data, "rings", "none") == "fit",
         "data.hardening": getattr(settings.data, "hardening", 0),
+        "data.scatter": getattr(settings.data, "scatter", False),
         "scan.refine": getattr(settings.scan, "refine", ()),
         "scan.tilt": getattr(settings.scan, "tilt", 0.0),
     }
@@ -335,6 +338,8 @@ def run_slabs(context: RunContext) -> Path:
         context.progress.say([*plan.source.notes, *(f"{line.choice}, because {line.reason}" for line in plan.choices)])
         run.begin(0)
         run.make("volumes")
+        if plan.source.sample is not None:
+            draw_steps(run, plan.source.sample, "a row in the middle")
         with run.stage("preview"):
             caption = _write_preview(plan, preview_rows(plan), run.path)
             record.images.append(Image(path=PREVIEW, role="picture", caption=caption))

@@ -86,7 +86,7 @@ def test_some_ray_must_meet_the_grid(views: int, asked: list[int], seen: float) 
 def scan(**data: object) -> SimpleNamespace:
     """The settings of a measured scan in parallel light of 2 x 3 pixels of 1 x 0.5."""
     plain = {"air": 0, "find_axis": False, "drift": 0, "saturation": 99.0, "rings": "none", "ring_width": None}
-    data = plain | {"zingers": 0.0, "phase": None} | data
+    data = plain | {"zingers": 0.0, "phase": None, "scatter": False, "hardening": 0} | data
     beam = Parallel(views=2, detector=(2, 3), pitch=(1.0, 0.5), axis_offset=0.25)
     return SimpleNamespace(data=SimpleNamespace(**data), scan=beam, solve=config.SolveSettings("pcg"))
 
@@ -114,6 +114,40 @@ def test_readings_become_line_integrals(measured: ScanReadings, monkeypatch: pyt
     monkeypatch.setattr(projections, "normalise_air", lambda t, n: Transmission(t.value * n, t.variance))
     monkeypatch.setattr(projections, "fit_air", lambda value, n: None)
     np.testing.assert_allclose(projections.read_measured(scan(air=2), Path()).y[0], 0, atol=1e-15)
+
+
+def test_air_is_not_looked_for_before_the_scatter_is_known(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scattered light brightens the air; with hardening it is behind the object only."""
+    asked = []
+    monkeypatch.setattr(projections, "find_air", lambda t: asked.append(t))
+    for changes in ({"scatter": True}, {"scatter": True, "hardening": 2}, {}):
+        projections.read_measured(scan(air=None, **changes), Path())
+        asked.append(None)
+    assert [t is not None for t in asked] == [False, True, False, True, False]
+
+
+def test_pictures_show_line_integrals_of_the_middle_row() -> None:
+    """Half of the light is log 2; pixels without light are 0."""
+    light = np.full((2, 3, 2), 0.5)
+    light[0, 1] = np.nan, -1.0
+    name, before, after = projections.show_step("air", light, 2 * light)
+    assert name == "air"
+    np.testing.assert_allclose(before, [[0, 0], [np.log(2), np.log(2)]])
+    np.testing.assert_allclose(after, 0, atol=1e-15)
+
+
+def test_mirror_images_continue_the_views_about_the_found_axis() -> None:
+    """A disc beside the axis: the first mirror image equals the view before it, as the view half a turn later would."""
+    angles, columns = np.arange(12) * np.pi / 6, np.arange(40)
+    y = np.exp(-(((columns - 23.0 - 6 * np.cos(angles)[:, None]) / 3) ** 2))[:, None]
+    settings = SimpleNamespace(scan=Parallel(pitch=(1.0, 0.5)))
+    ((name, before, after),) = projections.show_axis(settings, y, angles, (23 - 19.5) * 0.5)
+    assert name == "axis" and before.shape == after.shape == (12, 40)
+    # Beyond the first column the disc has exp(-(11 / 3)^2) = 1.45e-6.
+    np.testing.assert_allclose(after, y[:, 0], atol=1.5e-6)
+    assert np.abs(before - y[:, 0]).max() > 0.5
+    assert projections.show_axis(settings, y, angles, None) == []
+    assert projections.show_axis(SimpleNamespace(scan=Cone(source_to_axis=1, source_to_detector=2)), y, angles, 1.0) == []
 
 
 def test_voxels_that_hold_what_the_detector_sees() -> None:

@@ -1,9 +1,10 @@
-"""How near to the truth is a scan prepared before and during its inversion: axis, rings, motion?
+"""How near to the truth is a scan prepared before and during its inversion: axis, rings, motion, scattered light?
 
     mivol bench preparation                        every question
     mivol bench preparation --only axis            the rotation axis of twenty computed scans
     mivol bench preparation --only rings           gains of columns: error over that of the scan without rings
     mivol bench preparation --only motion          views shifted by a pixel and turned by half a degree
+    mivol bench preparation --only scatter         scattered light, smooth along the detector
 
 axis: twenty computed scans in parallel light, with noise, rings, an object off-centre, a region of interest, air of .5 to 1,
 and whole turns with the axis near the edge of the detector. Pixels see the mean light of three parts of a column; no grid takes
@@ -15,6 +16,9 @@ on the scan, over nRMSE of the same solver on the same scan without rings.
 
 motion: 90 views of 32 x 96 pixels of forty ellipsoids, with shifts of one pixel (RMS, along rows and along columns) and
 turns of half a degree. Errors are root mean squares, without the moves of a displaced object, which no view shows.
+
+scatter: scattered light of 5 % of the light, highest beside the middle of the detector; a head and forty ellipsoids in 129
+columns and 180 views, ellipsoids in 24 rows, and in a cone beam. Errors are root mean squares over the detector.
 """
 
 from __future__ import annotations
@@ -40,7 +44,8 @@ from mivol.experiments.solver_choice import (
 from mivol.optim.projections.alignment import align_views
 from mivol.optim.projections.inversion import LinearSolve, ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
+from mivol.optim.projections.scatter import fit_scatter
+from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
 from mivol.tomography.phantoms import random_ellipsoids, shepp_logan
 from mivol.tomography.preprocess import correct_transmission, find_air, to_line_integrals
 from mivol.tomography.projector import Projector
@@ -213,6 +218,65 @@ measure_motion = SweptQuestion(
 )
 
 
+# -- Scattered light --------------------------------------------------------------------------------------------------------
+
+SCATTER_CASES = {
+    "head, no noise": (BEAM, True, 0.0, 0.05, 0),
+    "head, 10,000 quanta": (BEAM, True, 1e4, 0.05, 0),
+    "head, 10,000 quanta, no scatter": (BEAM, True, 1e4, 0.0, 0),
+    "head, 10,000 quanta, views divided by air": (BEAM, True, 1e4, 0.05, 4),
+    "ellipsoids, no noise": (BEAM, False, 0.0, 0.05, 0),
+    "ellipsoids, 10,000 quanta": (BEAM, False, 1e4, 0.05, 0),
+    "ellipsoids, 300 quanta": (BEAM, False, 300.0, 0.05, 0),
+    "ellipsoids, 24 rows, 10,000 quanta": (replace(BEAM, detector=(24, COLUMNS)), False, 1e4, 0.05, 0),
+    "ellipsoids, cone beam, 10,000 quanta": (
+        ConeBeam(np.arange(90) * 2 * np.pi / 90, (48, 96), 6.0, 8.0, 2.9 / 96), False, 1e4, 0.05, 0
+    ),
+}  # fmt: skip
+"""Beam, head or ellipsoids, quanta of a pixel without object, largest scattered light, columns of air that divide the views."""
+
+
+def find_scatter(label: str, size: PreparationSize) -> dict[str, float]:
+    """Error of the scattered light of a scan, the error that the method tells, and errors of line integrals."""
+    beam, is_head, photons, amplitude, air = SCATTER_CASES[label]
+    exact = (shepp_logan(half_width=0.98) if is_head else random_ellipsoids(40, 3, 0.8)).project(beam)
+    exact = 2.5 * exact / exact.max()
+    rows, columns = beam.detector
+    u, v = np.linspace(-1, 1, columns), np.linspace(-1, 1, rows)[:, None] if rows > 1 else np.zeros((1, 1))
+    truth = amplitude * (1 - 0.6 * u**2 + 0.2 * u - 0.3 * v**2)
+    light = np.exp(-exact) + truth
+    if photons:
+        light = np.maximum(np.random.default_rng(0).poisson(photons * light), 1) / photons
+    if air:
+        level = light[..., np.r_[:air, columns - air : columns]].mean()
+        light, truth = light / level, truth / level
+    y = -np.log(light)
+    weights = (photons or 1e8) * light
+    found = fit_scatter(beam, y, weights, air)
+    straight, _ = found.subtract(y, weights)
+
+    def root_mean_square(a: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(a**2)))
+
+    answer = {
+        "scatter": root_mean_square(truth),
+        "error": root_mean_square(found.light - truth),
+        "sigma": root_mean_square(found.sigma),
+        "lines before": root_mean_square(y - exact),
+        "lines after": root_mean_square(straight - exact),
+        "subtracted": float(found.is_needed),
+    }
+    say_row(label, **answer)
+    return answer
+
+
+measure_scatter = SweptQuestion(
+    "How near to the truth is fitted scattered light, over the light without object?",
+    lambda size: list(SCATTER_CASES),
+    find_scatter,
+)
+
+
 # -- Tables -----------------------------------------------------------------------------------------------------------------
 
 
@@ -230,7 +294,7 @@ def table(question: str, answer: dict) -> list[str]:
     return ["| " + " | ".join(row) + " |" for row in rows]
 
 
-QUESTIONS = {"axis": measure_axis, "rings": measure_rings, "motion": measure_motion}
+QUESTIONS = {"axis": measure_axis, "rings": measure_rings, "motion": measure_motion, "scatter": measure_scatter}
 STUDY = Study(__name__, __doc__, PreparationSize, QUESTIONS, table=table)
 
 
