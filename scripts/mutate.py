@@ -10,8 +10,10 @@ failing, an import that breaks does not.
     scripts/mutate.py --random 60 --seed 7   not these: 60 faults drawn from the whole package, and the share that the
                                              tests of their lines notice; from a part of it with --only 'mivol/scene/*';
                                              without the first 40 with --from 41. The default suite is run once first (with
-                                             --slow all tests), to record which tests run which line; --lines FILE
+                                             --slow all tests), to record which tests run which line; --lines FOLDER
                                              keeps the recording.
+    scripts/mutate.py --unrun --lines FOLDER  by this recording: the share of the statements in functions that no test
+                                             runs, by room, and their lines
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mutation.faults import Fault, draw_faults, read_package
-from mutation.guards import group_entries, read_recording, record_suite
+from mutation.guards import group_entries, list_unrun, read_recording, record_suite
 from mutation.survivors import Checkout, judge_all, report
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -193,6 +195,20 @@ def judge_random(args: argparse.Namespace) -> None:
         report(judge_all(faults, guards, checkouts), len(faults), lambda line: print(line, flush=True))
 
 
+def print_unrun(recording: Path, only: str) -> None:
+    """Print the statements in functions of matching files that no test of a recording runs, and their share in each room."""
+    runners, rooms = read_recording(recording, {}).runners, {}
+    for file, text in read_package(ROOT).items():
+        if fnmatch.fnmatch(file, only):
+            count, unrun = list_unrun(text, file, runners)
+            room = rooms.setdefault(file.split("/")[1].removesuffix(".py"), [0, 0])
+            room[0], room[1] = room[0] + count, room[1] + len(unrun)
+            lines = text.splitlines()
+            print(*(f"{file}:{line}: {lines[line - 1].strip()}" for line in unrun), sep="\n", end="\n" if unrun else "")
+    for room, (count, unrun) in [*sorted(rooms.items()), ("together", [sum(n) for n in zip(*rooms.values(), strict=True)])]:
+        print(f"{room:<18}{unrun:6d} of {count:6d} statements run by no test; run: {1 - unrun / max(count, 1):.1%}")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Judge the chosen entries, 0 where each was noticed; or draw faults, and count those that are noticed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -203,9 +219,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--from", dest="first", type=int, default=1, metavar="N", help="of --random: continue at the Nth fault")
     parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
     parser.add_argument("--slow", action="store_true", help="of --random: record and run slow tests, too")
-    parser.add_argument("--lines", type=Path, metavar="FILE", help="of --random: recording to read, or to write if missing")
+    parser.add_argument("--lines", type=Path, metavar="FOLDER", help="of --random: recording to read, or to write if missing")
+    parser.add_argument("--unrun", action="store_true", help="instead of faults, the statements that no test of --lines runs")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)
+    if args.unrun:
+        if args.lines is None or not args.lines.is_dir():
+            parser.error("--unrun takes a recording: --lines FOLDER, as --random --lines FOLDER writes it")
+        print_unrun(args.lines, args.only)
+        return 0
     if args.random is not None:
         if args.jobs < 1 or not 1 <= args.first <= args.random:
             parser.error("--random and --jobs take a number of 1 or more, --from one that is no larger than that of --random")

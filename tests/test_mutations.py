@@ -274,6 +274,14 @@ def test_slow_tests_of_a_module_come_last(index, file: str, line: int, expected:
     assert index.rounds(fault_at(line, file), SMALL)[2] == (["-m", "slow", *expected] if expected else [])
 
 
+def test_statements_that_no_test_runs() -> None:
+    """A condition counts by its head, a docstring and the head of a function not at all."""
+    source = "def f(x=1):\n    'Text.'\n    if (x\n            > 0):\n        return 1\n    return [\n        2\n    ]\n"
+    run = {("a.py", 4), ("a.py", 5), ("b.py", 6), ("a.py", 2)}
+    assert guards.list_unrun(source, "a.py", run) == (3, [6])
+    assert guards.list_unrun(source, "a.py", {("a.py", 7)}) == (3, [3, 5])
+
+
 def test_a_study_may_measure_something_else():
     """Constants of studies are no faults; operators are."""
     found = {f.kind for f in faults.find_faults("mivol/bench/studies/a.py", "def f(n=3):\n    return 2 * n\n")}
@@ -299,6 +307,7 @@ def test_a_recording_tells_which_tests_run_a_line(tmp_path: Path) -> None:
     source = (tmp_path / "mivol" / "a.py").read_text()
     names = {line: {t.function.rpartition("::")[2] for t in index.find_runners(fault_at(line), source)} for line in (2, 6)}
     assert names == {2: {"test_f", "test_h"}, 6: {"test_g", "test_h"}}
+    assert guards.list_unrun(source, "mivol/a.py", index.runners) == (2, [])
     assert {t.name.rpartition("::")[2]: t.passed for t in index.tests} == {"test_f": False, "test_g": True, "test_h": True}
 
 

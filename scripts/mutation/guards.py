@@ -12,17 +12,16 @@ import pickle
 import re
 import subprocess
 import sys
-import tempfile
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
 from mutation.faults import Fault
 
-__all__ = ["Guards", "RunTest", "group_entries", "is_of_import", "lines_of", "read_recording", "record_suite"]
+__all__ = ["Guards", "RunTest", "group_entries", "is_of_import", "lines_of", "list_unrun", "read_recording", "record_suite"]
 
 FIRST, SECOND = 60.0, 300.0
 """Recorded time of the tests in the first round and in the second [s]."""
@@ -170,37 +169,50 @@ def statements_in(node: ast.AST) -> list[ast.stmt]:
     return [child for block in (*blocks, *handlers, *cases) if isinstance(block, list) for child in block]
 
 
+def list_unrun(source: str, file: str, runners: Container[tuple[str, int]]) -> tuple[int, list[int]]:
+    """How many statements the functions of a module have, and the lines of those that no test runs; docstrings do not count."""
+    heads = []
+    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+    for statement in {n for f in functions for n in ast.walk(f) if isinstance(n, ast.stmt) and n is not f}:
+        is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+        if is_text or isinstance(statement, ast.Pass | ast.Global | ast.Nonlocal | ast.FunctionDef | ast.ClassDef):
+            continue
+        body = getattr(statement, "body", None) or getattr(statement, "cases", None)
+        last = max(statement.lineno, _first_line(body[0]) - 1) if body else statement.end_lineno
+        heads.append(range(statement.lineno, last + 1))
+    return len(heads), sorted(head.start for head in heads if not any((file, line) in runners for line in head))
+
+
+def _first_line(node: ast.stmt | ast.match_case) -> int:
+    return node.pattern.lineno if isinstance(node, ast.match_case) else node.lineno
+
+
 def record_suite(copy: Path, jobs: int, target: Path, slow: bool = False) -> None:
-    """Run the default suite of a checkout under the recorder, or the slow tests as well, and write the recording.
+    """Run the default suite of a checkout under the recorder, or the slow tests as well; the recording is a folder of parts.
 
     Raises:
         RuntimeError: pytest wrote no recording.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        env = dict(os.environ, PYTHONPATH=f"{copy}{os.pathsep}{copy / 'scripts'}", PYTHONDONTWRITEBYTECODE="1")
-        env["MIVOL_LINES"] = str(Path(folder) / "lines")
-        env.pop("PYTEST_XDIST_WORKER_COUNT", None)
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutation.recorder"]
-        command += ["-n", str(jobs), "--dist", "worksteal"] if jobs > 1 else ["-p", "no:xdist"]
-        command += ["-m", "slow or not slow"] if slow else []
-        done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
-        parts = sorted(Path(folder).iterdir())
-        if not parts:
-            raise RuntimeError(
-                f"pytest ends with {done.returncode} and wrote no recording:\n{(done.stdout + done.stderr)[-2000:]}"
-            )
-        tests, runners = [], {}
-        for part in parts:
-            own, lines = pickle.loads(part.read_bytes())
-            for place, indices in lines.items():
-                runners.setdefault(place, array("H")).extend(k + len(tests) for k in indices)
-            tests += own
-        target.write_bytes(pickle.dumps((tests, runners)))
+    target.mkdir(parents=True, exist_ok=True)
+    env = dict(os.environ, PYTHONPATH=f"{copy}{os.pathsep}{copy / 'scripts'}", PYTHONDONTWRITEBYTECODE="1")
+    env["MIVOL_LINES"] = str(target)
+    env.pop("PYTEST_XDIST_WORKER_COUNT", None)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutation.recorder"]
+    command += ["-n", str(jobs), "--dist", "worksteal"] if jobs > 1 else ["-p", "no:xdist"]
+    command += ["-m", "slow or not slow"] if slow else []
+    done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
+    if not any(target.iterdir()):
+        raise RuntimeError(f"pytest ends with {done.returncode} and wrote no recording:\n{(done.stdout + done.stderr)[-2000:]}")
 
 
 def read_recording(path: Path, listed: dict[str, list[str]], test_files: Mapping[str, str] | None = None) -> Guards:
-    """The guards of a recording of :func:`record_suite`; ``test_files`` are the texts of all test files."""
-    tests, runners = pickle.loads(path.read_bytes())
+    """The guards of a recording: a folder with a part of each process of tests. ``test_files`` has texts of test files."""
+    tests, runners = [], {}
+    for part in sorted(path.iterdir()):
+        own, lines = pickle.loads(part.read_bytes())
+        for place, indices in lines.items():
+            runners.setdefault(place, array("H")).extend(k + len(tests) for k in indices)
+        tests += own
     return Guards([RunTest(*test) for test in tests], runners, listed, test_files or {})
 
 

@@ -1,7 +1,7 @@
 """A plugin of pytest that records which lines of the package each test runs, how long it takes, and whether it passes.
 
 Run it as ``pytest -p mutation.recorder`` with the folder ``scripts`` on the path of Python; the environment variable
-``MIVOL_LINES`` names the file for the recording.
+``MIVOL_LINES`` names a folder for the recording, to which each process of tests writes a part.
 """
 
 from __future__ import annotations
@@ -86,7 +86,9 @@ class Recorder:
         """Write the recording, each worker of pytest-xdist a part of it."""
         worker = os.environ.get("PYTEST_XDIST_WORKER", "")
         if self.tests:
-            Path(os.environ["MIVOL_LINES"] + worker).write_bytes(pickle.dumps((self.tests, self.runners)))
+            folder = Path(os.environ["MIVOL_LINES"])
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / f"part{worker}").write_bytes(pickle.dumps((self.tests, self.runners)))
 
 
 def pytest_configure(config: pytest.Config) -> None:
