@@ -351,7 +351,7 @@ def measure_emitter_noise(
     shares = []
     with without_garbage_collection(), dr.suspend_grad():
         whole = variance()
-        for emitter in scene.emitters() if whole > 0 else []:
+        for number, emitter in enumerate(scene.emitters() if whole > 0 else []):
             values = traverse(emitter)
             switch = next((key for key in SWITCHES if key in values), None)
             if switch is None:
@@ -365,9 +365,14 @@ def measure_emitter_noise(
             finally:
                 values[switch] = kept
                 values.update()
-            shape = emitter.shape() if emitter.class_name() == "AreaLight" else None
-            shares.append(((shape or emitter).id(), max(0.0, 1 - rest / whole)))
+            shares.append((_name_emitter(emitter, number), max(0.0, 1 - rest / whole)))
     return sorted(shares, key=lambda share: -share[1])
+
+
+def _name_emitter(emitter: mi.Emitter, number: int) -> str:
+    """The ``id`` of an emitter or of the shape that it lights; its class and number in a scene without names."""
+    shape = emitter.shape() if emitter.class_name() == "AreaLight" else None
+    return (shape or emitter).id() or f"{emitter.class_name()} {number}"
 
 
 def _measure_pixel_variance(sensor: mi.Sensor, estimators: Estimators) -> float:

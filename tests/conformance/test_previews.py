@@ -190,3 +190,17 @@ def test_explain_names_the_light_that_makes_the_noise(variant_rgb: str) -> None:
     found = mi.traverse(scene)
     assert [np.array(found[f"{name}.intensity.value"]).max() for name in lamps] == [1.0, 1000.0]
     assert "  noise" not in explain(lit_fog(lamp=SUN), max_depth=4)
+
+
+def test_a_light_without_a_name_is_told_by_its_kind(variant_rgb: str) -> None:
+    scene = mi.load_string(
+        """<scene version="3.0.0">
+        <sensor type="perspective"><transform name="to_world"><lookat origin="0,-4,0" target="0,0,0" up="0,0,1"/></transform>
+            <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film></sensor>
+        <emitter type="constant"><rgb name="radiance" value="1e-3"/></emitter>
+        <emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/></emitter>
+        <shape type="cube"><bsdf type="null"/><medium name="interior" type="homogeneous"><float name="albedo" value="0.8"/>
+            </medium></shape></scene>"""
+    )
+    (line,) = (line for line in explain(scene, max_depth=4).splitlines() if line.startswith("  noise"))
+    assert "DirectionalEmitter 1 makes 100%" in line
