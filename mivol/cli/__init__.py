@@ -7,6 +7,7 @@ code; only a bug of the program shows a traceback. Each verb makes its own slow 
 from __future__ import annotations
 
 import argparse
+import errno
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -63,6 +64,8 @@ def describe_error(error: MivolError | OSError | MemoryError) -> str:
     """Message for an error other than a bug."""
     if isinstance(error, MemoryError):
         return f"the memory does not suffice ({str(error) or 'nothing more is known'}): take fewer voxels, pixels or views."
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return f"no space is left on the disk ({error}): free some space, or write elsewhere; finished files are kept."
     return str(error)
 
 

@@ -38,6 +38,9 @@ EXHAUSTIVE = 150
 ODD = 0.3
 """Share of the pairs with an overlap from which a warning speaks of pairs without parallax."""
 
+FULL = 2**24
+"""Free space below which COLMAP is said to have filled the disk [byte]."""
+
 FEW = 50
 """Common points below which a pair of photographs is said to have few."""
 
@@ -91,8 +94,9 @@ class Poses:
                 f"{sizes} photographs ({first}, ...) have poses in models of their own, which share nothing with it; "
                 f"photograph what lies between {first} and {self.posed[-1]}"
             )
-        if self.unposed:
-            named = ", ".join(map(self._name_unposed, self.unposed[:5])) + (" ..." if len(self.unposed) > 5 else "")
+        apart = {name for names in self.others for name in names}
+        if unposed := [name for name in self.unposed if name not in apart]:
+            named = ", ".join(map(self._name_unposed, unposed[:5])) + (" ..." if len(unposed) > 5 else "")
             lines.append(f"without a pose: {named}; {AGAIN}")
         return "\n".join(lines)
 
@@ -271,6 +275,8 @@ def _run(job: dict[str, Any], work: Path, say: Callable[[str], None]) -> tuple[l
             say(facts["stage"])
     last = (errors.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no message"])[-1]
     if models is None:
+        if shutil.disk_usage(work).free < FULL:
+            raise MivolError(f"{work} filled the disk: free some space, about 2 MB for each photograph, and try again.")
         raise MivolError(f"COLMAP ended early ({last}): check that the photographs open, and the free disk and memory.")
     return models, matches
 

@@ -26,6 +26,11 @@ def folder(tmp_path: Path) -> Path:
     [
         (MivolError("no grid"), "no grid"),
         (FileNotFoundError("no file"), "no file"),
+        (
+            OSError(28, "No space left on device"),
+            "no space is left on the disk ([Errno 28] No space left on device): free some "
+            "space, or write elsewhere; finished files are kept.",
+        ),
         (MemoryError(), "the memory does not suffice (nothing more is known): take fewer voxels, pixels or views."),
     ],
 )

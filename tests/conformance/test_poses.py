@@ -67,15 +67,14 @@ def test_the_largest_model_is_kept_and_the_rest_is_named(
     folder: Path, job: dict, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cameras, "write_poses_page", lambda folder, found: folder / "poses.html")
-    job["matches"] = {"pairs": 3, "best": {"near/e.jpg": ["a.jpg", 21], "near/c.webp": ["a.jpg", 0]}}
+    job["matches"] = {"pairs": 3, "best": {"near/c.webp": ["a.jpg", 21]}}
     assert main(["poses", str(folder)]) == 0
     said = capsys.readouterr().out
     for fact in (
         f"{folder / 'sparse' / '0'}: 3 of 5 photographs have poses, 7 points, 1 camera, reprojection error 0.50 pixels",
         "1 photographs (near/e.jpg, ...) have poses in models of their own",
         "photograph what lies between near/e.jpg and near/d.jpg",
-        "without a pose: near/c.webp (shows no part of another photograph), "
-        "near/e.jpg (few matches: 21 points in common with a.jpg)",
+        "without a pose: near/c.webp (few matches: 21 points in common with a.jpg); photograph again",
         f"mivol optimize {folder} fits Gaussians",
     ):
         assert fact in said
@@ -312,6 +311,20 @@ def test_poses_are_found_one_by_one_if_photographs_are_left_out(
     (model,) = said[-1]["models"]
     assert len(model["names"]) == kept and (Path(model["folder"]) / "cameras.bin").read_text() == str(kept)
     assert any("one by one" in facts.get("stage", "") for facts in said) == (together < 5)
+
+
+def test_a_photograph_of_another_thing_is_named() -> None:
+    said = poses.Poses(Path("m"), ("a", "b", "c"), ("d", "e"), 0.5, 9, 1, best={"d": ("a", 0), "e": ("b", 80)}).describe()
+    assert "without a pose: d (shows no part of another photograph), e; " in said
+
+
+def test_a_full_disk_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "colmap_process.py").write_text("raise SystemExit(1)")
+    monkeypatch.setattr(poses, "__file__", str(tmp_path / "poses.py"))
+    monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(poses.shutil, "disk_usage", lambda path: SimpleNamespace(free=2**24 - 1))
+    with pytest.raises(MivolError, match="filled the disk: free some space, about 2 MB for each photograph"):
+        poses.find_poses(folder)
 
 
 PROGRAMS = {
