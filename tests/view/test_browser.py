@@ -133,6 +133,27 @@ def test_open_drag_and_slide(viewer: Viewer, chromium: Browser, artefacts: Path)
     assert tab.errors == []
 
 
+def hold_key(tab: Tab, letter: str, seconds: float) -> None:
+    """Hold a key down."""
+    key = {"key": letter, "code": f"Key{letter.upper()}", "windowsVirtualKeyCode": ord(letter.upper())}
+    tab.send("Input.dispatchKeyEvent", type="keyDown", **key)
+    time.sleep(seconds)
+    tab.send("Input.dispatchKeyEvent", type="keyUp", **key)
+
+
+def test_keys_fly(viewer: Viewer, chromium: Browser, artefacts: Path) -> None:
+    """D flies to the right, so the balls move to the left; S flies back, so they come together."""
+    tab = open_page(chromium, viewer)
+    tab.click((300, 250))
+    first = seen_colours(tab)
+    hold_key(tab, "d", 0.1)
+    wait_until(lambda: seen_colours(tab).get("green", np.inf) < first["green"] - 10)
+    tab.screenshot(artefacts / "view_flown.png")
+    hold_key(tab, "s", 1.0)
+    wait_until(lambda: len(seen := seen_colours(tab)) == 2 and seen["green"] - seen["red"] < first["green"] - first["red"] - 10)
+    assert tab.errors == []
+
+
 def test_a_crop_is_seen_and_saved(viewer: Viewer, chromium: Browser, artefacts: Path) -> None:
     tab = open_page(chromium, viewer)
     tab.click((802, tab.find("show crop")[1]))
