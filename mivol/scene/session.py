@@ -243,7 +243,7 @@ class Session:
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
-        if known is not None and known.state.others == state.others:
+        if not is_recording() and known is not None and known.state.others == state.others:
             placements, places = known.arrays.placements, known.places
         else:
             placements, places = prepare_placements(needs, survey.size)
