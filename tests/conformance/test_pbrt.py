@@ -7,8 +7,10 @@ of its bounds (fourth edition of the book, section 11.4); :func:`look_up` is tha
 from __future__ import annotations
 
 import gzip
+import math
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -21,6 +23,7 @@ import mivol
 from mivol.cli import main
 from mivol.fields.blackbody import blackbody_rgb, planck
 from mivol.files import VolumeData, frame_from_steps, read_volume, write_exr, write_grids
+from mivol.files.mesh import Mesh, write_mesh
 from mivol.scene.pbrt import fold_direction, unfold_sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -294,6 +297,74 @@ def test_what_is_left_out_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     ):
         assert words in said
     assert "conductor" not in said  # the material of an object ends with it
+
+
+SQUARE = [[0, 0, 2], [1, 0, 2], [0, 3, 2], [1, 3, 2]]
+"""Corners of a bilinear patch: along its first axis, then along its second."""
+
+
+@pytest.mark.parametrize(
+    ("shape", "area", "low", "high"),
+    [
+        (f'"bilinearmesh" "point3 P" {numbers(SQUARE)}', 3, (0, 0, 2), (1, 3, 2)),
+        (f'"bilinearmesh" "point3 P" {numbers([SQUARE[0], *SQUARE])} "integer indices" [1 2 3 4]', 3, (0, 0, 2), (1, 3, 2)),
+        (f'"trianglemesh" "point3 P" {numbers(SQUARE[:3])}', 1.5, (0, 0, 2), (1, 3, 2)),
+        (f'"trianglemesh" "point3 P" {numbers(SQUARE)} "integer indices" [0 1 2 1 3 2]', 3, (0, 0, 2), (1, 3, 2)),
+        ('"plymesh" "string filename" "m.ply"', 1.5, (0, 0, 2), (1, 3, 2)),
+        ('"disk" "float radius" 2 "float height" 3', 4 * math.pi, (-2, -2, 3), (2, 2, 3)),
+        ('"sphere" "float radius" 2', 16 * math.pi, (-2, -2, -2), (2, 2, 2)),
+    ],
+)
+def test_shapes_keep_their_place_and_area(tmp_path: Path, shape: str, area: float, low: tuple, high: tuple) -> None:
+    write_mesh(tmp_path / "m.ply", Mesh(np.array(SQUARE[:3], np.float64), np.array([[0, 1, 2]])))
+    (tmp_path / "a.pbrt").write_text(f"WorldBegin Translate 1 0 0 Shape {shape}")
+    mivol.convert_pbrt(tmp_path / "a.pbrt", tmp_path / "a.xml")
+    (found,) = mi.load_file(str(tmp_path / "a.xml"), parallel=False).shapes()
+    assert found.surface_area()[0] == pytest.approx(area, rel=1e-6)
+    assert np.allclose([found.bbox().min, found.bbox().max], np.add([low, high], [1, 0, 0]), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("material", "kinds", "values"),
+    [
+        ('"dielectric" "float eta" 1.3', ["dielectric"], {"int_ior": 1.3}),
+        ('"thindielectric"', ["thindielectric"], {"int_ior": 1.5}),
+        ('"dielectric" "spectrum eta" "glass-BK7"', ["dielectric"], {"int_ior": 1.5}),
+        ('"coateddiffuse" "float roughness" 0.04', ["twosided", "roughplastic"], {"alpha": 0.2}),
+        ('"coateddiffuse" "rgb reflectance" [.1 .2 .3]', ["twosided", "plastic"], {"diffuse_reflectance": [0.1, 0.2, 0.3]}),
+        ('"diffuse" "rgb reflectance" [.1 .2 .3]', ["twosided", "diffuse"], {"reflectance": [0.1, 0.2, 0.3]}),
+        ('"interface"', ["null"], {}),
+    ],
+)
+def test_materials(tmp_path: Path, material: str, kinds: list[str], values: dict) -> None:
+    (tmp_path / "a.pbrt").write_text(f'WorldBegin Material {material} Shape "sphere"')
+    mivol.convert_pbrt(tmp_path / "a.pbrt", tmp_path / "a.xml")
+    tree = ElementTree.parse(tmp_path / "a.xml")
+    assert [node.get("type") for node in tree.iter("bsdf")] == kinds
+    given = {node.get("name"): node.get("value") for bsdf in tree.iter("bsdf") for node in bsdf if node.get("value")}
+    for name, value in values.items():
+        words = [float(word) for word in given[name].replace(",", " ").split()]
+        assert words == pytest.approx(np.ravel(value).tolist(), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "low", "high"),
+    [
+        ("Transform [1 0 0 0  0 2 0 0  0 0 3 0  4 5 6 1]", (3, 3, 3), (5, 7, 9)),
+        ("Translate 4 5 6 Scale 1 2 3", (3, 3, 3), (5, 7, 9)),
+        ("Translate 4 5 6 ConcatTransform [1 0 0 0  0 2 0 0  0 0 3 0  0 0 0 1]", (3, 3, 3), (5, 7, 9)),
+        ("Rotate 90 0 0 1 Translate 3 0 0", (-1, 2, -1), (1, 4, 1)),
+        ("Translate 9 9 9 Identity", (-1, -1, -1), (1, 1, 1)),
+    ],
+)
+def test_transforms(tmp_path: Path, text: str, low: tuple, high: tuple) -> None:
+    """Columns of a matrix are written one after the other; a later transform acts in the space of the earlier ones."""
+    corners = numbers([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    shape = f'"trianglemesh" "point3 P" {corners} "integer indices" [0 1 2 3 4 5 6 7 0]'
+    (tmp_path / "a.pbrt").write_text(f"WorldBegin {text} Shape {shape}")
+    mivol.convert_pbrt(tmp_path / "a.pbrt", tmp_path / "a.xml")
+    (found,) = mi.load_file(str(tmp_path / "a.xml"), parallel=False).shapes()
+    assert np.allclose([found.bbox().min, found.bbox().max], [low, high], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(
