@@ -299,24 +299,24 @@ def test_what_is_left_out_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "conductor" not in said  # the material of an object ends with it
 
 
-SQUARE = [[0, 0, 2], [1, 0, 2], [0, 3, 2], [1, 3, 2]]
+PATCH = [[0, 0, 2], [1, 0, 2], [0, 3, 2], [2, 3, 2]]
 """Corners of a bilinear patch: along its first axis, then along its second."""
 
 
 @pytest.mark.parametrize(
     ("shape", "area", "low", "high"),
     [
-        (f'"bilinearmesh" "point3 P" {numbers(SQUARE)}', 3, (0, 0, 2), (1, 3, 2)),
-        (f'"bilinearmesh" "point3 P" {numbers([SQUARE[0], *SQUARE])} "integer indices" [1 2 3 4]', 3, (0, 0, 2), (1, 3, 2)),
-        (f'"trianglemesh" "point3 P" {numbers(SQUARE[:3])}', 1.5, (0, 0, 2), (1, 3, 2)),
-        (f'"trianglemesh" "point3 P" {numbers(SQUARE)} "integer indices" [0 1 2 1 3 2]', 3, (0, 0, 2), (1, 3, 2)),
+        (f'"bilinearmesh" "point3 P" {numbers(PATCH)}', 4.5, (0, 0, 2), (2, 3, 2)),
+        (f'"bilinearmesh" "point3 P" {numbers([PATCH[0], *PATCH])} "integer indices" [1 2 3 4]', 4.5, (0, 0, 2), (2, 3, 2)),
+        (f'"trianglemesh" "point3 P" {numbers(PATCH[:3])}', 1.5, (0, 0, 2), (1, 3, 2)),
+        (f'"trianglemesh" "point3 P" {numbers(PATCH)} "integer indices" [0 1 2 1 3 2]', 4.5, (0, 0, 2), (2, 3, 2)),
         ('"plymesh" "string filename" "m.ply"', 1.5, (0, 0, 2), (1, 3, 2)),
         ('"disk" "float radius" 2 "float height" 3', 4 * math.pi, (-2, -2, 3), (2, 2, 3)),
         ('"sphere" "float radius" 2', 16 * math.pi, (-2, -2, -2), (2, 2, 2)),
     ],
 )
 def test_shapes_keep_their_place_and_area(tmp_path: Path, shape: str, area: float, low: tuple, high: tuple) -> None:
-    write_mesh(tmp_path / "m.ply", Mesh(np.array(SQUARE[:3], np.float64), np.array([[0, 1, 2]])))
+    write_mesh(tmp_path / "m.ply", Mesh(np.array(PATCH[:3], np.float64), np.array([[0, 1, 2]])))
     (tmp_path / "a.pbrt").write_text(f"WorldBegin Translate 1 0 0 Shape {shape}")
     mivol.convert_pbrt(tmp_path / "a.pbrt", tmp_path / "a.xml")
     (found,) = mi.load_file(str(tmp_path / "a.xml"), parallel=False).shapes()
