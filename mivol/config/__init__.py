@@ -118,6 +118,8 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
+        if text.lstrip().startswith("<"):
+            raise MivolError(f"{path}: found XML, expected an experiment in TOML; name the scene in its table [scene].")
         if DEEP_KEY.search(text):
             raise RecursionError
         raw = tomllib.loads(text)

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import drjit as dr
 import mitsuba as mi
@@ -104,6 +105,8 @@ def read_field(path: str | os.PathLike) -> SphericalGrid | SampledField | Octree
     path = Path(path)
     if not path.is_file():
         raise MivolError(f"found no file {path}; give a radiance field (.npz).")
+    if path.suffix.lower() != ".npz" and not is_zipfile(path):
+        raise refusal(path, f"a file {path.suffix or 'without a suffix'}", "a radiance field (.npz)", "give the field of a fit")
     arrays = read_archive(path)
     readable = [kind for kind in FIELD_FORMATS.values() if kind.recognizes is not None]
     for kind in readable:

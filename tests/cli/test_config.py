@@ -134,6 +134,9 @@ def test_wrong_files(tmp_path: Path) -> None:
         config.load(tmp_path / "binary.toml")
     with pytest.raises(MivolError, match="is not TOML"):
         config.load(tmp_path)
+    (tmp_path / "scene.xml").write_text('\n<scene version="3.0.0"/>')
+    with pytest.raises(MivolError, match=r"found XML, expected an experiment in TOML; name the scene in its table \[scene\]"):
+        config.load(tmp_path / "scene.xml")
 
 
 def test_the_schema_is_strict() -> None:

@@ -217,7 +217,14 @@ def test_a_checkpoint_of_svox2(variant_rgb: str, tmp_path: Path) -> None:
 def test_files_that_are_refused(variant_rgb: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04 and no more")
-    for name, said in (("none.npz", "found no file"), ("other.npz", "holds a;"), ("torn.npz", "a damaged archive")):
+    (tmp_path / "smoke.vol").write_bytes(b"VOL\x03")
+    said_of = {
+        "none.npz": "found no file",
+        "other.npz": "holds a;",
+        "torn.npz": "a damaged archive",
+        "smoke.vol": "a file .vol, exp",
+    }
+    for name, said in said_of.items():
         with pytest.raises(MivolError, match=said):
             read_field(tmp_path / name)
     with pytest.raises(MivolError, match="found the suffix '.grid'"):
