@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,8 +15,11 @@ import h5py
 import laspy
 import numpy as np
 import scipy.io
+import tensorstore
 import tifffile
+from beamline_files import write_named, write_nxtomo
 from dicom_series import write_frames, write_series
+from fabio.edfimage import EdfImage
 from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
 from photo_sets import write_blender, write_colmap, write_transforms
 from PIL import Image
@@ -23,6 +27,7 @@ from volume_files import les, meta_head, mha, nifti, nrrd, nrrd_head, numbered, 
 
 import mivol
 from mivol import config
+from mivol.experiments.found_scan import draft_scan
 from mivol.fields.field_files import write_field
 from mivol.fields.sky import read_sky
 from mivol.fields.spherical_grid import SphericalGrid
@@ -86,6 +91,45 @@ def _matlab_hdf5(path: Path) -> None:
 def _tiff(compression: str | None) -> Write:
     more = {"compression": compression, "imagej": compression is None}
     return lambda path: tifffile.imwrite(path, numbered(5, 6, 7)[..., 0], photometric="minisblack", **more)
+
+
+NAMES = {"data": "scan/camera/frames", "flats": "before/reference", "darks": "before/background", "angles": "scan/stage"}
+"""Datasets of ``write_named``."""
+
+
+def _edf(path: Path) -> None:
+    EdfImage(data=numbered(2, 6, 7)[0, ..., 0], header={"k": "1"}).write(str(path))
+
+
+def his_bytes(frames: np.ndarray, comment: bytes = b"exposure=1") -> bytes:
+    """A sequence (n, rows, columns) of uint16 of a Hamamatsu camera."""
+    head = struct.pack("<2s6H", b"IM", len(comment), frames.shape[2], frames.shape[1], 0, 0, 2).ljust(64, b"\0") + comment
+    return b"".join(head + frame.astype("<u2").tobytes() for frame in frames)
+
+
+def _tilt_series(folder: Path) -> None:
+    values = np.ones((3, 4, 20, 1), np.float32)
+    values[:, :, 7:13] = 0.5
+    mivol.write_volume(folder / "a.mrc", values)
+    (folder / "a.mrc.mdoc").write_text("".join(f"[ZValue = {k}]\nTiltAngle = {10 * k}\n\n" for k in range(3)))
+
+
+def _views(folder: Path) -> None:
+    for k in range(3):
+        tifffile.imwrite(folder / f"view_{k}.tif", np.full((4, 20), 500 + k, "u2"))
+        tifffile.imwrite(folder / f"flat_{k}.tif", np.full((4, 20), 1000 + k, "u2"))
+    (folder / "angles.txt").write_text("0\n60\n120\n")
+
+
+def _zarr(folder: Path) -> None:
+    folder.rmdir()
+    mivol.write_volume(folder.with_suffix(".zarr"), numbered())
+    folder.with_suffix(".zarr").rename(folder)
+
+
+def _zarr_3(folder: Path) -> None:
+    store = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(folder)}}
+    tensorstore.open(store, create=True, dtype="float32", shape=(2, 3, 4)).result()[...] = numbered()[..., 0]
 
 
 def _slices(folder: Path) -> None:
@@ -285,6 +329,9 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "tiff zlib": (".tif", _tiff("zlib"), mivol.read_volume),
     "tiff ours": (".tif", _volume, mivol.read_volume),
     "mrc": (".mrc", _volume, mivol.read_volume),
+    "edf": (".edf", _edf, read_stack),
+    "his": (".his", _bytes(his_bytes(np.arange(84).reshape(2, 6, 7))), read_stack),
+    "hdf5 by names": (".h5", write_named, lambda path: read_projections(path, names=NAMES)),
     "dicom": (".dcm", _dicom, mivol.read_volume),
     "hdf5": (".h5", _hdf5, mivol.read_volume),
     "projections": (".h5", _projections, read_projections),
@@ -323,6 +370,19 @@ SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
     "nrrd detached": (_detached_nrrd, ("a.nhdr", "a.raw"), lambda folder: mivol.read_volume(folder / "a.nhdr")),
     "metaimage detached": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.mhd")),
     "raw by a header": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.raw")),
+    "nxtomo": (
+        lambda folder: write_nxtomo(folder / "a.nxs"),
+        ("a.nxs", "a_frames.h5"),
+        lambda folder: read_projections(folder / "a.nxs"),
+    ),
+    "tilt series": (_tilt_series, ("a.mrc", "a.mrc.mdoc"), lambda folder: draft_scan(folder / "a.mrc")),
+    "folder of views": (
+        _views,
+        ("view_0.tif", "view_2.tif", "flat_0.tif", "angles.txt"),
+        lambda folder: (draft_scan(folder), read_stack(folder / "view_*.tif"), read_stack(folder / "flat_*.tif")),
+    ),
+    "zarr": (_zarr, (".zattrs", "0/.zarray", "0/0/0/0"), mivol.read_volume),
+    "zarr 3": (_zarr_3, ("zarr.json", "c/0/0/0"), mivol.read_volume),
     "tiff slices": (_slices, ("s0.tif", "s1.tif"), mivol.read_volume),
     "dicom series": (_series, ("a.dcm", "b.dcm"), mivol.read_volume),
     "nikon": (_nikon, ("bead.xtekct", "_ctdata.txt", "bead_0002.tif"), _read_nikon),

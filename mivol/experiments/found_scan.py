@@ -40,6 +40,9 @@ DARK_WORDS = {"dark", "darks", "darkfield", "df", "dc", "di", "offset", "bias", 
 
 ANGLE_FILES = (".txt", ".csv", ".ang", ".tlt", ".rawtlt")
 
+DARKER = 0.9
+"""Share of the light of the edges below which the middle of a view counts as darker."""
+
 VOXEL_BYTES = 8 * 4 * 10
 """Memory per voxel of the default solver [byte]: eight unknowns, and about ten numbers each."""
 
@@ -272,17 +275,17 @@ def _draft_tilt_series(path: Path, given: dict[str, Any]) -> ScanDraft:
     if len(angles) != views:
         raise refusal(table, f"{len(angles)} angles", f"{views}, one for each image of {path.name}", "correct it")
     reading, why = guess_reading(path, stack[views // 2])
+    data = {"source": "stack", "file": str(path), "angles": str(table), "find_axis": False, "air": 0} | reading
     lines = [
         f"found: a tilt series in MRC: {_count(views, 'view')} of {rows} x {columns} pixels",
         f"found: angles from {angles[0]:.4g} to {angles[-1]:.4g} degrees in {table.name}",
-        f"assumed: {why}: the pixels are taken as {reading}s; data.reading sets it",
+        f"assumed: {why}: the pixels are taken as {reading['reading']}s; data.reading sets it",
         "assumed: a parallel beam, and a tilt axis along the columns of pixels (an aligned series)",
     ]
     scan: dict[str, Any] = {"beam": "parallel"}
     if volume.meta["unit"] == "A":
         scan["pitch"] = [float(f"{edge:.8g}") for edge in volume.spacing[1::-1]]
         lines.append(f"found: pixels of {scan['pitch'][0]:.6g} x {scan['pitch'][1]:.6g} angstrom (rows, columns)")
-    data = {"source": "stack", "file": str(path), "reading": reading, "angles": str(table), "find_axis": False, "air": 0}
     lines.append("chosen: the axis is in the middle; data.find_axis = true looks for it, if the views cover half a turn")
     raw = {"scan": scan, "data": data}
     return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], views)
@@ -323,7 +326,8 @@ def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
     if flats:
         data |= {"reading": "intensity", "flats": flats[0].pattern()} | ({"darks": darks[0].pattern()} if darks else {})
     else:
-        data["reading"], why = guess_reading(path, images["views"][0])
+        reading, why = guess_reading(path, images["views"][0])
+        data |= reading
         lines.append(f"assumed: no flats, and {why}: the pixels are taken as {data['reading']}s; data.reading sets it")
     lines.append("assumed: the first row of an image is the highest; data.first_row sets it")
     data["first_row"] = "highest"
@@ -356,23 +360,33 @@ def _draft_angles(folder: Path, scan: dict[str, Any], data: dict[str, Any], view
     return [f"{lead} {why}; scan.arc sets it"]
 
 
-def guess_reading(path: Path, view: np.ndarray) -> tuple[str, str]:
-    """Guess the quantity of a pixel from the air at both edges of a view (rows, columns): near 1, or near 0.
+def guess_reading(path: Path, view: np.ndarray) -> tuple[dict[str, Any], str]:
+    """Guess the quantity of a pixel from the air at both edges of a view (rows, columns): near 1, near 0, or equally bright.
+
+    Returns:
+        Settings of the data, and the reason.
 
     Raises:
         MivolError: neither.
     """
     width = max(1, view.shape[1] // 20)
+    left, right = (float(np.median(edge)) for edge in (view[:, :width], view[:, -width:]))
     air = float(np.median(np.concatenate([view[:, :width], view[:, -width:]], axis=1)))
     middle = float(np.median(view[:, view.shape[1] // 3 : -(view.shape[1] // 3) or None]))
     if 0.7 < air < 1.3 and middle < air:
-        return "transmission", f"the edges have a median of {air:.3g}"
+        return {"reading": "transmission"}, f"the edges have a median of {air:.3g}"
     if abs(air) < 0.1 * middle:
-        return "line_integral", f"the edges have a median of {air:.3g}, the middle of {middle:.3g}"
+        return {"reading": "line_integral"}, f"the edges have a median of {air:.3g}, the middle of {middle:.3g}"
+    if 0 < middle < DARKER * min(left, right) and max(left, right) < min(left, right) / DARKER and width > 1:
+        air_is_light = (
+            f"the edges ({left:.4g} and {right:.4g}) are brighter than the middle ({middle:.4g}), so {width} columns "
+        )
+        return {"reading": "transmission", "air": width}, air_is_light + "at each edge are taken for air (data.air)"
     raise refusal(
         path,
         f"no flats, and edges with a median of {air:.4g}",
-        "flats (light without sample), transmissions near 1 or line integrals near 0 at the edges",
+        "flats (light without sample), transmissions near 1 or line integrals near 0 at the edges, or edges that are equally "
+        "bright, and brighter than the middle",
         "put flats beside the views, with flat in their names",
     )
 
@@ -432,7 +446,8 @@ def _draft_sinogram(path: Path, given: dict[str, Any]) -> ScanDraft:
     image = read_images([path])[0]
     views, columns = image.shape
     data: dict[str, Any] = {"source": "stack", "file": str(path), "images": "sinograms"}
-    data["reading"], why = guess_reading(path, image)
+    reading, why = guess_reading(path, image)
+    data |= reading
     lines = [
         f"found: a single image of {views} x {columns} pixels",
         f"assumed: a sinogram, {_count(views, 'view')} of {columns} columns; turn the image if its columns are views",

@@ -161,7 +161,11 @@ def _guarded(file: Path) -> Iterator[None]:
 
 def _read_header(dcmread: Any, file: Path) -> Any:
     with _guarded(file):
-        return dcmread(file, stop_before_pixels=True, specific_tags=list(KEYWORDS))
+        header = dcmread(file, stop_before_pixels=True, specific_tags=list(KEYWORDS))
+        # pydicom converts an element when it is asked for it first.
+        for keyword in KEYWORDS:
+            header.get(keyword)
+        return header
 
 
 def _frames(header: Any, file: Path) -> int:

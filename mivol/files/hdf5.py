@@ -71,7 +71,8 @@ def opened(path: Path) -> Iterator[Any]:
             yield file
     except MivolError:
         raise
-    except (OSError, RuntimeError, KeyError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        # A damaged type of numbers is a ValueError, a damaged group a TypeError.
         raise damaged(path, error) from error
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,7 +27,7 @@ ALL = slice(None)
 """All rows."""
 
 DETECTOR_IMAGES = (".edf", ".his")
-"""Suffixes of images of detectors, read by the package fabio."""
+"""Suffixes of images of detectors; EDF is read by the package fabio."""
 
 IMAGES = (*TIFF, *DETECTOR_IMAGES)
 """Suffixes of images of which a pattern takes several."""
@@ -132,17 +134,61 @@ def read_images(files: list[Path], rows: slice = ALL) -> np.ndarray:
     return np.stack(pages)
 
 
+MOST_AXES = 9
+"""Axes that a header of EDF may name."""
+
+HIS_TYPES = {0: np.dtype("u1"), 2: np.dtype("<u2"), 3: np.dtype("<u4")}
+"""Numbers of a frame by the type in its header."""
+
+
+def _read_his(file: Path) -> np.ndarray:
+    """Frames (n, rows, columns), float32, of a sequence of a Hamamatsu camera: each after a header of 64 bytes and a comment.
+
+    fabio reads the first frame only, so mivol reads the sequence itself.
+
+    Raises:
+        MivolError: a damaged file, or frames of different sizes.
+    """
+    data, place, frames = file.read_bytes(), 0, []
+    while place < len(data):
+        head = data[place : place + 64]
+        if len(head) < 64 or head[:2] != b"IM":
+            raise refusal(
+                file, f"no frame at byte {place}", 'a header of 64 bytes that begins with "IM"', "copy the file again"
+            )
+        comment, columns, rows, _, _, kind = struct.unpack("<6H", head[2:14])
+        if kind not in HIS_TYPES or not rows * columns:
+            found = f"{rows} x {columns} pixels of type {kind} in frame {len(frames)}"
+            raise refusal(file, found, "pixels of the types 0, 2 or 3", "copy the file again")
+        first, size = place + 64 + comment, rows * columns * HIS_TYPES[kind].itemsize
+        if first + size > len(data):
+            raise refusal(file, f"{len(data)} bytes, which end in frame {len(frames)}", "whole frames", "copy the file again")
+        frames.append(np.frombuffer(data, HIS_TYPES[kind], rows * columns, first).reshape(rows, columns).astype(np.float32))
+        place = first + size
+    if len({frame.shape for frame in frames}) != 1:
+        found = f"frames of {len({frame.shape for frame in frames})} sizes"
+        raise refusal(file, found, "frames of one size", "split the file")
+    return np.stack(frames)
+
+
 def _read_detector_images(file: Path) -> np.ndarray:
     """Frames (n, rows, columns), float32, of an EDF or HIS file.
 
     Raises:
-        MivolError: no fabio, or a damaged file.
+        MivolError: no fabio for EDF, or a damaged file.
     """
+    if file.suffix.lower() == ".his":
+        return _read_his(file)
     try:
         import fabio
     except ImportError as error:
         found = f"an image in {file.suffix[1:].upper()} but no fabio"
         raise refusal(file, found, "an installed fabio", 'install it: pip install "mivol[lab]"') from error
+    # fabio walks to the highest axis that a header names, however high.
+    highest = max((int(n[:18]) for n in re.findall(rb"(?i)dim_(\d+)", file.read_bytes())), default=0)
+    if highest > MOST_AXES:
+        found, expected = f"a header that names the axis Dim_{highest}", f"Dim_1 to Dim_{MOST_AXES} at most"
+        raise refusal(file, found, expected, "copy the file again")
     log = logging.getLogger("fabio")
     level = log.level
     log.setLevel(logging.CRITICAL + 1)

@@ -153,6 +153,9 @@ def _read_pages(path: Path) -> tuple[np.ndarray, np.ndarray, str, tuple[str, ...
 
     size = check_file(path).stat().st_size
     with _guarded(path), TiffFile(path) as file:
+        # Pages that name each other in a circle are counted without a hang, and listed for ever.
+        if not len(file.pages):
+            raise refusal(path, "no page", "a whole TIFF file", "copy it again")
         series = file.series
         if len(series) != 1:
             listed = ", ".join(str(one.shape) for one in series[:4])

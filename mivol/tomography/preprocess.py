@@ -208,6 +208,9 @@ def normalise_air(transmission: Transmission, n_columns: int) -> Transmission:
     if not 2 <= n_columns <= columns // 2:
         raise MivolError(f"Found {n_columns} air columns, expected 2 to {columns // 2} of {columns}.")
     air = fit_air(value, n_columns)
+    if not transmission.is_noise_known:
+        # Values of any scale, such as counts without flats, become transmissions here.
+        return replace(assume_quantum_noise(value / air), notes=transmission.notes)
     return replace(transmission, value=value / air, variance=transmission.variance / air**2)
 
 

@@ -179,6 +179,10 @@ def test_air_is_a_straight_line_through_both_edges() -> None:
     found = preprocess.normalise_air(Transmission(value, np.ones_like(value)), 2)
     np.testing.assert_allclose(found.value, value / air, rtol=1e-14)
     np.testing.assert_allclose(found.variance, 1 / air**2, rtol=1e-14)
+    counts = preprocess.normalise_air(preprocess.assume_quantum_noise(1000 * value), 2)
+    known = preprocess.assume_quantum_noise(value / air)
+    np.testing.assert_allclose(counts.variance, known.variance, rtol=1e-14)
+    assert not counts.is_noise_known
     assert preprocess.normalise_air(Transmission(value, value), 3).value.shape == value.shape
     for n in (0, 1, 4):
         with pytest.raises(MivolError, match=f"Found {n} air columns, expected 2 to 3 of 6"):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sound_files import his_bytes
 
 from mivol.cli import main
 from mivol.errors import MivolError
@@ -94,6 +95,27 @@ def test_frames_of_edf(tmp_path: Path) -> None:
     (tmp_path / "a_0.edf").write_bytes((tmp_path / "a_0.edf").read_bytes()[:100])
     with pytest.raises(MivolError, match=r"a_0\.edf: found a damaged or foreign file"):
         read_stack(tmp_path / "a_*.edf")
+
+
+def test_a_sequence_of_a_hamamatsu_camera(tmp_path: Path) -> None:
+    """All frames, each after its own header and comment; fabio reads the first one, with the same values."""
+    frames = np.arange(84).reshape(2, 6, 7)
+    path = tmp_path / "a.his"
+    path.write_bytes(his_bytes(frames))
+    np.testing.assert_array_equal(read_stack(path), frames)
+    assert stack_shape(path) == (2, 6, 7)
+    first = pytest.importorskip("fabio").open(str(path)).data
+    np.testing.assert_array_equal(first, frames[0])
+    whole = path.read_bytes()
+    for damaged, said in (
+        (whole[:-1], "which end in frame 1"),
+        (whole + b"IM", "no frame at byte"),
+        (whole[:12] + b"\x09" + whole[13:], "pixels of type 9 in frame 0"),
+        (whole + his_bytes(frames[:1, :3]), "frames of 2 sizes"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(MivolError, match=said):
+            read_stack(path)
 
 
 def write_series(folder: Path) -> np.ndarray:

@@ -171,13 +171,17 @@ def test_the_first_middle_and_last_view_tell_the_arc(tmp_path: Path, files: int)
 
 
 def test_readings_without_flats(tmp_path: Path) -> None:
-    """Air near 1 is a transmission, air near 0 a line integral, and readings of a camera are refused."""
+    """Air near 1 is a transmission, air near 0 a line integral. Readings of a camera need air, equally bright at both edges."""
     view = np.ones((2, 40))
     view[:, 10:30] = 0.3
-    assert found_scan.guess_reading(tmp_path, view)[0] == "transmission"
-    assert found_scan.guess_reading(tmp_path, -np.log(view))[0] == "line_integral"
-    with pytest.raises(MivolError, match="no flats, and edges with a median of 1000"):
-        found_scan.guess_reading(tmp_path, 1000 * view)
+    assert found_scan.guess_reading(tmp_path, view)[0] == {"reading": "transmission"}
+    assert found_scan.guess_reading(tmp_path, -np.log(view))[0] == {"reading": "line_integral"}
+    found, why = found_scan.guess_reading(tmp_path, 1000 * view)
+    assert found == {"reading": "transmission", "air": 2} and "1000 and 1000" in why and "(300)" in why
+    uneven = 1000 * view * np.linspace(0.7, 1, 40)
+    for other in (uneven, 1300 - 1000 * view, np.full((2, 40), 1000.0)):
+        with pytest.raises(MivolError, match="no flats, and edges with a median of"):
+            found_scan.guess_reading(tmp_path, other)
 
 
 def test_photographs_are_no_scan(tmp_path: Path) -> None:

@@ -266,6 +266,16 @@ def test_numbers_of_thousands_of_digits_are_refused(tmp_path: Path) -> None:
         config.load(tmp_path / "a.toml")
 
 
+@pytest.mark.parametrize(
+    ("name", "number"), [("tiff zlib", 206), ("hdf5", 565), ("projections", 726), ("dicom", 188), ("edf", 18)]
+)
+def test_damage_that_was_a_fault_is_refused(tmp_path: Path, name: str, number: int) -> None:
+    """Found by fuzzing with the seed 42: pages in a circle (tifffile lists them for ever), axes without
+    end (fabio), and errors of h5py and pydicom."""
+    fuzz.write_sound(name, tmp_path)
+    assert fuzz.outcome(fuzz.case(name, number, 42, tmp_path)[0])[0] == "refused"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*FILES, *SETS])
 def test_damaged_files_are_read_or_refused(variant_rgb: str, tmp_path: Path, name: str) -> None:
