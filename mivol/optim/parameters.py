@@ -19,6 +19,9 @@ from mivol.errors import MivolError
 from mivol.optim.priors import Prior
 from mivol.optim.strategy import suggest_name
 
+ADDRESS = r"^object_\d+"
+"""The name that Mitsuba gives an object without an id: its address in memory, another one in each run."""
+
 GRID = 4
 """Axes of a grid (Z, Y, X, C); spherical harmonics have one more axis."""
 
@@ -261,10 +264,13 @@ def find(name: str, params: mi.SceneParameters) -> str:
             a value without derivatives.
     """
     keys = list(params.keys())
-    if name not in keys:
-        raise MivolError(f'the scene has no parameter "{name}": {suggest_name(name, keys)}')
-    if re.match(r"object_\d+", name):
+    if re.match(ADDRESS, name):
         raise MivolError(f'"{name}" begins with a memory address, which changes from run to run: give the object an id.')
+    if name not in keys:
+        hint = suggest_name(name, [re.sub(ADDRESS, "<id>", key) for key in keys])
+        if "<id>" in hint:
+            hint = f"{hint[:-1]}: give the objects without a name an id in the scene, and write it in the place of <id>."
+        raise MivolError(f'the scene has no parameter "{name}": {hint}')
     if not (dr.is_array_v(params[name]) and dr.is_float_v(params[name])):
         raise MivolError(
             f'"{name}" is a {type(params[name]).__name__}, expected a number, colour, point or tensor of floating point that '

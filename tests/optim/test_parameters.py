@@ -95,8 +95,13 @@ def test_find_offers_the_nearest_key(variant_rgb) -> None:
     emitter = mi.traverse(mi.load_dict({"type": "scene", "emitter": {"type": "spot"}}))
     with pytest.raises(MivolError, match="AffineTransform4f, expected a number"):
         find("emitter.to_world", emitter)
-    nameless = mi.traverse(mi.load_dict({"type": "scene", "s": {"type": "sphere"}}))
-    addressed = next((key for key in list(nameless.keys()) if key.startswith("object_")), None)
-    if addressed:
+
+
+def test_an_object_without_an_id_is_asked_for_one(variant_rgb) -> None:
+    """Mitsuba names it by its address, so a key of one run says nothing in the next."""
+    nameless = mi.traverse(mi.load_string('<scene version="3.0.0"><shape type="sphere"><emitter type="area"/></shape></scene>'))
+    with pytest.raises(MivolError, match='did you mean "<id>.emitter.radiance.value": give the objects .* an id in the scene'):
+        find("shape_1.emitter.radiance.value", nameless)
+    for key in (next(key for key in list(nameless.keys()) if key.startswith("object_")), "object_123.emitter.radiance.value"):
         with pytest.raises(MivolError, match="memory address"):
-            find(addressed, nameless)
+            find(key, nameless)
