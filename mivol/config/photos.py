@@ -298,6 +298,7 @@ class GaussianSettings(Section):
     ssim: Annotated[float, setting("1", "weight of SSIM in the loss; absent: preset", ge=0, le=1)] | None = None
     mip: Annotated[bool, setting("1", "keep the light of Gaussians smaller than a pixel, for other sizes")] = False
     exposure: Annotated[bool, setting("1", "gains of each photograph, for photographs without alpha")] = False
+    poses: Annotated[bool, setting("1", "cameras move with the fit, for poses that are off by a pixel or more")] = False
     views: Annotated[int, setting("1", "photographs of a step, which workers of a cluster share; fewer steps then", ge=1)] = 1
 
     def __post_init__(self) -> None:

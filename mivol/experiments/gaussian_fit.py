@@ -57,6 +57,11 @@ class GaussianFit(PhotoFit):
         """Whether the photographs have gains."""
         return self.problem.exposure is not None
 
+    @property
+    def refines_poses(self) -> bool:
+        """Whether the fit moves cameras."""
+        return self.problem.motions is not None
+
     def make_plan(self, settings: GaussianExperiment) -> GaussianPlan:
         return make_gaussian_plan(settings)
 
@@ -101,6 +106,9 @@ class GaussianFit(PhotoFit):
         path = run.path / FILE
         gaussians = self.write_gaussians(path)
         self.record.tables = [tabulate_gaussians(gaussians, path.stat().st_size)]
+        if self.refines_poses:
+            names = [view.name for view in self.photos.views]
+            self.record.tables.append(tabulate_motions(names, self.problem.motions, self.problem.extent))
         return {"gaussians": float(gaussians.count)}
 
     def gains(self) -> NDArray | None:
@@ -133,6 +141,21 @@ def tabulate_gaussians(gaussians: Gaussians, bytes_: int) -> Table:
         ("longest over shortest axis: median", f"{np.median(scale.max(axis=1) / scale.min(axis=1)):.3g}"),
     )
     return Table(title="Fitted Gaussians", head=("", ""), rows=rows)
+
+
+def tabulate_motions(names: Sequence[str], motions: NDArray, extent: float) -> Table:
+    """Table of the motions of the photographs' cameras, the farthest turn first.
+
+    Args:
+        names: of the photographs.
+        motions: (photographs, 6) as :attr:`mivol.optim.gaussians.gaussian_problem.GaussianProblem.motions`.
+        extent: unit of the translations [length].
+    """
+    turns, shifts = np.degrees(np.linalg.norm(motions[:, :3], axis=1)), np.linalg.norm(motions[:, 3:], axis=1) * extent
+    rows = [(names[k], f"{turns[k]:.3f}", f"{shifts[k]:.3g}") for k in np.argsort(-turns, kind="stable")]
+    return Table(
+        title="Motions of the cameras in the fit", head=("photograph", "turn [degree]", "shift [length]"), rows=tuple(rows)
+    )
 
 
 @dataclass(frozen=True)
@@ -171,7 +194,7 @@ def make_gaussian_plan(settings: GaussianExperiment) -> GaussianPlan:
         raise MivolError(f'gaussians.control = "{options.control}" is unknown: {suggest_name(options.control, list(CONTROLS))}')
     given = {name: getattr(options, name) for name in ("start", "most", "control", "ssim")}
     overrides = {name: value for name, value in given.items() if value is not None}
-    plan = replace(PRESETS[options.preset], mip=options.mip, exposure=options.exposure, **overrides)
+    plan = replace(PRESETS[options.preset], mip=options.mip, exposure=options.exposure, poses=options.poses, **overrides)
     if options.degree is not None:
         stages = [replace(stage, degree=min(stage.degree, options.degree)) for stage in plan.stages]
         plan = replace(plan, stages=(*stages[:-1], replace(stages[-1], degree=options.degree)))
@@ -218,6 +241,10 @@ def adapt_to_few(plan: GaussianPlan, photographs: int) -> GaussianPlan:
 
 
 GAINS = PlanLine(choice="gains of each photograph", reason="for cameras with automatic exposure; with a prior towards 1")
+MOTIONS = PlanLine(
+    choice="cameras move with the fit",
+    reason="for poses that are off by a pixel or more; held-out photographs are judged as they are, and after an alignment",
+)
 
 
 def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:
@@ -240,6 +267,7 @@ def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, me
         PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="the rest is the absolute error"),
         background,
         *[GAINS][: plan.exposure],
+        *[MOTIONS][: plan.poses],
         PlanLine(choice=f"about {minutes:.2g} minutes", reason="for two idle cores; the number of steps is fixed"),
         PlanLine(choice=memory, reason="estimated before the allocation"),
     ]

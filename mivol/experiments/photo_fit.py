@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +26,10 @@ from mivol.optim.loop import Course, Fit
 from mivol.optim.optimizer import Optimizer
 from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, Photo
+from mivol.photos.alignment import align_camera
 from mivol.photos.camera_path import HomeView, find_home_view
 from mivol.photos.photo_file import CONVERSIONS
-from mivol.photos.region import FEWEST_VIEWS, find_free_distances
+from mivol.photos.region import FEWEST_VIEWS, find_free_distances, viewing_distance
 from mivol.report.cameras import draw_photo_cameras, plot_cameras, survey_all_cameras
 from mivol.report.record import CODES, Image, PlanLine, Table
 from mivol.scene.explain import Explanation
@@ -152,20 +153,25 @@ def judge_colour_fitted(image: NDArray, photo: Photo, space: str) -> float:
     return score_image(fit_colours(render_codes, photo_codes, photo.mask), photo_codes, mask=photo.mask).values["psnr"]
 
 
-def tabulate_views(camera: Camera, scores: Sequence[ImageScore], fitted: Sequence[float] = ()) -> Table:
+def tabulate_views(
+    camera: Camera, scores: Sequence[ImageScore], fitted: Sequence[float] = (), aligned: Sequence[float] = ()
+) -> Table:
     """Table of the judged views with their metrics, the worst view first.
 
     Args:
         camera: camera of the first view, for the size in the title.
         scores: metrics of each view.
         fitted: PSNR [dB] of each view after colour correction; may be empty.
+        aligned: PSNR [dB] of each view after an alignment of the view's pose; may be empty.
     """
     metrics = list(scores[0].values)
     head = ("view", *(METRICS[name].label for name in metrics))
     rows = [(one.name, *(f"{one.values[name]:.{METRICS[name].digits}f}" for name in metrics)) for one in scores]
-    if fitted:
-        head += ("PSNR [dB], colours fitted to the photograph's",)
-        rows = [(*row, f"{value:.2f}") for row, value in zip(rows, fitted, strict=True)]
+    more = {"PSNR [dB], colours fitted to the photograph's": fitted, "PSNR [dB], pose aligned to the photograph": aligned}
+    for label, values in more.items():
+        if values:
+            head += (label,)
+            rows = [(*row, f"{value:.2f}") for row, value in zip(rows, values, strict=True)]
     rows.sort(key=lambda row: float(row[1]))
     width, height = camera.size
     return Table(title=f"Judged views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
@@ -196,11 +202,13 @@ class PhotoFit(FitKind):
         film: cameras of the film.
         levels: nested boxes of the model.
         fits_colours: whether judged views also have a PSNR with their colours fitted to the photographs'.
+        refines_poses: whether the fit moves cameras; judged views then also have a PSNR with their own poses aligned.
     """
 
     stages = Stages("photographs", "fit", "images and volumes")
     levels: int = 1
     fits_colours: bool
+    refines_poses: bool = False
     plan: Any
     settings: PhotoExperiment
 
@@ -322,7 +330,7 @@ class PhotoFit(FitKind):
     def write_judged(self, run: RunFolder) -> dict[str, float]:
         """Judge all views, and write the views beside the photographs; return the means of the metrics."""
         views, space, show = self.judged.views, self.judged.space, self.settings.show
-        qualities, fitted, first = [], [], []
+        qualities, fitted, aligned, first = [], [], [], []
         pictures = JudgedViews(run.path, space, len(views), show.views)
         for number, photo in enumerate(views):
             photo = self.rectified(photo)
@@ -331,15 +339,28 @@ class PhotoFit(FitKind):
             qualities.append(quality)
             if self.fits_colours:
                 fitted.append(judge_colour_fitted(image, photo, space))
+            if self.refines_poses:
+                aligned.append(self.judge(self.align(photo), ("psnr",))[1].values["psnr"])
             psnr = quality.values.get("psnr", fitted[-1] if fitted else next(iter(quality.values.values())))
             pictures.add(photo, image, psnr, describe_quality(quality, fitted[-1] if fitted else None))
             if number == 0:
                 first = self.write_first_view(run, view, photo)
         self.record.images += [*pictures.images(), *first]
         self.record.judged = describe_views(views)
-        self.record.tables.append(tabulate_views(views[0].camera, qualities, fitted))
+        self.record.tables.append(tabulate_views(views[0].camera, qualities, fitted, aligned))
         means = rename_metrics(average_scores(qualities).values)
-        return means | ({"psnr_colour_fitted": float(np.mean(fitted))} if fitted else {})
+        more = {"psnr_colour_fitted": fitted, "psnr_aligned": aligned}
+        return means | {name: float(np.mean(values)) for name, values in more.items() if values}
+
+    def align(self, photo: Photo) -> Photo:
+        """Return a judged photograph with the pose that shows the model most like the photograph."""
+
+        def render(camera: Camera) -> NDArray:
+            view, _ = self.judge(replace(photo, camera=camera), ())
+            return view if isinstance(view, np.ndarray) else view.image
+
+        distance = viewing_distance([view.camera for view in self.photos.views], self.photos.box)
+        return replace(photo, camera=align_camera(render, photo.camera, photo.image, photo.mask, distance))
 
     # -- Explain ---------------------------------------------------------------------------------------------------
 

@@ -77,6 +77,22 @@ def pixel_centres(size: tuple[int, int]) -> np.ndarray:
     return np.stack([x, y], axis=-1)
 
 
+def move_camera(camera: Camera, turn: np.ndarray, shift: np.ndarray) -> Camera:
+    """Return the camera after a small motion.
+
+    Args:
+        camera: camera before the motion.
+        turn: rotation vector (3,) about the camera's position, in the axes of the world [rad].
+        shift: translation (3,) in the world [length].
+    """
+    angle, pose = float(np.linalg.norm(turn)), camera.to_world.copy()
+    x, y, z = np.asarray(turn, np.float64) / (angle or 1.0)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross  # Rodrigues' formula
+    pose[:3, :3], pose[:3, 3] = rotation @ pose[:3, :3], pose[:3, 3] + shift
+    return dataclasses.replace(camera, to_world=pose)
+
+
 def directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Return unit directions (..., 3) in the camera frame of image points (..., 2), traced exactly through the lens.
 

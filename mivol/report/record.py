@@ -73,6 +73,7 @@ QUANTITIES: dict[str, Quantity] = {
     "psnr": Quantity("PSNR of the fitted views", "dB", log=False),
     "held_out_psnr": Quantity("PSNR of the held-out views", "dB", log=False),
     "psnr_colour_fitted": Quantity("PSNR of the held-out views after colour correction", "dB", log=False),
+    "psnr_aligned": Quantity("PSNR of the held-out views after an alignment of their poses", "dB", log=False),
     "few_psnr": Quantity("PSNR of a fixed few held-out views", "dB", log=False),
     "ssim": Quantity("SSIM of the held-out views", log=False),
     "flip": Quantity("FLIP of the held-out views", log=False),

@@ -108,7 +108,7 @@ def finished_fit(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, show
     fit.photos, fit.judged, fit.film = photos, photos if shown else None, Film(("camera",) * frames, shrink=4.0)
     fit.plan = SimpleNamespace(low_pass=0.3, low_pass_at=lambda shrink: ("low pass at", shrink))
     arrays = {name: getattr(cloud(), name) for name in outputs.Gaussians.__dataclass_fields__}
-    fit.problem = SimpleNamespace(exposure=None, cloud=arrays)
+    fit.problem = SimpleNamespace(exposure=None, motions=None, cloud=arrays)
     monkeypatch.setattr(outputs, "write_gaussians", lambda path, gaussians, view: path.write_bytes(view))
     monkeypatch.setattr(photo_fit, "find_home_view", lambda cameras, box: {("box", views): bytes(100)}[box, len(cameras)])
     monkeypatch.setattr(outputs, "rectify", lambda photo: photo)

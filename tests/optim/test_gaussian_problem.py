@@ -342,3 +342,37 @@ def test_gain_gradient_matches_the_loss(views: list[Photo]) -> None:
 def test_gains_of_photographs_with_alpha_are_refused(views: list[Photo]) -> None:
     with pytest.raises(MivolError, match="found gains and photographs with alpha"):
         GaussianProblem(RayBatches.from_photos(views, (1, 2)), [v.camera for v in views], truth(), replace(PLAN, exposure=True))
+
+
+# -- Motions of the cameras -----------------------------------------------------------------------------------------------
+
+
+def test_gradient_of_a_motion_matches_differences(
+    variant_rgb: str, views: list[Photo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the six numbers of a camera, against central differences, with the bound of the test above; 0 for other cameras."""
+    plan = replace(PLAN, stages=(GaussianStage(40, 1, 1, 1),), ssim=0.0, poses=True)
+    problem = problem_of(views, plan, 6)
+    smooth = Splatter(SIDE, SIDE, 1, least_alpha=1e-6, sheen=plan.sheen)
+    monkeypatch.setattr(problem, "splatter_for", lambda size, low_pass, sheen: smooth)
+    reals, behind = problem.initial_reals(), np.array([0.2, 0.7, 0.4])
+    gradient = np.array(problem.view_loss_and_gradient(reals, 3, behind)[1]["motions"])
+    way, step = np.zeros((8, 6), np.float32), 3e-3
+    way[3] = np.sign(gradient[3])
+    moved = [
+        float(problem.view_loss_and_gradient({**reals, "motions": mi.TensorXf(side * way)}, 3, behind)[0][0])
+        for side in (step, -step)
+    ]
+    assert (gradient * way).sum() == pytest.approx((moved[0] - moved[1]) / (2 * step), rel=0.01)
+    assert not np.delete(gradient, 3, axis=0).any()
+
+
+def test_motions_have_no_mean_and_survive_density_control(variant_rgb: str, views: list[Photo]) -> None:
+    """A common motion would carry the scene away from held-out photographs."""
+    plan = replace(PLAN, stages=(GaussianStage(20, 20, 0, 2),), poses=True)
+    problem = problem_of(views, plan)
+    reconstruct(problem, plan.optimizer, plan.course())
+    assert problem.motions.shape == (8, 6)
+    assert np.abs(problem.motions).max() > 1e-4
+    # 8 numbers of at most 0.05 are added in float32.
+    assert np.abs(problem.motions.mean(axis=0)).max() < 1e-7

@@ -63,6 +63,7 @@ class GaussianPlan:
         mip: whether Gaussians smaller than a pixel keep their light (Yu et al. 2024), instead of their opacity. Renderers with
             the same filter can then render the set at other sizes.
         exposure: a gain for each channel of each photograph (:mod:`mivol.optim.photographs.photo_colours`).
+        poses: whether the cameras of the photographs move with the fit.
         random_background: whether photographs with alpha get another background in each step.
         position_rate, final_position_rate: first and last rate of positions [extent], with geometric decay between.
         scale_rate, rotation_rate, opacity_rate, colour_rate: rates of log-scales, quaternions, opacity logits and constant
@@ -91,6 +92,7 @@ class GaussianPlan:
     low_pass: float = 0.3
     mip: bool = False
     exposure: bool = False
+    poses: bool = False
     random_background: bool = True
     position_rate: float = 4e-4
     final_position_rate: float = 4e-6

@@ -37,12 +37,23 @@ from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, StagedProblem, add_parts, to_arrays, to_tensors
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera
+from mivol.photos.camera import move_camera
 from mivol.photos.region import is_free_space
 from mivol.splatting import Splatter
-from mivol.splatting.splatter import ScreenStatistics
+from mivol.splatting.splatter import NAMES, ScreenStatistics
 
 GAIN_STEP = 0.05
 """Initial maximum change of a gain's logarithm per visit of the photograph: a gain of 1.5 needs eight visits or more."""
+
+MOTION = 6
+"""Numbers of a motion."""
+
+MOTION_STEP = 1e-3
+"""Initial maximum change of a camera's rotation [rad] and position [extent] per visit of the photograph: 0.1 to 0.3 pixels of a
+photograph of 200 pixels."""
+
+MOTION_PULL = 0.02
+"""Initial share by which a motion falls per visit of the photograph."""
 
 RESET_TO = 0.01
 """Maximum opacity after a reset of opacities."""
@@ -65,6 +76,8 @@ class GaussianProblem(StagedProblem, DividedProblem):
         divide: computes the views of a step elsewhere; None: in this process.
         stage: number of the current stage.
         exposure: gains of the photographs, if the plan has gains.
+        motions: (photographs, 6) motions of the cameras, if the plan refines poses: rotation vectors about their positions, in
+            the axes of the world [rad], and translations [extent].
 
     Example:
         >>> cloud = make_start_cloud(find_start_points(photos, 5000, 0)[0], photos.views, degree=0)
@@ -81,6 +94,7 @@ class GaussianProblem(StagedProblem, DividedProblem):
     divide: Divide | None = None
     stage: int = dataclasses.field(init=False, default=0)
     exposure: Exposure | None = dataclasses.field(init=False, default=None)
+    motions: np.ndarray | None = dataclasses.field(init=False, default=None)
 
     def __post_init__(self) -> None:
         if self.plan.control not in CONTROLS:
@@ -95,6 +109,8 @@ class GaussianProblem(StagedProblem, DividedProblem):
             if self.batches.channels == 4:
                 raise MivolError("found gains and photographs with alpha, which have equal exposures: set exposure = false.")
             self.exposure = Exposure.neutral(len(self.cameras))
+        if self.plan.poses:
+            self.motions = np.zeros((len(self.cameras), MOTION), np.float32)
         self.initial_count = len(self.cloud["means"])
         self._splatters: dict[tuple[int, int, float, float, int], Splatter] = {}
         self._shapes: dict[tuple[int, int], ImageShape] = {}
@@ -108,20 +124,24 @@ class GaussianProblem(StagedProblem, DividedProblem):
 
     def initial_reals(self) -> Reals:
         """Reals of the present cloud and gains."""
-        return self._with_gains(self._reals_of(self.cloud))
+        return self._with_photographs(self._reals_of(self.cloud))
 
     def values(self) -> Reals:
         """The cloud as tensors, with unscaled coefficients."""
         return {name: mi.TensorXf(array) for name, array in self.cloud.items()}
 
     def set_reals(self, reals: Reals) -> None:
-        """Set the cloud and the gains."""
+        """Set the cloud, the gains and the motions."""
         if self.exposure is not None:
             self.exposure = Exposure(reals["exposure"].array)
-        self.cloud = self._cloud_of({name: value for name, value in reals.items() if name != "exposure"})
+        if self.motions is not None:
+            self.motions = np.array(reals["motions"])
+        self.cloud = self._cloud_of({name: value for name, value in reals.items() if name in NAMES})
 
-    def _with_gains(self, reals: Reals) -> Reals:
-        return reals if self.exposure is None else reals | {"exposure": self.exposure.tensor}
+    def _with_photographs(self, reals: Reals) -> Reals:
+        """Reals of the cloud, with gains and motions."""
+        gains = {} if self.exposure is None else {"exposure": self.exposure.tensor}
+        return reals | gains | ({} if self.motions is None else {"motions": mi.TensorXf(self.motions)})
 
     def _reals_of(self, cloud: CloudArrays) -> Reals:
         return {name: mi.TensorXf(array) for name, array in cloud.items()} | {
@@ -206,14 +226,19 @@ class GaussianProblem(StagedProblem, DividedProblem):
             background: colour behind the photograph and the cloud (3,); None keeps the photograph's own background.
         """
         shrink = self.plan.stages[self.stage].shrink
-        camera = self._camera(view, shrink)
+        camera = self._moved(self._camera(view, shrink), reals, view)
         splatter = self.splatter_for(camera.size, self.plan.low_pass_at(shrink), self.plan.sheen)
         image, saved = splatter.forward(reals, camera)
         self.safe_point()
         gains = self._gains_of(reals, view)
         colour, target, backdrop, counted = self._compare_with_photograph(image, view, shrink, background, gains)
         loss, slope = self._image_loss(colour, target, self._shape(camera.size), self.plan.ssim)
-        gradient, statistics = splatter.backward(saved, _gradient_of_image(slope, backdrop, counted, gains, image.shape), False)
+        d_image = _gradient_of_image(slope, backdrop, counted, gains, image.shape)
+        gradient, statistics = splatter.backward(saved, d_image, self.motions is not None)
+        if self.motions is not None:
+            rows = np.zeros_like(self.motions)
+            rows[view] = np.array(gradient.pop("pose")) * ([1] * 3 + [self.extent] * 3)
+            gradient["motions"] = mi.TensorXf(rows)
         if self.exposure is not None:
             pixel, by_log = dr.arange(mi.UInt32, dr.width(colour) // 3), colour * slope
             by_log = mi.Color3f(*(dr.sum(dr.gather(mi.Float, by_log, 3 * pixel + c)) for c in range(3)))
@@ -230,6 +255,13 @@ class GaussianProblem(StagedProblem, DividedProblem):
             smaller = np.diag([1 / shrink, 1 / shrink, 1.0]) @ camera.K
             self._cameras[view, shrink] = dataclasses.replace(camera, K=smaller, size=size)
         return self._cameras[view, shrink]
+
+    def _moved(self, camera: Camera, reals: Reals, view: int) -> Camera:
+        """The camera of a view after its motion."""
+        if self.motions is None:
+            return camera
+        motion = np.array(reals["motions"], np.float64)[view]
+        return move_camera(camera, motion[:3], motion[3:] * self.extent)
 
     def splatter_for(self, size: tuple[int, int], low_pass: float, sheen: float = 1.0) -> Splatter:
         """Renderer of images of a size (width, height) for the degree of the stage; each is made once.
@@ -304,19 +336,28 @@ class GaussianProblem(StagedProblem, DividedProblem):
         """
         rates = self.plan.learning_rates(iteration, self.extent)
         if self.exposure is not None:
-            rates["exposure"] = self._gain_step(iteration) / len(self.cameras) ** 0.5
+            rates["exposure"] = GAIN_STEP * self._fall(iteration) / len(self.cameras) ** 0.5
+        if self.motions is not None:
+            rates["motions"] = MOTION_STEP * self._fall(iteration) / len(self.cameras) ** 0.5
         return rates
 
-    def _gain_step(self, iteration: int) -> float:
-        """Maximum change of a gain's logarithm per visit of the photograph."""
-        return GAIN_STEP * self.plan.final_rate ** (iteration / max(self.plan.steps, 1))
+    def _fall(self, iteration: int) -> float:
+        """Factor on the rates of gains and motions."""
+        return self.plan.final_rate ** (iteration / max(self.plan.steps, 1))
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
         """Pull gains towards 1; for relocation, move transparent Gaussians at random (Kheradmand et al. 2024, eq. 8)."""
         if self.exposure is not None:
-            pulled = Exposure(reals["exposure"].array).regularized(pull_at(self._gain_step(iteration) / len(self.cameras)))
+            pulled = Exposure(reals["exposure"].array).regularized(
+                pull_at(GAIN_STEP * self._fall(iteration) / len(self.cameras))
+            )
             dr.eval(pulled.logs)
             reals = reals | {"exposure": pulled.tensor}
+        if self.motions is not None:
+            # Without their mean, motions do not carry the whole scene away from the held-out photographs.
+            motions = np.array(reals["motions"])
+            motions = (motions - motions.mean(axis=0)) * (1 - MOTION_PULL * self._fall(iteration) / len(self.cameras))
+            reals = reals | {"motions": mi.TensorXf(motions.astype(np.float32))}
         if self.plan.control != "relocation" or iteration >= self.plan.growth[1] * self.plan.steps:
             return reals
         n = reals["means"].shape[0]
@@ -337,7 +378,7 @@ class GaussianProblem(StagedProblem, DividedProblem):
         self._reset_statistics()
 
         def carry(tensors: Reals) -> Reals:
-            learnt = change.carry({name: np.array(value) for name, value in tensors.items() if name != "exposure"})
+            learnt = change.carry({name: np.array(value) for name, value in tensors.items() if name in NAMES})
             if reset:
                 learnt["opacity_logits"][:] = 0
             return tensors | {name: mi.TensorXf(array) for name, array in learnt.items()}
