@@ -334,8 +334,12 @@ TIMED_EDGE, TURNS = 800, 5
 """Edge of a timed view [pixel], and turns of which the median ratio counts."""
 
 
-def describe_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree, other_name: str) -> str:
-    """Pixels a second of two fields and their ratio: ``VIEWS`` views of the whole box, ready to render, by processor time."""
+def compare_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree) -> tuple[tuple[float, float], float]:
+    """Pixels a second of two fields: ``VIEWS`` views of the whole box, ready to render, by processor time.
+
+    Returns:
+        The two rates [pixel/s], and the median of the ratios of all turns, first over second.
+    """
     cameras = cameras_around(other.to_world, TIMED_EDGE)
     views = [CameraRays.from_camera(camera) for camera in cameras]
     renders = [[prepare_view(one, camera, stop=1e-3) for camera in cameras] for one in (field, other)]
@@ -348,9 +352,15 @@ def describe_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree,
         # Views wait for each other only: threads that wait for a view's last pixels would count as work on a busy machine.
         dr.sync_thread()
         seconds[turn, which] = time.process_time() - begun
-    rates = len(views) * TIMED_EDGE**2 / np.median(seconds[1:], axis=0) / 1e6  # the first turn compiles
-    ratio = np.median(seconds[1:, 1] / seconds[1:, 0])
-    return f"{rates[0]:.1f} M pixels a second of processor time, {other_name} {rates[1]:.1f}: {ratio:.2f} times as many"
+    first, second = (float(v) for v in len(views) * TIMED_EDGE**2 / np.median(seconds[1:], axis=0))  # turn 0 compiles
+    return (first, second), float(np.median(seconds[1:, 1] / seconds[1:, 0]))
+
+
+def describe_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree, other_name: str) -> str:
+    """Pixels a second of two fields and their ratio (:func:`compare_speed`)."""
+    rates, ratio = compare_speed(field, other)
+    first, second = (rate / 1e6 for rate in rates)
+    return f"{first:.1f} M pixels a second of processor time, {other_name} {second:.1f}: {ratio:.2f} times as many"
 
 
 def describe_leaves(tree: Octree) -> str:

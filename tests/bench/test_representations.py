@@ -13,14 +13,42 @@ from bench_figures import drawn
 from mivol.bench import photo_fits
 from mivol.bench.studies import representations
 from mivol.bench.studies.representations import STUDY, RepresentationSize
+from mivol.fields.octree import Octree
+from mivol.fields.spherical_grid import SphericalGrid
 
 
 def test_the_chair_is_left_out_where_it_is_not(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(photo_fits, "DATA", tmp_path)
-    assert STUDY.questions["chair"](RepresentationSize.quick()) == {}
-    assert "chair: left out, its data is missing (MIVOL_DATA" in capsys.readouterr().err
+    for question in ("chair", "octree"):
+        assert STUDY.questions[question](RepresentationSize.quick()) == {}
+        assert "chair: left out, its data is missing (MIVOL_DATA" in capsys.readouterr().err
+
+
+def test_an_octree_stands_beside_its_grid() -> None:
+    grid = {"psnr": 36.349, "file_bytes": 2**20, "pixels_per_second": 12.82e6}
+    octree = {"psnr": 36.2, "file_bytes": 2**19, "pixels_per_second": 25.4e6}
+    lines = STUDY.table("octree", {"grid": grid, "octree": octree, "over_grid": {"db": -0.149, "bytes": 0.5, "pixels": 1.98}})
+    assert lines[2:] == ["| grid | 36.35 dB | 1 MiB | 12.8 M pixels/s |", "| octree | 36.20 dB | 0.5 MiB | 25.4 M pixels/s |"]
+
+
+@pytest.mark.slow
+def test_the_grid_is_that_of_which_the_octree_was_made(
+    variant_rgb: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    small = {"photo_folder": str(tmp_path / "photographs"), "photo_side": 32, "photo_views": 9, "edge": 16}
+    monkeypatch.setattr(representations, "find_photographs", lambda name, size: photo_fits.find_photographs("still_life", size))
+    timed = []
+    monkeypatch.setattr(
+        representations, "compare_speed", lambda *fields: (timed.extend(map(type, fields)), ((4e6, 2e6), 2.0))[1]
+    )
+    answer = STUDY.answer(("octree",), replace(RepresentationSize.quick(), **small))["octree"]
+    assert timed == [Octree, SphericalGrid]
+    grid, octree, gain = (answer[name] for name in ("grid", "octree", "over_grid"))
+    assert gain["db"] == octree["psnr"] - grid["psnr"] and gain["bytes"] == octree["file_bytes"] / grid["file_bytes"]
+    assert min(grid["psnr"], octree["psnr"]) > 8
+    assert (octree["pixels_per_second"], grid["pixels_per_second"], gain["pixels"]) == (4e6, 2e6, 2.0)
 
 
 @pytest.mark.slow

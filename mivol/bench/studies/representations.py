@@ -2,6 +2,7 @@
 
     mivol bench representations                 # two hours of processor time
     mivol bench representations --only chair    # a data set; --models grid octree for some models
+    mivol bench representations --only octree   # two minutes: an octree beside the grid that it was made of
     mivol bench representations --quick         # a minute, small sizes: the figures mean nothing
 
 The photographs of the still life (200 x 200 pixels; missing photographs are rendered to runs/photographs), of the chair (same
@@ -25,7 +26,7 @@ from drjit.hashgrid import HashGridEncoding
 from matplotlib.ticker import MaxNLocator
 
 from mivol.bench.extinctions import TO_WORLD, smoke
-from mivol.bench.harness.bars import AT_LEAST, Promise, say_row
+from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise, say_row
 from mivol.bench.harness.figures import new_figure, show_images
 from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.harness.timing import Stopwatch, race, ratio_of
@@ -34,14 +35,19 @@ from mivol.bench.reference_walk import REFERENCE_RATE
 from mivol.bench.scenes import box_scene, constant_light, make_integrator
 from mivol.errors import MivolError
 from mivol.experiments import field_fit
+from mivol.experiments.field_conversion import compare_speed
+from mivol.fields.field_files import read_field, write_field
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
 from mivol.fields.networks import Network
+from mivol.fields.octree import Octree
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.image_files import encode_srgb
 from mivol.optim.first_order import Adam
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import begin_fit
 from mivol.optim.parameters import Parameter
+from mivol.optim.photographs.field_view import render_view
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 from mivol.photos import rectify, survey_photos
@@ -158,6 +164,17 @@ def table(question: str, answer: dict) -> list[str]:
         return [*head, *(f"| {name} | {score} | {steps} |" for name, score, steps in rows)]
     if question in ("samples", "smoke") or not answer:
         return []
+    if question == "octree":
+        head = "| model | PSNR | file | views of 800 px |", "|---|---|---|---|"
+        rows = ((name, answer[name]) for name in ("grid", "octree"))
+        return [
+            *head,
+            *(
+                f"| {name} | {row['psnr']:.2f} dB | {row['file_bytes'] / 2**20:.2g} MiB | "
+                f"{row['pixels_per_second'] / 1e6:.1f} M pixels/s |"
+                for name, row in rows
+            ),
+        ]
     head = "| model | PSNR / SSIM | time | memory | file | rays shown |", "|---|---|---|---|---|---|"
     return [
         *head,
@@ -226,6 +243,43 @@ def measure_sample_rates(size: RepresentationSize) -> dict:
     for name, rate in rates.items():
         say_row(name, samples_per_processor_second=rate, on_2_cores=2 * rate)
     return {"rates": rates, "ratio": ratio_of(timings["drjit.hashgrid"], timings["mivol"], "processor")}
+
+
+def measure_octree(size: RepresentationSize) -> dict:
+    """How good, small and fast is the octree of the chair beside its grid, after a fit of its leaves?
+
+    Both are judged and rendered as their files hold them, in one run: test views over white, bytes of the files, and views of
+    ``mivol convert`` that end at the same transmittance.
+    """
+    folder, stages = find_photographs("chair", size), {}
+    if folder is None:
+        return {}
+    prepared = prepare_fit(folder, choose_photos("chair", folder, "octree", size), list_settings(size, True)["octree"])
+
+    def keep(name: str, field: SphericalGrid | Octree) -> str:
+        stages[name] = field
+        return name
+
+    prepared.problem.report = keep
+    fit_photographs(prepared.problem, size.walk_side)
+    answer, written = {}, {}
+    with TemporaryDirectory() as place:
+        for name, field in (("grid", stages["grid"]), ("octree", prepared.problem.field)):
+            path = Path(place) / f"{name}.npz"
+            write_field(path, field)
+            written[name] = read_field(path)
+            views = [rectify(view) for view in prepared.judged.views]
+            shown = [render_view(written[name], view.camera, view.background).image for view in views]
+            scores = [prepared.judge(image, view) for image, view in zip(shown, views, strict=True)]
+            answer[name] = {**average_scores(scores).values, "file_bytes": path.stat().st_size}
+    rates, ratio = compare_speed(written["octree"], written["grid"])
+    for name, rate in zip(("octree", "grid"), rates, strict=True):
+        answer[name]["pixels_per_second"] = rate
+        say_row(name, **answer[name])
+    octree, grid = answer["octree"], answer["grid"]
+    gain = {"db": octree["psnr"] - grid["psnr"], "bytes": octree["file_bytes"] / grid["file_bytes"], "pixels": ratio}
+    say_row("octree over grid", **gain)
+    return {**answer, "over_grid": gain}
 
 
 ROUNDS = {
@@ -341,7 +395,9 @@ def fit_smoke(fit: SmokeFit, views: list[View], light: dict, albedo: float, size
 def draw(answers: dict, path: Path) -> None:
     """Plot PSNR against minutes, and show a judged view of each fit beside its photograph."""
     rows = [
-        (question, answer) for question, answer in answers.items() if answer and question not in ("samples", "smoke", "rounds")
+        (question, answer)
+        for question, answer in answers.items()
+        if answer and question not in ("samples", "smoke", "rounds", "octree")
     ]
     if not rows:
         return
@@ -363,6 +419,7 @@ QUESTIONS = {
     "samples": measure_sample_rates,
     "smoke": measure_smoke,
     "rounds": measure_rounds,
+    "octree": measure_octree,
     "chair": ask("What are the photographs of the chair by each model, if its data is here?", measure, "chair"),
     "still_life": ask("What are the photographs of the still life by each model?", measure, "still_life"),
     "fox": ask("What are the photographs of the fox by each model, if its data is here?", measure, "fox"),
@@ -370,5 +427,10 @@ QUESTIONS = {
 PROMISES = {
     "samples": [Promise("samples per second of a hash grid on 2 cores [M]", ("rates", "mivol"), AT_LEAST, 0.9, 2e-6)],
     "smoke": [Promise("hash grid over voxels, smoke at depth 6 [dB]", ("hash_over_voxels_db",), AT_LEAST, -0.5)],
+    "octree": [
+        Promise("fitted octree over its grid, chair [dB]", ("over_grid", "db"), AT_LEAST, -0.1),
+        Promise("file of the octree over the grid's", ("over_grid", "bytes"), AT_MOST, 0.5),
+        Promise("pixels per second of the octree over the grid's", ("over_grid", "pixels"), AT_LEAST, 2.0),
+    ],
 }
 STUDY = Study(__name__, __doc__, RepresentationSize, QUESTIONS, draw=draw, table=table, promises=PROMISES)
