@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -193,8 +193,8 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
     set_variant(variant)
     cloud = read_as_gaussians(source)
     low, high = corners_of_box(cloud, box)
-    mesh = mesh_of_gaussians(cloud, low, high, resolution)
-    write_mesh(target, mesh)
+    mesh, view = mesh_of_gaussians(cloud, low, high, resolution), read_gaussian_view(source)
+    write_mesh(target, mesh if view is None else replace(mesh, up=view.up))
     loss, voxel = measure_mesh_error(cloud, mesh, low, high), float((high - low).max()) / resolution
     nine_tenths = f"{loss.most:.3g} for nine tenths of the pixels ({loss.most / voxel:.2g} voxels)"
     lines = [

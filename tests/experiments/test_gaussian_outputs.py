@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from mivol.cli import main
+from mivol.experiments import gaussian_conversion, photo_fit
 from mivol.experiments import gaussian_fit as outputs
-from mivol.experiments import photo_fit
 from mivol.experiments.film import Film
 from mivol.experiments.fit_kind import NullProgress
+from mivol.files.gltf import read_glb, turn_to_y
+from mivol.files.mesh import Mesh
 from mivol.photos.camera import project
 from mivol.photos.camera_path import HomeView
 from mivol.points import Gaussians, write_gaussians
@@ -71,6 +73,17 @@ def test_gaussians_become_a_scene(variant_rgb: str, tmp_path: Path, has_view: bo
     for target, fault in ((tmp_path / "place.obj", "expected a scene"), (place, "--level is for the mesh of a field")):
         assert main(["export", str(tmp_path / "a.ply"), str(target), *(["--level", "1"] if target == place else [])]) == 1
         assert fault in capsys.readouterr().err
+
+
+def test_a_mesh_of_gaussians_is_upright_as_the_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    triangle = Mesh(np.eye(3), np.array([[0, 1, 2]]))
+    monkeypatch.setattr(gaussian_conversion, "mesh_of_gaussians", lambda *given: triangle)
+    monkeypatch.setattr(gaussian_conversion, "measure_mesh_error", lambda *given: gaussian_conversion.MeshLoss(0, 0, 0, 0))
+    view = HomeView((0.6, -0.8, 0.0), (5.0, 0.0, -5.0), (5.0, 0.0, 0.0), 60.0, (960, 540))
+    write_gaussians(tmp_path / "a.ply", cloud(), view)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.glb"), "--to", "mesh"]) == 0
+    document, _ = read_glb(tmp_path / "b.glb")
+    np.testing.assert_allclose(document["nodes"][0]["rotation"], turn_to_y(view.up), atol=1e-9)
 
 
 def test_a_picture_stands_before_a_colour() -> None:
