@@ -271,7 +271,8 @@ def test_lines_of_an_import_are_judged_by_the_reference(index, line: int, expect
 def test_slow_tests_of_a_module_come_last(index, file: str, line: int, expected: list[str]) -> None:
     slow = "import pytest\nfrom mivol import b\nfrom mivol.c import f\n@pytest.mark.slow\ndef test(): pass\n"
     index.test_files = {"tests/x/test_a.py": "@pytest.mark.slow", "tests/test_a.py": "", "tests/test_two.py": slow}
-    assert index.rounds(fault_at(line, file), SMALL)[2] == (["-m", "slow", *expected] if expected else [])
+    which = "slow" if file == "mivol/a.py" else "slow or not slow"  # a process that is not recorded may run the line
+    assert index.rounds(fault_at(line, file), SMALL)[2] == (["-m", which, *expected] if expected else [])
 
 
 def test_statements_that_no_test_runs() -> None:

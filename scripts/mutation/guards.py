@@ -91,24 +91,25 @@ class Guards:
         1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them; ``OF_IMPORTS`` for a
            line that an import runs;
         2. more tests that run its line, ``SECOND`` seconds of them;
-        3. the slow tests of its module, by the names of their files.
+        3. the slow tests of its module, by the names of their files; all tests of these files if no recorded test runs the
+           line, because the recording sees no other processes.
         """
         runners = self.find_runners(fault, source)
         first, rest = split_by_time(runners, FIRST)
         of_import = OF_IMPORTS if is_of_import(source, fault.line) else ()
         one = list(dict.fromkeys([*self.listed.get(fault.file, []), *of_import, *(test.name for test in first)]))
         two = [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]
-        slow = self.find_slow_files(fault.file, also_by_import=not runners)
-        return [one, two, ["-m", "slow", *slow] if slow else []]
+        files = self.find_test_files(fault.file, is_unrun=not runners)
+        return [one, two, ["-m", "slow" if runners else "slow or not slow", *files] if files else []]
 
-    def find_slow_files(self, file: str, also_by_import: bool) -> list[str]:
-        """Test files with slow tests that are called like a module; if there are none, perhaps those that import it."""
-        slow = {name: text for name, text in self.test_files.items() if "mark.slow" in text}
+    def find_test_files(self, file: str, is_unrun: bool) -> list[str]:
+        """Test files with slow tests that are called like a module; for an unrun line any such file, or those that import it."""
+        texts = {name: text for name, text in self.test_files.items() if is_unrun or "mark.slow" in text}
         module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
         parent, _, name = module.rpartition(".")
         imported = re.compile(rf"(from {re.escape(module)} import|from {re.escape(parent)} import .*\b{name}\b)")
-        called = [test for test in slow if is_named_like(test, file)]
-        return called or [test for test, text in slow.items() if also_by_import and imported.search(text)]
+        called = [test for test in texts if is_named_like(test, file)]
+        return called or [test for test, text in texts.items() if is_unrun and imported.search(text)]
 
 
 def split_by_time(tests: Sequence[RunTest], seconds: float) -> tuple[list[RunTest], list[RunTest]]:
