@@ -103,7 +103,7 @@ class Guards:
         return [one, two, ["-m", "slow" if runners else "slow or not slow", *files] if files else []]
 
     def find_test_files(self, file: str, is_unrun: bool) -> list[str]:
-        """Test files with slow tests that are called like a module; for an unrun line any such file, or those that import it."""
+        """Files with slow tests that are called like a module; for an unrun line any such test file, or those that import it."""
         texts = {name: text for name, text in self.test_files.items() if is_unrun or "mark.slow" in text}
         module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
         parent, _, name = module.rpartition(".")
