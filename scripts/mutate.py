@@ -189,7 +189,7 @@ def judge_random(args: argparse.Namespace) -> None:
         if not recording.exists():
             record_suite(untouched, args.jobs, recording, args.slow)
         test_files = {str(path.relative_to(ROOT)): path.read_text() for path in sorted((ROOT / "tests").rglob("test_*.py"))}
-        guards = read_recording(recording, group_entries((e.file, e.test) for e in load_entries()), test_files)
+        guards = read_recording(recording, group_entries((e.file, e.test) for e in load_entries()), test_files, args.slow)
         first = Checkout(broken[0], untouched, args.limit, {test.name: test.passed for test in guards.tests})
         checkouts = [first, *(replace(first, broken=copy) for copy in broken[1:])]
         report(judge_all(faults, guards, checkouts), len(faults), lambda line: print(line, flush=True))

@@ -268,10 +268,17 @@ def test_lines_of_an_import_are_judged_by_the_reference(index, line: int, expect
         ("mivol/b.py", 13, []),  # a recorded test runs it
     ],
 )
-def test_slow_tests_of_a_module_come_last(index, file: str, line: int, expected: list[str]) -> None:
-    slow = "import pytest\nfrom mivol import b\nfrom mivol.c import f\n@pytest.mark.slow\ndef test(): pass\n"
-    index.test_files = {"tests/x/test_a.py": "@pytest.mark.slow", "tests/test_a.py": "", "tests/test_two.py": slow}
-    which = "slow" if file == "mivol/a.py" else "slow or not slow"  # a process that is not recorded may run the line
+@pytest.mark.parametrize("slow", [True, False])
+def test_slow_tests_of_a_module_come_last(index, file: str, line: int, expected: list[str], slow: bool) -> None:
+    index.slow, imports = (
+        slow,
+        "import pytest\nfrom mivol import b\nfrom mivol.c import f\n@pytest.mark.slow\ndef test(): pass\n",
+    )
+    index.test_files = {"tests/x/test_a.py": "@pytest.mark.slow", "tests/test_a.py": "", "tests/test_two.py": imports}
+    if file == "mivol/a.py":
+        which, expected = "slow", expected if slow else []
+    else:  # a process that is not recorded may run the line
+        which = "slow or not slow" if slow else "not slow"
     assert index.rounds(fault_at(line, file), SMALL)[2] == (["-m", which, *expected] if expected else [])
 
 

@@ -61,12 +61,14 @@ class Guards:
         runners: indices into ``tests`` by (file of the package, line).
         listed: the tests of the entries of tests/mutations, by file of the package.
         test_files: text of each test file.
+        slow: whether slow tests count.
     """
 
     tests: list[RunTest] = field(default_factory=list)
     runners: dict[tuple[str, int], Iterable[int]] = field(default_factory=dict)
     listed: dict[str, list[str]] = field(default_factory=dict)
     test_files: Mapping[str, str] = field(default_factory=dict)
+    slow: bool = False
 
     def find_runners(self, fault: Fault, source: str) -> list[RunTest]:
         """The tests that run the statement of a fault: tests in files called like the module first, then the most specific.
@@ -91,19 +93,20 @@ class Guards:
         1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them; ``OF_IMPORTS`` for a
            line that an import runs;
         2. more tests that run its line, ``SECOND`` seconds of them;
-        3. the slow tests of its module, by the names of their files; all tests of these files if no recorded test runs the
-           line, because the recording sees no other processes.
+        3. if slow tests count, those in files called like the module. If no recorded test runs the line, all tests of these
+           files, because the recording sees no other processes.
         """
         runners = self.find_runners(fault, source)
         first, rest = split_by_time(runners, FIRST)
         of_import = OF_IMPORTS if is_of_import(source, fault.line) else ()
         one = list(dict.fromkeys([*self.listed.get(fault.file, []), *of_import, *(test.name for test in first)]))
         two = [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]
-        files = self.find_test_files(fault.file, is_unrun=not runners)
-        return [one, two, ["-m", "slow" if runners else "slow or not slow", *files] if files else []]
+        files = self.find_test_files(fault.file, is_unrun=not runners) if self.slow or not runners else []
+        which = "not slow" if not self.slow else "slow" if runners else "slow or not slow"
+        return [one, two, ["-m", which, *files] if files else []]
 
     def find_test_files(self, file: str, is_unrun: bool) -> list[str]:
-        """Files with slow tests that are called like a module; for an unrun line any such test file, or those that import it."""
+        """Files with slow tests that are called like a module; for an unrun line any such file, or those that import it."""
         texts = {name: text for name, text in self.test_files.items() if is_unrun or "mark.slow" in text}
         module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
         parent, _, name = module.rpartition(".")
@@ -206,15 +209,17 @@ def record_suite(copy: Path, jobs: int, target: Path, slow: bool = False) -> Non
         raise RuntimeError(f"pytest ends with {done.returncode} and wrote no recording:\n{(done.stdout + done.stderr)[-2000:]}")
 
 
-def read_recording(path: Path, listed: dict[str, list[str]], test_files: Mapping[str, str] | None = None) -> Guards:
-    """The guards of a recording: a folder with a part of each process of tests. ``test_files`` has texts of test files."""
+def read_recording(
+    path: Path, listed: dict[str, list[str]], test_files: Mapping[str, str] | None = None, slow: bool = False
+) -> Guards:
+    """The guards of a recording: a folder with a part of each process of tests. The rest as in :class:`Guards`."""
     tests, runners = [], {}
     for part in sorted(path.iterdir()):
         own, lines = pickle.loads(part.read_bytes())
         for place, indices in lines.items():
             runners.setdefault(place, array("H")).extend(k + len(tests) for k in indices)
         tests += own
-    return Guards([RunTest(*test) for test in tests], runners, listed, test_files or {})
+    return Guards([RunTest(*test) for test in tests], runners, listed, test_files or {}, slow)
 
 
 def group_entries(entries: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
