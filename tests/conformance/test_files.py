@@ -308,7 +308,9 @@ def test_vti_placement(tmp_path: Path) -> None:
     volume = read(tmp_path, "a.vti", made.vti(made.numbered(), **turned))
     np.testing.assert_allclose(volume.steps, [[0, -2, 0], [1.5, 0, 0], [0, 0, 2.5]], atol=1e-12)
     np.testing.assert_allclose(volume.origin, (10 + 2, 20 + 3, 30 + 12.5))
+    assert volume.meta["centering"] == "point"
     volume = read(tmp_path, "b.vti", made.vti(made.numbered(), cells=True, **turned))
+    assert volume.meta["centering"] == "cell"
     np.testing.assert_array_equal(volume.values, made.numbered())
     np.testing.assert_allclose(volume.origin, (10 + 2 - 1, 20 + 3 + 0.75, 30 + 12.5 + 1.25))
 

@@ -32,6 +32,32 @@ def test_values_and_place_come_back(tmp_path: Path, suffix: str, channels: int) 
     np.testing.assert_allclose(volume.to_world, TURNED, atol=1e-12)
 
 
+FACTS: dict[str, dict] = {
+    ".vol": {"format": "vol", "encoding": 1},
+    ".npy": {"format": "npy"},
+    ".npz": {"format": "npz", "dataset": "values", "metadata": {}},
+    ".nrrd": {"format": "nrrd"},
+    ".vdb": {"format": "vdb", "grid": "density", "class": "fog volume", "index_min": (0, 0, 0), "active_voxels": 24},
+    ".nvdb": {"format": "nvdb", "grid": "density", "class": "fog volume", "index_min": (0, 0, 0)},
+    ".mhd": {"format": "metaimage", "space": "LPS"},
+    ".mha": {"format": "metaimage", "space": "LPS"},
+    ".nii": {"format": "nifti", "space": "RAS", "place": "sform", "unit": "unknown"},
+    ".vti": {"format": "vti", "dataset": "values", "centering": "point"},
+    ".mrc": {"format": "mrc", "unit": "A", "notes": ()},
+    ".tif": {"format": "tiff"},
+    ".tiff": {"format": "tiff"},
+}
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_a_reader_says_what_it_found(tmp_path: Path, suffix: str) -> None:
+    has_place = suffix not in (".npy", ".tif", ".tiff")
+    write_volume(tmp_path / f"a{suffix}", values(), *([UPRIGHT] if has_place else []))
+    meta = read_volume(tmp_path / f"a{suffix}").meta
+    expected = {"path": str(tmp_path / f"a{suffix}"), "dtype": "float32", "space": None, "frame": "file"} | FACTS[suffix]
+    assert {key: meta[key] for key in expected} == expected
+
+
 @pytest.mark.parametrize("suffix", [".mha", ".nii"])
 @pytest.mark.parametrize("space", ["RAS", "LPS", "LAS"])
 def test_the_frame_becomes_that_of_the_format(tmp_path: Path, suffix: str, space: str) -> None:
