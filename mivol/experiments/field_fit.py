@@ -323,7 +323,7 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find empty space"),
         explain_steps(plan),
         explain_sizes(plan, (width, height)),
-        PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
+        explain_degree(plan, len(photos.views)),
         explain_background(plan, photos),
         *[GAINS][: plan.exposure],
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="largest neglected share of the light"),
@@ -359,6 +359,14 @@ def explain_free_space(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
     """Return a line if nodes in free space stay empty."""
     cameras = [view.camera for view in photos.views]
     return [describe_free_space(cameras, median_distance(cameras, photos.box.mean(axis=0)))][: plan.free_space]
+
+
+def explain_degree(plan: RadiancePlan, photographs: int) -> PlanLine:
+    """Return the degree of the harmonics, and whether the number of photographs set it."""
+    is_few = plan.few_degree is not None and photographs < FEW_PHOTOGRAPHS
+    why = f"; fewer than {FEW_PHOTOGRAPHS} photographs overfit higher degrees" if is_few else ""
+    reason = f"{(plan.degree + 1) ** 2} numbers a colour and node{why}"
+    return PlanLine(choice=f"harmonics of degree {plan.degree}", reason=reason)
 
 
 def explain_steps(plan: RadiancePlan) -> PlanLine:

@@ -265,12 +265,28 @@ def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, me
         PlanLine(choice=f"up to {max(plan.most, count)} Gaussians", reason=control),
         PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason=f"small photographs first, {views} a step"),
         PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="the rest is the absolute error"),
+        *explain_capture(plan, len(photos.views)),
         background,
         *[GAINS][: plan.exposure],
         *[MOTIONS][: plan.poses],
         PlanLine(choice=f"about {minutes:.2g} minutes", reason="for two idle cores; the number of steps is fixed"),
         PlanLine(choice=memory, reason="estimated before the allocation"),
     ]
+
+
+def explain_capture(plan: GaussianPlan, photographs: int) -> list[PlanLine]:
+    """Return the choices for a capture: the degree by the number of photographs, and the largest Gaussian."""
+    why = (
+        "the preset's" if photographs >= FEW_PHOTOGRAPHS else f"fewer than {FEW_PHOTOGRAPHS} photographs overfit higher degrees"
+    )
+    lines = [
+        PlanLine(choice=f"harmonics of degree {plan.degree}", reason=why),
+        PlanLine(
+            choice=f"no scale above {plan.largest:g} of the cameras' extent, or of a Gaussian's distance from their middle",
+            reason="larger ones cover other photographs; sky and walls far away need large ones",
+        ),
+    ]
+    return lines[: 2 if plan.control == "clone_split" else 1] if plan.reach else []
 
 
 # -- First Gaussians -------------------------------------------------------------------------------------------------------

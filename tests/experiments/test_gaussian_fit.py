@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,6 +21,7 @@ from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments.gaussian_fit import (
     adapt_to_few,
+    explain_capture,
     find_start_points,
     make_background_cloud,
     make_gaussian_plan,
@@ -303,6 +305,11 @@ def test_few_photographs_of_a_capture_get_a_lower_degree() -> None:
     plan = PRESETS["minutes"]
     assert [stage.degree for stage in adapt_to_few(plan, 49).stages] == [0, 1]
     assert adapt_to_few(plan, 50) == plan and [stage.degree for stage in plan.stages] == [0, 3]
+    few, many = (explain_capture(replace(plan, reach=2.0), count) for count in (49, 50))
+    assert few[0].reason == "fewer than 50 photographs overfit higher degrees" != many[0].reason
+    assert "no scale above 0.1 of the cameras' extent" in few[1].choice
+    # Relocation removes no Gaussian, and a box of one object is no capture.
+    assert len(explain_capture(replace(plan, reach=2.0, control="relocation"), 49)) == 1 and explain_capture(plan, 49) == []
 
 
 def test_random_points_avoid_transparent_pixels() -> None:

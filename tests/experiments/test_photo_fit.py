@@ -412,6 +412,8 @@ def test_nested_boxes_are_those_that_points_and_cameras_need(photos: Photos, pho
         f"no matter nearer to a camera than {clear:.4g} [length], nor nearer than {within:.4g} where fewer than {FEWEST_VIEWS}"
     )
     assert free in said(points, replace(plan, free_space=True))
+    overfit = "fewer than 50 photographs overfit higher degrees"
+    assert overfit in said(points, replace(plan, few_degree=1)) and overfit not in said(points, plan)
     seen = replace(photos, views=tuple(replace(view, points=points[:7]) for view in photos.views))
     batches = field_fit.make_batches(plan, seen)
     lines = [line.choice for line in field_fit.explain_plan(replace(plan, depth=0.5), seen, batches)]
