@@ -72,6 +72,11 @@ class SceneState:
         followed = tuple(is_followed for _, _, is_followed in self.values)
         return (*self.others, shapes, followed)
 
+    @property
+    def sensor_facts(self) -> tuple:
+        """What the samples of the sensor depend on besides arrays."""
+        return self.others[-1]
+
     def is_same(self, other: SceneState) -> bool:
         """Whether no parameter differs, and the sensor is the same."""
         return self.sensor is other.sensor and self.values == other.values and self.others == other.others

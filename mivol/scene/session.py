@@ -41,6 +41,7 @@ from mivol.scene.render_tasks import (
 )
 from mivol.scene.scene_state import SceneState, find_differentiated, find_gradient_array
 from mivol.scene.sensors import check_film, find_sensor
+from mivol.scene.stand_in import StandIn, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.scene_graph import list_values, traverse
 from mivol.transport.estimators.scores import Primal
@@ -99,6 +100,7 @@ class Session:
         self.recordings = Recordings(MAX_RECORDINGS)
         self._surveyed: _SurveyedScene | None = None
         self._opened: dict[bool, PlannedScene] = {}
+        self._stand_ins: dict[tuple, tuple[mi.Sensor, StandIn | None]] = {}
         # Of the last image, for its derivatives; kept longer, they would keep the derivatives of an earlier step.
         self._views: tuple[MediumView, ...] = ()
 
@@ -170,16 +172,24 @@ class Session:
         if is_recording() or opened.unrecorded is not None:
             return make()(*given)
         self._join_arrays(scene, opened.arrays.tracer)
-        self._reset(sensor)
+        stand_in = self._find_stand_in(sensor, opened.state)
+        if stand_in is not None:
+            stand_in.meet(sensor, scene.sensors(), self.aovs)
+            stand_in.show(sensor)
+            given = (scene, stand_in.camera, *given[2:])
+        self._reset(given[1])
         gradients = [(value, dr.grad(value)) for value in find_differentiated(scene)] if kind is GradientTask else []
         try:
-            return self.recordings.call(kind, (opened.spp, *opened.key), make, *given)
+            found = self.recordings.call(kind, (opened.spp, *opened.key), make, *given)
+            if stand_in is not None and kind is not GradientTask:
+                stand_in.give_film(sensor, self.aovs)
+            return found
         except CannotRecordError:
             # The task has run up to the fault.
             for value, gradient in gradients:
                 dr.set_grad(value, gradient)
         try:
-            return make()(*given)
+            return make()(scene, sensor, *given[2:])
         except RuntimeError as error:
             if OUT_OF_MEMORY not in f"{error} {error.__cause__}":
                 raise
@@ -190,6 +200,14 @@ class Session:
             " the grids 80 % of their nodes along each axis (half the memory)."
         )
 
+    def _find_stand_in(self, sensor: mi.Sensor, state: SceneState) -> StandIn | None:
+        """The camera to render in the place of a sensor; None for the sensor itself."""
+        key = sensor.ptr, state.sensor_facts
+        if key not in self._stand_ins:
+            # With the sensor: another one could get its pointer.
+            self._stand_ins[key] = sensor, StandIn.find(sensor)
+        return self._stand_ins[key][1]
+
     def _reset(self, sensor: mi.Sensor) -> None:
         """Bring the film and the sampler into a state that does not depend on what was rendered before.
 
@@ -197,8 +215,7 @@ class Session:
         no image, and for arrays in place of the numbers of a sampler that was never seeded.
         """
         sensor.film().prepare(self.aovs)
-        if sensor.sampler().wavefront_size() != 1:
-            sensor.sampler().seed(dr.opaque(mi.UInt32, 0), 1)
+        reset_sampler(sensor)
 
     def _join_arrays(self, scene: mi.Scene, tracer: mi.Scene | None) -> None:
         """Let a scene and its tracer share their arrays before the first recording.
@@ -221,7 +238,7 @@ class Session:
             return self._opened[for_images]
         if not is_known or not self._surveyed.survey.is_current:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
-            self._opened = {}
+            self._opened, self._stand_ins = {}, {}
             self.recordings.clear()
         survey, views = self._surveyed.survey, self._views
         self._views = ()

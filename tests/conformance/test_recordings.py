@@ -21,6 +21,7 @@ from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, RecordedTask, Recordings, is_recording, without_garbage_collection
 from mivol.scene import plan, render_tasks, scene_state, session
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
+from mivol.scene.stand_in import FORMATS, StandIn, describe_kind
 from mivol.threads import set_thread_count
 from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views
 from scenes import ball_of, box_of, camera, grid_volume, medium, pencil, refused, sky
@@ -326,6 +327,33 @@ def test_an_image_and_a_gradient_are_recorded_once_in_any_order(order: str) -> N
             else:
                 integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (6, 6, 3)), seed=step, spp=2)
         assert integrator.session.recordings.count == 2
+
+
+def test_the_cameras_of_a_scene_are_recorded_once() -> None:
+    """Another camera takes their place: images to the last bit, and each on the film of its own camera."""
+    eyes = [camera((4 * np.sin(a), -4 * np.cos(a), 1.0), (0.0, 0.0, 0.0), res=6, fov=30.0 + a) for a in (0.0, 1.0, 2.0)]
+    eyes[1]["near_clip"], eyes[2]["principal_point_offset_x"] = 0.5, 0.1
+    pair = Pair(smoke_under(**{"sky": sky(0.7)} | {f"eye{k}": eye for k, eye in enumerate(eyes)}), 3)
+    cameras = pair.scene.sensors()
+    assert len(cameras) == 4
+    for seed in range(2):
+        for number in (0, 1, 3, 2, 1):
+            pair.assert_same(seed, sensor=number)
+            recorded = np.array(mi.render(pair.scene, integrator=pair.recorded, sensor=number, seed=9, spp=2))
+            np.testing.assert_array_equal(np.array(cameras[number].film().develop()), recorded)
+    assert pair.recordings.count == 1
+
+
+@pytest.mark.parametrize("pixel_format", FORMATS.values())
+def test_a_stand_in_has_a_film_like_the_given_one(pixel_format: str) -> None:
+    """Another camera than a perspective one has no stand-in."""
+    assert describe_kind(mi.load_dict({"type": "orthographic"})) is None
+    size = {"width": 8, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 1, "crop_offset_y": 2}
+    film = {"type": "hdrfilm", "rfilter": {"type": "mitchell"}, "sample_border": True, "pixel_format": pixel_format, **size}
+    sensor = mi.load_dict({"type": "perspective", "film": film, "sampler": {"type": "independent", "sample_count": 3}})
+    stand_in = StandIn.find(sensor)
+    assert describe_kind(stand_in.camera) == describe_kind(sensor)
+    assert StandIn.find(sensor) is stand_in and stand_in.camera.film().ptr != sensor.film().ptr
 
 
 @pytest.mark.parametrize(("albedo", "between", "readings"), [(0.8, False, 1), (0.8, True, 2), (0.0, False, 2)])

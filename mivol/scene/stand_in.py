@@ -1,0 +1,158 @@
+"""One camera in the place of all cameras of a kind, so that Dr.Jit records one render for all of them.
+
+Dr.Jit 1.5 finds the arrays of every plugin in memory, and records anew if other plugins share arrays with the inputs. A render
+through another camera of the scene is such a change. So a camera of its own takes the numbers of the camera to render.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, ClassVar
+from weakref import WeakValueDictionary
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.scene.scene_state import FOLLOWED_SENSOR, RECORDED_FILM
+from mivol.scene_graph import traverse
+
+FORMATS = {
+    "y": "luminance",
+    "ya": "luminance_alpha",
+    "rgb": "rgb",
+    "rgba": "rgba",
+    "xyz": "xyz",
+    "xyza": "xyza",
+}
+"""Names of pixel formats of ``hdrfilm``, by the names that it prints."""
+
+NUMBERS = ("near_clip", "far_clip", "shutter_open", "shutter_open_time")
+ARRAYS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
+
+
+def describe_kind(sensor: mi.Sensor) -> str | None:
+    """What cameras with the same stand-in have in common; None for a camera that has none."""
+    film, sampler = sensor.film(), sensor.sampler()
+    is_plain = sensor.class_name() == FOLLOWED_SENSOR and film.class_name() == RECORDED_FILM
+    if not is_plain or sampler.class_name() != "IndependentSampler" or sensor.get_medium() is not None:
+        return None
+    return f"{film}{sampler.sample_count()}" if _pixel_format(film) in FORMATS else None
+
+
+def _pixel_format(film: mi.Film) -> str:
+    found = re.search(r"pixel_format = (\w+)", str(film))
+    return found.group(1) if found else ""
+
+
+def reset_sampler(sensor: mi.Sensor) -> None:
+    """Seed a sampler whose numbers are not those of one lane: no task reads them, but they are inputs of recordings."""
+    if sensor.sampler().wavefront_size() != 1:
+        sensor.sampler().seed(dr.opaque(mi.UInt32, 0), 1)
+
+
+def _has_no_image(film: mi.Film) -> bool:
+    """Whether nothing was put on a film since it was made or cleared."""
+    try:
+        return film.develop(raw=True).array.state == dr.VarState.Literal
+    except RuntimeError:
+        return True
+
+
+MET_PIXELS = 1 << 22
+"""Most pixels of films that get an image before their first render."""
+
+
+class StandIn:
+    """A camera that takes the place of others.
+
+    Args:
+        sensor: a camera with a kind (:func:`describe_kind`).
+
+    Attributes:
+        camera: the camera to render.
+    """
+
+    _known: ClassVar[WeakValueDictionary[tuple[str, str], StandIn]] = WeakValueDictionary()
+
+    @classmethod
+    def find(cls, sensor: mi.Sensor) -> StandIn | None:
+        """The stand-in of a camera, shared by all integrators; None for a camera that has none."""
+        kind = describe_kind(sensor)
+        if kind is None:
+            return None
+        known = cls._known.get((mi.variant(), kind))
+        if known is None:
+            known = cls._known[mi.variant(), kind] = cls(sensor)
+        return known
+
+    def __init__(self, sensor: mi.Sensor) -> None:
+        film = sensor.film()
+        size, crop, offset = (tuple(int(n) for n in pair) for pair in (film.size(), film.crop_size(), film.crop_offset()))
+        own = {
+            **dict(zip(("width", "height", "crop_width", "crop_height"), (*size, *crop), strict=True)),
+            **dict(zip(("crop_offset_x", "crop_offset_y"), offset, strict=True)),
+            "pixel_format": FORMATS[_pixel_format(film)],
+            "component_format": re.search(r"component_format = (\w+)", str(film)).group(1),
+            "sample_border": film.sample_border(),
+            "rfilter": film.rfilter(),
+        }
+        sampler = {"type": "independent", "sample_count": sensor.sampler().sample_count()}
+        self.camera = mi.load_dict(
+            {"type": "perspective", "film": {"type": "hdrfilm", **own}, "sampler": sampler}, parallel=False
+        )
+        self._params = traverse(self.camera)
+        self._shown: tuple[list[Any], list[Any]] | None = None
+        self._met: set[int] = set()
+
+    def show(self, sensor: mi.Sensor) -> None:
+        """Take the numbers of a camera of the kind."""
+        given = traverse(sensor)
+        numbers, matrix = [given[name] for name in NUMBERS], given["to_world"].matrix
+        arrays = [dr.detach(given[name]) for name in ARRAYS]
+        state = [*numbers, *(array.index for array in arrays), *dr.detail.collect_indices(matrix)]
+        if self._shown is not None and self._shown[0] == state:
+            return
+        # Arrays of its own: shared arrays would tell the cameras apart.
+        is_own = dr.opaque(mi.Bool, True)
+        for name, number in zip(NUMBERS, numbers, strict=True):
+            self._params[name] = number
+        for name, array in zip(ARRAYS, arrays, strict=True):
+            self._params[name] = dr.select(is_own, array, 0)
+        copied = dr.unravel(type(matrix), dr.select(is_own, dr.ravel(dr.detach(matrix)), 0))
+        self._params["to_world"] = type(given["to_world"])(copied)
+        self._params.update()
+        # Held: Dr.Jit would give the index of a freed array to another array.
+        self._shown = state, [arrays, matrix]
+
+    def meet(self, sensor: mi.Sensor, others: Sequence[mi.Sensor], names: list[str]) -> None:
+        """Give the films of cameras an image, if they have none, and their samplers numbers: both would come with a render.
+
+        Dr.Jit finds the arrays of all cameras in memory, and records anew for one more.
+
+        Args:
+            sensor: the camera to render.
+            others: cameras to be rendered perhaps; those of the same kind are met as well.
+            names: of the AOVs.
+        """
+        if sensor.ptr in self._met:
+            return
+        kind = describe_kind(sensor)
+        new = [one for one in (sensor, *others) if one.ptr not in self._met and describe_kind(one) == kind]
+        if len(new) * math.prod(int(n) for n in self.camera.film().crop_size()) > MET_PIXELS:
+            new = new[:1]
+        for sensor in new:
+            self._met.add(sensor.ptr)
+            reset_sampler(sensor)
+            if _has_no_image(sensor.film()):
+                film, channels = sensor.film(), sensor.film().prepare(names)
+                width, height = (int(n) for n in film.crop_size())
+                black = mi.TensorXf(dr.opaque(mi.Float, 0, width * height * channels), (height, width, channels))
+                film.put_block(mi.ImageBlock(black, film.crop_offset(), None, False))
+
+    def give_film(self, sensor: mi.Sensor, names: list[str]) -> None:
+        """Put the image on the film of a camera; ``names`` of the AOVs."""
+        film = sensor.film()
+        film.prepare(names)
+        film.put_block(mi.ImageBlock(self.camera.film().develop(raw=True), film.crop_offset(), None, False))
