@@ -365,13 +365,14 @@ def measure_emitter_noise(
             finally:
                 values[switch] = kept
                 values.update()
-            shares.append((_name_emitter(emitter, number), max(0.0, 1 - rest / whole)))
+            shares.append((_name_emitter(scene, emitter, number), max(0.0, 1 - rest / whole)))
     return sorted(shares, key=lambda share: -share[1])
 
 
-def _name_emitter(emitter: mi.Emitter, number: int) -> str:
+def _name_emitter(scene: mi.Scene, emitter: mi.Emitter, number: int) -> str:
     """The ``id`` of an emitter or of the shape that it lights; its class and number in a scene without names."""
-    shape = emitter.shape() if emitter.class_name() == "AreaLight" else None
+    # An object that Python met first as an element of a list of emitters has no method ``shape``.
+    shape = next((s for s in scene.shapes() if s.is_emitter() and s.emitter().ptr == emitter.ptr), None)
     return (shape or emitter).id() or f"{emitter.class_name()} {number}"
 
 
