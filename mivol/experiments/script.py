@@ -179,9 +179,13 @@ def optimize(
         The fit: ``fit.values()`` has the parameters, ``fit.history`` the losses.
 
     Raises:
-        MivolError: a loss that is not finite, or a scene that cannot be rendered.
+        MivolError: no problem, a loss that is not finite, or a scene that cannot be rendered.
         KeyboardInterrupt: Ctrl-C; the scene holds the newest parameters.
     """
+    if not hasattr(problem, "initial_reals"):
+        raise MivolError(
+            f"found {type(problem).__name__}, expected a problem; write mivol.Problem(scene, references, parameters)."
+        )
     return reconstruct(problem, to_optimizer(optimizer or Adam()), iterations, measure=measure, observer=observer)
 
 
@@ -201,8 +205,13 @@ def explain(
         Facts, choices with their reasons, and the reason of a refusal.
 
     Raises:
-        MivolError: as :func:`mivol.scene.load.load_scene`.
+        MivolError: a ``max_depth`` that is no whole number from -1 on; else as :func:`mivol.scene.load.load_scene`.
     """
+    if max_depth is not None and (not isinstance(max_depth, int) or max_depth < -1):
+        raise MivolError(
+            f"found {max_depth!r} as max_depth, expected a whole number from -1 on; leave it out to take the depth of the "
+            "scene's own integrator."
+        )
     loaded = scene if isinstance(scene, mi.Scene) else load_scene(scene).scene
     return explain_scene(loaded, max_depth, sensor, noise).text
 

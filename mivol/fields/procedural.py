@@ -68,10 +68,12 @@ def make_procedural(name: str, shape: Sequence[int], seed: int, peak: float) -> 
         (Z, Y, X, 1) float32 in [0, peak].
 
     Raises:
-        MivolError: unknown name.
+        MivolError: unknown name, or a shape that is not three whole numbers from 1 on.
     """
     if name not in PROCEDURAL:
         raise MivolError(f'unknown procedural volume "{name}": known are {", ".join(PROCEDURAL)}.')
+    if not isinstance(shape, Sequence) or len(shape) != 3 or not all(isinstance(n, int | np.integer) and n > 0 for n in shape):
+        raise MivolError(f"found the shape {shape!r}, expected numbers of voxels along z, y and x; write (40, 40, 40).")
     axes = [(np.arange(n) + 0.5) / n for n in shape]
     z, y, x = np.meshgrid(*axes, indexing="ij")
     values = PROCEDURAL[name](np.stack([x, y, z], axis=-1), np.random.default_rng(seed))

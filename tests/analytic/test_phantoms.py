@@ -189,6 +189,12 @@ def test_procedural_points_are_voxel_centres(monkeypatch: pytest.MonkeyPatch) ->
         assert np.allclose(line, 2 * (np.arange(n) + 0.5) / n)
 
 
+@pytest.mark.parametrize("shape", [4, (4, 4), (4, -4, 4), (4, 0, 4), (4, 4.5, 4)])
+def test_a_procedural_volume_has_three_edges(shape: object) -> None:
+    with pytest.raises(MivolError, match="expected numbers of voxels along z, y and x"):
+        make_procedural("tangle", shape, seed=0, peak=1.0)
+
+
 def test_procedural_volumes_are_the_same_object_at_every_resolution() -> None:
     """Fine voxels averaged over coarse ones against coarse voxels: they differ by the curvature inside a voxel only; with two
     axes exchanged they would differ by the object's own contrast. And another seed is another object."""

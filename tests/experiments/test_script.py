@@ -216,3 +216,12 @@ def seen_by(camera: Camera, space: str) -> np.ndarray:
     box["to_world"] = T(field.to_world).translate(0.5).scale(0.5)
     parts = {"box": box, "sky": {"type": "constant"}, "camera": to_sensor(camera), "integrator": {"type": "mivol"}}
     return np.array(mi.render(mi.load_dict({"type": "scene", **parts}), spp=16))[..., :3]
+
+
+def test_wrong_arguments_of_explain_and_optimize_are_named(variant_rgb: str) -> None:
+    integrator = mi.load_dict({"type": "mivol"})
+    for depth in (integrator, 2.5, -2):
+        with pytest.raises(MivolError, match="as max_depth, expected a whole number from -1 on"):
+            mivol.explain({"type": "scene"}, depth)
+    with pytest.raises(MivolError, match="found str, expected a problem"):
+        optimize("scene.xml")
