@@ -43,7 +43,7 @@ def read_mrc(path: Path, dataset: str | None = None) -> VolumeData:
     try:
         with mrcfile.open(path, mode="r") as file:
             header, stored, voxel = file.header.copy(), file.data.copy(), file.voxel_size.copy()
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise refusal(path, f"a damaged MRC file ({error})", "a whole MRC file", "copy or write it again") from error
     if stored.ndim == 4:
         raise refusal(path, f"{len(stored)} volumes", "one volume", "write one of them to a file of its own")
