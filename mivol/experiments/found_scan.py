@@ -423,10 +423,17 @@ def _three_views(files: list[Path], flat: np.ndarray | None, dark: np.ndarray | 
     if len(files) == 1:
         three = pages[0][[0, len(pages[0]) // 2, -1]]
     else:
-        three = np.stack([pages[0][0], read_images([files[len(files) // 2]])[0], pages[-1][-1]])
+        found = [pages[0][0], read_images([files[len(files) // 2]])[0], pages[-1][-1]]
+        if len({view.shape for view in found}) > 1:
+            sizes = ", ".join("{} x {}".format(*view.shape) for view in found)
+            raise refusal(files[0].parent, f"views of {sizes} pixels (first, middle, last)", "one size", "remove other images")
+        three = np.stack(found)
     if flat is None:
         return three
     dark = np.zeros_like(flat) if dark is None else dark
+    if not three.shape[1:] == flat.shape == dark.shape:
+        sizes = ", ".join("{} x {}".format(*part.shape) for part in (three[0], flat, dark))
+        raise refusal(files[0].parent, f"views, flats and darks of {sizes} pixels", "one size", "remove other images")
     return (three - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
 
 

@@ -202,8 +202,8 @@ def plan_slabs(settings: config.ScanExperiment, base: Path) -> SlabPlan:
     solve, choices = _resolve(settings.solve, source.beam, walk)
     if solve.name not in DIRECT and isinstance(source.beam, ConeBeam):
         raise MivolError(
-            f"found {solve.name} for slabs of a cone beam, expected fdk: rays cross slabs, so an iteration needs the whole volume "
-            "several times; choose fdk, or leave out [slabs] and give grid.shape fewer voxels."
+            f"found {solve.name} for slabs of a cone beam, expected fdk: rays cross slabs, so an iteration needs the whole "
+            "volume several times; choose fdk, or leave out [slabs] and give grid.shape fewer voxels."
         )
     if solve.name in DIRECT and settings.solve.tv:
         raise MivolError(f"{solve.name} takes no solve.tv: choose pcg, or leave it out.")

@@ -170,6 +170,17 @@ def test_the_first_middle_and_last_view_tell_the_arc(tmp_path: Path, files: int)
     assert found_scan._three_views(paths, None, None)[:, 1, 2].tolist() == [0, 2, 4]
 
 
+def test_images_of_several_sizes_are_refused(tmp_path: Path) -> None:
+    """Found by fuzzing: among the views, and between views and flats."""
+    paths = [tmp_path / f"{k}.tif" for k in range(3)]
+    for path, width in zip(paths, (3, 3, 4), strict=True):
+        Image.fromarray(np.ones((2, width), "u2")).save(path)
+    with pytest.raises(MivolError, match="views of 2 x 3, 2 x 3, 2 x 4 pixels"):
+        found_scan._three_views(paths, None, None)
+    with pytest.raises(MivolError, match="views, flats and darks of 2 x 3, 2 x 4, 2 x 4 pixels"):
+        found_scan._three_views(paths[:2], np.ones((2, 4)), None)
+
+
 def test_readings_without_flats(tmp_path: Path) -> None:
     """Air near 1 is a transmission, air near 0 a line integral. Readings of a camera need air, equally bright at both edges."""
     view = np.ones((2, 40))
