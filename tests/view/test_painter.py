@@ -152,3 +152,23 @@ def test_exposure_doubles_radiance() -> None:
 def test_a_strip_sees_the_rows_of_the_image() -> None:
     part = strip(camera(), 100, 50)
     assert part.size == (1200, 50) and part.K[1, 2] == camera().K[1, 2] - 100
+
+
+@pytest.mark.parametrize(("is_noisy", "seeds"), [(True, range(3, 11)), (False, range(3, 4))])
+def test_a_picture_of_a_film_is_a_mean_of_eight_draws_of_noise(is_noisy: bool, seeds: range) -> None:
+    """Half of the seeds add 0.2 of blue; a subject without noise is drawn once."""
+    desk = Desk(is_noisy=is_noisy)
+    picture = desk.painter.draw(camera(), seed=3)
+    assert [seed for _, _, seed in desk.subject.drawn] == list(seeds)
+    mean = desk.subject.draw(camera(), desk.painter.look, 0) + [0, 0, 0.1 * is_noisy]
+    assert np.abs(picture.astype(int) - to_picture(mean, desk.subject.space, desk.painter.look.exposure)).max() <= 1
+
+
+def test_a_warm_up_learns_the_time_of_a_draw() -> None:
+    """Of a subject whose time is that of its pixels: as much for each pixel, and nothing else. Both sizes are drawn twice."""
+    desk = Desk(seconds=3e-7)
+    desk.painter._cost = desk.painter._fixed = 1.0
+    desk.painter.warm_up(camera())
+    assert (desk.painter._cost, desk.painter._fixed) == (pytest.approx(3e-7, rel=1e-6), pytest.approx(0, abs=1e-9))
+    sizes = [size for _, size, _ in desk.subject.drawn]
+    assert len(sizes) == 4 and sizes[0] == sizes[1] and sizes[2] == sizes[3] and sizes[2][0] == EDGES[0] > 5 * sizes[0][0]
