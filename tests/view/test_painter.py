@@ -160,7 +160,7 @@ def test_a_picture_of_a_film_is_a_mean_of_eight_draws_of_noise(is_noisy: bool, s
     desk = Desk(is_noisy=is_noisy)
     picture = desk.painter.draw(camera(), seed=3)
     assert [seed for _, _, seed in desk.subject.drawn] == list(seeds)
-    mean = desk.subject.draw(camera(), desk.painter.look, 0) + [0, 0, 0.1 * is_noisy]
+    mean = np.add(desk.subject.draw(camera(), desk.painter.look, 0), [0, 0, 0.1 * is_noisy])
     assert np.abs(picture.astype(int) - to_picture(mean, desk.subject.space, desk.painter.look.exposure)).max() <= 1
 
 
