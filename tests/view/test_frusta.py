@@ -36,7 +36,8 @@ def survey(*cameras: Camera, held_out: tuple[int, ...] = (), files: list[Path] |
     ("places", "size"),
     [
         ([3], 0.1 * 3),  # a tenth of the distance to the middle
-        ([3, 3], 0.1 * 3),  # copies have no distance
+        ([3, 3], 0.1 * 3),  # copies have no distance,
+        ([3, 3, 3, 3.125, 9], 0.1 * 3),  # and do not count
         ([3, 4.5, 6], 0.1 * 4.5),  # a tenth of the median distance, if cameras are far apart,
         ([3, 3.125, 3.25, 9], 0.4 * 0.125),  # else two fifths of the median distance of neighbours
     ],
