@@ -89,13 +89,13 @@ def from_lanes(tau: object) -> np.ndarray:
     return array[:, None] if array.ndim == 1 else array.T
 
 
-def make_lattice(values: np.ndarray | mi.TensorXf, to_world: np.ndarray, skip: bool = False) -> object:
-    """A lattice of the fast path, with or without the gaps that let it skip empty blocks."""
+def make_lattice(values: np.ndarray | mi.TensorXf, to_world: np.ndarray, skip: bool | str = False) -> object:
+    """A lattice of the fast path, whose walk skips no empty blocks, all (True), or those at the "ends" of a ray."""
     from mivol.transport.traversal.grid_blocks import find_empty_distances
     from mivol.transport.traversal.lattice import Lattice
 
     values = values if isinstance(values, mi.TensorXf) else tensor(values)
-    return Lattice(values, to_world, find_empty_distances(values) if skip else None)
+    return Lattice(values, to_world, find_empty_distances(values) if skip else None, trims=skip == "ends")
 
 
 def tau_fast(
@@ -104,7 +104,7 @@ def tau_fast(
     o: np.ndarray,
     d: np.ndarray,
     t_max: float | np.ndarray = math.inf,
-    skip: bool = False,
+    skip: bool | str = False,
 ) -> np.ndarray:
     """Optical depth (n, C) of rays (n, 3) by the code under test."""
     from mivol.transport.media.grid_integral import integrate_tau
@@ -115,7 +115,7 @@ def tau_fast(
 
 
 def tau_and_row(
-    shape: tuple[int, ...], to_world: np.ndarray, o: np.ndarray, d: np.ndarray, t_max: float = math.inf, skip: bool = False
+    shape: tuple[int, ...], to_world: np.ndarray, o: np.ndarray, d: np.ndarray, t_max: float = math.inf, skip: bool | str = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Optical depth through a grid of ones, and the sum over rays of its gradient (Z, Y, X), by the code under test."""
     from mivol.transport.media.grid_integral import integrate_tau

@@ -17,6 +17,7 @@ from mivol.errors import MivolError
 from mivol.files.sparse_volume import VOXELS
 from mivol.scene.choices import (
     MAX_SKIPPED_SHARE,
+    MAX_TRIMMED_SHARE,
     Choice,
     choose_branches,
     choose_channels,
@@ -98,6 +99,7 @@ class Plan:
     Attributes:
         choices: all choices with their reasons.
         skips_empty: whether empty blocks of each medium are skipped.
+        trims: whether only those before the first and behind the last occupied block of a ray are skipped.
         estimates_shadows: whether shadows of each medium are estimated in images.
         segment: name of the segment estimator in :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`.
         scattering_points: scattering points per camera ray in images.
@@ -119,6 +121,7 @@ class Plan:
 
     choices: tuple[Choice, ...]
     skips_empty: tuple[bool, ...]
+    trims: tuple[bool, ...]
     estimates_shadows: tuple[bool, ...]
     segment: str
     scattering_points: int
@@ -146,7 +149,7 @@ class Plan:
     def readings(self, for_images: bool) -> tuple:
         """All that decides what is read of the values of media (:func:`read_parts`)."""
         near = self.draws_near_light if for_images else self.near_light_in_derivatives
-        return self.skips_empty, self.estimates_shadows, self.segment == "free_flight", near
+        return self.skips_empty, self.trims, self.estimates_shadows, self.segment == "free_flight", near
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -173,9 +176,11 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         choose_tracing(needs),
         choose_channels(needs),
     ]
-    skips = tuple(bool(m.resolutions) and (m.occupied < MAX_SKIPPED_SHARE or any(m.bricks)) for m in needs.media)
+    skips = tuple(bool(m.resolutions) and (m.occupied < MAX_TRIMMED_SHARE or any(m.bricks)) for m in needs.media)
+    trims = tuple(skip and m.occupied >= MAX_SKIPPED_SHARE for m, skip in zip(needs.media, skips, strict=True))
     choices += [choose_storage(m) for m in needs.media if any(m.bricks)]
-    choices += [choose_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
+    ways = zip(needs.media, skips, trims, strict=True)
+    choices += [choose_skipping(m, skip, trim) for m, skip, trim in ways if m.resolutions]
     choices += [choice for m in needs.media if (choice := choose_flights(m, segment)) is not None]
     shadows = [choose_shadows(m, needs, settings) for m in needs.media]
     tracks = tuple(choice is not None and choice.choice == "estimated" for choice in shadows)
@@ -206,6 +211,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     return Plan(
         tuple(choices),
         skips,
+        trims,
         tracks,
         segment,
         events,
@@ -289,10 +295,11 @@ Readings = list[list[PartReading]]
 
 def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) -> Readings:
     """Read the values that the planned estimators need besides the values themselves."""
-    skips_empty, estimates_shadows, flies, near = plan.readings(for_images)
+    skips_empty, trims, estimates_shadows, flies, near = plan.readings(for_images)
+    media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, strict=True)
     return [
-        [read_part(p, survey, boundary.name, skip, tracks or (flies and p.channels == 1), near) for p in view.parts]
-        for boundary, view, skip, tracks in zip(needs.boundaries, needs.views, skips_empty, estimates_shadows, strict=True)
+        [read_part(p, survey, boundary.name, skip, trim, tracks or (flies and p.channels == 1), near) for p in view.parts]
+        for boundary, view, skip, trim, tracks in media
     ]
 
 

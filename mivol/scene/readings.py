@@ -214,12 +214,13 @@ class PartReading:
 
     Attributes:
         floored: the values with 0 in place of negative values; None without negative values.
-        empty_distances, block_ranges: as in :class:`mivol.transport.traversal.lattice.Lattice`.
+        empty_distances, trims, block_ranges: as in :class:`mivol.transport.traversal.lattice.Lattice`.
         rough, rough_distances: means of blocks of voxels, and their own ``empty_distances``.
     """
 
     floored: mi.Float | None = None
     empty_distances: mi.UInt32 | None = None
+    trims: bool = False
     block_ranges: BlockRanges | None = None
     rough: mi.TensorXf | None = None
     rough_distances: mi.UInt32 | None = None
@@ -229,7 +230,7 @@ class PartReading:
         if self.floored is not None:
             part.floor(self.floored)
         if self.empty_distances is not None:
-            part.lattice.empty_distances = self.empty_distances
+            part.lattice.empty_distances, part.lattice.trims = self.empty_distances, self.trims
         if self.block_ranges is not None:
             part.lattice.block_ranges = self.block_ranges
         if self.rough is not None:
@@ -238,14 +239,20 @@ class PartReading:
 
 
 def read_part(
-    part: Extinction, survey: SceneSurvey, name: str, skips_empty: bool, tracks: bool, draws_near_light: bool
+    part: Extinction,
+    survey: SceneSurvey,
+    name: str,
+    skips_empty: bool,
+    trims: bool,
+    tracks: bool,
+    draws_near_light: bool,
 ) -> PartReading:
     """Read what transport needs of a part, once for each state of its array.
 
     Args:
         part: a part of the extinction of the medium in ``name``.
         survey: keeps what was read.
-        skips_empty: whether walks skip empty blocks.
+        skips_empty, trims: whether walks skip empty blocks, and only before and behind the occupied ones.
         tracks: whether tracking needs the range of values of each block.
         draws_near_light: whether the light of near emitters is drawn along segments.
     """
@@ -254,6 +261,7 @@ def read_part(
         return reading
     if skips_empty:
         reading.empty_distances = lattice.empty_distances = read_empty_distances(part, survey, name)
+        reading.trims = lattice.trims = trims
     if part.activation is not None:
         return reading
     reading.floored = part.floored

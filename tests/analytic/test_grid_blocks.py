@@ -18,6 +18,8 @@ from mivol.transport.traversal.grid_blocks import (
     find_extremes,
     tabulate_ranges,
 )
+from mivol.transport.traversal.grid_walk import walk_cells
+from mivol.transport.traversal.lattice import clip_to_grid
 from scenes import FRAMES, as_float32, centred, make_lattice, random_rays, tensor, to_lanes
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -31,7 +33,7 @@ def shell(n):
 
 
 @pytest.mark.parametrize("tau_shell", [1e-3, 1.0, 1e3])
-@pytest.mark.parametrize("skip", [False, True])
+@pytest.mark.parametrize("skip", [False, True, "ends"])
 def test_thin_shell(tau_shell, skip):
     rng = np.random.default_rng(29)
     n = 40
@@ -40,7 +42,7 @@ def test_thin_shell(tau_shell, skip):
     assert_tau(values, np.eye(4), *random_rays(rng, np.eye(4), 96), skip=skip)
 
 
-@pytest.mark.parametrize("skip", [False, True])
+@pytest.mark.parametrize("skip", [False, True, "ends"])
 def test_half_empty(skip):
     rng = np.random.default_rng(30)
     values = positive(rng, (33, 20, 41, 3))
@@ -50,6 +52,36 @@ def test_half_empty(skip):
     corner = np.array([40.6, 0.3, 0.2]) / [41, 20, 33]
     o = np.tile(corner - [0, 0, 1], (1, 1))
     assert assert_tau(values, np.eye(4), o, [0, 0, 1], skip=skip)[0, 0] > 0.01
+
+
+def test_trimmed_walks_are_walks_through_every_cell():
+    """The cells between the first and the last occupied block of each ray are visited, and no others; depths are the same.
+
+    The ball has the radius of 10 cells in a box of 64. The longest way in its blocks is that of their circumscribed ball.
+    """
+    n, rng = 64, np.random.default_rng(31)
+    c = np.arange(n) - 31.5
+    inside = c[:, None, None] ** 2 + c[None, :, None] ** 2 + c[None, None, :] ** 2 < 100
+    values = np.where(inside, positive(rng, (n, n, n)), 0)
+    o, d = (np.concatenate(rays) for rays in zip(random_rays(rng, np.eye(4), 200)[:2], along_the_axes(rng, 24), strict=True))
+    rays, count = to_lanes(o, d), {}
+    for skip in (False, "ends"):
+        lattice = make_lattice(values, np.eye(4), skip)
+        segment = clip_to_grid(lattice, *rays, 0, mi.Float(math.inf))
+        count[skip] = np.array(walk_cells(lattice, segment, lambda sum, cell, on: sum + dr.select(on, 1, 0), mi.UInt32(0)))
+    assert (count["ends"] <= count[False]).all() and count["ends"].max() <= 3 * (2 * 10 + 8) + 1
+    assert (count["ends"] == 0).any() and 10 * count["ends"].sum() < 4 * count[False].sum()
+    every = assert_tau(values, np.eye(4), o, d)
+    assert_tau(values, np.eye(4), o, d, skip="ends")
+    assert (count["ends"] > 0)[every[:, 0] > 0].all()
+
+
+def along_the_axes(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays nearly along an axis, from before the unit cube, through places of it: 1e-9 to 1e-2 off."""
+    d = rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-9, -2, (n, 1))
+    d[np.arange(n), rng.integers(0, 3, n)] = rng.choice([-1, 1], n)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    return rng.uniform(0.3, 0.7, (n, 3)) - 2 * d, d
 
 
 def test_gaps_are_the_distances_between_blocks():
@@ -69,7 +101,7 @@ def test_gaps_are_the_distances_between_blocks():
     assert np.all(np.array(read_distances(find_empty_distances(tensor(np.zeros((9, 9, 9)))), (9, 9, 9))) == REACH)
 
 
-@pytest.mark.parametrize("skip", [False, True])
+@pytest.mark.parametrize("skip", [False, True, "ends"])
 def test_gradient_in_and_out_of_the_shell(skip):
     """d tau / d sigma does not know sigma: the voxels of an empty block have the same row of A as all others."""
     from mivol.transport.media.grid_integral import integrate_tau

@@ -160,7 +160,9 @@ def test_channels_emission_skipping_and_tracing():
     assert choices.choose_emission(needs(grey), ONCE) == []
     assert choices.choose_emission(needs(grey, rgb), "emission")[0].reason == "smoke emit"
     assert choices.choose_emission(needs(grey, rgb), FLIGHTS)[0].choice == "at one point of each flight"
-    assert [choices.choose_skipping(grey, skip).choice for skip in (True, False)] == ["skipped", "walked"]
+    ways = [(True, False), (True, True), (False, False)]
+    said = ["skipped", "skipped before and behind the content", "walked"]
+    assert [choices.choose_skipping(grey, *way).choice for way in ways] == said
     scene = needs(grey, rgb)
     scene.boundaries = (SimpleNamespace(box=1), SimpleNamespace(box=None))
     assert choices.choose_tracing(scene).reason == "not a box or ball, or overlapping another boundary: smoke"

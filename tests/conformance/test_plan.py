@@ -120,7 +120,7 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
                   boundaries=[SimpleNamespace(box="a box", hole=None)] * 3, are_emitters_far=False,
                   has_lamps=False, emitter_distances=(0.2, 0.0, math.inf, 0.0))  # fmt: skip
     made = plan.make_plan(asked, Settings(max_depth=2))
-    assert made.skips_empty == (True, False, False)
+    assert (made.skips_empty, made.trims) == ((True, True, False), (False, True, False))
     assert made.estimates_shadows == (False, True, False)
     assert (made.segment, made.scattering_points, made.side_flight_cosine) == ("single_scattering", 1, None)
     assert made.pass_rays == min(2**22, 2**29 // 1500)
@@ -129,9 +129,14 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     passes = math.ceil((2**24 + 1) / made.pass_rays)
     said = {choice.subject: choice.choice for choice in made.choices}
     assert said["passes"] == f"{passes} of at most {made.pass_rays} rays"
-    assert [c.choice for c in made.choices if c.subject == "empty space in fog"] == ["skipped", "walked"]
+    assert [c.choice for c in made.choices if c.subject == "empty space in fog"] == [
+        "skipped",
+        "skipped before and behind the content",
+    ]
     assert [c.choice for c in made.choices if c.subject == "shadows of fog"] == ["exact", "estimated"]
     assert made.gradient_bytes == plan._plan_gradient_memory(asked)[0]
+    asked.media = (thin, fog((300, 300, 300), occupied=plan.MAX_TRIMMED_SHARE), homogeneous)
+    assert plan.make_plan(asked, Settings(max_depth=2)).skips_empty == (True, False, False)
 
 
 CASES = [(False, False, 2), (True, False, 2), (False, True, 2), (False, False, 4)]

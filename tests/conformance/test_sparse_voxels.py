@@ -60,8 +60,8 @@ def plugin(volume: SparseVolumeData, **more: object) -> dict:
     }
 
 
-def lattice_of(volume: mi.Volume, skip: bool = True) -> Lattice:
-    lattice = Lattice(volume.data, volume.mivol_to_world, bricks=volume.mivol_bricks)
+def lattice_of(volume: mi.Volume, skip: bool | str = True) -> Lattice:
+    lattice = Lattice(volume.data, volume.mivol_to_world, bricks=volume.mivol_bricks, trims=skip == "ends")
     return lattice.where_derivatives() if skip else lattice
 
 
@@ -70,6 +70,7 @@ TWINS = {
     "part of a brick": (1, (1, 5, 2), (6, 0, 3), 3, "mirrored", False),
     "bricks": (2, (19, 9, 26), (0, 0, 0), 1, "sheared", True),
     "bricks before the box": (3, (17, 24, 11), (7, 1, 5), 1, "rotated", True),
+    "ends skipped": (5, (21, 9, 30), (3, 0, 6), 1, "sheared", "ends"),
     "every cell walked": (4, (9, 23, 16), (2, 0, 1), 1, "stretched", False),
 }
 """seed, shape, offset, channels, place, and whether the walk skips what is not stored."""
@@ -87,7 +88,7 @@ def test_random_sparse_grids_are_their_dense_twins(seed: int, size: tuple, offse
     assert_twins(seed, tuple(4 * n - 1 for n in size), offset, 1, frame, True)
 
 
-def assert_twins(seed: int, shape: tuple, offset: tuple, channels: int, frame: str, skip: bool) -> None:
+def assert_twins(seed: int, shape: tuple, offset: tuple, channels: int, frame: str, skip: bool | str) -> None:
     """Values at points (outer half voxels and outside too), optical depths, and their transposes at stored voxels."""
     rng, to_world = np.random.default_rng(seed), FRAMES[frame]
     values = patches(rng, shape, channels)

@@ -125,7 +125,8 @@ def test_diagonals_through_corners(n):
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     d = signs / math.sqrt(3)
     assert_tau(values, np.eye(4), 0.5 - 2 * signs, d)
-    assert_tau(values, np.eye(4), 0.5 - 2 * signs, d, skip=True)
+    for skip in (True, "ends"):
+        assert_tau(values, np.eye(4), 0.5 - 2 * signs, d, skip=skip)
     # Each unit of length once: through a grid of ones, the diagonal of the cube.
     fast = tau_fast(np.ones((n, n, n)), np.eye(4), 0.5 - 2 * signs, signs)
     assert np.all(np.abs(fast - 1) <= (3 * n + 3) * EPS)
@@ -164,7 +165,7 @@ def test_planes_that_coincide():
     steps = rng.integers(-2, 3, (96, 3)).astype(float)
     steps[np.all(steps == 0, axis=1)] = [1, 1, 0]
     d = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    for skip in (False, True):
+    for skip in (False, True, "ends"):
         assert_tau(values, np.eye(4), nodes - 4 * steps, d, skip=skip)
         assert_tau(values, np.eye(4), nodes, d, skip=skip)
         # Directions of any length: t then counts in that length, and the planes coincide to the last bit.
