@@ -245,6 +245,7 @@ class Session:
         if not for_images and views and not is_recording():
             opened = self._open_like_image(scene, sensor, spp, state, views)
             if opened is not None:
+                release_unread(survey)
                 return opened
         known = next(iter(self._opened.values()), None)
         with with_placements(None if known is None else known.arrays.placements, {} if known is None else known.places):
