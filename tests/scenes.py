@@ -115,7 +115,12 @@ def tau_fast(
 
 
 def tau_and_row(
-    shape: tuple[int, ...], to_world: np.ndarray, o: np.ndarray, d: np.ndarray, t_max: float = math.inf, skip: bool | str = False
+    shape: tuple[int, ...],
+    to_world: np.ndarray,
+    o: np.ndarray,
+    d: np.ndarray,
+    t_max: float = math.inf,
+    skip: bool | str = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Optical depth through a grid of ones, and the sum over rays of its gradient (Z, Y, X), by the code under test."""
     from mivol.transport.media.grid_integral import integrate_tau

@@ -41,9 +41,9 @@ __all__ = [
 
 MAX_SKIPPED_SHARE = 0.45
 """Share of occupied blocks below which every step of a walk looks for empty blocks; above, only the steps before the first and
-behind the last occupied block of a ray do. Measured rate over the walk through every cell (camera and random rays): a smoke with
-48 % occupied 1.2 and 0.8 with looks in every step, 1.6 and 1.1 without; CT with 43 % 1.05 to 1.1, smoke of 256^3 with 43 % 1.3
-to 1.4 with looks in every step."""
+behind the last occupied block of a ray do. Measured rate over the walk through every cell: smoke with 48 % occupied, camera
+and random rays, 1.2 and 0.8 with looks in every step, 1.6 and 1.1 without; with looks, CT with 43 % 1.05 to 1.1 and smoke of
+256^3 with 43 % 1.3 to 1.4."""
 
 MAX_TRIMMED_SHARE = 0.75
 """Share of occupied blocks above which no walk looks for empty blocks."""

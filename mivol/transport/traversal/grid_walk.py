@@ -89,8 +89,8 @@ def walk_cells(
             ``cell.dt``, and is called again from there.
 
     Cost: a step for each cell or empty region, at most X + Y + Z + 6 steps, and one more wherever a ray enters cells from an
-        empty region; 4 reads a step and channel. With ``trims`` a step across an empty region reads no values, and a step through
-        a cell looks up no block: it takes two thirds of the time.
+        empty region; 4 reads a step and channel. With ``trims`` a step across an empty region reads no values, and a step in a
+        cell looks up no block: it takes two thirds of the time.
     """
     # Dr.Jit makes every object that a loop's body names part of the loop's state: so the body names these arrays only, and
     # neither the lattice nor the segment.

@@ -38,7 +38,8 @@ class Lattice:
         to_world: (4, 4) float64, unit cube to world.
         empty_distances: packed distance of each block of cells to the nearest non-empty block
             (:mod:`mivol.transport.traversal.grid_blocks`); None to walk all blocks.
-        trims: whether a walk with ``empty_distances`` skips empty blocks before the first and behind the last occupied one only.
+        trims: whether a walk with ``empty_distances`` skips only the empty blocks before the first and behind the last occupied
+            block of a ray.
         block_ranges: :class:`mivol.transport.traversal.grid_blocks.BlockRanges` for tracking; None to walk every cell.
         from_world: (3, 4) map from the world to lattice coordinates; made from ``to_world`` by default.
         bricks: where the values of a sparse grid are stored; None for a dense grid.
