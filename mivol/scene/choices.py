@@ -46,8 +46,8 @@ and random rays, 1.2 and 0.8 with looks in every step, 1.6 and 1.1 without; with
 256^3 with 43 % 1.3 to 1.4."""
 
 MAX_TRIMMED_SHARE = 0.9
-"""Share of occupied blocks above which no walk looks for empty blocks. Measured rate over the walk through every cell, camera and
-random rays: balls with 52 % occupied 1.54 and 1.4, with 80 % 1.2 and 1.1; a full grid 0.98 and 1.05."""
+"""Share of occupied blocks above which no walk looks for empty blocks. Measured rate over the walk through every cell, camera
+and random rays: balls with 52 % occupied 1.54 and 1.4, with 80 % 1.2 and 1.1; a full grid 0.98 and 1.05."""
 
 MIN_ESTIMATED_CELLS = 300
 """Number of occupied cells along the three axes above which random look-ups for a shadow cost less than walking all cells.
