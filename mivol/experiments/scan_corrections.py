@@ -20,6 +20,9 @@ from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 from mivol.tomography.single_material import fit_hardening
 
+CUT_OFF = 0.1
+"""Share of the mean mass of a row above which the first or last row is said to cut the object off."""
+
 MOST_ROWS = 8
 """Rows in the middle of a parallel beam's detector by which beam hardening is fitted."""
 
@@ -91,6 +94,12 @@ def _straighten(data: Projections, beam: ParallelBeam | ConeBeam, degree: int, w
     return _with_picture(data, "hardening", y, weights, note)
 
 
+def is_cut_off(y: np.ndarray, weights: np.ndarray) -> bool:
+    """Whether the first or the last row of the views sees more than a tenth of the mass that a row sees on average."""
+    mass = np.where(weights > 0, y, 0.0).sum((0, 2))
+    return bool(max(mass[0], mass[-1]) > CUT_OFF * mass.mean())
+
+
 def refine_geometry(
     settings: config.ScanExperiment, grid: VoxelGrid, data: Projections, held_out: np.ndarray
 ) -> tuple[Projections, Alignment | None]:
@@ -120,6 +129,10 @@ def refine_geometry(
             f"the axis tilted by {along:.3f} +- {along_sigma:.3f} degrees along the light and {across:.3f} +- "
             f"{across_sigma:.3f} across it"
         )
+        if is_cut_off(data.y, data.weights):
+            lines.append(
+                "the object goes on beyond the first or last rows, so the tilt is wrong by up to several of these deviations"
+            )
     ratio = np.sqrt(found.after.mean() / max(found.before.mean(), 1e-30))
     judged = f"the residual of {len(found.after)} held-out views falls to {ratio:.2f}"
     used = judged if found.is_needed else f"{judged}, no more than by chance: the geometry stays as it was"

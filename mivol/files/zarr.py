@@ -244,12 +244,14 @@ def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
         raise refusal(path, f"a damaged Zarr ({_plain(error)})", "a whole Zarr", "copy the folder again") from error
     if kind not in "uifb":
         raise refusal(path, f"values of type {array.dtype.name}", "real numbers", "convert them")
-    check_memory(path, math.prod(array.shape) * max(4, array.dtype.numpy_dtype.itemsize))
+    # tensorstore holds a whole chunk, however little of the array lies in it, and ends the process without memory.
+    chunk = array.chunk_layout.write_chunk.shape
+    check_memory(path, max(math.prod(array.shape), math.prod(chunk)) * max(4, array.dtype.numpy_dtype.itemsize))
     try:
         stored = np.asarray(array.read().result())
     except ValueError as error:
         raise refusal(path, f"a damaged chunk ({_plain(error)})", "whole chunks", "copy the folder again") from error
-    chunks = math.prod(-(-n // c) for n, c in zip(array.shape, array.chunk_layout.write_chunk.shape, strict=True))
+    chunks = math.prod(-(-n // c) for n, c in zip(array.shape, chunk, strict=True))
     present = sum(name not in METADATA for _, _, names in os.walk(path) for name in names)
     if present < chunks:
         return stored, (f"{chunks - present} of {chunks} chunks have no file: they hold the fill value, {array.fill_value}.",)

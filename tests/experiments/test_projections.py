@@ -14,6 +14,7 @@ from mivol.config import Cone, Parallel
 from mivol.errors import MivolError
 from mivol.experiments import projections, readings
 from mivol.experiments.readings import ScanReadings, note_order, to_radians
+from mivol.experiments.scan_corrections import is_cut_off
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.tomography.geometry import ConeBeam, ParallelBeam
 from mivol.tomography.preprocess import Air, Quanta, Transmission
@@ -308,3 +309,15 @@ def test_views_brighter_than_the_flats_are_refused() -> None:
     projections.check_light(Transmission(np.full((1, 1, 2), np.nan), value))
     with pytest.raises(MivolError, match="found views with 4 times the light of the flats .* set data.air"):
         projections.check_light(Transmission(np.full((2, 2, 3), 4.0), value))
+
+
+@pytest.mark.parametrize(
+    ("rows", "wanted"), [([0.0, 1, 2, 1, 0.05], False), ([0.0, 1, 2, 1, 0.2], True), ([2.0, 1, 1, 0, 0], True)]
+)
+def test_an_object_that_goes_on_beyond_the_rows_is_named(rows: list[float], wanted: bool) -> None:
+    """A tenth of the mean mass of a row, in the first or last one; unused pixels do not count."""
+    y = np.array(rows)[None, :, None] * np.ones((3, 1, 4))
+    weights = np.ones(y.shape)
+    assert is_cut_off(y, weights) == wanted
+    y[0, 0, 0], weights[0, 0, 0] = 1000.0, 0.0
+    assert is_cut_off(y, weights) == wanted

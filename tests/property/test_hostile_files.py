@@ -268,11 +268,20 @@ def test_numbers_of_thousands_of_digits_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "number"),
-    [("tiff zlib", 206), ("hdf5", 565), ("projections", 726), ("dicom", 188), ("edf", 18), ("tilt series", 1860)],
+    [
+        ("tiff zlib", 206),
+        ("hdf5", 565),
+        ("projections", 726),
+        ("dicom", 188),
+        ("edf", 18),
+        ("tilt series", 1860),
+        ("zarr", 1371),
+        ("zarr 3", 461),
+    ],
 )
 def test_damage_that_was_a_fault_is_refused(tmp_path: Path, name: str, number: int) -> None:
     """Found by fuzzing with the seed 42: pages in a circle (tifffile lists them for ever), axes without
-    end (fabio), and errors of h5py, pydicom and mrcfile."""
+    end (fabio), chunks beyond the memory (tensorstore), and errors of h5py, pydicom and mrcfile."""
     fuzz.write_sound(name, tmp_path)
     assert fuzz.outcome(fuzz.case(name, number, 42, tmp_path)[0])[0] == "refused"
 
