@@ -44,6 +44,7 @@ KEYWORDS = (
     *("ImageOrientationPatient", "ImagePositionPatient", "PixelSpacing", "ImagerPixelSpacing", "SliceThickness"),
     *("SpacingBetweenSlices", "GridFrameOffsetVector", "RescaleSlope", "RescaleIntercept", "DoseGridScaling"),
     *("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"),
+    *("PositionerPrimaryAngle", "DistanceSourceToDetector"),
 )
 """Elements of a header that are read."""
 
@@ -110,6 +111,7 @@ def read_dicom(path: Path, dataset: str | None = None) -> VolumeData:
     if not series:
         raise refusal(path, "DICOM files without pixels", "images", "name the folder of a series of images")
     uid = _select_series(path, series, dataset)
+    _refuse_views(path, list(series[uid].values()))
     slices = [one for file, header in series[uid].items() for one in _list_slices(file, header)]
     sizes = Counter(one.size for one in slices)
     if len(sizes) > 1:
@@ -134,6 +136,15 @@ def read_dicom(path: Path, dataset: str | None = None) -> VolumeData:
 
 
 # -- Headers ---------------------------------------------------------------------------------------------------------------
+
+
+def _refuse_views(path: Path, headers: list[Any]) -> None:
+    """Refuse views of a turning source, which are no slices."""
+    views = [one for one in headers if "PositionerPrimaryAngle" in one and "DistanceSourceToDetector" in one]
+    angles = {str(one.PositionerPrimaryAngle) for one in views}
+    if len(angles) > 1 or any(int(one.get("NumberOfFrames") or 1) > 1 for one in views):
+        found = f"views of a source {views[0].DistanceSourceToDetector} mm from its detector, from {len(angles)} angles"
+        raise refusal(path, found, "slices", 'write the views as TIFF, and their geometry as [scan] with beam = "cone"')
 
 
 def _import_dcmread(path: Path) -> Any:

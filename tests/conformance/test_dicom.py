@@ -119,6 +119,18 @@ def test_slices_without_a_place_are_ordered_by_number(tmp_path: Path, capsys: py
     assert "assumed: no positions of slices in the file" in capsys.readouterr().out
 
 
+def test_views_of_a_turning_source_are_no_slices(tmp_path: Path) -> None:
+    """Each file has the angle of its view; one angle alone is a radiograph, which is an image."""
+    paths = write_series(tmp_path / "s", stored(), DistanceSourceToDetector=1200.0, PositionerPrimaryAngle=0.0)
+    read_volume(tmp_path / "s")
+    for k, path in enumerate(paths):
+        image = pydicom.dcmread(path)
+        image.PositionerPrimaryAngle = 30.0 * k
+        image.save_as(path)
+    with pytest.raises(MivolError, match=rf'views of a source 1200.* from {len(paths)} angles, expected slices.*beam = "cone"'):
+        read_volume(tmp_path / "s")
+
+
 def test_explain_and_convert_take_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     values = stored("u2")
     write_series(tmp_path / "s", values, "coronal")
