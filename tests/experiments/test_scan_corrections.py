@@ -1,0 +1,144 @@
+"""Corrections of a scan: which part of it they see, and what they say. The fits themselves are tested with synthetic scans."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mivol.errors import MivolError
+from mivol.experiments import scan_corrections as corrections
+from mivol.experiments.projections import Projections
+from mivol.tomography.geometry import ConeBeam, ParallelBeam
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+ROWS, COLUMNS = 13, 4
+ANGLES = np.linspace(0, np.pi, 3, endpoint=False)
+
+
+def projections(beam: object) -> Projections:
+    y = np.random.default_rng(4).uniform(1, 2, (len(ANGLES), ROWS, COLUMNS)).astype(np.float32)
+    return Projections(beam, y, 1 / y, notes=("before",))
+
+
+def parallel() -> ParallelBeam:
+    return ParallelBeam(ANGLES, (ROWS, COLUMNS), detector_offset=(0.5, 0.25))
+
+
+def cone() -> ConeBeam:
+    return ConeBeam(ANGLES, (ROWS, COLUMNS), 10.0, 20.0)
+
+
+def settings_of(solver: str = "pcg", name: str = "pcg", refine: tuple = (), **data: object) -> SimpleNamespace:
+    return SimpleNamespace(
+        data=SimpleNamespace(**data), solve=SimpleNamespace(solver=solver, name=name), scan=SimpleNamespace(refine=refine)
+    )
+
+
+@pytest.mark.parametrize(
+    ("beam", "rows", "offset"), [(parallel(), slice(2, 10), (0.0, 0.25)), (cone(), slice(None), (0.0, 0.0))]
+)
+@pytest.mark.parametrize("with_scatter", [True, False])
+def test_hardening_is_fitted_in_eight_rows_of_a_parallel_beam(
+    monkeypatch: pytest.MonkeyPatch, beam: object, rows: slice, offset: tuple, with_scatter: bool
+) -> None:
+    """The middle rows, around the height 0, tell the polynomial of all rows; a cone beam needs the whole detector."""
+    data, asked = projections(beam), []
+
+    def fit(a: object, y: np.ndarray, weights: np.ndarray, degree: int, scatter: bool) -> SimpleNamespace:
+        asked.append((a.geometry.detector, a.geometry.detector_offset, degree, scatter))
+        np.testing.assert_array_equal(y, data.y[:, rows])
+        np.testing.assert_array_equal(weights, data.weights[:, rows])
+        return SimpleNamespace(
+            straighten=lambda y, weights: (2 * y, weights / 4), coefficients=(0.5, -0.25), scatter=0.125, misfit=0.5
+        )
+
+    monkeypatch.setattr(corrections, "fit_hardening", fit)
+    found = corrections.straighten_lines(settings_of(hardening=3, scatter=with_scatter), data)
+    assert asked == [((data.y[:, rows].shape[1], COLUMNS), offset, 3, with_scatter)]
+    np.testing.assert_array_equal(found.y, 2 * data.y)
+    np.testing.assert_array_equal(found.weights, data.weights / 4)
+    light = ", scattered light 0.125 of the light" if with_scatter else ""
+    assert found.notes == (
+        "before",
+        f"line integrals y are straightened to y +0.5 y^2 -0.25 y^3{light} (data.hardening = 3): their misfit to one material "
+        "falls to 0.50 of what it was",
+    )
+    ((name, before, after),) = found.pictures
+    assert name == "hardening"
+    np.testing.assert_array_equal([before, after], [data.y[:, 6], 2 * data.y[:, 6]])
+
+
+@pytest.mark.parametrize("is_needed", [True, False])
+def test_scattered_light_is_subtracted_if_there_is_some(monkeypatch: pytest.MonkeyPatch, is_needed: bool) -> None:
+    data, asked = projections(cone()), []
+    fit = SimpleNamespace(
+        light=np.array([0.1, 0.2]),
+        sigma=np.array([0.03, 0.02, 0.01]),
+        is_needed=is_needed,
+        subtract=lambda y, w: (y + 1, w / 2),
+    )
+    monkeypatch.setattr(corrections, "fit_scatter", lambda *given: asked.append(given) or fit)
+    found = corrections.straighten_lines(settings_of(hardening=0, scatter=True, air=3), data)
+    assert asked[0][0] is data.geometry and asked[0][3] == 3
+    size = "scattered light of 0.1 to 0.2 +- 0.02 of the light"
+    if is_needed:
+        np.testing.assert_array_equal(found.y, data.y + 1)
+        assert found.notes[1] == f"{size}, smooth along the detector, is subtracted (data.scatter)"
+        assert found.pictures[0][0] == "scatter"
+    else:
+        np.testing.assert_array_equal(found.y, data.y)
+        assert found.notes[1] == f"{size} is not above its noise: none is subtracted" and not found.pictures
+
+
+@pytest.mark.parametrize(
+    ("settings", "beam", "words"),
+    [
+        (settings_of(hardening=1), parallel(), "found data.hardening = 1, which changes nothing"),
+        (settings_of(hardening=2, solver="ml-tr", name="ml-tr"), parallel(), "found data.hardening with ml-tr"),
+        (settings_of(scatter=True, solver="ml-tr", name="ml-tr"), parallel(), "found data.scatter with ml-tr"),
+        (settings_of(hardening=2), object(), "found data.hardening with a table of views"),
+    ],
+)
+def test_what_cannot_be_straightened_is_refused(settings: object, beam: object, words: str) -> None:
+    with pytest.raises(MivolError, match=words):
+        corrections.straighten_lines(settings, projections(beam))
+
+
+def test_nothing_is_done_unasked() -> None:
+    data = projections(object())
+    assert corrections.straighten_lines(settings_of(), data) is data
+    assert corrections.refine_geometry(settings_of(), None, data, np.arange(0)) == (data, None)
+    with pytest.raises(MivolError, match=r"found scan\.refine on another trajectory"):
+        corrections.refine_geometry(settings_of(refine=("axis",)), None, data, np.arange(0))
+
+
+WORDS = (
+    "views shifted by 3 +- 0.1 (rows) and 4 +- 0.2 pixels (columns), turned by 5 +- 0.6 degrees (RMS)",
+    "the axis +1.250 +- 0.125 pixels from where it was",
+    "the axis tilted by 1.000 +- 0.100 degrees along the light and -2.000 +- 0.200 across it",
+)
+
+
+@pytest.mark.parametrize(
+    ("names", "lines"),
+    [(("shift",), WORDS[:1]), (("axis",), WORDS[1:2]), (("tilt",), WORDS[2:]), (("shift", "axis", "tilt"), WORDS)],
+)
+@pytest.mark.parametrize("is_needed", [True, False])
+def test_a_fitted_geometry_in_words(monkeypatch: pytest.MonkeyPatch, names: tuple, lines: tuple, is_needed: bool) -> None:
+    """Root mean squares about the mean of the views; the residual falls from 2 to 1 in the root."""
+    data, moved = projections(parallel()), parallel()
+    fit = SimpleNamespace(
+        beam=moved, moves=np.array([[10, 20, 0.1], [4, 28, 0.1]]) + np.outer([1, -1], [0, 0, np.radians(5)]),
+        sigma=np.array([0.1, 0.2, np.radians(0.6)]), axis=(1.25, 0.125),
+        tilt=np.radians([[1.0, -2.0], [0.1, 0.2]]), before=np.array([3.0, 5.0]), after=np.array([0.5, 1.5]),
+        is_needed=is_needed,
+    )  # fmt: skip
+    monkeypatch.setattr(corrections, "align_views", lambda *given: fit)
+    found, alignment = corrections.refine_geometry(settings_of(refine=names), None, data, np.arange(2))
+    used = "" if is_needed else ", no more than by chance: the geometry stays as it was"
+    said = f"fitted geometry (scan.refine): {'; '.join(lines)}; the residual of 2 held-out views falls to 0.50{used}"
+    assert found.notes == ("before", said)
+    assert found.geometry is moved and alignment is fit
