@@ -38,6 +38,9 @@ EXHAUSTIVE = 150
 ODD = 0.3
 """Share of the pairs with an overlap from which a warning speaks of pairs without parallax."""
 
+MIRRORED = (2, 4, 5, 7)
+"""Orientations of EXIF with a mirror image, as some front cameras write them."""
+
 FULL = 2**24
 """Free space below which COLMAP is said to have filled the disk [byte]."""
 
@@ -128,7 +131,7 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_
     _begin_work(work, images, names)
     try:
         aliases = {name: f"blank-{number:05d}{Path(name).suffix}" for number, name in enumerate(names) if " " in name}
-        masks = _prepare(images, names, work, aliases)
+        masks = _prepare(images, names, work, aliases, say)
         groups = _group_by_lens(images, names).values()
         job = {
             "images": str(work / "images"),
@@ -217,7 +220,7 @@ def _leave_out_copies(folder: Path, images: Path, names: list[str], say: Callabl
     return kept
 
 
-def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, str]) -> int:
+def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, str], say: Callable[[str], None]) -> int:
     """Make folders of the photographs and masks as COLMAP is to read them: links, and copies of what is turned or converted.
 
     Returns:
@@ -228,6 +231,12 @@ def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, s
     """
     headers, masks = {name: read_photo_header(images / name) for name in names}, 0
     turns = any(header.orientation > 4 for header in headers.values())
+    mirrored = [name for name in names if headers[name].orientation in MIRRORED]
+    if 0 < len(mirrored) < len(names):
+        say(
+            f"{len(mirrored)} of {len(names)} photographs ({mirrored[0]}, ...) are mirrored by their EXIF orientation, and "
+            "mirror images do not match the others: take them again with the back camera, or remove a wrong tag"
+        )
     for name in names:
         copy = work / "images" / aliases.get(name, name)
         orientation = headers[name].orientation if turns else 1
