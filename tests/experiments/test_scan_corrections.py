@@ -121,13 +121,17 @@ WORDS = (
     "the axis tilted by 1.000 +- 0.100 degrees along the light and -2.000 +- 0.200 across it",
 )
 
+CUT = "the object goes on beyond the first or last rows, so the tilt is wrong by up to several of these deviations"
+
 
 @pytest.mark.parametrize(
     ("names", "lines"),
     [(("shift",), WORDS[:1]), (("axis",), WORDS[1:2]), (("tilt",), WORDS[2:]), (("shift", "axis", "tilt"), WORDS)],
 )
-@pytest.mark.parametrize("is_needed", [True, False])
-def test_a_fitted_geometry_in_words(monkeypatch: pytest.MonkeyPatch, names: tuple, lines: tuple, is_needed: bool) -> None:
+@pytest.mark.parametrize(("is_needed", "is_cut"), [(True, True), (True, False), (False, False)])
+def test_a_fitted_geometry_in_words(
+    monkeypatch: pytest.MonkeyPatch, names: tuple, lines: tuple, is_needed: bool, is_cut: bool
+) -> None:
     """Root mean squares about the mean of the views; the residual falls from 2 to 1 in the root."""
     data, moved = projections(parallel()), parallel()
     fit = SimpleNamespace(
@@ -137,6 +141,9 @@ def test_a_fitted_geometry_in_words(monkeypatch: pytest.MonkeyPatch, names: tupl
         is_needed=is_needed,
     )  # fmt: skip
     monkeypatch.setattr(corrections, "align_views", lambda *given: fit)
+    monkeypatch.setattr(corrections, "is_cut_off", lambda y, weights: is_cut)
+    if is_cut and "tilt" in names:
+        lines = (*lines, CUT)
     found, alignment = corrections.refine_geometry(settings_of(refine=names), None, data, np.arange(2))
     used = "" if is_needed else ", no more than by chance: the geometry stays as it was"
     said = f"fitted geometry (scan.refine): {'; '.join(lines)}; the residual of 2 held-out views falls to 0.50{used}"
