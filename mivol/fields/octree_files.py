@@ -332,8 +332,8 @@ def _svox_values(name: str, arrays: dict[str, np.ndarray], nodes: int) -> tuple[
     else:
         data = arrays["data"]
         if data.ndim != 5 or data.shape[:4] != (nodes, 2, 2, 2) or data.dtype.kind != "f" or data.shape[4] % 3 != 1:
-            shape = (nodes, 2, 2, 2, "3 basis + 1")
-            raise MivolError(f"{name} holds data of type {data.dtype} and shape {data.shape}; {shape} is expected.")
+            shape = f"floats of the shape ({nodes}, 2, 2, 2, 3 basis + 1)"
+            raise MivolError(f"{name} holds data of type {data.dtype} and shape {data.shape}; {shape} are expected.")
         rows = data.reshape(8 * nodes, -1).astype(np.float32)
         density, sh = rows[:, -1], rows[:, :-1].reshape(len(rows), 3, -1).transpose(0, 2, 1)
     harmonic_degree(sh.shape[1])
