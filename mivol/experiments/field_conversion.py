@@ -45,6 +45,7 @@ from mivol.points.gaussians import Gaussians
 from mivol.scene.explain import Explanation
 from mivol.space import bounds_of
 from mivol.splatting.splatter import Splatter, to_tensors
+from mivol.threads import set_thread_count
 from mivol.transport.line_integrals.radiance_field import RayBundle
 from mivol.validate.metrics import psnr
 
@@ -335,7 +336,9 @@ TIMED_EDGE, TURNS = 800, 5
 
 
 def compare_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree) -> tuple[tuple[float, float], float]:
-    """Pixels a second of two fields: ``VIEWS`` views of the whole box, ready to render, by processor time.
+    """Pixels a second of two fields: ``VIEWS`` views of the whole box, ready to render, by the processor time of one thread.
+
+    A second thread would count as work while it waits for the last pixels of a view, which takes long on a busy machine.
 
     Returns:
         The two rates [pixel/s], and the median of the ratios of all turns, first over second.
@@ -343,15 +346,18 @@ def compare_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree) 
     cameras = cameras_around(other.to_world, TIMED_EDGE)
     views = [CameraRays.from_camera(camera) for camera in cameras]
     renders = [[prepare_view(one, camera, stop=1e-3) for camera in cameras] for one in (field, other)]
-    seconds = np.empty((TURNS + 1, 2))
-    for turn, which in np.ndindex(seconds.shape):
-        begun = time.process_time()
-        for render, view in zip(renders[which], views, strict=True):
-            rendered = render(view.make(0, view.count)[1])
-            dr.eval(rendered.colour, rendered.T)
-        # Views wait for each other only: threads that wait for a view's last pixels would count as work on a busy machine.
-        dr.sync_thread()
-        seconds[turn, which] = time.process_time() - begun
+    seconds, threads = np.empty((TURNS + 1, 2)), dr.thread_count()
+    set_thread_count(1)
+    try:
+        for turn, which in np.ndindex(seconds.shape):
+            begun = time.process_time()
+            for render, view in zip(renders[which], views, strict=True):
+                rendered = render(view.make(0, view.count)[1])
+                dr.eval(rendered.colour, rendered.T)
+            dr.sync_thread()
+            seconds[turn, which] = time.process_time() - begun
+    finally:
+        set_thread_count(threads)
     first, second = (float(v) for v in len(views) * TIMED_EDGE**2 / np.median(seconds[1:], axis=0))  # turn 0 compiles
     return (first, second), float(np.median(seconds[1:, 1] / seconds[1:, 0]))
 

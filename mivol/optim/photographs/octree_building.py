@@ -56,8 +56,8 @@ class OctreeRecipe:
     """
 
     depth: int = 0
-    keep_weight: float = 0.02
-    tolerance: float = 0.1
+    keep_weight: float = 0.015
+    tolerance: float = 0.15
 
 
 def build_octree(grid: SphericalGrid, rays: ViewRays, recipe: OctreeRecipe = OctreeRecipe()) -> Octree:
