@@ -25,6 +25,7 @@ from mivol.fields.blackbody import blackbody_rgb, planck
 from mivol.files import VolumeData, frame_from_steps, read_volume, write_exr, write_grids
 from mivol.files.mesh import Mesh, write_mesh
 from mivol.scene.pbrt import fold_direction, unfold_sky
+from mivol.scene.pbrt_media import noise
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -165,6 +166,29 @@ def test_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert 0.05 < values[:, 8:24].mean() < 0.9 and values[:, 16:24].std() > 0.1
         found.append(values)
     assert not np.array_equal(*found)
+
+
+WAYS = np.array([[x, y, 0] for y in (1, -1) for x in (1, -1)] + [[x, 0, z] for z in (1, -1) for x in (1, -1)]
+                + [[0, y, z] for z in (1, -1) for y in (1, -1)] + [[1, 1, 0], [0, -1, 1], [-1, 1, 0], [0, -1, -1]])  # fmt: skip
+"""Perlin's directions: the middles of a cube's edges, four of them twice."""
+
+
+def test_noise_is_perlins() -> None:
+    """Of random places, those below 0 included, against the definition in float64: a gradient at each corner, faded between."""
+    table, places = np.random.default_rng(1).permutation(256), np.random.default_rng(2).uniform(-300, 300, (50, 3))
+    places = np.float32(places).astype(np.float64)
+    cell = np.floor(places).astype(int)
+    f, expected = places - cell, np.zeros(50)
+    fade = 6 * f**5 - 15 * f**4 + 10 * f**3
+    for corner in np.ndindex(2, 2, 2):
+        number = 0
+        for k in range(3):
+            number = table[(cell[:, k] + corner[k] + number) % 256]
+        weight = np.prod(np.where(corner, fade, 1 - fade), axis=1)
+        expected += weight * (WAYS[number % 16] * (f - corner)).sum(1)
+    found = np.array(noise(mi.Point3f(*np.float32(places.T)), mi.UInt32(table.astype(np.uint32))))
+    # Terms of at most 2, in a dozen operations of float32.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=24 * 2**-23)
 
 
 @pytest.mark.slow
