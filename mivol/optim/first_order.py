@@ -151,13 +151,14 @@ class RMSpropRun(OptimizerRun):
         rates = {name: dr.opaque(mi.Float, rate * factor) for name, rate in self.problem.learning_rates(iteration).items()}
         moves = getattr(self.problem, "moves_after_step", lambda iteration: [])(iteration)
         given = self.settings.memory, self.settings.half, self.reals, self.squares, slopes, rates
-        reals, squares = self._recorded.call(descend_and_move, *given, *(moves[0] if moves else (_stay, ())))
+        if moves:
+            reals, squares = self._recorded.call(descend_and_move, *given, *moves[0])
+        else:
+            # Evaluated with the step: a later move would hold a second copy of the reals.
+            reals, squares = descend_and_move(*given, self.problem.after_step, (iteration,))
         del slopes, given  # as large as the reals
         for function, arguments in moves[1:]:
             reals = self._recorded.call(function, reals, *arguments)
-        if not moves:
-            reals = self.problem.after_step(reals, iteration)
-            dr.eval(reals)
         self.reals, self.squares = reals, squares
         return loss
 
@@ -217,10 +218,6 @@ def descend_and_move(
     moved = move(moved, *arguments)
     dr.eval(moved, means)
     return moved, means
-
-
-def _stay(reals: Reals) -> Reals:
-    return reals
 
 
 def store_means(means: mi.TensorXf, half: bool) -> mi.TensorXf | mi.TensorXf16:
