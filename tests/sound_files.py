@@ -15,11 +15,9 @@ import h5py
 import laspy
 import numpy as np
 import scipy.io
-import tensorstore
 import tifffile
 from beamline_files import write_named, write_nxtomo
 from dicom_series import write_frames, write_series
-from fabio.edfimage import EdfImage
 from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
 from photo_sets import write_blender, write_colmap, write_transforms
 from PIL import Image
@@ -98,6 +96,8 @@ NAMES = {"data": "scan/camera/frames", "flats": "before/reference", "darks": "be
 
 
 def _edf(path: Path) -> None:
+    from fabio.edfimage import EdfImage
+
     EdfImage(data=numbered(2, 6, 7)[0, ..., 0], header={"k": "1"}).write(str(path))
 
 
@@ -128,6 +128,8 @@ def _zarr(folder: Path) -> None:
 
 
 def _zarr_3(folder: Path) -> None:
+    import tensorstore
+
     store = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(folder)}}
     tensorstore.open(store, create=True, dtype="float32", shape=(2, 3, 4)).result()[...] = numbered()[..., 0]
 
@@ -300,6 +302,9 @@ def _of(values: np.ndarray) -> list[tuple]:
     z, y, x, _ = values.shape
     return [(i, j, k, float(values[k, j, i, 0]), 9.0) for k in range(z) for j in range(y) for i in range(x)]
 
+
+PACKAGES = {"edf": "fabio", "zarr": "tensorstore", "zarr 3": "tensorstore"}
+"""Package of ``mivol[lab]`` without which a format is neither written nor read, by key of :data:`FILES` and :data:`SETS`."""
 
 FILES: dict[str, tuple[str, Write, Read]] = {
     "vol": (".vol", _bytes(vol(numbered())), mivol.read_volume),

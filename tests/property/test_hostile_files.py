@@ -12,7 +12,7 @@ import pytest
 from photo_sets import write_colmap
 from PIL import Image
 from script_modules import load
-from sound_files import FILES, SETS
+from sound_files import FILES, PACKAGES, SETS
 from volume_files import meta_head, nrrd_head, numbered
 
 from mivol import config
@@ -266,6 +266,13 @@ def test_numbers_of_thousands_of_digits_are_refused(tmp_path: Path) -> None:
         config.load(tmp_path / "a.toml")
 
 
+def write_sound(name: str, folder: Path) -> None:
+    """Write a sound file of a kind; skip the test where the package of the kind is not installed."""
+    if name in PACKAGES:
+        pytest.importorskip(PACKAGES[name], reason=f'{PACKAGES[name]} is not installed: pip install "mivol[lab]"')
+    fuzz.write_sound(name, folder)
+
+
 @pytest.mark.parametrize(
     ("name", "number"),
     [
@@ -282,14 +289,14 @@ def test_numbers_of_thousands_of_digits_are_refused(tmp_path: Path) -> None:
 def test_damage_that_was_a_fault_is_refused(tmp_path: Path, name: str, number: int) -> None:
     """Found by fuzzing with the seed 42: pages in a circle (tifffile lists them for ever), axes without
     end (fabio), chunks beyond the memory (tensorstore), and errors of h5py, pydicom and mrcfile."""
-    fuzz.write_sound(name, tmp_path)
+    write_sound(name, tmp_path)
     assert fuzz.outcome(fuzz.case(name, number, 42, tmp_path)[0])[0] == "refused"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*FILES, *SETS])
 def test_damaged_files_are_read_or_refused(variant_rgb: str, tmp_path: Path, name: str) -> None:
-    fuzz.write_sound(name, tmp_path)
+    write_sound(name, tmp_path)
     found = [fuzz.outcome(fuzz.case(name, number, 2, tmp_path)[0]) for number in range(SAMPLE)]
     assert [said for kind, said in found if kind == "fault"] == []
     assert any(kind == "refused" for kind, _ in found)
