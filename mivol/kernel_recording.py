@@ -188,7 +188,7 @@ PLAIN = frozenset({int, float, bool, str, type(None)})
 
 
 def _list_arrays(value: Any, arrays: list[Any]) -> Hashable:
-    """Append the arrays of a structure to a list; returns all else as a key."""
+    """Append the arrays of a structure to a list; returns all other values as a key."""
     kind = type(value)
     if kind in PLAIN:
         return value

@@ -88,7 +88,7 @@ SAMPLES = 4
 def convert_to_scene(source: Path, target: Path) -> list[Path]:
     """Write Gaussians, or points as Gaussians, and a scene of Mitsuba that traces rays through them (``mivol_gaussians``).
 
-    The camera is the first view of the file, else one before the middle half of the Gaussians, with up along z. Gaussians are
+    The camera is the first view of the file, or stands before the middle half of the Gaussians, with up along z. Gaussians are
     widened as splats are at the distance of what the camera looks at.
 
     Args:

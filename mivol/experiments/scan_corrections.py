@@ -61,7 +61,7 @@ def straighten_lines(settings: config.ScanExperiment, data: Projections) -> Proj
 
 
 def _subtract_scatter(data: Projections, beam: ParallelBeam | ConeBeam, air_columns: int) -> Projections:
-    """Subtract a smooth term of scattered light, if there is one."""
+    """Subtract any smooth term of scattered light."""
     found = fit_scatter(beam, data.y, data.weights, air_columns)
     size = f"{found.light.min():.3g} to {found.light.max():.3g} +- {np.median(found.sigma):.1g} of the light"
     if not found.is_needed:

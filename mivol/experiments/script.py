@@ -205,7 +205,7 @@ def explain(
         Facts, choices with their reasons, and the reason of a refusal.
 
     Raises:
-        MivolError: a ``max_depth`` that is no whole number from -1 on; else as :func:`mivol.scene.load.load_scene`.
+        MivolError: a ``max_depth`` that is no whole number from -1 on; otherwise as :func:`mivol.scene.load.load_scene`.
     """
     if max_depth is not None and (not isinstance(max_depth, int) or max_depth < -1):
         raise MivolError(

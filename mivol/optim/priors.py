@@ -278,7 +278,7 @@ class DecoupledPrior(Strategy, tag="decoupled prior"):
 
 
 def move_values(values: mi.Float, move: Move | None) -> mi.Float:
-    """Values after a move, if there is one."""
+    """Values after an optional move."""
     return values if move is None else move.function(values, *move.arguments)
 
 

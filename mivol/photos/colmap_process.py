@@ -3,7 +3,7 @@
 pycolmap brings its own zlib, which breaks Pillow's PNG in the same process. So nothing of mivol imports this file.
 
 Pairs. Of a short list of photographs all pairs are matched. Of a long one or a video (``sequential``), photographs are matched
-with neighbours in the order of names and with those that look alike (:func:`find_alike`), which close a walk around it.
+with neighbours in the order of names and with photographs that look alike (:func:`find_alike`), which close a walk around it.
 
 Global structure from motion (Pan et al. 2024) comes first. It averages the rotations of all photographs and finds all positions
 together, so errors do not add up along a chain of photographs. If it leaves out photographs, poses are also found one by one
@@ -97,7 +97,7 @@ def find_features(pycolmap: Any, job: dict, names: list[str]) -> None:
 
 
 def list_pairs(order: list[str], alike: dict[str, list[str]] | None) -> list[tuple[str, str]]:
-    """The pairs to match: all, or (``alike`` given) those of neighbours and of photographs that look alike."""
+    """The pairs to match: all, or (``alike`` given) the pairs of neighbours and of photographs that look alike."""
     if alike is None:
         return list(combinations(order, 2))
     steps = [*range(1, OVERLAP + 1), *(2**n for n in range(4, 31) if 2**n < len(order))]
@@ -189,7 +189,7 @@ def describe_matches(pycolmap: Any, database: Path, aliases: dict[str, str]) -> 
 
 
 def is_turn(homography: np.ndarray, size: tuple[int, int]) -> bool:
-    """Whether a homography of pixels (3, 3) is the one of a turn on the spot, for a common focal length.
+    """Whether a homography of pixels (3, 3) belongs to a turn on the spot, for a common focal length.
 
     It is K R K^-1 then, and K^-1 H K has three equal singular values (Hartley 1997, self-calibration of rotating cameras). A
     plane seen from two places has others.

@@ -33,7 +33,7 @@ FEWEST = 3
 """Fewest photographs of which poses are searched."""
 
 EXHAUSTIVE = 150
-"""Largest number of photographs of which all pairs are matched; of more, neighbours by name and those that look alike."""
+"""Largest number of photographs of which all pairs are matched; of more, neighbours by name and similar ones."""
 
 ODD = 0.3
 """Share of the pairs with an overlap from which a warning speaks of pairs without parallax."""
@@ -221,7 +221,7 @@ def _leave_out_copies(folder: Path, images: Path, names: list[str], say: Callabl
 
 
 def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, str], say: Callable[[str], None]) -> int:
-    """Make folders of the photographs and masks as COLMAP is to read them: links, and copies of what is turned or converted.
+    """Make folders of photographs and masks for COLMAP: links, and copies of turned or converted photographs.
 
     Returns:
         Number of masks.

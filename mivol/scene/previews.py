@@ -370,7 +370,7 @@ def measure_emitter_noise(
 
 
 def _name_emitter(scene: mi.Scene, emitter: mi.Emitter, number: int) -> str:
-    """The ``id`` of an emitter or of the shape that it lights; its class and number in a scene without names."""
+    """The ``id`` of an emitter or of its shape; its class and number in a scene without names."""
     # An object that Python met first as an element of a list of emitters has no method ``shape``.
     shape = next((s for s in scene.shapes() if s.is_emitter() and s.emitter().ptr == emitter.ptr), None)
     return (shape or emitter).id() or f"{emitter.class_name()} {number}"

@@ -277,7 +277,7 @@ class Session:
     def _open_like_image(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, views: tuple[MediumView, ...]
     ) -> PlannedScene | None:
-        """Plan derivatives by the facts and readings of an image of the same values; None if there are none.
+        """Plan derivatives by the facts and readings of an image of the same values; None without such an image.
 
         Args:
             views: of the media, from the image.

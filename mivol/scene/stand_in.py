@@ -26,14 +26,14 @@ FORMATS = {
     "xyz": "xyz",
     "xyza": "xyza",
 }
-"""Names of pixel formats of ``hdrfilm``, by the names that it prints."""
+"""Names of pixel formats of ``hdrfilm``, by the names that ``hdrfilm`` prints."""
 
 NUMBERS = ("near_clip", "far_clip", "shutter_open", "shutter_open_time")
 ARRAYS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
 
 
 def describe_kind(sensor: mi.Sensor) -> str | None:
-    """What cameras with the same stand-in have in common; None for a camera that has none."""
+    """The common properties of cameras with the same stand-in; None if a camera has no stand-in."""
     film, sampler = sensor.film(), sensor.sampler()
     is_plain = sensor.class_name() == FOLLOWED_SENSOR and film.class_name() == RECORDED_FILM
     if not is_plain or sampler.class_name() != "IndependentSampler" or sensor.get_medium() is not None:
@@ -47,7 +47,7 @@ def _pixel_format(film: mi.Film) -> str:
 
 
 def reset_sampler(sensor: mi.Sensor) -> None:
-    """Seed a sampler whose numbers are not those of one lane: no task reads them, but they are inputs of recordings."""
+    """Seed a sampler that does not have one lane: no task reads its numbers, but recordings have inputs for them."""
     if sensor.sampler().wavefront_size() != 1:
         sensor.sampler().seed(dr.opaque(mi.UInt32, 0), 1)
 
@@ -78,7 +78,7 @@ class StandIn:
 
     @classmethod
     def find(cls, sensor: mi.Sensor) -> StandIn | None:
-        """The stand-in of a camera, shared by all integrators; None for a camera that has none."""
+        """The stand-in of a camera, shared by all integrators; None if the camera has no stand-in."""
         kind = describe_kind(sensor)
         if kind is None:
             return None
@@ -133,7 +133,7 @@ class StandIn:
 
         Args:
             sensor: the camera to render.
-            others: cameras to be rendered perhaps; those of the same kind are met as well.
+            others: cameras to be rendered perhaps; cameras of the same kind are met as well.
             names: of the AOVs.
         """
         if sensor.ptr in self._met:

@@ -48,7 +48,7 @@ class GradientSettings:
 
 @dataclass
 class FieldModel:
-    """A field with its occupied cells, and what is behind and before it.
+    """A field with its occupied cells, its background, and the gains of the photographs.
 
     Attributes:
         field: the radiance field.

@@ -54,7 +54,7 @@ EMPTY = 0.1
 """Share of the brightest percentile of voxels below which a voxel is empty, two blocks away from others."""
 
 LEAST_LINE = 0.02
-"""Largest line integral below which there is no object."""
+"""Largest line integral of rays that miss the object."""
 
 FLOOR = 1e-3
 """Standard deviation of the method itself, over the light."""
@@ -73,7 +73,7 @@ class Scatter:
     Attributes:
         light: (rows, cols), the same in all views.
         sigma: (rows, cols), its standard deviation.
-        air: scattered light in the air beside the object, if the views were divided by that air; else 0.
+        air: scattered light in the air beside the object, if the views were divided by that air; otherwise 0.
         is_needed: whether ``light`` is above ``NEEDED`` deviations somewhere.
     """
 
@@ -98,7 +98,7 @@ def fit_scatter(beam: ParallelBeam | ConeBeam, y: np.ndarray, weights: np.ndarra
     Args:
         beam: geometry.
         y: line integrals (views, rows, cols).
-        weights: inverse variances; of unknown noise those of many quanta, because the noise raises the mean of logarithms.
+        weights: inverse variances; for unknown noise, as of many quanta, because noise raises the mean of logarithms.
         air_columns: columns of air at each edge, by which the views were divided; 0: the flats tell the light.
 
     Raises:
