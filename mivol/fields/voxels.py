@@ -246,13 +246,17 @@ def _as_grid(values: mi.TensorXf, name: str) -> np.ndarray:
     return host
 
 
+def is_worth_bricks(values: np.ndarray | SparseVolumeData) -> bool:
+    """Whether ``storage = "auto"`` stores values (Z, Y, X, C) in bricks."""
+    size = values.dense_bytes if isinstance(values, SparseVolumeData) else values.nbytes
+    return size >= LEAST_SPARSE_BYTES and measure_stored_share(values) <= MAX_STORED_SHARE
+
+
 def _store(values: np.ndarray | SparseVolumeData, storage: str) -> np.ndarray | SparseVolumeData:
     """The values as they are stored in memory."""
     is_sparse = isinstance(values, SparseVolumeData)
     if storage == "auto":
-        size = values.dense_bytes if is_sparse else values.nbytes
-        share = None if size < LEAST_SPARSE_BYTES else measure_stored_share(values)
-        storage = "sparse" if share is not None and share <= MAX_STORED_SHARE else "dense"
+        storage = "sparse" if is_worth_bricks(values) else "dense"
     if storage == "sparse":
         return values if is_sparse else SparseVolumeData.from_dense(values)
     return values.dense() if is_sparse else values

@@ -72,7 +72,7 @@ from mivol.transport.path.estimators import (
     choose_segment_estimator,
 )
 
-__all__ = ["Plan", "build_estimators", "build_media", "choose_segment", "make_plan"]
+__all__ = ["Plan", "build_estimators", "build_media", "choose_segment", "find_skipping", "make_plan"]
 
 
 PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
@@ -152,6 +152,17 @@ class Plan:
         return self.skips_empty, self.trims, self.estimates_shadows, self.segment == "free_flight", near
 
 
+def find_skipping(occupied: float, is_sparse: bool) -> tuple[bool, bool]:
+    """Whether walks through a grid skip empty blocks, and only those before and behind the occupied ones of a ray.
+
+    Args:
+        occupied: share of occupied blocks [1].
+        is_sparse: whether the grid is stored in bricks.
+    """
+    skips = is_sparse or occupied < MAX_TRIMMED_SHARE
+    return skips, skips and occupied >= MAX_SKIPPED_SHARE
+
+
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
     """Choose from the facts.
 
@@ -176,11 +187,10 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         choose_tracing(needs),
         choose_channels(needs),
     ]
-    skips = tuple(bool(m.resolutions) and (m.occupied < MAX_TRIMMED_SHARE or any(m.bricks)) for m in needs.media)
-    trims = tuple(skip and m.occupied >= MAX_SKIPPED_SHARE for m, skip in zip(needs.media, skips, strict=True))
+    ways = [find_skipping(m.occupied, any(m.bricks)) if m.resolutions else (False, False) for m in needs.media]
+    skips, trims = tuple(skip for skip, _ in ways), tuple(trim for _, trim in ways)
     choices += [choose_storage(m) for m in needs.media if any(m.bricks)]
-    ways = zip(needs.media, skips, trims, strict=True)
-    choices += [choose_skipping(m, skip, trim) for m, skip, trim in ways if m.resolutions]
+    choices += [choose_skipping(m, *way) for m, way in zip(needs.media, ways, strict=True) if m.resolutions]
     choices += [choice for m in needs.media if (choice := choose_flights(m, segment)) is not None]
     shadows = [choose_shadows(m, needs, settings) for m in needs.media]
     tracks = tuple(choice is not None and choice.choice == "estimated" for choice in shadows)

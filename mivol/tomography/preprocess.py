@@ -332,6 +332,22 @@ def to_line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple
     return np.where(seen, -np.log(safe), 0.0), np.where(seen, safe**2 / np.where(seen, variance, 1.0), 0.0)
 
 
+def subtract_light(y: np.ndarray, weights: np.ndarray, scatter: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Line integrals of the light that was not scattered, and their weights; both are 0 at pixels darker than the scatter.
+
+    Args:
+        y: line integrals (views, rows, cols).
+        weights: inverse variances.
+        scatter: scattered light over the light without object.
+    """
+    left = np.exp(-y) - scatter
+    seen = (weights > 0) & (left > 0)
+    safe = np.where(seen, left, 1.0)
+    # Delta method: dy'/dy = exp(-y) / (exp(-y) - scatter).
+    gain = np.exp(-y) / safe
+    return np.where(seen, -np.log(safe), 0.0), np.where(seen, weights / gain**2, 0.0)
+
+
 def interpolate_gaps(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Interpolate unused pixels (weight 0: dead, saturated, no light) linearly between their neighbours in the row.
 

@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from mivol.errors import MivolError
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam
-from mivol.tomography.preprocess import Transmission, interpolate_gaps
+from mivol.tomography.preprocess import Transmission, interpolate_gaps, subtract_light
 from mivol.tomography.projector import Projector
 
 KEV_METRES = 1.239841984e-9
@@ -90,13 +90,9 @@ class Hardening:
 
     def straighten(self, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Straightened line integrals and their weights; pixels darker than the scattered light get weight 0."""
-        light = np.exp(-y) - self.scatter
-        seen = (weights > 0) & (light > 0)
-        primary = np.where(seen, -np.log(np.where(seen, light, 1.0)), 0.0)
+        primary, weights = subtract_light(y, weights, self.scatter)
         slope = 1 + sum(k * c * primary ** (k - 1) for k, c in enumerate(self.coefficients, 2))
-        # Delta method: dy'/dy = slope exp(-y) / (exp(-y) - scatter).
-        gain = slope * np.exp(-y) / np.where(seen, light, 1.0)
-        return _evaluate(self.coefficients, primary), np.where(seen, weights / gain**2, 0.0)
+        return _evaluate(self.coefficients, primary), weights / slope**2
 
 
 def fit_hardening(a: Projector, y: np.ndarray, weights: np.ndarray, degree: int, with_scatter: bool) -> Hardening:

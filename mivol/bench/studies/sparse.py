@@ -38,9 +38,8 @@ from mivol.bench.studies.optical_depth import shuffle
 from mivol.errors import MivolError
 from mivol.fields.bricks import Bricks
 from mivol.fields.procedural import make_cumulus
-from mivol.fields.voxels import LEAST_SPARSE_BYTES, MAX_STORED_SHARE
+from mivol.fields.voxels import is_worth_bricks
 from mivol.files import SparseVolumeData, read_sparse_volume, write_volume
-from mivol.files.sparse_volume import measure_stored_share
 from mivol.machine import peak_memory
 from mivol.optim.events import AdaptBricks
 from mivol.optim.first_order import Adam, RMSprop
@@ -48,7 +47,7 @@ from mivol.optim.loop import Course, begin_fit
 from mivol.optim.parameters import Parameter
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
-from mivol.scene.choices import MAX_SKIPPED_SHARE, MAX_TRIMMED_SHARE
+from mivol.scene.plan import find_skipping
 from mivol.scene_graph import find_children
 from mivol.threads import run_child
 from mivol.transport.media.grid_integral import integrate_tau
@@ -138,7 +137,7 @@ def race_walks(volume: SparseVolumeData, size: SparseSize) -> dict:
     tensor, sparse = mi.TensorXf(volume.dense()), lattice_of(volume)
     share = np.count_nonzero(volume.values) / dr.width(tensor.array)
     lattices = {DENSE: plan_walk(Lattice(tensor, TO_WORLD), bound_blocks(tensor) > 0), "sparse": sparse}
-    is_sparse = volume.dense_bytes >= LEAST_SPARSE_BYTES and measure_stored_share(volume) <= MAX_STORED_SHARE
+    is_sparse = is_worth_bricks(volume)
     if share > LEAST_SHARE or not is_sparse:
         lattices[EVERY_CELL] = Lattice(tensor, TO_WORLD)
     default = ("sparse", DENSE) if is_sparse else (DENSE, EVERY_CELL)
@@ -157,10 +156,9 @@ def race_walks(volume: SparseVolumeData, size: SparseSize) -> dict:
 
 def plan_walk(lattice: Lattice, occupied: mi.Bool) -> Lattice:
     """The lattice whose walk skips empty blocks as a plan lets it, from whether each block is occupied."""
-    share = float(dr.count(occupied)[0]) / dr.width(occupied)
-    if share < MAX_TRIMMED_SHARE or lattice.bricks is not None:
+    skips, lattice.trims = find_skipping(float(dr.count(occupied)[0]) / dr.width(occupied), lattice.bricks is not None)
+    if skips:
         lattice.empty_distances = find_distances_of_bounds(occupied, lattice.res)
-        lattice.trims = share >= MAX_SKIPPED_SHARE
     return lattice
 
 

@@ -33,7 +33,7 @@ from scipy.sparse.linalg import LinearOperator, lsqr
 from mivol.errors import MivolError
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
-from mivol.tomography.preprocess import interpolate_gaps
+from mivol.tomography.preprocess import interpolate_gaps, subtract_light
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import matrix_bytes, store_matrix
 
@@ -84,12 +84,8 @@ class Scatter:
 
     def subtract(self, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Line integrals of the light that was not scattered, and their weights; 0 at pixels darker than the scatter."""
-        left = np.exp(-y) - self.light
-        seen = (weights > 0) & (left > 0)
-        safe = np.where(seen, left, 1.0)
-        # Delta method: dy'/dy = exp(-y) / (exp(-y) - S).
-        gain = np.exp(-y) / safe
-        return np.where(seen, -np.log(safe / (1 - self.air)), 0.0), np.where(seen, weights / gain**2, 0.0)
+        lines, weights = subtract_light(y, weights, self.light)
+        return np.where(weights > 0, lines + np.log(1 - self.air), 0.0), weights
 
 
 def fit_scatter(beam: ParallelBeam | ConeBeam, y: np.ndarray, weights: np.ndarray, air_columns: int = 0) -> Scatter:

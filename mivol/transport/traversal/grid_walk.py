@@ -120,8 +120,8 @@ def walk_cells(
     stride, top = _strides(lattice.res)
     if empty_distances is not None and lattice.trims:
         line = (empty_distances, res, speed, speed_rest, pace)
-        cell, frac, passed, s, s_rest, active = _find_content(*line, ahead, cell, entry, length, active)
-        length = _trim_end(*line, ahead, segment.cell, entry, length, active)
+        cell, frac, passed, s, s_rest, active = _find_content(line, ahead, cell, entry, length, active)
+        length = _trim_end(line, ahead, segment.cell, entry, length, active)
         active &= length > s
     near, far = _planes(cell, ahead, lattice.res)  #                            flat offsets of the corners, an axis each
     knows = mi.Bool(prepares)  #                                                whether the near corners are known
@@ -211,22 +211,18 @@ def _read_span(
 
 @dr.syntax
 def _find_content(
-    distances: mi.UInt32,
-    res: tuple[int, int, int],
-    speed: mi.Vector3f,
-    speed_rest: mi.Vector3f,
-    pace: mi.Vector3f,
-    ahead: Mask3,
-    cell: mi.Vector3i,
-    entry: mi.Vector3f,
-    length: mi.Float,
-    active: mi.Bool,
+    line: tuple, ahead: Mask3, cell: mi.Vector3i, entry: mi.Vector3f, length: mi.Float, active: mi.Bool
 ) -> tuple[mi.Vector3i, mi.Vector3f, mi.Vector3f, mi.Float, mi.Float, mi.Bool]:
     """Walk to the first cell of an occupied block, by the steps and with the state of :func:`walk_cells`.
+
+    Args:
+        line: distances of blocks, resolution, and speed, its lost digits and pace along the axes.
+        ahead, cell, entry, length, active: as the state of the same names.
 
     Returns:
         Cell, fraction, planes passed, length and its lost digits, and the lanes that meet an occupied block.
     """
+    distances, res, speed, speed_rest, pace = line
     top, sign = _strides(res)[1], dr.select(ahead, mi.Vector3i(1), mi.Vector3i(-1))
     cell, frac, passed = mi.Vector3i(cell), mi.Vector3f(entry), mi.Vector3f(0)
     s, s_rest, active = mi.Float(0), mi.Float(0), mi.Bool(active)
@@ -257,24 +253,14 @@ MARGIN = 0.01
 """Part of a cell that is walked behind the last occupied block, for the rounding of a length: 6e-8 of it."""
 
 
-def _trim_end(
-    distances: mi.UInt32,
-    res: tuple[int, int, int],
-    speed: mi.Vector3f,
-    speed_rest: mi.Vector3f,
-    pace: mi.Vector3f,
-    ahead: Mask3,
-    cell: mi.Vector3i,
-    entry: mi.Vector3f,
-    length: mi.Float,
-    active: mi.Bool,
-) -> mi.Float:
-    """The length to just behind the last occupied block: found from the end, against the ray."""
+def _trim_end(line: tuple, ahead: Mask3, cell: mi.Vector3i, entry: mi.Vector3f, length: mi.Float, active: mi.Bool) -> mi.Float:
+    """The length to just behind the last occupied block, found from the end, against the ray; arguments as before."""
+    _, res, speed, speed_rest, pace = line
     planes = dr.floor(dr.fma(speed, length, entry))
     # The fused multiply-add rounds the fraction, not the position.
     frac = fast_min(fast_max(dr.fma(speed, length, -planes) + dr.fma(speed_rest, length, entry), 0), 1)
     last = dr.clip(cell + dr.select(ahead, 1, -1) * mi.Vector3i(planes), -1, _strides(res)[1])
-    behind = _find_content(distances, res, speed, speed_rest, pace, ~ahead, last, 1 - frac, length, active)[3]
+    behind = _find_content(line, ~ahead, last, 1 - frac, length, active)[3]
     return fast_min(length, (length - behind) + MARGIN * fast_min(fast_min(pace.x, pace.y), pace.z))
 
 
